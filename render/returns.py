@@ -1,0 +1,85 @@
+"""Merging raw samples of light into the few returns a pixel keeps. Plain numpy, same bytes on any number of threads."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Samples(NamedTuple):
+    """Unsorted samples: flat pixel index, path centre and half width [m], radiance, number of bounces."""
+
+    pixel: np.ndarray
+    path_m: np.ndarray
+    half_width_m: np.ndarray
+    radiance: np.ndarray
+    bounces: np.ndarray
+
+
+class Returns(NamedTuple):
+    """Returns sorted by pixel, then path: `offsets` (pixels + 1), path interval [m], radiance, bounces."""
+
+    offsets: np.ndarray
+    path_near_m: np.ndarray
+    path_far_m: np.ndarray
+    radiance: np.ndarray
+    bounces: np.ndarray
+
+
+def concatenate(parts: list[Samples]) -> Samples:
+    return Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def merge(samples: Samples, tolerance_m: float, start_m: np.ndarray | None = None, growth: float = 0.0) -> Samples:
+    """Merge samples of one pixel whose path centres share a cell; direct and indirect samples stay apart.
+
+    Cells are `tolerance_m` wide. With `start_m`, one path length a pixel, they are counted from there and widen by
+    `growth` times the distance to it: indirect light is sharp near the direct return and smooth far behind it.
+    Energy, centroid and variance of the path length are kept exactly: the merged sample is uniform over
+    centroid +- sqrt(3 variance), where a sample uniform over c +- h has variance h^2 / 3, and has the fewest bounces of
+    its parts. Samples without energy go. The sums run over a stable sort in float64, so that the result depends on the
+    samples' order alone.
+    """
+    lit = samples.radiance > 0
+    if not lit.all():
+        samples = Samples(*(column[lit] for column in samples))
+    if len(samples.pixel) == 0:
+        return samples
+    cell = samples.path_m / tolerance_m
+    if start_m is not None:
+        cell = cell - start_m[samples.pixel] / tolerance_m
+    if growth > 0:
+        cell = np.sign(cell) * np.log1p(growth * np.abs(cell)) / growth
+    # light of another surface of the pixel can come before its mean direct path
+    cell = np.clip(np.floor(cell) + (1 << 27), 0, (1 << 28) - 1).astype(np.int64)
+    key = (samples.pixel.astype(np.int64) << 1 | (samples.bounces > 1)) << 28 | cell
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    first = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
+    energy = samples.radiance[order].astype(np.float64)
+    path = samples.path_m[order].astype(np.float64)
+    half_width = samples.half_width_m[order].astype(np.float64)
+    total = np.add.reduceat(energy, first)
+    centroid = np.add.reduceat(energy * path, first) / total
+    length = np.diff(np.append(first, len(key)))
+    spread = (path - np.repeat(centroid, length)) ** 2 + half_width**2 / 3
+    variance = np.add.reduceat(energy * spread, first) / total
+    bounces = np.minimum.reduceat(samples.bounces[order], first)
+    return Samples(samples.pixel[order[first]], centroid, np.sqrt(3 * variance), total, bounces)
+
+
+def to_returns(samples: Samples, pixels: int) -> Returns:
+    """Sort merged samples by pixel and path and pack them as ragged float32 lists."""
+    near = np.maximum(samples.path_m - samples.half_width_m, 0)
+    far = samples.path_m + samples.half_width_m
+    order = np.lexsort((samples.bounces, far, near, samples.pixel))
+    counts = np.bincount(samples.pixel, minlength=pixels)
+    near, far = near[order].astype(np.float32), far[order].astype(np.float32)
+    return Returns(
+        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        path_near_m=near,
+        path_far_m=np.maximum(far, near),
+        radiance=samples.radiance[order].astype(np.float32),
+        bounces=samples.bounces[order].astype(np.uint8),
+    )

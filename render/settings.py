@@ -1,0 +1,69 @@
+"""What a render is asked for, and the plan that answers it. Imports neither Mitsuba nor torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+from scenes.errors import InputError
+
+MAX_BOUNCES = 63
+MAX_SAMPLES = 1 << 20
+GRIDS = (2, 3, 4, 6, 8, 12, 16)
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """What the user asks for; None leaves a choice to the plan.
+
+    bounces     surfaces that light may meet, 1 = direct light only
+    spp         indirect light paths per pixel
+    grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
+    error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
+    budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
+    direct_tolerance_m, indirect_tolerance_m   returns of one pixel closer than this in path length merge
+    indirect_growth  that width grows by this share of the path behind the direct light
+    """
+
+    bounces: int | None = None
+    spp: int | None = None
+    grid: int | None = None
+    error: float | None = None
+    budget: tuple[float, float] | None = None
+    direct_tolerance_m: float = 0.005
+    indirect_tolerance_m: float = 0.03
+    indirect_growth: float = 0.1
+
+    def __post_init__(self) -> None:
+        limits = (("bounces", 1, MAX_BOUNCES), ("spp", 1, MAX_SAMPLES), ("grid", 1, 64), ("error", 1e-4, 1.0))
+        for name, low, high in limits:
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"render: {name} {value} is outside {low} to {high}")
+        if self.budget is not None:
+            signal, background = self.budget
+            if not (math.isfinite(signal) and math.isfinite(background) and signal > 0 and background >= 0):
+                raise InputError(
+                    f"render: budget of {signal:g} signal, {background:g} background photons is not positive"
+                )
+        if self.budget is not None and self.error is not None:
+            raise InputError("render: give an error target or a photon budget, not both")
+        if not 0 <= self.indirect_growth <= 1:
+            raise InputError(f"render: indirect_growth {self.indirect_growth:g} is outside 0 to 1")
+        for name in ("direct_tolerance_m", "indirect_tolerance_m"):
+            if not 1e-6 <= getattr(self, name) <= 10:
+                raise InputError(f"render: {name} {getattr(self, name):g} is outside 1e-6 to 10")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the renderer will do, and why: one reason a line, stored with the result."""
+
+    bounces: int
+    spp: int
+    grid: int
+    ambient: bool
+    reasons: tuple[str, ...]
+
+    def to_dict(self) -> dict:
+        return asdict(self)

@@ -1,0 +1,272 @@
+"""`Transient`: what a camera's pixels see of a pulse, over path length, and its file. Imports no renderer.
+
+One render serves every sensor: nothing here is tied to a bin width. The file is one multi-part OpenEXR, a deep part
+(Z = near, ZBack = far, Y = radiance, bounces) and a flat part, with all metadata in one JSON attribute `scene2spad`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from scenes.errors import InputError
+from scenes.files import whole_file
+
+SCHEMA = 1
+ATTRIBUTE = "scene2spad"
+RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bounces": "bounces"}
+LAYER_CHANNELS = ("depth", "normal.X", "normal.Y", "normal.Z", "albedo", "ambient", "mixed", "error")
+
+
+@dataclass(frozen=True, eq=False)
+class Transient:
+    """Per-pixel time-resolved radiance as a ragged list of returns, and flat layers beside it.
+
+    offsets       (H*W + 1,) int64: the returns of pixel p are [offsets[p], offsets[p+1])
+    path_near_m, path_far_m  float32: a return is uniform over this interval of optical path length, laser to surface to
+                  camera; sorted by `path_near_m` within a pixel
+    radiance      float32: radiance integrated over time, per joule emitted, pixel mean [1/(m^2 sr)]
+    bounces       uint8: surfaces met (1 = direct; of merged indirect light the fewest)
+    depth_m       (H, W) float32: radial distance to the first opaque surface at the pixel centre, NaN for none
+    normal        (H, W, 3) float16, world, toward the camera; albedo (H, W) float16 at the pixel centre
+    ambient       (H, W) float32: steady spectral radiance [W/(m^2 sr nm)]
+    mixed         (H, W) bool: surfaces more than 50 mm apart, or a surface and nothing, in one pixel
+    error         (H, W) float32: estimated standard error of the pixel's total radiance
+    meta          scene, seed, plan, versions: anything JSON holds
+    """
+
+    height: int
+    width: int
+    offsets: np.ndarray
+    path_near_m: np.ndarray
+    path_far_m: np.ndarray
+    radiance: np.ndarray
+    bounces: np.ndarray
+    depth_m: np.ndarray
+    normal: np.ndarray
+    albedo: np.ndarray
+    ambient: np.ndarray
+    mixed: np.ndarray
+    error: np.ndarray
+    meta: dict = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        pixels, shape = self.height * self.width, (self.height, self.width)
+        expected = {
+            "offsets": (np.int64, (pixels + 1,)),
+            "depth_m": (np.float32, shape),
+            "normal": (np.float16, (*shape, 3)),
+            "albedo": (np.float16, shape),
+            "ambient": (np.float32, shape),
+            "mixed": (np.bool_, shape),
+            "error": (np.float32, shape),
+        }
+        returns = (int(self.offsets[-1]),) if len(self.offsets) else (0,)
+        for name in ("path_near_m", "path_far_m", "radiance"):
+            expected[name] = (np.float32, returns)
+        expected["bounces"] = (np.uint8, returns)
+        for name, (dtype, size) in expected.items():
+            array = getattr(self, name)
+            if array.dtype != dtype or array.shape != size:
+                raise InputError(f"transient: {name} is {array.dtype}{array.shape}, expected {np.dtype(dtype)}{size}")
+            array.setflags(write=False)
+        if self.offsets[0] != 0 or (np.diff(self.offsets) < 0).any():
+            raise InputError("transient: offsets do not rise from 0")
+        good = (
+            np.isfinite(self.radiance) & (self.radiance >= 0) & np.isfinite(self.path_far_m) & (self.path_near_m >= 0)
+        )
+        good &= self.path_far_m >= self.path_near_m
+        if not good.all():
+            raise InputError(f"transient: {(~good).sum()} of {good.size} returns are negative, not finite or reversed")
+
+    @property
+    def returns(self) -> int:
+        return len(self.radiance)
+
+    @property
+    def return_pixel(self) -> np.ndarray:
+        """Flat pixel index of every return, int64."""
+        return np.repeat(np.arange(self.height * self.width), np.diff(self.offsets))
+
+    def total_radiance(self) -> np.ndarray:
+        """Sum of the returns of each pixel [1/(m^2 sr)], (H, W) float64."""
+        total = np.bincount(self.return_pixel, weights=self.radiance, minlength=self.height * self.width)
+        return total.reshape(self.height, self.width)
+
+    def mean_path_m(self) -> np.ndarray:
+        """Radiance-weighted mean optical path length of each pixel [m], (H, W) float64; NaN without returns."""
+        centre = 0.5 * (self.path_near_m.astype(np.float64) + self.path_far_m)
+        pixels = self.height * self.width
+        moment = np.bincount(self.return_pixel, weights=self.radiance * centre, minlength=pixels)
+        total = self.total_radiance().ravel()
+        mean = np.divide(moment, total, out=np.full(pixels, np.nan), where=total > 0)
+        return mean.reshape(self.height, self.width)
+
+    @property
+    def indirect_fraction(self) -> float:
+        """Share of the summed radiance that met more than one surface."""
+        total = float(self.radiance.sum(dtype=np.float64))
+        return float(self.radiance[self.bounces > 1].sum(dtype=np.float64)) / total if total > 0 else 0.0
+
+    def delayed(self, offset_m: float) -> Transient:
+        """The same scene `offset_m` farther in time alone (a `time` offset): paths + 2 offset, depth + offset."""
+        return replace(
+            self,
+            path_near_m=self.path_near_m + np.float32(2 * offset_m),
+            path_far_m=self.path_far_m + np.float32(2 * offset_m),
+            depth_m=self.depth_m + np.float32(offset_m),
+            meta={**self.meta, "time_offset_m": self.meta.get("time_offset_m", 0.0) + offset_m},
+        )
+
+    def sha256(self) -> str:
+        """SHA-256 over all arrays, in the order of the fields."""
+        sha = hashlib.sha256(f"{self.height}x{self.width}".encode())
+        for name in (*RETURN_FIELDS, "offsets", "depth_m", "normal", "albedo", "ambient", "mixed", "error"):
+            sha.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        return sha.hexdigest()
+
+
+def check_schema(path: Path, meta: dict, kind: str) -> None:
+    """The rule for every file of ours: of the expected kind, and not of a newer schema than this program knows."""
+    if meta.get("kind") != kind:
+        raise InputError(f"{path}: holds {meta.get('kind', 'something else')!s}, expected a {kind}")
+    if meta.get("schema") != SCHEMA:
+        raise InputError(f"{path}: schema {meta.get('schema')}, this program reads {SCHEMA}; use a newer scene2spad")
+
+
+def write_transient(transient: Transient, path: Path) -> None:
+    """Write the multi-part EXR, whole or not at all."""
+    import OpenEXR
+
+    meta = {
+        **transient.meta,
+        "kind": "transient",
+        "schema": SCHEMA,
+        "returns": transient.returns,
+        "sha256": transient.sha256(),
+    }
+    deep = {
+        channel: OpenEXR.Channel(channel, _ragged(getattr(transient, name), transient))
+        for name, channel in RETURN_FIELDS.items()
+    }
+    normal = np.moveaxis(transient.normal, -1, 0)
+    values = (transient.depth_m, *normal, transient.albedo, transient.ambient, transient.mixed, transient.error)
+    flat = {
+        name: OpenEXR.Channel(name, np.ascontiguousarray(value.astype(np.uint32) if value.dtype == bool else value))
+        for name, value in zip(LAYER_CHANNELS, values, strict=True)
+    }
+    deep_header = {
+        "type": OpenEXR.deepscanline,
+        "compression": OpenEXR.ZIPS_COMPRESSION,
+        ATTRIBUTE: json.dumps(meta, sort_keys=True),
+    }
+    flat_header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    parts = [OpenEXR.Part(deep_header, deep, "transient"), OpenEXR.Part(flat_header, flat, "layers")]
+    with whole_file(path) as beside:
+        try:
+            OpenEXR.File(parts).write(str(beside))
+        except RuntimeError as error:
+            raise OSError(str(error)) from None
+
+
+def _ragged(values: np.ndarray, transient: Transient) -> np.ndarray:
+    """(H, W) object array of each pixel's values, None where a pixel has none: what OpenEXR takes as deep samples."""
+    if values.dtype == np.uint8:
+        values = values.astype(np.uint32)
+    cells = np.empty(transient.height * transient.width, dtype=object)
+    cells[0] = values[:0]  # OpenEXR needs one array to learn the type from, also where no pixel has a return
+    bounds = transient.offsets
+    for pixel in np.flatnonzero(np.diff(bounds)):
+        cells[pixel] = values[bounds[pixel] : bounds[pixel + 1]]
+    return cells.reshape(transient.height, transient.width)
+
+
+def read_transient(path: Path) -> Transient:
+    """Read a transient and check parts, channels, counts and hash.
+
+    Raises InputError in one line for a missing, foreign, truncated or altered file, or one of a newer schema.
+    """
+    import OpenEXR
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: file not found")
+    try:
+        # OpenEXR reports damage on stdout and returns what it could read
+        with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = {part.name(): part for part in file.parts}
+            headers = {name: dict(part.header) for name, part in parts.items()}
+            channels = {name: {k: c.pixels for k, c in part.channels.items()} for name, part in parts.items()}
+    except Exception as error:  # OpenEXR raises bare exceptions of its own
+        raise InputError(f"{path}: not a readable EXR file ({' '.join(str(error).split())[:120]})") from None
+    if ATTRIBUTE not in headers.get("transient", {}) or "layers" not in channels:
+        raise InputError(
+            f"{path}: no transient of scene2spad, or a truncated one (parts: {', '.join(parts) or 'none'})"
+        )
+    try:
+        meta = json.loads(headers["transient"][ATTRIBUTE])
+    except ValueError:
+        raise InputError(f"{path}: its {ATTRIBUTE} attribute is not JSON") from None
+    check_schema(path, meta, "transient")
+    missing = (set(RETURN_FIELDS.values()) - set(channels["transient"])) | (
+        set(LAYER_CHANNELS) - set(channels["layers"])
+    )
+    if missing:
+        raise InputError(f"{path}: channels {', '.join(sorted(missing))} are missing")
+    transient = _assemble(path, channels["transient"], channels["layers"], meta)
+    if transient.returns != meta.get("returns") or transient.sha256() != meta.get("sha256"):
+        raise InputError(f"{path}: contents do not match their SHA-256: the file is damaged or was altered")
+    return transient
+
+
+def _assemble(path: Path, deep: dict[str, np.ndarray], flat: dict[str, np.ndarray], meta: dict) -> Transient:
+    height, width = flat["depth"].shape
+    sizes = np.zeros(height * width, dtype=np.int64)
+    columns = {}
+    for name, channel in RETURN_FIELDS.items():
+        cells = deep[channel].ravel()
+        sizes = np.fromiter((0 if cell is None else len(cell) for cell in cells), np.int64, len(cells))
+        dtype = np.uint8 if name == "bounces" else np.float32
+        parts = [cell for cell in cells if cell is not None]
+        columns[name] = np.concatenate(parts).astype(dtype) if parts else np.empty(0, dtype)
+    if len(sizes) != height * width or len({len(column) for column in columns.values()}) != 1:
+        raise InputError(f"{path}: its parts differ in size")
+    return Transient(
+        height=height,
+        width=width,
+        offsets=np.concatenate(([0], np.cumsum(sizes))).astype(np.int64),
+        **columns,
+        depth_m=flat["depth"],
+        normal=np.stack([flat[f"normal.{axis}"] for axis in "XYZ"], axis=-1),
+        albedo=flat["albedo"],
+        ambient=flat["ambient"],
+        mixed=flat["mixed"].astype(bool),
+        error=flat["error"],
+        meta={k: v for k, v in meta.items() if k not in ("kind", "schema", "returns", "sha256")},
+    )
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Send what C code prints to stdout and stderr to nowhere."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = os.dup(1), os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        for descriptor, copy in enumerate(saved, start=1):
+            os.dup2(copy, descriptor)
+            os.close(copy)
+        os.close(nowhere)

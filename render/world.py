@@ -1,0 +1,261 @@
+"""A `Scene` as the ray tracer holds it: a Mitsuba scene, and the camera and laser as Dr.Jit arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from render.llvm import start_mitsuba
+from scenes.model import Material, Scene, Surface, Texture
+
+mi = start_mitsuba()
+import drjit as dr  # noqa: E402  (other modules take dr and mi from here: only now has an LLVM been chosen)
+
+Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
+OPACITY = "opacity"
+MAX_LAYERS = 16
+
+
+class World:
+    """A scene ready to trace: one merged mesh for every material, the laser's intensity per pixel.
+
+    Tables per registered shape: index of refraction of solid and thin glass (0: none), albedo of conductors (-1: none).
+    Not a dataclass: Dr.Jit would take its fields for variables of every loop that mentions it.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        groups: dict[tuple[int, float, bool], list[Surface]] = {}
+        for surface in scene.surfaces:
+            groups.setdefault((id(surface.material), surface.emission, surface.normals is not None), []).append(surface)
+        materials = [group[0].material for group in groups.values()]
+        self.scene = scene
+        self.has_glass = any(m.is_glass for m in materials)
+        self.has_cutouts = any(_has_cutouts(m) for m in materials)
+        meshes = {f"mesh{i}": _mesh(f"mesh{i}", group, self.has_cutouts) for i, group in enumerate(groups.values())}
+        environment = _environment(scene)
+        lights = {} if environment is None else {"environment": environment}
+        # optimize=False: equal objects must not be merged, since shapes are told apart by their registry index
+        self.traced = mi.load_dict({"type": "scene", **meshes, **lights}, optimize=False)
+        index = np.array([int(dr.reinterpret_array(UInt32, mi.ShapePtr(mesh))[0]) for mesh in meshes.values()])
+        self.solid_ior = _table(index, [m.ior if m.kind == "dielectric" else 0 for m in materials])
+        self.thin_ior = _table(index, [m.ior if m.kind == "thindielectric" else 0 for m in materials])
+        self.albedo = _table(index, [_specular_albedo(m) for m in materials])
+        self.intensity = Float(scene.laser.intensity(scene.camera).ravel())
+        self.laser = mi.Point3f(*scene.laser.position(scene.camera).tolist())
+        # the corner pixels' rays lie on the rim of the smallest cone
+        self.cos_half_angle = scene.laser.cos_half_angle(scene.camera) - 1e-6
+
+    @property
+    def sees_through(self) -> bool:
+        return self.has_glass or self.has_cutouts
+
+
+def _has_cutouts(material: Material) -> bool:
+    return material.lets_light_through and not material.is_glass
+
+
+def _table(index: np.ndarray, values: list[float]) -> Any:
+    table = np.zeros(index.max() + 1)
+    table[index] = values
+    return Float(table)
+
+
+def _specular_albedo(material: Material) -> float:
+    """Scaled reflectance of a conductor at normal incidence; -1 for what has a diffuse reflectance of its own."""
+    if material.kind not in ("conductor", "roughconductor"):
+        return -1.0
+    eta, k = material.eta, material.k
+    return material.specular * ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
+
+
+def _mesh(name: str, surfaces: list[Surface], has_cutouts: bool) -> Any:
+    material, emission = surfaces[0].material, surfaces[0].emission
+    starts = np.cumsum([0] + [len(s.vertices) for s in surfaces])
+    vertices = np.concatenate([s.vertices for s in surfaces])
+    faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts[:-1], strict=True)])
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(_bsdf(material))
+    if emission > 0:
+        props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": emission}})
+    smooth = surfaces[0].normals is not None
+    mesh = mi.Mesh(name, len(vertices), len(faces), props, has_vertex_normals=smooth, has_vertex_texcoords=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = Float(vertices.ravel())
+    params["faces"] = UInt32(faces.ravel())
+    uv = np.concatenate([np.zeros((len(s.vertices), 2)) if s.uv is None else s.uv for s in surfaces])
+    # Mitsuba's v runs down the image, ours up
+    params["vertex_texcoords"] = Float(np.column_stack((uv[:, 0], 1 - uv[:, 1])).ravel())
+    if smooth:
+        params["vertex_normals"] = Float(np.concatenate([s.normals for s in surfaces]).ravel())
+    params.update()
+    if has_cutouts:
+        mesh.add_texture_attribute(OPACITY, mi.load_dict(_texture(material.opacity)))
+    return mesh
+
+
+def _texture(value: float | Texture) -> dict[str, Any]:
+    if not isinstance(value, Texture):
+        return {"type": "uniform", "value": float(value)}
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.array(value.image[..., None])),
+        "raw": True,
+        "filter_type": "bilinear",
+    }
+
+
+def _bsdf(material: Material) -> dict[str, Any]:
+    """Mitsuba's name for a material. Glass and cut-outs are the tracer's business, not the BSDF's."""
+    kind = material.kind
+    if kind in ("diffuse", "roughdiffuse"):
+        inner = {"type": "diffuse", "reflectance": _texture(material.albedo)}
+    elif kind in ("plastic", "roughplastic"):
+        inner = {
+            "type": kind,
+            "diffuse_reflectance": _texture(material.albedo),
+            "specular_reflectance": material.specular,
+            "int_ior": material.ior,
+            "ext_ior": 1.0,
+        }
+    elif kind in ("conductor", "roughconductor"):
+        inner = {"type": kind, "specular_reflectance": material.specular, "eta": material.eta, "k": material.k}
+    else:
+        return {
+            "type": "thindielectric" if kind == "thindielectric" else "dielectric",
+            "int_ior": material.ior,
+            "ext_ior": 1.0,
+        }
+    if kind.startswith("rough") and kind != "roughdiffuse":
+        inner |= {"alpha": material.roughness, "distribution": "ggx"}
+    return {"type": "twosided", "nested": inner}
+
+
+def _environment(scene: Scene) -> dict[str, Any] | None:
+    ambient = scene.ambient
+    if ambient.environment is not None:
+        image = np.repeat(ambient.environment.image[..., None], 3, axis=-1)
+        return {"type": "envmap", "bitmap": mi.Bitmap(image), "to_world": mi.ScalarTransform4f(ambient.pose)}
+    if ambient.radiance > 0:
+        return {"type": "constant", "radiance": {"type": "rgb", "value": ambient.radiance}}
+    return None
+
+
+def camera_rays(world: World, x: Any, y: Any) -> tuple[Any, Any]:
+    """Rays from the camera's centre through raster positions, and their camera-frame directions with z = 1."""
+    camera = world.scene.camera
+    local = mi.Vector3f((x - camera.width / 2) / camera.focal_px, (y - camera.height / 2) / camera.focal_px, 1)
+    return mi.Ray3f(mi.Point3f(*camera.origin.tolist()), dr.normalize(to_world(world, local))), local
+
+
+def to_world(world: World, local: Any) -> Any:
+    """A camera-frame vector in the world."""
+    right, down, forward = (mi.Vector3f(*column.tolist()) for column in world.scene.camera.rotation.T)
+    return right * local.x + down * local.y + forward * local.z
+
+
+def to_camera(world: World, vector: Any) -> Any:
+    """A world vector in the camera's frame."""
+    right, down, forward = (mi.Vector3f(*column.tolist()) for column in world.scene.camera.rotation.T)
+    return mi.Vector3f(dr.dot(right, vector), dr.dot(down, vector), dr.dot(forward, vector))
+
+
+def shape_index(si: Any) -> Any:
+    return dr.reinterpret_array(UInt32, si.shape)
+
+
+def first_opaque(world: World, ray: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+    """The first surface that stops light, past glass and the holes of cut-outs, in a straight line.
+
+    Returns the interaction, the transmission of the glass on the way, the optical path (group index counted inside
+    solid glass) and the geometric distance [m]. A cut-out stops light where its opacity is 1/2 or more. Refraction's
+    change of direction is left out: exact for a co-located laser at normal incidence, a plan says so otherwise.
+    """
+    if not world.sees_through:
+        si = world.traced.ray_intersect(ray, active)
+        return si, Float(1), si.t, si.t
+    return _pass_layers(world, ray, Bool(active), Float(dr.inf))
+
+
+@dr.syntax
+def _pass_layers(world: World, ray: Any, active: Any, limit: Any) -> tuple[Any, Any, Any, Any]:
+    """`first_opaque` with layers, no farther than `limit`; where nothing stops the ray the paths run to the limit."""
+    lanes = dr.width(ray.d)
+    transmission, optical, distance = dr.full(Float, 1, lanes), dr.zeros(Float, lanes), dr.zeros(Float, lanes)
+    layer = dr.zeros(UInt32, lanes)
+    ray = mi.Ray3f(ray)
+    start = mi.Point3f(ray.o)
+    si = dr.zeros(mi.SurfaceInteraction3f, lanes)
+    si.t = dr.full(Float, dr.inf, lanes)
+    searching = Bool(active)
+    while searching:
+        ray.maxt = limit - distance
+        si = world.traced.ray_intersect(ray, searching)
+        hit = searching & si.is_valid()
+        solid = dr.gather(Float, world.solid_ior, shape_index(si), hit)
+        thin = dr.gather(Float, world.thin_ior, shape_index(si), hit)
+        passing = hit & ((solid > 0) | (thin > 0))
+        cosine = dr.dot(ray.d, si.n)
+        fresnel = mi.fresnel(dr.abs(cosine), dr.maximum(dr.maximum(solid, thin), 1.0001))[0]
+        # one interface lets 1 - F through; a thin pane, with all its inner reflections, (1 - F) / (1 + F)
+        crossing = dr.select(thin > 0, (1 - fresnel) / (1 + fresnel), 1 - fresnel)
+        transmission = dr.select(passing, transmission * crossing, transmission)
+        # measured from the start: every new ray begins a little off the surface
+        reached = dr.select(hit, dr.dot(si.p - start, ray.d), limit)
+        step = reached - distance
+        leaving = passing & (solid > 0) & (cosine > 0)
+        optical += dr.select(leaving, step * solid, step)
+        distance = reached
+        if dr.hint(world.has_cutouts, mode="scalar"):
+            passing |= hit & ~passing & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
+        ray = si.spawn_ray(ray.d)
+        layer += 1
+        searching = passing & (layer < MAX_LAYERS)
+        si.t = dr.select(passing & ~searching, dr.inf, si.t)
+    return si, transmission, optical, distance
+
+
+def laser_leg(
+    world: World, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
+) -> tuple[Any, Any]:
+    """What the laser does at a surface: radiance scattered towards `si.wi` [1/(m^2 sr)] and the laser leg's path [m].
+
+    L = f(wi, wo) cos I(w) T / d^2. With `seen_by_camera` = (transmission, optical path) the point was reached by a
+    straight camera ray, along which a co-located laser sees it too: no shadow ray is needed.
+    """
+    laser = world.scene.laser
+    to_laser = world.laser - si.p
+    distance2 = dr.squared_norm(to_laser)
+    direction = to_laser * dr.rsqrt(distance2)
+    if laser.is_colocated and seen_by_camera is not None:
+        transmission, path = seen_by_camera
+    else:
+        transmission, path = _shadow(world, si, direction, dr.sqrt(distance2), active)
+    lit = active & (distance2 > 0)
+    if laser.mode == "flood":
+        lit &= dr.dot(-direction, to_world(world, mi.Vector3f(0, 0, 1))) >= world.cos_half_angle
+    elif seen_by_camera is None:
+        lit &= _in_beam(world, si.p, pixel)
+    intensity = dr.gather(Float, world.intensity, pixel, lit)
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), lit)
+    radiance = value[0] * intensity * transmission / distance2
+    return dr.select(lit & dr.isfinite(radiance), radiance, 0), path
+
+
+def _in_beam(world: World, point: Any, pixel: Any) -> Any:
+    """Whether a point lies in the image row (line) or the pixel (scan) that is being measured."""
+    camera = world.scene.camera
+    local = to_camera(world, point - mi.Point3f(*camera.origin.tolist()))
+    row = dr.floor(local.y / local.z * camera.focal_px + camera.height / 2)
+    column = dr.floor(local.x / local.z * camera.focal_px + camera.width / 2)
+    same = (local.z > 0) & (row == Float(pixel // camera.width))
+    return same & (column == Float(pixel % camera.width)) if world.scene.laser.mode == "scan" else same
+
+
+def _shadow(world: World, si: Any, direction: Any, distance: Any, active: Any) -> tuple[Any, Any]:
+    """Transmission and optical path of the straight way from a surface to the laser; 0 where it is blocked."""
+    if not world.sees_through:
+        blocked = world.traced.ray_test(si.spawn_ray_to(world.laser), active)
+        return dr.select(blocked, Float(0), Float(1)), distance
+    end, transmission, optical, _ = _pass_layers(world, si.spawn_ray(direction), Bool(active), distance * (1 - 1e-4))
+    return dr.select(end.is_valid(), 0, transmission), optical

@@ -1,0 +1,5 @@
+"""The one exception a user's mistake ends in."""
+
+
+class InputError(ValueError):
+    """Bad input, in one line that names value, limit and place. The command line prints it and exits with 2."""

@@ -1,0 +1,381 @@
+"""The nouns of a scene: surfaces and materials, one camera, one laser, ambient light.
+
+World frame: right-handed, metres, y up. Camera frame: x right, y down, z forward; row 0 on top; pixel (row, column)
+has its centre at raster (column + 1/2, row + 1/2). All classes are frozen and validated in the constructor.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields, replace
+from typing import Literal
+
+import numpy as np
+
+from scenes.errors import InputError
+
+MaterialKind = Literal[
+    "diffuse", "roughdiffuse", "plastic", "roughplastic", "conductor", "roughconductor", "dielectric", "thindielectric"
+]
+LaserMode = Literal["flood", "line", "scan"]
+MATERIAL_KINDS: tuple[str, ...] = MaterialKind.__args__
+LASER_MODES: tuple[str, ...] = LaserMode.__args__
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise InputError(message)
+
+
+def _frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: str) -> np.ndarray:
+    """`value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError."""
+    try:
+        array = np.array(value, dtype=dtype, order="C")
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{what}: not an array of numbers ({error})") from None
+    tail = array.shape[array.ndim - len(shape_tail) :] if array.ndim >= len(shape_tail) else None
+    _require(tail == shape_tail, f"{what}: shape {array.shape}, expected (..., {', '.join(map(str, shape_tail))})")
+    array.setflags(write=False)
+    return array
+
+
+def rigid_pose(value: object, what: str) -> np.ndarray:
+    """`value` as a read-only 4x4 rotation and translation (camera or environment to world); a reflection is refused."""
+    pose = _frozen_array(value, np.float64, (4, 4), what)
+    _require(pose.ndim == 2 and bool(np.isfinite(pose).all()), f"{what}: needs 4x4 finite numbers")
+    rotation = pose[:3, :3]
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
+    _require(orthonormal, f"{what}: the upper 3x3 block is not a rotation")
+    _require(np.allclose(pose[3], (0, 0, 0, 1)), f"{what}: the last row is {pose[3].tolist()}, expected 0 0 0 1")
+    return pose
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A single-channel linear image mapped by texture coordinates: u to the right, v upwards, both repeating.
+
+    image: (h, w) float32, row 0 on top. `name` says where it came from.
+    """
+
+    image: np.ndarray
+    name: str
+
+    def __post_init__(self) -> None:
+        image = np.array(self.image, dtype=np.float32, order="C")
+        _require(image.ndim == 2 and image.size > 0, f"texture {self.name}: shape {image.shape}, expected (h, w)")
+        _require(bool(np.isfinite(image).all()), f"texture {self.name}: holds NaN or infinite values")
+        _require(bool(image.min() >= 0), f"texture {self.name}: negative value {image.min():g}")
+        image.setflags(write=False)
+        object.__setattr__(self, "image", image)
+
+
+def _check_fraction(value: float | Texture, what: str) -> None:
+    """A number or texture that must lie in [0, 1], as a reflectance or an opacity does."""
+    low, high = (value.image.min(), value.image.max()) if isinstance(value, Texture) else (value, value)
+    _require(bool(np.isfinite(high) and low >= 0 and high <= 1), f"{what}: {low:g} to {high:g} is outside [0, 1]")
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """How a surface reflects at the laser's wavelength.
+
+    kind        the reflectance model; names and meaning are those of Mitsuba 3
+    albedo      diffuse reflectance, number or texture (diffuse, roughdiffuse, plastic, roughplastic)
+    roughness   GGX alpha of the rough kinds; Oren-Nayar alpha of roughdiffuse
+    specular    scale of the specular reflectance (plastic, conductor)
+    ior         interior index of refraction (plastic, dielectric)
+    eta, k      complex index of a conductor; (0, 1) is a perfect mirror
+    opacity     share of the surface that is there (cut-out masks), number or texture
+    """
+
+    kind: MaterialKind = "diffuse"
+    albedo: float | Texture = 0.5
+    roughness: float = 0.1
+    specular: float = 1.0
+    ior: float = 1.5
+    eta: float = 0.0
+    k: float = 1.0
+    opacity: float | Texture = 1.0
+    name: str = "material"
+
+    def __post_init__(self) -> None:
+        where = f"material {self.name}"
+        _require(
+            self.kind in MATERIAL_KINDS, f"{where}: kind {self.kind!r}, expected one of {', '.join(MATERIAL_KINDS)}"
+        )
+        _check_fraction(self.albedo, f"{where}: albedo")
+        _check_fraction(self.specular, f"{where}: specular reflectance")
+        _check_fraction(self.opacity, f"{where}: opacity")
+        _require(0 < self.roughness <= 1, f"{where}: roughness {self.roughness:g} is outside (0, 1]")
+        _require(1 < self.ior <= 5, f"{where}: index of refraction {self.ior:g} is outside (1, 5]")
+        for label, value in (("eta", self.eta), ("k", self.k)):
+            _require(
+                math.isfinite(value) and value >= 0, f"{where}: conductor {label} {value:g} is negative or not finite"
+            )
+
+    @property
+    def is_glass(self) -> bool:
+        """Whether light goes through the surface itself (not through holes cut in it)."""
+        return self.kind in ("dielectric", "thindielectric")
+
+    @property
+    def lets_light_through(self) -> bool:
+        opaque = self.opacity.image.min() >= 1 if isinstance(self.opacity, Texture) else self.opacity >= 1
+        return self.is_glass or not opaque
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A triangle mesh with one material; both of its sides reflect.
+
+    vertices (n, 3) metres, faces (m, 3), optional uv (n, 2) and shading normals (n, 3) per vertex.
+    `emission` is the steady spectral radiance of an area light [W/(m^2 sr nm)], on the side of the face normals.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    material: Material = field(default_factory=Material)
+    uv: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    emission: float = 0.0
+    name: str = "surface"
+
+    def __post_init__(self) -> None:
+        where = f"mesh {self.name}"
+        vertices = _frozen_array(self.vertices, np.float64, (3,), f"{where}: vertices")
+        faces = _frozen_array(self.faces, np.int64, (3,), f"{where}: faces")
+        _require(vertices.ndim == 2 and faces.ndim == 2, f"{where}: vertices and faces must be tables of three columns")
+        _require(len(faces) > 0 and len(vertices) > 0, f"{where}: has no faces")
+        bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+        _require(bad == 0, f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
+        in_range = faces.min() >= 0 and faces.max() < len(vertices)
+        _require(bool(in_range), f"{where}: a face refers to vertex {faces.max()}, there are {len(vertices)}")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+        for label, width in (("uv", 2), ("normals", 3)):
+            value = getattr(self, label)
+            if value is None:
+                continue
+            array = _frozen_array(value, np.float64, (width,), f"{where}: {label}")
+            _require(len(array) == len(vertices), f"{where}: {len(array)} {label} for {len(vertices)} vertices")
+            _require(bool(np.isfinite(array).all()), f"{where}: {label} hold NaN or infinite values")
+            object.__setattr__(self, label, array)
+        textured = isinstance(self.material.albedo, Texture) or isinstance(self.material.opacity, Texture)
+        _require(
+            self.uv is not None or not textured, f"{where}: its material has a texture, the mesh no uv coordinates"
+        )
+        _require(
+            math.isfinite(self.emission) and self.emission >= 0, f"{where}: emission {self.emission:g} is negative"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera. `pose` is camera to world (4x4); `fov_deg` the full horizontal angle; pixels are square."""
+
+    pose: np.ndarray
+    fov_deg: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", rigid_pose(self.pose, "camera pose"))
+        for label, value in (("width", self.width), ("height", self.height)):
+            _require(
+                int(value) == value and 1 <= value <= 16384, f"camera {label} {value} pixels is outside 1 to 16384"
+            )
+            object.__setattr__(self, label, int(value))
+        _require(0.01 <= self.fov_deg <= 170, f"camera fov {self.fov_deg:g} degrees is outside 0.01 to 170")
+
+    @classmethod
+    def look_at(
+        cls,
+        origin: Iterable[float],
+        target: Iterable[float],
+        *,
+        fov_deg: float,
+        width: int,
+        height: int,
+        up: Iterable[float] = (0.0, 1.0, 0.0),
+    ) -> Camera:
+        """A camera at `origin` whose axis meets `target`, with `up` (world) upwards in the image."""
+        origin, target, up = (np.asarray(tuple(v), float) for v in (origin, target, up))
+        forward = target - origin
+        right = np.cross(forward, up)
+        far_enough = np.linalg.norm(forward) > 1e-9 and np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward)
+        _require(
+            bool(far_enough), f"camera at {origin.tolist()} cannot look at {target.tolist()} with up {up.tolist()}"
+        )
+        forward = forward / np.linalg.norm(forward)
+        right = right / np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.column_stack((right, np.cross(forward, right), forward, origin))
+        return cls(pose, fov_deg, width, height)
+
+    @property
+    def origin(self) -> np.ndarray:
+        return self.pose[:3, 3]
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """Camera to world, 3x3: its columns are the image's right, down and forward in the world."""
+        return self.pose[:3, :3]
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels, (W/2) / tan(fov/2)."""
+        return 0.5 * self.width / math.tan(math.radians(self.fov_deg) / 2)
+
+    def resized(self, width: int | None = None, height: int | None = None) -> Camera:
+        """The same horizontal angle with another image size; one size alone keeps the proportions."""
+        if width is None and height is None:
+            return self
+        if width is None:
+            width = max(1, round(self.width * height / self.height))
+        if height is None:
+            height = max(1, round(self.height * width / self.width))
+        return replace(self, width=width, height=height)
+
+    def rays(self, x: np.ndarray | None = None, y: np.ndarray | None = None) -> np.ndarray:
+        """Unit directions in the world, float64, through raster positions x, y (default: all pixel centres)."""
+        if x is None or y is None:
+            x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        local = np.stack(
+            ((x - self.width / 2) / self.focal_px, (y - self.height / 2) / self.focal_px, np.ones_like(x, float)),
+            axis=-1,
+        )
+        local /= np.linalg.norm(local, axis=-1, keepdims=True)
+        return local @ self.rotation.T
+
+    def pixel_solid_angle(self) -> np.ndarray:
+        """Solid angle of each pixel [sr], (H, W), exact: the sum over corners of +-atan(x y / sqrt(1 + x^2 + y^2))."""
+        x = (np.arange(self.width + 1) - self.width / 2) / self.focal_px
+        y = (np.arange(self.height + 1)[:, None] - self.height / 2) / self.focal_px
+        corner = np.arctan(x * y / np.sqrt(1 + x * x + y * y))
+        return corner[1:, 1:] - corner[1:, :-1] - corner[:-1, 1:] + corner[:-1, :-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Laser:
+    """A pulsed laser, co-located with the camera or displaced by a baseline.
+
+    mode        flood: constant radiant intensity over a circular cone; line: the image row being measured is lit;
+                scan: the pixel being measured is lit
+    baseline_m  laser minus camera, in the camera frame (x right, y down, z forward)
+    cone_deg    full angle of the flood cone around the camera's axis; None: the smallest cone that holds the image
+
+    Its profile I(w) [1/sr] integrates to 1 over its cone, row or pixel. A displaced line or scan beam keeps its solid
+    angle and is steered onto what the pixel sees.
+    """
+
+    mode: LaserMode = "flood"
+    baseline_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    cone_deg: float | None = None
+
+    def __post_init__(self) -> None:
+        _require(self.mode in LASER_MODES, f"laser mode {self.mode!r}, expected one of {', '.join(LASER_MODES)}")
+        baseline = tuple(float(v) for v in self.baseline_m)
+        _require(
+            len(baseline) == 3 and all(map(math.isfinite, baseline)), f"laser baseline {baseline} is not 3 numbers"
+        )
+        object.__setattr__(self, "baseline_m", baseline)
+        good = self.cone_deg is None or 0 < self.cone_deg <= 360
+        _require(good, f"laser cone {self.cone_deg} degrees is outside (0, 360]")
+        _require(self.cone_deg is None or self.mode == "flood", f"laser mode {self.mode}: a cone is for flood only")
+
+    @property
+    def is_colocated(self) -> bool:
+        return self.baseline_m == (0.0, 0.0, 0.0)
+
+    def position(self, camera: Camera) -> np.ndarray:
+        """Laser position in the world, metres."""
+        return camera.origin + camera.rotation @ np.asarray(self.baseline_m)
+
+    def cos_half_angle(self, camera: Camera) -> float:
+        """Cosine of the flood cone's half angle."""
+        if self.cone_deg is not None:
+            return math.cos(math.radians(self.cone_deg) / 2)
+        return camera.focal_px / math.hypot(camera.focal_px, camera.width / 2, camera.height / 2)
+
+    def intensity(self, camera: Camera) -> np.ndarray:
+        """Radiant intensity of the lit cone, row or pixel while each pixel is measured [1/sr per joule], (H, W)."""
+        if self.mode == "flood":
+            return np.full((camera.height, camera.width), 1 / (2 * math.pi * (1 - self.cos_half_angle(camera))))
+        solid_angle = camera.pixel_solid_angle()
+        if self.mode == "line":
+            solid_angle = np.broadcast_to(solid_angle.sum(axis=1, keepdims=True), solid_angle.shape)
+        return 1 / solid_angle
+
+
+@dataclass(frozen=True, eq=False)
+class Ambient:
+    """Steady light that is not the laser's: a constant radiance or an environment map [W/(m^2 sr nm)].
+
+    The map is equirectangular, placed as Mitsuba's `envmap` places it: its top row looks along +y of its own frame,
+    its left and right edges meet along -z; `pose` is environment to world. Area lights belong to their `Surface`.
+    """
+
+    radiance: float = 0.0
+    environment: Texture | None = None
+    pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+    def __post_init__(self) -> None:
+        _require(math.isfinite(self.radiance) and self.radiance >= 0, f"ambient radiance {self.radiance:g} is negative")
+        both = self.environment is not None and self.radiance > 0
+        _require(not both, "ambient light is either a constant radiance or an environment map, not both")
+        object.__setattr__(self, "pose", rigid_pose(self.pose, "environment pose"))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything that is there. `notes` says, one line each, what a loader changed, assumed or left out."""
+
+    name: str
+    surfaces: tuple[Surface, ...]
+    camera: Camera
+    laser: Laser = field(default_factory=Laser)
+    ambient: Ambient = field(default_factory=Ambient)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "surfaces", tuple(self.surfaces))
+        object.__setattr__(self, "notes", tuple(self.notes))
+        _require(len(self.surfaces) > 0, f"scene {self.name}: has no surfaces")
+
+    @property
+    def triangles(self) -> int:
+        return sum(len(surface.faces) for surface in self.surfaces)
+
+    @property
+    def has_ambient(self) -> bool:
+        lit = self.ambient.radiance > 0 or self.ambient.environment is not None
+        return lit or any(surface.emission > 0 for surface in self.surfaces)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of all surfaces, metres."""
+        low = np.min([s.vertices.min(axis=0) for s in self.surfaces], axis=0)
+        return low, np.max([s.vertices.max(axis=0) for s in self.surfaces], axis=0)
+
+    def digest(self) -> str:
+        """SHA-256 over everything that decides what is rendered; names and notes do not count."""
+        sha = hashlib.sha256()
+        _digest(sha, (self.surfaces, self.camera, self.laser, self.ambient))
+        return sha.hexdigest()
+
+
+def _digest(sha: hashlib._Hash, value: object) -> None:
+    if isinstance(value, tuple):
+        sha.update(f"({len(value)}".encode())
+        for item in value:
+            _digest(sha, item)
+    elif isinstance(value, np.ndarray):
+        sha.update(f"{value.dtype.str}{value.shape}".encode())
+        sha.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, (Texture, Material, Surface, Camera, Laser, Ambient)):
+        for item in fields(value):
+            if item.name != "name":
+                _digest(sha, getattr(value, item.name))
+    else:
+        sha.update(f"{type(value).__name__}:{value!r};".encode())

@@ -1,0 +1,1 @@
+"""Transient -> expected counts -> detections -> Histogram, and the classical depth estimators."""

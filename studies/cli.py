@@ -1,0 +1,113 @@
+"""`scene2spad COMMAND`: parse, run, report. Bad input ends with exit status 2 and one line on stderr."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import re
+import sys
+from collections.abc import Callable, Iterator
+
+import tyro
+
+from scenes.errors import InputError
+from studies import commands
+
+log = logging.getLogger("scene2spad")
+DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."
+
+
+def script() -> None:
+    """Entry point of the console script."""
+    sys.exit(main(sys.argv[1:]))
+
+
+def main(argv: list[str]) -> int:
+    """Run one command and return the exit status: 0 done, 2 bad input, 130 interrupted. Bad input never raises."""
+    try:
+        command = _parse(argv)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    _log_to_stderr()
+    try:
+        # heavy imports (torch, Mitsuba) only once the command line is known to be good
+        from studies import run
+
+        with _progress() as progress:
+            result = run.RUNNERS[type(command)](command, progress)
+    except InputError as error:
+        return _refuse(str(error))
+    except OSError as error:
+        return _refuse(f"{error.filename or 'file system'}: {error.strerror or error}")
+    except MemoryError:
+        return _refuse("out of memory: use a smaller image or fewer samples")
+    except KeyboardInterrupt:
+        print("interrupted; finished files stay, nothing is half-written", file=sys.stderr)
+        return 130
+    print(json.dumps(result) if command.json else _prose(result))
+    return 0
+
+
+def _parse(argv: list[str]) -> commands.Common:
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(commands.Command, prog="scene2spad", description=DESCRIPTION, args=argv)
+    except SystemExit as stop:
+        if stop.code:
+            print(f"scene2spad: {_one_line(said.getvalue())}", file=sys.stderr)
+            raise SystemExit(2) from None
+        sys.stderr.write(said.getvalue())
+        raise
+
+
+def _one_line(box: str) -> str:
+    """tyro explains errors in a box of several lines: its sentences in one line."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    lines = [re.sub(r"[│╭╮╰╯─|]+", " ", line).strip() for line in plain.splitlines()]
+    text = " ".join(line for line in lines if line and not set(line) <= set("-=_ "))
+    text = re.sub(r"\s+", " ", text).removeprefix("Parsing error ").strip()
+    return re.sub(r"For full helptext, run (.*)$", r"(see \1)", text) or "bad command line; see scene2spad --help"
+
+
+def _refuse(reason: str) -> int:
+    print(f"scene2spad: {' '.join(reason.split())}", file=sys.stderr)
+    return 2
+
+
+def _prose(result: dict) -> str:
+    return "\n".join(f"{key}: {_spelled(value)}" for key, value in result.items())
+
+
+def _spelled(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_spelled(item)}" for key, item in value.items())
+    if isinstance(value, (list, tuple)):
+        return "".join(f"\n  {_spelled(item)}" for item in value)
+    return str(value)
+
+
+def _log_to_stderr() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    for name in ("scene2spad", "render", "spad", "csph"):
+        logger = logging.getLogger(name)
+        logger.handlers[:] = [handler]
+        logger.setLevel(logging.INFO)
+        logger.propagate = False
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[str, float], None]]:
+    """A progress bar on stderr, and the function that moves it; silent where nobody looks."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("start", total=1.0)
+        yield lambda what, share: bar.update(task, description=what, completed=share)

@@ -1,0 +1,124 @@
+"""The command line's configuration: one dataclass a command. No torch, no Mitsuba: --help must be quick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Positional = tyro.conf.Positional
+
+
+@dataclass(frozen=True)
+class Common:
+    seed: int = 0
+    """Seed of everything random; the same seed gives the same bytes."""
+    json: bool = False
+    """Print one JSON object as the last line of stdout, and nothing else there."""
+
+
+@dataclass(frozen=True)
+class Demo(Common):
+    """From the default scene to depth, with a figure: render, sense, classical and compressive depth."""
+
+    scene: str = "living-room"
+    """A scene as `render` takes it."""
+    width: int = 128
+    """Image width, pixels."""
+    height: int = 96
+    """Image height, pixels."""
+    signal: float = 50.0
+    """Mean signal photons per pixel."""
+    background: float = 50.0
+    """Mean background photons per pixel."""
+    out: Path = Path("out/demo")
+    """Folder for the transient (.exr), the histogram (.h5) and the figure (.png)."""
+
+
+@dataclass(frozen=True)
+class Scenes(Common):
+    """List the built-in scenes, or describe one: size, triangles, camera, laser, lights, and what a loader changed."""
+
+    scene: Positional[str] = ""
+    """A scene as `render` takes it; none lists the names."""
+
+
+@dataclass(frozen=True)
+class Render(Common):
+    """Render a scene's time-resolved radiance to a deep EXR file, with a picture beside it."""
+
+    scene: Positional[str] = "living-room"
+    """A name (see `scenes`), a mesh (.obj .ply .stl .glb) or a Mitsuba scene (.xml)."""
+    out: Path | None = None
+    """The .exr file (default: the scene's name in this folder)."""
+    width: int | None = None
+    """Image width, pixels (default: the scene's own; one of width and height alone keeps the proportions)."""
+    height: int | None = None
+    """Image height, pixels."""
+    laser: Literal["flood", "line", "scan"] | None = None
+    """What the laser lights: the field of view, the row being measured, or the pixel being measured."""
+    bounces: int | None = None
+    """Surfaces light may meet, 1 = direct only (default: planned from a pilot)."""
+    spp: int | None = None
+    """Indirect light paths per pixel (default: planned from a pilot)."""
+    grid: int | None = None
+    """Direct rays per pixel side (default: planned from a pilot)."""
+    error: float | None = None
+    """Target of the relative error: nRMSE of the expected counts on the reference sensor (default: 0.02)."""
+    budget: tuple[float, float] | None = None
+    """Mean SIGNAL and BACKGROUND photons: render no finer than their shot noise can show, instead of --error."""
+    offset: float = 0.0
+    """Move the scene this many metres away in time alone: identical counts per pixel, later."""
+    figure: bool = True
+    """Draw a picture of the layers beside the file."""
+
+
+@dataclass(frozen=True)
+class Sense(Common):
+    """Record a transient with a single-photon sensor: photon counts to HDF5, with a picture beside it."""
+
+    file: Positional[Path]
+    """A transient written by `render` (.exr)."""
+    out: Path | None = None
+    """The .h5 file (default: the transient's name)."""
+    sensor: str = "reference"
+    """Sensor preset."""
+    signal: float = 50.0
+    """Mean signal photons per pixel and exposure."""
+    background: float = 50.0
+    """Mean background photons per pixel and exposure, dark counts included."""
+    dark_count_rate: float | None = None
+    """Dark counts per second and pixel [Hz] (default: the preset's)."""
+    model: Literal["auto", "poisson"] = "auto"
+    """Detection law; auto says why it chose."""
+    figure: bool = True
+    """Draw a picture of the counts beside the file."""
+
+
+@dataclass(frozen=True)
+class Depth(Common):
+    """Estimate depth from a histogram and compare it with the truth; writes the depth map and a picture."""
+
+    file: Positional[Path]
+    """A histogram written by `sense` (.h5)."""
+    out: Path | None = None
+    """The depth map (.exr) to write (default: the histogram's and the method's name)."""
+    method: Literal["argmax", "matched", "log-matched", "compressive"] = "log-matched"
+    """Estimator; log-matched is the Poisson maximum likelihood."""
+    code: Literal["fourier"] = "fourier"
+    """Coding tensor of `--method compressive`: truncated Fourier."""
+    codes: int = 16
+    """Number K of codes kept per pixel by `--method compressive`."""
+    figure: bool = True
+    """Draw estimate, truth and error beside the file."""
+
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Sense, tyro.conf.subcommand("sense")]
+    | Annotated[Depth, tyro.conf.subcommand("depth")]
+)

@@ -1,0 +1,201 @@
+"""Pictures of what the chain makes: transients, histograms, depth maps, and the demo's figure. Units on every axis."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+from render.transient import Transient
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.files import whole_file
+from spad.detect import expected_in_pixel
+from spad.histogram import Histogram
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+DEPTH_COLOURS = matplotlib.colormaps["viridis_r"].with_extremes(bad="lightgrey")
+ERROR_COLOURS = matplotlib.colormaps["magma"].with_extremes(bad="lightgrey")
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG, whole or not at all."""
+    with whole_file(path) as beside:
+        figure.savefig(beside, dpi=130, format="png", metadata={"Software": None})
+    plt.close(figure)
+    return path
+
+
+def _image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: object) -> None:
+    shown = axes.imshow(image, interpolation="nearest", **options)
+    axes.set_title(title, fontsize=10)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    bar = axes.figure.colorbar(shown, ax=axes, fraction=0.046 * image.shape[0] / image.shape[1] + 0.01, pad=0.02)
+    bar.set_label(unit, fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+
+
+def _display(radiance: np.ndarray) -> np.ndarray:
+    """Radiance for looking: relative to its 99th percentile, display gamma."""
+    top = np.quantile(radiance[radiance > 0], 0.99) if (radiance > 0).any() else 1.0
+    return np.clip(radiance / top, 0, 1) ** (1 / 2.2)
+
+
+def _depth_limits(depth_m: np.ndarray) -> dict[str, float]:
+    known = depth_m[np.isfinite(depth_m)]
+    low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
+    margin = max(0.02 * (high - low), 0.01)
+    return {"vmin": max(low - margin, 0.0), "vmax": high + margin}
+
+
+def draw_transient(transient: Transient, path: Path) -> Path:
+    """Intensity, indirect share, depth, normals, ambient light, and the image's mean transient."""
+    figure, axes = plt.subplots(2, 3, figsize=(13, 7), layout="constrained")
+    total = transient.total_radiance()
+    later = transient.bounces > 1
+    pixel = transient.return_pixel[later]
+    indirect = np.bincount(pixel, weights=transient.radiance[later], minlength=total.size).reshape(total.shape)
+    share = np.divide(indirect, total, out=np.full(total.shape, np.nan), where=total > 0)
+    _image(axes[0, 0], _display(total), "laser light, all paths", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
+    _image(
+        axes[0, 1],
+        transient.depth_m,
+        "depth at pixel centres",
+        "m",
+        cmap=DEPTH_COLOURS,
+        **_depth_limits(transient.depth_m),
+    )
+    _image(axes[0, 2], 100 * share, "indirect share of the laser light", "%", cmap=ERROR_COLOURS, vmin=0)
+    axes[1, 0].imshow(np.abs(transient.normal.astype(float)))
+    axes[1, 0].set(title="|normal|, world x y z as red green blue", xticks=[], yticks=[])
+    axes[1, 0].title.set_fontsize(10)
+    _image(axes[1, 1], _display(transient.ambient), "ambient light", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
+    _mean_transient(axes[1, 2], transient)
+    error = transient.meta.get("relative_error", {}).get("total", float("nan"))
+    figure.suptitle(f"{transient.meta.get('scene', '')}: {transient.returns:,} returns, estimated error {error:.2%}")
+    return save(figure, path)
+
+
+def _mean_transient(axes: Axes, transient: Transient) -> None:
+    centre = 0.5 * (transient.path_near_m + transient.path_far_m)
+    edges = np.linspace(0.98 * centre.min(initial=0), 1.02 * np.quantile(centre, 0.999) if centre.size else 1, 200)
+    pixels = transient.height * transient.width
+    for label, kept in (("direct", transient.bounces == 1), ("indirect", transient.bounces > 1)):
+        if kept.any():
+            energy = np.histogram(centre[kept], edges, weights=transient.radiance[kept])[0]
+            axes.stairs(energy / pixels / np.diff(edges), edges, label=label)
+    axes.set_yscale("log")
+    axes.set(xlabel="optical path length [m]", ylabel="mean radiance per path [1/(m$^3$ sr)]", title="image mean")
+    axes.title.set_fontsize(10)
+    axes.legend(fontsize=8)
+
+
+def draw_histogram(histogram: Histogram, path: Path) -> Path:
+    """Counts per pixel, expected signal share, and three pixels' histograms."""
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    counts = histogram.counts.sum(axis=2, dtype=np.int64)
+    ratio = histogram.expected_signal / np.maximum(histogram.expected_background, 1e-12)
+    _image(
+        axes[0], counts, "detections per pixel", "photons", cmap="gray", vmin=0, vmax=max(np.quantile(counts, 0.995), 1)
+    )
+    log_ratio = np.log10(np.maximum(ratio, 1e-6))
+    _image(axes[1], log_ratio, "expected signal to background", "log10", cmap=ERROR_COLOURS)
+    time_ns = (np.arange(histogram.sensor.bins) + 0.5) * histogram.sensor.bin_width_s * 1e9
+    order = np.argsort(histogram.expected_signal, axis=None, kind="stable")
+    for name, share in (("dark", 0.1), ("median", 0.5), ("bright", 0.9)):
+        row, column = np.unravel_index(order[int(share * (order.size - 1))], counts.shape)
+        axes[2].plot(time_ns, histogram.counts[row, column], lw=0.8, label=f"{name} pixel ({row}, {column})")
+    axes[2].set(xlabel="time [ns]", ylabel="counts per bin", title="three pixels")
+    axes[2].title.set_fontsize(10)
+    axes[2].legend(fontsize=8)
+    budget = histogram.budget
+    figure.suptitle(
+        f"{histogram.sensor.name} sensor, {budget.signal:g} + {budget.background:g} photons per pixel on average"
+    )
+    return save(figure, path)
+
+
+def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: dict, path: Path) -> Path:
+    """Truth, estimate and absolute error."""
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    limits = _depth_limits(histogram.depth_m)
+    _image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
+    title = f"{method}: MAE {errors['mae_mm']:.1f} mm, {errors['within_10mm']:.0%} within 10 mm"
+    _image(axes[1], depth_m, title, "m", cmap=DEPTH_COLOURS, **limits)
+    error_mm = 1000 * np.abs(depth_m - histogram.depth_m)
+    _image(axes[2], error_mm, "absolute error (colours end at 100 mm)", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
+    return save(figure, path)
+
+
+def draw_demo(
+    transient: Transient, histogram: Histogram, depths: dict[str, np.ndarray], errors: dict[str, dict], path: Path
+) -> Path:
+    """Intensity, true depth, every estimate with its error, and one pixel from returns to detections."""
+    figure = plt.figure(figsize=(15, 10.5), layout="constrained")
+    panels = figure.subplot_mosaic("ABC;DEF;GGG", height_ratios=(1, 1, 0.9))
+    limits = _depth_limits(histogram.depth_m)
+    _image(panels["A"], histogram.expected_signal, "expected signal", "photons per pixel", cmap="gray", vmin=0,
+           vmax=np.quantile(histogram.expected_signal, 0.98))  # fmt: skip
+    _image(panels["B"], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
+    for key, (name, depth) in zip("CDEF", depths.items(), strict=True):
+        said = f"{name}: MAE {errors[name]['mae_mm']:.0f} mm, {errors[name]['within_10mm']:.0%} within 10 mm"
+        _image(panels[key], depth, said, "m", cmap=DEPTH_COLOURS, **limits)
+    row, column = _telling_pixel(transient)
+    for key in "ABCDEF":
+        panels[key].plot(column, row, "o", mfc="none", mec="red", ms=9)
+    _one_pixel(panels["G"], transient, histogram, row, column)
+    budget = histogram.budget
+    figure.suptitle(
+        f"{transient.meta['scene']}: {budget.signal:g} signal + {budget.background:g} background photons per pixel, "
+        f"{histogram.sensor.bins} bins of {histogram.sensor.bin_width_s * 1e12:.1f} ps, render error "
+        f"{transient.meta['relative_error']['total']:.1%}"
+    )
+    return save(figure, path)
+
+
+def _telling_pixel(transient: Transient) -> tuple[int, int]:
+    """The unmixed pixel of median brightness with most indirect light."""
+    total = transient.total_radiance()
+    pixel = transient.return_pixel[transient.bounces > 1]
+    weights = transient.radiance[transient.bounces > 1]
+    share = np.bincount(pixel, weights=weights, minlength=total.size).reshape(total.shape) / np.maximum(total, 1e-30)
+    bright = (total >= np.quantile(total, 0.5)) & ~transient.mixed & np.isfinite(transient.depth_m)
+    return np.unravel_index(int(np.argmax(np.where(bright, share, -1))), total.shape)
+
+
+def _one_pixel(axes: Axes, transient: Transient, histogram: Histogram, row: int, column: int) -> None:
+    sensor = histogram.sensor
+    expected = expected_in_pixel(transient, sensor, histogram.budget, row, column)
+    first = float(2 * transient.depth_m[row, column] / SPEED_OF_LIGHT_M_PER_S)
+    edges_ns = np.arange(sensor.bins + 1) * sensor.bin_width_s * 1e9
+    axes.stairs(histogram.counts[row, column], edges_ns, fill=True, color="0.8", label="detections")
+    axes.stairs(expected, edges_ns, color="tab:blue", label="expected counts per bin")
+    pixel = row * transient.width + column
+    mine = slice(int(transient.offsets[pixel]), int(transient.offsets[pixel + 1]))
+    centre = 0.5 * (transient.path_near_m + transient.path_far_m)[mine] / SPEED_OF_LIGHT_M_PER_S * 1e9
+    share = transient.radiance[mine] / transient.radiance[mine].sum()
+    twin = axes.twinx()
+    for name, colour, kept in (
+        ("direct returns", "tab:green", transient.bounces[mine] == 1),
+        ("indirect returns", "tab:red", transient.bounces[mine] > 1),
+    ):
+        twin.vlines(centre[kept], 0, share[kept], color=colour, lw=1.2)
+        twin.plot(centre[kept], share[kept], "o", color=colour, ms=3, label=name)
+    twin.set_yscale("log")
+    twin.set_ylabel("share of the pixel's radiance")
+    start, stop = first * 1e9 - 3, first * 1e9 + 25
+    axes.set_xlim(max(start, 0), min(stop, edges_ns[-1]))
+    axes.set(xlabel="time since the laser's emission [ns]", ylabel="photons per bin")
+    axes.set_title(
+        f"the circled pixel ({row}, {column}): the transient, what the sensor expects, what it detected", fontsize=10
+    )
+    scale = SPEED_OF_LIGHT_M_PER_S * 1e-9 / 2
+    top = axes.secondary_xaxis("top", functions=(lambda t: t * scale, lambda d: d / scale))
+    top.set_xlabel("depth [m]", fontsize=8)
+    handles = [h for ax in (axes, twin) for h in ax.get_legend_handles_labels()[0]]
+    axes.legend(handles=handles, fontsize=8, loc="upper right")

@@ -1,0 +1,228 @@
+"""What each command does: configuration in, files and one dictionary of results out."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scenes.catalog import SCENES, load_scene
+
+from csph import CodingTensor, decode_depth, encode, truncated_fourier
+from render.engine import render
+from render.settings import RenderSettings
+from render.transient import ATTRIBUTE, SCHEMA, Transient, read_transient, write_transient
+from scenes import InputError, Laser, Scene
+from scenes.files import whole_file
+from spad.depth import depth_errors, estimate_depth
+from spad.detect import sense
+from spad.histogram import Histogram, read_histogram, write_histogram
+from spad.sensor import PhotonBudget, sensor_by_name
+from studies import commands, figures
+
+log = logging.getLogger("scene2spad")
+Progress = Callable[[str, float], None]
+
+
+def _output(path: Path, suffix: str) -> Path:
+    """An output path that can be written later: checked before the work, not after it."""
+    if path.suffix.lower() != suffix:
+        raise InputError(f"{path}: the output must end in {suffix}")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: folder {path.parent} does not exist")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected a file name")
+    return path
+
+
+def _load(command: commands.Render | commands.Demo) -> Scene:
+    scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
+    for note in scene.notes:
+        log.info("%s: %s", scene.name, note)
+    return scene
+
+
+def _in_view(transient: Transient) -> Transient:
+    if transient.returns == 0:
+        raise InputError(f"scene {transient.meta['scene']}: nothing in view of the camera returns light")
+    return transient
+
+
+def run_scenes(command: commands.Scenes, progress: Progress) -> dict:
+    """List or describe."""
+    if not command.scene:
+        return {"scenes": dict(SCENES)}
+    scene = load_scene(command.scene, seed=command.seed)
+    low, high = scene.bounds()
+    camera, laser = scene.camera, scene.laser
+    described = {
+        "size_m": (high - low).tolist(),
+        "surfaces": len(scene.surfaces),
+        "materials": sorted({f"{s.material.name} ({s.material.kind})" for s in scene.surfaces}),
+        "triangles": scene.triangles,
+        "camera": {
+            "position_m": camera.origin.tolist(),
+            "fov_deg": camera.fov_deg,
+            "pixels": [camera.width, camera.height],
+        },
+        "laser": {"mode": laser.mode, "baseline_m": list(laser.baseline_m)},
+        "ambient_light": scene.has_ambient,
+        "notes": list(scene.notes),
+    }
+    return {"scenes": {scene.name: described}}
+
+
+def run_render(command: commands.Render, progress: Progress) -> dict:
+    """Scene -> .exr and a picture of its layers."""
+    settings = RenderSettings(
+        bounces=command.bounces, spp=command.spp, grid=command.grid, error=command.error, budget=command.budget
+    )
+    if not 0 <= command.offset <= 1e4:
+        raise InputError(f"offset {command.offset:g} m is outside 0 to 10000")
+    scene = _load(command)
+    out = _output(command.out or Path(f"{scene.name}.exr"), ".exr")
+    if command.laser is not None:
+        scene = replace(scene, laser=Laser(command.laser, scene.laser.baseline_m))
+    start = time.perf_counter()
+    transient = _in_view(render(scene, settings, seed=command.seed, progress=progress))
+    seconds = time.perf_counter() - start
+    if command.offset:
+        transient = transient.delayed(command.offset)
+    write_transient(transient, out)
+    error, plan = transient.meta["relative_error"], transient.meta["plan"]
+    result = {
+        "seconds": seconds,
+        "rays": transient.meta["rays"],
+        "spp": plan["spp"],
+        "returns": transient.returns,
+        "indirect_fraction": transient.indirect_fraction,
+        "relative_error": error["total"],
+        "pixel_error_median": error["pixel_median"],
+        "pixel_error_p95": error["pixel_p95"],
+        "plan": plan,
+        "out": str(out),
+    }
+    if command.figure:
+        result["figure"] = str(figures.draw_transient(transient, out.with_suffix(".png")))
+    return result
+
+
+def run_sense(command: commands.Sense, progress: Progress) -> dict:
+    """Transient -> .h5 and a picture of its counts."""
+    sensor, budget = sensor_by_name(command.sensor), PhotonBudget(command.signal, command.background)
+    if command.dark_count_rate is not None:
+        sensor = replace(sensor, dark_count_rate_hz=command.dark_count_rate)
+    out = _output(command.out or command.file.with_suffix(".h5"), ".h5")
+    transient = read_transient(command.file)
+    start = time.perf_counter()
+    histogram = sense(transient, sensor, budget, seed=command.seed, model=command.model, progress=progress)
+    seconds = time.perf_counter() - start
+    for reason in histogram.meta["plan"]:
+        log.info("%s", reason)
+    write_histogram(histogram, out)
+    result = {
+        "seconds": seconds,
+        "mean_signal": float(histogram.expected_signal.mean(dtype=np.float64)),
+        "mean_background": float(histogram.expected_background.mean(dtype=np.float64)),
+        "mean_counts": float(histogram.counts.sum(dtype=np.int64) / histogram.depth_m.size),
+        "pile_up": histogram.meta["pile_up"],
+        "model": histogram.meta["model"],
+        "wrapped": histogram.meta["wrapped"],
+        "dark_share": histogram.meta["dark_share"],
+        "out": str(out),
+    }
+    if command.figure:
+        result["figure"] = str(figures.draw_histogram(histogram, out.with_suffix(".png")))
+    return result
+
+
+def depth_map(histogram: Histogram, method: str, codes: int = 16) -> np.ndarray:
+    """Depth [m] of every pixel by a method's name, (H, W) float32; `compressive` is truncated Fourier with K codes."""
+    counts = torch.from_numpy(np.array(histogram.counts))
+    if method != "compressive":
+        return estimate_depth(counts, histogram.sensor, method).numpy()
+    coding = CodingTensor(f"fourier-{codes}", truncated_fourier(codes, histogram.sensor.bins))
+    return decode_depth(encode(counts, coding), coding, histogram.sensor).numpy()
+
+
+def run_depth(command: commands.Depth, progress: Progress) -> dict:
+    """Histogram -> depth map, error figures and a picture."""
+    label = command.method if command.method != "compressive" else f"{command.code}-{command.codes}"
+    out = _output(command.out or command.file.with_name(f"{command.file.stem}-{label}.exr"), ".exr")
+    histogram = read_histogram(command.file)
+    progress(command.method, 0.1)
+    start = time.perf_counter()
+    depth = depth_map(histogram, command.method, command.codes)
+    seconds = time.perf_counter() - start
+    range_m = histogram.sensor.range_m
+    errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
+    _write_depth(depth, out, {"method": label, "histogram_sha256": histogram.sha256()})
+    result = {
+        "seconds": seconds,
+        "method": label,
+        **errors,
+        "unmixed": depth_errors(depth, histogram.depth_m, range_m=range_m, exclude=histogram.mixed),
+        "out": str(out),
+    }
+    if command.figure:
+        result["figure"] = str(figures.draw_depth(histogram, depth, label, errors, out.with_suffix(".png")))
+    return result
+
+
+def _write_depth(depth_m: np.ndarray, path: Path, meta: dict) -> None:
+    import OpenEXR
+
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        ATTRIBUTE: json.dumps({**meta, "kind": "depth", "schema": SCHEMA, "unit": "m"}, sort_keys=True),
+    }
+    with whole_file(path) as beside:
+        try:
+            OpenEXR.File(header, {"Z": np.ascontiguousarray(depth_m, dtype=np.float32)}).write(str(beside))
+        except RuntimeError as error:
+            raise OSError(str(error)) from None
+
+
+def run_demo(command: commands.Demo, progress: Progress) -> dict:
+    """Scene -> transient -> histogram -> four depth maps -> one figure."""
+    budget = PhotonBudget(command.signal, command.background)
+    scene = _load(command)
+    command.out.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    transient = _in_view(render(scene, seed=command.seed, progress=progress))
+    rendered = time.perf_counter()
+    sensor = sensor_by_name("reference")
+    histogram = sense(transient, sensor, budget, seed=command.seed, progress=progress)
+    sensed = time.perf_counter()
+    names = {"argmax": "argmax", "matched": "matched", "log-matched": "log-matched", "compressive": "Fourier K = 16"}
+    depths = {name: depth_map(histogram, method) for method, name in names.items()}
+    errors = {n: depth_errors(d, histogram.depth_m, range_m=sensor.range_m) for n, d in depths.items()}
+    estimated = time.perf_counter()
+    write_transient(transient, command.out / f"{scene.name}.exr")
+    write_histogram(histogram, command.out / f"{scene.name}.h5")
+    figure = figures.draw_demo(transient, histogram, depths, errors, command.out / "demo.png")
+    return {
+        "seconds": time.perf_counter() - start,
+        "seconds_render": rendered - start,
+        "seconds_sense": sensed - rendered,
+        "seconds_depth": estimated - sensed,
+        "relative_error": transient.meta["relative_error"]["total"],
+        "mae_mm": {name: e["mae_mm"] for name, e in errors.items()},
+        "within_10mm": {name: e["within_10mm"] for name, e in errors.items()},
+        "figure": str(figure),
+    }
+
+
+RUNNERS: dict[type, Callable] = {
+    commands.Demo: run_demo,
+    commands.Scenes: run_scenes,
+    commands.Render: run_render,
+    commands.Sense: run_sense,
+    commands.Depth: run_depth,
+}

@@ -1,0 +1,17 @@
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+# the tests' own helpers (oracles) are imported by name; the packages are installed
+sys.path.insert(0, str(Path(__file__).parent / "render"))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Checks beside the project: skipped where they are absent."""
+    folder = Path(os.environ.get("SCENE2SPAD_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no data for checks (set SCENE2SPAD_DATA; looked in {folder})")
+    return folder

@@ -1,0 +1,225 @@
+"""The renderer against closed forms, float64 quadratures of the same geometry and Mitsuba's steady render."""
+
+import numpy as np
+import oracles
+import pytest
+
+from render.engine import render
+from render.settings import RenderSettings
+from render.transient import Transient
+from scenes import Ambient, Laser, Material, Scene, Surface, Texture
+from scenes.shapes import box, sphere
+
+DIRECT = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
+
+
+def path_deviation(transient: Transient) -> np.ndarray:
+    """Standard deviation of each pixel's path lengths, footprints included."""
+    near, far = transient.path_near_m.astype(float), transient.path_far_m.astype(float)
+    mean = transient.mean_path_m().ravel()[transient.return_pixel]
+    second = transient.radiance * ((0.5 * (near + far) - mean) ** 2 + (far - near) ** 2 / 12)
+    total = transient.total_radiance()
+    moment = np.bincount(transient.return_pixel, weights=second, minlength=total.size).reshape(total.shape)
+    return np.sqrt(moment / total)
+
+
+@pytest.mark.parametrize("distance_m", [0.3, 1.0, 3.0, 14.0])
+def test_frontal_plane(distance_m):
+    scene = Scene("plane", (oracles.wall(distance_m, 0.5, half_size_m=20),), oracles.camera())
+    transient = render(scene, DIRECT)
+    total, mean, _ = oracles.plane_moments(scene, distance_m=distance_m, tilt_deg=0, albedo=0.5)
+    assert np.abs(transient.total_radiance() / total - 1).max() < 1e-4
+    assert np.abs(transient.mean_path_m() - mean).max() < 1e-4
+    # the optical axis meets the corner of four pixels: the first light of all comes from there
+    assert abs(transient.path_near_m.min() - 2 * distance_m) < 1e-4
+    centre = 1 / np.linalg.norm(scene.camera.rays() @ np.array([[0], [0], [-1.0]]), axis=-1)
+    assert np.abs(transient.depth_m - distance_m * centre).max() < 2e-6 * distance_m
+    assert not transient.mixed.any() and np.allclose(transient.normal, [0, 0, 1]) and np.allclose(transient.albedo, 0.5)
+
+
+def test_frontal_plane_follows_the_inverse_square_law():
+    distances = np.array([0.3, 1.0, 3.0, 14.0])
+    scenes = [Scene("p", (oracles.wall(d, 0.5, half_size_m=20),), oracles.camera()) for d in distances]
+    totals = np.array([render(scene, DIRECT).total_radiance().sum() for scene in scenes])
+    assert np.ptp(totals * distances**2) / np.mean(totals * distances**2) < 1e-6
+
+
+@pytest.mark.parametrize("tilt_deg", [20, 45, 65])
+@pytest.mark.parametrize("mode", ["flood", "line", "scan"])
+def test_oblique_plane(tilt_deg, mode):
+    surface = oracles.wall(3.0, 0.8, tilt_deg=tilt_deg, half_size_m=60)
+    scene = Scene("oblique", (surface,), oracles.camera(), Laser(mode))
+    transient = render(scene, RenderSettings(bounces=1, grid=8, direct_tolerance_m=1e-4))
+    total, mean, deviation = oracles.plane_moments(scene, distance_m=3.0, tilt_deg=tilt_deg, albedo=0.8, per_side=12)
+    assert np.abs(transient.total_radiance() / total - 1).max() < 1e-4
+    # a pixel at 82 degrees of incidence spans 1.8 m of path
+    assert (np.abs(transient.mean_path_m() - mean) < 1e-4 + 1e-3 * deviation).all()
+    assert np.abs(path_deviation(transient) / deviation - 1).max() < 2e-3
+    assert not transient.mixed.any()
+
+
+def test_sphere_of_subdivision_seven():
+    vertices, faces, _ = sphere(0.5, 7)
+    surface = Surface(vertices + [0, 0, -3], faces, Material(albedo=0.7))
+    scene = Scene("sphere", (surface,), oracles.camera(48, 36, 30))
+    transient = render(scene, RenderSettings(bounces=1, grid=16, direct_tolerance_m=1e-4))
+    total, mean, _ = oracles.sphere_moments(scene, distance_m=3.0, radius_m=0.5, albedo=0.7, per_side=64)
+    got = transient.total_radiance()
+    assert abs(got.sum() / total.sum() - 1) < 1e-4
+    both = (total > 0) & (got > 0) & ~transient.mixed
+    error = np.abs(transient.mean_path_m() - mean)[both]
+    assert error.max() < 2e-4
+
+
+def test_first_interreflection_of_a_groove():
+    albedo, edges = 0.6, np.linspace(5.0, 7.5, 51)
+    scene = oracles.groove_scene(16, 12, albedo=albedo)
+    expected = oracles.groove_interreflection(scene, albedo=albedo, edges_m=edges)
+    settings = RenderSettings(bounces=2, spp=1 << 16, grid=2, indirect_tolerance_m=1e-3, indirect_growth=0)
+    transient = render(scene, settings, seed=1)
+    second = transient.bounces == 2
+    centre = 0.5 * (transient.path_near_m + transient.path_far_m)[second]
+    got = np.histogram(centre, bins=edges, weights=transient.radiance[second])[0] / (16 * 12)
+    assert abs(got.sum() / expected.sum() - 1) < 5e-3
+    assert np.linalg.norm(got - expected) / np.linalg.norm(expected) < 1e-2
+
+
+def diffuse_room(laser: Laser) -> Scene:
+    """A closed box with a ball, a plastic table top and a tilted panel: something for every kind of reflection."""
+    vertices, faces, uv = box((4, 3, 5))
+    room = Surface(vertices + [0, 0, -1.5], faces[:, ::-1], Material(albedo=0.6), uv=uv, name="room")
+    checker = Texture(np.kron([[0.2, 0.9], [0.9, 0.2]], np.ones((4, 4))), "checker")
+    table = Material("roughplastic", albedo=checker, roughness=0.3, name="table")
+    corners = [(-1, -0.6, -1.5), (1, -0.6, -1.5), (1, -0.6, -3), (-1, -0.6, -3)]
+    top = Surface(
+        np.array(corners, float), [[0, 1, 2], [0, 2, 3]], table, uv=np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    )
+    vertices, faces, _ = sphere(0.4, 4)
+    ball = Surface(vertices + [0.5, -0.1, -2.2], faces, Material("roughconductor", roughness=0.4, eta=1.5, k=6.0))
+    return Scene("box", (room, top, ball), oracles.camera(24, 18, 60), laser)
+
+
+@pytest.mark.parametrize("bounces", [1, 3])
+def test_energy_equals_mitsuba_steady_render(bounces):
+    """Summed over time, laser light is what Mitsuba's path tracer gives for a point light of intensity 1/(4 pi)."""
+    scene = diffuse_room(Laser("flood", cone_deg=360))
+    transient = render(scene, RenderSettings(bounces=bounces, spp=4096, grid=64), seed=3)
+    ours, our_error = transient.total_radiance(), transient.error.astype(float)
+    lamp = {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": 1 / (4 * np.pi)}}
+    runs = np.array([steady_by_mitsuba(scene, lamp, max_depth=bounces + 1, spp=1024, seed=seed) for seed in range(16)])
+    theirs, their_error = runs.mean(axis=0), runs.std(axis=0, ddof=1) / 4
+    # the image mean: 16 runs give Student's t with 15 degrees of freedom, 4.1 is the two-sided 0.1 % point
+    error = np.hypot(np.sqrt((our_error**2).sum()), runs.sum(axis=(1, 2)).std(ddof=1) / 4)
+    assert abs(ours.sum() - theirs.sum()) < 4.1 * error + 2e-4 * theirs.sum()
+    # every pixel, Sidak-corrected over 432 pixels; on an edge a 64 x 64 grid knows the coverage to 1/128
+    z = np.abs(ours - theirs) / np.hypot(np.hypot(our_error, their_error), 4e-3 * theirs)
+    assert (z < 7.0).all()
+
+
+def steady_by_mitsuba(scene: Scene, light: dict, *, max_depth: int, spp: int, seed: int) -> np.ndarray:
+    from render.world import World, mi
+
+    objects = {f"shape{i}": shape for i, shape in enumerate(World(scene).traced.shapes())}
+    traced = mi.load_dict({"type": "scene", "light": light, **objects})
+    view = scene.camera
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": view.fov_deg,
+            "to_world": mi.ScalarTransform4f(view.pose @ np.diag([-1.0, -1, 1, 1])),
+            "film": {"type": "hdrfilm", "width": view.width, "height": view.height, "rfilter": {"type": "box"}},
+        }
+    )
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 100})
+    return np.array(mi.render(traced, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., 0].astype(float)
+
+
+def test_displaced_laser_follows_the_ellipsoid():
+    """Laser 10 cm to the right: path |x - C| + |x - L|, radiance albedo/pi cos_L I / |x - L|^2; none in shadow."""
+    baseline = (0.1, 0.0, 0.0)
+    scene = Scene("plane", (oracles.wall(2.0, 0.5, half_size_m=20),), oracles.camera(), Laser("flood", baseline, 100.0))
+    transient = render(scene, DIRECT)
+    directions, weight = oracles.pixel_samples(scene.camera, 4)
+    point = directions * (2.0 / -directions[..., 2])[..., None]
+    from_laser = point - np.array(baseline)
+    leg = np.linalg.norm(from_laser, axis=-1)
+    intensity = scene.laser.intensity(scene.camera)[..., None]
+    radiance = 0.5 / np.pi * intensity * (-from_laser[..., 2] / leg) / leg**2
+    total, mean, deviation = oracles.moments(radiance, np.linalg.norm(point, axis=-1) + leg, weight)
+    assert np.abs(transient.total_radiance() / total - 1).max() < 1e-4
+    assert np.abs(transient.mean_path_m() - mean).max() < 1e-4
+    assert np.abs(path_deviation(transient) - deviation).max() < 1e-4
+
+    post = oracles.quad([(-0.1, -1, -1), (0.0, -1, -1), (0.0, 1, -1), (-0.1, 1, -1)], Material(albedo=0.5))
+    shadowed = render(Scene("post", (*scene.surfaces, post), scene.camera, scene.laser), DIRECT).total_radiance()
+    # seen from the laser, the post from x = -0.1 to 0 m at 1 m hides x = -0.3 to -0.1 m of the wall at 2 m;
+    # the camera sees the wall left of x = -0.2 m past the post
+    x = 2.0 * scene.camera.rays()[..., 0] / -scene.camera.rays()[..., 2]
+    pitch = 2.0 / scene.camera.focal_px
+    assert (shadowed[(x > -0.3 + pitch) & (x < -0.2 - pitch)] == 0).all()
+    assert np.allclose(shadowed[(x < -0.3 - pitch) | (x > pitch)], total[(x < -0.3 - pitch) | (x > pitch)], rtol=1e-4)
+
+
+def test_flood_light_ends_at_its_cone():
+    scene = Scene(
+        "plane", (oracles.wall(2.0, 0.5, half_size_m=20),), oracles.camera(32, 24, 60), Laser("flood", cone_deg=30)
+    )
+    lit = render(scene, DIRECT).total_radiance() > 0
+    cosine = -scene.camera.rays()[..., 2]
+    margin = 2 / scene.camera.focal_px
+    assert (
+        lit[cosine > np.cos(np.radians(15) - margin)].all() and not lit[cosine < np.cos(np.radians(15) + margin)].any()
+    )
+
+
+def test_window_dims_the_wall_behind_it_and_delays_it():
+    """A thin pane dims by ((1 - F) / (1 + F))^2; a slab of thickness t by (1 - F)^4, and adds 2 t (n - 1) of path."""
+    fresnel = (0.5 / 2.5) ** 2
+    wall, view = oracles.wall(3.0, 0.5, half_size_m=20), oracles.camera(8, 6, 2.0)
+    bare = render(Scene("bare", (wall,), view), DIRECT)
+    pane = oracles.quad([(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)], Material("thindielectric", ior=1.5))
+    seen = render(Scene("pane", (wall, pane), view), DIRECT)
+    assert np.allclose(seen.total_radiance() / bare.total_radiance(), ((1 - fresnel) / (1 + fresnel)) ** 2, rtol=1e-3)
+    assert np.allclose(seen.depth_m, bare.depth_m)
+    vertices, faces, uv = box((2, 2, 0.3))
+    slab = Surface(vertices + [0, 0, -1], faces, Material("dielectric", ior=1.5), uv=uv)
+    seen = render(Scene("slab", (wall, slab), view), DIRECT)
+    assert np.allclose(seen.total_radiance() / bare.total_radiance(), (1 - fresnel) ** 4, rtol=1e-3)
+    assert np.allclose(seen.mean_path_m() - bare.mean_path_m(), 2 * 0.3 * 0.5, atol=2e-4)
+    assert np.allclose(seen.depth_m, bare.depth_m, atol=1e-5)
+
+
+def test_cutout_shows_what_lies_behind_its_holes():
+    holes = Texture(np.kron([[0, 1], [1, 0]], np.ones((32, 32))), "holes")
+    corners = np.array([(-2, -2, -2), (2, -2, -2), (2, 2, -2), (-2, 2, -2)], float)
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    leaf = Surface(corners, [[0, 1, 2], [0, 2, 3]], Material(albedo=0.5, opacity=holes), uv=uv)
+    scene = Scene("leaf", (oracles.wall(3.0, 0.5, half_size_m=20), leaf), oracles.camera(16, 12, 20))
+    depth = render(scene, DIRECT).depth_m * -scene.camera.rays()[..., 2]
+    # the image's first row is on top: holes lie to the left above and to the right below
+    expected = np.where((np.arange(12)[:, None] < 6) == (np.arange(16)[None, :] < 8), 3.0, 2.0)
+    assert np.allclose(depth[1:5, 1:7], expected[1:5, 1:7], atol=1e-4)
+    assert np.allclose(depth[7:11, 1:7], expected[7:11, 1:7], atol=1e-4)
+    assert np.allclose(depth[7:11, 9:15], expected[7:11, 9:15], atol=1e-4)
+
+
+def test_mixed_pixels_are_those_on_a_depth_edge():
+    post = oracles.quad([(-0.2, -1, -2), (0.205, -1, -2), (0.205, 1, -2), (-0.2, 1, -2)], Material(albedo=0.5))
+    scene = Scene("post", (oracles.wall(3.0, 0.5, half_size_m=20), post), oracles.camera(64, 4, 34))
+    transient = render(scene, DIRECT)
+    edges = scene.camera.focal_px * np.array([-0.2, 0.205]) / 2 + 32
+    assert set(np.flatnonzero(transient.mixed.all(axis=0))) == set(edges.astype(int))
+    assert transient.mixed.sum() == 2 * 4
+
+
+def test_ambient_furnace():
+    """In a closed box whose walls emit L and reflect albedo a, every pixel sees L (1 + a + a^2 + ...)."""
+    vertices, faces, uv = box((4, 4, 4))
+    walls = Surface(vertices, faces[:, ::-1], Material(albedo=0.5), uv=uv, emission=0.3)
+    ambient = render(Scene("furnace", (walls,), oracles.camera(16, 12, 60)), RenderSettings(bounces=1)).ambient
+    expected = 0.3 * (1 - 0.5**6) / (1 - 0.5)
+    assert abs(ambient.mean() / expected - 1) < 0.01
+    constant = Scene(
+        "sky", (oracles.wall(2.0, 0.5, half_size_m=0.1),), oracles.camera(16, 12, 60), ambient=Ambient(0.7)
+    )
+    assert np.allclose(render(constant, RenderSettings(bounces=1)).ambient[0], 0.7)

@@ -1,0 +1,294 @@
+"""Classical depth estimators against closed forms, the Cramer-Rao bound, and the laws that hold for each of them."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
+from scenes.errors import InputError
+from spad.depth import ESTIMATORS, METHODS, by_pixels, cramer_rao_m, depth_errors, estimate_depth, noise_free_bias_m
+from spad.sensor import Pulse, Sensor
+from spad.template import binned_pulse
+
+REFERENCE = Sensor()
+WIDTH = REFERENCE.bin_width_s
+SMALL = Sensor(name="small", bins=64)
+GATED = Sensor(name="gated", bins=512, period_s=REFERENCE.period_s)
+NARROW = Sensor(name="narrow", pulse=Pulse(0.25 * WIDTH))
+WIDE = Sensor(name="wide", pulse=Pulse(30 * WIDTH))
+SUB_BIN = ("matched", "log-matched")
+
+
+def wrapped_error(depth: torch.Tensor, arrival_s: torch.Tensor, sensor: Sensor) -> torch.Tensor:
+    half = sensor.range_m / 2
+    return torch.remainder(depth.double() - arrival_s * C / 2 + half, 2 * half) - half
+
+
+def drawn(signal: float, background: float, pixels: int, seed: int, sensor: Sensor = REFERENCE) -> tuple:
+    """Poisson counts (P, T) int32 of lone pulses at uniform arrival times (P,) over the whole period."""
+    rng = np.random.default_rng(seed)
+    arrival = torch.from_numpy(rng.random(pixels) * sensor.period_s)
+    rate = signal * binned_pulse(arrival, sensor) + background / sensor.bins
+    return torch.from_numpy(rng.poisson(rate.numpy()).astype(np.int32)), arrival
+
+
+# The noise-free answer
+
+
+@pytest.mark.parametrize("sensor", [REFERENCE, NARROW, WIDE, GATED, SMALL], ids=lambda sensor: sensor.name)
+@pytest.mark.parametrize("method", METHODS)
+def test_noise_free_answer_is_the_truth(method: str, sensor: Sensor) -> None:
+    # Other phases and another place than the ones the subtraction is averaged over, same spacing: the mean is zero
+    # as far as the answer repeats with the bin.
+    phases = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
+    arrival = (20 + phases) * WIDTH if sensor is SMALL else (200 + phases) * WIDTH
+    error_mm = 1e3 * wrapped_error(estimate_depth(1e4 * binned_pulse(arrival, sensor), sensor, method), arrival, sensor)
+    # Measured: 0.0006 mm on `reference` (parabola over eighths of a bin), float32 depth rounds to 0.0002 mm at 3 m.
+    # A pulse of a quarter bin is two steps of the grid wide, too few for a parabola: measured 0.71 mm, 0.05 bin.
+    limit = 1.0 if sensor is NARROW else 0.005
+    bin_mm = 1e3 * sensor.bin_depth_m
+    assert error_mm.abs().max() < (0.5 * bin_mm + 0.01 if method == "argmax" else limit)
+    assert abs(error_mm.mean()) < (0.01 if method == "argmax" else limit / 2)
+
+
+def test_subtracted_answer_of_a_method_and_of_a_function_agree() -> None:
+    for method in METHODS:
+        assert abs(noise_free_bias_m(lambda counts, m=method: estimate_depth(counts, REFERENCE, m), REFERENCE)) < 1e-6
+    # A function that is 7 mm off says so.
+    shifted = noise_free_bias_m(lambda counts: estimate_depth(counts, REFERENCE) + 0.007, REFERENCE)
+    assert shifted == pytest.approx(0.007, abs=1e-6)
+
+
+def test_an_estimator_that_answers_late_is_put_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts, _ = drawn(50, 5, 20, seed=2, sensor=SMALL)
+    late = {name: lambda part, sensor, f=function: f(part, sensor) + 0.7 for name, function in ESTIMATORS.items()}
+    other = Sensor(name="another", bins=64)  # its answer is not cached yet, and is not asked for again
+    monkeypatch.setattr("spad.depth.ESTIMATORS", late)
+    shifted = {method: estimate_depth(counts, other, method) for method in METHODS}
+    monkeypatch.undo()
+    for method in METHODS:
+        assert torch.allclose(shifted[method], estimate_depth(counts, SMALL, method), atol=1e-6)
+
+
+@pytest.mark.parametrize("method", SUB_BIN)
+@pytest.mark.parametrize("arrival_bins", [0.0, 0.3, 1.9, 1022.1, 1023.5, 1023.99])
+def test_pulse_over_the_edge_of_the_period(method: str, arrival_bins: float) -> None:
+    arrival = torch.tensor([arrival_bins], dtype=torch.float64) * WIDTH
+    depth = estimate_depth(500 * binned_pulse(arrival, REFERENCE), REFERENCE, method)
+    assert 0 <= depth < REFERENCE.range_m
+    assert wrapped_error(depth, arrival, REFERENCE).abs() < 1e-5
+
+
+# Noise
+
+
+# Relative standard error of a sample median of |N(0,1)| over n: sqrt(1/4n) / (density 0.636) / 0.6745 = 1.17 / sqrt(n),
+# 1.9 % at 4000. 1.10 leaves four of them above the 0.98 to 1.02 that 8000 other pixels showed.
+@pytest.mark.parametrize(("signal", "background"), [(50, 50), (20, 50), (1e4, 0)])
+def test_log_matched_reaches_the_cramer_rao_bound(signal: float, background: float) -> None:
+    counts, arrival = drawn(signal, background, 4000, seed=11)
+    bound = cramer_rao_m(arrival, torch.tensor(signal), torch.tensor(background / 1024), REFERENCE)
+    error = wrapped_error(estimate_depth(counts, REFERENCE), arrival, REFERENCE)
+    assert (error.abs() / bound).median() < 1.10 * 0.6745
+    # The median's standard error is 1.25 bound / sqrt(n): under 0.1 mm here.
+    assert error.median().abs() < 5 * 1.25 * bound.mean() / math.sqrt(4000) < 1e-3
+    assert (error.abs() > 6 * bound).double().mean() < 2e-3
+    # The matched filter does not know that tails tell more where there is no background: measured 1.19 to 1.25.
+    matched = wrapped_error(estimate_depth(counts, REFERENCE, "matched"), arrival, REFERENCE)
+    assert (matched.abs() / bound).median() < 1.40 * 0.6745
+    assert matched.median().abs() < 1e-3
+
+
+def test_argmax_is_within_the_pulse() -> None:
+    counts, arrival = drawn(1e6, 50, 500, seed=3)
+    assert (
+        wrapped_error(estimate_depth(counts, REFERENCE, "argmax"), arrival, REFERENCE).abs().max()
+        < REFERENCE.bin_depth_m
+    )
+
+
+@pytest.mark.parametrize("sensor", [NARROW, WIDE, SMALL], ids=lambda sensor: sensor.name)
+def test_log_matched_keeps_to_the_bound_on_other_sensors(sensor: Sensor) -> None:
+    counts, arrival = drawn(100, 10, 2000, seed=5, sensor=sensor)
+    bound = cramer_rao_m(arrival, torch.tensor(100.0), torch.tensor(10 / sensor.bins), sensor)
+    error = wrapped_error(estimate_depth(counts, sensor), arrival, sensor)
+    # Only where the bound says something: a quarter-bin pulse inside one bin has no information on its place.
+    known = bound < sensor.bin_depth_m / 8 if sensor is NARROW else torch.ones_like(bound, dtype=torch.bool)
+    assert known.double().mean() > 0.3
+    assert (error.abs() / bound)[known].median() < 1.15 * 0.6745
+
+
+def test_gated_sensor_sees_to_the_end_of_its_bins() -> None:
+    rng = np.random.default_rng(9)
+    arrival = torch.from_numpy(rng.uniform(5, 507, 1000)) * WIDTH
+    rate = 50 * binned_pulse(arrival, GATED) + 25 / 512
+    counts = torch.from_numpy(rng.poisson(rate.numpy()))
+    bound = cramer_rao_m(arrival, torch.tensor(50.0), torch.tensor(25 / 512), GATED)
+    depth = estimate_depth(counts, GATED)
+    assert depth.min() >= 0 and depth.max() <= GATED.bins * GATED.bin_depth_m
+    assert ((depth - arrival * C / 2).abs() / bound).median() < 1.15 * 0.6745
+
+
+@pytest.mark.parametrize("position", [0.3, 1.0, 2.7, 509.2, 511.0, 511.8])
+def test_gated_sensor_sees_half_a_pulse_at_its_edges(position: float) -> None:
+    # The likelihood knows what falls outside the bins: without that it is pulled inwards by up to 8 mm, as the matched
+    # filter is by up to 13 mm. Measured 0.016 mm.
+    arrival = torch.tensor([position], dtype=torch.float64) * WIDTH
+    pulse = 1e4 * binned_pulse(arrival, GATED)
+    depth = estimate_depth(pulse, GATED)
+    assert (depth - arrival * C / 2).abs() < 5e-5
+    # Counts at the other end of the bins are no neighbours.
+    other = torch.tensor([512.0 - position], dtype=torch.float64) * WIDTH
+    alone, both = (estimate_depth(pulse + n * binned_pulse(other, GATED), GATED, "matched") for n in (0, 1000))
+    assert (both - alone).abs() < 1e-5
+
+
+# Odd pixels
+
+
+@pytest.mark.parametrize("sensor", [REFERENCE, GATED, SMALL, Sensor(bins=1)], ids=lambda sensor: str(sensor.bins))
+@pytest.mark.parametrize("method", METHODS)
+def test_pixels_without_a_clear_answer_stay_finite_and_empty_ones_are_missing(method: str, sensor: Sensor) -> None:
+    bins = sensor.bins
+    counts = torch.zeros((4, bins), dtype=torch.int32)
+    counts[1, bins // 3] = 1
+    counts[2] = torch.from_numpy(np.random.default_rng(1).poisson(0.3, bins).astype(np.int32))
+    counts[2, 0] += 1
+    counts[3] = 7
+    depth = estimate_depth(counts, sensor, method)
+    assert depth.dtype == torch.float32 and depth.shape == (4,)
+    assert depth.isnan().tolist() == [True, False, False, False]
+    assert (depth[1:] >= 0).all() and (depth[1:] < sensor.range_m).all()
+    assert abs(depth[1] - (bins // 3 + 0.5) * sensor.bin_depth_m) < 0.5 * sensor.bin_depth_m
+
+
+def test_ten_million_detections_in_a_pixel() -> None:
+    counts, arrival = drawn(1e7, 1e3, 50, seed=4)
+    bound = cramer_rao_m(arrival, torch.tensor(1e7), torch.tensor(1e3 / 1024), REFERENCE)
+    for method, factor in (("matched", 1.5), ("log-matched", 1.1)):
+        error = wrapped_error(estimate_depth(counts, REFERENCE, method), arrival, REFERENCE)
+        # 5 standard errors above the bound, plus half a unit in the last place of a float32 depth (0.5 um at 15 m).
+        assert error.abs().max() < 5 * factor * bound.mean() + 1e-6
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_chunks_shape_and_type_do_not_matter(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    counts, _ = drawn(20, 20, 60, seed=8, sensor=SMALL)
+    depth = estimate_depth(counts, SMALL, method)
+    assert torch.equal(estimate_depth(counts.reshape(3, 4, 5, 64), SMALL, method), depth.reshape(3, 4, 5))
+    assert torch.equal(estimate_depth(counts.double(), SMALL, method), depth)
+    assert torch.equal(estimate_depth(counts.to(torch.uint8), SMALL, method), depth)
+    assert torch.equal(estimate_depth(counts[7], SMALL, method), depth[7])
+    assert estimate_depth(counts[:0], SMALL, method).shape == (0,)
+    monkeypatch.setattr("spad.depth._CHUNK", {"cpu": 7 * 64, "cuda": 7 * 64})
+    assert [len(part) for part in _parts(counts)] == [7] * 8 + [4]
+    assert torch.equal(estimate_depth(counts, SMALL, method), depth)
+
+
+def _parts(counts: torch.Tensor) -> list[torch.Tensor]:
+    seen: list[torch.Tensor] = []
+    by_pixels(lambda part: seen.append(part) or part, counts)
+    return seen
+
+
+def test_bad_input_is_refused_in_one_line() -> None:
+    counts = torch.ones((2, 1024))
+    bad = {
+        "last axis": (counts[:, :1000], "matched"),
+        "0 or more": (-counts, "matched"),
+        "nan": (counts * math.nan, "argmax"),
+        "inf": (counts * math.inf, "argmax"),
+        "argmax, matched, log-matched": (counts, "median"),
+    }
+    for expected, (histogram, method) in bad.items():
+        with pytest.raises(InputError, match=expected) as caught:
+            estimate_depth(histogram, REFERENCE, method)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="last axis"):
+        estimate_depth(torch.tensor(3), REFERENCE)
+    with pytest.raises(InputError, match="unknown"):
+        noise_free_bias_m("median", REFERENCE)
+
+
+# Laws
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.sampled_from(METHODS), st.integers(-200, 200), st.integers(0, 2**32 - 1), st.integers(1, 50))
+def test_shifting_the_histogram_shifts_the_depth(method: str, shift: int, seed: int, factor: int) -> None:
+    counts, _ = drawn(300, 20, 4, seed=seed, sensor=SMALL)
+    if method == "argmax":  # no two equal maxima: the first of them depends on where bin 0 is
+        counts = counts * 64 + torch.arange(64, dtype=torch.int32).flip(0)
+    depth = estimate_depth(counts, SMALL, method).double()
+    moved = estimate_depth(counts.roll(shift, dims=-1), SMALL, method).double()
+    expected = depth / C * 2 + shift * SMALL.bin_width_s
+    assert wrapped_error(moved, expected, SMALL).abs().max() < 1e-6
+    # A linear score does not change its peak when all counts are multiplied.
+    if method != "log-matched":
+        scaled = estimate_depth(counts * factor, SMALL, method).double()
+        assert wrapped_error(scaled, depth / C * 2, SMALL).abs().max() < 1e-6
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.sampled_from(SUB_BIN), st.integers(0, 2**32 - 1))
+def test_a_mirrored_histogram_mirrors_the_depth(method: str, seed: int) -> None:
+    counts, _ = drawn(300, 20, 4, seed=seed, sensor=SMALL)
+    depth = estimate_depth(counts, SMALL, method).double()
+    mirrored = estimate_depth(counts.flip(-1), SMALL, method).double()
+    # A symmetric pulse has no preferred direction; the two scores add in another order (float32, 1e-7).
+    assert wrapped_error(mirrored, SMALL.period_s - depth / C * 2, SMALL).abs().max() < 2e-6
+
+
+# The bound
+
+
+def test_cramer_rao_bound_from_finite_differences() -> None:
+    arrival = torch.tensor([0.2, 100.5, 900.99], dtype=torch.float64) * WIDTH
+    step = 1e-5 * REFERENCE.pulse.sigma_s
+    rate = 50 * binned_pulse(arrival, REFERENCE) + 0.05
+    slope = 50 * (binned_pulse(arrival + step, REFERENCE) - binned_pulse(arrival - step, REFERENCE)) / (2 * step)
+    expected = C / 2 / (slope**2 / rate).sum(-1).sqrt()
+    bound = cramer_rao_m(arrival, torch.tensor(50.0), torch.tensor(0.05), REFERENCE)
+    assert torch.allclose(bound, expected, rtol=1e-7)
+
+
+def test_cramer_rao_limits() -> None:
+    # Without background and with fine bins: c sigma / (2 sqrt S). Bins of w lose w^2 / (12 sigma^2) of information.
+    fine = Sensor(bins=4096, bin_width_s=WIDTH / 32)
+    arrival = torch.tensor([2000.3], dtype=torch.float64) * fine.bin_width_s
+    textbook = C / 2 * fine.pulse.sigma_s / math.sqrt(80)
+    assert cramer_rao_m(arrival, torch.tensor(80.0), torch.tensor(0.0), fine) == pytest.approx(textbook, rel=1e-4)
+    ladder = cramer_rao_m(arrival, torch.tensor(80.0), torch.tensor([0.0, 0.1, 1.0, 10.0]), fine)
+    assert ladder.shape == (4,) and (ladder.diff() > 0).all()
+    # Much background: (S f')^2 / b is left, the integral of f'^2 is 1 / (4 sqrt(pi) sigma^3), b in counts per second.
+    heavy = 1e6
+    information = 80**2 / (heavy / fine.bin_width_s) / (4 * math.sqrt(math.pi) * fine.pulse.sigma_s**3)
+    bound = cramer_rao_m(arrival, torch.tensor(80.0), torch.tensor(heavy), fine)
+    assert bound == pytest.approx(C / 2 / math.sqrt(information), rel=1e-3)
+    assert cramer_rao_m(arrival, torch.tensor(0.0), torch.tensor(1.0), fine).isinf().all()
+
+
+# Error figures
+
+
+def test_depth_errors_counts_what_it_leaves_out() -> None:
+    truth = np.array([[1.0, 2.0, np.nan, 20.0], [3.0, 4.0, 5.0, 6.0]])
+    estimate = np.array([[1.010, 2.004, 1.0, 5.0], [np.nan, 3.992, 9.0, 6.02]])
+    exclude = np.zeros((2, 4), bool)
+    exclude[1, 2] = True
+    figures = depth_errors(torch.from_numpy(estimate), truth, range_m=15.0, exclude=exclude)
+    errors = np.array([10.0, 4.0, -8.0, 20.0])
+    assert (figures["pixels"], figures["empty"], figures["beyond_range"], figures["missing"]) == (4, 1, 1, 1)
+    assert figures["mae_mm"] == pytest.approx(np.abs(errors).mean())
+    assert figures["rmse_mm"] == pytest.approx(np.sqrt((errors**2).mean()))
+    assert figures["median_mm"] == pytest.approx(7.0)
+    exact = depth_errors(np.array([0.0, 0.010]), np.zeros(2), range_m=1.0)
+    assert exact["within_10mm"] == 0.5  # strictly under
+    nothing = depth_errors(np.array([np.nan]), np.array([1.0]), range_m=15.0)
+    assert nothing["pixels"] == 0 and nothing["missing"] == 1 and math.isnan(nothing["mae_mm"])
+    with pytest.raises(InputError, match="alike"):
+        depth_errors(np.zeros(3), np.zeros(4), range_m=1.0)
