@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from render.direct import centre_layers, direct_light
-from render.error import ErrorEstimate, estimate, response
+from render.error import ErrorEstimate, estimate, merging_error, response
 from render.indirect import ambient_light, indirect_light
 from render.planning import BATCHES, make_plan, pilot_pixels
 from render.returns import Samples, concatenate, merge, to_returns
@@ -61,8 +61,11 @@ def render(
     checked = pilot_pixels(world, pilot_seed)
     start_m = _mean_path(merged, len(pixels))
     indirect, noise, batches = _indirect(world, plan, settings, start_m, checked, seed, say)
+    coarse = response(_of_pixels(merged, checked), checked)
+    fine = response(direct_light(world, checked, FINER * plan.grid).samples, checked)
+    responses = [response(batch, checked) for batch in batches]
+    error = estimate(coarse, fine, responses, _merging(batches, responses, settings, start_m, checked))
     merged = concatenate([merged, indirect])
-    error = _error(world, plan, merged, checked, batches)
 
     ambient = np.zeros((camera.height, camera.width), np.float32)
     if plan.ambient:
@@ -92,8 +95,8 @@ def _indirect(
     checked: np.ndarray,
     seed: int,
     say: Progress,
-) -> tuple[Samples, np.ndarray, list[np.ndarray]]:
-    """Merged indirect samples of all pixels, each pixel's standard error, and the batches' responses where `checked`.
+) -> tuple[Samples, np.ndarray, list[Samples]]:
+    """Merged indirect samples of all pixels, each pixel's standard error, and each batch's samples where `checked`.
 
     `start_m` is the pixels' direct path, from which the cells that merge are counted.
     """
@@ -102,19 +105,42 @@ def _indirect(
     if plan.bounces == 1:
         return none, np.zeros(len(pixels)), []
     count = min(BATCHES, plan.spp)
-    merged, totals, responses = none, [], []
+    merged, totals, batches = none, [], []
     for number in range(count):
         say("indirect light", 0.1 + 0.8 * number / count)
-        batch = indirect_light(
-            world, pixels, plan.spp // count, plan.bounces, derived_seed(seed, STAGE_INDIRECT, 0, number)
-        )
+        batch_seed = derived_seed(seed, STAGE_INDIRECT, 0, number)
+        batch = indirect_light(world, pixels, plan.spp // count, plan.bounces, batch_seed)
         totals.append(np.bincount(batch.pixel, weights=batch.radiance, minlength=len(pixels)))
-        in_view = np.isin(batch.pixel, checked)
-        responses.append(response(Samples(*(column[in_view] for column in batch)), checked))
+        batches.append(_of_pixels(batch, checked))
         share = batch._replace(radiance=batch.radiance / count)
         merged = merge(concatenate([merged, share]), settings.indirect_tolerance_m, start_m, settings.indirect_growth)
     spread = np.std(totals, axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.zeros(len(pixels))
-    return merged, spread, responses
+    return merged, spread, batches
+
+
+def _merging(
+    batches: list[Samples],
+    responses: list[np.ndarray],
+    settings: RenderSettings,
+    start_m: np.ndarray,
+    checked: np.ndarray,
+) -> np.ndarray | None:
+    """Squared error of merged indirect returns in the checked pixels, from even against odd batches."""
+    if len(batches) < 2:
+        return None
+    raw, merged = [], []
+    for half in (slice(0, None, 2), slice(1, None, 2)):
+        count = len(batches[half])
+        together = concatenate(batches[half])
+        kept = merge(together, settings.indirect_tolerance_m, start_m, settings.indirect_growth)
+        raw.append(sum(responses[half]) / count)
+        merged.append(response(kept, checked) / count)
+    return merging_error(tuple(raw), tuple(merged))
+
+
+def _of_pixels(samples: Samples, pixels: np.ndarray) -> Samples:
+    kept = np.isin(samples.pixel, pixels)
+    return Samples(*(column[kept] for column in samples))
 
 
 def _mean_path(samples: Samples, pixels: int) -> np.ndarray:
@@ -122,14 +148,6 @@ def _mean_path(samples: Samples, pixels: int) -> np.ndarray:
     total = np.bincount(samples.pixel, weights=samples.radiance, minlength=pixels)
     moment = np.bincount(samples.pixel, weights=samples.radiance * samples.path_m, minlength=pixels)
     return np.divide(moment, total, out=np.zeros(pixels), where=total > 0)
-
-
-def _error(world: World, plan: Plan, merged: Samples, checked: np.ndarray, batches: list[np.ndarray]) -> ErrorEstimate:
-    """Compare what is kept (merged, `plan.grid` cells a side) with finer direct light and unmerged indirect batches."""
-    kept = np.isin(merged.pixel, checked)
-    coarse = response(Samples(*(column[kept] for column in merged)), checked)
-    fine = response(direct_light(world, checked, FINER * plan.grid).samples, checked)
-    return estimate(coarse, fine, batches)
 
 
 def _meta(

@@ -22,10 +22,11 @@ WIDEST_STENCIL = 256
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """Relative errors: overall (nRMSE), of it deterministic and Monte Carlo; median and 95th percentile over pixels."""
+    """Relative errors: overall (nRMSE) and its parts; median and 95th percentile over pixels."""
 
     total: float
-    deterministic: float
+    direct: float
+    merging: float
     monte_carlo: float
     pixel_median: float
     pixel_p95: float
@@ -57,32 +58,43 @@ def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
     return counts.reshape(len(pixels), REFERENCE_BINS)
 
 
-def estimate(kept: np.ndarray, direct: np.ndarray, batches: list[np.ndarray]) -> ErrorEstimate:
-    """Error of what is `kept` against finer `direct` light and the mean of independent indirect `batches`.
+def estimate(
+    coarse: np.ndarray, fine: np.ndarray, batches: list[np.ndarray], merging: np.ndarray | None = None
+) -> ErrorEstimate:
+    """Error of direct light by `coarse` against `fine` cells and of the mean of independent indirect `batches`.
 
-    All are (pixels, bins) responses; each batch is an estimate of the whole indirect light. The deterministic part is
-    what coarser direct cells and merged returns change, the Monte-Carlo part the variance of the batches' mean,
-    sum_b (r_b - mean)^2 / (n (n - 1)), summed over bins.
+    All are (pixels, bins) responses; each batch estimates the whole indirect light, and their mean's variance is
+    sum_b (r_b - mean)^2 / (n (n - 1)). `merging` is the squared error of merged returns per pixel (`merging_error`).
     """
-    reference, noise = direct, np.zeros(len(direct))
+    direct = ((coarse - fine) ** 2).sum(axis=1)
+    merging = np.zeros(len(fine)) if merging is None else merging
+    reference, noise = fine, np.zeros(len(fine))
     if batches:
         mean = sum(batches) / len(batches)
-        reference = direct + mean
+        reference = fine + mean
     if len(batches) > 1:
         noise = sum(((batch - mean) ** 2).sum(axis=1) for batch in batches) / (len(batches) * (len(batches) - 1))
-    deterministic = ((kept - reference) ** 2).sum(axis=1)
     power = (reference**2).sum(axis=1)
     whole = power.sum()
     if whole <= 0:
-        return ErrorEstimate(0.0, 0.0, 0.0, 0.0, 0.0)
-    per_pixel = np.sqrt((deterministic + noise)[power > 0] / power[power > 0])
+        return ErrorEstimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    parts = [max(part.sum() / whole, 0.0) for part in (direct, merging, noise)]
+    per_pixel = np.sqrt(np.maximum(direct + merging + noise, 0)[power > 0] / power[power > 0])
     return ErrorEstimate(
-        total=math.sqrt((deterministic.sum() + noise.sum()) / whole),
-        deterministic=math.sqrt(deterministic.sum() / whole),
-        monte_carlo=math.sqrt(noise.sum() / whole),
+        math.sqrt(sum(parts)),
+        *(math.sqrt(part) for part in parts),
         pixel_median=float(np.median(per_pixel)),
         pixel_p95=float(np.quantile(per_pixel, 0.95)),
     )
+
+
+def merging_error(raw: tuple[np.ndarray, np.ndarray], merged: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Squared error that merging makes in each pixel, from two independent halves of the samples, raw and merged.
+
+    The product of the halves' changes, sum_i (m_a - r_a)(m_b - r_b): their noise, which merging smooths, cancels on
+    average; what both halves change alike is the error. Single pixels can come out negative.
+    """
+    return ((merged[0] - raw[0]) * (merged[1] - raw[1])).sum(axis=1)
 
 
 def error_for_budget(reference: np.ndarray, signal: float, background: float) -> float:

@@ -15,6 +15,8 @@ from render.world import World
 from scenes.model import Material
 
 DEFAULT_ERROR = 0.02
+# Squares of the parts must sum to less than 1; the rest is for merged returns and the pilot's own uncertainty.
+DIRECT_SHARE, MONTE_CARLO_SHARE = 0.4, 0.65
 BATCHES = 16
 PILOT_PIXELS = 256
 PILOT_SPP = 64
@@ -81,20 +83,20 @@ def _target(settings: RenderSettings, fine: np.ndarray) -> tuple[float, str]:
 def _grid(
     world: World, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray, target: float
 ) -> tuple[int, str]:
-    """The smallest grid whose direct light differs from the finest one by at most half the error target."""
+    """The smallest grid whose direct light differs from the finest one by at most DIRECT_SHARE of the error target."""
     if settings.grid is not None:
         return settings.grid, f"direct light: {settings.grid} x {settings.grid} rays a pixel, forced"
     for grid in GRIDS[:-1]:
         error = estimate(response(direct_light(world, pixels, grid).samples, pixels), fine, []).total
-        if error <= target / 2:
+        if error <= DIRECT_SHARE * target:
             break
     else:
         grid = GRIDS[-1]
         return (
             grid,
-            f"direct light: {grid} x {grid} rays a pixel, the most; half the target was not reached at {error:.2g}",
+            f"direct light: {grid} x {grid} rays a pixel, the most; their share of the target was not reached at {error:.2g}",
         )
-    return grid, f"direct light: {grid} x {grid} rays a pixel reach an error of {error:.2g}, at most half the target"
+    return grid, f"direct light: {grid} x {grid} rays a pixel reach an error of {error:.2g}"
 
 
 def _indirect(
@@ -129,8 +131,8 @@ def _indirect(
         spp = _whole_batches(settings.spp)
         return bounces, spp, [*whys, f"indirect light: {spp} paths a pixel, forced"]
     responses = [response(_up_to(batch, bounces), pixels) for batch in batches]
-    error = estimate(fine + sum(responses) / BATCHES, fine, responses).monte_carlo
-    wanted = _whole_batches(math.ceil(PILOT_SPP * (error / (0.7 * target)) ** 2))
+    error = estimate(fine, fine, responses).monte_carlo
+    wanted = _whole_batches(math.ceil(PILOT_SPP * (error / (MONTE_CARLO_SHARE * target)) ** 2))
     spp = int(np.clip(wanted, *SPP_LIMITS))
     whys.append(f"indirect light: {spp} paths a pixel; the pilot's {PILOT_SPP} had an error of {error:.2g}")
     if wanted > spp:

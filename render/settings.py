@@ -32,7 +32,7 @@ class RenderSettings:
     budget: tuple[float, float] | None = None
     direct_tolerance_m: float = 0.005
     indirect_tolerance_m: float = 0.03
-    indirect_growth: float = 0.1
+    indirect_growth: float = 0.05
 
     def __post_init__(self) -> None:
         limits = (("bounces", 1, MAX_BOUNCES), ("spp", 1, MAX_SAMPLES), ("grid", 1, 64), ("error", 1e-4, 1.0))

@@ -6,12 +6,14 @@ One render serves every sensor: nothing here is tied to a bin width. The file is
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
+import io
 import json
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -256,7 +258,7 @@ def _assemble(path: Path, deep: dict[str, np.ndarray], flat: dict[str, np.ndarra
 
 @contextmanager
 def _silenced() -> Iterator[None]:
-    """Send what C code prints to stdout and stderr to nowhere."""
+    """Send what Python and C code print to stdout and stderr to nowhere."""
     sys.stdout.flush()
     sys.stderr.flush()
     saved = os.dup(1), os.dup(2)
@@ -264,8 +266,10 @@ def _silenced() -> Iterator[None]:
     try:
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
-        yield
+        with redirect_stdout(io.StringIO()):
+            yield
     finally:
+        ctypes.CDLL(None).fflush(None)  # what C still holds in its buffers belongs to nowhere too
         for descriptor, copy in enumerate(saved, start=1):
             os.dup2(copy, descriptor)
             os.close(copy)

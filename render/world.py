@@ -36,7 +36,9 @@ class World:
         environment = _environment(scene)
         lights = {} if environment is None else {"environment": environment}
         # optimize=False: equal objects must not be merged, since shapes are told apart by their registry index
-        self.traced = mi.load_dict({"type": "scene", **meshes, **lights}, optimize=False)
+        # robust: without it a ray through the shared edge of two triangles can miss both
+        described = {"type": "scene", "embree_use_robust_intersections": True, **meshes, **lights}
+        self.traced = mi.load_dict(described, optimize=False)
         index = np.array([int(dr.reinterpret_array(UInt32, mi.ShapePtr(mesh))[0]) for mesh in meshes.values()])
         self.solid_ior = _table(index, [m.ior if m.kind == "dielectric" else 0 for m in materials])
         self.thin_ior = _table(index, [m.ior if m.kind == "thindielectric" else 0 for m in materials])

@@ -1,16 +1,17 @@
 """The default demo scene: a furnished living room made from a seed, no files needed.
 
-The room lies around the origin with the floor at y = 0; the camera stands near the right wall and looks along -z, turned
-left towards the far corner. Every piece of furniture is a small function that builds it around its own origin, standing
-on y = 0 with its front towards +z; `_placed` turns it and sets it down. Lengths are metres.
+The room lies around the origin with the floor at y = 0; the camera looks along -z, turned left towards the
+far corner. Every piece of furniture is a small function that builds it around its own origin, standing on y = 0 with
+its front towards +z; `_placed` turns it and sets it down. Lengths are metres.
 """
 
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from numbers import Integral
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from scenes.model import Camera, Material, Scene, Surface, Texture
 
 LOW, HIGH = np.array((-2.05, 0.0, -3.2)), np.array((1.85, 2.5, 3.0))  # the room's corners
 TILE_M = 2.0  # edge of the square that one floor or wall texture covers
+RUG_M = 0.012  # thickness of the rug
 
 # Steady light near 550 to 700 nm [W/(m^2 sr nm)]. Full sun is 1e5 lx and about 1.5 W/(m^2 nm), so an overcast sky of
 # 3,300 cd/m^2 seen through the window is 3.3e3 / 1e5 * 1.5 = 0.05; an 800 to 1,500 lm bulb whose light leaves through
@@ -29,63 +31,28 @@ LAMP_RADIANCE = 0.02
 
 Random = np.random.Generator
 Vector = Sequence[float]
-
-
-@dataclass(frozen=True)
-class _Palette:
-    """One Material object per paint, cloth or wood, shared by all that is made of it."""
-
-    planks: Material
-    plaster: Material
-    ceiling: Material
-    varnish: Material
-    wood: Material
-    paint: Material
-    cloth: Material
-    cushion: Material
-    rug: Material
-    painting: Material
-    metal: Material
-    shade: Material
-    rubber: Material
-    clay: Material
-    leather: Material
-    covers: tuple[Material, ...]
+Palette = dict[str, Material]  # one object per paint, cloth or wood, shared by all that is made of it
 
 
 def living_room(seed: int = 0, *, width: int = 128, height: int = 96) -> Scene:
     """A closed, furnished room of 3.9 x 6.2 x 2.5 m seen from 1.4 m above its floor, depths 0.8 to 6.2 m.
 
-    The seed moves and colours the furniture and shapes the sculpture; the same seed gives the same scene, byte for byte.
+    The seed moves and colours the furniture and shapes the sculpture; equal seeds give equal scenes, byte for byte.
     """
     draw = _streams(seed)
     palette = _palette(draw("colours"), draw("textures"))
     surfaces = room(palette) + window(palette)
     surfaces += furniture(palette, draw("places"), draw("books"), draw("sculpture"))
-    camera = _camera(turn_left_deg=25.0, down_deg=13.0, width=width, height=height)
+    camera = Camera.look_at((0.0, 1.4, 2.3), (-1.24, 0.72, -0.35), fov_deg=60.0, width=width, height=height)
     return Scene("living-room", tuple(surfaces), camera, notes=(f"procedural, seed {int(seed)}",))
 
 
-def _streams(seed: int):
+def _streams(seed: int) -> Callable[[str], Random]:
     """A function that gives each purpose its own random stream, so that one more draw here changes nothing there."""
-    try:
-        number = operator.index(seed)
-    except TypeError:
-        number = -1
-    if number < 0:
+    if not isinstance(seed, Integral) or seed < 0:
         raise InputError(f"living-room: seed {seed!r} is not a whole number of 0 or more")
     purposes = ("colours", "textures", "places", "books", "sculpture")
-    return lambda name: np.random.default_rng(np.random.SeedSequence(number, spawn_key=(purposes.index(name),)))
-
-
-def _camera(turn_left_deg: float, down_deg: float, width: int, height: int) -> Camera:
-    turn, down = math.radians(turn_left_deg), math.radians(down_deg)
-    forward = (-math.sin(turn) * math.cos(down), -math.sin(down), -math.cos(turn) * math.cos(down))
-    origin = np.array((0.0, 1.4, 2.3))
-    return Camera.look_at(origin, origin + forward, fov_deg=60.0, width=width, height=height)
-
-
-# --- Shapes put together ---------------------------------------------------------------------------------------------
+    return lambda name: np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=(purposes.index(name),)))
 
 
 def _box(low: Vector, high: Vector) -> shapes.Shape:
@@ -93,6 +60,11 @@ def _box(low: Vector, high: Vector) -> shapes.Shape:
     low, high = np.asarray(low, float), np.asarray(high, float)
     vertices, faces, uv = shapes.box(high - low)
     return vertices + (low + high) / 2, faces, uv
+
+
+def _post(x: float, z: float, half: float, bottom: float, top: float) -> shapes.Shape:
+    """An upright square post around (x, z)."""
+    return _box((x - half, bottom, z - half), (x + half, top, z + half))
 
 
 def _panel(centre: Vector, half_right: Vector, half_up: Vector, tile_m: float | None = None) -> shapes.Shape:
@@ -131,22 +103,19 @@ def _placed(surfaces: list[Surface], x: float, z: float, *, y: float = 0.0, turn
     return moved
 
 
-# --- The room --------------------------------------------------------------------------------------------------------
-
-
-def room(palette: _Palette) -> list[Surface]:
+def room(palette: Palette) -> list[Surface]:
     """Floor, ceiling and four walls, all facing inwards."""
     x, y, z = np.diag((HIGH - LOW) / 2)
     centre = (LOW + HIGH) / 2
     walls = ((-z, x), (z, -x), (-x, -z), (x, z))
     return [
-        _surface("floor", palette.planks, _panel(centre - y, x, -z, TILE_M)),
-        _surface("ceiling", palette.ceiling, _panel(centre + y, x, z)),
-        _surface("walls", palette.plaster, *(_panel(centre + out, right, y, TILE_M) for out, right in walls)),
+        _surface("floor", palette["oak planks"], _panel(centre - y, x, -z, TILE_M)),
+        _surface("ceiling", palette["ceiling paint"], _panel(centre + y, x, z)),
+        _surface("walls", palette["plaster"], *(_panel(centre + out, right, y, TILE_M) for out, right in walls)),
     ]
 
 
-def window(palette: _Palette, width: float = 1.3, height: float = 1.15) -> list[Surface]:
+def window(palette: Palette, width: float = 1.3, height: float = 1.15) -> list[Surface]:
     """A window on the far wall: an emitting pane behind a painted frame with a cross of bars and a sill."""
     left, right, bottom, top = -0.45 - width / 2, -0.45 + width / 2, 0.95, 0.95 + height
     x, y, z, bar = (left + right) / 2, (bottom + top) / 2, LOW[2], 0.05
@@ -166,59 +135,46 @@ def window(palette: _Palette, width: float = 1.3, height: float = 1.15) -> list[
         for sy in ((bottom + y - 0.02) / 2, (top + y + 0.02) / 2)
     )
     return [
-        _surface("window: frame", palette.paint, *frame),
-        _surface("window: panes", palette.paint, *panes, emission=WINDOW_RADIANCE),
+        _surface("window: frame", palette["white paint"], *frame),
+        _surface("window: panes", palette["white paint"], *panes, emission=WINDOW_RADIANCE),
     ]
 
 
-def furniture(palette: _Palette, places: Random, books: Random, form: Random) -> list[Surface]:
+def furniture(palette: Palette, places: Random, books: Random, form: Random) -> list[Surface]:
     """Everything that stands in the room, each piece moved and turned a little by the seed."""
 
     def near(value: float, spread: float) -> float:
         return value + places.uniform(-spread, spread)
 
     left, back = LOW[0], LOW[2]
-    table_x, table_z, radius = near(-0.25, 0.08), near(0.2, 0.1), near(0.16, 0.04)
+    table_x, table_z, radius = near(-0.1, 0.08), near(0.2, 0.1), near(0.16, 0.04)
     table_turn, table_top = near(0, 5), 0.74
     pieces = _placed(bookshelf(palette, books), left, near(0.45, 0.1), turn_deg=90)
-    pieces += _placed(sofa(palette, 1.7, palette.cloth), left + 0.03, near(-1.6, 0.1), turn_deg=90)
+    pieces += _placed(sofa(palette, 1.7, palette["sofa cloth"]), left + 0.03, near(-1.65, 0.08), turn_deg=90)
     pieces += _placed(picture(palette), left, near(-1.6, 0.1), y=near(1.15, 0.05), turn_deg=90)
-    pieces += _placed(sofa(palette, 0.95, palette.leather), near(0.0, 0.12), back + 0.15, turn_deg=near(0, 3))
-    pieces += _placed(floor_lamp(palette), near(-0.98, 0.08), near(-0.35, 0.08))
-    pieces += _placed(rug(palette), -1.0, near(0.5, 0.05))
-    pieces += _placed(ball(palette, radius), near(-1.15, 0.12), near(0.75, 0.15), y=RUG_M)
+    pieces += _placed(sofa(palette, 0.95, palette["leather"]), near(0.0, 0.12), back + 0.15, turn_deg=near(0, 3))
+    pieces += _placed(floor_lamp(palette), near(-1.05, 0.06), near(-0.45, 0.08))
+    pieces += _placed(rug(palette), -1.23, near(0.55, 0.05))
+    pieces += _placed(ball(palette, radius), near(-1.15, 0.1), near(0.45, 0.15), y=RUG_M)
     pieces += _placed(table(palette, table_top), table_x, table_z, turn_deg=table_turn)
     pieces += _placed(sculpture(palette, form), table_x + near(-0.2, 0.08), table_z + near(-0.05, 0.06), y=table_top)
     pieces += _placed(chair(palette), near(-0.12, 0.06), near(1.22, 0.02), turn_deg=180 + near(0, 8))
     return pieces
 
 
-# --- The furniture ---------------------------------------------------------------------------------------------------
-
-RUG_M = 0.012  # thickness
-
-
-def table(palette: _Palette, top: float, width: float = 1.15, depth: float = 0.75) -> list[Surface]:
+def table(palette: Palette, top: float, width: float = 1.05, depth: float = 0.75) -> list[Surface]:
     """A varnished board with an apron on four square legs."""
-    x, z, leg, board = width / 2 - 0.04, depth / 2 - 0.04, 0.055, top - 0.03
-    legs = [
-        _box(
-            (sx * x - (sx > 0) * leg, 0, sz * z - (sz > 0) * leg),
-            (sx * x + (sx < 0) * leg, board, sz * z + (sz < 0) * leg),
-        )
-        for sx in (-1, 1)
-        for sz in (-1, 1)
-    ]
-    rails = [
-        _box((leg - x, board - 0.08, s * (z - 0.03) - 0.01), (x - leg, board, s * (z - 0.03) + 0.01)) for s in (-1, 1)
-    ]
+    x, z, leg, board = width / 2 - 0.07, depth / 2 - 0.07, 0.0275, top - 0.03
+    plate = _box((-width / 2, board, -depth / 2), (width / 2, top, depth / 2))
+    legs = [_post(sx, sz, leg, 0, board) for sx in (-x, x) for sz in (-z, z)]
+    rails = [_box((leg - x, board - 0.08, sz - 0.01), (x - leg, board, sz + 0.01)) for sz in (-z, z)]
     return [
-        _surface("table: board", palette.varnish, _box((-width / 2, board, -depth / 2), (width / 2, top, depth / 2))),
-        _surface("table: legs", palette.wood, *legs, *rails),
+        _surface("table: board", palette["varnished wood"], plate),
+        _surface("table: legs", palette["wood"], *legs, *rails),
     ]
 
 
-def chair(palette: _Palette, seat: float = 0.45, top: float = 1.0) -> list[Surface]:
+def chair(palette: Palette, seat: float = 0.45, top: float = 1.0) -> list[Surface]:
     """A wooden chair whose back (at -z) has upright slats between two rails."""
     half, post = 0.21, 0.032
     inner = half - post
@@ -231,12 +187,12 @@ def chair(palette: _Palette, seat: float = 0.45, top: float = 1.0) -> list[Surfa
     ]
     cushion = _box((-half, seat - 0.03, -inner), (half, seat, half))
     return [
-        _surface("chair: frame", palette.wood, *posts, *legs, *rails, *slats),
-        _surface("chair: seat", palette.varnish, cushion),
+        _surface("chair: frame", palette["wood"], *posts, *legs, *rails, *slats),
+        _surface("chair: seat", palette["varnished wood"], cushion),
     ]
 
 
-def sofa(palette: _Palette, width: float, cover: Material, depth: float = 0.82) -> list[Surface]:
+def sofa(palette: Palette, width: float, cover: Material, depth: float = 0.82) -> list[Surface]:
     """A sofa with as many seats as its width has room for, its back at z = 0; a narrow one is an armchair."""
     seats = max(1, round((width - 0.4) / 0.65))
     name = "sofa" if seats > 1 else "armchair"
@@ -248,23 +204,16 @@ def sofa(palette: _Palette, width: float, cover: Material, depth: float = 0.82) 
         _box((arm - x, base, 0), (x - arm, 0.84, 0.2)),
     )
     edges = np.linspace(arm - x, x - arm, seats + 1)
-    cushions = [
-        _box((a + 0.005, base, 0.2), (b - 0.005, seat, depth + 0.02))
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
-    ]
-    feet = [
-        _box((sx - 0.03, 0, sz - 0.03), (sx + 0.03, foot, sz + 0.03))
-        for sx in (0.1 - x, x - 0.1)
-        for sz in (0.1, depth - 0.1)
-    ]
+    cushions = [_box((a + 0.005, base, 0.2), (b - 0.005, seat, depth + 0.02)) for a, b in pairwise(edges)]
+    feet = [_post(sx, sz, 0.03, 0, foot) for sx in (0.1 - x, x - 0.1) for sz in (0.1, depth - 0.1)]
     return [
         _surface(f"{name}: body", cover, *body),
-        _surface(f"{name}: cushions", palette.cushion, *cushions),
-        _surface(f"{name}: feet", palette.wood, *feet),
+        _surface(f"{name}: cushions", palette["cushion cloth"], *cushions),
+        _surface(f"{name}: feet", palette["wood"], *feet),
     ]
 
 
-def bookshelf(palette: _Palette, rng: Random, width: float = 1.5, height: float = 2.0) -> list[Surface]:
+def bookshelf(palette: Palette, rng: Random, width: float = 1.5, height: float = 2.0) -> list[Surface]:
     """A painted case, its back on z = 0, whose five compartments are more or less full of upright books."""
     depth, board, x = 0.28, 0.025, width / 2
     floors = np.linspace(0.06, height - board, 6)
@@ -274,19 +223,20 @@ def bookshelf(palette: _Palette, rng: Random, width: float = 1.5, height: float 
         _box((board - x, 0.06, 0), (x - board, height, 0.012)),
     ]
     case += [_box((board - x, y, 0.012), (x - board, y + board, depth - 0.005)) for y in floors]
-    books: list[list[shapes.Shape]] = [[] for _ in palette.covers]
+    covers = [material for name, material in palette.items() if name.startswith("book cover")]
+    books: list[list[shapes.Shape]] = [[] for _ in covers]
     for y in floors[:-1] + board:
         at, end = board - x + 0.004, (x - board) - rng.uniform(0.0, 0.5)
         while at + 0.06 < end:
             thick, tall, deep = rng.uniform((0.018, 0.2, 0.13), (0.055, 0.32, 0.2))
             books[rng.integers(len(books))].append(_box((at, y, 0.02), (at + thick, y + tall, 0.02 + deep)))
             at += thick + rng.choice((0.001, 0.001, 0.001, 0.04))
-    filled = zip(palette.covers, books, strict=True)
-    spines = [_surface(f"bookshelf: books, {m.name}", m, *parts) for m, parts in filled if parts]
-    return [_surface("bookshelf: case", palette.paint, *case), *spines]
+    shelved = zip(covers, books, strict=True)
+    spines = [_surface(f"bookshelf: books, {cover.name}", cover, *parts) for cover, parts in shelved if parts]
+    return [_surface("bookshelf: case", palette["white paint"], *case), *spines]
 
 
-def floor_lamp(palette: _Palette) -> list[Surface]:
+def floor_lamp(palette: Palette) -> list[Surface]:
     """A round foot, an 18 mm stand, and a cloth shade on a crossbar that glows on its outside."""
     wall, faces, uv = shapes.cylinder((0, 1.36, 0), (0, 1.66, 0), 1.0)
     wall[:, ::2] *= np.interp(wall[:, 1:2], (1.36, 1.66), (0.2, 0.12))
@@ -295,41 +245,43 @@ def floor_lamp(palette: _Palette) -> list[Surface]:
     reach = float(np.interp(1.43, (1.36, 1.66), (0.2, 0.12))) - 0.002
     bar = _box((-reach, 1.42, -0.005), (reach, 1.43, 0.005))
     return [
-        _surface("lamp: stand", palette.metal, foot, stand, bar),
-        _surface("lamp: shade", palette.shade, (wall, faces, uv), emission=LAMP_RADIANCE),
+        _surface("lamp: stand", palette["brushed steel"], foot, stand, bar),
+        _surface("lamp: shade", palette["lamp cloth"], (wall, faces, uv), emission=LAMP_RADIANCE),
     ]
 
 
-def picture(palette: _Palette, width: float = 0.9, height: float = 0.62, bar: float = 0.035) -> list[Surface]:
+def picture(palette: Palette, width: float = 0.9, height: float = 0.62, bar: float = 0.035) -> list[Surface]:
     """A framed painting whose back is on z = 0 and whose lower edge is on y = 0."""
     x, board = width / 2, 0.015
     frame = (
-        _box((-x, 0, 0), (x, bar, 0.03)),
-        _box((-x, height - bar, 0), (x, height, 0.03)),
-        _box((-x, bar, 0), (bar - x, height - bar, 0.03)),
-        _box((x - bar, bar, 0), (x, height - bar, 0.03)),
+        *(_box((-x, y, 0), (x, y + bar, 0.03)) for y in (0, height - bar)),
+        *(_box((left, bar, 0), (left + bar, height - bar, 0.03)) for left in (-x, x - bar)),
     )
     canvas = _panel((0, height / 2, board), (x - bar, 0, 0), (0, height / 2 - bar, 0))
-    return [_surface("picture: frame", palette.wood, *frame), _surface("picture: canvas", palette.painting, canvas)]
+    return [
+        _surface("picture: frame", palette["wood"], *frame),
+        _surface("picture: canvas", palette["painting"], canvas),
+    ]
 
 
-def rug(palette: _Palette, width: float = 0.95, length: float = 1.5) -> list[Surface]:
-    return [_surface("rug: wool", palette.rug, _box((-width / 2, 0, -length / 2), (width / 2, RUG_M, length / 2)))]
+def rug(palette: Palette, width: float = 0.9, length: float = 1.4) -> list[Surface]:
+    x, z = width / 2, length / 2
+    return [_surface("rug: wool", palette["rug wool"], _box((-x, 0, -z), (x, RUG_M, z)))]
 
 
-def ball(palette: _Palette, radius: float) -> list[Surface]:
+def ball(palette: Palette, radius: float) -> list[Surface]:
     vertices, faces, uv = shapes.sphere(radius, subdivisions=4)
     normals = vertices / radius
-    return [Surface(vertices + (0, radius, 0), faces, palette.rubber, uv, normals, name="ball: rubber")]
+    return [Surface(vertices + np.array((0, radius, 0)), faces, palette["rubber"], uv, normals, name="ball: rubber")]
 
 
-def sculpture(palette: _Palette, rng: Random, height: float = 0.4) -> list[Surface]:
+def sculpture(palette: Palette, rng: Random, height: float = 0.4) -> list[Surface]:
     """A smooth lump of clay: a sphere swollen and dented by a few soft random waves, twisted, with a flat foot."""
     directions, faces, uv = shapes.sphere(1.0, subdivisions=5)
     swell = np.zeros(len(directions))
     for _ in range(7):
         wave, phase = rng.normal(0, 1.7, 3), rng.uniform(0, 2 * np.pi)
-        swell += 0.11 * np.sin(directions @ wave + phase)
+        swell += 0.13 * np.sin(directions @ wave + phase)
     points = directions * (1 + swell)[:, None] * (0.62, 1.0, 0.62)
     twist = rng.choice((-1, 1)) * rng.uniform(0.5, 1.1) * points[:, 1]
     c, s = np.cos(twist), np.sin(twist)
@@ -340,7 +292,7 @@ def sculpture(palette: _Palette, rng: Random, height: float = 0.4) -> list[Surfa
     points = (points - (0, foot, 0)) * (height / (high - foot))
     points[:, ::2] -= points[points[:, 1] <= 0][:, ::2].mean(axis=0)
     normals = _smooth_normals(points, directions, faces)
-    return [Surface(points, faces, palette.clay, uv, normals, name="sculpture: clay")]
+    return [Surface(points, faces, palette["clay"], uv, normals, name="sculpture: clay")]
 
 
 def _smooth_normals(points: np.ndarray, key: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -355,37 +307,36 @@ def _smooth_normals(points: np.ndarray, key: np.ndarray, faces: np.ndarray) -> n
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-# --- Colours and textures --------------------------------------------------------------------------------------------
+def _palette(colours: Random, textures: Random) -> Palette:
+    """The materials of one seed by name. Albedos span 0.05 (leather, dark covers) to 0.9 (ceiling)."""
 
+    def plain(low: float, high: float) -> dict:
+        return {"albedo": float(colours.uniform(low, high))}
 
-def _palette(colours: Random, textures: Random) -> _Palette:
-    """The materials of one seed. Albedos span 0.05 (leather, dark covers) to 0.9 (ceiling)."""
+    def printed(image: np.ndarray) -> dict:
+        return {"albedo": Texture(image, "made from the seed")}
 
-    def plain(name: str, low: float, high: float) -> Material:
-        return Material(albedo=float(colours.uniform(low, high)), name=name)
-
-    def printed(name: str, image: np.ndarray, **kind) -> Material:
-        return Material(albedo=Texture(image, name), name=name, **kind)
-
+    gloss = {"kind": "roughplastic", "ior": 1.5}
     wood = float(colours.uniform(0.25, 0.42))
-    return _Palette(
-        planks=printed("oak planks", _planks(textures, wood)),
-        plaster=printed("plaster", _mottled(textures, colours.uniform(0.55, 0.72), 0.03, 6)),
-        ceiling=Material(albedo=0.9, name="ceiling paint"),
-        varnish=printed("varnished wood", _grain(textures, 0.8 * wood), kind="roughplastic", roughness=0.2, ior=1.5),
-        wood=plain("wood", 0.15, 0.35),
-        paint=plain("white paint", 0.75, 0.85),
-        cloth=printed("sofa cloth", _mottled(textures, colours.uniform(0.25, 0.5), 0.05, 2)),
-        cushion=plain("cushion cloth", 0.3, 0.65),
-        rug=printed("rug wool", _rug_pattern(textures)),
-        painting=printed("painting", _landscape(textures)),
-        metal=Material("roughconductor", roughness=0.3, eta=2.9, k=3.1, name="brushed steel"),
-        shade=plain("lamp cloth", 0.65, 0.8),
-        rubber=Material("roughplastic", float(colours.uniform(0.3, 0.7)), roughness=0.3, name="rubber"),
-        clay=plain("clay", 0.4, 0.75),
-        leather=plain("leather", 0.05, 0.12),
-        covers=tuple(Material(albedo=a, name=f"cover {a:g}") for a in (0.06, 0.12, 0.22, 0.35, 0.5, 0.7)),
-    )
+    made = {
+        "oak planks": printed(_planks(textures, wood)),
+        "plaster": printed(_mottled(textures, colours.uniform(0.55, 0.72), 0.03, 6)),
+        "ceiling paint": {"albedo": 0.9},
+        "varnished wood": printed(_grain(textures, 0.8 * wood)) | gloss | {"roughness": 0.2},
+        "wood": plain(0.15, 0.35),
+        "white paint": plain(0.75, 0.85),
+        "sofa cloth": printed(_mottled(textures, colours.uniform(0.25, 0.5), 0.05, 2)),
+        "cushion cloth": plain(0.3, 0.65),
+        "rug wool": printed(_rug_pattern(textures)),
+        "painting": printed(_landscape(textures)),
+        "brushed steel": {"kind": "roughconductor", "roughness": 0.3, "eta": 2.9, "k": 3.1},
+        "lamp cloth": plain(0.65, 0.8),
+        "rubber": plain(0.3, 0.7) | gloss | {"roughness": 0.3},
+        "clay": plain(0.4, 0.75),
+        "leather": plain(0.05, 0.12),
+    }
+    made |= {f"book cover {a:g}": {"albedo": a} for a in (0.06, 0.12, 0.22, 0.35, 0.5, 0.7)}
+    return {name: Material(**values, name=name) for name, values in made.items()}
 
 
 def _soft_noise(rng: Random, shape: tuple[int, int], size_px: tuple[float, float]) -> np.ndarray:
@@ -411,7 +362,7 @@ def _planks(rng: Random, mean: float, side: int = 512, across: int = 14) -> np.n
     """Floor boards running up the image: each has its own brightness and joints, dark gaps between them."""
     image = _grain(rng, mean, side)
     edges = np.round(np.linspace(0, side, across + 1)).astype(int)
-    for left, right in zip(edges[:-1], edges[1:], strict=True):
+    for left, right in pairwise(edges):
         joint = int(rng.integers(side))
         board = np.roll(image[:, left:right], joint, axis=0)
         half = side // 2 + int(rng.integers(-side // 8, side // 8))
@@ -429,9 +380,8 @@ def _rug_pattern(rng: Random, side: int = 256) -> np.ndarray:
     rows, columns = centred[:, None], centred[None]
     inset = 1 - np.maximum(rows, columns)
     dark, light = rng.uniform(0.08, 0.2), rng.uniform(0.5, 0.75)
-    waves = np.cos(np.pi * rng.integers(3, 6) * (rows + columns)) + np.cos(
-        np.pi * rng.integers(3, 6) * (rows - columns)
-    )
+    across, along = np.pi * rng.integers(3, 6, 2)
+    waves = np.cos(across * (rows + columns)) + np.cos(along * (rows - columns))
     image = np.where(waves > 0, light, (dark + light) / 2)
     image = np.where(inset < 0.22, np.where(inset % 0.11 < 0.06, dark, light), image)
     return np.clip(image * (1 + 0.08 * _soft_noise(rng, (side, side), (1, 1))), 0.05, 0.9)

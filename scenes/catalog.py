@@ -1,0 +1,81 @@
+"""Scenes by name or by file: one door for the command line and for studies."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from scenes import shapes
+from scenes.errors import InputError
+from scenes.living_room import living_room
+from scenes.meshes import EXTENSIONS as MESH_EXTENSIONS
+from scenes.meshes import load_mesh
+from scenes.model import Camera, Material, Scene, Surface
+
+SCENES: dict[str, str] = {
+    "living-room": "a furnished room made from the seed, 0.8 to 6.2 m, with a window and a lamp as ambient light",
+    "plane": "a frontal Lambertian wall at 3 m, albedo 0.5",
+    "sphere": "a Lambertian sphere of radius 0.5 m whose centre is 3 m away, albedo 0.5, nothing behind it",
+    "corner": "a V-groove: two walls of 2 x 4 m, albedo 0.5, that meet at 90 degrees on an upright edge 3 m away",
+}
+EXTENSIONS = (*MESH_EXTENSIONS, ".xml")
+WIDTH, HEIGHT = 128, 96  # pixels, where neither the caller nor the file says
+
+
+def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
+    """The scene of that name (a key of SCENES) or in that file (.obj .ply .stl .glb, or Mitsuba .xml).
+
+    width, height: pixels; None is 128 x 96, or the film size of an .xml; one alone keeps the proportions. The seed
+    matters to procedural scenes only. Raises InputError in one line for an unknown name or extension, or a bad file.
+    """
+    spec = str(spec)
+    kind = Path(spec).suffix.lower()
+    if spec not in SCENES and kind not in EXTENSIONS:
+        raise InputError(
+            f"scene {spec!r}: expected one of {', '.join(SCENES)}, or a file with extension {' '.join(EXTENSIONS)}"
+        )
+    if kind == ".xml":
+        from scenes.mitsuba_xml import load_mitsuba_xml
+
+        return load_mitsuba_xml(Path(spec), width=width, height=height)
+    size = _looking_ahead(WIDTH, HEIGHT).resized(width, height)
+    if kind in MESH_EXTENSIONS:
+        return load_mesh(Path(spec), width=size.width, height=size.height)
+    if spec == "living-room":
+        return living_room(seed, width=size.width, height=size.height)
+    make = {"plane": _plane, "sphere": _sphere, "corner": _corner}[spec]
+    return Scene(spec, make(), size)
+
+
+def _looking_ahead(width: int, height: int, fov_deg: float = 40.0) -> Camera:
+    """A camera at the origin that looks along -z."""
+    return Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=fov_deg, width=width, height=height)
+
+
+def _plane(distance_m: float = 3.0, half_m: float = 8.0) -> tuple[Surface, ...]:
+    """A square large enough to fill an image up to 7 times as tall as wide."""
+    square, faces, uv = shapes.rectangle()
+    return (Surface(half_m * square - (0, 0, distance_m), faces, Material(name="grey"), uv=uv, name="wall"),)
+
+
+def _sphere(distance_m: float = 3.0, radius_m: float = 0.5) -> tuple[Surface, ...]:
+    """Triangles inscribed in the sphere (no deeper than 0.2 mm), with the true sphere's normals for shading."""
+    points, faces, uv = shapes.sphere()
+    vertices = radius_m * points - (0, 0, distance_m)
+    return (Surface(vertices, faces, Material(name="grey"), uv=uv, normals=points, name="sphere"),)
+
+
+def _corner(distance_m: float = 3.0, width_m: float = 2.0, height_m: float = 4.0) -> tuple[Surface, ...]:
+    """Two upright rectangles, one material, each at 45 degrees to the camera's axis, open towards the camera."""
+    square, faces, uv = shapes.rectangle()
+    along, up = width_m * (square[:, :1] + 1) / 2, square[:, 1:2] * (0, height_m / 2, 0)
+    slant, grey = math.sqrt(0.5), Material(name="grey")
+    edge = np.array((0, 0, -distance_m))
+    right = edge + up + along * (slant, 0, slant)
+    left = edge + up + (width_m - along) * (-slant, 0, slant)
+    return (
+        Surface(left, faces, grey, uv=uv, name="left wall"),
+        Surface(right, faces, grey, uv=uv, name="right wall"),
+    )

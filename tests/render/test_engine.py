@@ -1,0 +1,150 @@
+"""The whole render: determinism, the plan and its reasons, the error estimate, hard and empty cases."""
+
+import numpy as np
+import oracles
+import pytest
+
+from render.engine import render
+from render.error import BIN_M, SIGMA_M, response
+from render.returns import Samples
+from render.settings import RenderSettings
+from scenes import Camera, InputError, Laser, Material, Scene, Surface
+from scenes.shapes import box, sphere
+
+
+def room(mode: str = "flood", width: int = 24, height: int = 18) -> Scene:
+    vertices, faces, uv = box((4, 3, 5))
+    walls = Surface(vertices + [0, 0, -1.5], faces[:, ::-1], Material(albedo=0.7), uv=uv)
+    vertices, faces, _ = sphere(0.4, 4)
+    ball = Surface(vertices + [0.5, -0.1, -2.2], faces, Material(albedo=0.3))
+    return Scene("room", (walls, ball), oracles.camera(width, height, 60), Laser(mode))
+
+
+def test_same_seed_same_bytes_with_one_and_two_threads():
+    from render.world import dr
+
+    threads = dr.thread_count()
+    hashes = set()
+    try:
+        for count in (1, 2, 2):
+            dr.set_thread_count(count)
+            hashes.add(render(room(), RenderSettings(bounces=4, spp=64, grid=4), seed=5).sha256())
+    finally:
+        dr.set_thread_count(threads)
+    assert len(hashes) == 1
+    assert render(room(), RenderSettings(bounces=4, spp=64, grid=4), seed=6).sha256() not in hashes
+
+
+def test_plan_gives_a_reason_for_every_choice_and_can_be_forced():
+    planned = render(room()).meta["plan"]
+    assert planned["bounces"] > 2 and planned["spp"] % 16 == 0 and not planned["ambient"]
+    for topic in ("error target", "direct light", "bounces", "indirect light", "ambient light"):
+        assert any(topic in reason for reason in planned["reasons"]), topic
+    forced = render(room(), RenderSettings(bounces=2, spp=20, grid=3)).meta["plan"]
+    assert (forced["bounces"], forced["spp"], forced["grid"]) == (2, 32, 3)
+    assert sum("forced" in reason for reason in forced["reasons"]) == 3
+    assert render(room("scan")).meta["plan"]["bounces"] == 1
+    coarse = render(room(), RenderSettings(budget=(10, 1000))).meta["plan"]
+    fine = render(room(), RenderSettings(budget=(1000, 0))).meta["plan"]
+    assert fine["spp"] > 4 * coarse["spp"], "more photons show more of the render's error"
+
+
+def test_error_target_is_met_and_the_estimate_is_honest():
+    """The true error, from a much finer render, agrees with the estimate; both meet the target."""
+    scene, pixels = room(), np.arange(24 * 18)
+    fine = as_response(render(scene, RenderSettings(spp=8192, grid=32, bounces=8), seed=99), pixels)
+    for target in (0.05, 0.02):
+        coarse = render(scene, RenderSettings(error=target, bounces=8), seed=1)
+        true = np.linalg.norm(as_response(coarse, pixels) - fine) / np.linalg.norm(fine)
+        estimated = coarse.meta["relative_error"]["total"]
+        assert true < target and estimated < target
+        assert 1 / 1.5 < true / estimated < 1.5
+
+
+def as_response(transient, pixels):
+    near, far = transient.path_near_m.astype(float), transient.path_far_m.astype(float)
+    centre, half = 0.5 * (near + far), 0.5 * (far - near)
+    return response(Samples(transient.return_pixel, centre, half, transient.radiance, transient.bounces), pixels)
+
+
+def test_response_is_a_pulse_at_the_right_place():
+    samples = Samples(np.array([3]), np.array([100.25 * BIN_M]), np.array([0.0]), np.array([2.0]), np.array([1]))
+    counts = response(samples, np.array([1, 3]))
+    assert counts[0].sum() == 0 and counts[1].sum() == pytest.approx(2, rel=1e-6)
+    centre = (counts[1] * (np.arange(1024) + 0.5)).sum() / 2
+    assert centre == pytest.approx(100.25, abs=1e-4)
+    assert counts[1].max() == pytest.approx(2 * BIN_M / SIGMA_M / np.sqrt(2 * np.pi), rel=0.02)
+
+
+def test_different_seeds_agree_within_the_estimated_error():
+    settings = RenderSettings(bounces=4, spp=256, grid=4)
+    first, second = render(room(), settings, seed=1), render(room(), settings, seed=2)
+    error = np.hypot(first.error, second.error)
+    z = (first.total_radiance() - second.total_radiance()) / error
+    # Student's t with about 30 degrees of freedom: variance 30/28; 432 pixels give its mean to 7 %
+    assert 0.7 < (z**2).mean() < 1.5 and np.abs(z).max() < 6
+
+
+def test_nothing_in_view_is_an_empty_transient():
+    behind = Scene("behind", (oracles.wall(-3.0, 0.5),), oracles.camera())
+    transient = render(behind)
+    assert transient.returns == 0 and np.isnan(transient.depth_m).all() and not transient.mixed.any()
+    assert transient.indirect_fraction == 0 and np.isnan(transient.mean_path_m()).all()
+    black = render(Scene("black", (oracles.wall(3.0, 0.0),), oracles.camera()))
+    assert black.returns == 0 and np.isfinite(black.depth_m).any()
+
+
+@pytest.mark.parametrize("tilt_deg", [80, 89, 89.9])
+def test_grazing_plane_stays_finite(tilt_deg):
+    scene = Scene("grazing", (oracles.wall(3.0, 0.5, tilt_deg=tilt_deg, half_size_m=2),), oracles.camera(32, 24, 60))
+    transient = render(scene, RenderSettings(bounces=1))
+    assert transient.returns > 0 and np.isfinite(transient.total_radiance()).all()
+    assert transient.path_near_m.min() > 0 and transient.path_far_m.max() < 40
+
+
+@pytest.mark.parametrize("distance_m", [0.05, 14.9, 500.0])
+def test_near_and_far_walls_keep_their_distance(distance_m):
+    wall = oracles.wall(distance_m, 0.5, half_size_m=2 * distance_m)
+    transient = render(Scene("wall", (wall,), oracles.camera(16, 12)), RenderSettings(bounces=1, grid=4))
+    total, mean, _ = oracles.plane_moments(
+        Scene("wall", (wall,), oracles.camera(16, 12)), distance_m=distance_m, tilt_deg=0, albedo=0.5
+    )
+    assert np.allclose(transient.total_radiance(), total, rtol=2e-4)
+    assert np.allclose(transient.mean_path_m(), mean, rtol=2e-5)
+
+
+def test_odd_meshes_do_no_harm():
+    """Duplicated faces, degenerate triangles and inverted normals: the same wall."""
+    wall = oracles.wall(3.0, 0.5, half_size_m=20)
+    good = render(Scene("wall", (wall,), oracles.camera()), RenderSettings(bounces=1, grid=4))
+    faces = np.concatenate([wall.faces[:, ::-1], wall.faces[:1, ::-1], [[0, 0, 1], [2, 2, 2]]])
+    odd = render(Scene("odd", (Surface(wall.vertices, faces, wall.material),), oracles.camera()),
+                 RenderSettings(bounces=1, grid=4))  # fmt: skip
+    assert np.allclose(odd.total_radiance(), good.total_radiance(), rtol=1e-5)
+    assert np.allclose(odd.normal, good.normal) and np.allclose(odd.depth_m, good.depth_m, rtol=1e-6)
+
+
+def test_progress_is_told():
+    told = []
+    render(room(width=8, height=6), RenderSettings(bounces=2, spp=32), progress=lambda what, share: told.append(share))
+    assert told == sorted(told) and told[-1] == 1.0 and len(told) > 10
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"bounces": 0}, {"spp": 0}, {"grid": 0}, {"grid": 65}, {"error": 0.0}, {"error": float("nan")},
+        {"budget": (0, 10)}, {"budget": (10, -1)}, {"error": 0.1, "budget": (1, 1)}, {"direct_tolerance_m": 0.0},
+        {"indirect_growth": 2.0},
+    ],
+)  # fmt: skip
+def test_bad_settings_are_refused_in_one_line(bad):
+    with pytest.raises(InputError) as refused:
+        RenderSettings(**bad)
+    assert "\n" not in str(refused.value)
+
+
+def test_camera_of_one_pixel():
+    scene = Scene("one", (oracles.wall(3.0, 0.5, half_size_m=20),), Camera(oracles.camera().pose, 34.0, 1, 1))
+    transient = render(scene)
+    assert transient.depth_m.shape == (1, 1) and transient.depth_m[0, 0] == pytest.approx(3.0, abs=1e-5)

@@ -1,0 +1,68 @@
+"""Merging keeps what it says it keeps, for any samples."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from render.returns import Samples, merge, to_returns
+
+
+def random_samples(seed: int, count: int, pixels: int = 5) -> Samples:
+    rng = np.random.default_rng(seed)
+    return Samples(
+        rng.integers(0, pixels, count),
+        rng.uniform(0, 3, count),
+        rng.uniform(0, 0.05, count),
+        rng.exponential(1, count) * (rng.random(count) > 0.1),
+        rng.integers(1, 4, count).astype(np.uint8),
+    )
+
+
+def moments(samples: Samples, pixels: int = 5) -> np.ndarray:
+    """Energy, first and second moment of each pixel's direct and indirect light."""
+    key = samples.pixel * 2 + (samples.bounces > 1)
+    second = samples.path_m**2 + samples.half_width_m**2 / 3
+    weights = (np.ones(len(key)), samples.path_m, second)
+    return np.array([np.bincount(key, weights=samples.radiance * w, minlength=2 * pixels) for w in weights])
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 400), st.sampled_from([1e-4, 0.01, 0.3, 10.0]), st.floats(0, 0.5))
+def test_merging_keeps_energy_centroid_and_variance(seed, count, tolerance, growth):
+    samples = random_samples(seed, count)
+    start = np.full(5, 1.0)
+    merged = merge(samples, tolerance, start, growth)
+    assert np.allclose(moments(merged), moments(samples), rtol=1e-11, atol=1e-11)
+    assert len(merged.pixel) <= len(samples.pixel)
+    again = merge(merged, tolerance, start, growth)
+    assert np.allclose(moments(again), moments(merged), rtol=1e-11, atol=1e-11)
+
+
+def test_merging_depends_on_the_cell_alone():
+    samples = Samples(
+        np.zeros(4, int),
+        np.array([1.001, 1.009, 1.011, 1.005]),
+        np.zeros(4),
+        np.ones(4),
+        np.array([1, 1, 1, 2], np.uint8),
+    )
+    merged = merge(samples, 0.01)
+    assert merged.radiance.tolist() == [2, 1, 1]
+    assert merged.path_m[0] == pytest.approx(1.005) and merged.half_width_m[0] == pytest.approx(0.004 * np.sqrt(3))
+    assert merged.bounces.tolist() == [1, 1, 2]
+
+
+def test_returns_are_sorted_and_ragged():
+    samples = random_samples(1, 300)
+    returns = to_returns(merge(samples, 0.01), 7)
+    assert returns.offsets.tolist()[-2:] == [len(returns.radiance)] * 2 and returns.offsets[0] == 0
+    for first, last in zip(returns.offsets[:-1], returns.offsets[1:], strict=True):
+        assert (np.diff(returns.path_near_m[first:last]) >= 0).all()
+    assert (returns.path_far_m >= returns.path_near_m).all() and (returns.path_near_m >= 0).all()
+    assert returns.radiance.dtype == np.float32 and returns.bounces.dtype == np.uint8
+
+
+def test_no_samples_give_no_returns():
+    empty = Samples(np.empty(0, int), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.uint8))
+    assert to_returns(merge(empty, 0.01), 3).offsets.tolist() == [0, 0, 0, 0]

@@ -1,0 +1,160 @@
+"""The transient's file: bit for bit, and every kind of damage refused in one line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from render.returns import Samples, merge, to_returns
+from render.transient import ATTRIBUTE, Transient, read_transient, write_transient
+from scenes import InputError
+
+
+def make(returns: int = 2000, height: int = 12, width: int = 16, seed: int = 0) -> Transient:
+    rng = np.random.default_rng(seed)
+    samples = Samples(
+        rng.integers(0, height * width, returns),
+        rng.uniform(1, 9, returns),
+        rng.uniform(0, 0.01, returns),
+        rng.exponential(1, returns),
+        rng.integers(1, 9, returns).astype(np.uint8),
+    )
+    shape = (height, width)
+    depth = rng.uniform(1, 5, shape).astype(np.float32)
+    depth[0, 0] = np.nan
+    return Transient(
+        height,
+        width,
+        *to_returns(merge(samples, 0.01), height * width),
+        depth_m=depth,
+        normal=rng.normal(size=(*shape, 3)).astype(np.float16),
+        albedo=rng.random(shape).astype(np.float16),
+        ambient=rng.random(shape).astype(np.float32),
+        mixed=rng.random(shape) > 0.5,
+        error=rng.random(shape).astype(np.float32),
+        meta={"scene": "noise", "seed": 2**40, "deep": {"list": [1, 2.5, "ü"]}},
+    )
+
+
+@pytest.mark.parametrize("returns", [0, 1, 3, 2000])
+def test_read_back_bit_for_bit(tmp_path, returns):
+    transient = make(returns)
+    write_transient(transient, tmp_path / "t.exr")
+    again = read_transient(tmp_path / "t.exr")
+    for name in (
+        "offsets",
+        "path_near_m",
+        "path_far_m",
+        "radiance",
+        "bounces",
+        "depth_m",
+        "normal",
+        "albedo",
+        "ambient",
+    ):
+        left, right = getattr(transient, name), getattr(again, name)
+        assert left.dtype == right.dtype and left.tobytes() == right.tobytes(), name
+    assert (transient.mixed == again.mixed).all() and transient.error.tobytes() == again.error.tobytes()
+    assert again.meta == transient.meta
+    assert [path.name for path in tmp_path.iterdir()] == ["t.exr"]
+
+
+def test_same_transient_same_file(tmp_path):
+    write_transient(make(), tmp_path / "a.exr")
+    write_transient(make(), tmp_path / "b.exr")
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+def test_truncated_at_any_length_is_refused(tmp_path, capfd):
+    write_transient(make(300, 6, 8), tmp_path / "t.exr")
+    data = (tmp_path / "t.exr").read_bytes()
+    cut = tmp_path / "cut.exr"
+    for length in [*range(0, len(data), max(1, len(data) // 150)), len(data) - 2, len(data) - 1]:
+        cut.write_bytes(data[:length])
+        with pytest.raises(InputError) as refused:
+            read_transient(cut)
+        assert "cut.exr" in str(refused.value) and "\n" not in str(refused.value)
+    assert capfd.readouterr() == ("", ""), "OpenEXR's own warnings must not reach the terminal"
+
+
+def test_damaged_contents_are_refused(tmp_path):
+    write_transient(make(300, 6, 8), tmp_path / "t.exr")
+    data = bytearray((tmp_path / "t.exr").read_bytes())
+    rng = np.random.default_rng(0)
+    refused = 0
+    for position in rng.integers(len(data) // 2, len(data), 40):
+        damaged = data.copy()
+        damaged[position] ^= 0x55
+        (tmp_path / "d.exr").write_bytes(damaged)
+        try:
+            again = read_transient(tmp_path / "d.exr")
+            assert again.sha256() == make(300, 6, 8).sha256()
+        except InputError:
+            refused += 1
+    assert refused > 30
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"schema": 2}, "schema 2"), ({"kind": "depth"}, "expected a transient"), ({"returns": 1}, "do not match")],
+)
+def test_other_kinds_and_newer_schemas_are_refused_by_name(tmp_path, change, message):
+    import OpenEXR
+
+    write_transient(make(300, 6, 8), tmp_path / "t.exr")
+    with OpenEXR.File(str(tmp_path / "t.exr"), separate_channels=True) as file:
+        parts = [OpenEXR.Part(dict(p.header), dict(p.channels), p.name()) for p in file.parts]
+        meta = json.loads(parts[0].header[ATTRIBUTE])
+        parts[0].header[ATTRIBUTE] = json.dumps({**meta, **change})
+        OpenEXR.File(parts).write(str(tmp_path / "u.exr"))
+    with pytest.raises(InputError, match=message):
+        read_transient(tmp_path / "u.exr")
+
+
+def test_foreign_and_missing_files_are_refused(tmp_path):
+    import OpenEXR
+
+    pixels = np.zeros((4, 4), np.float32)
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": pixels}).write(str(tmp_path / "image.exr"))
+    (tmp_path / "text.exr").write_text("not an image")
+    for name, message in (("image.exr", "no transient"), ("text.exr", "not a readable"), ("none.exr", "not found")):
+        with pytest.raises(InputError, match=message):
+            read_transient(tmp_path / name)
+
+
+def test_write_leaves_nothing_behind_when_it_fails(tmp_path, monkeypatch):
+    import OpenEXR
+
+    def full_disk(self, path):
+        Path(path).write_bytes(b"half")
+        raise RuntimeError("No space left on device")
+
+    monkeypatch.setattr(OpenEXR.File, "write", full_disk)
+    with pytest.raises(InputError, match=r"t.exr: cannot be written .*No space left"):
+        write_transient(make(), tmp_path / "t.exr")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match="does not exist"):
+        write_transient(make(), tmp_path / "nowhere" / "t.exr")
+
+
+def test_invalid_returns_are_refused_in_the_constructor():
+    from dataclasses import replace
+
+    good = make(50, 4, 4)
+    with pytest.raises(InputError, match="negative"):
+        replace(good, radiance=-good.radiance)
+    with pytest.raises(InputError, match="reversed"):
+        replace(good, path_near_m=good.path_far_m + 1)
+    with pytest.raises(InputError, match="offsets"):
+        replace(good, offsets=np.concatenate(([0], good.offsets[-2:0:-1], good.offsets[-1:])))
+    with pytest.raises(InputError, match="depth_m"):
+        replace(good, depth_m=good.depth_m[:2])
+
+
+def test_delay_moves_paths_by_twice_the_offset():
+    transient = make()
+    later = transient.delayed(7.0)
+    assert np.allclose(later.mean_path_m(), transient.mean_path_m() + 14, atol=1e-5, equal_nan=True)
+    assert np.allclose(later.depth_m, transient.depth_m + 7, equal_nan=True)
+    assert (later.radiance == transient.radiance).all() and later.delayed(1.0).meta["time_offset_m"] == 8.0
