@@ -86,17 +86,11 @@ def _grid(
     """The smallest grid whose direct light differs from the finest one by at most DIRECT_SHARE of the error target."""
     if settings.grid is not None:
         return settings.grid, f"direct light: {settings.grid} x {settings.grid} rays a pixel, forced"
-    for grid in GRIDS[:-1]:
+    for grid in GRIDS:
         error = estimate(response(direct_light(world, pixels, grid).samples, pixels), fine, []).total
         if error <= DIRECT_SHARE * target:
             break
-    else:
-        grid = GRIDS[-1]
-        return (
-            grid,
-            f"direct light: {grid} x {grid} rays a pixel, the most; their share of the target was not reached at {error:.2g}",
-        )
-    return grid, f"direct light: {grid} x {grid} rays a pixel reach an error of {error:.2g}"
+    return grid, f"direct light: {grid} x {grid} rays a pixel, error {error:.2g} against {GRIDS[-1]} x {GRIDS[-1]}"
 
 
 def _indirect(

@@ -48,7 +48,7 @@ def load_mesh(path: Path, *, width: int = 128, height: int = 96) -> Scene:
 
     The model keeps its size if its largest extent is 0.2 to 2.5 m and is scaled to 1 m otherwise. Every surface is
     diffuse with the file's colour as albedo (luminance of linear colour), 0.6 where the file has none. Raises
-    InputError in one line for a file that is missing, of another kind, broken, empty, without faces or with NaN vertices.
+    InputError in one line for a file that is missing, of another kind, broken, empty, without faces or with NaNs.
     """
     path = Path(path)
     parts = _read(path)
@@ -222,7 +222,7 @@ def _sound(part: _Part, notes: list[str]) -> _Part | None:
         (int((~first & ~flat).sum()), "duplicate faces"),
         (len(part.vertices) - len(np.unique(part.faces)), "unreferenced vertices"),
     )
-    notes += [f"{part.name}: {count} {what} dropped" for count, what in counts if count]
+    notes += [f"{part.name}: {what} dropped: {count}" for count, what in counts if count]
     if not keep.any():
         return None
     uv, normals = (None if value is None else value[used] for value in (part.uv, part.normals))

@@ -261,7 +261,9 @@ def depth_errors(
     mae_mm, rmse_mm, median_mm (signed) and within_10mm (share strictly under 10 mm) over `pixels` pixels; left out and
     counted: empty (truth NaN), beyond_range (truth at the range or beyond), missing (estimate NaN).
     """
-    estimate, truth = (np.asarray(torch.as_tensor(value).cpu(), dtype=np.float64) for value in (estimate, truth))
+    estimate, truth = (
+        np.asarray(value.cpu() if isinstance(value, Tensor) else value, dtype=np.float64) for value in (estimate, truth)
+    )
     keep = np.ones(truth.shape, bool) if exclude is None else ~np.asarray(torch.as_tensor(exclude).cpu(), dtype=bool)
     if not estimate.shape == truth.shape == keep.shape:
         raise InputError(f"depth of shape {estimate.shape}, truth {truth.shape} and mask {keep.shape} must be alike")

@@ -85,7 +85,11 @@ def _spelled(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, dict):
-        return ", ".join(f"{key} {_spelled(item)}" for key, item in value.items())
+        flat = all(isinstance(item, (int, float)) for item in value.values())
+        spelled = [f"{key}: {_spelled(item)}" for key, item in value.items()]
+        return ", ".join(spelled) if flat else "".join(f"\n  {item}".replace("\n", "\n  ") for item in spelled)
+    if isinstance(value, (list, tuple)) and all(isinstance(item, (int, float)) for item in value):
+        return " ".join(map(_spelled, value))
     if isinstance(value, (list, tuple)):
         return "".join(f"\n  {_spelled(item)}" for item in value)
     return str(value)

@@ -11,7 +11,19 @@ import tyro
 Positional = tyro.conf.Positional
 
 
-@dataclass(frozen=True)
+def _open(metavar: str) -> object:
+    """An option that may stay open: its help says itself what happens then."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
+Pixels = Annotated[int | None, _open("PIXELS")]
+Count = Annotated[int | None, _open("N")]
+Number = Annotated[float | None, _open("X")]
+Mode = Annotated[Literal["flood", "line", "scan"] | None, _open("{flood,line,scan}")]
+File = Annotated[Path | None, _open("FILE")]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Common:
     seed: int = 0
     """Seed of everything random; the same seed gives the same bytes."""
@@ -19,7 +31,7 @@ class Common:
     """Print one JSON object as the last line of stdout, and nothing else there."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Demo(Common):
     """From the default scene to depth, with a figure: render, sense, classical and compressive depth."""
 
@@ -37,7 +49,7 @@ class Demo(Common):
     """Folder for the transient (.exr), the histogram (.h5) and the figure (.png)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scenes(Common):
     """List the built-in scenes, or describe one: size, triangles, camera, laser, lights, and what a loader changed."""
 
@@ -45,29 +57,29 @@ class Scenes(Common):
     """A scene as `render` takes it; none lists the names."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Render(Common):
     """Render a scene's time-resolved radiance to a deep EXR file, with a picture beside it."""
 
     scene: Positional[str] = "living-room"
     """A name (see `scenes`), a mesh (.obj .ply .stl .glb) or a Mitsuba scene (.xml)."""
-    out: Path | None = None
+    out: File = None
     """The .exr file (default: the scene's name in this folder)."""
-    width: int | None = None
+    width: Pixels = None
     """Image width, pixels (default: the scene's own; one of width and height alone keeps the proportions)."""
-    height: int | None = None
+    height: Pixels = None
     """Image height, pixels."""
-    laser: Literal["flood", "line", "scan"] | None = None
-    """What the laser lights: the field of view, the row being measured, or the pixel being measured."""
-    bounces: int | None = None
+    laser: Mode = None
+    """What the laser lights: the field of view, the row being measured, or the pixel being measured (default: the scene's)."""
+    bounces: Count = None
     """Surfaces light may meet, 1 = direct only (default: planned from a pilot)."""
-    spp: int | None = None
+    spp: Count = None
     """Indirect light paths per pixel (default: planned from a pilot)."""
-    grid: int | None = None
+    grid: Count = None
     """Direct rays per pixel side (default: planned from a pilot)."""
-    error: float | None = None
+    error: Number = None
     """Target of the relative error: nRMSE of the expected counts on the reference sensor (default: 0.02)."""
-    budget: tuple[float, float] | None = None
+    budget: Annotated[tuple[float, float] | None, _open("SIGNAL BACKGROUND")] = None
     """Mean SIGNAL and BACKGROUND photons: render no finer than their shot noise can show, instead of --error."""
     offset: float = 0.0
     """Move the scene this many metres away in time alone: identical counts per pixel, later."""
@@ -75,13 +87,13 @@ class Render(Common):
     """Draw a picture of the layers beside the file."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sense(Common):
     """Record a transient with a single-photon sensor: photon counts to HDF5, with a picture beside it."""
 
     file: Positional[Path]
     """A transient written by `render` (.exr)."""
-    out: Path | None = None
+    out: File = None
     """The .h5 file (default: the transient's name)."""
     sensor: str = "reference"
     """Sensor preset."""
@@ -89,7 +101,7 @@ class Sense(Common):
     """Mean signal photons per pixel and exposure."""
     background: float = 50.0
     """Mean background photons per pixel and exposure, dark counts included."""
-    dark_count_rate: float | None = None
+    dark_count_rate: Number = None
     """Dark counts per second and pixel [Hz] (default: the preset's)."""
     model: Literal["auto", "poisson"] = "auto"
     """Detection law; auto says why it chose."""
@@ -97,13 +109,13 @@ class Sense(Common):
     """Draw a picture of the counts beside the file."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Depth(Common):
     """Estimate depth from a histogram and compare it with the truth; writes the depth map and a picture."""
 
     file: Positional[Path]
     """A histogram written by `sense` (.h5)."""
-    out: Path | None = None
+    out: File = None
     """The depth map (.exr) to write (default: the histogram's and the method's name)."""
     method: Literal["argmax", "matched", "log-matched", "compressive"] = "log-matched"
     """Estimator; log-matched is the Poisson maximum likelihood."""

@@ -136,8 +136,8 @@ def draw_demo(
     transient: Transient, histogram: Histogram, depths: dict[str, np.ndarray], errors: dict[str, dict], path: Path
 ) -> Path:
     """Intensity, true depth, every estimate with its error, and one pixel from returns to detections."""
-    figure = plt.figure(figsize=(15, 10.5), layout="constrained")
-    panels = figure.subplot_mosaic("ABC;DEF;GGG", height_ratios=(1, 1, 0.9))
+    figure = plt.figure(figsize=(14, 11.5), layout="constrained")
+    panels = figure.subplot_mosaic("ABC;DEF;GGG;HHH", height_ratios=(1, 1, 0.45, 0.6))
     limits = _depth_limits(histogram.depth_m)
     _image(panels["A"], histogram.expected_signal, "expected signal", "photons per pixel", cmap="gray", vmin=0,
            vmax=np.quantile(histogram.expected_signal, 0.98))  # fmt: skip
@@ -148,7 +148,7 @@ def draw_demo(
     row, column = _telling_pixel(transient)
     for key in "ABCDEF":
         panels[key].plot(column, row, "o", mfc="none", mec="red", ms=9)
-    _one_pixel(panels["G"], transient, histogram, row, column)
+    _one_pixel(panels["G"], panels["H"], transient, histogram, row, column)
     budget = histogram.budget
     figure.suptitle(
         f"{transient.meta['scene']}: {budget.signal:g} signal + {budget.background:g} background photons per pixel, "
@@ -159,43 +159,54 @@ def draw_demo(
 
 
 def _telling_pixel(transient: Transient) -> tuple[int, int]:
-    """The unmixed pixel of median brightness with most indirect light."""
+    """An unmixed pixel of at least median brightness whose indirect share is the 90th percentile of such pixels."""
     total = transient.total_radiance()
-    pixel = transient.return_pixel[transient.bounces > 1]
-    weights = transient.radiance[transient.bounces > 1]
-    share = np.bincount(pixel, weights=weights, minlength=total.size).reshape(total.shape) / np.maximum(total, 1e-30)
+    later = transient.bounces > 1
+    indirect = np.bincount(transient.return_pixel[later], weights=transient.radiance[later], minlength=total.size)
+    share = indirect / np.maximum(total.ravel(), 1e-30)
     bright = (total >= np.quantile(total, 0.5)) & ~transient.mixed & np.isfinite(transient.depth_m)
-    return np.unravel_index(int(np.argmax(np.where(bright, share, -1))), total.shape)
+    candidates = np.flatnonzero(bright) if bright.any() else np.arange(total.size)
+    ranked = candidates[np.argsort(share[candidates], kind="stable")]
+    return np.unravel_index(int(ranked[int(0.9 * (len(ranked) - 1))]), total.shape)
 
 
-def _one_pixel(axes: Axes, transient: Transient, histogram: Histogram, row: int, column: int) -> None:
-    sensor = histogram.sensor
-    expected = expected_in_pixel(transient, sensor, histogram.budget, row, column)
-    first = float(2 * transient.depth_m[row, column] / SPEED_OF_LIGHT_M_PER_S)
-    edges_ns = np.arange(sensor.bins + 1) * sensor.bin_width_s * 1e9
-    axes.stairs(histogram.counts[row, column], edges_ns, fill=True, color="0.8", label="detections")
-    axes.stairs(expected, edges_ns, color="tab:blue", label="expected counts per bin")
+def _one_pixel(above: Axes, below: Axes, transient: Transient, histogram: Histogram, row: int, column: int) -> None:
+    """One pixel from returns (above) to expected and detected photons (below), on one time axis."""
+    sensor, ns = histogram.sensor, 1e9
     pixel = row * transient.width + column
     mine = slice(int(transient.offsets[pixel]), int(transient.offsets[pixel + 1]))
-    centre = 0.5 * (transient.path_near_m + transient.path_far_m)[mine] / SPEED_OF_LIGHT_M_PER_S * 1e9
+    centre = 0.5 * (transient.path_near_m + transient.path_far_m)[mine] / SPEED_OF_LIGHT_M_PER_S * ns
     share = transient.radiance[mine] / transient.radiance[mine].sum()
-    twin = axes.twinx()
     for name, colour, kept in (
-        ("direct returns", "tab:green", transient.bounces[mine] == 1),
-        ("indirect returns", "tab:red", transient.bounces[mine] > 1),
+        ("direct", "tab:green", transient.bounces[mine] == 1),
+        ("indirect", "tab:red", transient.bounces[mine] > 1),
     ):
-        twin.vlines(centre[kept], 0, share[kept], color=colour, lw=1.2)
-        twin.plot(centre[kept], share[kept], "o", color=colour, ms=3, label=name)
-    twin.set_yscale("log")
-    twin.set_ylabel("share of the pixel's radiance")
-    start, stop = first * 1e9 - 3, first * 1e9 + 25
-    axes.set_xlim(max(start, 0), min(stop, edges_ns[-1]))
-    axes.set(xlabel="time since the laser's emission [ns]", ylabel="photons per bin")
-    axes.set_title(
-        f"the circled pixel ({row}, {column}): the transient, what the sensor expects, what it detected", fontsize=10
+        if kept.any():
+            above.vlines(centre[kept], 0, share[kept], color=colour, lw=1)
+            above.plot(
+                centre[kept], share[kept], "o", color=colour, ms=3, label=f"{name} returns ({share[kept].sum():.0%})"
+            )
+    above.set_yscale("log")
+    above.set_ylabel("share of the\npixel's radiance")
+    above.set_title(
+        f"the circled pixel (row {row}, column {column}): its transient, and what the sensor makes of it", fontsize=10
     )
-    scale = SPEED_OF_LIGHT_M_PER_S * 1e-9 / 2
-    top = axes.secondary_xaxis("top", functions=(lambda t: t * scale, lambda d: d / scale))
-    top.set_xlabel("depth [m]", fontsize=8)
-    handles = [h for ax in (axes, twin) for h in ax.get_legend_handles_labels()[0]]
-    axes.legend(handles=handles, fontsize=8, loc="upper right")
+    above.legend(fontsize=8, loc="upper right")
+    above.tick_params(labelbottom=False)
+
+    edges_ns = np.arange(sensor.bins + 1) * sensor.bin_width_s * ns
+    below.stairs(histogram.counts[row, column], edges_ns, fill=True, color="0.75", label="detections")
+    expected = expected_in_pixel(transient, sensor, histogram.budget, row, column)
+    below.stairs(expected, edges_ns, color="tab:blue", label="expected counts")
+    first_ns = float(2 * transient.depth_m[row, column] / SPEED_OF_LIGHT_M_PER_S) * ns
+    for axes in (above, below):
+        axes.axvline(first_ns, color="k", lw=0.8, ls=":")
+        axes.set_xlim(max(first_ns - 3, 0), min(first_ns + 18, edges_ns[-1]))
+    below.annotate("true depth", (first_ns, 0.92), xycoords=("data", "axes fraction"), xytext=(-4, 0),
+                   textcoords="offset points", fontsize=8, ha="right", va="top")  # fmt: skip
+    below.set(xlabel="time since the laser's emission [ns]", ylabel="photons per bin")
+    below.legend(fontsize=8, loc="upper right")
+    metres_per_ns = SPEED_OF_LIGHT_M_PER_S / ns / 2
+    depth_axis = below.secondary_xaxis("top", functions=(lambda t: t * metres_per_ns, lambda d: d / metres_per_ns))
+    depth_axis.set_xlabel("depth [m]", fontsize=8)
+    depth_axis.tick_params(labelsize=8)
