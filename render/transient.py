@@ -138,7 +138,8 @@ class Transient:
 
 def check_schema(path: Path, meta: dict, kind: str) -> None:
     """The rule for every file of ours: of the expected kind, and not of a newer schema than this program knows."""
-    if meta.get("kind") != kind:
+    if not isinstance(meta, dict) or meta.get("kind") != kind:
+        meta = meta if isinstance(meta, dict) else {}
         raise InputError(f"{path}: holds {meta.get('kind', 'something else')!s}, expected a {kind}")
     if meta.get("schema") != SCHEMA:
         raise InputError(f"{path}: schema {meta.get('schema')}, this program reads {SCHEMA}; use a newer scene2spad")
@@ -223,13 +224,18 @@ def read_transient(path: Path) -> Transient:
     )
     if missing:
         raise InputError(f"{path}: channels {', '.join(sorted(missing))} are missing")
-    transient = _assemble(path, channels["transient"], channels["layers"], meta)
+    try:
+        transient = _assemble(channels["transient"], channels["layers"], meta)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (TypeError, ValueError, AttributeError, MemoryError) as error:
+        raise InputError(f"{path}: damaged, {type(error).__name__} {' '.join(str(error).split())[:120]}") from None
     if transient.returns != meta.get("returns") or transient.sha256() != meta.get("sha256"):
         raise InputError(f"{path}: contents do not match their SHA-256: the file is damaged or was altered")
     return transient
 
 
-def _assemble(path: Path, deep: dict[str, np.ndarray], flat: dict[str, np.ndarray], meta: dict) -> Transient:
+def _assemble(deep: dict[str, np.ndarray], flat: dict[str, np.ndarray], meta: dict) -> Transient:
     height, width = flat["depth"].shape
     sizes = np.zeros(height * width, dtype=np.int64)
     columns = {}
@@ -240,7 +246,7 @@ def _assemble(path: Path, deep: dict[str, np.ndarray], flat: dict[str, np.ndarra
         parts = [cell for cell in cells if cell is not None]
         columns[name] = np.concatenate(parts).astype(dtype) if parts else np.empty(0, dtype)
     if len(sizes) != height * width or len({len(column) for column in columns.values()}) != 1:
-        raise InputError(f"{path}: its parts differ in size")
+        raise InputError("its parts differ in size")
     return Transient(
         height=height,
         width=width,

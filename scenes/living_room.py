@@ -154,7 +154,7 @@ def furniture(palette: Palette, places: Random, books: Random, form: Random) -> 
     pieces += _placed(picture(palette), left, near(-1.6, 0.1), y=near(1.15, 0.05), turn_deg=90)
     pieces += _placed(sofa(palette, 0.95, palette["leather"]), near(0.0, 0.12), back + 0.15, turn_deg=near(0, 3))
     pieces += _placed(floor_lamp(palette), near(-1.05, 0.06), near(-0.45, 0.08))
-    pieces += _placed(rug(palette), -1.23, near(0.55, 0.05))
+    pieces += _placed(rug(palette), -1.23, near(0.6, 0.05))
     pieces += _placed(ball(palette, radius), near(-1.15, 0.1), near(0.45, 0.15), y=RUG_M)
     pieces += _placed(table(palette, table_top), table_x, table_z, turn_deg=table_turn)
     pieces += _placed(sculpture(palette, form), table_x + near(-0.2, 0.08), table_z + near(-0.05, 0.06), y=table_top)

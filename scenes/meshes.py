@@ -26,7 +26,7 @@ BACKDROP_ALBEDO = 0.55
 SENSIBLE_EXTENT_M = (0.2, 2.5)  # a model whose largest extent lies in here is taken to be in metres already
 WALL_GAP_M = 1.0
 FOV_DEG = 40.0
-ELEVATION_DEG = 15.0
+ELEVATION_DEG, AZIMUTH_DEG = 15.0, 30.0  # a little from above, and from the side: what faces away shows its flank
 FILL = 0.7  # share of the smaller image dimension that the model's bounding sphere takes
 ZERO_AREA = 1e-12  # a face with a smaller area than this, for a model of unit extent, is degenerate
 
@@ -69,8 +69,9 @@ def _camera(centre: np.ndarray, radius: float, width: int, height: int) -> Camer
     focal = Camera(np.eye(4), FOV_DEG, width, height).focal_px
     edge = FILL * min(width, height) / 2 / focal
     distance = radius * math.hypot(1, edge) / edge
-    elevation = math.radians(ELEVATION_DEG)
-    origin = centre + distance * np.array((0, math.sin(elevation), math.cos(elevation)))
+    up, aside = math.radians(ELEVATION_DEG), math.radians(AZIMUTH_DEG)
+    toward = (math.cos(up) * math.sin(aside), math.sin(up), math.cos(up) * math.cos(aside))
+    origin = centre + distance * np.array(toward)
     return Camera.look_at(origin, centre, fov_deg=FOV_DEG, width=width, height=height)
 
 

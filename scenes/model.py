@@ -71,10 +71,19 @@ class Texture:
         object.__setattr__(self, "image", image)
 
 
+def _number(value: object, what: str) -> float:
+    """`value` as a finite float, or an InputError."""
+    good = isinstance(value, (int, float, np.number)) and math.isfinite(value)
+    _require(good, f"{what} {value!r} is not a finite number")
+    return float(value)
+
+
 def _check_fraction(value: float | Texture, what: str) -> None:
     """A number or texture that must lie in [0, 1], as a reflectance or an opacity does."""
+    if not isinstance(value, Texture):
+        value = _number(value, what)
     low, high = (value.image.min(), value.image.max()) if isinstance(value, Texture) else (value, value)
-    _require(bool(np.isfinite(high) and low >= 0 and high <= 1), f"{what}: {low:g} to {high:g} is outside [0, 1]")
+    _require(bool(low >= 0 and high <= 1), f"{what}: {low:g} to {high:g} is outside [0, 1]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +117,12 @@ class Material:
         _check_fraction(self.albedo, f"{where}: albedo")
         _check_fraction(self.specular, f"{where}: specular reflectance")
         _check_fraction(self.opacity, f"{where}: opacity")
+        for label in ("roughness", "ior", "eta", "k"):
+            object.__setattr__(self, label, _number(getattr(self, label), f"{where}: {label}"))
         _require(0 < self.roughness <= 1, f"{where}: roughness {self.roughness:g} is outside (0, 1]")
         _require(1 < self.ior <= 5, f"{where}: index of refraction {self.ior:g} is outside (1, 5]")
-        for label, value in (("eta", self.eta), ("k", self.k)):
-            _require(
-                math.isfinite(value) and value >= 0, f"{where}: conductor {label} {value:g} is negative or not finite"
-            )
+        for label in ("eta", "k"):
+            _require(getattr(self, label) >= 0, f"{where}: conductor {label} {getattr(self, label):g} is negative")
 
     @property
     def is_glass(self) -> bool:
@@ -151,7 +160,8 @@ class Surface:
         bad = int((~np.isfinite(vertices).all(axis=1)).sum())
         _require(bad == 0, f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
         in_range = faces.min() >= 0 and faces.max() < len(vertices)
-        _require(bool(in_range), f"{where}: a face refers to vertex {faces.max()}, there are {len(vertices)}")
+        worst = faces.min() if faces.min() < 0 else faces.max()
+        _require(bool(in_range), f"{where}: a face refers to vertex {worst}, expected 0 to {len(vertices) - 1}")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
         for label, width in (("uv", 2), ("normals", 3)):
@@ -183,10 +193,11 @@ class Camera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", rigid_pose(self.pose, "camera pose"))
         for label, value in (("width", self.width), ("height", self.height)):
-            _require(
-                int(value) == value and 1 <= value <= 16384, f"camera {label} {value} pixels is outside 1 to 16384"
-            )
+            value = _number(value, f"camera {label}")
+            good = value == int(value) and 1 <= value <= 16384
+            _require(good, f"camera {label} {value:g} is outside 1 to 16384 whole pixels")
             object.__setattr__(self, label, int(value))
+        object.__setattr__(self, "fov_deg", _number(self.fov_deg, "camera fov"))
         _require(0.01 <= self.fov_deg <= 170, f"camera fov {self.fov_deg:g} degrees is outside 0.01 to 170")
 
     @classmethod
@@ -322,7 +333,8 @@ class Ambient:
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
-        _require(math.isfinite(self.radiance) and self.radiance >= 0, f"ambient radiance {self.radiance:g} is negative")
+        object.__setattr__(self, "radiance", _number(self.radiance, "ambient radiance"))
+        _require(self.radiance >= 0, f"ambient radiance {self.radiance:g} is negative")
         both = self.environment is not None and self.radiance > 0
         _require(not both, "ambient light is either a constant radiance or an environment map, not both")
         object.__setattr__(self, "pose", rigid_pose(self.pose, "environment pose"))

@@ -264,7 +264,11 @@ def depth_errors(
     estimate, truth = (
         np.asarray(value.cpu() if isinstance(value, Tensor) else value, dtype=np.float64) for value in (estimate, truth)
     )
-    keep = np.ones(truth.shape, bool) if exclude is None else ~np.asarray(torch.as_tensor(exclude).cpu(), dtype=bool)
+    keep = (
+        np.ones(truth.shape, bool)
+        if exclude is None
+        else ~np.array(exclude.cpu() if isinstance(exclude, Tensor) else exclude, dtype=bool)
+    )
     if not estimate.shape == truth.shape == keep.shape:
         raise InputError(f"depth of shape {estimate.shape}, truth {truth.shape} and mask {keep.shape} must be alike")
     empty = keep & np.isnan(truth)

@@ -100,7 +100,8 @@ def signal_per_bin(transient: Transient, sensor: Sensor, pixels: slice, device: 
     for size in torch.unique(bins).tolist():
         for rows in torch.nonzero(bins == size).squeeze(1).split(max(1, BLOCK_ENTRIES // size)):
             steps = torch.arange(size + 1, device=device)
-            time = (start[rows] * width - near[rows])[:, None] + steps * width
+            # in float64: torch would take integers times a number for float32
+            time = (start[rows].double() * width - near[rows])[:, None] + steps.double() * width
             arrived = interval_cdf(sensor.pulse, time, length[rows, None])
             # all of a return's energy lies between its first and last edge, whatever the pulse's tails
             arrived[:, 0], arrived[:, -1] = 0, 1

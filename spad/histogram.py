@@ -121,20 +121,30 @@ def read_histogram(path: Path) -> Histogram:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a readable histogram of scene2spad ({reason})") from None
     check_schema(path, meta, "histogram")
-    missing = sorted(set(TRUTH) - set(data))
-    if missing or not ("counts" in data or {"timestamps", "offsets"} <= set(data)):
-        raise InputError(f"{path}: datasets are missing ({', '.join(missing) or 'counts or timestamps'})")
-    sensor, budget = Sensor.from_dict(meta.pop("sensor")), PhotonBudget(**meta.pop("budget"))
-    counts = data.get("counts")
-    if counts is None:
-        counts = counts_from_timestamps(data["timestamps"], data["offsets"], sensor.bins)
+    try:
+        return _assemble(meta, data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (KeyError, TypeError, ValueError, IndexError, MemoryError) as error:
+        raise InputError(f"{path}: damaged, {type(error).__name__} {' '.join(str(error).split())[:120]}") from None
+
+
+def _assemble(meta: dict, data: dict[str, np.ndarray]) -> Histogram:
+    if not (set(TRUTH) <= set(data) and ("counts" in data or {"timestamps", "offsets"} <= set(data))):
+        raise InputError(f"datasets are missing, there are {', '.join(sorted(data)) or 'none'}")
+    sensor, budget = Sensor.from_dict(meta["sensor"]), PhotonBudget(**meta["budget"])
+    shape = (meta["height"], meta["width"], sensor.bins)
+    counts = (
+        data["counts"] if "counts" in data else counts_from_timestamps(data["timestamps"], data["offsets"], shape[2])
+    )
+    own = ("kind", "schema", "height", "width", "sha256", "sensor", "budget")
     histogram = Histogram(
-        counts=counts.reshape(meta["height"], meta["width"], sensor.bins),
+        counts=counts.reshape(shape),
         sensor=sensor,
         budget=budget,
         **{name: data[name] for name in TRUTH},
-        meta={k: v for k, v in meta.items() if k not in ("kind", "schema", "height", "width", "sha256")},
+        meta={key: value for key, value in meta.items() if key not in own},
     )
     if histogram.sha256() != meta["sha256"]:
-        raise InputError(f"{path}: contents do not match their SHA-256: the file is damaged or was altered")
+        raise InputError("contents do not match their SHA-256: the file is damaged or was altered")
     return histogram

@@ -31,6 +31,8 @@ def main(argv: list[str]) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     _log_to_stderr()
+    if command.seed < 0:
+        return _refuse(f"seed {command.seed} is negative, expected 0 or more")
     try:
         # heavy imports (torch, Mitsuba) only once the command line is known to be good
         from studies import run

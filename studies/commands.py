@@ -70,7 +70,7 @@ class Render(Common):
     height: Pixels = None
     """Image height, pixels."""
     laser: Mode = None
-    """What the laser lights: the field of view, the row being measured, or the pixel being measured (default: the scene's)."""
+    """What is lit: the field of view, the row being measured, or the pixel being measured (default: the scene's)."""
     bounces: Count = None
     """Surfaces light may meet, 1 = direct only (default: planned from a pilot)."""
     spp: Count = None

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 # the tests' own helpers (oracles) are imported by name; the packages are installed
-sys.path.insert(0, str(Path(__file__).parent / "render"))
+sys.path[:0] = [str(Path(__file__).parent / folder) for folder in ("render", "spad")]
 
 
 @pytest.fixture(scope="session")
