@@ -21,7 +21,8 @@ BATCHES = 16
 PILOT_PIXELS = 256
 PILOT_SPP = 64
 PILOT_BOUNCES = 8
-SPP_LIMITS = (BATCHES, 4096)
+# The most paths a pixel that a plan takes by itself: nobody asked for the default target, a long wait needs asking.
+MOST_SPP, MOST_SPP_BY_DEFAULT = 4096, 256
 
 
 def pilot_pixels(world: World, seed: int) -> np.ndarray:
@@ -127,10 +128,12 @@ def _indirect(
     responses = [response(_up_to(batch, bounces), pixels) for batch in batches]
     error = estimate(fine, fine, responses).monte_carlo
     wanted = _whole_batches(math.ceil(PILOT_SPP * (error / (MONTE_CARLO_SHARE * target)) ** 2))
-    spp = int(np.clip(wanted, *SPP_LIMITS))
+    asked = settings.error is not None or settings.budget is not None
+    spp = int(np.clip(wanted, BATCHES, MOST_SPP if asked else MOST_SPP_BY_DEFAULT))
     whys.append(f"indirect light: {spp} paths a pixel; the pilot's {PILOT_SPP} had an error of {error:.2g}")
     if wanted > spp:
-        whys.append(f"indirect light: {wanted} paths a pixel would meet the target, {spp} is the limit of the plan")
+        remedy = "force more with spp" if asked else "ask for more with an error target"
+        whys.append(f"indirect light: {wanted} paths a pixel would meet the target, {spp} is a plan's limit; {remedy}")
     return bounces, spp, whys
 
 
