@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.returns import Samples
+from render.returns import Samples, concatenate, merge
 from render.world import (
     Bool,
     Float,
@@ -44,8 +44,8 @@ class Layers(NamedTuple):
     albedo: np.ndarray
 
 
-def direct_light(world: World, pixels: np.ndarray, grid: int) -> DirectLight:
-    """Direct returns of the given flat pixel indices, grid x grid footprints each.
+def direct_light(world: World, pixels: np.ndarray, grid: int, tolerance_m: float = 1e-4) -> DirectLight:
+    """Direct returns of the given flat pixel indices, grid x grid footprints each, merged within `tolerance_m`.
 
     A cell of a pixel, seen on the tangent plane of the point its centre hits, spans path lengths
     p(x, y) = rho + |p - L|. To first order p is linear over the cell, so its distribution is a trapezoid of variance
@@ -54,13 +54,13 @@ def direct_light(world: World, pixels: np.ndarray, grid: int) -> DirectLight:
     the number of cells.
     """
     per_chunk = max(1, LANES // grid**2)
-    parts = [_chunk(world, pixels[i : i + per_chunk], grid) for i in range(0, len(pixels), per_chunk)]
-    samples = Samples(*(np.concatenate(column) for column in zip(*(part.samples for part in parts), strict=True)))
+    parts = [_chunk(world, pixels[i : i + per_chunk], grid, tolerance_m) for i in range(0, len(pixels), per_chunk)]
     mixed = np.concatenate([part.mixed for part in parts])
+    samples = concatenate([part.samples for part in parts])
     return DirectLight(samples, mixed, sum(p.clipped for p in parts), sum(p.rays for p in parts))
 
 
-def _chunk(world: World, pixels: np.ndarray, grid: int) -> DirectLight:
+def _chunk(world: World, pixels: np.ndarray, grid: int, tolerance_m: float) -> DirectLight:
     cells = grid * grid
     lane = dr.arange(UInt32, len(pixels) * cells)
     pixel = dr.gather(UInt32, UInt32(pixels.astype(np.uint32)), lane // dr.opaque(UInt32, cells))
@@ -96,7 +96,7 @@ def _chunk(world: World, pixels: np.ndarray, grid: int) -> DirectLight:
         np.array(radiance, dtype=np.float64)[lit],
         np.ones(int(lit.sum()), dtype=np.uint8),
     )
-    return DirectLight(samples, mixed, int(np.array(clipped).sum()), len(pixels) * cells)
+    return DirectLight(merge(samples, tolerance_m), mixed, int(np.array(clipped).sum()), len(pixels) * cells)
 
 
 def _half_spans(world: World, ray: Any, local: Any, si: Any, distance: Any, pitch: Any) -> Any:

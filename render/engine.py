@@ -12,7 +12,7 @@ from render.direct import centre_layers, direct_light
 from render.error import ErrorEstimate, estimate, merging_error, response
 from render.indirect import ambient_light, indirect_light
 from render.planning import BATCHES, make_plan, pilot_pixels
-from render.returns import Samples, concatenate, merge, to_returns
+from render.returns import Samples, concatenate, merge, select, to_returns
 from render.settings import Plan, RenderSettings
 from render.transient import Transient
 from render.world import World
@@ -50,14 +50,14 @@ def render(
     say("plan", 0.0)
     pilot_seed = derived_seed(seed, STAGE_PLAN)
     plan = make_plan(world, settings, pilot_seed)
-    for reason in plan.reasons:
-        log.info("%s", reason)
-
     pixels = np.arange(camera.height * camera.width)
     say("direct light", 0.05)
-    direct = direct_light(world, pixels, plan.grid)
+    direct = direct_light(world, pixels, plan.grid, settings.direct_tolerance_m)
     layers = centre_layers(world)
-    merged = merge(direct.samples, settings.direct_tolerance_m)
+    merged = direct.samples
+    # where nothing is in view there is nothing to explain
+    for line in (*scene.notes, *plan.reasons) if len(merged.pixel) else ():
+        log.info("%s", line)
     checked = pilot_pixels(world, pilot_seed)
     start_m = _mean_path(merged, len(pixels))
     indirect, noise, batches = _indirect(world, plan, settings, start_m, checked, seed, say)
@@ -109,11 +109,15 @@ def _indirect(
     for number in range(count):
         say("indirect light", 0.1 + 0.8 * number / count)
         batch_seed = derived_seed(seed, STAGE_INDIRECT, 0, number)
-        batch = indirect_light(world, pixels, plan.spp // count, plan.bounces, batch_seed)
-        totals.append(np.bincount(batch.pixel, weights=batch.radiance, minlength=len(pixels)))
-        batches.append(_of_pixels(batch, checked))
-        share = batch._replace(radiance=batch.radiance / count)
-        merged = merge(concatenate([merged, share]), settings.indirect_tolerance_m, start_m, settings.indirect_growth)
+        total, seen, shares = np.zeros(len(pixels)), [none], [merged]
+        for chunk in indirect_light(world, pixels, plan.spp // count, plan.bounces, batch_seed):
+            total += np.bincount(chunk.pixel, weights=chunk.radiance, minlength=len(pixels))
+            seen.append(_of_pixels(chunk, checked))
+            share = chunk._replace(radiance=chunk.radiance / count)
+            shares.append(merge(share, settings.indirect_tolerance_m, start_m, settings.indirect_growth))
+        totals.append(total)
+        batches.append(concatenate(seen))
+        merged = merge(concatenate(shares), settings.indirect_tolerance_m, start_m, settings.indirect_growth)
     spread = np.std(totals, axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.zeros(len(pixels))
     return merged, spread, batches
 
@@ -139,8 +143,7 @@ def _merging(
 
 
 def _of_pixels(samples: Samples, pixels: np.ndarray) -> Samples:
-    kept = np.isin(samples.pixel, pixels)
-    return Samples(*(column[kept] for column in samples))
+    return select(samples, np.isin(samples.pixel, pixels))
 
 
 def _mean_path(samples: Samples, pixels: int) -> np.ndarray:

@@ -18,6 +18,7 @@ from scenes.constants import (
 BIN_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PERIOD_S / REFERENCE_BINS
 SIGMA_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PULSE_SIGMA_S
 WIDEST_STENCIL = 256
+BLOCK_ENTRIES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -49,12 +50,13 @@ def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
     # a few footprints are wide, most are not: one stencil width for each power of two
     size = 1 << np.ceil(np.log2(np.maximum(reach, 1))).astype(int)
     for half in np.unique(size):
-        chosen = size == half
-        first = np.floor(centre[chosen]).astype(np.int64)[:, None] + np.arange(-half, half + 1)
-        z = (first + 0.5 - centre[chosen, None]) / sigma[chosen, None]
-        weight = np.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * sigma[chosen, None]) * samples.radiance[chosen, None]
-        index = row[chosen, None] * REFERENCE_BINS + first % REFERENCE_BINS
-        counts += np.bincount(index.ravel(), weights=weight.ravel(), minlength=len(counts))
+        chosen = np.flatnonzero(size == half)
+        for part in np.array_split(chosen, 1 + len(chosen) * (2 * half + 1) // BLOCK_ENTRIES):
+            first = np.floor(centre[part]).astype(np.int64)[:, None] + np.arange(-half, half + 1)
+            z = (first + 0.5 - centre[part, None]) / sigma[part, None]
+            weight = np.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * sigma[part, None]) * samples.radiance[part, None]
+            index = row[part, None] * REFERENCE_BINS + first % REFERENCE_BINS
+            counts += np.bincount(index.ravel(), weights=weight.ravel(), minlength=len(counts))
     return counts.reshape(len(pixels), REFERENCE_BINS)
 
 

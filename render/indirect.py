@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,19 +13,18 @@ from render.world import Bool, Float, UInt32, World, camera_rays, dr, first_opaq
 LANES = 1 << 20
 
 
-def indirect_light(world: World, pixels: np.ndarray, spp: int, bounces: int, seed: int) -> Samples:
+def indirect_light(world: World, pixels: np.ndarray, spp: int, bounces: int, seed: int) -> Iterator[Samples]:
     """Light of 2 to `bounces` surfaces in the given flat pixels: `spp` camera paths a pixel, one sample a vertex.
+
+    Samples come in chunks of whole pixels, so that the caller can merge before memory fills.
 
     Unbiased but for what `first_opaque` leaves out: a path vertex x_k adds T_k f(x_k) cos I(w) / d^2, with T_k the
     product of BSDF weights so far (Russian roulette after the second surface), at path length |C x_1| + ... + |x_k L|.
     """
     per_chunk = max(1, LANES // spp)
     seeds = np.random.SeedSequence(seed).generate_state(-(-len(pixels) // per_chunk))
-    parts = [
-        _chunk(world, pixels[i : i + per_chunk], spp, bounces, int(s))
-        for i, s in zip(range(0, len(pixels), per_chunk), seeds, strict=True)
-    ]
-    return Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    for first, chunk_seed in zip(range(0, len(pixels), per_chunk), seeds, strict=True):
+        yield _chunk(world, pixels[first : first + per_chunk], spp, bounces, int(chunk_seed))
 
 
 def _chunk(world: World, pixels: np.ndarray, spp: int, bounces: int, seed: int) -> Samples:
@@ -62,8 +62,8 @@ def _trace(world: World, pixels: Any, lanes: int, spp: int, vertices: int, seed:
         )
         throughput *= weight[0]
         active &= throughput > 0
-        ray = si.spawn_ray(si.to_world(sample.wo))
-        si, transmission, optical, _ = first_opaque(world, ray, active)
+        ray, vertex_point = si.spawn_ray(si.to_world(sample.wo)), mi.Point3f(si.p)
+        si, transmission, optical, _ = first_opaque(world, ray, active, vertex_point)
         throughput *= transmission
         path += optical
         active &= si.is_valid()
@@ -86,13 +86,17 @@ def ambient_light(world: World, spp: int, bounces: int, seed: int) -> np.ndarray
     Mitsuba's own path integrator: steady light needs nothing of ours.
     """
     camera = world.scene.camera
+    if world.has_cutouts:
+        world = World(world.scene, cutouts_by_mitsuba=True)
+    # the camera is the traced world's origin; Mitsuba's has x to the left and y up
+    turned = np.eye(4)
+    turned[:3, :3] = camera.rotation @ np.diag([-1.0, -1.0, 1.0])
     sensor = mi.load_dict(
         {
             "type": "perspective",
             "fov": camera.fov_deg,
             "fov_axis": "x",
-            # Mitsuba's camera has x to the left and y up
-            "to_world": mi.ScalarTransform4f(camera.pose @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+            "to_world": mi.ScalarTransform4f(turned),
             "near_clip": 1e-4,
             "film": {
                 "type": "hdrfilm",

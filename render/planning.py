@@ -9,7 +9,7 @@ import numpy as np
 from render.direct import direct_light
 from render.error import error_for_budget, estimate, response
 from render.indirect import indirect_light
-from render.returns import Samples
+from render.returns import concatenate, select
 from render.settings import GRIDS, MAX_BOUNCES, Plan, RenderSettings
 from render.world import World
 from scenes.model import Material
@@ -37,7 +37,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
     """Plan a render: every choice that `settings` leaves open follows from a pilot; every choice gets a reason."""
     pixels = pilot_pixels(world, seed)
     reasons = list(_limits(world))
-    fine = response(direct_light(world, pixels, GRIDS[-1]).samples, pixels)
+    fine = response(direct_light(world, pixels, 2 * GRIDS[-1]).samples, pixels)
     target, why = _target(settings, fine)
     reasons.append(why)
     grid, why = _grid(world, settings, pixels, fine, target)
@@ -91,7 +91,8 @@ def _grid(
         error = estimate(response(direct_light(world, pixels, grid).samples, pixels), fine, []).total
         if error <= DIRECT_SHARE * target:
             break
-    return grid, f"direct light: {grid} x {grid} rays a pixel, error {error:.2g} against {GRIDS[-1]} x {GRIDS[-1]}"
+    why = f"direct light: {grid} x {grid} rays a pixel, error {error:.2g} against {2 * GRIDS[-1]} x {2 * GRIDS[-1]}"
+    return grid, why if error <= DIRECT_SHARE * target else f"{why}: its share of the target needs more; force grid"
 
 
 def _indirect(
@@ -100,10 +101,15 @@ def _indirect(
     mode = world.scene.laser.mode
     if settings.bounces == 1:
         return 1, 0, ["indirect light: none, forced by 1 bounce"]
-    if settings.bounces is None and mode != "flood":
-        return 1, 0, [f"indirect light: none, a {mode} laser's light returns to its own pixels only after 3 surfaces"]
+    if settings.bounces is None and mode == "scan":
+        return (
+            1,
+            0,
+            ["indirect light: left out with a scanning laser unless bounces ask for it; the error leaves it out"],
+        )
     most = PILOT_BOUNCES if settings.bounces is None else settings.bounces
-    batches = [indirect_light(world, pixels, PILOT_SPP // BATCHES, most, seed + 1 + i) for i in range(BATCHES)]
+    per_batch = PILOT_SPP // BATCHES
+    batches = [concatenate(list(indirect_light(world, pixels, per_batch, most, seed + 1 + i))) for i in range(BATCHES)]
     energy = np.zeros(most + 1)
     energy[1] = fine.sum()
     for batch in batches:
@@ -125,7 +131,7 @@ def _indirect(
     if settings.spp is not None:
         spp = _whole_batches(settings.spp)
         return bounces, spp, [*whys, f"indirect light: {spp} paths a pixel, forced"]
-    responses = [response(_up_to(batch, bounces), pixels) for batch in batches]
+    responses = [response(select(batch, batch.bounces <= bounces), pixels) for batch in batches]
     error = estimate(fine, fine, responses).monte_carlo
     wanted = _whole_batches(math.ceil(PILOT_SPP * (error / (MONTE_CARLO_SHARE * target)) ** 2))
     asked = settings.error is not None or settings.budget is not None
@@ -154,8 +160,3 @@ def _bounces(energy: np.ndarray, allowed: float) -> tuple[int, float]:
 def _whole_batches(spp: int) -> int:
     """The next number of paths that is the same in every batch."""
     return spp if spp < BATCHES else -(-spp // BATCHES) * BATCHES
-
-
-def _up_to(samples: Samples, bounces: int) -> Samples:
-    kept = samples.bounces <= bounces
-    return Samples(*(column[kept] for column in samples))

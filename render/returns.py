@@ -27,6 +27,11 @@ class Returns(NamedTuple):
     bounces: np.ndarray
 
 
+def select(samples: Samples, kept: np.ndarray) -> Samples:
+    """The samples where `kept` is true."""
+    return Samples(*(column[kept] for column in samples))
+
+
 def concatenate(parts: list[Samples]) -> Samples:
     return Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
@@ -43,7 +48,7 @@ def merge(samples: Samples, tolerance_m: float, start_m: np.ndarray | None = Non
     """
     lit = samples.radiance > 0
     if not lit.all():
-        samples = Samples(*(column[lit] for column in samples))
+        samples = select(samples, lit)
     if len(samples.pixel) == 0:
         return samples
     cell = samples.path_m / tolerance_m

@@ -51,8 +51,8 @@ class RenderSettings:
         if not 0 <= self.indirect_growth <= 1:
             raise InputError(f"render: indirect_growth {self.indirect_growth:g} is outside 0 to 1")
         for name in ("direct_tolerance_m", "indirect_tolerance_m"):
-            if not 1e-6 <= getattr(self, name) <= 10:
-                raise InputError(f"render: {name} {getattr(self, name):g} is outside 1e-6 to 10")
+            if not 1e-4 <= getattr(self, name) <= 10:
+                raise InputError(f"render: {name} {getattr(self, name):g} is outside 1e-4 to 10")
 
 
 @dataclass(frozen=True)

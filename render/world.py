@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -14,17 +15,18 @@ import drjit as dr  # noqa: E402  (other modules take dr and mi from here: only 
 
 Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
 OPACITY = "opacity"
-MAX_LAYERS = 16
+MAX_LAYERS = 64
 
 
 class World:
     """A scene ready to trace: one merged mesh for every material, the laser's intensity per pixel.
 
+    The traced world has the scene's axes and the camera at its origin, where float32 resolves best.
     Tables per registered shape: index of refraction of solid and thin glass (0: none), albedo of conductors (-1: none).
     Not a dataclass: Dr.Jit would take its fields for variables of every loop that mentions it.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, *, cutouts_by_mitsuba: bool = False) -> None:
         groups: dict[tuple[int, float, bool], list[Surface]] = {}
         for surface in scene.surfaces:
             groups.setdefault((id(surface.material), surface.emission, surface.normals is not None), []).append(surface)
@@ -32,7 +34,9 @@ class World:
         self.scene = scene
         self.has_glass = any(m.is_glass for m in materials)
         self.has_cutouts = any(_has_cutouts(m) for m in materials)
-        meshes = {f"mesh{i}": _mesh(f"mesh{i}", group, self.has_cutouts) for i, group in enumerate(groups.values())}
+        masks = "mitsuba" if cutouts_by_mitsuba else "ours" if self.has_cutouts else "none"
+        origin = scene.camera.origin
+        meshes = {f"mesh{i}": _mesh(f"mesh{i}", group, origin, masks) for i, group in enumerate(groups.values())}
         environment = _environment(scene)
         lights = {} if environment is None else {"environment": environment}
         # optimize=False: equal objects must not be merged, since shapes are told apart by their registry index
@@ -44,9 +48,9 @@ class World:
         self.thin_ior = _table(index, [m.ior if m.kind == "thindielectric" else 0 for m in materials])
         self.albedo = _table(index, [_specular_albedo(m) for m in materials])
         self.intensity = Float(scene.laser.intensity(scene.camera).ravel())
-        self.laser = mi.Point3f(*scene.laser.position(scene.camera).tolist())
+        self.laser = mi.Point3f(*(scene.laser.position(scene.camera) - origin).tolist())
         # the corner pixels' rays lie on the rim of the smallest cone
-        self.cos_half_angle = scene.laser.cos_half_angle(scene.camera) - 1e-6
+        self.half_angle = math.acos(scene.laser.cos_half_angle(scene.camera)) * (1 + 1e-5)
 
     @property
     def sees_through(self) -> bool:
@@ -71,13 +75,17 @@ def _specular_albedo(material: Material) -> float:
     return material.specular * ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
 
 
-def _mesh(name: str, surfaces: list[Surface], has_cutouts: bool) -> Any:
+def _mesh(name: str, surfaces: list[Surface], origin: np.ndarray, masks: str) -> Any:
+    """One mesh of surfaces that share a material; cut-outs by `masks`: none, ours (an attribute), or Mitsuba's BSDF."""
     material, emission = surfaces[0].material, surfaces[0].emission
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces])
-    vertices = np.concatenate([s.vertices for s in surfaces])
+    vertices = np.concatenate([s.vertices for s in surfaces]) - origin
     faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts[:-1], strict=True)])
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict(_bsdf(material))
+    bsdf = _bsdf(material)
+    if masks == "mitsuba" and _has_cutouts(material):
+        bsdf = {"type": "mask", "opacity": _texture(material.opacity), "nested": bsdf}
+    props["bsdf"] = mi.load_dict(bsdf)
     if emission > 0:
         props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": emission}})
     smooth = surfaces[0].normals is not None
@@ -91,7 +99,7 @@ def _mesh(name: str, surfaces: list[Surface], has_cutouts: bool) -> Any:
     if smooth:
         params["vertex_normals"] = Float(np.concatenate([s.normals for s in surfaces]).ravel())
     params.update()
-    if has_cutouts:
+    if masks == "ours":
         mesh.add_texture_attribute(OPACITY, mi.load_dict(_texture(material.opacity)))
     return mesh
 
@@ -147,7 +155,7 @@ def camera_rays(world: World, x: Any, y: Any) -> tuple[Any, Any]:
     """Rays from the camera's centre through raster positions, and their camera-frame directions with z = 1."""
     camera = world.scene.camera
     local = mi.Vector3f((x - camera.width / 2) / camera.focal_px, (y - camera.height / 2) / camera.focal_px, 1)
-    return mi.Ray3f(mi.Point3f(*camera.origin.tolist()), dr.normalize(to_world(world, local))), local
+    return mi.Ray3f(mi.Point3f(0), dr.normalize(to_world(world, local))), local
 
 
 def to_world(world: World, local: Any) -> Any:
@@ -166,27 +174,35 @@ def shape_index(si: Any) -> Any:
     return dr.reinterpret_array(UInt32, si.shape)
 
 
-def first_opaque(world: World, ray: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+def first_opaque(world: World, ray: Any, active: Any, origin: Any = None) -> tuple[Any, Any, Any, Any]:
     """The first surface that stops light, past glass and the holes of cut-outs, in a straight line.
 
-    Returns the interaction, the transmission of the glass on the way, the optical path (group index counted inside
-    solid glass) and the geometric distance [m]. A cut-out stops light where its opacity is 1/2 or more. Refraction's
-    change of direction is left out: exact for a co-located laser at normal incidence, a plan says so otherwise.
+    `origin` is the surface point that the ray was spawned from, a little off its own start; None is the camera.
+    Returns the interaction, the transmission of the glass on the way, the optical path (the index of refraction counted
+    inside solid glass, as its group index) and the geometric distance [m]. A cut-out stops light where its opacity is
+    1/2 or more. Refraction's change of direction is left out: exact for a co-located laser at normal incidence, a plan
+    says so otherwise.
     """
     if not world.sees_through:
         si = world.traced.ray_intersect(ray, active)
-        return si, Float(1), si.t, si.t
-    return _pass_layers(world, ray, Bool(active), Float(dr.inf))
+        distance = si.t if origin is None else dr.norm(si.p - origin)
+        return si, Float(1), distance, distance
+    return _pass_layers(world, ray, ray.o if origin is None else origin, active, Float(dr.inf), origin is None)
 
 
 @dr.syntax
-def _pass_layers(world: World, ray: Any, active: Any, limit: Any) -> tuple[Any, Any, Any, Any]:
-    """`first_opaque` with layers, no farther than `limit`; where nothing stops the ray the paths run to the limit."""
+def _pass_layers(world: World, ray: Any, origin: Any, active: Any, limit: Any, in_air: bool) -> tuple[Any, ...]:
+    """`first_opaque` with layers, no farther than `limit`; where nothing stops the ray the paths run to the limit.
+
+    A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
+    ray that starts at a surface may start inside glass: the side of its first interface tells. A ray that meets more
+    than MAX_LAYERS is lost.
+    """
     lanes = dr.width(ray.d)
     transmission, optical, distance = dr.full(Float, 1, lanes), dr.zeros(Float, lanes), dr.zeros(Float, lanes)
+    medium = dr.full(Float, 1 if in_air else 0, lanes)  # index of refraction on the way, 0 = not known yet
     layer = dr.zeros(UInt32, lanes)
-    ray = mi.Ray3f(ray)
-    start = mi.Point3f(ray.o)
+    ray, start = mi.Ray3f(ray), mi.Point3f(origin)
     si = dr.zeros(mi.SurfaceInteraction3f, lanes)
     si.t = dr.full(Float, dr.inf, lanes)
     searching = Bool(active)
@@ -202,18 +218,21 @@ def _pass_layers(world: World, ray: Any, active: Any, limit: Any) -> tuple[Any, 
         # one interface lets 1 - F through; a thin pane, with all its inner reflections, (1 - F) / (1 + F)
         crossing = dr.select(thin > 0, (1 - fresnel) / (1 + fresnel), 1 - fresnel)
         transmission = dr.select(passing, transmission * crossing, transmission)
+        interface = passing & (solid > 0)
+        medium = dr.select(interface & (medium == 0), dr.select(cosine > 0, solid, 1), medium)
         # measured from the start: every new ray begins a little off the surface
         reached = dr.select(hit, dr.dot(si.p - start, ray.d), limit)
-        step = reached - distance
-        leaving = passing & (solid > 0) & (cosine > 0)
-        optical += dr.select(leaving, step * solid, step)
+        optical += (reached - distance) * dr.maximum(medium, 1)
         distance = reached
+        medium = dr.select(interface, dr.select(medium == 1, solid, 1), medium)
         if dr.hint(world.has_cutouts, mode="scalar"):
             passing |= hit & ~passing & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
         ray = si.spawn_ray(ray.d)
         layer += 1
         searching = passing & (layer < MAX_LAYERS)
-        si.t = dr.select(passing & ~searching, dr.inf, si.t)
+        lost = passing & ~searching
+        si.t = dr.select(lost, dr.inf, si.t)
+        transmission = dr.select(lost, 0, transmission)
     return si, transmission, optical, distance
 
 
@@ -235,7 +254,8 @@ def laser_leg(
         transmission, path = _shadow(world, si, direction, dr.sqrt(distance2), active)
     lit = active & (distance2 > 0)
     if laser.mode == "flood":
-        lit &= dr.dot(-direction, to_world(world, mi.Vector3f(0, 0, 1))) >= world.cos_half_angle
+        aim = to_camera(world, -direction)
+        lit &= dr.atan2(dr.norm(mi.Vector2f(aim.x, aim.y)), aim.z) <= world.half_angle
     elif seen_by_camera is None:
         lit &= _in_beam(world, si.p, pixel)
     intensity = dr.gather(Float, world.intensity, pixel, lit)
@@ -247,7 +267,7 @@ def laser_leg(
 def _in_beam(world: World, point: Any, pixel: Any) -> Any:
     """Whether a point lies in the image row (line) or the pixel (scan) that is being measured."""
     camera = world.scene.camera
-    local = to_camera(world, point - mi.Point3f(*camera.origin.tolist()))
+    local = to_camera(world, mi.Vector3f(point))
     row = dr.floor(local.y / local.z * camera.focal_px + camera.height / 2)
     column = dr.floor(local.x / local.z * camera.focal_px + camera.width / 2)
     same = (local.z > 0) & (row == Float(pixel // camera.width))
@@ -259,5 +279,6 @@ def _shadow(world: World, si: Any, direction: Any, distance: Any, active: Any) -
     if not world.sees_through:
         blocked = world.traced.ray_test(si.spawn_ray_to(world.laser), active)
         return dr.select(blocked, Float(0), Float(1)), distance
-    end, transmission, optical, _ = _pass_layers(world, si.spawn_ray(direction), Bool(active), distance * (1 - 1e-4))
-    return dr.select(end.is_valid(), 0, transmission), optical
+    short = distance * (1 - 1e-4)
+    end, transmission, optical, _ = _pass_layers(world, si.spawn_ray(direction), si.p, active, short, False)
+    return dr.select(end.is_valid(), 0, transmission), optical + (distance - short)
