@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import io
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -20,10 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from scenes.errors import InputError
-from scenes.files import whole_file
+from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 
-SCHEMA = 1
-ATTRIBUTE = "scene2spad"
 RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bounces": "bounces"}
 LAYER_CHANNELS = ("depth", "normal.X", "normal.Y", "normal.Z", "albedo", "ambient", "mixed", "error")
 
@@ -119,7 +116,12 @@ class Transient:
         return float(self.radiance[self.bounces > 1].sum(dtype=np.float64)) / total if total > 0 else 0.0
 
     def delayed(self, offset_m: float) -> Transient:
-        """The same scene `offset_m` farther in time alone (a `time` offset): paths + 2 offset, depth + offset."""
+        """The same scene `offset_m` farther in time alone (a `time` offset): paths + 2 offset, depth + offset.
+
+        Raises InputError with a displaced laser, for which a delay is no distance.
+        """
+        if any(self.meta.get("laser", {}).get("baseline_m", ())):
+            raise InputError("a time offset needs a co-located laser: with a baseline a delay is no distance")
         return replace(
             self,
             path_near_m=self.path_near_m + np.float32(2 * offset_m),
@@ -136,26 +138,10 @@ class Transient:
         return sha.hexdigest()
 
 
-def check_schema(path: Path, meta: dict, kind: str) -> None:
-    """The rule for every file of ours: of the expected kind, and not of a newer schema than this program knows."""
-    if not isinstance(meta, dict) or meta.get("kind") != kind:
-        meta = meta if isinstance(meta, dict) else {}
-        raise InputError(f"{path}: holds {meta.get('kind', 'something else')!s}, expected a {kind}")
-    if meta.get("schema") != SCHEMA:
-        raise InputError(f"{path}: schema {meta.get('schema')}, this program reads {SCHEMA}; use a newer scene2spad")
-
-
 def write_transient(transient: Transient, path: Path) -> None:
     """Write the multi-part EXR, whole or not at all."""
     import OpenEXR
 
-    meta = {
-        **transient.meta,
-        "kind": "transient",
-        "schema": SCHEMA,
-        "returns": transient.returns,
-        "sha256": transient.sha256(),
-    }
     deep = {
         channel: OpenEXR.Channel(channel, _ragged(getattr(transient, name), transient))
         for name, channel in RETURN_FIELDS.items()
@@ -169,7 +155,7 @@ def write_transient(transient: Transient, path: Path) -> None:
     deep_header = {
         "type": OpenEXR.deepscanline,
         "compression": OpenEXR.ZIPS_COMPRESSION,
-        ATTRIBUTE: json.dumps(meta, sort_keys=True),
+        ATTRIBUTE: seal(transient.meta, "transient", transient.sha256()),
     }
     flat_header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     parts = [OpenEXR.Part(deep_header, deep, "transient"), OpenEXR.Part(flat_header, flat, "layers")]
@@ -215,27 +201,19 @@ def read_transient(path: Path) -> Transient:
             f"{path}: no transient of scene2spad, or a truncated one (parts: {', '.join(parts) or 'none'})"
         )
     try:
-        meta = json.loads(headers["transient"][ATTRIBUTE])
-    except ValueError:
-        raise InputError(f"{path}: its {ATTRIBUTE} attribute is not JSON") from None
-    check_schema(path, meta, "transient")
-    missing = (set(RETURN_FIELDS.values()) - set(channels["transient"])) | (
-        set(LAYER_CHANNELS) - set(channels["layers"])
-    )
-    if missing:
-        raise InputError(f"{path}: channels {', '.join(sorted(missing))} are missing")
-    try:
-        transient = _assemble(channels["transient"], channels["layers"], meta)
+        meta, sha256 = open_seal(headers["transient"][ATTRIBUTE], "transient")
+        missing = {*RETURN_FIELDS.values()} - {*channels["transient"]} | {*LAYER_CHANNELS} - {*channels["layers"]}
+        if missing:
+            raise InputError(f"channels {', '.join(sorted(missing))} are missing")
+        transient = _assemble(channels["transient"], channels["layers"])
+        return replace(transient, meta=check_seal(meta, sha256, transient.sha256()))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (TypeError, ValueError, AttributeError, MemoryError) as error:
         raise InputError(f"{path}: damaged, {type(error).__name__} {' '.join(str(error).split())[:120]}") from None
-    if transient.returns != meta.get("returns") or transient.sha256() != meta.get("sha256"):
-        raise InputError(f"{path}: contents do not match their SHA-256: the file is damaged or was altered")
-    return transient
 
 
-def _assemble(deep: dict[str, np.ndarray], flat: dict[str, np.ndarray], meta: dict) -> Transient:
+def _assemble(deep: dict[str, np.ndarray], flat: dict[str, np.ndarray]) -> Transient:
     height, width = flat["depth"].shape
     sizes = np.zeros(height * width, dtype=np.int64)
     columns = {}
@@ -258,7 +236,6 @@ def _assemble(deep: dict[str, np.ndarray], flat: dict[str, np.ndarray], meta: di
         ambient=flat["ambient"],
         mixed=flat["mixed"].astype(bool),
         error=flat["error"],
-        meta={k: v for k, v in meta.items() if k not in ("kind", "schema", "returns", "sha256")},
     )
 
 

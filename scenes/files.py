@@ -1,13 +1,18 @@
-"""Writing files so that a reader never sees half of one."""
+"""Files of ours: written whole or not at all, and sealed, so that a reader sees neither half of one nor damage."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from scenes.errors import InputError
+
+ATTRIBUTE = "scene2spad"
+SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1}
 
 
 @contextmanager
@@ -30,3 +35,40 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise InputError(f"{path}: cannot be written ({error.strerror or str(error).splitlines()[0]})") from None
     finally:
         beside.unlink(missing_ok=True)
+
+
+def seal(meta: dict, kind: str, arrays_sha256: str) -> str:
+    """The JSON that a file of ours carries: `meta`, its kind and schema, and a SHA-256 over these and the arrays."""
+    body = {**meta, "kind": kind, "schema": SCHEMAS[kind]}
+    return json.dumps({**body, "sha256": _digest(body, arrays_sha256)}, sort_keys=True)
+
+
+def open_seal(text: str, kind: str) -> tuple[dict, str]:
+    """Metadata and SHA-256 of a sealed file of the expected kind; `check_seal` follows when the arrays are read.
+
+    Raises InputError if it is something else, or of a newer schema.
+    """
+    try:
+        body = json.loads(text)
+    except (TypeError, ValueError):
+        body = None
+    if not isinstance(body, dict) or body.get("kind") not in SCHEMAS:
+        raise InputError(f"its {ATTRIBUTE} attribute is not one of ours, expected a {kind}")
+    if body["kind"] != kind:
+        raise InputError(f"holds a {body['kind']}, expected a {kind}")
+    if body.get("schema") != SCHEMAS[kind]:
+        raise InputError(
+            f"{kind} of schema {body.get('schema')}, this program reads {SCHEMAS[kind]}; use another scene2spad"
+        )
+    return body, str(body.pop("sha256", ""))
+
+
+def check_seal(body: dict, sha256: str, arrays_sha256: str) -> dict:
+    """The metadata as it was given to `seal`; InputError where metadata or arrays changed since."""
+    if _digest(body, arrays_sha256) != sha256:
+        raise InputError("contents do not match their SHA-256: the file is damaged or was altered")
+    return {key: value for key, value in body.items() if key not in ("kind", "schema")}
+
+
+def _digest(body: dict, arrays_sha256: str) -> str:
+    return hashlib.sha256((json.dumps(body, sort_keys=True) + arrays_sha256).encode()).hexdigest()

@@ -12,7 +12,7 @@ noise-free pulse, `noise_free_bias_m`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 
 import numpy as np
@@ -247,6 +247,17 @@ def cramer_rao_m(arrival_s: Tensor, signal: Tensor, background_per_bin: Tensor, 
     slope = signal * binned_pulse_slope(arrival_s, sensor)
     information = torch.where(rate > 0, slope**2 / rate, 0.0).sum(-1)
     return SPEED_OF_LIGHT_M_PER_S / 2 * information**-0.5
+
+
+def radial_depth_m(half_path_m: np.ndarray, directions: np.ndarray, baseline_m: Iterable[float]) -> np.ndarray:
+    """Distance from the camera, given half the optical path from a displaced laser to the surface to the camera [m].
+
+    With p the path, b the laser's place relative to the camera and r the unit ray: the ellipsoid
+    d = (p^2 - |b|^2) / (2 (p - r.b)). half_path_m (...,), directions (..., 3) and b in one frame -> (...,) float32.
+    """
+    path, baseline = 2.0 * np.asarray(half_path_m, dtype=np.float64), np.asarray(tuple(baseline_m), dtype=np.float64)
+    distance = (path**2 - baseline @ baseline) / (2 * (path - directions @ baseline))
+    return distance.astype(np.float32)
 
 
 def depth_errors(

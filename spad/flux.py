@@ -37,17 +37,22 @@ def rates_for(transient: Transient, sensor: Sensor, budget: PhotonBudget) -> Rat
 
     Signal: all returns times one factor, so that their mean over the image is `budget.signal`. Background: dark counts
     are what the sensor says, ambient light fills the mean up to `budget.background`; dark counts alone above it are
-    scaled down to it. Raises InputError when there is no light to scale.
+    scaled down to it, and the reason says so. Raises InputError when there is no light to scale.
     """
     pixels = transient.height * transient.width
     total = float(transient.radiance.sum(dtype=np.float64))
     if total <= 0 and budget.signal > 0:
         raise InputError(f"no light returns to the camera: {budget.signal:g} signal photons a pixel cannot be had")
     scale = budget.signal * pixels / total if total > 0 else 0.0
-    dark = min(sensor.dark_count_rate_hz * sensor.exposure_s, budget.background)
+    counted = sensor.dark_count_rate_hz * sensor.exposure_s
+    dark = min(counted, budget.background)
     ambient = transient.ambient.astype(np.float64)
     share = dark / budget.background if budget.background > 0 else 0.0
-    if dark > 0:
+    if counted > budget.background:
+        reason = (
+            f"background: {counted:g} dark counts a pixel exceed the asked {budget.background:g}, scaled down to it"
+        )
+    elif dark > 0:
         reason = f"background: {share:.1%} dark counts ({sensor.dark_count_rate_hz:g} Hz), the rest ambient light"
     elif ambient.sum() > 0:
         reason = "background: the scene's ambient light"

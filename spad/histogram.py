@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import json
-from dataclasses import dataclass, field
+import io
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from render.transient import ATTRIBUTE, SCHEMA, check_schema
 from scenes.errors import InputError
-from scenes.files import whole_file
+from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from spad.sensor import PhotonBudget, Sensor
 
 TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
@@ -51,7 +50,6 @@ class Histogram:
             if array.shape != self.counts.shape[:2]:
                 raise InputError(f"histogram: {name} is {array.shape}, expected {self.counts.shape[:2]}")
             array.setflags(write=False)
-        self.counts.setflags(write=False)
 
     def timestamps(self) -> tuple[np.ndarray, np.ndarray]:
         """Sparse form: time bin of every detection (uint16, ascending in a pixel), and (H*W + 1,) int64 offsets."""
@@ -79,20 +77,11 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
     """Write HDF5, whole or not at all: timestamps where they are the smaller form, else dense counts."""
     import h5py
 
-    height, width, _ = histogram.counts.shape
-    meta = {
-        **histogram.meta,
-        "kind": "histogram",
-        "schema": SCHEMA,
-        "sensor": histogram.sensor.to_dict(),
-        "budget": histogram.budget.to_dict(),
-        "height": height,
-        "width": width,
-        "sha256": histogram.sha256(),
-    }
+    meta = {**histogram.meta, "sensor": histogram.sensor.to_dict(), "budget": histogram.budget.to_dict()}
     packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    with whole_file(path) as beside, h5py.File(beside, "w") as file:
-        file.attrs[ATTRIBUTE] = json.dumps(meta, sort_keys=True)
+    buffer = io.BytesIO()  # HDF5 itself does not survive a full disk
+    with h5py.File(buffer, "w") as file:
+        file.attrs[ATTRIBUTE] = seal(meta, "histogram", histogram.sha256())
         if int(histogram.counts.sum(dtype=np.int64)) * 2 < histogram.counts.nbytes:
             stamps, offsets = histogram.timestamps()
             file.create_dataset("timestamps", data=stamps, **(packed if len(stamps) else {}))
@@ -101,6 +90,8 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
             file.create_dataset("counts", data=histogram.counts, **packed)
         for name in TRUTH:
             file.create_dataset(name, data=getattr(histogram, name), **packed)
+    with whole_file(path) as beside:
+        beside.write_bytes(buffer.getbuffer())
 
 
 def read_histogram(path: Path) -> Histogram:
@@ -115,36 +106,24 @@ def read_histogram(path: Path) -> Histogram:
         raise InputError(f"{path}: file not found")
     try:
         with h5py.File(path, "r") as file:
-            meta = json.loads(file.attrs[ATTRIBUTE])
-            data = {name: dataset[()] for name, dataset in file.items()}
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: not a readable histogram of scene2spad ({reason})") from None
-    check_schema(path, meta, "histogram")
-    try:
-        return _assemble(meta, data)
+            if ATTRIBUTE not in file.attrs:
+                raise InputError("not a file of scene2spad")
+            meta, sha256 = open_seal(file.attrs[ATTRIBUTE], "histogram")
+            histogram = _assemble(meta, {name: dataset[()] for name, dataset in file.items()})
+        meta = check_seal(meta, sha256, histogram.sha256())
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (KeyError, TypeError, ValueError, IndexError, MemoryError) as error:
-        raise InputError(f"{path}: damaged, {type(error).__name__} {' '.join(str(error).split())[:120]}") from None
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, IndexError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable HDF5 file ({' '.join(str(error).split())[:120]})") from None
+    return replace(histogram, meta={key: value for key, value in meta.items() if key not in ("sensor", "budget")})
 
 
 def _assemble(meta: dict, data: dict[str, np.ndarray]) -> Histogram:
-    if not (set(TRUTH) <= set(data) and ("counts" in data or {"timestamps", "offsets"} <= set(data))):
+    if not ({*TRUTH} <= {*data} and ("counts" in data or {"timestamps", "offsets"} <= {*data})):
         raise InputError(f"datasets are missing, there are {', '.join(sorted(data)) or 'none'}")
     sensor, budget = Sensor.from_dict(meta["sensor"]), PhotonBudget(**meta["budget"])
-    shape = (meta["height"], meta["width"], sensor.bins)
-    counts = (
-        data["counts"] if "counts" in data else counts_from_timestamps(data["timestamps"], data["offsets"], shape[2])
-    )
-    own = ("kind", "schema", "height", "width", "sha256", "sensor", "budget")
-    histogram = Histogram(
-        counts=counts.reshape(shape),
-        sensor=sensor,
-        budget=budget,
-        **{name: data[name] for name in TRUTH},
-        meta={key: value for key, value in meta.items() if key not in own},
-    )
-    if histogram.sha256() != meta["sha256"]:
-        raise InputError("contents do not match their SHA-256: the file is damaged or was altered")
-    return histogram
+    counts = data.get("counts")
+    if counts is None:
+        flat = counts_from_timestamps(data["timestamps"], data["offsets"], sensor.bins)
+        counts = flat.reshape(*data["depth_m"].shape, sensor.bins)
+    return Histogram(counts, sensor, budget, **{name: data[name] for name in TRUTH})

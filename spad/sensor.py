@@ -115,8 +115,8 @@ def sensor_by_name(name: str) -> Sensor:
 class PhotonBudget:
     """Mean signal and mean background primary detections per pixel per exposure, averaged over all pixels.
 
-    Signal sums direct and indirect light, what wraps included. Background is ambient light and dark counts, rescaled
-    together to the asked mean.
+    Signal sums direct and indirect light, what wraps included. Background is dark counts, as the sensor has them, and
+    ambient light scaled to fill the asked mean.
     """
 
     signal: float = 50.0

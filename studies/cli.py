@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import logging
+import math
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -48,7 +49,10 @@ def main(argv: list[str]) -> int:
     except KeyboardInterrupt:
         print("interrupted; finished files stay, nothing is half-written", file=sys.stderr)
         return 130
-    print(json.dumps(result) if command.json else _prose(result))
+    try:
+        print(json.dumps(_finite(result), allow_nan=False) if command.json else _prose(result), flush=True)
+    except BrokenPipeError:
+        sys.stdout = None  # the reader has gone: Python must not try to flush again
     return 0
 
 
@@ -71,12 +75,22 @@ def _one_line(box: str) -> str:
     lines = [re.sub(r"[│╭╮╰╯─|]+", " ", line).strip() for line in plain.splitlines()]
     text = " ".join(line for line in lines if line and not set(line) <= set("-=_ "))
     text = re.sub(r"\s+", " ", text).removeprefix("Parsing error ").strip()
+    text = re.sub(r" no type matching .*?could be instantiated from (\[.*?\])\. Got errors.*", r" cannot be \1", text)
     return re.sub(r"For full helptext, run (.*)$", r"(see \1)", text) or "bad command line; see scene2spad --help"
 
 
 def _refuse(reason: str) -> int:
     print(f"scene2spad: {' '.join(reason.split())}", file=sys.stderr)
     return 2
+
+
+def _finite(value: object) -> object:
+    """JSON knows no NaN: null instead."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _prose(result: dict) -> str:

@@ -103,8 +103,9 @@ def draw_histogram(histogram: Histogram, path: Path) -> Path:
     _image(
         axes[0], counts, "detections per pixel", "photons", cmap="gray", vmin=0, vmax=max(np.quantile(counts, 0.995), 1)
     )
-    log_ratio = np.log10(np.maximum(ratio, 1e-6))
-    _image(axes[1], log_ratio, "expected signal to background", "log10", cmap=ERROR_COLOURS)
+    decibels = 10 * np.log10(np.maximum(ratio, 1e-12))
+    low, high = np.quantile(decibels[ratio > 0], (0.01, 0.99)) if (ratio > 0).any() else (0, 1)
+    _image(axes[1], decibels, "expected signal to background", "dB", cmap=ERROR_COLOURS, vmin=low, vmax=high)
     time_ns = (np.arange(histogram.sensor.bins) + 0.5) * histogram.sensor.bin_width_s * 1e9
     order = np.argsort(histogram.expected_signal, axis=None, kind="stable")
     for name, share in (("dark", 0.1), ("median", 0.5), ("bright", 0.9)):
@@ -164,8 +165,9 @@ def _telling_pixel(transient: Transient) -> tuple[int, int]:
     later = transient.bounces > 1
     indirect = np.bincount(transient.return_pixel[later], weights=transient.radiance[later], minlength=total.size)
     share = indirect / np.maximum(total.ravel(), 1e-30)
-    bright = (total >= np.quantile(total, 0.5)) & ~transient.mixed & np.isfinite(transient.depth_m)
-    candidates = np.flatnonzero(bright) if bright.any() else np.arange(total.size)
+    known = np.isfinite(transient.depth_m) if np.isfinite(transient.depth_m).any() else total > 0
+    bright = known & (total >= np.median(total[known])) & ~transient.mixed
+    candidates = np.flatnonzero(bright if bright.any() else known)
     ranked = candidates[np.argsort(share[candidates], kind="stable")]
     return np.unravel_index(int(ranked[int(0.9 * (len(ranked) - 1))]), total.shape)
 
@@ -198,12 +200,14 @@ def _one_pixel(above: Axes, below: Axes, transient: Transient, histogram: Histog
     below.stairs(histogram.counts[row, column], edges_ns, fill=True, color="0.75", label="detections")
     expected = expected_in_pixel(transient, sensor, histogram.budget, row, column)
     below.stairs(expected, edges_ns, color="tab:blue", label="expected counts")
-    first_ns = float(2 * transient.depth_m[row, column] / SPEED_OF_LIGHT_M_PER_S) * ns
+    first_ns = min(float(centre.min()), edges_ns[-1] - 1)
     for axes in (above, below):
-        axes.axvline(first_ns, color="k", lw=0.8, ls=":")
         axes.set_xlim(max(first_ns - 3, 0), min(first_ns + 18, edges_ns[-1]))
-    below.annotate("true depth", (first_ns, 0.92), xycoords=("data", "axes fraction"), xytext=(-4, 0),
-                   textcoords="offset points", fontsize=8, ha="right", va="top")  # fmt: skip
+    if np.isfinite(transient.depth_m[row, column]):
+        true_ns = 2 * float(transient.depth_m[row, column]) / SPEED_OF_LIGHT_M_PER_S * ns
+        below.axvline(true_ns, color="k", lw=0.8, ls=":")
+        below.annotate("true depth", (true_ns, 0.92), xycoords=("data", "axes fraction"), xytext=(-4, 0),
+                       textcoords="offset points", fontsize=8, ha="right", va="top")  # fmt: skip
     below.set(xlabel="time since the laser's emission [ns]", ylabel="photons per bin")
     below.legend(fontsize=8, loc="upper right")
     metres_per_ns = SPEED_OF_LIGHT_M_PER_S / ns / 2

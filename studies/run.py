@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import hashlib
 import logging
+import mmap
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scenes.catalog import SCENES, load_scene
 
 from csph import CodingTensor, decode_depth, encode, truncated_fourier
 from render.engine import render
 from render.settings import RenderSettings
-from render.transient import ATTRIBUTE, SCHEMA, Transient, read_transient, write_transient
-from scenes import InputError, Laser, Scene
-from scenes.files import whole_file
-from spad.depth import depth_errors, estimate_depth
+from render.transient import Transient, read_transient, write_transient
+from scenes import Camera, InputError, Laser, Scene
+from scenes.catalog import SCENES, load_scene
+from scenes.files import ATTRIBUTE, seal, whole_file
+from spad.depth import depth_errors, estimate_depth, radial_depth_m
 from spad.detect import sense
 from spad.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor import PhotonBudget, sensor_by_name
@@ -29,22 +31,47 @@ log = logging.getLogger("scene2spad")
 Progress = Callable[[str, float], None]
 
 
-def _output(path: Path, suffix: str) -> Path:
-    """An output path that can be written later: checked before the work, not after it."""
+def _input(path: Path) -> Path:
+    if not path.is_file():
+        raise InputError(
+            f"{path}: {'is a folder, expected a file' if path.is_dir() and path.name else 'file not found'}"
+        )
+    return path
+
+
+def _output(path: Path, suffix: str, kind: str) -> Path:
+    """An output path that can be written later, with its picture: checked before the work, not after it.
+
+    Results of the same kind may be written again; any other file is not overwritten.
+    """
     if path.suffix.lower() != suffix:
         raise InputError(f"{path}: the output must end in {suffix}")
     if not path.parent.is_dir():
         raise InputError(f"{path}: folder {path.parent} does not exist")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, expected a file name")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"{path}: folder {path.parent} cannot be written to")
+    for target in (path, _picture(path, kind)):
+        if target.is_dir():
+            raise InputError(f"{target}: is a folder, expected a file name")
+    if path.is_file() and not _holds(path, f'"kind": "{kind}"'.encode()):
+        raise InputError(f"{path}: exists and is no {kind} of scene2spad; choose another --out")
     return path
 
 
+def _holds(path: Path, words: bytes) -> bool:
+    if path.stat().st_size == 0:
+        return False
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
+        return contents.find(words) >= 0
+
+
+def _picture(path: Path, kind: str) -> Path:
+    """The picture's name beside a result: its own kind, so that it meets no texture and no other picture."""
+    return path.with_name(f"{path.stem}.{kind}.png")
+
+
 def _load(command: commands.Render | commands.Demo) -> Scene:
-    scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
-    for note in scene.notes:
-        log.info("%s: %s", scene.name, note)
-    return scene
+    return load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
 
 
 def _in_view(transient: Transient) -> Transient:
@@ -84,8 +111,10 @@ def run_render(command: commands.Render, progress: Progress) -> dict:
     )
     if not 0 <= command.offset <= 1e4:
         raise InputError(f"offset {command.offset:g} m is outside 0 to 10000")
+    if command.out is not None:
+        _output(command.out, ".exr", "transient")
     scene = _load(command)
-    out = _output(command.out or Path(f"{scene.name}.exr"), ".exr")
+    out = command.out or _output(Path(f"{scene.name}.exr"), ".exr", "transient")
     if command.laser is not None:
         scene = replace(scene, laser=Laser(command.laser, scene.laser.baseline_m))
     start = time.perf_counter()
@@ -108,7 +137,7 @@ def run_render(command: commands.Render, progress: Progress) -> dict:
         "out": str(out),
     }
     if command.figure:
-        result["figure"] = str(figures.draw_transient(transient, out.with_suffix(".png")))
+        result["figure"] = str(figures.draw_transient(transient, _picture(out, "transient")))
     return result
 
 
@@ -117,8 +146,9 @@ def run_sense(command: commands.Sense, progress: Progress) -> dict:
     sensor, budget = sensor_by_name(command.sensor), PhotonBudget(command.signal, command.background)
     if command.dark_count_rate is not None:
         sensor = replace(sensor, dark_count_rate_hz=command.dark_count_rate)
-    out = _output(command.out or command.file.with_suffix(".h5"), ".h5")
-    transient = read_transient(command.file)
+    source = _input(command.file)
+    out = _output(command.out or source.with_suffix(".h5"), ".h5", "histogram")
+    transient = read_transient(source)
     start = time.perf_counter()
     histogram = sense(transient, sensor, budget, seed=command.seed, model=command.model, progress=progress)
     seconds = time.perf_counter() - start
@@ -137,24 +167,35 @@ def run_sense(command: commands.Sense, progress: Progress) -> dict:
         "out": str(out),
     }
     if command.figure:
-        result["figure"] = str(figures.draw_histogram(histogram, out.with_suffix(".png")))
+        result["figure"] = str(figures.draw_histogram(histogram, _picture(out, "histogram")))
     return result
 
 
 def depth_map(histogram: Histogram, method: str, codes: int = 16) -> np.ndarray:
-    """Depth [m] of every pixel by a method's name, (H, W) float32; `compressive` is truncated Fourier with K codes."""
-    counts = torch.from_numpy(np.array(histogram.counts))
-    if method != "compressive":
-        return estimate_depth(counts, histogram.sensor, method).numpy()
-    coding = CodingTensor(f"fourier-{codes}", truncated_fourier(codes, histogram.sensor.bins))
-    return decode_depth(encode(counts, coding), coding, histogram.sensor).numpy()
+    """Depth [m] of every pixel by a method's name, (H, W) float32; `compressive` is truncated Fourier with K codes.
+
+    With a displaced laser the arrival time is a path on an ellipsoid, and becomes a distance by the scene's geometry.
+    """
+    counts = torch.from_numpy(histogram.counts)
+    if method == "compressive":
+        coding = CodingTensor(f"fourier-{codes}", truncated_fourier(codes, histogram.sensor.bins))
+        depth = decode_depth(encode(counts, coding), coding, histogram.sensor).numpy()
+    else:
+        depth = estimate_depth(counts, histogram.sensor, method).numpy()
+    geometry = histogram.meta.get("transient", {})
+    baseline = geometry.get("laser", {}).get("baseline_m", (0, 0, 0))
+    if not any(baseline):
+        return depth
+    camera = Camera(**geometry["camera"])
+    return radial_depth_m(depth, camera.rays() @ camera.rotation, baseline)
 
 
 def run_depth(command: commands.Depth, progress: Progress) -> dict:
     """Histogram -> depth map, error figures and a picture."""
     label = command.method if command.method != "compressive" else f"{command.code}-{command.codes}"
-    out = _output(command.out or command.file.with_name(f"{command.file.stem}-{label}.exr"), ".exr")
-    histogram = read_histogram(command.file)
+    source = _input(command.file)
+    out = _output(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
+    histogram = read_histogram(source)
     progress(command.method, 0.1)
     start = time.perf_counter()
     depth = depth_map(histogram, command.method, command.codes)
@@ -170,7 +211,7 @@ def run_depth(command: commands.Depth, progress: Progress) -> dict:
         "out": str(out),
     }
     if command.figure:
-        result["figure"] = str(figures.draw_depth(histogram, depth, label, errors, out.with_suffix(".png")))
+        result["figure"] = str(figures.draw_depth(histogram, depth, label, errors, _picture(out, "depth")))
     return result
 
 
@@ -180,7 +221,7 @@ def _write_depth(depth_m: np.ndarray, path: Path, meta: dict) -> None:
     header = {
         "type": OpenEXR.scanlineimage,
         "compression": OpenEXR.ZIP_COMPRESSION,
-        ATTRIBUTE: json.dumps({**meta, "kind": "depth", "schema": SCHEMA, "unit": "m"}, sort_keys=True),
+        ATTRIBUTE: seal({**meta, "unit": "m"}, "depth", hashlib.sha256(depth_m.tobytes()).hexdigest()),
     }
     with whole_file(path) as beside:
         try:
@@ -192,8 +233,13 @@ def _write_depth(depth_m: np.ndarray, path: Path, meta: dict) -> None:
 def run_demo(command: commands.Demo, progress: Progress) -> dict:
     """Scene -> transient -> histogram -> four depth maps -> one figure."""
     budget = PhotonBudget(command.signal, command.background)
+    folder = command.out
+    if not (folder.is_dir() or not folder.exists()):
+        raise InputError(f"{folder}: is a file, expected a folder for the demo's results")
     scene = _load(command)
-    command.out.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    _output(folder / f"{scene.name}.exr", ".exr", "transient")
+    _output(folder / f"{scene.name}.h5", ".h5", "histogram")
     start = time.perf_counter()
     transient = _in_view(render(scene, seed=command.seed, progress=progress))
     rendered = time.perf_counter()
@@ -204,9 +250,9 @@ def run_demo(command: commands.Demo, progress: Progress) -> dict:
     depths = {name: depth_map(histogram, method) for method, name in names.items()}
     errors = {n: depth_errors(d, histogram.depth_m, range_m=sensor.range_m) for n, d in depths.items()}
     estimated = time.perf_counter()
-    write_transient(transient, command.out / f"{scene.name}.exr")
-    write_histogram(histogram, command.out / f"{scene.name}.h5")
-    figure = figures.draw_demo(transient, histogram, depths, errors, command.out / "demo.png")
+    write_transient(transient, folder / f"{scene.name}.exr")
+    write_histogram(histogram, folder / f"{scene.name}.h5")
+    figure = figures.draw_demo(transient, histogram, depths, errors, folder / "demo.png")
     return {
         "seconds": time.perf_counter() - start,
         "seconds_render": rendered - start,

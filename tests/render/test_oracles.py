@@ -7,7 +7,7 @@ import pytest
 from render.engine import render
 from render.settings import RenderSettings
 from render.transient import Transient
-from scenes import Ambient, Laser, Material, Scene, Surface, Texture
+from scenes import Ambient, Camera, Laser, Material, Scene, Surface, Texture
 from scenes.shapes import box, sphere
 
 DIRECT = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
@@ -187,6 +187,69 @@ def test_window_dims_the_wall_behind_it_and_delays_it():
     assert np.allclose(seen.total_radiance() / bare.total_radiance(), (1 - fresnel) ** 4, rtol=1e-3)
     assert np.allclose(seen.mean_path_m() - bare.mean_path_m(), 2 * 0.3 * 0.5, atol=2e-4)
     assert np.allclose(seen.depth_m, bare.depth_m, atol=1e-5)
+    inside_out = Surface(slab.vertices, faces[:, ::-1], slab.material, uv=uv)
+    assert np.allclose(
+        render(Scene("in", (wall, inside_out), view), DIRECT).mean_path_m(), seen.mean_path_m(), atol=1e-5
+    )
+
+
+def test_wall_inside_glass_is_reached_through_it():
+    """Glass from 2 to 4 m with a wall in it at 3 m: 2 m of air, 1 m of glass, and back."""
+    vertices, faces, uv = box((4, 4, 2))
+    block = Surface(vertices + [0, 0, -3], faces, Material("dielectric", ior=1.5), uv=uv)
+    for baseline in ((0, 0, 0), (0.01, 0, 0)):
+        laser = Laser("flood", baseline, 30.0)
+        scene = Scene("block", (oracles.wall(3.0, 0.5), block), oracles.camera(8, 6, 2.0), laser)
+        assert np.allclose(render(scene, DIRECT).mean_path_m(), 2 * (2 + 1.5), atol=2e-3)
+
+
+def test_glass_elsewhere_changes_no_path():
+    """A pane behind the camera switches the slow tracer on; a displaced laser's path must stay what it was."""
+    laser, wall = Laser("flood", (0.2, 0, 0), 100.0), oracles.wall(10.0, 0.5, half_size_m=40)
+    pane = oracles.quad([(-1, -1, 3), (1, -1, 3), (1, 1, 3), (-1, 1, 3)], Material("thindielectric"))
+    plain = render(Scene("plain", (wall,), oracles.camera(), laser), DIRECT)
+    glazed = render(Scene("glazed", (wall, pane), oracles.camera(), laser), DIRECT)
+    assert np.abs(glazed.mean_path_m() - plain.mean_path_m()).max() < 2e-5
+
+
+@pytest.mark.parametrize("cone_deg", [0.5, 2, 20])
+def test_narrow_cones_carry_one_joule(cone_deg):
+    """Irradiance over a frontal wall, pi L / albedo, integrates to the laser's energy: what leaves arrives."""
+    scene = Scene(
+        "beam",
+        (oracles.wall(5.0, 0.5, half_size_m=5),),
+        oracles.camera(64, 64, 1.5 * cone_deg),
+        Laser("flood", cone_deg=cone_deg),
+    )
+    radiance = render(scene, RenderSettings(bounces=1, grid=16)).total_radiance()
+    pixel_area = (5.0 / scene.camera.focal_px) ** 2
+    assert (np.pi / 0.5 * radiance * pixel_area).sum() == pytest.approx(1, abs=2e-3)
+
+
+@pytest.mark.parametrize("shift_m", [0, 1000.0])
+def test_a_scene_far_from_the_origin_is_the_same_scene(shift_m):
+    scene = diffuse_room(Laser("flood", cone_deg=360))
+    moved = Scene("moved", tuple(Surface(s.vertices + shift_m, s.faces, s.material, s.uv) for s in scene.surfaces),
+                  Camera.look_at((shift_m,) * 3, (shift_m, shift_m, shift_m - 1), fov_deg=60, width=24, height=18),
+                  scene.laser)  # fmt: skip
+    settings = RenderSettings(bounces=3, spp=256, grid=4)
+    here, there = render(scene, settings), render(moved, settings)
+    assert np.nanmax(np.abs(here.depth_m - there.depth_m)) < 1e-5
+    later, later_there = here.bounces > 1, there.bounces > 1
+    mean = [np.average(t.path_near_m[k] + t.path_far_m[k], weights=t.radiance[k]) / 2
+            for t, k in ((here, later), (there, later_there))]  # fmt: skip
+    assert abs(mean[0] - mean[1]) < 1e-3
+
+
+def test_line_laser_keeps_its_indirect_light():
+    transient = render(diffuse_room(Laser("line")))
+    assert transient.meta["plan"]["bounces"] > 1 and 0.01 < transient.indirect_fraction < 0.3
+
+
+def test_ambient_light_passes_the_holes_of_a_cutout():
+    sheet = oracles.quad([(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)], Material(albedo=0.0, opacity=0.0))
+    scene = Scene("sheet", (oracles.wall(2, 1.0, half_size_m=9), sheet), oracles.camera(8, 6, 40), ambient=Ambient(1.0))
+    assert render(scene, RenderSettings(bounces=1)).ambient.mean() == pytest.approx(1.0, abs=0.02)
 
 
 def test_cutout_shows_what_lies_behind_its_holes():

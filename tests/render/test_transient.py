@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from render.returns import Samples, merge, to_returns
-from render.transient import ATTRIBUTE, Transient, read_transient, write_transient
+from render.transient import Transient, read_transient, write_transient
 from scenes import InputError
+from scenes.files import ATTRIBUTE
 
 
 def make(returns: int = 2000, height: int = 12, width: int = 16, seed: int = 0) -> Transient:
@@ -83,23 +84,29 @@ def test_damaged_contents_are_refused(tmp_path):
     data = bytearray((tmp_path / "t.exr").read_bytes())
     rng = np.random.default_rng(0)
     refused = 0
-    for position in rng.integers(len(data) // 2, len(data), 40):
+    for position in rng.integers(0, len(data), 200):
         damaged = data.copy()
         damaged[position] ^= 0x55
         (tmp_path / "d.exr").write_bytes(damaged)
         try:
             again = read_transient(tmp_path / "d.exr")
-            assert again.sha256() == make(300, 6, 8).sha256()
+            assert again.sha256() == make(300, 6, 8).sha256() and again.meta == make(300, 6, 8).meta
         except InputError:
             refused += 1
-    assert refused > 30
+    assert refused > 100
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"schema": 2}, "schema 2"), ({"kind": "depth"}, "expected a transient"), ({"returns": 1}, "do not match")],
+    [
+        ({"schema": 2}, "schema 2"),
+        ({"kind": "depth"}, "holds a depth, expected a transient"),
+        ({"kind": "dream"}, "not one of ours"),
+        ({"seed": 5}, "do not match"),
+        ({"sha256": "0"}, "do not match"),
+    ],
 )
-def test_other_kinds_and_newer_schemas_are_refused_by_name(tmp_path, change, message):
+def test_other_kinds_newer_schemas_and_altered_metadata_are_refused(tmp_path, change, message):
     import OpenEXR
 
     write_transient(make(300, 6, 8), tmp_path / "t.exr")

@@ -165,18 +165,23 @@ def test_truncated_and_damaged_files_are_refused_in_one_line(tmp_path):
 
 def test_foreign_and_newer_files_are_refused_by_name(tmp_path):
     write_histogram(made(), tmp_path / "h.h5")
-    with h5py.File(tmp_path / "h.h5", "r+") as file:
+    with h5py.File(tmp_path / "h.h5") as file:
         meta = json.loads(file.attrs["scene2spad"])
-        file.attrs["scene2spad"] = json.dumps({**meta, "schema": 2})
-    with pytest.raises(InputError, match="schema 2"):
-        read_histogram(tmp_path / "h.h5")
-    with h5py.File(tmp_path / "h.h5", "r+") as file:
-        file.attrs["scene2spad"] = json.dumps({**meta, "kind": "transient"})
-    with pytest.raises(InputError, match="expected a histogram"):
-        read_histogram(tmp_path / "h.h5")
+    slower = {**meta["sensor"], "bin_width_s": 2e-10, "period_s": 1024 * 2e-10}
+    for change, message in (
+        ({"schema": 2}, "schema 2"),
+        ({"kind": "transient"}, "holds a transient, expected a histogram"),
+        ({"sensor": slower}, "do not match"),
+        ({"sensor": {}}, "not a readable"),
+        ({"budget": {"signal": -1}}, "signal -1"),
+    ):
+        with h5py.File(tmp_path / "h.h5", "r+") as file:
+            file.attrs["scene2spad"] = json.dumps({**meta, **change})
+        with pytest.raises(InputError, match=message):
+            read_histogram(tmp_path / "h.h5")
     with h5py.File(tmp_path / "g.h5", "w") as file:
         file["x"] = 1
-    with pytest.raises(InputError, match="not a readable histogram"):
+    with pytest.raises(InputError, match="not a file of scene2spad"):
         read_histogram(tmp_path / "g.h5")
     with pytest.raises(InputError, match="not found"):
         read_histogram(tmp_path / "none.h5")

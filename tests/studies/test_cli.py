@@ -57,7 +57,8 @@ def test_render_sense_depth(capfd, folder):
         assert status == 0 and {"seconds", "mae_mm", "rmse_mm", "within_10mm", "unmixed", "out"} <= result.keys()
         assert result["unmixed"]["mae_mm"] < 400
     names = {path.name for path in folder.iterdir()}
-    assert {"living-room.png", "living-room-log-matched.exr", "living-room-fourier-16.png"} <= names
+    assert {"living-room.transient.png", "living-room.histogram.png", "living-room-fourier-16.depth.png"} <= names
+    assert "living-room-log-matched.exr" in names
     assert not any("part" in name for name in names)
 
 
@@ -137,6 +138,8 @@ def test_help_needs_neither_torch_nor_mitsuba():
         (["sense", "missing.exr", "--model", "magic"], "magic"),
         (["depth", "missing.h5"], "missing.h5"),
         (["depth", "missing.h5", "--method", "magic"], "magic"),
+        (["sense", ""], "file not found"),
+        (["depth", "."], "."),
         (["demo", "--signal", "-4"], "signal -4"),
         (["demo", "--seed", "-1", "--width", "8", "--height", "6"], "seed -1"),
     ],
@@ -154,7 +157,7 @@ def test_bad_files_end_in_one_line_and_leave_nothing(capfd, folder):
     (folder / "t.mtl").write_text("newmtl a\nmap_Kd missing.png\n")
     (folder / "broken.xml").write_text("<scene version='3.0.0'><shape type='sphere'>")
     (folder / "unknown.xml").write_text("<scene version='3.0.0'><shape type='teapotahedron'/></scene>")
-    (folder / "text.exr").write_text("no image")
+    (folder / "words.exr").write_text("no image")
     (folder / "text.h5").write_text("no histogram")
     before = sorted(path.name for path in folder.iterdir())
     for argv, said in (
@@ -164,9 +167,9 @@ def test_bad_files_end_in_one_line_and_leave_nothing(capfd, folder):
         (["render", "textured.obj"], "missing.png"),
         (["render", "broken.xml"], "broken.xml"),
         (["render", "unknown.xml"], "teapotahedron"),
-        (["sense", "text.exr"], "text.exr"),
+        (["sense", "words.exr"], "words.exr"),
         (["depth", "text.h5"], "text.h5"),
-        (["depth", "text.exr"], "text.exr"),
+        (["depth", "words.exr"], "words.exr"),
     ):
         assert said in refused(capfd, *argv)
     assert sorted(path.name for path in folder.iterdir()) == before
@@ -184,12 +187,40 @@ def test_truncated_files_end_in_one_line(capfd, folder):
     assert len(list(folder.iterdir())) == 4
 
 
+def test_other_files_are_not_overwritten(capfd, folder):
+    main(["render", "sphere", *SMALL, "--no-figure"])
+    main(["sense", "sphere.exr", "--no-figure"])
+    (folder / "notes.exr").write_text("mine")
+    (folder / "sphere.transient.png").mkdir()
+    capfd.readouterr()
+    transient = (folder / "sphere.exr").read_bytes()
+    assert "no depth" in refused(capfd, "depth", "sphere.h5", "--out", "sphere.exr")
+    assert "no transient" in refused(capfd, "render", "plane", *SMALL, "--out", "notes.exr")
+    assert "is a folder" in refused(capfd, "render", "sphere", *SMALL)
+    assert (folder / "sphere.exr").read_bytes() == transient and (folder / "notes.exr").read_text() == "mine"
+
+
+def test_json_holds_no_nan(capfd, folder):
+    main(["render", "sphere", *SMALL, "--no-figure"])
+    main(["sense", "sphere.exr", "--signal", "0", "--background", "0", "--no-figure"])
+    capfd.readouterr()
+    status, out, _ = run(capfd, "depth", "sphere.h5", "--json")
+    assert status == 0 and "NaN" not in out and json.loads(out)["mae_mm"] is None
+
+
+def test_tiny_and_partly_empty_images_are_drawn(capfd, folder):
+    for scene, width, height in (("sphere", 2, 2), ("plane", 1, 1), ("sphere", 5, 3)):
+        status, _, err = run(capfd, "demo", "--scene", scene, "--width", str(width), "--height", str(height))
+        assert status == 0, err
+
+
 def test_nothing_in_view_is_refused(capfd, folder):
     (folder / "dark.xml").write_text(
         "<scene version='3.0.0'><sensor type='perspective'><float name='fov' value='40'/></sensor>"
         "<shape type='sphere'><point name='center' x='0' y='0' z='-9'/></shape></scene>"
     )
-    assert "nothing in view" in refused(capfd, "render", "dark.xml", *SMALL)
+    status, out, err = run(capfd, "render", "dark.xml", *SMALL)
+    assert (status, out) == (2, "") and "nothing in view" in err and len(err.splitlines()) == 1
     assert [path.name for path in folder.iterdir()] == ["dark.xml"]
 
 
