@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 from xml.etree import ElementTree
 
 from scenes.errors import InputError
-from scenes.mitsuba_plugin import Plugin
 
 MAX_INCLUDES = 32
 NOTE_NAMES = 8
+
+Made = TypeVar("Made")
 
 
 class LocatedError(InputError):
@@ -50,7 +53,7 @@ class Document:
         self._ids: dict[str, ElementTree.Element] = {}
         self._defaults: dict[str, str] = {}
         self._sources: dict[ElementTree.Element, Path] = {}
-        self._plugins: dict[ElementTree.Element, Plugin] = {}
+        self._made: dict[ElementTree.Element, object] = {}
         root = _parse(path)
         if root.tag != "scene":
             raise LocatedError(f"{path}: the outermost element is <{root.tag}>, expected <scene>")
@@ -135,11 +138,11 @@ class Document:
             raise self.error(element, f"unknown id {name!r}, known: {_listed(sorted(self._ids)) or 'none'}")
         return self._ids[name]
 
-    def plugin(self, element: ElementTree.Element) -> Plugin:
-        """The one Plugin object of an element, so that references share it."""
-        if element not in self._plugins:
-            self._plugins[element] = Plugin(element, self)
-        return self._plugins[element]
+    def shared(self, element: ElementTree.Element, make: Callable[[], Made]) -> Made:
+        """What `make` makes of an element, once: all references to it share the one object."""
+        if element not in self._made:
+            self._made[element] = make()
+        return self._made[element]
 
     def file(self, element: ElementTree.Element, name: str, what: str) -> Path:
         """A file inside the scene's folder; anything else is refused, symbolic links followed."""

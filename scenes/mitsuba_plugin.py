@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from scenes.errors import InputError
+from scenes.mitsuba_nodes import Document
 from scenes.shapes import axis_frame
 from scenes.textures import luminance, srgb_to_linear
-
-if TYPE_CHECKING:
-    from scenes.errors import InputError
-    from scenes.mitsuba_nodes import Document
 
 COLOUR_TAGS = ("float", "integer", "rgb", "srgb", "spectrum")
 VALUE_TAGS = (*COLOUR_TAGS, "boolean", "string", "vector", "point", "blackbody", "transform")
@@ -30,6 +27,11 @@ class Plugin:
 
     Every reader takes a default; without one the value must be there.
     """
+
+    @classmethod
+    def of(cls, document: Document, element: Element) -> Plugin:
+        """The one Plugin object of an element, so that references share it."""
+        return document.shared(element, lambda: cls(element, document))
 
     def __init__(self, element: Element, document: Document) -> None:
         self.element = element
@@ -85,7 +87,7 @@ class Plugin:
         return self._inner(found[0]) if found else None
 
     def _inner(self, element: Element) -> Plugin:
-        plugin = self.document.plugin(element)
+        plugin = Plugin.of(self.document, element)
         plugin._owner = plugin._owner or self.name
         return plugin
 

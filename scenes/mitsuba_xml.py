@@ -47,7 +47,7 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
     found: dict[str, list[Plugin]] = {"shape": [], "sensor": [], "emitter": []}
     for element in document.elements:
         if element.tag in found:
-            found[element.tag].append(document.plugin(element))
+            found[element.tag].append(Plugin.of(document, element))
         elif element.tag in ("medium", "volume", "phase", "subsurface"):
             raise document.error(element, "is not supported, remove it")
         elif element.tag not in _DEFINITIONS:
