@@ -23,8 +23,7 @@ log = logging.getLogger(__name__)
 STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT = 10, 11, 12
 AMBIENT_SPP = 64
 AMBIENT_BOUNCES = 6
-# Direct light whose direct error is unknown costs nothing to check on the pilot's pixels: twice the cells a side.
-FINER = 2
+FINER = 2  # direct light is checked, on the pilot's pixels, against this many times the cells a side
 
 Progress = Callable[[str, float], None]
 

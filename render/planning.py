@@ -17,6 +17,7 @@ from scenes.model import Material
 DEFAULT_ERROR = 0.02
 # Squares of the parts must sum to less than 1; the rest is for merged returns and the pilot's own uncertainty.
 DIRECT_SHARE, MONTE_CARLO_SHARE = 0.4, 0.65
+MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 BATCHES = 16
 PILOT_PIXELS = 256
 PILOT_SPP = 64
@@ -56,9 +57,7 @@ def _limits(world: World) -> list[str]:
     materials: list[Material] = [surface.material for surface in world.scene.surfaces]
     said = []
     if world.has_glass:
-        said.append(
-            "glass: passed in a straight line with Fresnel loss and group delay; its own reflections are left out"
-        )
+        said.append("glass: passed in a straight line with Fresnel loss and delay; its own reflections are left out")
     if world.has_cutouts:
         said.append("cut-outs: solid where their opacity is 1/2 or more")
     if any(m.kind in ("conductor", "plastic") for m in materials):
@@ -72,10 +71,8 @@ def _target(settings: RenderSettings, fine: np.ndarray) -> tuple[float, str]:
     if settings.budget is not None:
         signal, background = settings.budget
         target = error_for_budget(fine, signal, background)
-        return (
-            target,
-            f"error target: {target:.2g}, 1 % of shot variance at {signal:g} + {background:g} photons a pixel",
-        )
+        why = f"error target: {target:.2g}, 1 % of shot variance at {signal:g} + {background:g} photons a pixel"
+        return target, why
     if settings.error is not None:
         return settings.error, f"error target: {settings.error:g}, as asked"
     return DEFAULT_ERROR, f"error target: {DEFAULT_ERROR:g}, the default"
@@ -102,14 +99,11 @@ def _indirect(
     if settings.bounces == 1:
         return 1, 0, ["indirect light: none, forced by 1 bounce"]
     if settings.bounces is None and mode == "scan":
-        return (
-            1,
-            0,
-            ["indirect light: left out with a scanning laser unless bounces ask for it; the error leaves it out"],
-        )
+        return 1, 0, ["indirect light: left out, also of the error, under a scanning laser unless bounces ask for it"]
     most = PILOT_BOUNCES if settings.bounces is None else settings.bounces
     per_batch = PILOT_SPP // BATCHES
-    batches = [concatenate(list(indirect_light(world, pixels, per_batch, most, seed + 1 + i))) for i in range(BATCHES)]
+    seeds = np.random.SeedSequence(seed).generate_state(BATCHES)
+    batches = [concatenate(list(indirect_light(world, pixels, per_batch, most, int(s)))) for s in seeds]
     energy = np.zeros(most + 1)
     energy[1] = fine.sum()
     for batch in batches:
@@ -119,7 +113,7 @@ def _indirect(
     whys = []
     bounces = settings.bounces
     if bounces is None:
-        bounces, left_out = _bounces(energy, target / 3)
+        bounces, left_out = _bounces(energy, min(target / 3, MOST_LEFT_OUT))
         share = energy[2:].sum() / energy.sum()
         whys.append(
             f"bounces: {bounces}; indirect light is {share:.2%} of the energy, {left_out:.2%} is left out beyond"
@@ -127,7 +121,7 @@ def _indirect(
     else:
         whys.append(f"bounces: {bounces}, forced")
     if bounces == 1:
-        return 1, 0, [*whys, "indirect light: none, what it adds is under a third of the error target"]
+        return 1, 0, [*whys, "indirect light: none, what it adds is less than may be left out"]
     if settings.spp is not None:
         spp = _whole_batches(settings.spp)
         return bounces, spp, [*whys, f"indirect light: {spp} paths a pixel, forced"]

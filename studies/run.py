@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from csph import CodingTensor, decode_depth, encode, truncated_fourier
-from render.engine import render
+from render.engine import Progress, render
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
 from scenes import Camera, InputError, Laser, Scene
@@ -28,7 +28,6 @@ from spad.sensor import PhotonBudget, sensor_by_name
 from studies import commands, figures
 
 log = logging.getLogger("scene2spad")
-Progress = Callable[[str, float], None]
 
 
 def _input(path: Path) -> Path:
