@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 from scenes.errors import InputError
+from scenes.files import silenced
 
 log = logging.getLogger(__name__)
 
@@ -72,15 +73,16 @@ def start_mitsuba() -> ModuleType:
         if library is not None:
             os.environ[PATH_VARIABLE] = str(library)
             log.debug("LLVM: %s", library)
-    import drjit as dr
-    import mitsuba as mi
+    try:
+        with silenced():  # Dr.Jit prints lines of its own before it raises
+            import drjit as dr
+            import mitsuba as mi
 
-    if mi.variant() != VARIANT:
-        try:
-            mi.set_variant(VARIANT)
-        except ImportError as error:
-            reason = " ".join(str(error).split())[:160]
-            raise InputError(f"Mitsuba finds no usable LLVM ({reason}); {REMEDY}") from None
+            if mi.variant() != VARIANT:
+                mi.set_variant(VARIANT)
+    except ImportError as error:
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(f"Mitsuba finds no usable LLVM ({reason}); {REMEDY}") from None
     check_llvm_version(tuple(dr.detail.llvm_version()))
     mi.set_log_level(mi.LogLevel.Error)
     return mi

@@ -6,20 +6,14 @@ One render serves every sensor: nothing here is tied to a bin width. The file is
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
-import io
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from scenes.errors import InputError
-from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
 
 RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bounces": "bounces"}
 LAYER_CHANNELS = ("depth", "normal.X", "normal.Y", "normal.Z", "albedo", "ambient", "mixed", "error")
@@ -190,7 +184,7 @@ def read_transient(path: Path) -> Transient:
         raise InputError(f"{path}: file not found")
     try:
         # OpenEXR reports damage on stdout and returns what it could read
-        with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
+        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = {part.name(): part for part in file.parts}
             headers = {name: dict(part.header) for name, part in parts.items()}
             channels = {name: {k: c.pixels for k, c in part.channels.items()} for name, part in parts.items()}
@@ -237,23 +231,3 @@ def _assemble(deep: dict[str, np.ndarray], flat: dict[str, np.ndarray]) -> Trans
         mixed=flat["mixed"].astype(bool),
         error=flat["error"],
     )
-
-
-@contextmanager
-def _silenced() -> Iterator[None]:
-    """Send what Python and C code print to stdout and stderr to nowhere."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    saved = os.dup(1), os.dup(2)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        os.dup2(nowhere, 2)
-        with redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        ctypes.CDLL(None).fflush(None)  # what C still holds in its buffers belongs to nowhere too
-        for descriptor, copy in enumerate(saved, start=1):
-            os.dup2(copy, descriptor)
-            os.close(copy)
-        os.close(nowhere)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
+import io
 import json
 import os
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 
 from scenes.errors import InputError
@@ -72,3 +75,23 @@ def check_seal(body: dict, sha256: str, arrays_sha256: str) -> dict:
 
 def _digest(body: dict, arrays_sha256: str) -> str:
     return hashlib.sha256((json.dumps(body, sort_keys=True) + arrays_sha256).encode()).hexdigest()
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Send what Python and C code print to stdout and stderr to nowhere."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = os.dup(1), os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # what C still holds in its buffers belongs to nowhere too
+        for descriptor, copy in enumerate(saved, start=1):
+            os.dup2(copy, descriptor)
+            os.close(copy)
+        os.close(nowhere)

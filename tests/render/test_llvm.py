@@ -74,7 +74,7 @@ def test_no_llvm_at_all_is_one_line():
     code = START.replace("try:", "import render.llvm\nrender.llvm.choose_llvm = lambda: None\ntry:", 1)
     done = run(code, DRJIT_LIBLLVM_PATH="/nowhere/libLLVM.so")
     assert done.returncode == 0 and done.stdout.startswith("refused: "), done.stderr
-    assert len(done.stdout.splitlines()) == 1
+    assert len(done.stdout.splitlines()) == 1 and done.stderr == ""
 
 
 def test_explicit_variable_wins_over_the_wheel(monkeypatch, tmp_path):
