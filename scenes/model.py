@@ -78,12 +78,13 @@ def _number(value: object, what: str) -> float:
     return float(value)
 
 
-def _check_fraction(value: float | Texture, what: str) -> None:
-    """A number or texture that must lie in [0, 1], as a reflectance or an opacity does."""
+def _fraction(value: float | Texture, what: str) -> float | Texture:
+    """`value`, a number or a texture, if it lies in [0, 1], as a reflectance or an opacity does."""
     if not isinstance(value, Texture):
         value = _number(value, what)
     low, high = (value.image.min(), value.image.max()) if isinstance(value, Texture) else (value, value)
     _require(bool(low >= 0 and high <= 1), f"{what}: {low:g} to {high:g} is outside [0, 1]")
+    return value
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +115,8 @@ class Material:
         _require(
             self.kind in MATERIAL_KINDS, f"{where}: kind {self.kind!r}, expected one of {', '.join(MATERIAL_KINDS)}"
         )
-        _check_fraction(self.albedo, f"{where}: albedo")
-        _check_fraction(self.specular, f"{where}: specular reflectance")
-        _check_fraction(self.opacity, f"{where}: opacity")
+        for label in ("albedo", "specular", "opacity"):
+            object.__setattr__(self, label, _fraction(getattr(self, label), f"{where}: {label}"))
         for label in ("roughness", "ior", "eta", "k"):
             object.__setattr__(self, label, _number(getattr(self, label), f"{where}: {label}"))
         _require(0 < self.roughness <= 1, f"{where}: roughness {self.roughness:g} is outside (0, 1]")
@@ -176,9 +176,8 @@ class Surface:
         _require(
             self.uv is not None or not textured, f"{where}: its material has a texture, the mesh no uv coordinates"
         )
-        _require(
-            math.isfinite(self.emission) and self.emission >= 0, f"{where}: emission {self.emission:g} is negative"
-        )
+        object.__setattr__(self, "emission", _number(self.emission, f"{where}: emission"))
+        _require(self.emission >= 0, f"{where}: emission {self.emission:g} is negative")
 
 
 @dataclass(frozen=True, eq=False)
