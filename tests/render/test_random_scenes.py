@@ -1,4 +1,4 @@
-"""Random scenes, materials, cameras and lasers: nothing crashes, nothing is NaN, negative or infinite on the way to depth."""
+"""Random scenes, materials, cameras and lasers: nothing crashes, nothing is NaN, negative or infinite, up to depth."""
 
 import warnings
 
