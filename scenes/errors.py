@@ -3,3 +3,6 @@
 
 class InputError(ValueError):
     """Bad input, in one line that names value, limit and place. The command line prints it and exits with 2."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(str(message).split()))

@@ -25,19 +25,20 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises InputError in one line when the folder is missing, the disk is full, or writing is not allowed.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: folder {path.parent} does not exist")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, expected a file name")
     # the suffix stays last: some libraries choose the format by it
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    beside = path.with_name(f".{path.stem[:100]}.{os.getpid()}.part{path.suffix}")
     try:
-        yield beside
-        beside.replace(path)
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: folder {path.parent} does not exist")
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder, expected a file name")
+        try:
+            yield beside
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or str(error).splitlines()[0]})") from None
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def seal(meta: dict, kind: str, arrays_sha256: str) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 
 from scenes import shapes
 from scenes.errors import InputError
-from scenes.model import Camera, Material, Scene, Surface, Texture
+from scenes.model import Camera, Material, Scene, Surface, Texture, check_faces
 from scenes.textures import load_texture, luminance, srgb_to_linear
 
 EXTENSIONS = (".obj", ".ply", ".stl", ".glb")
@@ -154,6 +154,7 @@ def _part(mesh: Any, pose: np.ndarray, name: str) -> _Part | None:
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise InputError(f"vertices of {name} are not x y z")
+    check_faces(faces, len(vertices), name)
     bad = int((~np.isfinite(vertices).all(axis=1)).sum())
     if bad:
         raise InputError(f"{bad} of {len(vertices)} vertices of {name} are NaN or infinite")
@@ -311,17 +312,24 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, _Entry]:
     trimesh reads the library too, but silently drops such textures and rounds Kd to 8 bits.
     """
     text = path.read_text(encoding="utf-8", errors="replace")
-    named = next((line.split(maxsplit=1)[1].strip() for line in text.splitlines() if line.startswith("mtllib ")), None)
-    if named is None:
+    lines = [line.split(maxsplit=1) for line in text.splitlines() if line.startswith("mtllib")]
+    named = [words[1].strip() for words in lines if len(words) == 2 and words[0] == "mtllib"]
+    if not named:
         return {}
-    library = path.parent / named.replace("\\", "/")
+    if len(named) > 1:
+        notes.append(f"of {len(named)} material files only {named[0]} is read")
+    library = path.parent / named[0].replace("\\", "/")
     if not library.is_file():
-        notes.append(f"material file {named} not found")
+        notes.append(f"material file {named[0]} not found")
         return {}
+    return _read_library(library)
+
+
+def _read_library(library: Path) -> dict[str, _Entry]:
     entries: dict[str, _Entry] = {}
     name = ""
     for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
-        key, _, rest = line.strip().partition(" ")
+        key, rest = (*line.split(maxsplit=1), "", "")[:2]
         if key.lower() == "newmtl":
             name = " ".join(rest.split())
             entries[name] = _Entry()

@@ -10,7 +10,8 @@ from xml.etree import ElementTree
 
 from scenes.errors import InputError
 
-MAX_INCLUDES = 32
+MAX_INCLUDES = 256
+MAX_VALUE = 65536
 NOTE_NAMES = 8
 
 Made = TypeVar("Made")
@@ -54,6 +55,7 @@ class Document:
         self._defaults: dict[str, str] = {}
         self._sources: dict[ElementTree.Element, Path] = {}
         self._made: dict[ElementTree.Element, object] = {}
+        self._includes = 0
         root = _parse(path)
         if root.tag != "scene":
             raise LocatedError(f"{path}: the outermost element is <{root.tag}>, expected <scene>")
@@ -94,14 +96,18 @@ class Document:
 
         for key, text in element.items():
             if "$" in text:
-                element.set(key, re.sub(r"\$(\w+)", value, text))
+                filled = re.sub(r"\$(\w+)", value, text)
+                if len(filled) > MAX_VALUE:
+                    raise self.error(element, f"{key} grows over {MAX_VALUE} characters by its $names")
+                element.set(key, filled)
 
     def _include(self, element: ElementTree.Element, stack: tuple[Path, ...]) -> None:
         path = self.file(element, self.need(element, "filename"), "included file")
         if path.resolve() in stack:
             raise self.error(element, f"{path.name} includes itself")
-        if len(stack) > MAX_INCLUDES:
-            raise self.error(element, f"includes are nested more than {MAX_INCLUDES} deep")
+        self._includes += 1
+        if self._includes > MAX_INCLUDES:
+            raise self.error(element, f"there are more than {MAX_INCLUDES} includes")
         root = _parse(path)
         if root.tag != "scene":
             raise LocatedError(f"{path}: the outermost element is <{root.tag}>, expected <scene>")

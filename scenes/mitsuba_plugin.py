@@ -166,7 +166,9 @@ class Plugin:
         text = self.document.need(element, "value").strip()
         if element.tag == "spectrum" and ":" in text:
             pairs = [self.numbers(pair.replace(":", " "), name, 2) for pair in re.split(r"[\s,]+", text) if pair]
-            return float(np.mean([value for _, value in pairs]))
+            wavelength, value = np.array(sorted(map(tuple, pairs))).T
+            span = wavelength[-1] - wavelength[0]
+            return float(np.trapezoid(value, wavelength) / span if span > 0 else value.mean())
         if element.tag in ("rgb", "srgb"):
             encoded = element.tag == "srgb" or text.startswith("#")
             rgb = self._hex(name, text) if text.startswith("#") else self.numbers(text, name, 1, 3)

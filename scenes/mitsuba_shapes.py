@@ -15,7 +15,7 @@ from scenes.errors import InputError
 from scenes.mitsuba_bsdf import Look, Materials
 from scenes.mitsuba_nodes import Document
 from scenes.mitsuba_plugin import Plugin
-from scenes.model import Surface
+from scenes.model import Surface, check_faces
 
 # At 128 segments a disk's area is 4e-4 too small, at 5 subdivisions a sphere's 3e-4: under the 1e-3 that is promised.
 SEGMENTS = 128
@@ -103,6 +103,7 @@ class Shapes:
         mesh = self._files[key]
         if len(mesh.faces) == 0:
             raise plugin.fail(f"{filename}: holds no triangles")
+        check_faces(mesh.faces, len(mesh.vertices), str(path))
         return mesh
 
 

@@ -41,6 +41,12 @@ def _frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what:
     return array
 
 
+def check_faces(faces: np.ndarray, vertices: int, where: str) -> None:
+    """InputError if a face refers to a vertex that is not there."""
+    worst = faces.min() if faces.min() < 0 else faces.max()
+    _require(0 <= worst < vertices, f"{where}: a face refers to vertex {worst}, expected 0 to {vertices - 1}")
+
+
 def rigid_pose(value: object, what: str) -> np.ndarray:
     """`value` as a read-only 4x4 rotation and translation (camera or environment to world); a reflection is refused."""
     pose = _frozen_array(value, np.float64, (4, 4), what)
@@ -159,9 +165,7 @@ class Surface:
         _require(len(faces) > 0 and len(vertices) > 0, f"{where}: has no faces")
         bad = int((~np.isfinite(vertices).all(axis=1)).sum())
         _require(bad == 0, f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
-        in_range = faces.min() >= 0 and faces.max() < len(vertices)
-        worst = faces.min() if faces.min() < 0 else faces.max()
-        _require(bool(in_range), f"{where}: a face refers to vertex {worst}, expected 0 to {len(vertices) - 1}")
+        check_faces(faces, len(vertices), where)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
         for label, width in (("uv", 2), ("normals", 3)):
@@ -352,7 +356,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
-        object.__setattr__(self, "notes", tuple(self.notes))
+        object.__setattr__(self, "notes", tuple(" ".join(note.split()) for note in self.notes))
         _require(len(self.surfaces) > 0, f"scene {self.name}: has no surfaces")
 
     @property

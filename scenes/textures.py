@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from scenes.errors import InputError
+from scenes.files import silenced
 from scenes.model import Texture
 
-MAX_PIXELS = 1 << 28
+MAX_PIXELS = 1 << 26
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:
     """Rec. 709 luminance of linear RGB (..., 3): the one number this project keeps of a colour."""
-    return np.asarray(rgb)[..., :3] @ np.array([0.2126, 0.7152, 0.0722])
+    rgb = np.asarray(rgb)[..., :3]
+    return rgb @ np.array([0.2126, 0.7152, 0.0722], dtype=np.result_type(rgb, np.float32))
 
 
 def srgb_to_linear(value: np.ndarray) -> np.ndarray:
@@ -42,7 +45,7 @@ def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise InputError(f"{path}: {image.width} x {image.height} pixels is over the limit of {MAX_PIXELS}")
             if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV", "1"):
@@ -55,14 +58,19 @@ def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
         raise InputError(f"{path}: not an image this reader knows (.png .jpg .bmp .tga .tif .exr)") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: broken image file ({str(error).splitlines()[0]})") from None
-    full_scale = (
-        np.iinfo(values.dtype).max if values.dtype in (np.uint8, np.uint16) else 65535 if bands == ("I",) else 1
-    )
-    values = values.reshape(values.shape[0], values.shape[1], -1) / full_scale
-    if channel == "alpha" and bands[-1] == "A":
-        return values[..., -1]
-    if not linear:
-        values = srgb_to_linear(values)
+    values = values.reshape(*values.shape[:2], -1)
+    alpha = channel == "alpha" and bands[-1] == "A"
+    values = values[..., -1:] if alpha else values[..., :3]
+    if values.dtype in (np.uint8, np.uint16):
+        # by table, in float32: a large image must not become many times its size
+        levels = np.arange(np.iinfo(values.dtype).max + 1) / np.iinfo(values.dtype).max
+        table = (levels if linear or alpha else srgb_to_linear(levels)).astype(np.float32)
+        values = table[values]
+    else:
+        values = values / (65535 if bands == ("I",) else 1)
+        values = values if linear or alpha else srgb_to_linear(values)
+    if alpha:
+        return values[..., 0]
     return luminance(values) if len(bands) >= 3 else values[..., 0]
 
 
@@ -70,7 +78,7 @@ def _exr_pixels(path: Path, channel: str) -> np.ndarray:
     import OpenEXR
 
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
             pixels = {name: np.asarray(part.pixels, np.float64) for name, part in file.channels().items()}
     except Exception as error:  # OpenEXR raises bare exceptions of its own
         raise InputError(f"{path}: broken EXR file ({(str(error).splitlines() or ['no reason given'])[0]})") from None

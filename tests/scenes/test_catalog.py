@@ -115,3 +115,40 @@ def test_no_mesh_library_is_loaded_for_a_named_scene():
     heavy = ["trimesh", "mitsuba", "torch", "drjit", "PIL"]
     result = subprocess.run([sys.executable, "-c", program % heavy], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("face", ["3 0 1 9", "3 0 1 -1"])
+def test_faces_that_refer_to_nothing_are_refused_in_one_line(tmp_path, face):
+    ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    ply += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+    (tmp_path / "odd.ply").write_text(ply + face + "\n")
+    shape = "<shape type='ply'><string name='filename' value='odd.ply'/></shape>"
+    camera = "<sensor type='perspective'><float name='fov' value='40'/></sensor>"
+    (tmp_path / "odd.xml").write_text(f"<scene version='3.0.0'>{camera}{shape}</scene>")
+    for name in ("odd.ply", "odd.xml"):
+        with pytest.raises(InputError, match="refers to vertex"):
+            load_scene(str(tmp_path / name))
+
+
+def test_small_files_do_not_become_large_work(tmp_path):
+    """Includes that double and defaults that multiply end in one line."""
+    for level in range(12):
+        twice = f"<include filename='i{level + 1}.xml'/>" * 2
+        (tmp_path / f"i{level}.xml").write_text(f"<scene version='3.0.0'>{twice}</scene>")
+    (tmp_path / "i12.xml").write_text("<scene version='3.0.0'></scene>")
+    with pytest.raises(InputError, match="more than 256 includes"):
+        load_scene(str(tmp_path / "i0.xml"))
+    grows = "".join(f"<default name='a{i + 1}' value='{f'$a{i} ' * 10}'/>" for i in range(9))
+    (tmp_path / "grow.xml").write_text(f"<scene version='3.0.0'><default name='a0' value='x'/>{grows}</scene>")
+    with pytest.raises(InputError, match="characters"):
+        load_scene(str(tmp_path / "grow.xml"))
+
+
+def test_a_material_library_with_tabs_is_read_and_a_second_one_is_noted(tmp_path):
+    (tmp_path / "one.mtl").write_text("newmtl\ta\nKd\t1 1 1\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+    (tmp_path / "m.obj").write_text(f"mtllib one.mtl\nmtllib two.mtl\n{corners}usemtl a\nf 1 2 3\n")
+    scene = load_scene(str(tmp_path / "m.obj"))
+    assert scene.surfaces[0].material.albedo == 1 and any("only one.mtl is read" in note for note in scene.notes)
+    (tmp_path / "m.obj").write_text(f"mtllib \n{corners}f 1 2 3\n")
+    assert load_scene(str(tmp_path / "m.obj")).surfaces[0].material.albedo == 0.6

@@ -446,7 +446,7 @@ AIR = 1.000277
         ('<rgb name="reflectance" value="#808080"/>', float(srgb_to_linear(128 / 255))),
         ('<srgb name="reflectance" value="0.5 0.5 0.5"/>', float(srgb_to_linear(0.5))),
         ('<spectrum name="reflectance" value="0.25"/>', 0.25),
-        ('<spectrum name="reflectance" value="400:0.1, 500:0.2 600:0.6"/>', 0.3),
+        ('<spectrum name="reflectance" value="400:0.1, 500:0.2 600:0.6"/>', 0.275),
         ('<float name="reflectance" value="0.7"/>', 0.7),
         ("", 0.5),
     ],
