@@ -6,3 +6,9 @@ class InputError(ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__(" ".join(str(message).split()))
+
+
+def require(condition: bool, message: str) -> None:
+    """InputError with `message` unless `condition` holds."""
+    if not condition:
+        raise InputError(message)

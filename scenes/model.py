@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 
 MaterialKind = Literal[
     "diffuse", "roughdiffuse", "plastic", "roughplastic", "conductor", "roughconductor", "dielectric", "thindielectric"
@@ -24,11 +24,6 @@ MATERIAL_KINDS: tuple[str, ...] = MaterialKind.__args__
 LASER_MODES: tuple[str, ...] = LaserMode.__args__
 
 
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise InputError(message)
-
-
 def _frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: str) -> np.ndarray:
     """`value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError."""
     try:
@@ -36,7 +31,7 @@ def _frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what:
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what}: not an array of numbers ({error})") from None
     tail = array.shape[array.ndim - len(shape_tail) :] if array.ndim >= len(shape_tail) else None
-    _require(tail == shape_tail, f"{what}: shape {array.shape}, expected (..., {', '.join(map(str, shape_tail))})")
+    require(tail == shape_tail, f"{what}: shape {array.shape}, expected (..., {', '.join(map(str, shape_tail))})")
     array.setflags(write=False)
     return array
 
@@ -44,17 +39,17 @@ def _frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what:
 def check_faces(faces: np.ndarray, vertices: int, where: str) -> None:
     """InputError if a face refers to a vertex that is not there."""
     worst = faces.min() if faces.min() < 0 else faces.max()
-    _require(0 <= worst < vertices, f"{where}: a face refers to vertex {worst}, expected 0 to {vertices - 1}")
+    require(0 <= worst < vertices, f"{where}: a face refers to vertex {worst}, expected 0 to {vertices - 1}")
 
 
 def rigid_pose(value: object, what: str) -> np.ndarray:
     """`value` as a read-only 4x4 rotation and translation (camera or environment to world); a reflection is refused."""
     pose = _frozen_array(value, np.float64, (4, 4), what)
-    _require(pose.ndim == 2 and bool(np.isfinite(pose).all()), f"{what}: needs 4x4 finite numbers")
+    require(pose.ndim == 2 and bool(np.isfinite(pose).all()), f"{what}: needs 4x4 finite numbers")
     rotation = pose[:3, :3]
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
-    _require(orthonormal, f"{what}: the upper 3x3 block is not a rotation")
-    _require(np.allclose(pose[3], (0, 0, 0, 1)), f"{what}: the last row is {pose[3].tolist()}, expected 0 0 0 1")
+    require(orthonormal, f"{what}: the upper 3x3 block is not a rotation")
+    require(np.allclose(pose[3], (0, 0, 0, 1)), f"{what}: the last row is {pose[3].tolist()}, expected 0 0 0 1")
     return pose
 
 
@@ -70,9 +65,9 @@ class Texture:
 
     def __post_init__(self) -> None:
         image = np.array(self.image, dtype=np.float32, order="C")
-        _require(image.ndim == 2 and image.size > 0, f"texture {self.name}: shape {image.shape}, expected (h, w)")
-        _require(bool(np.isfinite(image).all()), f"texture {self.name}: holds NaN or infinite values")
-        _require(bool(image.min() >= 0), f"texture {self.name}: negative value {image.min():g}")
+        require(image.ndim == 2 and image.size > 0, f"texture {self.name}: shape {image.shape}, expected (h, w)")
+        require(bool(np.isfinite(image).all()), f"texture {self.name}: holds NaN or infinite values")
+        require(bool(image.min() >= 0), f"texture {self.name}: negative value {image.min():g}")
         image.setflags(write=False)
         object.__setattr__(self, "image", image)
 
@@ -80,7 +75,7 @@ class Texture:
 def _number(value: object, what: str) -> float:
     """`value` as a finite float, or an InputError."""
     good = isinstance(value, (int, float, np.number)) and math.isfinite(value)
-    _require(good, f"{what} {value!r} is not a finite number")
+    require(good, f"{what} {value!r} is not a finite number")
     return float(value)
 
 
@@ -89,7 +84,7 @@ def _fraction(value: float | Texture, what: str) -> float | Texture:
     if not isinstance(value, Texture):
         value = _number(value, what)
     low, high = (value.image.min(), value.image.max()) if isinstance(value, Texture) else (value, value)
-    _require(bool(low >= 0 and high <= 1), f"{what}: {low:g} to {high:g} is outside [0, 1]")
+    require(bool(low >= 0 and high <= 1), f"{what}: {low:g} to {high:g} is outside [0, 1]")
     return value
 
 
@@ -118,17 +113,17 @@ class Material:
 
     def __post_init__(self) -> None:
         where = f"material {self.name}"
-        _require(
+        require(
             self.kind in MATERIAL_KINDS, f"{where}: kind {self.kind!r}, expected one of {', '.join(MATERIAL_KINDS)}"
         )
         for label in ("albedo", "specular", "opacity"):
             object.__setattr__(self, label, _fraction(getattr(self, label), f"{where}: {label}"))
         for label in ("roughness", "ior", "eta", "k"):
             object.__setattr__(self, label, _number(getattr(self, label), f"{where}: {label}"))
-        _require(0 < self.roughness <= 1, f"{where}: roughness {self.roughness:g} is outside (0, 1]")
-        _require(1 < self.ior <= 5, f"{where}: index of refraction {self.ior:g} is outside (1, 5]")
+        require(0 < self.roughness <= 1, f"{where}: roughness {self.roughness:g} is outside (0, 1]")
+        require(1 < self.ior <= 5, f"{where}: index of refraction {self.ior:g} is outside (1, 5]")
         for label in ("eta", "k"):
-            _require(getattr(self, label) >= 0, f"{where}: conductor {label} {getattr(self, label):g} is negative")
+            require(getattr(self, label) >= 0, f"{where}: conductor {label} {getattr(self, label):g} is negative")
 
     @property
     def is_glass(self) -> bool:
@@ -161,10 +156,10 @@ class Surface:
         where = f"mesh {self.name}"
         vertices = _frozen_array(self.vertices, np.float64, (3,), f"{where}: vertices")
         faces = _frozen_array(self.faces, np.int64, (3,), f"{where}: faces")
-        _require(vertices.ndim == 2 and faces.ndim == 2, f"{where}: vertices and faces must be tables of three columns")
-        _require(len(faces) > 0 and len(vertices) > 0, f"{where}: has no faces")
+        require(vertices.ndim == 2 and faces.ndim == 2, f"{where}: vertices and faces must be tables of three columns")
+        require(len(faces) > 0 and len(vertices) > 0, f"{where}: has no faces")
         bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-        _require(bad == 0, f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
+        require(bad == 0, f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
         check_faces(faces, len(vertices), where)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
@@ -173,15 +168,13 @@ class Surface:
             if value is None:
                 continue
             array = _frozen_array(value, np.float64, (width,), f"{where}: {label}")
-            _require(len(array) == len(vertices), f"{where}: {len(array)} {label} for {len(vertices)} vertices")
-            _require(bool(np.isfinite(array).all()), f"{where}: {label} hold NaN or infinite values")
+            require(len(array) == len(vertices), f"{where}: {len(array)} {label} for {len(vertices)} vertices")
+            require(bool(np.isfinite(array).all()), f"{where}: {label} hold NaN or infinite values")
             object.__setattr__(self, label, array)
         textured = isinstance(self.material.albedo, Texture) or isinstance(self.material.opacity, Texture)
-        _require(
-            self.uv is not None or not textured, f"{where}: its material has a texture, the mesh no uv coordinates"
-        )
+        require(self.uv is not None or not textured, f"{where}: its material has a texture, the mesh no uv coordinates")
         object.__setattr__(self, "emission", _number(self.emission, f"{where}: emission"))
-        _require(self.emission >= 0, f"{where}: emission {self.emission:g} is negative")
+        require(self.emission >= 0, f"{where}: emission {self.emission:g} is negative")
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +191,10 @@ class Camera:
         for label, value in (("width", self.width), ("height", self.height)):
             value = _number(value, f"camera {label}")
             good = value == int(value) and 1 <= value <= 16384
-            _require(good, f"camera {label} {value:g} is outside 1 to 16384 whole pixels")
+            require(good, f"camera {label} {value:g} is outside 1 to 16384 whole pixels")
             object.__setattr__(self, label, int(value))
         object.__setattr__(self, "fov_deg", _number(self.fov_deg, "camera fov"))
-        _require(0.01 <= self.fov_deg <= 170, f"camera fov {self.fov_deg:g} degrees is outside 0.01 to 170")
+        require(0.01 <= self.fov_deg <= 170, f"camera fov {self.fov_deg:g} degrees is outside 0.01 to 170")
 
     @classmethod
     def look_at(
@@ -219,9 +212,7 @@ class Camera:
         forward = target - origin
         right = np.cross(forward, up)
         far_enough = np.linalg.norm(forward) > 1e-9 and np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward)
-        _require(
-            bool(far_enough), f"camera at {origin.tolist()} cannot look at {target.tolist()} with up {up.tolist()}"
-        )
+        require(bool(far_enough), f"camera at {origin.tolist()} cannot look at {target.tolist()} with up {up.tolist()}")
         forward = forward / np.linalg.norm(forward)
         right = right / np.linalg.norm(right)
         pose = np.eye(4)
@@ -289,15 +280,13 @@ class Laser:
     cone_deg: float | None = None
 
     def __post_init__(self) -> None:
-        _require(self.mode in LASER_MODES, f"laser mode {self.mode!r}, expected one of {', '.join(LASER_MODES)}")
+        require(self.mode in LASER_MODES, f"laser mode {self.mode!r}, expected one of {', '.join(LASER_MODES)}")
         baseline = tuple(float(v) for v in self.baseline_m)
-        _require(
-            len(baseline) == 3 and all(map(math.isfinite, baseline)), f"laser baseline {baseline} is not 3 numbers"
-        )
+        require(len(baseline) == 3 and all(map(math.isfinite, baseline)), f"laser baseline {baseline} is not 3 numbers")
         object.__setattr__(self, "baseline_m", baseline)
         good = self.cone_deg is None or 0 < self.cone_deg <= 360
-        _require(good, f"laser cone {self.cone_deg} degrees is outside (0, 360]")
-        _require(self.cone_deg is None or self.mode == "flood", f"laser mode {self.mode}: a cone is for flood only")
+        require(good, f"laser cone {self.cone_deg} degrees is outside (0, 360]")
+        require(self.cone_deg is None or self.mode == "flood", f"laser mode {self.mode}: a cone is for flood only")
 
     @property
     def is_colocated(self) -> bool:
@@ -337,9 +326,9 @@ class Ambient:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "radiance", _number(self.radiance, "ambient radiance"))
-        _require(self.radiance >= 0, f"ambient radiance {self.radiance:g} is negative")
+        require(self.radiance >= 0, f"ambient radiance {self.radiance:g} is negative")
         both = self.environment is not None and self.radiance > 0
-        _require(not both, "ambient light is either a constant radiance or an environment map, not both")
+        require(not both, "ambient light is either a constant radiance or an environment map, not both")
         object.__setattr__(self, "pose", rigid_pose(self.pose, "environment pose"))
 
 
@@ -357,7 +346,7 @@ class Scene:
     def __post_init__(self) -> None:
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
         object.__setattr__(self, "notes", tuple(" ".join(note.split()) for note in self.notes))
-        _require(len(self.surfaces) > 0, f"scene {self.name}: has no surfaces")
+        require(len(self.surfaces) > 0, f"scene {self.name}: has no surfaces")
 
     @property
     def triangles(self) -> int:

@@ -91,10 +91,8 @@ def signal_per_bin(transient: Transient, sensor: Sensor, pixels: slice, device: 
     near = column(transient.path_near_m) / SPEED_OF_LIGHT_M_PER_S
     length = column(transient.path_far_m) / SPEED_OF_LIGHT_M_PER_S - near
     energy = column(transient.radiance)
-    owner = torch.from_numpy(np.repeat(np.arange(count), np.diff(transient.offsets[pixels.start : pixels.stop + 1])))
-
-    owner = owner.to(device)
-
+    sizes = np.diff(transient.offsets[pixels.start : pixels.stop + 1])
+    owner = torch.from_numpy(np.repeat(np.arange(count), sizes)).to(device)
     width, reach = sensor.bin_width_s, sensor.pulse.reach_s
     start = torch.floor((near - reach) / width).long()
     bins = torch.ceil((near + length + reach) / width).long() - start

@@ -80,7 +80,7 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
     meta = {**histogram.meta, "sensor": histogram.sensor.to_dict(), "budget": histogram.budget.to_dict()}
     packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     buffer = io.BytesIO()  # HDF5 itself does not survive a full disk
-    with h5py.File(buffer, "w") as file:
+    with h5py.File(buffer, "w", libver="latest") as file:  # older layouts hold no metadata over 64 kB
         file.attrs[ATTRIBUTE] = seal(meta, "histogram", histogram.sha256())
         if int(histogram.counts.sum(dtype=np.int64)) * 2 < histogram.counts.nbytes:
             stamps, offsets = histogram.timestamps()

@@ -6,12 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, REFERENCE_PULSE_SIGMA_S, SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise InputError(message)
+from scenes.errors import require
 
 
 @dataclass(frozen=True)
@@ -25,7 +20,7 @@ class Pulse:
 
     def __post_init__(self) -> None:
         good = math.isfinite(self.sigma_s) and 0 < self.sigma_s < 1e-3
-        _require(good, f"pulse sigma {self.sigma_s:g} s is outside (0, 1e-3)")
+        require(good, f"pulse sigma {self.sigma_s:g} s is outside (0, 1e-3)")
 
     @property
     def fwhm_s(self) -> float:
@@ -58,22 +53,22 @@ class Sensor:
     def __post_init__(self) -> None:
         where = f"sensor {self.name}"
         in_range = int(self.bins) == self.bins and 1 <= self.bins <= 65536
-        _require(in_range, f"{where}: {self.bins} bins is outside 1 to 65536")
+        require(in_range, f"{where}: {self.bins} bins is outside 1 to 65536")
         width = self.bin_width_s
-        _require(
+        require(
             math.isfinite(width) and 1e-15 <= width <= 1e-3, f"{where}: bin width {width:g} s is outside 1e-15 to 1e-3"
         )
         if self.period_s is None:
             object.__setattr__(self, "period_s", self.bins * width)
         ratio = self.period_s / width
         whole = math.isfinite(ratio) and abs(ratio - round(ratio)) < 1e-6 * ratio and round(ratio) >= self.bins
-        _require(whole, f"{where}: period {self.period_s:g} s is not a whole number of bin widths, {self.bins} or more")
-        _require(
+        require(whole, f"{where}: period {self.period_s:g} s is not a whole number of bin widths, {self.bins} or more")
+        require(
             math.isfinite(self.exposure_s) and self.exposure_s >= self.period_s,
             f"{where}: exposure {self.exposure_s:g} s is shorter than the period {self.period_s:g} s",
         )
         rate = self.dark_count_rate_hz
-        _require(math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite")
+        require(math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite")
 
     @property
     def bins_per_period(self) -> int:
@@ -107,7 +102,7 @@ PRESETS: dict[str, Sensor] = {"reference": Sensor()}
 
 def sensor_by_name(name: str) -> Sensor:
     """The preset of that name, or an InputError that lists the names."""
-    _require(name in PRESETS, f"sensor {name!r} is unknown, expected one of {', '.join(PRESETS)}")
+    require(name in PRESETS, f"sensor {name!r} is unknown, expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
 
 
@@ -125,7 +120,7 @@ class PhotonBudget:
     def __post_init__(self) -> None:
         for label, value in (("signal", self.signal), ("background", self.background)):
             good = math.isfinite(value) and 0 <= value <= 1e9
-            _require(good, f"photon budget: {label} {value:g} photons per pixel is outside 0 to 1e9")
+            require(good, f"photon budget: {label} {value:g} photons per pixel is outside 0 to 1e9")
 
     @property
     def sbr(self) -> float:

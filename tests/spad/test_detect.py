@@ -143,6 +143,13 @@ def test_empty_histogram_survives_its_file(tmp_path):
     assert read_histogram(tmp_path / "h.h5").counts.sum() == 0
 
 
+def test_metadata_may_be_long(tmp_path):
+    histogram = made()
+    long = replace(histogram, meta={**histogram.meta, "notes": ["what a loader changed"] * 20000})
+    write_histogram(long, tmp_path / "h.h5")
+    assert len(read_histogram(tmp_path / "h.h5").meta["notes"]) == 20000
+
+
 def test_truncated_and_damaged_files_are_refused_in_one_line(tmp_path):
     write_histogram(made(), tmp_path / "h.h5")
     data, good = (tmp_path / "h.h5").read_bytes(), made().sha256()
