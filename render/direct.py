@@ -66,7 +66,7 @@ def _chunk(world: World, pixels: np.ndarray, grid: int, tolerance_m: float) -> D
     pixel = dr.gather(UInt32, UInt32(pixels.astype(np.uint32)), lane // dr.opaque(UInt32, cells))
     cell = lane % dr.opaque(UInt32, cells)
     side = dr.opaque(UInt32, grid)
-    width = dr.opaque(UInt32, world.scene.camera.width)
+    width = world.width
     pitch = 1 / Float(side)
     x = Float(pixel % width) + (Float(cell % side) + 0.5) * pitch
     y = Float(pixel // width) + (Float(cell // side) + 0.5) * pitch
@@ -76,7 +76,7 @@ def _chunk(world: World, pixels: np.ndarray, grid: int, tolerance_m: float) -> D
     hit = si.is_valid()
     value, leg = laser_leg(world, si, pixel, hit, seen_by_camera=(transmission, optical))
     path = optical + leg
-    span = _half_spans(world, ray, local, si, distance, pitch / world.scene.camera.focal_px)
+    span = _half_spans(world, ray, local, si, distance, pitch / world.focal_px)
     limit = WIDEST_SPREAD * path
     spread = dr.sqrt(dr.square(span.x) + dr.square(span.y))
     clipped = hit & ~(spread <= limit)
@@ -138,8 +138,7 @@ def centre_layers(world: World) -> Layers:
     """Depth, normal and albedo at every pixel centre, (H, W)."""
     camera = world.scene.camera
     pixel = dr.arange(UInt32, camera.height * camera.width)
-    width = dr.opaque(UInt32, camera.width)
-    ray, _ = camera_rays(world, Float(pixel % width) + 0.5, Float(pixel // width) + 0.5)
+    ray, _ = camera_rays(world, Float(pixel % world.width) + 0.5, Float(pixel // world.width) + 0.5)
     si, _, _, distance = first_opaque(world, ray, Bool(True))
     hit = si.is_valid()
     diffuse = si.bsdf().eval_diffuse_reflectance(si, hit)[0]

@@ -49,7 +49,7 @@ def _trace(world: World, pixels: Any, lanes: int, spp: int, vertices: int, seed:
     pixel = dr.gather(UInt32, pixels, lane // dr.opaque(UInt32, spp))
     sampler = mi.load_dict({"type": "independent", "sample_count": 1})
     sampler.seed(dr.opaque(UInt32, seed), lanes)
-    width = dr.opaque(UInt32, world.scene.camera.width)
+    width = world.width
     jitter = sampler.next_2d()
     ray, _ = camera_rays(world, Float(pixel % width) + jitter.x, Float(pixel // width) + jitter.y)
     si, throughput, path, _ = first_opaque(world, ray, Bool(True))

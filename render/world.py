@@ -48,13 +48,22 @@ class World:
         self.thin_ior = _table(index, [m.ior if m.kind == "thindielectric" else 0 for m in materials])
         self.albedo = _table(index, [_specular_albedo(m) for m in materials])
         self.intensity = Float(scene.laser.intensity(scene.camera).ravel())
-        self.laser = mi.Point3f(*(scene.laser.position(scene.camera) - origin).tolist())
+        # What differs between the views of a set is opaque: a literal would compile every kernel again.
+        camera = scene.camera
+        self.laser = _opaque(scene.laser.position(camera) - origin)
+        self.axes = tuple(_opaque(column) for column in camera.rotation.T)
+        self.focal_px = dr.opaque(Float, camera.focal_px)
+        self.width, self.height = dr.opaque(UInt32, camera.width), dr.opaque(UInt32, camera.height)
         # the corner pixels' rays lie on the rim of the smallest cone
-        self.half_angle = math.acos(scene.laser.cos_half_angle(scene.camera)) * (1 + 1e-5)
+        self.half_angle = dr.opaque(Float, math.acos(scene.laser.cos_half_angle(camera)) * (1 + 1e-5))
 
     @property
     def sees_through(self) -> bool:
         return self.has_glass or self.has_cutouts
+
+
+def _opaque(vector: np.ndarray) -> Any:
+    return mi.Vector3f(*(dr.opaque(Float, float(v)) for v in vector))
 
 
 def _has_cutouts(material: Material) -> bool:
@@ -153,21 +162,21 @@ def _environment(scene: Scene) -> dict[str, Any] | None:
 
 def camera_rays(world: World, x: Any, y: Any) -> tuple[Any, Any]:
     """Rays from the camera's centre through raster positions, and their camera-frame directions with z = 1."""
-    camera = world.scene.camera
-    local = mi.Vector3f((x - camera.width / 2) / camera.focal_px, (y - camera.height / 2) / camera.focal_px, 1)
+    local = mi.Vector3f(
+        (x - Float(world.width) / 2) / world.focal_px, (y - Float(world.height) / 2) / world.focal_px, 1
+    )
     return mi.Ray3f(mi.Point3f(0), dr.normalize(to_world(world, local))), local
 
 
 def to_world(world: World, local: Any) -> Any:
     """A camera-frame vector in the world."""
-    right, down, forward = (mi.Vector3f(*column.tolist()) for column in world.scene.camera.rotation.T)
+    right, down, forward = world.axes
     return right * local.x + down * local.y + forward * local.z
 
 
 def to_camera(world: World, vector: Any) -> Any:
     """A world vector in the camera's frame."""
-    right, down, forward = (mi.Vector3f(*column.tolist()) for column in world.scene.camera.rotation.T)
-    return mi.Vector3f(dr.dot(right, vector), dr.dot(down, vector), dr.dot(forward, vector))
+    return mi.Vector3f(*(dr.dot(axis, vector) for axis in world.axes))
 
 
 def shape_index(si: Any) -> Any:
@@ -251,7 +260,7 @@ def laser_leg(
     if laser.is_colocated and seen_by_camera is not None:
         transmission, path = seen_by_camera
     else:
-        transmission, path = _shadow(world, si, direction, dr.sqrt(distance2), active)
+        transmission, path = segment(world, si, world.laser, active)
     lit = active & (distance2 > 0)
     if laser.mode == "flood":
         aim = to_camera(world, -direction)
@@ -266,19 +275,21 @@ def laser_leg(
 
 def _in_beam(world: World, point: Any, pixel: Any) -> Any:
     """Whether a point lies in the image row (line) or the pixel (scan) that is being measured."""
-    camera = world.scene.camera
     local = to_camera(world, mi.Vector3f(point))
-    row = dr.floor(local.y / local.z * camera.focal_px + camera.height / 2)
-    column = dr.floor(local.x / local.z * camera.focal_px + camera.width / 2)
-    same = (local.z > 0) & (row == Float(pixel // camera.width))
-    return same & (column == Float(pixel % camera.width)) if world.scene.laser.mode == "scan" else same
+    row = dr.floor(local.y / local.z * world.focal_px + Float(world.height) / 2)
+    column = dr.floor(local.x / local.z * world.focal_px + Float(world.width) / 2)
+    same = (local.z > 0) & (row == Float(pixel // world.width))
+    return same & (column == Float(pixel % world.width)) if world.scene.laser.mode == "scan" else same
 
 
-def _shadow(world: World, si: Any, direction: Any, distance: Any, active: Any) -> tuple[Any, Any]:
-    """Transmission and optical path of the straight way from a surface to the laser; 0 where it is blocked."""
+def segment(world: World, si: Any, point: Any, active: Any) -> tuple[Any, Any]:
+    """Transmission and optical path [m] of the straight way from a surface to a point; 0 where it is blocked."""
+    ray = si.spawn_ray_to(point)
+    distance = dr.norm(point - si.p)
     if not world.sees_through:
-        blocked = world.traced.ray_test(si.spawn_ray_to(world.laser), active)
-        return dr.select(blocked, Float(0), Float(1)), distance
+        return dr.select(world.traced.ray_test(ray, active), Float(0), Float(1)), distance
     short = distance * (1 - 1e-4)
-    end, transmission, optical, _ = _pass_layers(world, si.spawn_ray(direction), si.p, active, short, False)
+    end, transmission, optical, _ = _pass_layers(
+        world, si.spawn_ray(dr.normalize(point - si.p)), si.p, active, short, False
+    )
     return dr.select(end.is_valid(), 0, transmission), optical + (distance - short)
