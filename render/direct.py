@@ -1,30 +1,24 @@
-"""Direct light, integrated: each ray's footprint on the tangent plane spreads its energy over path lengths."""
+"""Direct light, integrated: every cell's footprint spreads its energy over path lengths."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from typing import NamedTuple
 
 import numpy as np
 
+from render.footprint import albedo
+from render.quadtree import MOST_CELLS, CellTree
 from render.returns import Samples, concatenate, merge
-from render.world import (
-    Bool,
-    Float,
-    UInt32,
-    World,
-    camera_rays,
-    dr,
-    first_opaque,
-    laser_leg,
-    mi,
-    shape_index,
-    to_camera,
-)
+from render.world import Bool, Float, UInt32, World, camera_rays, dr, first_opaque
 
 LANES = 1 << 21
-MIXED_GAP_M = 0.05
-# The tangent plane's footprint is unbounded near grazing: beyond this share of the path it describes no mesh.
-WIDEST_SPREAD = 0.25
+REFINE = 4
+# A footprint whose smaller half span is below this is as good as uniform: a thirtieth of the reference sensor's bin.
+NARROW_M = 1e-3
+# Edges that can change less than this share of a first cell of a typical pixel are not worth their rays: the error of
+# what is left falls with the grid, as that of all other cells does.
+LEAST_SHARE = 0.04
 
 
 class DirectLight(NamedTuple):
@@ -44,94 +38,127 @@ class Layers(NamedTuple):
     albedo: np.ndarray
 
 
-def direct_light(world: World, pixels: np.ndarray, grid: int, tolerance_m: float = 1e-4) -> DirectLight:
-    """Direct returns of the given flat pixel indices, grid x grid footprints each, merged within `tolerance_m`.
+def direct_light(
+    world: World,
+    pixels: np.ndarray,
+    grid: int,
+    tolerance_m: float = 1e-4,
+    refine: int = REFINE,
+    least_share: float = LEAST_SHARE,
+) -> DirectLight:
+    """Direct returns of the given flat pixel indices (sorted, each once), merged within `tolerance_m`.
 
-    A cell of a pixel, seen on the tangent plane of the point its centre hits, spans path lengths
-    p(x, y) = rho + |p - L|. To first order p is linear over the cell, so its distribution is a trapezoid of variance
-    (a^2 + b^2) / 3 with half spans a = |dp/dx| dx/2, b = |dp/dy| dy/2; the cell's return is uniform over
-    p +- sqrt(a^2 + b^2), which has the same mean and variance. Its radiance is f cos I / d^2 (`laser_leg`), divided by
-    the number of cells.
+    Every pixel starts as grid x grid cells, one ray and footprint each (`render.footprint`). A cell is cut in four, at
+    most `refine` times and down to 1/MOST_CELLS of a pixel, where
+    - its footprint is not small, so that first order no longer describes it; or
+    - it and a neighbouring cell lie on different surfaces, or one is in shadow: an edge runs through one of them.
+      An edge that could change less than `least_share` of a first cell's energy, in a pixel of the root mean square of
+      all pixels' radiance, is left alone.
+    New cells are compared with their neighbours too, of whatever size and pixel, and those are cut in turn: a wire
+    thinner than a cell is followed from wherever a ray hit it. All cuts of a pass are traced in one launch. Footprints
+    not small at the end are clipped to the face they lie on, and counted if that changes them.
+
+    Pixels are treated in groups of whole rows, about LANES rays each. Neither edges between groups nor, where not all
+    pixels are asked for, edges between pixels start a refinement.
     """
-    per_chunk = max(1, LANES // grid**2)
-    parts = [_chunk(world, pixels[i : i + per_chunk], grid, tolerance_m) for i in range(0, len(pixels), per_chunk)]
+    width = world.scene.camera.width
+    per_chunk = max(1, LANES // (grid * grid * width)) * width
+    parts = [
+        _chunk(world, pixels[i : i + per_chunk], grid, tolerance_m, refine, least_share)
+        for i in range(0, max(len(pixels), 1), per_chunk)
+    ]
+    if len(parts) == 1:
+        return parts[0]
     mixed = np.concatenate([part.mixed for part in parts])
     samples = concatenate([part.samples for part in parts])
     return DirectLight(samples, mixed, sum(p.clipped for p in parts), sum(p.rays for p in parts))
 
 
-def _chunk(world: World, pixels: np.ndarray, grid: int, tolerance_m: float) -> DirectLight:
-    cells = grid * grid
-    lane = dr.arange(UInt32, len(pixels) * cells)
-    pixel = dr.gather(UInt32, UInt32(pixels.astype(np.uint32)), lane // dr.opaque(UInt32, cells))
-    cell = lane % dr.opaque(UInt32, cells)
-    side = dr.opaque(UInt32, grid)
-    width = world.width
-    pitch = 1 / Float(side)
-    x = Float(pixel % width) + (Float(cell % side) + 0.5) * pitch
-    y = Float(pixel // width) + (Float(cell // side) + 0.5) * pitch
-
-    ray, local = camera_rays(world, x, y)
-    si, transmission, optical, distance = first_opaque(world, ray, Bool(True))
-    hit = si.is_valid()
-    value, leg = laser_leg(world, si, pixel, hit, seen_by_camera=(transmission, optical))
-    path = optical + leg
-    span = _half_spans(world, ray, local, si, distance, pitch / world.focal_px)
-    limit = WIDEST_SPREAD * path
-    spread = dr.sqrt(dr.square(span.x) + dr.square(span.y))
-    clipped = hit & ~(spread <= limit)
-    spread = dr.select(clipped, limit, spread)
-    radiance = dr.select(hit, value * transmission / cells, 0)
-    # what separates two surfaces is their distance from the camera, not the path: half of it for a co-located laser
-    reach = 0.5 * (span.x + span.y)
-    dr.eval(path, spread, radiance, distance, reach, hit, clipped)
-
-    shape = (len(pixels), cells)
-    lit = np.array(hit).astype(bool)
-    mixed = _mixed(np.array(distance).reshape(shape), np.array(reach).reshape(shape), lit.reshape(shape))
-    samples = Samples(
-        np.repeat(pixels, cells)[lit],
-        np.array(path, dtype=np.float64)[lit],
-        np.array(spread, dtype=np.float64)[lit],
-        np.array(radiance, dtype=np.float64)[lit],
-        np.ones(int(lit.sum()), dtype=np.uint8),
-    )
-    return DirectLight(merge(samples, tolerance_m), mixed, int(np.array(clipped).sum()), len(pixels) * cells)
+def _chunk(
+    world: World, pixels: np.ndarray, grid: int, tolerance_m: float, refine: int, least_share: float
+) -> DirectLight:
+    tree = CellTree(world, pixels, grid)
+    touched = tree.refine(max(0, min(refine, int(math.log2(MOST_CELLS / grid)))), least_share / grid**2)
+    clipped = tree.clip()
+    # pixels that were left alone are a table of equal cells; what was cut is a list
+    plain = _merge_plain(tree, np.flatnonzero(~touched), tolerance_m)
+    cells = np.flatnonzero(np.repeat(touched, grid * grid))
+    cells = np.concatenate((cells, np.arange(len(pixels) * grid * grid, tree.used)))
+    cells = cells[tree.child[cells] < 0]
+    cut = merge(_samples(tree, cells, tree.pitch(cells), tolerance_m), tolerance_m)
+    return DirectLight(concatenate([plain, cut]), tree.mixed, clipped, tree.rays)
 
 
-def _half_spans(world: World, ray: Any, local: Any, si: Any, distance: Any, pitch: Any) -> Any:
-    """Half spans of the path length over a cell of angular size `pitch` along image x and y [m], (2,).
+def _samples(tree: CellTree, cells: np.ndarray, pitch: np.ndarray | float, tolerance_m: float) -> Samples:
+    """What cells of that width, in pixels, return; float64.
 
-    On the tangent plane n . (p - C) = const the distance along l = (x, y, 1) is rho = const |l| / (n . l), so
-    drho/dx = rho (x / |l|^2 - n_x / (n . l)), and dp/dx = (drho/dx) r + rho (e_x / |l| - l x / |l|^3).
+    A cell with half spans a > b is a trapezoid of path lengths, which one uniform return describes badly at the edges
+    of bins. Where b is above the tolerance two returns do it better, without another ray: its halves along the smaller
+    span, at p +- b/2 with half width sqrt(a^2 + b^2 / 4).
     """
-    normal = to_camera(world, si.n)
-    inverse = dr.rcp(dr.dot(normal, local))
-    length2 = dr.squared_norm(local)
-    along = dr.normalize(local)
-    to_point = along
-    if not world.scene.laser.is_colocated:
-        to_point = dr.normalize(to_camera(world, si.p - world.laser))
-    spans = []
-    for axis in range(2):
-        slope = distance * (local[axis] / length2 - normal[axis] * inverse)
-        unit = mi.Vector3f(1, 0, 0) if axis == 0 else mi.Vector3f(0, 1, 0)
-        sideways = distance * (unit - along * (local[axis] * dr.rsqrt(length2))) * dr.rsqrt(length2)
-        along_laser = dr.dot(to_point, along * slope + sideways)
-        spans.append(dr.abs(slope + along_laser) * pitch / 2)
-    return mi.Vector2f(*spans)
+    rank = tree.rank[cells]
+    path, half_width = tree.path_m[cells].astype(np.float64), tree.half_width_m[cells].astype(np.float64)
+    radiance = tree.radiance[cells] * np.square(pitch, dtype=np.float64)
+    wide = np.flatnonzero(tree.minor_m[cells] > max(tolerance_m, NARROW_M))
+    if len(wide):
+        minor = tree.minor_m[cells[wide]].astype(np.float64)
+        radiance[wide] /= 2
+        half_width[wide] = np.sqrt(half_width[wide] ** 2 - 0.75 * minor**2)
+        other_half = path[wide] + minor / 2
+        path[wide] -= minor / 2
+        rank = np.concatenate((rank, rank[wide]))
+        path = np.concatenate((path, other_half))
+        half_width = np.concatenate((half_width, half_width[wide]))
+        radiance = np.concatenate((radiance, radiance[wide]))
+    return Samples(tree.pixels[rank], path, half_width, radiance, np.ones(len(path), np.uint8))
 
 
-def _mixed(distance: np.ndarray, reach: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Pixels whose footprints leave a gap of more than 50 mm or see past an edge into nothing; (pixels, cells) each."""
-    distance = np.where(hit, distance, 0)
-    reach = np.where(np.isfinite(reach), reach, WIDEST_SPREAD * distance)
-    near, far = distance - reach, distance + reach
-    order = np.argsort(near, axis=1)
-    near, far = np.take_along_axis(near, order, 1), np.take_along_axis(far, order, 1)
-    gap = (near[:, 1:] - np.maximum.accumulate(far, axis=1)[:, :-1] > MIXED_GAP_M).any(axis=1)
-    covered = hit.all(axis=1)
-    return np.where(covered, gap, hit.any(axis=1))
+def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Samples:
+    """Merged returns of pixels whose cells are all of level 0.
+
+    Most pixels need no sort: all their cells merge, or no two do.
+    """
+    cells = tree.grid**2
+    index = ranks[:, None] * cells + np.arange(cells)
+    share = 1 / cells
+    if cells > 16:
+        return merge(_samples(tree, index.ravel(), 1 / tree.grid, tolerance_m), tolerance_m)
+    radiance = tree.radiance[index]
+    lit = radiance > 0
+    key = np.floor(tree.path_m[index] / tolerance_m)
+    columns = [key[:, k] for k in range(cells)]
+    same = _all([columns[0] == column for column in columns[1:]], len(ranks)) & _all(list(lit.T), len(ranks))
+    parts = [_merge_rows(tree, index[same], radiance[same], share)]
+    rest = index[~same]
+    if cells == 1:
+        return parts[0]
+    if cells <= 4:
+        pairs = [columns[i] != columns[j] for i in range(cells) for j in range(i)]
+        apart = _all(pairs, len(ranks)) & _all(list(lit.T), len(ranks))
+        parts.append(_samples(tree, index[apart].ravel(), 1 / tree.grid, tolerance_m))
+        rest = index[~(same | apart)]
+    parts.append(merge(_samples(tree, rest.ravel(), 1 / tree.grid, tolerance_m), tolerance_m))
+    return concatenate(parts)
+
+
+def _all(conditions: list[np.ndarray], length: int) -> np.ndarray:
+    """Elementwise and."""
+    every = np.ones(length, bool)
+    for condition in conditions:
+        every &= condition
+    return every
+
+
+def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, share: float) -> Samples:
+    """One return for each row of cells, with the sum of energy, the centroid and the variance of its cells."""
+    weight = radiance.astype(np.float64).T * share
+    path = tree.path_m[index].astype(np.float64).T
+    half_width = tree.half_width_m[index].astype(np.float64).T
+    total = sum(weight)
+    centroid = sum(weight * path) / total if len(total) else total
+    variance = sum(weight * ((path - centroid) ** 2 + half_width**2 / 3)) / total if len(total) else total
+    pixel = tree.pixels[tree.rank[index[:, 0]]]
+    return Samples(pixel, centroid, np.sqrt(3 * variance), total, np.ones(len(index), np.uint8))
 
 
 def centre_layers(world: World) -> Layers:
@@ -141,15 +168,13 @@ def centre_layers(world: World) -> Layers:
     ray, _ = camera_rays(world, Float(pixel % world.width) + 0.5, Float(pixel // world.width) + 0.5)
     si, _, _, distance = first_opaque(world, ray, Bool(True))
     hit = si.is_valid()
-    diffuse = si.bsdf().eval_diffuse_reflectance(si, hit)[0]
-    specular = dr.gather(Float, world.albedo, shape_index(si), hit)
-    albedo = dr.select(hit, dr.select(specular >= 0, specular, diffuse), 0)
     normal = si.n * dr.select(hit, dr.select(dr.dot(si.n, ray.d) > 0, -1, 1), 0)
     depth = dr.select(hit, distance, dr.nan)
-    dr.eval(depth, normal, albedo)
+    reflectance = albedo(world, si, hit)
+    dr.eval(depth, normal, reflectance)
     shape = (camera.height, camera.width)
     return Layers(
         np.array(depth, dtype=np.float32).reshape(shape),
         np.array(normal, dtype=np.float32).T.reshape(*shape, 3).astype(np.float16),
-        np.array(albedo, dtype=np.float32).reshape(shape).astype(np.float16),
+        np.array(reflectance, dtype=np.float32).reshape(shape).astype(np.float16),
     )

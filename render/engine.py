@@ -5,27 +5,57 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from render.ambient import ambient_light
+from render.cells import coarsened
 from render.direct import centre_layers, direct_light
-from render.error import ErrorEstimate, estimate, merging_error, response
-from render.indirect import ambient_light, indirect_light
-from render.planning import BATCHES, make_plan, pilot_pixels
-from render.returns import Samples, concatenate, merge, select, to_returns
-from render.settings import Plan, RenderSettings
+from render.error import ErrorEstimate, estimate, noise_power, power_of, response
+from render.indirect import IndirectLight, Schedule, allocate, image_cells, indirect_light, pilot_noise, uniform
+from render.paths import block_order
+from render.planning import make_plan, pilot_pixels
+from render.returns import Samples, concatenate, no_samples, select, to_returns
+from render.settings import BATCHES, Plan, RenderSettings
+from render.specular import specular_light
 from render.transient import Transient
 from render.world import World
 from scenes.model import Scene
 
 log = logging.getLogger(__name__)
 
-STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT = 10, 11, 12
+STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT, STAGE_PILOT = 10, 11, 12, 13
+# Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
+MOST_SPP, MOST_SPP_BY_DEFAULT = 16384, 1024
 AMBIENT_SPP = 64
 AMBIENT_BOUNCES = 6
 FINER = 2  # direct light is checked, on the pilot's pixels, against this many times the cells a side
 
 Progress = Callable[[str, float], None]
+
+
+class Traced(NamedTuple):
+    """Light of a planned render before it is packed: direct and specular samples, indirect light or None, counts."""
+
+    direct: Samples
+    indirect: IndirectLight | None
+    origin_m: np.ndarray
+    mixed: np.ndarray
+    clipped: int
+    rays: int
+    schedule: Schedule | None
+    reasons: tuple[str, ...]
+
+    @property
+    def spp(self) -> int:
+        """Work on indirect light in paths a pixel."""
+        return 0 if self.schedule is None else round(self.schedule.cost)
+
+    @property
+    def samples(self) -> Samples:
+        return self.direct if self.indirect is None else concatenate([self.direct, self.indirect.samples])
 
 
 def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
@@ -49,112 +79,140 @@ def render(
     say("plan", 0.0)
     pilot_seed = derived_seed(seed, STAGE_PLAN)
     plan = make_plan(world, settings, pilot_seed)
-    pixels = np.arange(camera.height * camera.width)
-    say("direct light", 0.05)
-    direct = direct_light(world, pixels, plan.grid, settings.direct_tolerance_m)
-    layers = centre_layers(world)
-    merged = direct.samples
-    # where nothing is in view there is nothing to explain
-    for line in (*scene.notes, *plan.reasons) if len(merged.pixel) else ():
-        log.info("%s", line)
     checked = pilot_pixels(world, pilot_seed)
-    start_m = _mean_path(merged, len(pixels))
-    indirect, noise, batches = _indirect(world, plan, settings, start_m, checked, seed, say)
-    coarse = response(_of_pixels(merged, checked), checked)
-    fine = response(direct_light(world, checked, FINER * plan.grid).samples, checked)
-    responses = [response(batch, checked) for batch in batches]
-    error = estimate(coarse, fine, responses, _merging(batches, responses, settings, start_m, checked))
-    merged = concatenate([merged, indirect])
+    traced = trace(world, plan, settings, seed=seed, checked=checked, progress=say)
+    layers = centre_layers(world)
+    # where nothing is in view there is nothing to explain
+    plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, *traced.reasons))
+    for line in (*scene.notes, *plan.reasons) if len(traced.direct.pixel) else ():
+        log.info("%s", line)
+    error = _estimated(world, plan, settings, traced, checked)
+    noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
 
     ambient = np.zeros((camera.height, camera.width), np.float32)
     if plan.ambient:
         say("ambient light", 0.9)
         ambient = ambient_light(world, AMBIENT_SPP, AMBIENT_BOUNCES, derived_seed(seed, STAGE_AMBIENT))
-    rays = direct.rays + pixels.size * plan.spp * (2 * plan.bounces - 1) * (plan.bounces > 1)
     say("done", 1.0)
     return Transient(
         camera.height,
         camera.width,
-        *to_returns(merged, len(pixels)),
+        *to_returns(traced.samples, camera.height * camera.width),
         depth_m=layers.depth_m,
         normal=layers.normal,
         albedo=layers.albedo,
         ambient=ambient,
-        mixed=direct.mixed.reshape(camera.height, camera.width),
+        mixed=traced.mixed.reshape(camera.height, camera.width),
         error=noise.reshape(camera.height, camera.width).astype(np.float32),
-        meta=_meta(scene, settings, plan, seed, error, rays, direct.clipped),
+        meta=_meta(scene, settings, plan, seed, error, traced),
     )
 
 
-def _indirect(
+def trace(
     world: World,
     plan: Plan,
     settings: RenderSettings,
-    start_m: np.ndarray,
-    checked: np.ndarray,
-    seed: int,
-    say: Progress,
-) -> tuple[Samples, np.ndarray, list[Samples]]:
-    """Merged indirect samples of all pixels, each pixel's standard error, and each batch's samples where `checked`.
+    *,
+    seed: int = 0,
+    checked: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> Traced:
+    """Trace what the plan says: the light alone, without layers, ambient light or an error estimate.
 
-    `start_m` is the pixels' direct path, from which the cells that merge are counted.
+    `checked` are sorted flat pixels whose indirect light is kept by batches, for the error estimate.
     """
-    pixels = np.arange(len(start_m))
-    none = Samples(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.uint8))
-    if plan.bounces == 1:
-        return none, np.zeros(len(pixels)), []
-    count = min(BATCHES, plan.spp)
-    merged, totals, batches = none, [], []
-    for number in range(count):
-        say("indirect light", 0.1 + 0.8 * number / count)
-        batch_seed = derived_seed(seed, STAGE_INDIRECT, 0, number)
-        total, seen, shares = np.zeros(len(pixels)), [none], [merged]
-        for chunk in indirect_light(world, pixels, plan.spp // count, plan.bounces, batch_seed):
-            total += np.bincount(chunk.pixel, weights=chunk.radiance, minlength=len(pixels))
-            seen.append(_of_pixels(chunk, checked))
-            share = chunk._replace(radiance=chunk.radiance / count)
-            shares.append(merge(share, settings.indirect_tolerance_m, start_m, settings.indirect_growth))
-        totals.append(total)
-        batches.append(concatenate(seen))
-        merged = merge(concatenate(shares), settings.indirect_tolerance_m, start_m, settings.indirect_growth)
-    spread = np.std(totals, axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.zeros(len(pixels))
-    return merged, spread, batches
+    say = progress or (lambda what, share: None)
+    camera = world.scene.camera
+    pixels = np.arange(camera.height * camera.width)
+    say("direct light", 0.05)
+    direct = direct_light(world, pixels, plan.grid, settings.direct_tolerance_m)
+    origin_m, brightest = _mean_path(direct.samples, len(pixels))
+    specular = specular_light(world, plan.grid, settings.direct_tolerance_m)
+    exact = concatenate([direct.samples, specular.samples])
+    rays, indirect, schedule, reasons = direct.rays, None, None, ()
+    if plan.bounces > 1 and brightest > 0:
+        schedule, reasons = _schedule(world, plan, settings, direct.samples, seed)
+        indirect = indirect_light(
+            world,
+            schedule,
+            plan.bounces,
+            derived_seed(seed, STAGE_INDIRECT),
+            origin_m,
+            brightest,
+            np.empty(0, np.int64) if checked is None else checked,
+            width_m=settings.indirect_tolerance_m,
+            growth=settings.indirect_growth,
+            say=lambda share: say("indirect light", 0.1 + 0.8 * share),
+        )
+        rays += schedule.paths * (2 * plan.bounces - 1) + schedule.connections
+    reasons = (*specular.notes, *reasons)
+    return Traced(exact, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
 
 
-def _merging(
-    batches: list[Samples],
-    responses: list[np.ndarray],
-    settings: RenderSettings,
-    start_m: np.ndarray,
-    checked: np.ndarray,
-) -> np.ndarray | None:
-    """Squared error of merged indirect returns in the checked pixels, from even against odd batches."""
-    if len(batches) < 2:
-        return None
-    raw, merged = [], []
+def _schedule(
+    world: World, plan: Plan, settings: RenderSettings, direct: Samples, seed: int
+) -> tuple[Schedule, tuple[str, ...]]:
+    """How many paths each pixel traces, and why: from the noise of a pilot of a few paths, which is not used again."""
+    camera = world.scene.camera
+    blocks = block_order(np.arange(camera.height * camera.width), camera.width)
+    if plan.spp is not None and (not plan.adaptive or plan.spp < BATCHES):
+        rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
+        return uniform(blocks, rounds, shared=False), ()
+    own, shared = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT))
+    if not plan.adaptive:
+        own, shared = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
+    if plan.spp is not None:
+        return allocate(blocks, own, shared, cost=plan.spp), ()
+    power, per_sample = power_of(direct)
+    allowed = plan.noise**2 * power / per_sample
+    schedule = allocate(blocks, own, shared, squared_error=allowed)
+    asked = settings.error is not None or settings.budget is not None
+    limit = MOST_SPP if asked else MOST_SPP_BY_DEFAULT
+    wanted, reasons = schedule.cost, []
+    if wanted > limit:
+        schedule = allocate(blocks, own, shared, cost=limit)
+        remedy = "force more with spp" if asked else "ask for more with an error target"
+        reasons.append(f"indirect light: the work of {wanted:.0f} paths a pixel would meet the target; {remedy}")
+    spread = f"{schedule.rounds.min()} to {schedule.rounds.max()} paths a pixel, {schedule.shared.mean():.0%} shared"
+    reasons.append(f"indirect light: {spread}; the work of {schedule.cost:.0f} paths a pixel")
+    return schedule, tuple(reasons)
+
+
+def _estimated(
+    world: World, plan: Plan, settings: RenderSettings, traced: Traced, checked: np.ndarray
+) -> ErrorEstimate:
+    """The error of a trace, from the checked pixels' batches and from finer direct light there."""
+    coarse = response(_of_pixels(select(traced.direct, traced.direct.bounces == 1), checked), checked)
+    fine = response(direct_light(world, checked, FINER * plan.grid).samples, checked)
+    if traced.indirect is None:
+        none = np.zeros(len(checked))
+        return estimate(coarse, fine, np.zeros_like(fine), none, none)
+    seen = traced.indirect.watched
+    place, origin_m = np.arange(len(checked)), traced.origin_m[checked]
+    cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
+    # what merging changes, in two independent halves: their noise, which merging smooths, cancels in the product
+    changes = []
     for half in (slice(0, None, 2), slice(1, None, 2)):
-        count = len(batches[half])
-        together = concatenate(batches[half])
-        kept = merge(together, settings.indirect_tolerance_m, start_m, settings.indirect_growth)
-        raw.append(sum(responses[half]) / count)
-        merged.append(response(kept, checked) / count)
-    return merging_error(tuple(raw), tuple(merged))
+        kept = seen.samples(half) if seen.radiance.shape[1] > 1 else no_samples()
+        merged = coarsened(kept, cells, origin_m)
+        changes.append(response(concatenate([merged, kept._replace(radiance=-kept.radiance)]), place))
+    merging = (changes[0] * changes[1]).sum(axis=1)
+    indirect = response(seen.samples(), place)
+    return estimate(coarse, fine, indirect, noise_power(seen.radiance, seen.cells.width_of_m), merging)
 
 
 def _of_pixels(samples: Samples, pixels: np.ndarray) -> Samples:
     return select(samples, np.isin(samples.pixel, pixels))
 
 
-def _mean_path(samples: Samples, pixels: int) -> np.ndarray:
-    """Radiance-weighted mean path of each pixel [m], 0 where there is none."""
+def _mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:
+    """Radiance-weighted mean path of each pixel [m], 0 where there is none; and the brightest pixel's radiance."""
     total = np.bincount(samples.pixel, weights=samples.radiance, minlength=pixels)
     moment = np.bincount(samples.pixel, weights=samples.radiance * samples.path_m, minlength=pixels)
-    return np.divide(moment, total, out=np.zeros(pixels), where=total > 0)
+    return np.divide(moment, total, out=np.zeros(pixels), where=total > 0), float(total.max(initial=0))
 
 
-def _meta(
-    scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: ErrorEstimate, rays: int, clipped: int
-) -> dict:
+def _meta(scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: ErrorEstimate, traced: Traced) -> dict:
     camera, laser = scene.camera, scene.laser
     return {
         "scene": scene.name,
@@ -175,8 +233,8 @@ def _meta(
             "indirect": settings.indirect_tolerance_m,
             "growth": settings.indirect_growth,
         },
-        "rays": int(rays),
-        "clipped_footprints": clipped,
+        "rays": int(traced.rays),
+        "clipped_footprints": traced.clipped,
         "relative_error": error.to_dict(),
         "versions": {name: importlib.metadata.version(name) for name in ("scene2spad", "mitsuba", "drjit", "numpy")},
     }

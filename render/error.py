@@ -61,22 +61,14 @@ def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
 
 
 def estimate(
-    coarse: np.ndarray, fine: np.ndarray, batches: list[np.ndarray], merging: np.ndarray | None = None
+    coarse: np.ndarray, fine: np.ndarray, indirect: np.ndarray, noise: np.ndarray, merging: np.ndarray
 ) -> ErrorEstimate:
-    """Error of direct light by `coarse` against `fine` cells and of the mean of independent indirect `batches`.
+    """Error of direct light by `coarse` against `fine` cells beside the indirect light's `noise` and `merging` error.
 
-    All are (pixels, bins) responses; each batch estimates the whole indirect light, and their mean's variance is
-    sum_b (r_b - mean)^2 / (n (n - 1)). `merging` is the squared error of merged returns per pixel (`merging_error`).
+    coarse, fine, indirect are (pixels, bins) responses; noise and merging squared errors of the pixels.
     """
     direct = ((coarse - fine) ** 2).sum(axis=1)
-    merging = np.zeros(len(fine)) if merging is None else merging
-    reference, noise = fine, np.zeros(len(fine))
-    if batches:
-        mean = sum(batches) / len(batches)
-        reference = fine + mean
-    if len(batches) > 1:
-        noise = sum(((batch - mean) ** 2).sum(axis=1) for batch in batches) / (len(batches) * (len(batches) - 1))
-    power = (reference**2).sum(axis=1)
+    power = ((fine + indirect) ** 2).sum(axis=1)
     whole = power.sum()
     if whole <= 0:
         return ErrorEstimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -90,13 +82,36 @@ def estimate(
     )
 
 
-def merging_error(raw: tuple[np.ndarray, np.ndarray], merged: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Squared error that merging makes in each pixel, from two independent halves of the samples, raw and merged.
+def noise_power(batches: np.ndarray, width_m: np.ndarray) -> np.ndarray:
+    """Expected squared error of the mean of independent batches after the pulse, per pixel.
 
-    The product of the halves' changes, sum_i (m_a - r_a)(m_b - r_b): their noise, which merging smooths, cancels on
-    average; what both halves change alike is the error. Single pixels can come out negative.
+    batches (pixels, batches, cells) radiance; cells of width w. A cell's variance of the mean is
+    sum_b (r_b - mean)^2 / (n (n - 1)); spread over the cell and the pulse, a Gaussian of variance
+    s^2 = sigma^2 + w^2 / 12, an energy has the squared sum bin / (2 sqrt(pi) s) over bins. The cells' errors are taken
+    as uncorrelated, as those of different paths are.
     """
-    return ((merged[0] - raw[0]) * (merged[1] - raw[1])).sum(axis=1)
+    count = batches.shape[1]
+    if count < 2:
+        return np.zeros(len(batches))
+    variance = batches.var(axis=1, ddof=1) / count
+    sigma = np.sqrt(SIGMA_M**2 + width_m**2 / 12)
+    return variance @ (BIN_M / (2 * math.sqrt(math.pi) * sigma))
+
+
+def power_of(direct: Samples) -> tuple[float, float]:
+    """Squared sum of direct light's response over bins and pixels; and that of a unit of energy with the pulse alone.
+
+    A pixel's light is taken as one Gaussian, of the pulse's variance and its own: an underestimate where it is mixed.
+    """
+    pixels = int(direct.pixel.max(initial=-1)) + 1
+    energy = np.bincount(direct.pixel, weights=direct.radiance, minlength=pixels)
+    first = np.bincount(direct.pixel, weights=direct.radiance * direct.path_m, minlength=pixels)
+    spread = direct.path_m**2 + direct.half_width_m**2 / 3
+    second = np.bincount(direct.pixel, weights=direct.radiance * spread, minlength=pixels)
+    lit = energy > 0
+    variance = np.maximum(second[lit] / energy[lit] - (first[lit] / energy[lit]) ** 2, 0)
+    power = energy[lit] ** 2 * BIN_M / (2 * math.sqrt(math.pi) * np.sqrt(SIGMA_M**2 + variance))
+    return float(power.sum()), BIN_M / (2 * math.sqrt(math.pi) * SIGMA_M)
 
 
 def error_for_budget(reference: np.ndarray, signal: float, background: float) -> float:

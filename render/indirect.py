@@ -1,112 +1,243 @@
-"""Indirect light by path tracing from the camera, each vertex connected to the laser; and steady ambient light."""
+"""Indirect light of an image: which pixels trace paths together, in which launches, and what they add up to."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
-from render.returns import Samples
-from render.world import Bool, Float, UInt32, World, camera_rays, dr, first_opaque, laser_leg, mi
+from render.cells import Cells, Rows, cell_samples, make_cells, quantum_for
+from render.paths import BLOCK, LANES, Sums, Turns, add_paths, noise_of_paths
+from render.returns import Samples, concatenate, no_samples
+from render.settings import BATCHES
+from render.world import World
 
-LANES = 1 << 20
+MOST_CELLS = 1 << 22  # of one launch: 64 MB of accumulators
+# Seconds of one path with its tail in units of one connection, on 2 cores. Only the choice of who shares depends on it.
+PATH_COST = 9.0
 
 
-def indirect_light(world: World, pixels: np.ndarray, spp: int, bounces: int, seed: int) -> Iterator[Samples]:
-    """Light of 2 to `bounces` surfaces in the given flat pixels: `spp` camera paths a pixel, one sample a vertex.
+class Schedule(NamedTuple):
+    """Who traces how many paths: blocks of flat pixels (-1: none), and per block its rounds and whether it shares.
 
-    Samples come in chunks of whole pixels, so that the caller can merge before memory fills.
-
-    Unbiased but for what `first_opaque` leaves out: a path vertex x_k adds T_k f(x_k) cos I(w) / d^2, with T_k the
-    product of BSDF weights so far (Russian roulette after the second surface), at path length |C x_1| + ... + |x_k L|.
+    A round is one path in every pixel of a block. `batches` of rounds are kept apart for the error estimate.
     """
-    per_chunk = max(1, LANES // spp)
-    seeds = np.random.SeedSequence(seed).generate_state(-(-len(pixels) // per_chunk))
-    for first, chunk_seed in zip(range(0, len(pixels), per_chunk), seeds, strict=True):
-        yield _chunk(world, pixels[first : first + per_chunk], spp, bounces, int(chunk_seed))
+
+    pixels: np.ndarray
+    rounds: np.ndarray
+    shared: np.ndarray
+
+    @property
+    def batches(self) -> int:
+        return int(min(BATCHES, self.rounds.min(initial=BATCHES)))
+
+    @property
+    def paths(self) -> int:
+        """Paths traced from the camera."""
+        return int((self.rounds * (self.pixels.reshape(-1, BLOCK) >= 0).sum(axis=1)).sum())
+
+    @property
+    def connections(self) -> int:
+        """Rays between pixels and their neighbours' paths."""
+        return int(self.rounds[self.shared].sum()) * BLOCK**2
+
+    @property
+    def cost(self) -> float:
+        """Work of the schedule in paths of its own for every pixel."""
+        each = np.where(self.shared, 1 + BLOCK / PATH_COST, 1)
+        return float((self.rounds * each).mean())
 
 
-def _chunk(world: World, pixels: np.ndarray, spp: int, bounces: int, seed: int) -> Samples:
-    lanes, vertices = len(pixels) * spp, bounces - 1
-    paths, values = _trace(world, UInt32(pixels.astype(np.uint32)), lanes, spp, vertices, seed)
-    value = np.array(values, dtype=np.float64).reshape(lanes, vertices)
-    lane, vertex = np.nonzero(value > 0)
-    return Samples(
-        pixels[lane // spp],
-        np.array(paths, dtype=np.float64).reshape(lanes, vertices)[lane, vertex],
-        np.zeros(len(lane)),
-        value[lane, vertex] / spp,
-        (vertex + 2).astype(np.uint8),
-    )
+def uniform(blocks: np.ndarray, rounds: int, *, shared: bool) -> Schedule:
+    """The same for every block."""
+    count = len(blocks) // BLOCK
+    return Schedule(blocks, np.full(count, rounds), np.full(count, shared))
 
 
-@dr.syntax
-def _trace(world: World, pixels: Any, lanes: int, spp: int, vertices: int, seed: int) -> tuple[Any, Any]:
-    """Path lengths and radiances, vertex-minor flat arrays of lanes x vertices, 0 where a path ended."""
-    paths, values = dr.zeros(Float, lanes * vertices), dr.zeros(Float, lanes * vertices)
-    lane = dr.arange(UInt32, lanes)
-    pixel = dr.gather(UInt32, pixels, lane // dr.opaque(UInt32, spp))
-    sampler = mi.load_dict({"type": "independent", "sample_count": 1})
-    sampler.seed(dr.opaque(UInt32, seed), lanes)
-    width = world.width
-    jitter = sampler.next_2d()
-    ray, _ = camera_rays(world, Float(pixel % width) + jitter.x, Float(pixel // width) + jitter.y)
-    si, throughput, path, _ = first_opaque(world, ray, Bool(True))
-    throughput = Float(throughput) + dr.zeros(Float, lanes)
-    vertex, last = dr.zeros(UInt32, lanes), dr.opaque(UInt32, vertices)
-    active = si.is_valid()
-    while active:
-        sample, weight = si.bsdf().sample(
-            mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active
-        )
-        throughput *= weight[0]
-        active &= throughput > 0
-        ray, vertex_point = si.spawn_ray(si.to_world(sample.wo)), mi.Point3f(si.p)
-        si, transmission, optical, _ = first_opaque(world, ray, active, vertex_point)
-        throughput *= transmission
-        path += optical
-        active &= si.is_valid()
-        value, leg = laser_leg(world, si, pixel, active, seen_by_camera=None)
-        slot = lane * last + vertex
-        dr.scatter(paths, path + leg, slot, active)
-        dr.scatter(values, throughput * value, slot, active)
-        vertex += 1
-        active &= vertex < last
-        # Russian roulette: paths that carry little end early, the others carry their energy on
-        survive = dr.select(vertex > 1, dr.clip(throughput, 0.05, 0.95), 1)
-        active &= sampler.next_1d(active) < survive
-        throughput /= survive
-    return paths, values
+def pilot_noise(world: World, blocks: np.ndarray, bounces: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Squared contributions of one round summed over the pixels of every block, without and with sharing.
 
-
-def ambient_light(world: World, spp: int, bounces: int, seed: int) -> np.ndarray:
-    """Steady spectral radiance of environment and area lights at each pixel [W/(m^2 sr nm)], (H, W) float32.
-
-    Mitsuba's own path integrator: steady light needs nothing of ours.
+    From a round or a few, smoothed along the Z-order curve: single bright paths must not rule.
     """
-    camera = world.scene.camera
-    if world.has_cutouts:
-        world = World(world.scene, cutouts_by_mitsuba=True)
-    # the camera is the traced world's origin; Mitsuba's has x to the left and y up
-    turned = np.eye(4)
-    turned[:3, :3] = camera.rotation @ np.diag([-1.0, -1.0, 1.0])
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": camera.fov_deg,
-            "fov_axis": "x",
-            "to_world": mi.ScalarTransform4f(turned),
-            "near_clip": 1e-4,
-            "film": {
-                "type": "hdrfilm",
-                "width": camera.width,
-                "height": camera.height,
-                "rfilter": {"type": "box"},
-                "pixel_format": "luminance",
-            },
-        }
-    )
-    integrator = mi.load_dict({"type": "path", "max_depth": bounces})
-    image = np.array(mi.render(world.traced, sensor=sensor, integrator=integrator, spp=spp, seed=seed))
-    return np.maximum(np.nan_to_num(image.reshape(camera.height, camera.width)), 0).astype(np.float32)
+    count = len(blocks) // BLOCK
+    rounds = int(np.clip(256 // max(count, 1), 1, 16))
+    own, shared = np.zeros(count), np.zeros(count)
+    per_launch = max(1, LANES // BLOCK**2 // rounds)
+    for first in range(0, count, per_launch):
+        size = min(per_launch, count - first)
+        block = np.repeat(np.arange(size), rounds)
+        turns = Turns(block, block + first, np.tile(np.arange(rounds), size))
+        chosen = blocks[first * BLOCK : (first + size) * BLOCK]
+        for total, part in zip((own, shared), noise_of_paths(world, chosen, turns, bounces, seed), strict=True):
+            total[first : first + size] = part.sum(axis=1).reshape(size, rounds).mean(axis=1)
+    kernel = np.array((1, 2, 3, 2, 1)) / 9
+    smooth = [np.convolve(np.pad(total, 2, mode="edge"), kernel, mode="valid") for total in (own, shared)]
+    return smooth[0], smooth[1]
+
+
+def allocate(
+    blocks: np.ndarray, own: np.ndarray, shared: np.ndarray, *, cost: float = np.inf, squared_error: float = 0.0
+) -> Schedule:
+    """Spend work where it lowers the summed squared error most, until the error is met or `cost` paths a pixel spent.
+
+    R rounds with noise N and work c add N / R to the error and R c to the work, in one block and one way (own paths or
+    shared ones); N / R + L R c is least at R = sqrt(N / (L c)), at least BATCHES (Neyman 1934). L comes by bisection.
+    A block's noise is at least 2 % of the mean, since a short pilot sees no rare path.
+    """
+    each = np.array((1.0, 1 + BLOCK / PATH_COST))[:, None]
+    noise = np.stack((own, shared))
+    least = noise.min(axis=0).mean()
+    noise = np.maximum(noise, 0.02 * least) if least > 0 else np.ones_like(noise)
+    most = max(BATCHES, 256 * cost) if np.isfinite(cost) else np.inf
+
+    def spent(price: float) -> tuple[np.ndarray, np.ndarray]:
+        rounds = np.clip(np.sqrt(noise / (price * each)), BATCHES, most)
+        rounds = np.ceil(rounds / BATCHES) * BATCHES
+        best = np.argmin(noise / rounds + price * rounds * each, axis=0)
+        return best, np.take_along_axis(rounds, best[None], 0)[0]
+
+    unit = noise.min(axis=0).mean()
+    low, high = -60.0, 60.0  # logarithm of the price in units of the mean noise: the lower, the more is spent
+    for _ in range(48):
+        middle = 0.5 * (low + high)
+        best, rounds = spent(np.exp(middle) * unit)
+        left = (np.take_along_axis(noise, best[None], 0)[0] / rounds).sum()
+        if (rounds * each[best, 0]).mean() > cost or left < squared_error:
+            low = middle
+        else:
+            high = middle
+    best, rounds = spent(np.exp(high) * unit)
+    return Schedule(blocks, rounds.astype(np.int64), best == 1)
+
+
+class Watched(NamedTuple):
+    """Light of a few flat `pixels` by independent batches: (pixels, batches, cells) radiance, in cells half as wide.
+
+    Every batch estimates the whole indirect light.
+    """
+
+    pixels: np.ndarray
+    cells: Cells
+    origin_m: np.ndarray
+    radiance: np.ndarray
+
+    def samples(self, turns: slice = slice(None)) -> Samples:
+        """The mean of some batches as samples, their pixel an index into `pixels`."""
+        mean = self.radiance[:, turns].mean(axis=1)
+        row, cell = np.nonzero(mean)
+        return cell_samples(self.cells, row, self.origin_m[row], cell, mean[row, cell], np.full(len(row), 0.5))
+
+
+class Chunk(NamedTuple):
+    """Finished rows of some pixels, and each pixel's total radiance by batch, (pixels, batches)."""
+
+    pixels: np.ndarray
+    rows: Rows
+    totals: np.ndarray
+
+
+class IndirectLight(NamedTuple):
+    """Merged samples; standard error of each pixel's total; batches of the watched pixels."""
+
+    samples: Samples
+    noise: np.ndarray
+    watched: Watched
+
+
+def image_cells(world: World, width_m: float, growth: float, origin_m: np.ndarray, bounces: int) -> Cells:
+    """Cells that hold every path of up to `bounces` surfaces, counted from the pixels' origins."""
+    low, high = world.scene.bounds()
+    ends = np.stack((low, high, world.scene.camera.origin, world.scene.laser.position(world.scene.camera)))
+    diagonal = float(np.linalg.norm(np.ptp(ends, axis=0)))
+    slowest = max((s.material.ior for s in world.scene.surfaces if s.material.is_glass), default=1.0)
+    return make_cells(width_m, growth, -float(origin_m.max(initial=0)), (bounces + 1) * diagonal * slowest)
+
+
+def collect(
+    world: World,
+    schedule: Schedule,
+    origin_m: np.ndarray,
+    cells: Cells,
+    bounces: int,
+    seed: int,
+    brightest: float,
+    *,
+    watch: tuple[np.ndarray, Rows] | None = None,
+    say: Callable[[float], None] = lambda share: None,
+) -> Iterator[Chunk]:
+    """Trace a schedule and hand out finished rows, some blocks at a time.
+
+    `origin_m` belongs to flat pixels of the image. `watch` = (row of every flat pixel or -1, rows by batch).
+    """
+    per_chunk = max(1, MOST_CELLS // (cells.count * BLOCK))
+    done = 0
+    for shared in (False, True):
+        numbers = np.flatnonzero(schedule.shared == shared)
+        for first in range(0, len(numbers), per_chunk):
+            say(done / len(schedule.rounds))
+            chosen = numbers[first : first + per_chunk]
+            done += len(chosen)
+            pixels = schedule.pixels.reshape(-1, BLOCK)[chosen].ravel()
+            rounds = schedule.rounds[chosen]
+            rows = Rows(len(pixels), cells, quantum_for(brightest))
+            sums = Sums(
+                rows,
+                origin_m[pixels],
+                rounds=np.repeat(rounds, BLOCK),
+                batches=schedule.batches,
+                watched=None if watch is None else watch[1],
+                watch=None if watch is None else np.where(pixels >= 0, watch[0][pixels], -1),
+            )
+            for turns in _turns(chosen, rounds, LANES // BLOCK**2 if shared else LANES // BLOCK):
+                add_paths(world, pixels, turns, bounces, seed, sums, shared=shared)
+            yield Chunk(pixels, rows, sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum)
+
+
+def _turns(streams: np.ndarray, rounds: np.ndarray, most: int) -> Iterator[Turns]:
+    """All rounds of some blocks in launches of at most `most` turns."""
+    ends = np.cumsum(rounds)
+    for first in range(0, int(ends[-1]), most):
+        turn = np.arange(first, min(first + most, int(ends[-1])))
+        block = np.searchsorted(ends, turn, side="right")
+        yield Turns(block, streams[block], turn - (ends - rounds)[block])
+
+
+def watched_rows(pixels: np.ndarray, image_pixels: int, cells: Cells, batches: int, brightest: float) -> tuple:
+    """`watch` of `collect` for a sorted few of the image's pixels."""
+    row = np.full(image_pixels, -1)
+    row[pixels] = np.arange(len(pixels))
+    return row, Rows(len(pixels) * batches, cells, quantum_for(brightest))
+
+
+def indirect_light(
+    world: World,
+    schedule: Schedule,
+    bounces: int,
+    seed: int,
+    origin_m: np.ndarray,
+    brightest: float,
+    watched: np.ndarray,
+    *,
+    width_m: float,
+    growth: float,
+    say: Callable[[float], None] = lambda share: None,
+) -> IndirectLight:
+    """Light of 2 to `bounces` surfaces in the scheduled pixels, unbiased.
+
+    `origin_m`, for every pixel of the image, is the path length from which cells widen: the direct return's.
+    `brightest` sets the fixed-point scale. The `watched` pixels, sorted, must be among the scheduled.
+    """
+    image_pixels, batches = len(origin_m), schedule.batches
+    cells = image_cells(world, width_m, growth, origin_m, bounces)
+    fine = image_cells(world, width_m / 2, growth / 2, origin_m, bounces)
+    watch = watched_rows(watched, image_pixels, fine, batches, brightest) if len(watched) else None
+    parts, noise = [no_samples()], np.zeros(image_pixels)
+    for chunk in collect(world, schedule, origin_m, cells, bounces, seed, brightest, watch=watch, say=say):
+        real = chunk.pixels >= 0
+        parts.append(chunk.rows.samples(chunk.pixels, origin_m[chunk.pixels]))
+        if batches > 1:
+            noise[chunk.pixels[real]] = chunk.totals[real].std(axis=1, ddof=1) * np.sqrt(batches)
+    seen = watch[1].radiance() if watch else np.zeros((0, fine.count))
+    seen = seen.reshape(len(watched), batches, fine.count)
+    return IndirectLight(concatenate(parts), noise, Watched(watched, fine, origin_m[watched], seen))

@@ -1,11 +1,14 @@
-"""Choosing a working LLVM before Dr.Jit is imported, and starting Mitsuba on it.
+"""Choosing the backend, and a working LLVM before Dr.Jit is imported, and starting Mitsuba on it.
 
-Dr.Jit reads `DRJIT_LIBLLVM_PATH` when it is imported. LLVM 15 and 16 pass `set_variant` and then abort the
-process in the first render (their x86 back end cannot lower `llvm.minimum`), so anything below 19 is refused here.
+CUDA is taken where the driver's CUDA and OptiX libraries are found and Mitsuba starts on them, else LLVM on the CPU;
+SCENE2SPAD_BACKEND=llvm|cuda forces one. This module has the name of the backend that needs care: Dr.Jit reads
+`DRJIT_LIBLLVM_PATH` when it is imported, and LLVM 15 and 16 pass `set_variant` and then abort the process in the first
+render (their x86 back end cannot lower `llvm.minimum`), so anything below 19 is refused here.
 """
 
 from __future__ import annotations
 
+import ctypes.util
 import importlib.metadata
 import logging
 import os
@@ -19,7 +22,10 @@ from scenes.files import silenced
 
 log = logging.getLogger(__name__)
 
-VARIANT = "llvm_ad_mono"
+VARIANTS = {"llvm": "llvm_ad_mono", "cuda": "cuda_ad_mono"}
+BACKEND_VARIABLE = "SCENE2SPAD_BACKEND"
+# the driver's libraries, and the variables by which Dr.Jit takes them from elsewhere
+CUDA_LIBRARIES = {"cuda": "DRJIT_LIBCUDA_PATH", "nvoptix": "DRJIT_LIBOPTIX_PATH"}
 OLDEST_LLVM = 19
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 WHEEL = "karellen-llvm-core"
@@ -62,28 +68,60 @@ def system_llvm(root: Path = Path("/usr")) -> Path | None:
     return versions[newest] if newest >= OLDEST_LLVM else None
 
 
-def start_mitsuba() -> ModuleType:
-    """Import Mitsuba on a working LLVM, set the variant, and return the module. Idempotent.
+def backends() -> list[str]:
+    """The backends to try, best first: what SCENE2SPAD_BACKEND forces, else CUDA if its libraries are there, and LLVM.
 
-    Raises InputError in one line if LLVM is missing or older than 19, also when the user imported Dr.Jit first or
-    chose an old library by the variable.
+    Raises InputError when the variable names neither, or CUDA where a library of the driver is missing.
     """
+    forced = os.environ.get(BACKEND_VARIABLE, "")
+    if forced and forced not in VARIANTS:
+        raise InputError(f"{BACKEND_VARIABLE}={forced}: no such backend, expected {' or '.join(VARIANTS)}")
+    if forced == "llvm":
+        return ["llvm"]
+    missing = [name for name, variable in CUDA_LIBRARIES.items() if not _found(name, variable)]
+    if forced == "cuda":
+        if missing:
+            raise InputError(f"{BACKEND_VARIABLE}=cuda: found no lib{missing[0]}.so of an NVIDIA driver; use llvm")
+        return ["cuda"]
+    return ["llvm"] if missing else ["cuda", "llvm"]
+
+
+def _found(library: str, variable: str) -> bool:
+    explicit = os.environ.get(variable)
+    return Path(explicit).is_file() if explicit else ctypes.util.find_library(library) is not None
+
+
+def start_mitsuba() -> ModuleType:
+    """Import Mitsuba on the first of `backends` that starts, set its variant, and return the module. Idempotent.
+
+    A variant of ours that is set already stays. Raises InputError in one line if a forced backend does not start, or if
+    LLVM is missing or older than 19, also when the user imported Dr.Jit first or chose an old library by the variable.
+    """
+    wanted = backends()
     if "drjit" not in sys.modules:
-        library = choose_llvm()
+        library = choose_llvm() if "llvm" in wanted else None
         if library is not None:
             os.environ[PATH_VARIABLE] = str(library)
             log.debug("LLVM: %s", library)
-    try:
-        with silenced():  # Dr.Jit prints lines of its own before it raises
-            import drjit as dr
-            import mitsuba as mi
+    for backend in wanted:
+        try:
+            with silenced():  # Dr.Jit prints lines of its own before it raises
+                import drjit as dr
+                import mitsuba as mi
 
-            if mi.variant() != VARIANT:
-                mi.set_variant(VARIANT)
-    except ImportError as error:
-        reason = " ".join(str(error).split())[:160]
-        raise InputError(f"Mitsuba finds no usable LLVM ({reason}); {REMEDY}") from None
-    check_llvm_version(tuple(dr.detail.llvm_version()))
+                if mi.variant() not in [VARIANTS[name] for name in wanted]:
+                    mi.set_variant(VARIANTS[backend])
+        except (ImportError, RuntimeError) as error:
+            reason = " ".join(str(error).split())[:160]
+            if backend != wanted[-1]:
+                log.info("backend: llvm, since cuda does not start (%s)", reason)
+                continue
+            if backend == "cuda":
+                raise InputError(f"Mitsuba does not start on CUDA ({reason}); use {BACKEND_VARIABLE}=llvm") from None
+            raise InputError(f"Mitsuba finds no usable LLVM ({reason}); {REMEDY}") from None
+        break
+    if mi.variant() == VARIANTS["llvm"]:
+        check_llvm_version(tuple(dr.detail.llvm_version()))
     mi.set_log_level(mi.LogLevel.Error)
     return mi
 

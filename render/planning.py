@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from render.direct import direct_light
 from render.error import error_for_budget, estimate, response
-from render.indirect import indirect_light
-from render.returns import concatenate, select
-from render.settings import GRIDS, MAX_BOUNCES, Plan, RenderSettings
+from render.paths import energy_by_bounces
+from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
 from render.world import World
 from scenes.model import Material
 
@@ -18,12 +15,8 @@ DEFAULT_ERROR = 0.02
 # Squares of the parts must sum to less than 1; the rest is for merged returns and the pilot's own uncertainty.
 DIRECT_SHARE, MONTE_CARLO_SHARE = 0.4, 0.65
 MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
-BATCHES = 16
 PILOT_PIXELS = 256
-PILOT_SPP = 64
 PILOT_BOUNCES = 8
-# The most paths a pixel that a plan takes by itself: nobody asked for the default target, a long wait needs asking.
-MOST_SPP, MOST_SPP_BY_DEFAULT = 4096, 256
 
 
 def pilot_pixels(world: World, seed: int) -> np.ndarray:
@@ -38,6 +31,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
     """Plan a render: every choice that `settings` leaves open follows from a pilot; every choice gets a reason."""
     pixels = pilot_pixels(world, seed)
     reasons = list(_limits(world))
+    mode_is_flood = world.scene.laser.mode == "flood"
     fine = response(direct_light(world, pixels, 2 * GRIDS[-1]).samples, pixels)
     target, why = _target(settings, fine)
     reasons.append(why)
@@ -49,19 +43,23 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         reasons.append("ambient light: rendered, the scene has environment or area lights")
     else:
         reasons.append("ambient light: none in the scene; a sensor's background will be uniform")
-    return Plan(bounces, spp, grid, world.scene.has_ambient, tuple(reasons))
+    return Plan(
+        bounces,
+        spp,
+        grid,
+        world.scene.has_ambient,
+        tuple(reasons),
+        noise=MONTE_CARLO_SHARE * target,
+        adaptive=settings.adaptive and mode_is_flood,
+    )
 
 
 def _limits(world: World) -> list[str]:
     """What this renderer leaves out of the given scene."""
     materials: list[Material] = [surface.material for surface in world.scene.surfaces]
     said = []
-    if world.has_glass:
-        said.append("glass: passed in a straight line with Fresnel loss and delay; its own reflections are left out")
     if world.has_cutouts:
         said.append("cut-outs: solid where their opacity is 1/2 or more")
-    if any(m.kind in ("conductor", "plastic") for m in materials):
-        said.append("smooth mirrors: their direct return and light that reaches a surface by way of them are left out")
     if any(m.kind == "roughdiffuse" for m in materials):
         said.append("rough diffuse surfaces: rendered as Lambertian")
     return said
@@ -85,7 +83,8 @@ def _grid(
     if settings.grid is not None:
         return settings.grid, f"direct light: {settings.grid} x {settings.grid} rays a pixel, forced"
     for grid in GRIDS:
-        error = estimate(response(direct_light(world, pixels, grid).samples, pixels), fine, []).total
+        coarse = response(direct_light(world, pixels, grid).samples, pixels)
+        error = estimate(coarse, fine, np.zeros_like(fine), np.zeros(len(fine)), np.zeros(len(fine))).total
         if error <= DIRECT_SHARE * target:
             break
     why = f"direct light: {grid} x {grid} rays a pixel, error {error:.2g} against {2 * GRIDS[-1]} x {2 * GRIDS[-1]}"
@@ -94,22 +93,18 @@ def _grid(
 
 def _indirect(
     world: World, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray, target: float, seed: int
-) -> tuple[int, int, list[str]]:
+) -> tuple[int, int | None, list[str]]:
     mode = world.scene.laser.mode
     if settings.bounces == 1:
         return 1, 0, ["indirect light: none, forced by 1 bounce"]
     if settings.bounces is None and mode == "scan":
-        return 1, 0, ["indirect light: left out, also of the error, under a scanning laser unless bounces ask for it"]
+        why = "indirect light: left out, also of the error, under a scanning laser unless bounces ask for it"
+        return 1, 0, [why]
     most = PILOT_BOUNCES if settings.bounces is None else settings.bounces
-    per_batch = PILOT_SPP // BATCHES
-    seeds = np.random.SeedSequence(seed).generate_state(BATCHES)
-    batches = [concatenate(list(indirect_light(world, pixels, per_batch, most, int(s)))) for s in seeds]
-    energy = np.zeros(most + 1)
+    energy = energy_by_bounces(world, pixels, BATCHES, most, seed)
     energy[1] = fine.sum()
-    for batch in batches:
-        energy += np.bincount(batch.bounces, weights=batch.radiance, minlength=most + 1)[: most + 1] / BATCHES
     if energy.sum() <= 0:
-        return settings.bounces or 1, _whole_batches(settings.spp or BATCHES), ["indirect light: nothing is lit"]
+        return settings.bounces or 1, settings.spp or BATCHES, ["indirect light: nothing is lit"]
     whys = []
     bounces = settings.bounces
     if bounces is None:
@@ -123,18 +118,8 @@ def _indirect(
     if bounces == 1:
         return 1, 0, [*whys, "indirect light: none, what it adds is less than may be left out"]
     if settings.spp is not None:
-        spp = _whole_batches(settings.spp)
-        return bounces, spp, [*whys, f"indirect light: {spp} paths a pixel, forced"]
-    responses = [response(select(batch, batch.bounces <= bounces), pixels) for batch in batches]
-    error = estimate(fine, fine, responses).monte_carlo
-    wanted = _whole_batches(math.ceil(PILOT_SPP * (error / (MONTE_CARLO_SHARE * target)) ** 2))
-    asked = settings.error is not None or settings.budget is not None
-    spp = int(np.clip(wanted, BATCHES, MOST_SPP if asked else MOST_SPP_BY_DEFAULT))
-    whys.append(f"indirect light: {spp} paths a pixel; the pilot's {PILOT_SPP} had an error of {error:.2g}")
-    if wanted > spp:
-        remedy = "force more with spp" if asked else "ask for more with an error target"
-        whys.append(f"indirect light: {wanted} paths a pixel would meet the target, {spp} is a plan's limit; {remedy}")
-    return bounces, spp, whys
+        whys.append(f"indirect light: the work of {settings.spp} paths a pixel, forced")
+    return bounces, settings.spp, whys
 
 
 def _bounces(energy: np.ndarray, allowed: float) -> tuple[int, float]:
@@ -149,8 +134,3 @@ def _bounces(energy: np.ndarray, allowed: float) -> tuple[int, float]:
     left_out = (full.sum() + tail - np.cumsum(full)) / (full.sum() + tail)
     bounces = int(np.argmax(left_out[1:] <= allowed)) + 1 if (left_out[1:] <= allowed).any() else MAX_BOUNCES
     return bounces, max(float(left_out[bounces]), 0.0)
-
-
-def _whole_batches(spp: int) -> int:
-    """The next number of paths that is the same in every batch."""
-    return spp if spp < BATCHES else -(-spp // BATCHES) * BATCHES

@@ -36,13 +36,11 @@ def concatenate(parts: list[Samples]) -> Samples:
     return Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def merge(samples: Samples, tolerance_m: float, start_m: np.ndarray | None = None, growth: float = 0.0) -> Samples:
+def merge(samples: Samples, tolerance_m: float) -> Samples:
     """Merge samples of one pixel whose path centres share a cell; direct and indirect samples stay apart.
 
-    Cells are `tolerance_m` wide. With `start_m`, one path length a pixel, they are counted from there and widen by
-    `growth` times the distance to it: indirect light is sharp near the direct return and smooth far behind it.
-    Energy, centroid and variance of the path length are kept exactly: the merged sample is uniform over
-    centroid +- sqrt(3 variance), where a sample uniform over c +- h has variance h^2 / 3, and has the fewest bounces of
+    Cells are `tolerance_m` wide. Energy, centroid and variance of the path length are kept exactly: the merged sample
+    is uniform over centroid +- sqrt(3 variance), where a sample uniform over c +- h has variance h^2 / 3, and has the fewest bounces of
     its parts. Samples without energy go. The sums run over a stable sort in float64, so that the result depends on the
     samples' order alone.
     """
@@ -52,11 +50,6 @@ def merge(samples: Samples, tolerance_m: float, start_m: np.ndarray | None = Non
     if len(samples.pixel) == 0:
         return samples
     cell = samples.path_m / tolerance_m
-    if start_m is not None:
-        cell = cell - start_m[samples.pixel] / tolerance_m
-    if growth > 0:
-        cell = np.sign(cell) * np.log1p(growth * np.abs(cell)) / growth
-    # light of another surface of the pixel can come before its mean direct path
     cell = np.clip(np.floor(cell) + (1 << 27), 0, (1 << 28) - 1).astype(np.int64)
     key = (samples.pixel.astype(np.int64) << 1 | (samples.bounces > 1)) << 28 | cell
     order = np.argsort(key, kind="stable")
@@ -88,3 +81,8 @@ def to_returns(samples: Samples, pixels: int) -> Returns:
         radiance=samples.radiance[order].astype(np.float32),
         bounces=samples.bounces[order].astype(np.uint8),
     )
+
+
+def no_samples() -> Samples:
+    """An empty list of samples."""
+    return Samples(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.uint8))

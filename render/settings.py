@@ -8,7 +8,8 @@ from dataclasses import asdict, dataclass
 from scenes.errors import InputError
 
 MAX_BOUNCES = 63
-MAX_SAMPLES = 1 << 20
+MAX_SAMPLES = 1 << 26
+BATCHES = 16  # independent batches of indirect light, whose spread is the error estimate
 GRIDS = (2, 3, 4, 6, 8, 12, 16)
 
 
@@ -17,7 +18,8 @@ class RenderSettings:
     """What the user asks for; None leaves a choice to the plan.
 
     bounces     surfaces that light may meet, 1 = direct light only
-    spp         indirect light paths per pixel
+    spp         work on indirect light, in paths per pixel; spent where the noise is, and partly on sharing paths
+    adaptive    whether it is spent so, or evenly and without sharing
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
@@ -27,6 +29,7 @@ class RenderSettings:
 
     bounces: int | None = None
     spp: int | None = None
+    adaptive: bool = True
     grid: int | None = None
     error: float | None = None
     budget: tuple[float, float] | None = None
@@ -57,13 +60,19 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the renderer will do, and why: one reason a line, stored with the result."""
+    """What the renderer will do, and why: one reason a line, stored with the result.
+
+    spp         work on indirect light in paths per pixel; None: whatever `noise` takes
+    noise       target of the Monte-Carlo part of the error where spp is open
+    """
 
     bounces: int
-    spp: int
+    spp: int | None
     grid: int
     ambient: bool
     reasons: tuple[str, ...]
+    noise: float = 0.0
+    adaptive: bool = True
 
     def to_dict(self) -> dict:
         return asdict(self)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +22,21 @@ SCENES: dict[str, str] = {
     "corner": "a V-groove: two walls of 2 x 4 m, albedo 0.5, that meet at 90 degrees on an upright edge 3 m away",
 }
 EXTENSIONS = (*MESH_EXTENSIONS, ".xml")
+HARD = "hard-cases/"
 WIDTH, HEIGHT = 128, 96  # pixels, where neither the caller nor the file says
 
 
 def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
-    """The scene of that name (a key of SCENES) or in that file (.obj .ply .stl .glb, or Mitsuba .xml).
+    """The scene of that name (a key of SCENES, or `hard-cases/NAME`) or in that file (.obj .ply .stl .glb, or
+    Mitsuba .xml).
 
     width, height: pixels; None is 128 x 96, or the film size of an .xml; one alone keeps the proportions. The seed
     matters to procedural scenes only. Raises InputError in one line for an unknown name or extension, or a bad file.
     """
     spec = str(spec)
     kind = Path(spec).suffix.lower()
+    if spec.startswith(HARD):
+        return _hard_case(spec.removeprefix(HARD), width, height)
     if spec not in SCENES and kind not in EXTENSIONS:
         raise InputError(
             f"scene {spec!r}: expected one of {', '.join(SCENES)}, or a file with extension {' '.join(EXTENSIONS)}"
@@ -47,6 +52,16 @@ def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: in
         return living_room(seed, width=size.width, height=size.height)
     make = {"plane": _plane, "sphere": _sphere, "corner": _corner}[spec]
     return Scene(spec, make(), size)
+
+
+def _hard_case(name: str, width: int | None, height: int | None) -> Scene:
+    from scenes.hard_cases import SCENES as HARD_CASES
+    from scenes.hard_cases import hard_case
+
+    if name not in HARD_CASES:
+        raise InputError(f"scene {HARD + name!r}: expected {HARD} and one of {', '.join(HARD_CASES)}")
+    scene = hard_case(name)
+    return replace(scene, camera=scene.camera.resized(width, height))
 
 
 def _looking_ahead(width: int, height: int, fov_deg: float = 40.0) -> Camera:

@@ -127,10 +127,41 @@ class Depth(Common):
     """Draw estimate, truth and error beside the file."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Bench(Common):
+    """Speed against error beside mitransient (`bench render`), or the table of hard cases (`bench hard-cases`)."""
+
+    stage: Positional[Literal["render", "hard-cases"]] = "render"
+    """What is measured."""
+    scenes: tuple[Literal["flash", "lamp", "artist", "groove"], ...] = ()
+    """Scenes of `bench render` (default: all)."""
+    sizes: tuple[int, ...] = ()
+    """Image sides, pixels (default: 64 128 256 of flash and lamp, 64 128 of artist and groove)."""
+    only: tuple[str, ...] = ()
+    """Cases of `bench hard-cases` (default: all)."""
+    quick: bool = False
+    """No 256 pixels, and artist and groove at 64 alone; no slow hard cases."""
+    peer: Literal["mitransient", "none"] = "mitransient"
+    """The renderer beside ours; none measures ours alone, against its own finer results."""
+    repeats: int = 3
+    """Warm runs of each quality; their median is reported."""
+    seeds: int = 3
+    """Runs of different seeds that the error is averaged over."""
+    memory: bool = False
+    """Compare peak memory in fresh processes instead."""
+    data: Annotated[Path | None, _open("FOLDER")] = None
+    """Folder with the artist's scene (default: SCENE2SPAD_DATA, else ../shared/data)."""
+    cache: Annotated[Path | None, _open("FOLDER")] = None
+    """Folder that keeps references from run to run (default: ~/.cache/scene2spad)."""
+    out: Path = Path("out/bench")
+    """Folder for the table (.csv) and the pictures (.png)."""
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Sense, tyro.conf.subcommand("sense")]
     | Annotated[Depth, tyro.conf.subcommand("depth")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )

@@ -264,10 +264,20 @@ def run_demo(command: commands.Demo, progress: Progress) -> dict:
     }
 
 
+def run_bench(command: commands.Bench, progress: Progress) -> dict:
+    """One stage of the bench; each is imported only when it is asked for."""
+    if command.stage == "hard-cases":
+        from studies.bench import hard_cases as stage
+    else:
+        from studies.bench import render as stage
+    return stage.run(command, progress)
+
+
 RUNNERS: dict[type, Callable] = {
     commands.Demo: run_demo,
     commands.Scenes: run_scenes,
     commands.Render: run_render,
     commands.Sense: run_sense,
     commands.Depth: run_depth,
+    commands.Bench: run_bench,
 }

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-# the tests' own helpers (oracles) are imported by name; the packages are installed
-sys.path[:0] = [str(Path(__file__).parent / folder) for folder in ("render", "spad")]
+# the tests' own helpers are imported by name; the packages are installed
+sys.path[:0] = [str(Path(__file__).parent / "spad")]
 
 
 @pytest.fixture(scope="session")

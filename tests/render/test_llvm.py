@@ -1,8 +1,9 @@
-"""The choice of LLVM. What could abort the process runs in one of its own."""
+"""The choice of backend and LLVM. What could abort the process runs in one of its own."""
 
 import os
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -106,3 +107,118 @@ def test_system_search_takes_the_newest_from_19_on(tmp_path):
     assert llvm.system_llvm(tmp_path).name == "libLLVM.so.19.1"
     (folder / "libLLVM-22.so.1").touch()
     assert llvm.system_llvm(tmp_path).name == "libLLVM-22.so.1"
+
+
+# ---- CUDA or LLVM, without a GPU: the driver's libraries and Mitsuba itself are stand-ins ----
+
+
+class FakeMitsuba(types.ModuleType):
+    """Starts on the variants it is told to, and refuses the others as Mitsuba does."""
+
+    LogLevel = types.SimpleNamespace(Error=0)
+
+    def __init__(self, *works: str) -> None:
+        super().__init__("mitsuba")
+        self.works, self.chosen, self.tried = works, None, []
+
+    def variant(self):
+        return self.chosen
+
+    def set_variant(self, name):
+        self.tried.append(name)
+        if name not in self.works:
+            raise ImportError(f"{name}: could not\nbe started")
+        self.chosen = name
+
+    def set_log_level(self, level):
+        pass
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Set up a machine: which driver libraries it has, which variants start, what LLVM says it is."""
+
+    def set_up(libraries=(), works=("llvm_ad_mono",), version=(23, 1, 4), backend=None):
+        for name in (llvm.BACKEND_VARIABLE, *llvm.CUDA_LIBRARIES.values()):
+            monkeypatch.delenv(name, raising=False)
+        if backend is not None:
+            monkeypatch.setenv(llvm.BACKEND_VARIABLE, backend)
+        monkeypatch.setattr(
+            llvm.ctypes.util, "find_library", lambda name: f"lib{name}.so.1" if name in libraries else None
+        )
+        drjit = types.ModuleType("drjit")
+        drjit.detail = types.SimpleNamespace(llvm_version=lambda: version)
+        mitsuba = FakeMitsuba(*works)
+        monkeypatch.setitem(sys.modules, "drjit", drjit)
+        monkeypatch.setitem(sys.modules, "mitsuba", mitsuba)
+        return mitsuba
+
+    return set_up
+
+
+BOTH = ("cuda", "nvoptix")
+EVERY = ("cuda_ad_mono", "llvm_ad_mono")
+
+
+def test_cuda_is_taken_where_driver_and_optix_are_there(machine):
+    fake = machine(BOTH, EVERY, version=())  # no LLVM at all: nobody asks for it
+    assert llvm.start_mitsuba() is fake and fake.chosen == "cuda_ad_mono"
+    assert llvm.start_mitsuba() is fake and fake.tried == ["cuda_ad_mono"]
+
+
+@pytest.mark.parametrize("libraries", [(), ("cuda",), ("nvoptix",)])
+def test_llvm_is_taken_without_driver_or_optix(machine, libraries):
+    fake = machine(libraries, EVERY)
+    llvm.start_mitsuba()
+    assert fake.tried == ["llvm_ad_mono"]
+
+
+def test_llvm_is_taken_where_cuda_does_not_start(machine):
+    fake = machine(BOTH)
+    llvm.start_mitsuba()
+    assert fake.tried == ["cuda_ad_mono", "llvm_ad_mono"] and fake.chosen == "llvm_ad_mono"
+    machine(BOTH, version=(15, 0, 6))
+    with pytest.raises(InputError, match="would abort"):
+        llvm.start_mitsuba()
+
+
+def test_the_variable_forces_a_backend(machine):
+    fake = machine(BOTH, EVERY, backend="llvm")
+    llvm.start_mitsuba()
+    assert fake.tried == ["llvm_ad_mono"]
+    fake = machine(BOTH, EVERY, backend="cuda")
+    llvm.start_mitsuba()
+    assert fake.tried == ["cuda_ad_mono"]
+
+
+@pytest.mark.parametrize(
+    ("set_up", "message"),
+    [
+        ({"backend": "metal"}, "SCENE2SPAD_BACKEND=metal: no such backend, expected llvm or cuda"),
+        ({"backend": "cuda"}, "SCENE2SPAD_BACKEND=cuda: found no libcuda.so of an NVIDIA driver; use llvm"),
+        ({"backend": "cuda", "libraries": ("cuda",)}, "found no libnvoptix.so"),
+        ({"backend": "cuda", "libraries": BOTH}, "does not start on CUDA"),
+        ({"works": ()}, "finds no usable LLVM"),
+    ],
+)
+def test_a_backend_that_cannot_be_had_is_one_line(machine, set_up, message):
+    machine(**set_up)
+    with pytest.raises(InputError) as error:
+        llvm.start_mitsuba()
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_explicit_driver_libraries_count(machine, monkeypatch, tmp_path):
+    fake = machine((), EVERY)
+    for name in llvm.CUDA_LIBRARIES.values():
+        (tmp_path / name).touch()
+        monkeypatch.setenv(name, str(tmp_path / name))
+    llvm.start_mitsuba()
+    assert fake.chosen == "cuda_ad_mono"
+
+
+def test_a_forced_backend_reaches_a_real_process():
+    done = run(START, SCENE2SPAD_BACKEND="llvm")
+    assert done.returncode == 0 and done.stdout.strip() == "rendered True", done.stderr
+    done = run(START, SCENE2SPAD_BACKEND="quantum")
+    assert done.stdout.strip() == "refused: SCENE2SPAD_BACKEND=quantum: no such backend, expected llvm or cuda"

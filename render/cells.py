@@ -1,0 +1,136 @@
+"""Path-length cells in which indirect light accumulates: fine near the direct return, wide far behind it.
+
+Sums run in UInt64 fixed point, so that their result does not depend on the order in which threads add.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.returns import Samples
+from render.world import Float, UInt32, dr, mi
+
+UInt64 = mi.UInt64
+# One quantum is 2^-43 of the brightest pixel's direct radiance: 2^26 samples of a tenth of it keep 13 bits each, and a
+# cell overflows only beyond 2^21 times that radiance. A single sample above 2^17 times is clipped, and counted.
+QUANTA_PER_BRIGHTEST = 2.0**43
+MOST_QUANTA = 2.0**60
+
+
+class Cells(NamedTuple):
+    """Edges of the cells of x = path - origin [m], rising; `behind` cells lie below x = 0.
+
+    Cell k >= 0 begins at expm1(growth k) width / growth: it is `width_m` wide plus `growth` times its distance.
+    """
+
+    width_m: float
+    growth: float
+    behind: int
+    edges_m: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return len(self.edges_m) - 1
+
+    @property
+    def width_of_m(self) -> np.ndarray:
+        """Width of every cell [m]."""
+        return np.diff(self.edges_m)
+
+
+def make_cells(width_m: float, growth: float, nearest_m: float, farthest_m: float) -> Cells:
+    """Cells that cover x from `nearest_m` (negative) to `farthest_m`."""
+    behind, ahead = (math.ceil(float(_cell_number(abs(x), width_m, growth))) + 1 for x in (nearest_m, farthest_m))
+    number = np.arange(-behind, ahead + 1, dtype=np.float64)
+    far = np.expm1(growth * np.abs(number)) / growth if growth > 0 else np.abs(number)
+    return Cells(width_m, growth, behind, np.sign(number) * far * width_m)
+
+
+def _cell_number(x: Any, width_m: float, growth: float) -> Any:
+    return np.log1p(growth * x / width_m) / growth if growth > 0 else x / width_m
+
+
+class Rows:
+    """Accumulators of several rows (a pixel, or a pixel and batch, each): energy, and its moment within the cell.
+
+    `quantum` is the radiance of one unit. Not a dataclass: Dr.Jit would take its fields for variables of a loop.
+    """
+
+    def __init__(self, rows: int, cells: Cells, quantum: float) -> None:
+        self.rows, self.cells, self.quantum = rows, cells, quantum
+        self.energy = dr.zeros(UInt64, int(rows * cells.count))
+        self.moment = dr.zeros(UInt64, int(rows * cells.count))
+        self._edges = Float(cells.edges_m)
+        self._growth, self._width = dr.opaque(Float, cells.growth), dr.opaque(Float, cells.width_m)
+        self._behind, self._count = dr.opaque(UInt32, cells.behind), dr.opaque(UInt32, cells.count)
+        self._per_quantum = dr.opaque(Float, 1 / quantum)
+
+    def add(self, row: Any, x_m: Any, radiance: Any, active: Any) -> None:
+        """Add samples of radiance at x = path - origin to their rows' cells."""
+        ratio = dr.abs(x_m) / self._width
+        number = dr.log(1 + self._growth * ratio) / self._growth if self.cells.growth > 0 else ratio
+        signed = dr.floor(dr.mulsign(number, x_m)) + Float(self._behind)
+        cell = UInt32(dr.clip(signed, 0, Float(self._count) - 1))
+        low, high = (
+            dr.gather(Float, self._edges, cell, active),
+            dr.gather(Float, self._edges, cell + 1, active),
+        )
+        share = dr.clip((x_m - low) / (high - low), 0, 1)
+        index = row * self._count + cell
+        dr.scatter_add(self.energy, self.quanta(radiance), index, active, mode=dr.ReduceMode.Direct)
+        dr.scatter_add(self.moment, self.quanta(radiance * share), index, active, mode=dr.ReduceMode.Direct)
+
+    def quanta(self, radiance: Any) -> Any:
+        """Radiance in units of the fixed-point sums, rounded."""
+        return UInt64(dr.minimum(radiance * self._per_quantum, MOST_QUANTA) + 0.5)
+
+    def samples(self, pixels: np.ndarray, origin_m: np.ndarray) -> Samples:
+        """Merged samples, one for every cell that holds energy, of rows that belong to `pixels`.
+
+        Energy and centroid are exact; a sample is uniform over the widest interval around its centroid in its cell.
+        """
+        energy, moment = self.energy.numpy(), self.moment.numpy()
+        filled = np.flatnonzero(energy)
+        energy, moment = energy[filled].astype(np.float64), moment[filled].astype(np.float64)
+        row, cell = np.divmod(filled, self.cells.count)
+        return cell_samples(
+            self.cells, pixels[row], origin_m[row], cell, energy * self.quantum, np.clip(moment / energy, 0, 1)
+        )
+
+    def radiance(self) -> np.ndarray:
+        """Radiance of every cell, (rows, cells) float64."""
+        return self.energy.numpy().reshape(self.rows, self.cells.count) * self.quantum
+
+
+def cell_samples(
+    cells: Cells, pixel: np.ndarray, origin_m: np.ndarray, cell: np.ndarray, radiance: np.ndarray, share: np.ndarray
+) -> Samples:
+    """Samples of filled cells, `share` of the cell's width being the centroid's place in it."""
+    low, width = cells.edges_m[cell], cells.width_of_m[cell]
+    return Samples(
+        pixel,
+        origin_m + low + share * width,
+        np.minimum(share, 1 - share) * width,
+        radiance,
+        np.full(len(pixel), 2, dtype=np.uint8),
+    )
+
+
+def coarsened(samples: Samples, cells: Cells, origin_m: np.ndarray) -> Samples:
+    """Samples merged into cells counted from their pixels' origins, as `Rows` would; radiance may be negative."""
+    x = samples.path_m - origin_m[samples.pixel]
+    cell = np.clip(np.searchsorted(cells.edges_m, x, side="right") - 1, 0, cells.count - 1)
+    key, place = np.unique(samples.pixel * cells.count + cell, return_inverse=True)
+    energy = np.bincount(place, weights=samples.radiance)
+    moment = np.bincount(place, weights=samples.radiance * (x - cells.edges_m[cell]) / cells.width_of_m[cell])
+    pixel, cell = np.divmod(key, cells.count)
+    share = np.clip(np.divide(moment, energy, out=np.full(len(key), 0.5), where=energy > 0), 0, 1)
+    return cell_samples(cells, pixel, origin_m[pixel], cell, energy, share)
+
+
+def quantum_for(brightest: float) -> float:
+    """The radiance of one unit of a fixed-point sum, from the brightest pixel's direct radiance."""
+    return brightest / QUANTA_PER_BRIGHTEST

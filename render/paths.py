@@ -1,0 +1,441 @@
+"""Paths of indirect light: camera paths whose tails are shared by the pixels around them, each connected to the laser.
+
+A camera path meets x1, the first surface of its pixel, then x2, x3, ... and is connected to the laser at each of them.
+What follows x1 is its tail. Pixels near each other form a block of T, and every pixel of the block uses the tails of
+all: it sees T samples for the price of one path and T rays that test whether its x1 sees x2 (path reuse: Bekaert,
+Sbert, Halton 2002, "Accelerating path tracing by re-using paths"). Weighted by the balance heuristic (Veach 1997,
+eq. 9.8) the estimate stays unbiased: with F_i the integrand of pixel i over x2 and p_k the density, per area at x2,
+with which pixel k samples x2 (0 where x2 is hidden from it),
+
+    L_i = sum_j F_i(x2_j) / sum_k p_k(x2_j),
+
+where tail j goes on in a direction that was sampled as seen from x1_j, so that beyond x2 the densities have the factor
+p(w3 | x1_k, x2). Paths that leave x1 (or x2) by a mirror-like lobe, or whose x1 or x2 lies on plastic, are disjoint
+from all others and stay their own.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.cells import Rows
+from render.world import (
+    Bool,
+    Float,
+    UInt32,
+    World,
+    camera_rays,
+    dr,
+    first_opaque,
+    laser_leg,
+    laser_light,
+    mi,
+    segment,
+    shape_index,
+)
+
+BLOCK = 16  # pixels that share their paths
+LANES = 1 << 20  # connections, or paths, of one launch
+# Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32
+GOLDEN = (3242174889, 2447445414)
+
+
+class Sums:
+    """Where connections are added: rows of the pixels' cells, finer rows of watched pixels by batch, totals by batch.
+
+    origin_m   zero of every pixel's cells
+    watch      the watched row of every pixel, -1 for none
+    batches    rounds take turns: round r belongs to batch r modulo this
+    rounds     paths of every pixel: each counts one of them
+    Not a dataclass: Dr.Jit would take its fields for variables of a loop.
+    """
+
+    def __init__(
+        self,
+        rows: Rows,
+        origin_m: np.ndarray,
+        *,
+        rounds: np.ndarray,
+        batches: int,
+        watched: Rows | None = None,
+        watch: np.ndarray | None = None,
+    ) -> None:
+        self.rows, self.watched = rows, watched
+        self.origin_m = Float(origin_m)
+        self.watch = None if watch is None else mi.Int32(watch)
+        self.totals = dr.zeros(mi.UInt64, rows.rows * batches)
+        self.batches = dr.opaque(UInt32, batches)
+        self._scale = Float(1 / rounds)
+
+    def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
+        """Add samples to the pixels' and the watched rows; returns what was added, for `add_total`."""
+        x = path - dr.gather(Float, self.origin_m, pixel, active)
+        radiance *= dr.gather(Float, self._scale, pixel, active)
+        radiance = dr.select(active & dr.isfinite(radiance), radiance, 0)
+        active = active & (radiance > 0)  # not in place: the caller goes on with its own
+        self.rows.add(pixel, x, radiance, active)
+        if self.watched is not None:
+            watch = dr.gather(mi.Int32, self.watch, pixel, active)
+            row = UInt32(dr.maximum(watch, 0)) * self.batches + batch
+            self.watched.add(row, x, radiance * Float(self.batches), active & (watch >= 0))
+        return radiance
+
+    def add_total(self, pixel: Any, batch: Any, radiance: Any) -> None:
+        dr.scatter_add(
+            self.totals,
+            self.rows.quanta(radiance),
+            pixel * self.batches + batch,
+            radiance > 0,
+            mode=dr.ReduceMode.Direct,
+        )
+
+    def evaluate(self) -> None:
+        """Run what was added so far."""
+        watched = [] if self.watched is None else [self.watched.energy, self.watched.moment]
+        dr.eval(self.rows.energy, self.rows.moment, self.totals, *watched)
+
+
+class _Heads(NamedTuple):
+    """x1 of every path of a launch and where it belongs."""
+
+    receiver: Any
+    pixel: Any
+    si: Any
+    transmission: Any
+    path: Any
+    valid: Any
+    shares: Any
+
+
+class _Tails(NamedTuple):
+    """x2 and beyond: light of the laser at x2; direction to x3; light from there on per path vertex.
+
+    `own_weight` leads from x2 to the pixel, `own_onward` from x3; `shared` and `onward` say whether the pool may use
+    the light at x2, and the light beyond.
+    """
+
+    si: Any
+    to_laser: Any
+    irradiance: Any
+    laser_path: Any
+    onward_direction: Any
+    shared: Any
+    onward: Any
+    leg: Any
+    own_transmission: Any
+    own_value: Any
+    own_onward: Any
+    values: Any
+    paths: Any
+
+
+class Turns(NamedTuple):
+    """One launch: turn n traces a path in each pixel of its block `block[n]`, number `stream[n]` of the image.
+
+    `round` numbers the turns of a block. With the seed, stream and round decide the random numbers.
+    """
+
+    block: np.ndarray
+    stream: np.ndarray
+    round: np.ndarray
+
+
+def block_order(pixels: np.ndarray, width: int) -> np.ndarray:
+    """Flat pixel indices along a Z-order curve, so that runs of 16 are square neighbourhoods; padded with -1."""
+    row, column = np.divmod(pixels.astype(np.uint64), np.uint64(width))
+    code = np.zeros(len(pixels), np.uint64)
+    for bit in range(15):
+        one, shift = np.uint64(1), np.uint64(bit)
+        code |= ((column >> shift) & one) << np.uint64(2 * bit) | ((row >> shift) & one) << np.uint64(2 * bit + 1)
+    ordered = pixels[np.argsort(code, kind="stable")]
+    return np.concatenate((ordered, np.full(-len(ordered) % BLOCK, -1, ordered.dtype)))
+
+
+def add_paths(
+    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int, sums: Sums, *, shared: bool
+) -> None:
+    """Trace paths of the given blocks of flat pixels (-1: none) and add their light to `sums`; `shared` by blocks."""
+    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches)
+    if not shared or world.has_own:
+        _add_own(heads, tails, batch, sums, bounces - 2, shared)
+    if shared:
+        head, tail = _pairs(dr.width(batch))
+        _add_pairs(tails, head, tail, _weights(world, heads, tails, head, tail), heads, batch, sums, bounces - 2)
+    sums.evaluate()
+
+
+def noise_of_paths(
+    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sum of the squared contributions of one path to each pixel, own and shared; (turns, BLOCK) each.
+
+    Histograms of paths that fall into different bins have this variance.
+    """
+    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, dr.opaque(UInt32, 1))
+    lanes = dr.width(batch)
+    values = tails.values.numpy().reshape(-1, lanes)[: bounces - 2].astype(np.float64)
+    beyond = (values**2).sum(axis=0)
+    own = tails.own_value.numpy().astype(np.float64) ** 2 + tails.own_onward.numpy().astype(np.float64) ** 2 * beyond
+    head, tail = _pairs(lanes)
+    _, first, weight = _weights(world, heads, tails, head, tail)
+    power = first.numpy().astype(np.float64) ** 2
+    power += weight.numpy().astype(np.float64) ** 2 * np.repeat(beyond, BLOCK)
+    shared = np.nan_to_num(power.reshape(-1, BLOCK, BLOCK)).sum(axis=1)
+    if world.has_own:
+        alone, onward = ~tails.shared.numpy().astype(bool), ~tails.onward.numpy().astype(bool)
+        mirrored = np.where(alone, tails.own_value.numpy(), 0).astype(np.float64) ** 2
+        mirrored += np.where(onward, tails.own_onward.numpy(), 0).astype(np.float64) ** 2 * beyond
+        shared += mirrored.reshape(-1, BLOCK)
+    return np.nan_to_num(own).reshape(-1, BLOCK), shared
+
+
+def _pairs(lanes: int) -> tuple[Any, Any]:
+    """Head and tail of every pair: neighbours in a block are neighbours in the launch, which keeps rays coherent."""
+    pair = dr.arange(UInt32, lanes * BLOCK)
+    tail = pair // BLOCK
+    return tail // BLOCK * BLOCK + pair % BLOCK, tail
+
+
+def _trace(
+    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int, batches: Any
+) -> tuple[_Heads, _Tails, Any]:
+    lanes = len(turns.block) * BLOCK
+    lane = dr.arange(UInt32, lanes)
+    turn, member = lane // BLOCK, lane % BLOCK
+    block, stream, round_index = (dr.gather(UInt32, UInt32(column), turn) for column in turns)
+    receiver = block * BLOCK + member
+    pixels = UInt32(pixels.astype(np.int64) & 0xFFFFFFFF)
+    keys = [dr.opaque(UInt32, int(key)) for key in np.random.SeedSequence(seed).generate_state(2)]
+    # one random shift a block and round; the members share a low-discrepancy set of first directions
+    shift = mi.sample_tea_32(stream, round_index ^ keys[0])
+    spread = [Float((s + member * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
+    # a hash of block, member and round numbers the streams, whichever launch they run in
+    lane_key = mi.sample_tea_32(stream * BLOCK + member, round_index ^ keys[1])
+    random = mi.PCG32(initstate=mi.UInt64(lane_key[0]), initseq=mi.UInt64(lane_key[1]))
+    pixel = dr.gather(UInt32, pixels, receiver)
+    valid = pixel != 0xFFFFFFFF
+    pixel = dr.select(valid, pixel, 0)
+    jitter = mi.Point2f(random.next_float32(), random.next_float32())
+    ray, _ = camera_rays(world, Float(pixel % world.width) + jitter.x, Float(pixel // world.width) + jitter.y)
+    si, transmission, path, _ = first_opaque(world, ray, valid)
+    hit = valid & si.is_valid()
+    shares = hit & (dr.gather(Float, world.shares, shape_index(si), hit) > 0)
+    heads = _Heads(receiver, pixel, si, transmission + dr.zeros(Float, lanes), path, hit, shares)
+    context = mi.BSDFContext()
+    sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), heads.valid)
+    alive = heads.valid & (weight[0] > 0)
+    point = mi.Point3f(si.p)
+    si, passed, leg, _ = first_opaque(world, si.spawn_ray(si.to_world(sample.wo)), alive, point)
+    alive &= si.is_valid()
+    own = dr.select(alive, transmission * weight[0] * passed, 0)
+    to_laser, irradiance, laser_path = laser_light(world, si, pixel, alive, seen_by_camera=None)
+    value = si.bsdf().eval(context, si, si.to_local(to_laser), alive)[0] * irradiance
+    shares = shares & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
+    spread_lobe = ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    onward, onward_weight = si.bsdf().sample(
+        context, si, random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32()), alive
+    )
+    spread_onward = ~mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
+    direction = si.to_world(onward.wo)
+    values, paths = _beyond(world, si, direction, alive & (onward_weight[0] > 0), pixel, random, bounces - 2)
+    tails = _Tails(
+        si=si,
+        to_laser=to_laser,
+        irradiance=dr.select(alive, irradiance, 0),
+        laser_path=laser_path,
+        onward_direction=direction,
+        shared=alive & shares & spread_lobe,
+        onward=alive & shares & spread_lobe & spread_onward & (onward_weight[0] > 0),
+        leg=leg,
+        own_transmission=dr.select(alive, passed, 0),
+        own_value=dr.select(alive & dr.isfinite(value), own * value, 0),
+        own_onward=own * onward_weight[0],
+        values=values,
+        paths=paths,
+    )
+    batch = round_index % batches
+    dr.eval(*heads, *tails, batch)
+    return heads, tails, batch
+
+
+@dr.syntax
+def _beyond(
+    world: World, si: Any, direction: Any, active: Any, pixel: Any, random: Any, vertices: int
+) -> tuple[Any, Any]:
+    """Light of x3, x4, ... that goes to x2 from `direction`, divided by the density of the path after x2.
+
+    Returns radiances and path lengths from x2 to the laser, vertex-major flat arrays of vertices x lanes.
+    """
+    lanes = dr.width(pixel)
+    values, paths = dr.zeros(Float, lanes * max(vertices, 1)), dr.zeros(Float, lanes * max(vertices, 1))
+    lane, stride = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes)
+    last = dr.opaque(UInt32, vertices)
+    vertex, throughput, path = dr.zeros(UInt32, lanes), dr.full(Float, 1, lanes), dr.zeros(Float, lanes)
+    si, direction = mi.SurfaceInteraction3f(si), mi.Vector3f(direction)
+    active = Bool(active) & (vertex < last)
+    while active:
+        ray, point = si.spawn_ray(direction), mi.Point3f(si.p)
+        si, passed, optical, _ = first_opaque(world, ray, active, point)
+        throughput *= passed
+        path += optical
+        active &= si.is_valid()
+        value, leg = laser_leg(world, si, pixel, active, seen_by_camera=None)
+        slot = vertex * stride + lane
+        dr.scatter(paths, path + leg, slot, active)
+        dr.scatter(values, throughput * value, slot, active)
+        vertex += 1
+        active &= vertex < last
+        sample, weight = si.bsdf().sample(
+            mi.BSDFContext(),
+            si,
+            random.next_float32(),
+            mi.Point2f(random.next_float32(), random.next_float32()),
+            active,
+        )
+        direction = si.to_world(sample.wo)
+        throughput *= weight[0]
+        # Russian roulette: paths that carry little end early, the others carry their energy on
+        survive = dr.clip(throughput, 0.05, 0.95)
+        active &= (throughput > 0) & (random.next_float32() < survive)
+        throughput /= survive
+    return values, paths
+
+
+def _add_own(heads: _Heads, tails: _Tails, batch: Any, sums: Sums, vertices: int, shared: bool) -> None:
+    """Light that a pixel gets from its own path alone."""
+    first, onward = Bool(heads.valid), Bool(heads.valid)
+    if shared:
+        first, onward = first & ~tails.shared, onward & ~tails.onward
+    light = _Light(
+        heads.receiver,
+        batch,
+        dr.arange(UInt32, dr.width(batch)),
+        heads.path + tails.leg,
+        dr.select(first, tails.own_value, 0),
+        dr.select(onward, tails.own_onward, 0),
+    )
+    _add(light, tails, sums, vertices)
+
+
+def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: int, seed: int) -> np.ndarray:
+    """Mean radiance, summed over the pixels, of light that met exactly 0, 1, ..., `bounces` surfaces (0 below 2)."""
+    blocks = block_order(pixels, world.scene.camera.width)
+    block = np.tile(np.arange(len(blocks) // BLOCK), rounds)
+    turns = Turns(block, block, np.repeat(np.arange(rounds), len(blocks) // BLOCK))
+    _, tails, batch = _trace(world, blocks, turns, bounces, seed, dr.opaque(UInt32, 1))
+    beyond = tails.own_onward.numpy() * tails.values.numpy().reshape(-1, dr.width(batch))
+    energy = np.zeros(bounces + 1)
+    energy[2] = tails.own_value.numpy().sum(dtype=np.float64)
+    energy[3:] = beyond[: bounces - 2].sum(axis=1, dtype=np.float64)
+    return energy / rounds
+
+
+class _Connections(NamedTuple):
+    """Of every pair: leg x1 to x2 [m], pixel radiance from x2's laser light and from beyond, and their densities."""
+
+    leg: Any
+    value: Any
+    onward: Any
+    density: Any
+    onward_density: Any
+
+
+def _connect(world: World, heads: _Heads, tails: _Tails, head: Any, tail: Any) -> _Connections:
+    shared = dr.gather(Bool, tails.shared, tail) & dr.gather(Bool, heads.shares, head)
+    si1 = dr.gather(mi.SurfaceInteraction3f, heads.si, head, shared)
+    si2 = dr.gather(mi.SurfaceInteraction3f, tails.si, tail, shared)
+    offset = si2.p - si1.p
+    distance2 = dr.squared_norm(offset)
+    direction = offset * dr.rsqrt(distance2)
+    passed, leg = segment(world, si1, si2.p, shared)
+    # a tail is seen from where it came, whatever rounding says
+    own = head == tail
+    passed = dr.select(own, dr.gather(Float, tails.own_transmission, tail, shared), passed)
+    leg = dr.select(own, dr.gather(Float, tails.leg, tail, shared), leg)
+    active = shared & (passed > 0) & (distance2 > 0)
+    context = mi.BSDFContext()
+    value1, density1 = si1.bsdf().eval_pdf(context, si1, si1.to_local(direction), active)
+    si2.wi = si2.to_local(-direction)
+    to_laser = si2.to_local(_gather_vector(tails.to_laser, tail, active))
+    value2 = si2.bsdf().eval(context, si2, to_laser, active)[0]
+    irradiance = dr.gather(Float, tails.irradiance, tail, active)
+    going = active & dr.gather(Bool, tails.onward, tail, active)
+    onward = si2.to_local(_gather_vector(tails.onward_direction, tail, going))
+    value3, density3 = si2.bsdf().eval_pdf(context, si2, onward, going)
+    area = dr.abs(dr.dot(si2.n, direction)) / distance2
+    reach = dr.gather(Float, heads.transmission, head, active) * value1[0] * area * passed
+    density = dr.select(active, density1 * area, 0)
+    connections = _Connections(
+        leg,
+        dr.select(active, reach * value2 * irradiance, 0),
+        dr.select(going, reach * value3[0], 0),
+        density,
+        dr.select(going, density * density3, 0),
+    )
+    dr.eval(*connections)
+    return connections
+
+
+def _weights(world: World, heads: _Heads, tails: _Tails, head: Any, tail: Any) -> tuple[Any, Any, Any]:
+    """Of every pair: leg from x1 to x2 [m], radiance of x2's laser light, factor of what lies beyond x2."""
+    made = _connect(world, heads, tails, head, tail)
+    density, onward_density = dr.block_sum(made.density, BLOCK), dr.block_sum(made.onward_density, BLOCK)
+    dr.eval(density, onward_density)
+    density, onward_density = dr.gather(Float, density, tail), dr.gather(Float, onward_density, tail)
+    first = dr.select(density > 0, made.value / density, 0)
+    weight = dr.select(onward_density > 0, made.onward / onward_density, 0)
+    return made.leg, first, weight
+
+
+def _add_pairs(
+    tails: _Tails,
+    head: Any,
+    tail: Any,
+    weights: tuple[Any, Any, Any],
+    heads: _Heads,
+    batch: Any,
+    sums: Sums,
+    vertices: int,
+) -> None:
+    """Light that every pixel of a block gets from every tail of the block."""
+    leg, first, weight = weights
+    base = dr.gather(Float, heads.path, head) + leg
+    receiver, turn = dr.gather(UInt32, heads.receiver, head), dr.gather(UInt32, batch, tail)
+    _add(_Light(receiver, turn, tail, base, first, weight), tails, sums, vertices)
+
+
+class _Light(NamedTuple):
+    """What lanes add to their pixels: path to x2, radiance of x2's laser light, factor of light beyond."""
+
+    receiver: Any
+    batch: Any
+    tail: Any
+    base: Any
+    first: Any
+    weight: Any
+
+
+@dr.syntax
+def _add(light: _Light, tails: _Tails, sums: Sums, vertices: int) -> None:
+    receiver, batch, tail, base, first, weight = light
+    laser_path = dr.gather(Float, tails.laser_path, tail)
+    values, paths = tails.values, tails.paths
+    stride, last = dr.opaque(UInt32, dr.width(tails.leg)), dr.opaque(UInt32, vertices)
+    vertex, total = dr.zeros(UInt32, dr.width(tail)), dr.zeros(Float, dr.width(tail))
+    going = (first > 0) | (weight > 0)
+    # x2's own light is the loop's first turn: additions before a loop would cost a kernel of their own
+    while going:
+        beyond = going & (vertex > 0)
+        slot = (vertex - 1) * stride + tail
+        radiance = dr.select(beyond, weight * dr.gather(Float, values, slot, beyond), first)
+        path = base + dr.select(beyond, dr.gather(Float, paths, slot, beyond), laser_path)
+        total += sums.add(receiver, batch, path, radiance, going)
+        going &= (vertex < last) & (weight > 0)
+        vertex += 1
+    sums.add_total(receiver, batch, total)
+
+
+def _gather_vector(source: Any, index: Any, active: Any) -> Any:
+    return mi.Vector3f(*(dr.gather(Float, component, index, active) for component in source))

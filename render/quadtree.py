@@ -1,0 +1,280 @@
+"""A quadtree over the pixels' cells: cut where a footprint is not small, and along silhouettes and shadow edges."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from render.footprint import CLIPPED, HIT, LARGE, LIT, Footprints, trace
+from render.world import World
+
+# Two neighbours lie on one surface if their planes explain the step between their distances up to this [m]: a sixth of
+# the reference sensor's bin. A crease lies between them if their planes differ by more than CREASE_M over the step, or
+# if the cosines toward the laser differ by more than CREASE_COSINE.
+STEP_M = 0.0025
+CREASE_M = 0.03
+CREASE_COSINE = 0.05
+MIXED_GAP_M = 0.05
+# Refinement ends at this many cells a side of a pixel, however fine the grid it started from.
+MOST_CELLS = 64
+# A wire that runs through the image is followed by at most this many launches.
+MOST_LAUNCHES = 256
+
+_NAMES = ("rank", "column", "row", "level", "child", *Footprints._fields)
+_TYPES = (np.int32, np.int32, np.int32, np.uint8, np.int32, *(np.float32,) * 8, np.uint32)
+_COMPARED = ("distance_m", "slope_x_m", "slope_y_m", "facing", "radiance", "flags", "rank")
+# a cut cell's children: (0, 0), (1, 0), (0, 1), (1, 1) in (column, row)
+_CHILD_COLUMN, _CHILD_ROW = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
+# per side of a cut cell: the way to the neighbour, the children on that side, and the neighbour's children facing them
+_SIDES = (
+    (-1, 0, (0, 2), (1, 3)),
+    (1, 0, (1, 3), (0, 2)),
+    (0, -1, (0, 1), (2, 3)),
+    (0, 1, (2, 3), (0, 1)),
+)
+# cells before and after each other along the rows, and along the columns, of images (..., rows, columns)
+_ALONG_X = (..., slice(None, -1)), (..., slice(1, None))
+_ALONG_Y = (..., slice(None, -1), slice(None)), (..., slice(1, None), slice(None))
+
+Two = tuple[np.ndarray, np.ndarray]
+
+
+class CellTree:
+    """Cells of the pixels `pixels` (sorted flat indices), grid x grid each at level 0, half as wide with every level.
+
+    One array per property, `used` cells long, children after their parents and four in a row. `rank` is the place in
+    `pixels`; `column`, `row` count cells of the same level from the image's corner; `child` is the first of a cell's
+    four children, -1 for a leaf; the rest is the cell's `Footprints`. `mixed` (pixels,) is true where neighbouring
+    cells of a pixel hold surfaces more than 50 mm apart, or a surface and nothing; `rays` counts.
+    """
+
+    rank: np.ndarray
+    column: np.ndarray
+    row: np.ndarray
+    level: np.ndarray
+    child: np.ndarray
+    path_m: np.ndarray
+    half_width_m: np.ndarray
+    minor_m: np.ndarray
+    radiance: np.ndarray
+    distance_m: np.ndarray
+    slope_x_m: np.ndarray
+    slope_y_m: np.ndarray
+    facing: np.ndarray
+    flags: np.ndarray
+
+    def __init__(self, world: World, pixels: np.ndarray, grid: int) -> None:
+        self.world, self.pixels, self.grid = world, pixels, grid
+        self.width = world.scene.camera.width
+        self.first = int(pixels[0]) if len(pixels) else 0
+        span = int(pixels[-1]) - self.first + 1 if len(pixels) else 0
+        self.rank_of = np.full(span, -1, np.int32)
+        self.rank_of[pixels - self.first] = np.arange(len(pixels))
+        self.whole_rows = self.first % self.width == 0 and span == len(pixels) and span % self.width == 0
+        self.used = self.rays = 0
+        self.least = np.float32(0)
+        self.mixed = np.zeros(len(pixels), bool)
+        for name, dtype in zip(_NAMES, _TYPES, strict=True):
+            setattr(self, name, np.empty(0, dtype))
+        cell_row, cell_column = np.divmod(np.arange(grid * grid, dtype=np.int32), grid)
+        column = ((pixels % self.width)[:, None] * grid + cell_column).ravel()
+        row = ((pixels // self.width)[:, None] * grid + cell_row).ravel()
+        self._add(np.repeat(np.arange(len(pixels), dtype=np.int32), grid * grid), column, row, np.uint8(0))
+
+    def refine(self, levels: int, least_share: float) -> np.ndarray:
+        """Cut cells until none needs it or is `levels` deep; whether a cell of each pixel was, (pixels,) bool.
+
+        An edge that could change less than `least_share` of the root mean square of the pixels' radiance is left.
+        """
+        touched = np.zeros(len(self.pixels), bool)
+        if len(self.pixels) == 0:
+            return touched
+        per_pixel = self.radiance[: self.used].reshape(len(self.pixels), -1).mean(axis=1, dtype=np.float64)
+        self.least = np.float32(least_share * np.sqrt(np.square(per_pixel).mean()))
+        pending = np.flatnonzero(self._first_reasons())
+        if levels == 0:
+            return touched
+        for _ in range(MOST_LAUNCHES):
+            if len(pending) == 0:
+                break
+            touched[self.rank[pending]] = True
+            pending = self._cut(pending, levels)
+        return touched
+
+    def clip(self) -> int:
+        """Clip the leaves that are still not small to their faces; the number that this changes."""
+        large = np.flatnonzero((self.flags[: self.used] & LARGE) != 0)
+        large = large[self.child[large] < 0]
+        found = self._trace(large, clip=True)
+        self.path_m[large], self.half_width_m[large] = found.path_m, found.half_width_m
+        return int(np.count_nonzero(found.flags & CLIPPED))
+
+    def pitch(self, index: np.ndarray | slice) -> np.ndarray:
+        """Width of cells in pixels, float32."""
+        return np.ldexp(np.float32(1 / self.grid), -self.level[index].astype(np.int32))
+
+    def _trace(self, index: np.ndarray | slice, *, clip: bool = False) -> Footprints:
+        column, row, level = self.column[index], self.row[index], self.level[index]
+        self.rays += len(column)
+        return trace(self.world, column, row, level, self.grid, clip=clip)
+
+    def _add(self, rank: np.ndarray, column: np.ndarray, row: np.ndarray, level: np.ndarray | np.uint8) -> slice:
+        """Trace new cells and append them."""
+        new = slice(self.used, self.used + len(rank))
+        if new.stop > len(self.rank):
+            for name in _NAMES:
+                old = getattr(self, name)
+                grown = np.empty(new.stop + new.stop // 2, old.dtype)
+                grown[: self.used] = old[: self.used]
+                setattr(self, name, grown)
+        self.rank[new], self.column[new], self.row[new], self.level[new], self.child[new] = rank, column, row, level, -1
+        for name, values in zip(Footprints._fields, self._trace(new), strict=True):
+            getattr(self, name)[new] = values
+        self.used = new.stop
+        return new
+
+    def _first_reasons(self) -> np.ndarray:
+        """Which cells of level 0 to cut, (cells,) bool.
+
+        Raster images of the cells where whole rows were asked for; else one small image for each pixel.
+        """
+        grid, cells = self.grid, self.used
+        images = [getattr(self, name)[:cells].reshape(-1, grid, grid) for name in _COMPARED]
+        if self.whole_rows:
+            by_row = (-1, self.width, grid, grid)
+            flat = (-1, self.width * grid)
+            images = [image.reshape(by_row).transpose(0, 2, 1, 3).reshape(flat) for image in images]
+        reasons = (images[-2] & LARGE) != 0
+        self._compare_images(images, np.float32(1 / grid), reasons)
+        if self.whole_rows:
+            reasons = reasons.reshape(-1, grid, self.width, grid).transpose(0, 2, 1, 3)
+        return reasons.reshape(cells)
+
+    def _cut(self, parents: np.ndarray, levels: int) -> np.ndarray:
+        """Cut cells in four; the cells (children, and older leaves beside them) that now need cutting, sorted."""
+        start = self.used
+        child = np.arange(start, start + 4 * len(parents), 4, dtype=np.int32)
+        self.child[parents] = child
+        new = self._add(
+            np.repeat(self.rank[parents], 4),
+            (2 * self.column[parents, None] + _CHILD_COLUMN).ravel(),
+            (2 * self.row[parents, None] + _CHILD_ROW).ravel(),
+            np.repeat(self.level[parents] + np.uint8(1), 4),
+        )
+        cut = np.zeros(self.used, bool)
+        cut[new] = (self.flags[new] & LARGE) != 0
+        siblings = [getattr(self, name)[new].reshape(-1, 2, 2) for name in _COMPARED]
+        self._compare_images(siblings, self.pitch(new).reshape(-1, 2, 2), cut[new].reshape(-1, 2, 2))
+        one, other = self._pairs_across(parents, child, start)
+        worth = self._worth_cutting(one, other)
+        cut[one[worth]] = True
+        cut[other[worth]] = True
+        cut = np.flatnonzero(cut)
+        return cut[(self.child[cut] < 0) & (self.level[cut] < levels)]
+
+    def _pairs_across(self, parents: np.ndarray, child: np.ndarray, start: int) -> Two:
+        """Children of cut cells with what lies beyond the cut cell's sides: a child of a cell of its size, or a leaf.
+
+        Two cells cut in this pass, side by side, are met once.
+        """
+        level, column, row = self.level[parents].astype(np.int32), self.column[parents], self.row[parents]
+        one, other = [], []
+        for way_x, way_y, near_side, far_side in _SIDES:
+            beside = self._find(level, column + way_x, row + way_y)
+            its_child = np.where(beside >= 0, self.child[beside], -1)
+            met = beside >= 0 if way_x + way_y > 0 else (beside >= 0) & (its_child < start)
+            beside, mine, its_child = beside[met], child[met], its_child[met]
+            even = (its_child >= 0) & (self.level[beside] == level[met])
+            for a, b in zip(near_side, far_side, strict=True):
+                one.append(mine + a)
+                other.append(np.where(even, its_child + b, beside))
+        return np.concatenate(one), np.concatenate(other)
+
+    def _find(self, level: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """The deepest cell, no deeper than `level`, that holds the cell (column, row) of that level; -1 where none."""
+        column_0, row_0 = column >> level, row >> level
+        pixel_x, pixel_y = column_0 // self.grid, row_0 // self.grid
+        place = pixel_y * self.width + pixel_x - self.first
+        inside = (pixel_x >= 0) & (pixel_x < self.width) & (place >= 0) & (place < len(self.rank_of))
+        rank = np.where(inside, self.rank_of[np.where(inside, place, 0)], -1)
+        found = (rank * self.grid + row_0 % self.grid) * self.grid + column_0 % self.grid
+        found = np.where(rank >= 0, found, -1)
+        for deeper in range(int(level.max(initial=0)) - 1, -1, -1):
+            child = self.child[found]
+            down = (child >= 0) & (deeper < level) & (found >= 0)
+            found = np.where(down, child + 2 * (row >> deeper & 1) + (column >> deeper & 1), found)
+        return found
+
+    def _compare_images(self, images: list[np.ndarray], pitch: np.ndarray | np.float32, reasons: np.ndarray) -> None:
+        """Compare cells with their neighbours in images (..., rows, columns) of `_COMPARED`; adds to `reasons` to cut.
+
+        Marks `mixed` pixels among them.
+        """
+        distance, slope_x, slope_y, facing, radiance, flags, rank = images
+        energy = radiance * np.square(pitch)
+        for slope, (before, after) in ((slope_x, _ALONG_X), (slope_y, _ALONG_Y)):
+            rise = slope * pitch
+            pairs = _compare(
+                (flags[before], flags[after]),
+                (facing[before], facing[after]),
+                distance[after] - distance[before],
+                (rise[before], rise[after]),
+            )
+            self._find_mixed(pairs, (rank[before], rank[after]), (flags[before], flags[after]))
+            worth = pairs.differ & (np.maximum(energy[before], energy[after]) * pairs.contrast >= self.least)
+            reasons[before] |= worth
+            reasons[after] |= worth
+
+    def _worth_cutting(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """`_compare` pairs of cells of any size: which are worth cutting; marks the `mixed` pixels among them."""
+        level = self.level.take(one), self.level.take(other)
+        # half a cell's width, in the unit of the finer cell of the pair's half width; columns and rows at that unit
+        finer = np.maximum(*level)
+        unit = np.ldexp(np.float32(0.5 / self.grid), -finer.astype(np.int32))
+        shift = finer - level[0], finer - level[1]
+        way_x, way_y = (
+            (((2 * place.take(other) + 1) << shift[1]) - ((2 * place.take(one) + 1) << shift[0])) * unit
+            for place in (self.column, self.row)
+        )
+        flags = self.flags.take(one), self.flags.take(other)
+        pairs = _compare(
+            flags,
+            (self.facing.take(one), self.facing.take(other)),
+            self.distance_m.take(other) - self.distance_m.take(one),
+            tuple(self.slope_x_m.take(cell) * way_x + self.slope_y_m.take(cell) * way_y for cell in (one, other)),
+        )
+        self._find_mixed(pairs, (self.rank.take(one), self.rank.take(other)), flags)
+        brighter = np.maximum(self.radiance.take(one), self.radiance.take(other))
+        wider = 2 * np.ldexp(unit, np.maximum(*shift).astype(np.int32))
+        return pairs.differ & (brighter * np.square(wider) * pairs.contrast >= self.least)
+
+    def _find_mixed(self, pairs: _Pairs, rank: Two, flags: Two) -> None:
+        """Mark pixels that hold both cells of a pair on surfaces too far apart, or on a surface and nothing."""
+        chosen = np.nonzero(pairs.differ)
+        apart = (pairs.gap_m[chosen] > MIXED_GAP_M) | (((flags[0][chosen] ^ flags[1][chosen]) & HIT) != 0)
+        pixel = rank[0][chosen]
+        self.mixed[pixel[apart & (pixel == rank[1][chosen])]] = True
+
+
+class _Pairs(NamedTuple):
+    """What lies between neighbouring cells: whether an edge, the gap between their surfaces [m] (0 unless both hit),
+    and the share of the brighter one's radiance that misplacing the edge between them can change."""
+
+    differ: np.ndarray
+    gap_m: np.ndarray
+    contrast: np.ndarray
+
+
+def _compare(flags: Two, facing: Two, step: np.ndarray, rise: Two) -> _Pairs:
+    """Compare cells with their neighbours.
+
+    `step` is the difference of two hits' distances [m], `rise` what each one's tangent plane predicts for it. Across a
+    crease, or along a surface that bends one way, the step lies between the two predictions; across a gap it does not.
+    """
+    least, most = np.minimum(*rise), np.maximum(*rise)
+    both = (flags[0] & flags[1] & HIT) != 0
+    gap = np.where(both, np.maximum(step - most, least - step), np.float32(0))
+    edge = (gap > STEP_M) | (both & (most - least > CREASE_M)) | (((flags[0] ^ flags[1]) & (HIT | LIT)) != 0)
+    bend = np.abs(facing[0] - facing[1])
+    return _Pairs(edge | (both & (bend > CREASE_COSINE)), gap, np.where(edge, np.float32(1), bend))

@@ -1,0 +1,28 @@
+"""The renderer under test, behind one function: the only place that changes with its interface."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from render import engine
+from render.returns import Samples
+from render.settings import Plan, RenderSettings
+from render.world import World
+from studies.bench.settings import Method, grid_beside
+
+HAS_FILTER = "filter" in {f.name for f in fields(RenderSettings)}
+
+
+def has(method: Method) -> bool:
+    return HAS_FILTER or not method.filter
+
+
+def trace(world: World, method: Method, bounces: int, quality: int, seed: int) -> Samples:
+    """Merged samples of all pixels, nothing planned or estimated: every setting is forced."""
+    grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality), quality)
+    forced = {"bounces": bounces, "spp": spp, "grid": grid}
+    switches = {"filter": method.filter} if HAS_FILTER else {}
+    settings = RenderSettings(**forced, **switches)
+    known = {f.name for f in fields(Plan)}
+    plan = Plan(**forced, ambient=False, reasons=(), **{k: v for k, v in switches.items() if k in known})
+    return engine.trace(world, plan, settings, seed=seed).samples

@@ -1,0 +1,66 @@
+"""Compiling a kernel takes longer than rendering a small view: from the third view of a set on nothing is compiled."""
+
+import numpy as np
+import pytest
+
+from render.engine import render
+from render.settings import RenderSettings
+from render.specular import specular_light
+from render.world import World, dr
+from scenes import Camera, Laser, Material, Scene, Surface
+from scenes.shapes import box, rectangle, sphere
+
+SETTINGS = RenderSettings(bounces=3, spp=16, grid=2)
+
+
+def compiled(work) -> int:
+    """How many kernels `work` compiled, or read from the cache on disk for the first time in this process."""
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        work()
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert history, "nothing was recorded"
+    return sum(not kernel["cache_hit"] or kernel["cache_disk"] for kernel in history)
+
+
+def room(seed: int, kinds: tuple[str, ...], *, balls: int = 2, detail: int = 2, mirrors: int = 0) -> Scene:
+    """A box with balls of random albedo and place, seen from a random place."""
+    rng = np.random.default_rng(seed)
+    vertices, faces, uv = box((4, 3, 5))
+    surfaces = [Surface(vertices - (0, 0, 1.5), faces[:, ::-1], Material(albedo=rng.uniform(0.2, 0.9)), uv=uv)]
+    for i in range(balls):
+        vertices, faces, uv = sphere(rng.uniform(0.1, 0.3), detail + i % 2)
+        material = Material(kinds[i % len(kinds)], albedo=rng.uniform(0.1, 0.9))
+        surfaces.append(Surface(vertices + rng.uniform((-1, -1, -3), (1, 1, -2)), faces, material, uv=uv))
+    for _ in range(mirrors):
+        vertices, faces, uv = rectangle()
+        surfaces.append(
+            Surface(vertices + rng.uniform((-1, -1, -3.9), (1, 1, -3)), faces, Material("conductor"), uv=uv)
+        )
+    camera = Camera.look_at(rng.uniform(-0.2, 0.2, 3), (0, 0, -2), fov_deg=50, width=24, height=18)
+    return Scene("room", tuple(surfaces), camera, Laser())
+
+
+@pytest.mark.parametrize("kinds", [("diffuse",), ("plastic", "diffuse", "roughplastic")])
+def test_no_kernel_is_compiled_from_the_third_view_on(kinds):
+    """Same size and materials: another pose."""
+    views = [compiled(lambda seed=seed: render(room(seed, kinds), SETTINGS, seed=seed)) for seed in range(4)]
+    assert views[2:] == [0, 0], views
+
+
+@pytest.mark.parametrize("kinds", [("diffuse",), ("plastic", "diffuse", "roughplastic")])
+def test_albedos_objects_and_triangles_compile_nothing(kinds):
+    """Other scenes of a set, with the same kinds of material: more objects, more triangles, other albedos."""
+    scenes = [
+        room(7, kinds, balls=3),
+        room(8, kinds, balls=4),
+        room(9, kinds, balls=7),
+        room(10, kinds, detail=3, balls=5),
+    ]
+    views = [compiled(lambda scene=scene: render(scene, SETTINGS)) for scene in scenes]
+    assert views[2:] == [0, 0], views
+
+
+def test_specular_light_compiles_nothing_from_the_third_view_on():
+    views = [compiled(lambda s=s: specular_light(World(room(s, ("plastic",), mirrors=2)), 2)) for s in range(4)]
+    assert views[2:] == [0, 0], views
