@@ -8,12 +8,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
+from render.engine import render
+from render.settings import RenderSettings
 from render.transient import Transient
+from scenes.model import Scene
 from studies.bench.oracles import Moments
 
-# Monte-Carlo limits are this many standard errors: 6e-5 two-sided for a normal error, 1e-3 with 15 degrees of freedom.
-SIGMAS = 4.0
+# Independent renders behind a Monte-Carlo limit. Only they tell the error of an image's mean: paths may be shared, so
+# that pixels of one render are not independent, and the errors of its pixels do not add as squares.
+RENDERS = 8
+FALSE_ALARM = 1e-4
 
 
 class Measured(NamedTuple):
@@ -90,7 +96,17 @@ def relative(got: float, expected: float) -> float:
     return abs(float(got) / float(expected) - 1)
 
 
-def standard_error(transient: Transient) -> float:
-    """Standard error of the summed indirect radiance, relative to it; pixels are independent."""
-    total = float(transient.radiance[transient.bounces > 1].sum(dtype=float))
-    return float(np.sqrt((transient.error.astype(float) ** 2).sum())) / total if total > 0 else math.inf
+def over_renders(values: list[float], bias: float = 0.0) -> Measured:
+    """The mean of an error that independent renders measured, against what its scatter allows.
+
+    The limit is Student's t with n - 1 degrees of freedom at a two-sided FALSE_ALARM, times the standard error of the
+    mean, and what the comparison itself is off by.
+    """
+    quantile = float(stats.t.ppf(1 - FALSE_ALARM / 2, len(values) - 1))
+    return Measured(abs(float(np.mean(values))), quantile * float(stats.sem(values)) + bias)
+
+
+def independent(scene: Scene, settings: RenderSettings, seed: int) -> list[Transient]:
+    """RENDERS renders whose seeds follow from one."""
+    seeds = np.random.SeedSequence(seed).generate_state(RENDERS)
+    return [render(scene, settings, seed=int(one)) for one in seeds]

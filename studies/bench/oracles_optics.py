@@ -104,6 +104,16 @@ def integrating_sphere(scene: Scene, *, radius_m: float, offset_m: float, albedo
     )
 
 
+def two_chords_longer_than(length_m: float, radius_m: float) -> float:
+    """Probability that two independent chords of a sphere, each of density c / (2 r^2) up to 2 r, sum to more."""
+    node, weight = np.polynomial.legendre.leggauss(64)
+    low = max(0.0, length_m - 2 * radius_m)
+    first = low + (2 * radius_m - low) * (node + 1) / 2
+    rest = np.clip(length_m - first, 0, 2 * radius_m)
+    longer = first / (2 * radius_m**2) * (1 - (rest / (2 * radius_m)) ** 2)
+    return float((longer * weight).sum() * (2 * radius_m - low) / 2)
+
+
 class WallCounts(NamedTuple):
     """Image-mean signal per bin of unit total, and the share of it that arrives after the period."""
 
