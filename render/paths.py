@@ -34,6 +34,7 @@ from render.world import (
     mi,
     segment,
     shape_index,
+    upload,
 )
 
 BLOCK = 16  # pixels that share their paths
@@ -63,11 +64,11 @@ class Sums:
         watch: np.ndarray | None = None,
     ) -> None:
         self.rows, self.watched = rows, watched
-        self.origin_m = Float(origin_m)
-        self.watch = None if watch is None else mi.Int32(watch)
+        self.origin_m = upload(Float, origin_m)
+        self.watch = None if watch is None else upload(mi.Int32, watch)
         self.totals = dr.zeros(mi.UInt64, rows.rows * batches)
         self.batches = dr.opaque(UInt32, batches)
-        self._scale = Float(1 / rounds)
+        self._scale = upload(Float, 1 / rounds)
 
     def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
         """Add samples to the pixels' and the watched rows; returns what was added, for `add_total`."""
@@ -204,9 +205,9 @@ def _trace(
     lanes = len(turns.block) * BLOCK
     lane = dr.arange(UInt32, lanes)
     turn, member = lane // BLOCK, lane % BLOCK
-    block, stream, round_index = (dr.gather(UInt32, UInt32(column), turn) for column in turns)
+    block, stream, round_index = (dr.gather(UInt32, upload(UInt32, column), turn) for column in turns)
     receiver = block * BLOCK + member
-    pixels = UInt32(pixels.astype(np.int64) & 0xFFFFFFFF)
+    pixels = upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF)
     keys = [dr.opaque(UInt32, int(key)) for key in np.random.SeedSequence(seed).generate_state(2)]
     # one random shift a block and round; the members share a low-discrepancy set of first directions
     shift = mi.sample_tea_32(stream, round_index ^ keys[0])
