@@ -39,10 +39,10 @@ def concatenate(parts: list[Samples]) -> Samples:
 def merge(samples: Samples, tolerance_m: float) -> Samples:
     """Merge samples of one pixel whose path centres share a cell; direct and indirect samples stay apart.
 
-    Cells are `tolerance_m` wide. Energy, centroid and variance of the path length are kept: the merged sample is uniform
-    over centroid +- sqrt(3 variance), where a sample uniform over c +- h has variance h^2 / 3, and has the
-    fewest bounces of its parts. Samples without energy go. The sums run over a stable sort in float64, so that the result depends on the
-    samples' order alone.
+    Cells are `tolerance_m` wide. Energy, centroid and variance of the path length are kept: the merged sample is
+    uniform over centroid +- sqrt(3 variance), where one uniform over c +- h has variance h^2 / 3, and has the fewest
+    bounces of its parts. Samples without energy go. The sums run over a stable sort in float64, so that the result
+    depends on the samples' order alone.
     """
     lit = samples.radiance > 0
     if not lit.all():

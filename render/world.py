@@ -86,7 +86,7 @@ def upload(kind: type, values: np.ndarray) -> Any:
 
     Dr.Jit uses a numpy array's own memory, and compiles one kernel for aligned and another for unaligned input.
     """
-    dtype = np.dtype({Float: np.float32, UInt32: np.uint32, Bool: np.bool_}[kind])
+    dtype = np.dtype({Float: np.float32, UInt32: np.uint32, Bool: np.bool_, mi.Int32: np.int32}[kind])
     size = np.size(values)
     memory = np.empty(size * dtype.itemsize + ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % ALIGNMENT
