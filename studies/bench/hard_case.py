@@ -18,7 +18,7 @@ from studies.bench.oracles import Moments
 
 # Independent renders behind a Monte-Carlo limit. Only they tell the error of an image's mean: paths may be shared, so
 # that pixels of one render are not independent, and the errors of its pixels do not add as squares.
-RENDERS = 8
+RENDERS = 16
 FALSE_ALARM = 1e-4
 
 
