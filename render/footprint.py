@@ -68,6 +68,9 @@ def trace(world: World, column: np.ndarray, row: np.ndarray, level: np.ndarray, 
         owner = weakref.ref(world)
         recorded[clip] = dr.freeze(lambda *arguments: _footprints(owner(), *arguments, clip), warn_after=1000)
     packed = row.astype(np.uint32) | level.astype(np.uint32) << LEVEL_BIT
+    if len(column) == 1:  # arrays of one entry are scalars to Dr.Jit: another kernel
+        alone = trace(world, np.repeat(column, 2), np.repeat(row, 2), np.repeat(level, 2), grid, clip=clip)
+        return Footprints(*(values[:1] for values in alone))
     columns = UInt32(_aligned(column)), UInt32(_aligned(packed)), dr.opaque(UInt32, grid)
     found = recorded[clip](_arrays(world), *columns)
     dr.eval(found)
