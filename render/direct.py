@@ -16,9 +16,6 @@ LANES = 1 << 21
 REFINE = 4
 # A footprint whose smaller half span is below this is as good as uniform: a thirtieth of the reference sensor's bin.
 NARROW_M = 1e-3
-# Edges that can change less than this share of a first cell of a typical pixel are not worth their rays: the error of
-# what is left falls with the grid, as that of all other cells does.
-LEAST_SHARE = 0.04
 
 
 class DirectLight(NamedTuple):
@@ -38,13 +35,21 @@ class Layers(NamedTuple):
     albedo: np.ndarray
 
 
+def least_share_of(grid: int) -> float:
+    """Share of a first cell of a typical pixel below which an edge is not worth its rays.
+
+    Falls with the grid, as the error of all other cells does: what both leave costs least in sum (measured).
+    """
+    return min(1.0, 2 / grid)
+
+
 def direct_light(
     world: World,
     pixels: np.ndarray,
     grid: int,
     tolerance_m: float = 1e-4,
     refine: int = REFINE,
-    least_share: float = LEAST_SHARE,
+    least_share: float | None = None,
 ) -> DirectLight:
     """Direct returns of the given flat pixel indices (sorted, each once), merged within `tolerance_m`.
 
@@ -53,7 +58,7 @@ def direct_light(
     - its footprint is not small, so that first order no longer describes it; or
     - it and a neighbouring cell lie on different surfaces, or one is in shadow: an edge runs through one of them.
       An edge that could change less than `least_share` of a first cell's energy, in a pixel of the root mean square of
-      all pixels' radiance, is left alone.
+      all pixels' radiance, is left alone; by default `least_share_of` the grid.
     New cells are compared with their neighbours too, of whatever size and pixel, and those are cut in turn: a wire
     thinner than a cell is followed from wherever a ray hit it. All cuts of a pass are traced in one launch. Footprints
     not small at the end are clipped to the face they lie on, and counted if that changes them.
@@ -61,6 +66,7 @@ def direct_light(
     Pixels are treated in groups of whole rows, about LANES rays each. Neither edges between groups nor, where not all
     pixels are asked for, edges between pixels start a refinement.
     """
+    least_share = least_share_of(grid) if least_share is None else least_share
     width = world.scene.camera.width
     per_chunk = max(1, LANES // (grid * grid * width)) * width
     parts = [

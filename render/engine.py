@@ -125,9 +125,9 @@ def trace(
     camera = world.scene.camera
     pixels = np.arange(camera.height * camera.width)
     say("direct light", 0.05)
-    direct = direct_light(world, pixels, plan.grid, settings.direct_tolerance_m)
+    direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, least_share=plan.least_share)
     origin_m, brightest = _mean_path(direct.samples, len(pixels))
-    specular = specular_light(world, plan.grid, settings.direct_tolerance_m)
+    specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
     exact = concatenate([direct.samples, specular.samples])
     rays, indirect, schedule, reasons = direct.rays, None, None, ()
     if plan.bounces > 1 and brightest > 0:
@@ -183,7 +183,8 @@ def _estimated(
 ) -> ErrorEstimate:
     """The error of a trace, from the checked pixels' batches and from finer direct light there."""
     coarse = response(_of_pixels(select(traced.direct, traced.direct.bounces == 1), checked), checked)
-    fine = response(direct_light(world, checked, FINER * plan.grid).samples, checked)
+    finer = direct_light(world, checked, FINER * plan.grid, least_share=plan.least_share / FINER)
+    fine = response(finer.samples, checked)
     if traced.indirect is None:
         none = np.zeros(len(checked))
         return estimate(coarse, fine, np.zeros_like(fine), none, none)
@@ -229,7 +230,7 @@ def _meta(scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: 
         "seed": seed,
         "plan": plan.to_dict(),
         "tolerance_m": {
-            "direct": settings.direct_tolerance_m,
+            "direct": plan.direct_tolerance_m,
             "indirect": settings.indirect_tolerance_m,
             "growth": settings.indirect_growth,
         },

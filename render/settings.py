@@ -10,7 +10,7 @@ from scenes.errors import InputError
 MAX_BOUNCES = 63
 MAX_SAMPLES = 1 << 26
 BATCHES = 16  # independent batches of indirect light, whose spread is the error estimate
-GRIDS = (2, 3, 4, 6, 8, 12, 16)
+GRIDS = (2, 4, 8, 16)
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,8 @@ class RenderSettings:
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
+    least_share edges of surfaces and shadows are followed where they could change this share of a cell or more;
+                0 follows all of them
     direct_tolerance_m, indirect_tolerance_m   returns of one pixel closer than this in path length merge
     indirect_growth  that width grows by this share of the path behind the direct light
     """
@@ -33,12 +35,19 @@ class RenderSettings:
     grid: int | None = None
     error: float | None = None
     budget: tuple[float, float] | None = None
-    direct_tolerance_m: float = 0.005
+    least_share: float | None = None
+    direct_tolerance_m: float | None = None
     indirect_tolerance_m: float = 0.03
     indirect_growth: float = 0.05
 
     def __post_init__(self) -> None:
-        limits = (("bounces", 1, MAX_BOUNCES), ("spp", 1, MAX_SAMPLES), ("grid", 1, 64), ("error", 1e-4, 1.0))
+        limits = (
+            ("bounces", 1, MAX_BOUNCES),
+            ("spp", 1, MAX_SAMPLES),
+            ("grid", 1, 64),
+            ("error", 1e-4, 1.0),
+            ("least_share", 0, 1),
+        )
         for name, low, high in limits:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
@@ -54,7 +63,7 @@ class RenderSettings:
         if not 0 <= self.indirect_growth <= 1:
             raise InputError(f"render: indirect_growth {self.indirect_growth:g} is outside 0 to 1")
         for name in ("direct_tolerance_m", "indirect_tolerance_m"):
-            if not 1e-4 <= getattr(self, name) <= 10:
+            if getattr(self, name) is not None and not 1e-4 <= getattr(self, name) <= 10:
                 raise InputError(f"render: {name} {getattr(self, name):g} is outside 1e-4 to 10")
 
 
@@ -71,6 +80,8 @@ class Plan:
     grid: int
     ambient: bool
     reasons: tuple[str, ...]
+    least_share: float = 0.5
+    direct_tolerance_m: float = 0.005
     noise: float = 0.0
     adaptive: bool = True
 

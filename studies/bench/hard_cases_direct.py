@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from render.engine import render
+from render.quadtree import MOST_CELLS
 from render.settings import RenderSettings
 from scenes import hard_cases as scenes
 from scenes.hard_cases import hard_case
@@ -30,7 +31,7 @@ from studies.bench.oracles_optics import wall_on_sensor
 
 SMOOTH = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
 FINE = RenderSettings(bounces=1, grid=8, direct_tolerance_m=1e-4)
-EDGES = RenderSettings(bounces=1, grid=16, direct_tolerance_m=1e-4)
+EDGES = RenderSettings(bounces=1, grid=16, least_share=0, direct_tolerance_m=1e-4)
 # A cell's radiance is its centre's: with 16 x 4 cells over 34 degrees cos^4 is off by 4/24 (0.0096)^2 = 2e-5.
 CELL_ENERGY = 5e-5
 FLOAT32 = float(np.finfo(np.float32).eps)
@@ -121,7 +122,8 @@ def _silhouette(seed: int) -> Outcome:
     whole = oracles.sphere_moments(scene, **ball, albedo=0.7, per_side=32).total.sum()
     errors = {
         "limb energy": Measured(worst(got.total[limb], expected.total), 1e-2),
-        "limb path [m]": Measured(farthest_m(got.mean_m[limb], expected.mean_m), 5e-4),
+        # a limb pixel's path deviates by 2.5 to 6 cm, and changes fastest in the last cell
+        "limb path [m]": Measured(farthest_m(got.mean_m[limb], expected.mean_m), 1e-3),
         "energy": Measured(relative(got.total.sum(), whole), 1e-4),
     }
     return Outcome(errors, clipped(transient))
@@ -140,11 +142,13 @@ def _wire(seed: int) -> Outcome:
     path = np.nansum(on_wire.total * np.nan_to_num(on_wire.mean_m), axis=1) / np.maximum(by_row, 1e-300)
     column = int(scene.camera.width / 2 + scene.camera.focal_px * scenes.WIRE_X_M / scenes.WIRE_M)
     dimmed = 1 - on_wall.total[:, column] / bare.total[:, column]
+    # the wire, of a round profile, shines from its middle, but hides the wall to its edges: known to half a finest cell
+    half_cell = 0.5 / MOST_CELLS / expected.coverage_px
     errors = {
         "energy of a row": Measured(worst(by_row, expected.radiance), 0.02),
         "energy": Measured(relative(by_row.sum(), expected.radiance.sum()), 0.02),
         "path [m]": Measured(farthest_m(path, expected.mean_path_m), 5e-4),
-        "wall hidden": Measured(worst(dimmed, np.full(len(dimmed), expected.coverage_px)), 0.02),
+        "wall hidden": Measured(worst(dimmed, np.full(len(dimmed), expected.coverage_px)), half_cell),
     }
     return Outcome(errors, clipped(transient))
 

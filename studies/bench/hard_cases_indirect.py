@@ -42,7 +42,8 @@ TESSELLATION = 2e-4
 @lru_cache(maxsize=2)
 def _two_bounces(name: str, seed: int) -> Transient:
     """A groove with its first interreflection; kept, since several cases are held against the same one."""
-    return render(hard_case(name), RenderSettings(bounces=2, spp=4 * GROOVE_SPP, grid=4, **SHARP), seed=seed)
+    settings = RenderSettings(bounces=2, spp=4 * GROOVE_SPP, adaptive=False, grid=4, **SHARP)
+    return render(hard_case(name), settings, seed=seed)
 
 
 def _groove(opening_deg: float, seed: int) -> Outcome:
@@ -154,7 +155,7 @@ def _scaled(name: str, scale: float, seed: int) -> Outcome:
     widths = {
         key: float(np.clip(scale * SHARP[key], 1e-4, 10)) for key in ("direct_tolerance_m", "indirect_tolerance_m")
     }
-    settings = RenderSettings(bounces=2, spp=4 * GROOVE_SPP, grid=4, indirect_growth=0, **widths)
+    settings = RenderSettings(bounces=2, spp=4 * GROOVE_SPP, adaptive=False, grid=4, indirect_growth=0, **widths)
     scaled, plain = render(hard_case(name), settings, seed=seed), _two_bounces("groove-90", seed)
     here, there = (moments_of(t, t.bounces == 1) for t in (scaled, plain))
     lit = (there.total > 0) & ~plain.mixed & ~scaled.mixed

@@ -26,7 +26,7 @@ from studies.bench.hard_case import (
 from studies.bench.oracles_optics import fresnel, mirror_return, pane_transmission, slab_moments
 
 SMOOTH = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
-EDGES = RenderSettings(bounces=1, grid=16, direct_tolerance_m=1e-4)
+EDGES = RenderSettings(bounces=1, grid=16, least_share=0, direct_tolerance_m=1e-4)
 # A specular return is one number per pixel, in float32 from a handful of operations.
 SPECULAR_ENERGY, SPECULAR_PATH_M = 1e-4, 1e-5
 

@@ -37,6 +37,7 @@ def camera(width: int, height: int, fov_deg: float) -> Camera:
 
 def direct(scene: Scene, grid: int = 2, **options) -> DirectLight:
     view = scene.camera
+    options = {"least_share": 0.04, **options}
     return direct_light(World(scene), np.arange(view.width * view.height), grid, **options)
 
 
