@@ -34,6 +34,7 @@ from render.world import (
     mi,
     segment,
     shape_index,
+    spawn,
     upload,
 )
 
@@ -228,7 +229,7 @@ def _trace(
     sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), heads.valid)
     alive = heads.valid & (weight[0] > 0)
     point = mi.Point3f(si.p)
-    si, passed, leg, _ = first_opaque(world, si.spawn_ray(si.to_world(sample.wo)), alive, point)
+    si, passed, leg, _ = first_opaque(world, spawn(si, si.to_world(sample.wo)), alive, point)
     alive &= si.is_valid()
     own = dr.select(alive, transmission * weight[0] * passed, 0)
     to_laser, irradiance, laser_path = laser_light(world, si, pixel, alive, seen_by_camera=None)
@@ -277,7 +278,7 @@ def _beyond(
     si, direction = mi.SurfaceInteraction3f(si), mi.Vector3f(direction)
     active = Bool(active) & (vertex < last)
     while active:
-        ray, point = si.spawn_ray(direction), mi.Point3f(si.p)
+        ray, point = spawn(si, direction), mi.Point3f(si.p)
         si, passed, optical, _ = first_opaque(world, ray, active, point)
         throughput *= passed
         path += optical

@@ -40,6 +40,7 @@ from render.world import (
     mi,
     passage,
     shape_index,
+    spawn,
     spreading,
     upload,
 )
@@ -342,7 +343,7 @@ def _seen(world: World, tables: _Tables, ray: Any, lanes: int) -> tuple[Any, ...
         right = right - 2 * dr.dot(normal, right) * normal
         down = down - 2 * dr.dot(normal, down) * normal
         forward = forward - 2 * dr.dot(normal, forward) * normal
-        onward, origin = si.spawn_ray(direction), mi.Point3f(si.p)
+        onward, origin = spawn(si, direction), mi.Point3f(si.p)
         si, transmission, more, step = first_opaque(world, onward, mirror, origin)
         weight *= transmission
         optical += more

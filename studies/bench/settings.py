@@ -52,7 +52,7 @@ METHODS = {
 def qualities(method: Method, transport: str, size: int, quick: bool) -> tuple[int, ...]:
     """The qualities measured, by rising cost. Larger images get fewer."""
     if method is OURS_DIRECT:
-        return (1, 2, 3, 4, 6, 8) if size <= 128 else (1, 2, 3, 4, 6)
+        return (1, 2, 3, 5, 8, 12) if size <= 128 else (1, 2, 3, 5)
     if method is INDEPENDENT:  # plain Monte Carlo: its slope is known
         return (16, 64) if size <= 64 else (16,)
     if method is MULTIJITTER and transport == "direct":
