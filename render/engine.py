@@ -14,8 +14,17 @@ from render.ambient import ambient_light
 from render.cells import coarsened
 from render.direct import centre_layers, direct_light
 from render.error import ErrorEstimate, estimate, noise_power, power_of, response
-from render.indirect import IndirectLight, Schedule, allocate, image_cells, indirect_light, pilot_noise, uniform
-from render.paths import block_order
+from render.indirect import (
+    IndirectLight,
+    Schedule,
+    allocate,
+    combined,
+    image_cells,
+    indirect_light,
+    pilot_noise,
+    uniform,
+)
+from render.paths import BLOCK, block_order
 from render.planning import make_plan, pilot_pixels
 from render.returns import Samples, concatenate, no_samples, select, to_returns
 from render.settings import BATCHES, Plan, RenderSettings
@@ -26,11 +35,13 @@ from scenes.model import Scene
 
 log = logging.getLogger(__name__)
 
-STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT, STAGE_PILOT = 10, 11, 12, 13
+STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT, STAGE_PILOT, STAGE_MORE = 10, 11, 12, 13, 14
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
 MOST_SPP, MOST_SPP_BY_DEFAULT = 16384, 1024
 AMBIENT_SPP = 64
 AMBIENT_BOUNCES = 6
+# Paths traced on top aim at the target's square times MARGIN, and are at most MOST_MORE times those traced before.
+MARGIN, MOST_MORE = 0.75, 3.0
 FINER = 2  # direct light is checked, on the pilot's pixels, against this many times the cells a side
 
 Progress = Callable[[str, float], None]
@@ -84,9 +95,14 @@ def render(
     layers = centre_layers(world)
     # where nothing is in view there is nothing to explain
     plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, *traced.reasons))
+    error = _estimated(world, plan, settings, traced, checked)
+    more = _missing(plan, settings, traced, error)
+    if more is not None:
+        traced = _traced_on(world, plan, settings, traced, more, seed, checked, say)
+        plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
+        error = _estimated(world, plan, settings, traced, checked)
     for line in (*scene.notes, *plan.reasons) if len(traced.direct.pixel) else ():
         log.info("%s", line)
-    error = _estimated(world, plan, settings, traced, checked)
     noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
 
     ambient = np.zeros((camera.height, camera.width), np.float32)
@@ -132,21 +148,82 @@ def trace(
     rays, indirect, schedule, reasons = direct.rays, None, None, ()
     if plan.bounces > 1 and brightest > 0:
         schedule, reasons = _schedule(world, plan, settings, direct.samples, seed)
-        indirect = indirect_light(
-            world,
-            schedule,
-            plan.bounces,
-            derived_seed(seed, STAGE_INDIRECT),
-            origin_m,
-            brightest,
-            np.empty(0, np.int64) if checked is None else checked,
-            width_m=settings.indirect_tolerance_m,
-            growth=settings.indirect_growth,
-            say=lambda share: say("indirect light", 0.1 + 0.8 * share),
-        )
+        indirect = _indirect(world, plan, settings, schedule, STAGE_INDIRECT, seed, origin_m, brightest, checked, say)
         rays += schedule.paths * (2 * plan.bounces - 1) + schedule.connections
     reasons = (*specular.notes, *reasons)
     return Traced(exact, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
+
+
+def _indirect(
+    world: World,
+    plan: Plan,
+    settings: RenderSettings,
+    schedule: Schedule,
+    stage: int,
+    seed: int,
+    origin_m: np.ndarray,
+    brightest: float,
+    checked: np.ndarray | None,
+    say: Progress,
+) -> IndirectLight:
+    return indirect_light(
+        world,
+        schedule,
+        plan.bounces,
+        derived_seed(seed, stage),
+        origin_m,
+        brightest,
+        np.empty(0, np.int64) if checked is None else checked,
+        width_m=settings.indirect_tolerance_m,
+        growth=settings.indirect_growth,
+        say=lambda share: say("indirect light", 0.1 + 0.8 * share),
+    )
+
+
+def _missing(plan: Plan, settings: RenderSettings, traced: Traced, error: ErrorEstimate) -> Schedule | None:
+    """What to trace on top where a planned render misses its target: pilots see few of the rare bright paths."""
+    if settings.spp is not None or traced.schedule is None or traced.indirect is None or plan.target <= 0:
+        return None
+    allowed = plan.target**2 * MARGIN - error.direct**2 - error.merging**2
+    if error.total**2 <= MARGIN * plan.target**2 or allowed <= 0 or traced.schedule.batches < BATCHES:
+        return None
+    asked = settings.error is not None or settings.budget is not None
+    left = (MOST_SPP if asked else MOST_SPP_BY_DEFAULT) / traced.schedule.cost - 1
+    factor = min(error.monte_carlo**2 / allowed - 1, MOST_MORE, left)
+    if factor <= 0:
+        return None
+    rounds = np.ceil(traced.schedule.rounds * factor / BATCHES).astype(np.int64) * BATCHES
+    return traced.schedule._replace(rounds=rounds)
+
+
+def _traced_on(
+    world: World,
+    plan: Plan,
+    settings: RenderSettings,
+    traced: Traced,
+    more: Schedule,
+    seed: int,
+    checked: np.ndarray,
+    say: Progress,
+) -> Traced:
+    """A trace with further paths, weighted by their numbers.
+
+    These follow the first paths' noise; the bias of such a stop is of second order in it.
+    """
+    _, brightest = _mean_path(select(traced.direct, traced.direct.bounces == 1), len(traced.origin_m))
+    added = _indirect(world, plan, settings, more, STAGE_MORE, seed, traced.origin_m, brightest, checked, say)
+    before = traced.schedule
+    share = np.ones(len(traced.origin_m))
+    pixels, real = before.pixels, before.pixels >= 0
+    share[pixels[real]] = np.repeat(before.rounds / (before.rounds + more.rounds), BLOCK)[real]
+    cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
+    reason = f"indirect light: the work of {more.cost:.0f} paths a pixel on top, to meet the target"
+    return traced._replace(
+        indirect=combined(traced.indirect, added, share, cells, traced.origin_m),
+        rays=traced.rays + more.paths * (2 * plan.bounces - 1) + more.connections,
+        schedule=before._replace(rounds=before.rounds + more.rounds),
+        reasons=(*traced.reasons, reason),
+    )
 
 
 def _schedule(
@@ -199,7 +276,12 @@ def _estimated(
         changes.append(response(concatenate([merged, kept._replace(radiance=-kept.radiance)]), place))
     merging = (changes[0] * changes[1]).sum(axis=1)
     indirect = response(seen.samples(), place)
-    return estimate(coarse, fine, indirect, noise_power(seen.radiance, seen.cells.width_of_m), merging)
+    noise = noise_power(seen.radiance, seen.cells.width_of_m)
+    # few pixels hold the rare bright paths: the noise of all pixels' totals says how typical the checked ones are
+    variance = traced.indirect.noise**2
+    of_checked = variance[checked].mean()
+    typical = variance.mean() / of_checked if of_checked > 0 else 1.0
+    return estimate(coarse, fine, indirect, noise * typical, merging)
 
 
 def _of_pixels(samples: Samples, pixels: np.ndarray) -> Samples:

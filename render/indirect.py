@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.cells import Cells, Rows, cell_samples, make_cells, quantum_for
+from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
 from render.paths import BLOCK, LANES, Sums, Turns, add_paths, noise_of_paths
 from render.returns import Samples, concatenate, no_samples
 from render.settings import BATCHES
@@ -143,6 +143,20 @@ class IndirectLight(NamedTuple):
     samples: Samples
     noise: np.ndarray
     watched: Watched
+
+
+def combined(
+    one: IndirectLight, other: IndirectLight, share: np.ndarray, cells: Cells, origin_m: np.ndarray
+) -> IndirectLight:
+    """The weighted mean of two independent estimates in the same `cells`; `share` of the first, for every pixel."""
+    parts = [
+        light.samples._replace(radiance=light.samples.radiance * weight[light.samples.pixel])
+        for light, weight in ((one, share), (other, 1 - share))
+    ]
+    weight = share[one.watched.pixels][:, None, None]
+    seen = one.watched._replace(radiance=weight * one.watched.radiance + (1 - weight) * other.watched.radiance)
+    noise = np.hypot(share * one.noise, (1 - share) * other.noise)
+    return IndirectLight(coarsened(concatenate(parts), cells, origin_m), noise, seen)
 
 
 def image_cells(world: World, width_m: float, growth: float, origin_m: np.ndarray, bounces: int) -> Cells:

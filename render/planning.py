@@ -15,7 +15,7 @@ from scenes.model import Material
 
 DEFAULT_ERROR = 0.02
 # Squares of the parts must sum to less than 1; the rest is for merged returns and the pilot's own uncertainty.
-DIRECT_SHARE, MONTE_CARLO_SHARE = 0.4, 0.65
+DIRECT_SHARE, MONTE_CARLO_SHARE = 0.4, 0.75
 MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
@@ -62,6 +62,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         least_share=share,
         direct_tolerance_m=tolerance_m,
         noise=MONTE_CARLO_SHARE * target,
+        target=target,
         adaptive=settings.adaptive and mode_is_flood,
     )
 

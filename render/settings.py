@@ -73,6 +73,7 @@ class Plan:
 
     spp         work on indirect light in paths per pixel; None: whatever `noise` takes
     noise       target of the Monte-Carlo part of the error where spp is open
+    target      that of the whole error
     """
 
     bounces: int
@@ -83,6 +84,7 @@ class Plan:
     least_share: float = 0.5
     direct_tolerance_m: float = 0.005
     noise: float = 0.0
+    target: float = 0.0
     adaptive: bool = True
 
     def to_dict(self) -> dict:
