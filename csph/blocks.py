@@ -7,6 +7,8 @@ transposed convolution its transpose. Sums are in float32, or in float64 where t
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -54,8 +56,8 @@ def _wide(values: Tensor, columns: int) -> Tensor:
 def _rearranged(values: Tensor, shape: tuple[int, ...], order: tuple[int, ...]) -> Tensor:
     """`values.view(shape).permute(order)` made contiguous, where both keep the last axis last."""
     wide = _wide(values.contiguous().view(-1), shape[-1])
-    factor = values.numel() // wide.numel()
-    moved = wide.view(*shape[:-1], shape[-1] // factor).permute(order).contiguous()
+    run = shape[-1] * values.element_size() // wide.element_size()
+    moved = wide.view(*shape[:-1], run).permute(order).contiguous()
     return moved.view(-1).view(values.dtype)
 
 
@@ -105,7 +107,7 @@ class _Centre(torch.autograd.Function):
 
 def mean_over(values: Tensor, axis: int) -> Tensor:
     """Mean over the first or second axis, kept with length 1."""
-    flat = values.reshape(*values.shape[: axis + 1], -1)
+    flat = values.reshape(*values.shape[: axis + 1], math.prod(values.shape[axis + 1 :]))
     weights = torch.full((1, flat.shape[axis]), 1 / flat.shape[axis], dtype=values.dtype, device=values.device)
     return (weights @ flat).view(*values.shape[:axis], 1, *values.shape[axis + 1 :])
 
