@@ -159,7 +159,7 @@ def encode_blocks(counts: Tensor, weights: Tensor) -> Tensor:
     matrix = weights.reshape(codes, -1)
     if mr == mc == 1:
         stacked = counts.reshape(batch * (bins // mt), mt, rows * columns).to(weights.dtype)
-        product = matrix @ stacked
+        product = torch.bmm(matrix.expand(len(stacked), -1, -1), stacked)
         return product.view(batch, bins // mt, codes, rows, columns).transpose(1, 2)
     gathered = _Gather.apply(counts, tuple(block)).to(weights.dtype)
     product = gathered @ matrix.T
@@ -176,10 +176,9 @@ def back_project(codes: Tensor, weights: Tensor) -> Tensor:
     size = torch.Size((batch, 1, times * mt, rows * mr, columns * mc))
     matrix = weights.reshape(*own, count, mt * mr * mc)
     if mr == mc == 1:
-        stacked = codes.transpose(1, 2).reshape(batch, times, count, rows * columns)
-        if not own:
-            stacked = stacked.view(batch * times, count, rows * columns)
-        return (matrix.mT @ stacked).reshape(size)
+        stacked = codes.transpose(1, 2).reshape(batch * times, count, rows * columns)
+        matrices = matrix.expand(batch, times, count, mt).reshape(batch * times, count, mt)
+        return torch.bmm(matrices.mT, stacked).view(size)
     if own:
         stacked = codes.permute(0, 2, 3, 4, 1).reshape(batch, times, rows * columns, count)
         product = stacked @ matrix

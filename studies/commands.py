@@ -129,9 +129,10 @@ class Depth(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Common):
-    """Speed against error beside mitransient (`bench render`), or the table of hard cases (`bench hard-cases`)."""
+    """Speed against error: beside mitransient (`bench render`), of compressive layers (`bench encode`), or the table of
+    hard cases (`bench hard-cases`)."""
 
-    stage: Positional[Literal["render", "hard-cases"]] = "render"
+    stage: Positional[Literal["render", "encode", "hard-cases"]] = "render"
     """What is measured."""
     scenes: tuple[Literal["flash", "lamp", "artist", "groove"], ...] = ()
     """Scenes of `bench render` (default: all)."""

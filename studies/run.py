@@ -268,6 +268,8 @@ def run_bench(command: commands.Bench, progress: Progress) -> dict:
     """One stage of the bench; each is imported only when it is asked for."""
     if command.stage == "hard-cases":
         from studies.bench import hard_cases as stage
+    elif command.stage == "encode":
+        from studies.bench import encode as stage
     else:
         from studies.bench import render as stage
     return stage.run(command, progress)
