@@ -69,7 +69,7 @@ def encode_photons(
         time, index = _divided(stamps, mt)
         group = 1
         bag = _repeated(torch.arange(0, pixels * times, times, dtype=stamps.dtype, device=device), counts) + time
-        if bool((bag[1:] < bag[:-1]).any()):
+        if _falls(bag):
             bag, order = bag.sort(stable=True)
             index = index[order]
         starts = torch.nn.functional.pad(torch.bincount(bag, minlength=pixels * times).cumsum(0), (1, 0))
@@ -91,6 +91,12 @@ def _divided(stamps: Tensor, mt: int) -> tuple[Tensor, Tensor]:
         return stamps >> (mt.bit_length() - 1), stamps & (mt - 1)
     time = stamps // mt
     return time, stamps - time * mt
+
+
+def _falls(values: Tensor) -> bool:
+    """Whether a value is below the one before it; by numpy on a CPU, as in `_repeated`."""
+    values = values.numpy() if values.device.type == "cpu" else values
+    return bool((values[1:] < values[:-1]).any())
 
 
 def _repeated(per_pixel: Tensor, counts: Tensor) -> Tensor:

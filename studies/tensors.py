@@ -121,12 +121,12 @@ def draw(codings: list[CodingTensor], path: Path) -> Path:
     figure = plt.figure(figsize=(max(6.5, 4.2 * len(codings)), 7), layout="constrained")
     parts = figure.subfigures(1, len(codings), squeeze=False)[0]
     for part, coding in zip(parts, codings, strict=True):
-        _column(part, coding)
+        _column(part, coding, with_scale=coding is codings[-1])
     figure.suptitle("Temporal part of coding tensors")
     return save(figure, path)
 
 
-def _column(part: SubFigure, coding: CodingTensor) -> None:
+def _column(part: SubFigure, coding: CodingTensor, with_scale: bool) -> None:
     matrix = temporal_matrix(coding)
     above, below = part.subplots(2, 1, height_ratios=(1.4, 1))
     shown = above.imshow(row_scaled(matrix), cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto", interpolation="nearest")
@@ -136,9 +136,12 @@ def _column(part: SubFigure, coding: CodingTensor) -> None:
     note = coding.name.partition(", ")[2]
     above.set_title(f"{name}{pixel}\n{block}, K = {coding.codes}{f' ({note})' if note else ''}", fontsize=9)
     above.set(xlabel="time bin of the block", ylabel="code k")
-    part.colorbar(shown, ax=above, pad=0.02).set_label("row scaled to ±1", fontsize=8)
+    if with_scale:
+        part.colorbar(shown, ax=above, pad=0.02).set_label("every row scaled to ±1", fontsize=8)
     rows = np.unique(np.linspace(0, coding.codes - 1, min(CURVES, coding.codes)).astype(int))
-    for row in rows:
-        below.plot(matrix[row], lw=0.9, label=f"k = {row}")
-    below.set(xlabel="time bin of the block", ylabel="weight")
-    below.legend(fontsize=7, loc="upper right", ncols=2)
+    scaled = row_scaled(matrix)
+    for place, row in enumerate(rows):  # one above the other: rows of noise would hide each other
+        below.plot(scaled[row] - 2.5 * place, lw=0.7)
+    below.set(xlabel="time bin of the block", yticks=-2.5 * np.arange(len(rows)))
+    below.set_yticklabels([f"k = {row}" for row in rows])
+    below.set_ylabel("rows, scaled to ±1 each")

@@ -222,6 +222,7 @@ def _draw(rows: list[Row], path: Path) -> Path:
     """Error against seconds, one panel a part, one mark a design, one colour a method."""
     from matplotlib import pyplot as plt
     from matplotlib.lines import Line2D
+    from matplotlib.ticker import NullFormatter
 
     from studies.figures import save
 
@@ -238,6 +239,9 @@ def _draw(rows: list[Row], path: Path) -> Path:
             axes.plot(row.seconds, row.error, marks[row.design], color=colours[row.name], ms=8)
         axes.set(xscale="log", yscale="log", title=title, xlabel="seconds, median",
                  ylabel="largest deviation from float64, relative")  # fmt: skip
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_minor_formatter(NullFormatter())
+        axes.margins(0.15)
         axes.grid(alpha=0.3, which="both")
         handles = [Line2D([], [], color=colour, marker="s", ls="", label=name) for name, colour in colours.items()]
         axes.legend(handles=handles, fontsize=8, loc="best")
