@@ -333,9 +333,10 @@ class _Assembly:
         token = cursor.next
         if token.kind == "number":
             cursor.at += 1
-            return self._in_range(
-                cursor.line, token, int(token.text, 0 if token.text[:2].lower() in ("0x", "0b") else 10)
-            )
+            value = int(token.text, {"0x": 16, "0b": 2}.get(token.text[:2].lower(), 10))
+            if value >= _MOST_VALUE:
+                raise cursor.line.fail(token.column, f"{token.text} does not fit into 32 bits")
+            return value
         token = cursor.take("name", "a number or a name")
         name = self._name(cursor.line, token)
         for known in (cursor.line.loops, self.values, more):

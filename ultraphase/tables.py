@@ -55,8 +55,8 @@ def fourier_matrix(quarter: np.ndarray, codes: int) -> np.ndarray:
 
 
 def block_matrix(temporal: np.ndarray, timestamps: int) -> np.ndarray:
-    """What `separable.s` and `learned.s` add: temporal codes (K, Mt) of every block of Mt timestamps, block after block,
-    (timestamps / Mt x K, timestamps)."""
+    """What `separable.s` and `learned.s` add, (timestamps / Mt x K, timestamps): the temporal codes (K, Mt) of every
+    block of Mt timestamps, block after block."""
     codes, width = temporal.shape
     matrix = np.zeros((timestamps // width, codes, timestamps), np.int64)
     for block in range(timestamps // width):
@@ -70,7 +70,8 @@ def coarse_matrix(codes: int, timestamps: int) -> np.ndarray:
 
 
 def spatial_sum(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The frame end of 2 x 2 cores (`sum2x2.s`): round(sum over the cores of w s / 128), halves up, saturated to 16 bits.
+    """The frame end of 2 x 2 cores (`sum2x2.s`): sum over the cores of w s / 128, rounded (halves up), then saturated
+    to 16 bits.
 
     sums (..., cores, blocks, K) and weights (cores, K), both integer -> (..., blocks, K) int64.
     """

@@ -85,7 +85,8 @@ def verify(
     program      with `tables` for its RAM
     matrix       (numbers in RAM, timestamps) integers; None skips the comparison
     timestamps   how many there are (the matrix' columns, else the chip's)
-    States: all zero, all at the top, all at the bottom, random; of 8-bit counters every uniform value. Registers random.
+    States: all zero, all at the top, all at the bottom, random; of 8-bit counters every uniform value. Registers are
+    random.
 
     Raises InputError if what a photon adds, or how long it takes, depends on the state; if it changes a table or lets
     words out; and where the program differs from the matrix, saying at which timestamp and number.
@@ -174,11 +175,12 @@ def _not_additive(
 
 
 def _compare(program: Program, added: np.ndarray, matrix: np.ndarray) -> None:
+    shape = added.T.shape
     require(
-        matrix.shape == added.T.shape,
-        f"program {program.name}: matrix of shape {matrix.shape}, the program has {added.T.shape} (numbers, timestamps)",
+        matrix.shape == shape,
+        f"program {program.name}: matrix of shape {matrix.shape}, the program has {shape} (numbers, timestamps)",
     )
-    number, t = np.nonzero(added.T != matrix)
+    number, t = np.nonzero(matrix != added.T)
     if t.size:
         raise InputError(
             f"program {program.name} differs from the matrix in {t.size} of {matrix.size} entries, first at timestamp "
