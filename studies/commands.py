@@ -129,9 +129,10 @@ class Depth(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Common):
-    """Speed against error beside mitransient (`bench render`), or the table of hard cases (`bench hard-cases`)."""
+    """Speed against error beside mitransient (`bench render`), the table of hard cases (`bench hard-cases`), or the
+    emulator's speed and its two routes to the same bits (`bench emulate`)."""
 
-    stage: Positional[Literal["render", "hard-cases"]] = "render"
+    stage: Positional[Literal["render", "hard-cases", "emulate"]] = "render"
     """What is measured."""
     scenes: tuple[Literal["flash", "lamp", "artist", "groove"], ...] = ()
     """Scenes of `bench render` (default: all)."""
@@ -157,6 +158,55 @@ class Bench(Common):
     """Folder for the table (.csv) and the pictures (.png)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Ultraphase(Common):
+    """Compressive histograms as programs on the emulated UltraPhase processor: `table` (Supplementary Figure 5 beside
+    the emulation), `run PROGRAM`, `asm FILE`, `list FILE`, `verify PROGRAM`, `sweep`."""
+
+    action: Positional[Literal["table", "run", "asm", "list", "verify", "sweep"]] = "table"
+    """What is done."""
+    program: Positional[str] = ""
+    """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s)."""
+    define: tuple[str, ...] = ()
+    """Constants of a source file, as NAME=VALUE."""
+    out: File = None
+    """File for the words (asm: one hexadecimal word a line), the listing (list) or the rows (table, sweep: .csv)."""
+    photons: tuple[float, ...] = (550.0,)
+    """Photons a pixel and frame, background included; `run` takes one number, `sweep` several."""
+    signal: float = 50.0
+    """Of these, photons of one laser return (run)."""
+    fps: tuple[float, ...] = (30.0,)
+    """Frames a second (sweep)."""
+    codes: tuple[int, ...] = ()
+    """K of the Fourier and separable programs (sweep; default: the seven of the paper)."""
+    pixels: tuple[int, ...] = (4, 1048576)
+    """Pixels of the sensor (sweep)."""
+    trace: int = 0
+    """Show this many instructions of one core (run)."""
+    watch: str = ""
+    """Show every change of this region of one core's RAM, 100 at the most (run)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study(Common):
+    """Regenerate a group of the paper's figures from geometry: `power` is Supplementary Figures 4 and 5."""
+
+    name: Positional[Literal["power"]] = "power"
+    """The study."""
+    scene: str = "living-room"
+    """A scene as `render` takes it."""
+    width: int = 64
+    """Image width, pixels."""
+    height: int = 48
+    """Image height, pixels."""
+    signal: float = 50.0
+    """Mean signal photons per pixel."""
+    background: float = 500.0
+    """Mean background photons per pixel."""
+    out: Path = Path("out/study")
+    """Folder for tables (.csv) and figures (.png)."""
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
@@ -164,4 +214,6 @@ Command = (
     | Annotated[Sense, tyro.conf.subcommand("sense")]
     | Annotated[Depth, tyro.conf.subcommand("depth")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Ultraphase, tyro.conf.subcommand("ultraphase")]
+    | Annotated[Study, tyro.conf.subcommand("study")]
 )

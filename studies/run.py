@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import logging
 import mmap
 import os
@@ -268,9 +269,24 @@ def run_bench(command: commands.Bench, progress: Progress) -> dict:
     """One stage of the bench; each is imported only when it is asked for."""
     if command.stage == "hard-cases":
         from studies.bench import hard_cases as stage
+    elif command.stage == "emulate":
+        from studies.bench import emulate as stage
     else:
         from studies.bench import render as stage
     return stage.run(command, progress)
+
+
+def run_ultraphase(command: commands.Ultraphase, progress: Progress) -> dict:
+    """The emulated in-pixel processor."""
+    from studies import ultraphase_cli
+
+    return ultraphase_cli.run(command, progress)
+
+
+def run_study(command: commands.Study, progress: Progress) -> dict:
+    """One figure group; each is the module of its name, imported only when it is asked for."""
+    study = importlib.import_module(f"studies.{command.name.replace('-', '_')}")
+    return study.run(command, progress)
 
 
 RUNNERS: dict[type, Callable] = {
@@ -280,4 +296,6 @@ RUNNERS: dict[type, Callable] = {
     commands.Sense: run_sense,
     commands.Depth: run_depth,
     commands.Bench: run_bench,
+    commands.Ultraphase: run_ultraphase,
+    commands.Study: run_study,
 }

@@ -110,6 +110,12 @@ def _block_ends(program: Program) -> list[int]:
     return ends
 
 
+def _outside(value: np.ndarray, low: int, high: int) -> int:
+    """How many values are outside low .. high; one pass where none is: below low is huge as an unsigned number."""
+    raised = (value - low).view(np.uint64)
+    return int(np.count_nonzero(raised > high - low)) if int(raised.max(initial=0)) > high - low else 0
+
+
 class _Run:
     """One frame while it runs."""
 
@@ -129,23 +135,28 @@ class _Run:
         self.visits = np.zeros(len(self.program.instructions), np.int64)
         self.wraps = self.saturations = self.events = 0
         self.out: list[tuple[np.ndarray, np.ndarray, int]] = []
+        self.ram_bytes = self.program.ram_bytes
+        self.changed = True  # the status of some core
         self.code = [self._kind(one) for one in self.program.instructions]
         self.block_end = _block_ends(self.program)
 
     def to_end(self) -> Frame:
-        patience, events = PATIENCE, 0
+        patience, events, live = PATIENCE, 0, self.array._lane
         while True:
-            live = np.flatnonzero(self.status == _RUNS)
-            if not live.size:
-                break
+            if self.changed:
+                live, self.changed = np.flatnonzero(self.status == _RUNS), False
+                if not live.size:
+                    break
             words = self.word[live]
             word = int(words.min())
             index = live[words == word]
-            require(word < len(self.code), f"program {self.program.name}: runs behind its last instruction")
+            if word >= len(self.code):
+                raise InputError(f"program {self.program.name}: runs behind its last instruction")
             self._block(word, slice(None) if index.size == self.status.size else index, index)
             patience = PATIENCE if self.events != events else patience - 1
             events = self.events
-            require(patience > 0, f"{self.program.where(word)}: no progress in {PATIENCE} branches")
+            if patience == 0:
+                raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} branches")
         self._explain_waiting()
         return self._result()
 
@@ -195,22 +206,22 @@ class _Run:
         if one.op.reads:
             value = cells[place] + (value if one.name == "ADDM" else -value)
             high = HALF_LIMITS[1]
-        if int(value.min()) < low or int(value.max()) > high:
-            self.wraps += int(np.count_nonzero((value < low) | (value > high)))
+        self.wraps += _outside(value, low, high)
         cells[place] = value.astype(cells.dtype)
 
     def _cells(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> tuple:
         """RAM in cells of the operand's size, and the cell of every core: (cells, index)."""
-        last = self.program.ram_bytes - one.op.size
+        last = self.ram_bytes - one.op.size
         at = one.value if one.constant else self.registers[one.rs][lanes] + one.value
-        low, high = (at, at) if one.constant else (int(at.min()), int(at.max()))
-        if low < 0 or high > last:
-            wrong = low if low < 0 else high
+        if not 0 <= at <= last if one.constant else _outside(at, 0, last):
+            wrong = np.atleast_1d(at)
+            wrong = wrong[(wrong < 0) | (wrong > last)][0]
             raise InputError(f"{self.program.where(word)}: RAM address {wrong} is outside the declared 0 to {last}")
         if one.op.size == 1:
             return self.bytes, self.array._first_byte[lanes] + at
-        odd = np.atleast_1d(at)[np.atleast_1d(at) % 2 == 1]
-        require(not odd.size, f"{self.program.where(word)}: address {odd[:1].sum()} of 16 bits is odd")
+        if np.any(at & 1):
+            odd = np.atleast_1d(at)
+            raise InputError(f"{self.program.where(word)}: address {odd[odd % 2 == 1][0]} of 16 bits is odd")
         return self.halves, (self.array._first_byte[lanes] + at) >> 1
 
     def _branch(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> np.ndarray | None:
@@ -218,7 +229,7 @@ class _Run:
         if one.name in ("BNT", "BFE"):
             empty = self.next[lanes] == self.last[lanes]
             if one.name == "BNT" and self.park and empty.any():
-                self.status[index[empty]] = _PARKED
+                self.status[index[empty]], self.changed = _PARKED, True
                 self.word[index[empty]] = word
                 return index[empty]
             taken = empty & (one.name == "BNT" or not self.park)
@@ -232,18 +243,18 @@ class _Run:
         return None
 
     def _halt(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
-        self.status[lanes] = _HALTED
+        self.status[lanes], self.changed = _HALTED, True
 
     def _rdt(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
-        there = bool((self.next[lanes] < self.last[lanes]).all())
-        require(there, f"{self.program.where(word)}: no timestamp is there")
+        if not (self.next[lanes] < self.last[lanes]).all():
+            raise InputError(f"{self.program.where(word)}: no timestamp is there")
         self.registers[one.rd][lanes] = self.port[self.next[lanes]]
         self.next[lanes] += 1
         self.events += 1
 
     def _saturate(self, one: Instruction, lanes: slice | np.ndarray, low: int, high: int) -> None:
         value = self.registers[one.rs][lanes]
-        self.saturations += int(np.count_nonzero((value < low) | (value > high)))
+        self.saturations += _outside(value, low, high)
         self.registers[one.rd][lanes] = value.clip(low, high)
 
     def _satb(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
@@ -254,7 +265,7 @@ class _Run:
 
     def _leave(self, one: Instruction, lanes: slice | np.ndarray, index: np.ndarray, low: int, high: int) -> None:
         value = self.registers[one.rs][lanes]
-        self.wraps += int(np.count_nonzero((value < low) | (value > high)))
+        self.wraps += _outside(value, low, high)
         bits = (high - low + 1).bit_length() - 1
         self.out.append((index.copy(), (value - low) % (high - low + 1) + low, bits))
         self.events += 1
@@ -302,7 +313,7 @@ class _Run:
 
     def _hold(self, lanes: np.ndarray, word: int, wake: np.ndarray) -> np.ndarray:
         """Cores that cannot go on stay at this instruction; those at the other end of a moved word try again."""
-        self.status[lanes], self.word[lanes] = _BLOCKED, word
+        self.status[lanes], self.word[lanes], self.changed = _BLOCKED, word, True
         self.status[wake[self.status[wake] == _BLOCKED]] = _RUNS
         self.events += bool(wake.size)
         return lanes

@@ -30,6 +30,7 @@ from ultraphase.source import Cursor, Line, Token, source_lines
 _REGISTER = re.compile(r"r(\d+)\Z")
 _MOST_STATEMENTS = 20_000
 _MOST_INCLUDES = 8
+_MOST_NESTED = 32
 _MOST_VALUE = 1 << 31
 
 Reader = Callable[[str], str]
@@ -324,11 +325,13 @@ class _Assembly:
         return total
 
     def _atom(self, cursor: Cursor, more: Mapping[str, int]) -> int:
-        if cursor.mark("-"):
-            return -self._atom(cursor, more)
-        if cursor.mark("("):
-            value = self._expression(cursor, more)
-            cursor.expect(")")
+        if cursor.depth > _MOST_NESTED:
+            raise cursor.fail(f"more than {_MOST_NESTED} parentheses or signs deep")
+        if cursor.next.text in ("-", "("):
+            cursor.depth += 1
+            negative = cursor.mark("-")
+            value = -self._atom(cursor, more) if negative else self._parenthesis(cursor, more)
+            cursor.depth -= 1
             return value
         token = cursor.next
         if token.kind == "number":
@@ -343,6 +346,12 @@ class _Assembly:
             if name in known:
                 return known[name]
         raise cursor.line.fail(token.column, f"{name!r} is not defined here")
+
+    def _parenthesis(self, cursor: Cursor, more: Mapping[str, int]) -> int:
+        cursor.expect("(")
+        value = self._expression(cursor, more)
+        cursor.expect(")")
+        return value
 
     def program(self, name: str) -> Program:
         """All labels known: the branches find their targets; checked against the chip."""

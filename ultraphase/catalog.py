@@ -16,7 +16,9 @@ from ultraphase.tables import block_matrix, coarse_matrix, fourier_matrix, quart
 
 FOLDER = Path(__file__).parent / "programs"
 SPATIAL_BLOCK = (2, 2)
+TIMESTAMPS = 1024
 TIME_BLOCK = 256
+SPADS = 16  # of a core that keeps their addresses
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ FAMILIES = {
     "fourier": "truncated Fourier 1024 x 1 x 1",
     "separable": "Fourier + learned 256 x 2 x 2",
     "learned": "learned 256 x 2 x 2",
-    "addressed": "coarse histogram of each of 4 x 4 SPADs",
+    "addressed": "truncated Fourier of each of 4 x 4 SPADs",
 }
 
 
@@ -62,7 +64,7 @@ class Method:
     fourier    K codes of 16 bits from a quarter wave of 256
     separable  K codes for each of 4 blocks of 256 bins from a quarter wave of 64, weighted and added over 2 x 2 cores
     learned    the same with a learned temporal table: does not fit for K >= 2
-    addressed  K counters for each SPAD of the core; timestamps carry their SPAD's address above their time bits
+    addressed  fourier for each SPAD of the core; timestamps carry their SPAD's address above their time bits
     """
 
     family: str
@@ -71,7 +73,7 @@ class Method:
 
     def __post_init__(self) -> None:
         require(self.family in FAMILIES, f"program family {self.family!r}, expected one of {', '.join(FAMILIES)}")
-        if self.family in ("coarse", "addressed"):
+        if self.family == "coarse":
             good = self.codes in (2, 4, 8, 16, 32, 64, 128, 256, 512)
             require(good, f"program {self.name}: {self.codes} bins, expected a power of two from 2 to 512")
         else:
@@ -100,20 +102,17 @@ class Method:
     @property
     def temporal_bins(self) -> int:
         """Mt of the temporal coding tensor that its table comes from; 0 where there is none."""
-        return {"fourier": 1024, "separable": TIME_BLOCK, "learned": TIME_BLOCK}.get(self.family, 0)
+        wide = dict.fromkeys(("fourier", "addressed"), TIMESTAMPS)
+        return {**wide, "separable": TIME_BLOCK, "learned": TIME_BLOCK}.get(self.family, 0)
 
     def program(self, chip: ChipSpec | None = None) -> Program:
         """Assembled, and checked against the chip. Raises InputError for what is over."""
         constants = {"K": self.codes}
-        file = self.family
-        if self.family in ("coarse", "addressed"):
-            file, constants["SHIFT"] = "coarse", (1024 // self.codes).bit_length() - 1
-            if self.family == "addressed":
-                rows, columns = (chip or ChipSpec()).spads_per_core
-                constants["COUNTERS"] = rows * columns * self.codes
+        if self.family == "coarse":
+            constants["SHIFT"] = (TIMESTAMPS // self.codes).bit_length() - 1
             if self.shift_step is not None:
                 constants["STEP"] = self.shift_step
-        return assemble_file(FOLDER / f"{file}.s", constants, chip, name=self.name)
+        return assemble_file(FOLDER / f"{self.family}.s", constants, chip, name=self.name)
 
     def tables(self, temporal: np.ndarray | None = None, weights: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Tables for `CoreArray`: from the int8 temporal tensor (K, Mt), and of spatial weights (..., K) a core."""
@@ -127,19 +126,18 @@ class Method:
             tables["weight"] = np.full(self.codes, 127) if weights is None else weights
         return tables
 
-    def matrix(self, temporal: np.ndarray | None = None, timestamps: int = 1024) -> np.ndarray:
+    def matrix(self, temporal: np.ndarray | None = None) -> np.ndarray:
         """The integer matrix (numbers in RAM, timestamps) that the program computes, from the int8 temporal tensor."""
         if self.family == "coarse":
-            return coarse_matrix(self.codes, timestamps)
-        if self.family == "addressed":
-            spads = ChipSpec().spads_per_core
-            return coarse_matrix(spads[0] * spads[1] * self.codes, spads[0] * spads[1] * timestamps)
+            return coarse_matrix(self.codes, TIMESTAMPS)
         require(temporal is not None, f"program {self.name}: needs an int8 temporal tensor (K, {self.temporal_bins})")
         self._check(temporal)
         if self.family == "learned":
-            return block_matrix(np.asarray(temporal, np.int64), timestamps)
+            return block_matrix(np.asarray(temporal, np.int64), TIMESTAMPS)
         fourier = fourier_matrix(quarter_wave(temporal), self.codes)
-        return fourier if self.family == "fourier" else block_matrix(fourier, timestamps)
+        if self.family == "addressed":
+            return block_matrix(fourier, SPADS * TIMESTAMPS)
+        return fourier if self.family == "fourier" else block_matrix(fourier, TIMESTAMPS)
 
     def _check(self, temporal: np.ndarray) -> None:
         shape, found = (self.codes, self.temporal_bins), f"{temporal.dtype} {temporal.shape}"

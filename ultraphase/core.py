@@ -28,6 +28,9 @@ class Counters:
     wraps: int = 0
     saturations: int = 0
 
+    def __add__(self, other: Counters) -> Counters:
+        return Counters(*(getattr(self, name) + getattr(other, name) for name in Counters.__dataclass_fields__))
+
     def __sub__(self, other: Counters) -> Counters:
         return Counters(*(getattr(self, name) - getattr(other, name) for name in Counters.__dataclass_fields__))
 
@@ -154,7 +157,8 @@ class Core:
                     break
             else:
                 stuck = progress == (self._read, len(self.out))
-                require(not stuck, f"{self.program.where(word)}: no progress in {PATIENCE} instructions")
+                if stuck:
+                    raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} instructions")
         self._stopped = True
 
     def contents(self, region: str) -> np.ndarray:
@@ -297,7 +301,8 @@ class Core:
             return after
 
         def read() -> int:
-            require(self._read < len(self._port), f"{self.program.where(word)}: no timestamp is there")
+            if self._read == len(self._port):
+                raise InputError(f"{self.program.where(word)}: no timestamp is there")
             self._read += 1
             self._photons += 1
             return put(self._port[self._read - 1])

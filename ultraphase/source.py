@@ -64,7 +64,7 @@ class Cursor:
     """Reads the tokens of one line."""
 
     def __init__(self, line: Line, start: int = 0) -> None:
-        self.line, self.at = line, start
+        self.line, self.at, self.depth = line, start, 0
 
     @property
     def next(self) -> Token:

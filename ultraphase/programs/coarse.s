@@ -1,15 +1,13 @@
 ; Coarse histogram of K bins with 8-bit counters that stay at 255.
 ;
-; The timestamp loses its low SHIFT bits and is the counter's address. With timestamps that carry the address of their
-; SPAD above their time bits, the same program keeps one histogram a SPAD: COUNTERS = SPADs x K.
+; The timestamp without its low SHIFT bits is the counter's address.
 
 .equ K, 16
 .equ SHIFT, 6
-.equ COUNTERS, K
 .equ STEP, MAX_SHIFT                           ; bits that one instruction shifts by
 .equ STEPS, (SHIFT + STEP - 1) / STEP
 
-.space codes, u8, COUNTERS
+.space codes, u8, K
 .reg bin, r1
 .reg count, r2
 .reg last, r3
@@ -31,7 +29,7 @@ idle:   BFE  end
         JMP  loop
 
 end:    MOV  bin, #0                           ; the frame leaves, and the counters start again at 0
-        MOV  last, #COUNTERS
+        MOV  last, #K
         MOV  zero, #0
 drain:  LDB  count, [codes + bin]
         OUTB count

@@ -20,14 +20,5 @@ loop:   BNT  idle
 idle:   BFE  end
         JMP  loop
 
-.reg last, r8
-.reg zero, r9
-end:    MOV  i, #0                             ; the frame leaves, and the sums start again at 0
-        MOV  last, #2*K
-        MOV  zero, #0
-drain:  LDH  a, [codes + i]
-        OUTH a
-        STH  [codes + i], zero
-        ADD  i, i, #2
-        BLT  i, last, drain
-        HALT
+.equ SUMS, K
+.include "drain16.s"
