@@ -86,11 +86,15 @@ def _table(command: Ultraphase, progress: Progress) -> dict:
 
 def _row_in_words(row: dict) -> str:
     printed, ours = row["published"], row["emulated"]
+    clocks = f"{printed['clocks']:3d} printed, {ours['clocks']:5.1f} emulated ({row['residual_clocks']:+.1f})"
+    processing = (
+        f"{printed['processing_uw']:.3g} uW printed, {ours['processing_uw']:.3g} emulated, "
+        f"{ours['processing_uw_energy']:.3g} as energy x rate"
+    )
+    readout = f"{printed['readout_uw']:.2f} / {ours['readout_uw']:.2f} uW"
     return (
-        f"{row['name']:13s} clocks a photon {printed['clocks']:3d} printed, {ours['clocks']:5.1f} emulated "
-        f"({row['residual_clocks']:+.1f}); {ours['rate_kb_per_s']:5.2f} kB/s; processing "
-        f"{printed['processing_uw']:.3g} uW printed, {ours['processing_uw']:.3g} emulated, {ours['processing_uw_energy']:.3g} as energy x rate; readout "
-        f"{printed['readout_uw']:.2f} / {ours['readout_uw']:.2f} uW; frame end {ours['frame_end_clocks']:.0f} clocks"
+        f"{row['name']:13s} clocks a photon {clocks}; {ours['rate_kb_per_s']:5.2f} kB/s; processing {processing}; "
+        f"readout {readout}; frame end {ours['frame_end_clocks']:.0f} clocks"
     )
 
 

@@ -13,7 +13,7 @@ from ultraphase.chip import ChipSpec
 from ultraphase.program import KINDS, Program
 
 _EXACT_IN_FLOAT32 = 1 << 24
-_CHUNK = 4096  # pixels at a time: 16 MB of float32 histogram
+_CHUNK = 256  # pixels at a time: 1 MB of float32 histogram, which a cache holds
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,17 +43,15 @@ class Tabulated:
         count, bins = histograms.shape
         require(bins == len(self.table), f"histograms of {bins} bins, {self.program} has {len(self.table)} timestamps")
         largest = max(int(np.abs(self.table).max()), 1)
-        with_total = np.column_stack([self.table, np.ones(bins, np.int64)])
-        narrow, result = with_total.astype(np.float32), np.empty((count, self.table.shape[1]), np.int64)
+        narrow, result = self.table.astype(np.float32), np.empty((count, self.table.shape[1]), np.int64)
         block = np.empty((min(_CHUNK, count), bins), np.float32)
         for first in range(0, count, _CHUNK):
             part = histograms[first : first + _CHUNK]
-            np.copyto(block[: len(part)], part, casting="unsafe")
-            found = block[: len(part)] @ narrow
-            # the total is exact below 2^24 and cannot round to less than half of it above
-            if len(part) and largest * float(found[:, -1].max()) >= _EXACT_IN_FLOAT32:
-                found = part.astype(np.float64) @ with_total
-            result[first : first + len(part)] = found[:, :-1]
+            if largest * _most_photons(part) < _EXACT_IN_FLOAT32:
+                np.copyto(block[: len(part)], part, casting="unsafe")
+                result[first : first + len(part)] = block[: len(part)] @ narrow
+            else:
+                result[first : first + len(part)] = part.astype(np.float64) @ self.table.astype(np.float64)
         return result
 
     def frame(self, histograms: np.ndarray) -> np.ndarray:
@@ -63,12 +61,22 @@ class Tabulated:
 
     def limited(self, sums: np.ndarray) -> np.ndarray:
         """Sums as the RAM holds them: saturated or wrapped."""
+        if not self.overflowed(sums):
+            return sums
         wrapped = (sums - self.low) % (self.high - self.low + 1) + self.low
         return np.where(self.saturates, np.minimum(sums, self.high), wrapped)
 
     def overflowed(self, sums: np.ndarray) -> int:
         """How many sums the RAM cannot hold."""
         return int(np.count_nonzero((sums < self.low) | (sums > self.high)))
+
+
+def _most_photons(histograms: np.ndarray) -> int:
+    """Bound on the photons of a pixel: from the fullest bin where that is enough to be small, else counted."""
+    least = int(histograms.min(initial=0))
+    require(least >= 0, f"histogram holds {least} counts")
+    bound = int(histograms.max(initial=0)) * histograms.shape[1]
+    return bound if bound < 1 << 16 else int(histograms.sum(axis=1, dtype=np.int64).max(initial=0))
 
 
 def verify(
