@@ -12,7 +12,7 @@ from ultraphase.chip import ChipSpec
 from ultraphase.isa import ALU, BYTE_LIMIT, HALF_LIMITS, REGISTERS, Instruction, spelled
 from ultraphase.program import KINDS, Program
 
-PATIENCE = 1 << 16  # instructions without a timestamp read, a word out or an end, after which a core is stuck
+PATIENCE = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
 _STOP = -1
 
 

@@ -108,7 +108,7 @@ def verify(
     tables_before = _table_bytes(program, array)
     random = np.random.default_rng(seed)
     added = clocks = None
-    wraps = saturates = np.ones(len(kinds), bool)
+    wraps = np.ones(len(kinds), bool)
     states = 0
     for before in _states(low, high, random):
         after, frame = _run(program, array, before, random)
@@ -116,14 +116,15 @@ def verify(
         same_tables = np.array_equal(_table_bytes(program, array), tables_before)
         require(same_tables, f"program {program.name}: a photon changes a table")
         if added is None:
-            added, clocks = after, frame.cycles[0]
-        wrapped = (before + added - low) % (high - low + 1) + low
-        held = np.minimum(before + added, high)
-        wraps = wraps & (after == wrapped).all(axis=0)
-        saturates = saturates & (after == held).all(axis=0) & (added >= 0).all(axis=0)
-        bad = ~(wraps | saturates)
-        if bad.any() or (frame.cycles[0] != clocks).any():
-            raise InputError(_not_additive(program, bad, before, after, wrapped, frame.cycles[0] != clocks))
+            added, clocks, saturates = after, frame.cycles[0], (after >= 0).all(axis=0)
+        exact = before + added
+        if wraps.any():
+            wraps = wraps & (after == (exact - low) % (high - low + 1) + low).all(axis=0)
+        if saturates.any():
+            saturates = saturates & (after == np.minimum(exact, high)).all(axis=0)
+        slow, bad = frame.cycles[0] != clocks, ~(wraps | saturates)
+        if bad.any() or slow.any():
+            raise InputError(_not_additive(program, bad, before, after, added, slow))
         states += 1
     if matrix is not None:
         _compare(program, added, np.asarray(matrix))
@@ -167,17 +168,16 @@ def _not_additive(
     bad: np.ndarray,
     before: np.ndarray,
     after: np.ndarray,
-    wrapped: np.ndarray,
+    added: np.ndarray,
     slow: np.ndarray,
 ) -> str:
     names = [f"{region.name}[{n}]" for region in program.state for n in range(region.count)]
     if bad.any():
         number = int(np.flatnonzero(bad)[0])
-        off = np.flatnonzero(after[:, number] != wrapped[:, number])
-        t = int(off[0]) if off.size else 0
+        t = int(np.argmax(after[:, number] != before[number] + added[:, number]))
         return (
             f"program {program.name} is not additive: timestamp {t} takes {names[number]} from {before[number]} to "
-            f"{after[t, number]}, from 0 it adds {wrapped[t, number] - before[number]}"
+            f"{after[t, number]}, from 0 to {added[t, number]}"
         )
     return f"program {program.name}: how long timestamp {int(np.flatnonzero(slow)[0])} takes depends on RAM"
 
