@@ -109,8 +109,9 @@ def draw_power(costs: dict[str, Cost], path: Path) -> Path:
         (axes[1], "processing_energy_w", "processing, energy x rate\n(94.6 GOPS/W; inferred)"),
     ):
         _bars(one, {"printed clocks": printed, "emulated clocks": ours}, field, title)
-    end = {name: 1e6 * found.frame_end_energy_w for name, found in ours.items()}
-    axes[1].plot(range(len(end)), list(end.values()), "kx", label="frame end, emulated (not in the published table)")
+    end = [1e6 * found.frame_end_energy_w for found in ours.values()]
+    axes[1].plot(range(len(end)), end, "kx", label="frame end, emulated (not in the published table)")
+    axes[1].set_ylim(0.5 * min(end), None)
     axes[1].legend(fontsize=8, loc="upper left")
     readout = {**printed, **bare}
     _bars(axes[2], {"readout": readout}, "readout_w", "readout interface\n(rate x 5 pF x (3.3 V)²)")
@@ -124,12 +125,12 @@ def _bars(axes: Axes, groups: dict[str, dict], field: str, title: str) -> None:
         at = np.arange(len(found)) + (number - (len(groups) - 1) / 2) * wide
         values = [1e6 * getattr(one, field) for one in found.values()]
         shown = axes.bar(at, values, wide, label=label)
-        axes.bar_label(shown, [f"{value:.2g}" for value in values], fontsize=6, padding=1)
+        axes.bar_label(shown, [f"{value:.2g}" for value in values], fontsize=7, padding=2, rotation=90)
     names = list(next(iter(groups.values())))
     axes.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=8)
     axes.set(yscale="log", ylabel="power of 2 x 2 pixels [µW]", title=title)
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high * 4)
+    axes.set_ylim(low, high * 8)
     axes.legend(fontsize=8, loc="upper left")
 
 
@@ -138,7 +139,8 @@ def draw_depths(histogram: Histogram, depths: dict[str, np.ndarray], rows: list[
     errors = {row["name"]: row for row in rows}
     titles = {
         name: f"{name}: {errors[name]['bytes_per_pixel']:.0f} B a pixel\n"
-        f"MAE {errors[name]['mae_mm']:.0f} mm, median {errors[name]['median_mm']:.0f} mm"
+        f"MAE {errors[name]['mae_mm']:.0f} mm, median {errors[name]['median_mm']:.0f} mm\n"
+        f"{errors[name]['wraps']:,} wraps, {errors[name]['saturations']:,} saturations"
         for name in depths
     }
     level = f"{histogram.budget.signal:g} signal and {histogram.budget.background:g} background photons a pixel"

@@ -12,7 +12,7 @@ from ultraphase import Core, CoreArray, assemble, method, verify
 from ultraphase.catalog import FOLDER, PUBLISHED
 from ultraphase.tables import block_matrix, fourier_matrix, int8_codes, quarter_wave, spatial_sum
 
-DEFAULT = settings(deadline=None, derandomize=True, max_examples=12)
+DEFAULT = settings(deadline=None, derandomize=True, max_examples=8)
 
 
 def temporal(codes: int, bins: int) -> np.ndarray:
