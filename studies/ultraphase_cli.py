@@ -17,9 +17,9 @@ from studies.ultraphase_chain import fixed_spatial, int8_temporal, verified
 from ultraphase import ChipSpec, Core, CoreArray, Method, Program, assemble_file, listing, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.chip import ASSUMPTIONS
-from ultraphase.power import READINGS, Cost, Load, as_csv, measured_cost, power, sweep, table
+from ultraphase.power import READINGS, Cost, Load, as_csv, measured_cost, power, reference_bits, sweep, table
 
-_MOST_PHOTONS = 100_000
+_MOST_PHOTONS = 20_000
 _MOST_WATCHED = 100
 
 
@@ -72,6 +72,10 @@ def _table(command: Ultraphase, progress: Progress) -> dict:
     step = method("coarse-16-shift-2")
     shown: dict[str, Any] = {
         "rows": rows,
+        "references": {
+            name: {"bytes_per_pixel": bits / 8, "readout_uw": 1e6 * power(Cost(0, 0, bits), Load()).readout_w}
+            for name, bits in reference_bits(Load().photons).items()
+        },
         "readings": READINGS,
         "assumptions": ASSUMPTIONS,
         "footnote": {

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from scenes.errors import require
 
 ASSUMPTIONS: dict[str, str] = {
-    "instruction set": "ours, of the kinds that S.2 names: logic, 32-bit arithmetic, data movement, core to core",
+    "instruction set": "UltraPhase-constrained, ours: the chip's is not public; logic, 32-bit arithmetic, data, links",
     "program store": "separate from the 4,096 bits of RAM",
     "ram access": "bytes, and aligned 16-bit words; one access, or one 16-bit read-modify-write, an instruction",
     "registers": "16 of 32 bits, not counted as RAM",

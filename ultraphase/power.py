@@ -54,11 +54,13 @@ class Cost:
     clocks_per_photon   mean over timestamps
     clocks_per_frame    the frame's end, mean over the cores of a block: not in the published table
     bits_per_pixel      what leaves the sensor a frame and pixel
+    waits_per_frame     clocks more at the frame's end in which a core waits for a neighbour: time, but no energy
     """
 
     clocks_per_photon: float
     clocks_per_frame: float
     bits_per_pixel: float
+    waits_per_frame: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ def measured_cost(method: Method, temporal: np.ndarray | None, chip: ChipSpec | 
     array = CoreArray(program, method.block, tables, chip=chip)
     cores = method.block[0] * method.block[1]
     frame = array.frame(np.zeros(0, np.int64), np.zeros(cores + 1, np.int64))
-    return Cost(float(per_photon), float(frame.cycles.mean()), float(frame.out_bits.sum() / cores))
+    waits = float(frame.stalls.mean())
+    return Cost(float(per_photon), float(frame.cycles.mean()) - waits, float(frame.out_bits.sum() / cores), waits)
 
 
 def reference_bits(photons: float, chip: ChipSpec | None = None) -> dict[str, float]:
@@ -129,6 +132,7 @@ def table(costs: dict[str, Cost], chip: ChipSpec | None = None) -> list[dict]:
                 "emulated": {
                     **_columns(costs[name].clocks_per_photon, costs[name].bits_per_pixel / 8, ours),
                     "frame_end_clocks": costs[name].clocks_per_frame,
+                    "frame_end_waits": costs[name].waits_per_frame,
                     "frame_end_uw_energy": ours.frame_end_energy_w * MICRO,
                 },
                 "residual_clocks": costs[name].clocks_per_photon - printed.clocks,
@@ -166,7 +170,8 @@ def sweep(
                 load = Load(count, rate, size)
                 for name, cost in {**costs, **bare}.items():
                     found = power(cost, load, chip)
-                    busy = (found.frame_time_s + chip.processing_time_s(1, cost.clocks_per_frame)) * rate
+                    end_s = chip.processing_time_s(1, cost.clocks_per_frame + cost.waits_per_frame)
+                    busy = (found.frame_time_s + end_s) * rate
                     rows.append(
                         {"name": name, **asdict(load), "busy": busy, "keeps_up": busy <= 1}
                         | _columns(cost.clocks_per_photon, cost.bits_per_pixel / 8, found)

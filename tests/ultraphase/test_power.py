@@ -81,6 +81,7 @@ def test_table_shows_residuals_of_the_emulation():
     for name, row in rows.items():
         assert row["emulated"]["bytes_per_pixel"] == PUBLISHED[name].bytes_per_pixel  # measured: what left the cores
         assert row["emulated"]["frame_end_clocks"] > 0
+        assert (row["emulated"]["frame_end_waits"] > 0) == name.startswith("separable")
     # of a block of 2 x 2: 64 numbers, each loaded, weighted, cleared and passed on or added up
     assert rows["separable-16"]["emulated"]["frame_end_clocks"] > 64 * 3 * 8
     assert "residual_clocks" in as_csv(list(rows.values())).splitlines()[0]
