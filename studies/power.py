@@ -18,7 +18,7 @@ from spad.sensor import PhotonBudget, sensor_by_name
 from studies import figures
 from studies.commands import Study
 from studies.figures import DEPTH_COLOURS, plt
-from studies.ultraphase_chain import by_torch, decode, emulate, fixed_spatial, shared_core_depths
+from studies.ultraphase_chain import by_torch, decode, emulate, shared_core_depths
 from studies.ultraphase_cli import all_costs
 from ultraphase import method
 from ultraphase.catalog import PUBLISHED
@@ -77,9 +77,8 @@ def _depths(histogram: Histogram, progress: Progress) -> tuple[dict[str, np.ndar
     for number, name in enumerate(PUBLISHED):
         progress(name, 0.1 + 0.8 * number / len(PUBLISHED))
         chosen = method(name)
-        spatial = fixed_spatial(chosen.codes) if chosen.block != (1, 1) else None
-        found = emulate(histogram.counts, chosen, spatial)
-        depths[name] = decode(found.codes, chosen, histogram.sensor, spatial)
+        found = emulate(histogram.counts, chosen)
+        depths[name] = decode(found.codes, chosen, histogram.sensor)
         counted = found.counters
         rows.append(
             {
@@ -90,7 +89,7 @@ def _depths(histogram: Histogram, progress: Progress) -> tuple[dict[str, np.ndar
                 "cycles": counted.cycles,
                 "wraps": counted.wraps,
                 "saturations": counted.saturations,
-                "differs_from_torch": int(np.count_nonzero(found.codes != by_torch(histogram.counts, chosen, spatial))),
+                "differs_from_torch": int(np.count_nonzero(found.codes != by_torch(histogram.counts, chosen))),
             }
         )
     return depths, rows

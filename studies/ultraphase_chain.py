@@ -17,7 +17,7 @@ from spad.sensor import Sensor
 from ultraphase import CoreArray, Method
 from ultraphase.catalog import TIMESTAMPS
 from ultraphase.core import Counters
-from ultraphase.tables import int8_codes, spatial_sum
+from ultraphase.tables import INT8_SCALE, int8_codes, spatial_sum
 from ultraphase.verify import verify
 
 _CORES = 1 << 16  # emulated at a time
@@ -45,18 +45,20 @@ def int8_temporal(method: Method) -> np.ndarray | None:
     return int8_codes(truncated_fourier(method.codes, method.temporal_bins).numpy())
 
 
-def fixed_spatial(codes: int) -> np.ndarray:
-    """Spatial weights (2, 2, K) int8 that stand in for learned ones where none are given: all four pixels alike."""
-    return np.full((2, 2, codes), 127, np.int64)
+def fixed_spatial(method: Method) -> np.ndarray | None:
+    """Spatial weights (rows, columns, K) in int8 steps that stand in for learned ones where none are given: all pixels
+    of a block alike. None for a method without a block."""
+    return None if method.block == (1, 1) else np.full((*method.block, method.codes), INT8_SCALE, np.int64)
 
 
 def emulate(counts: np.ndarray, method: Method, spatial: np.ndarray | None = None) -> Emulated:
     """One frame of an image, every photon a timestamp that a core's program works on.
 
     counts   (H, W, 1024) integers; H and W are multiples of the method's block
-    spatial  (rows, columns, K) int8 weights of one block of cores
+    spatial  (rows, columns, K) int8 weights of one block of cores, else `fixed_spatial`
     """
     height, width = _blocks_fit(counts, method)
+    spatial = fixed_spatial(method) if spatial is None else spatial
     program, tables = method.program(), method.tables(int8_temporal(method))
     rows = max(_CORES // width // method.block[0], 1) * method.block[0]
     codes, total, bits = [], None, 0
@@ -96,6 +98,7 @@ def by_torch(counts: np.ndarray, method: Method, spatial: np.ndarray | None = No
     Raises InputError where a sum is so large that float32 does not hold it exactly.
     """
     height, width = _blocks_fit(counts, method)
+    spatial = fixed_spatial(method) if spatial is None else spatial
     matrix = torch.from_numpy(method.matrix(int8_temporal(method))).float()
     largest = int(counts.sum(axis=-1, dtype=np.int64).max(initial=0)) * int(matrix.abs().max())
     require(largest < 1 << 24, f"sums up to {largest} are not exact in float32")
@@ -118,6 +121,7 @@ def decode(codes: np.ndarray, method: Method, sensor: Sensor, spatial: np.ndarra
     The codes of a block answer to a pulse in its pixel p with w[p, k] C[k, t]: that matrix is pixel p's coding tensor.
     """
     matrix = method.matrix(int8_temporal(method))
+    spatial = fixed_spatial(method) if spatial is None else spatial
     found = torch.from_numpy(codes).float()
     down, right = method.block
     depth = np.empty((codes.shape[0] * down, codes.shape[1] * right), np.float32)

@@ -145,8 +145,7 @@ def _run(command: Ultraphase, progress: Progress) -> dict:
     require(family not in ("learned", "addressed"), f"{program.name}: has no frame of 2 x 2 pixels to run")
     tables: dict[str, np.ndarray] = {}
     if chosen is not None:
-        weights = fixed_spatial(chosen.codes) if chosen.block != (1, 1) else None
-        tables = chosen.tables(int8_temporal(chosen), weights)
+        tables = chosen.tables(int8_temporal(chosen), fixed_spatial(chosen))
     streams = [_timestamps(photons, command.signal, command.seed, core) for core in range(4)]
     offsets = np.concatenate([[0], np.cumsum([len(stream) for stream in streams])])
     array = CoreArray(program, (2, 2), tables)

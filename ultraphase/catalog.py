@@ -12,7 +12,7 @@ from scenes.errors import InputError, require
 from ultraphase.assembler import assemble_file
 from ultraphase.chip import ChipSpec
 from ultraphase.program import Program
-from ultraphase.tables import block_matrix, coarse_matrix, fourier_matrix, quarter_wave
+from ultraphase.tables import INT8_SCALE, block_matrix, coarse_matrix, fourier_matrix, quarter_wave
 
 FOLDER = Path(__file__).parent / "programs"
 SPATIAL_BLOCK = (2, 2)
@@ -123,7 +123,7 @@ class Method:
         learned = self.family == "learned"
         tables = {"learned": temporal.reshape(-1)} if learned else {"quarter": quarter_wave(temporal)}
         if self.block != (1, 1):
-            tables["weight"] = np.full(self.codes, 127) if weights is None else weights
+            tables["weight"] = np.full(self.codes, INT8_SCALE) if weights is None else weights
         return tables
 
     def matrix(self, temporal: np.ndarray | None = None) -> np.ndarray:

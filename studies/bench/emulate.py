@@ -15,7 +15,7 @@ from scenes.files import whole_file
 from studies.ultraphase_chain import int8_temporal, timestamps_of
 from ultraphase import Core, CoreArray, Method, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
-from ultraphase.tables import spatial_sum
+from ultraphase.tables import INT8_SCALE, spatial_sum
 from ultraphase.verify import Tabulated
 
 COLUMNS = ("name", "seconds", "error", "pixels", "photons", "instructions_per_second", "photons_per_second")
@@ -100,7 +100,7 @@ def _left(chosen: Method, sums: np.ndarray, shape: tuple[int, int] = (16, 32)) -
     (down, right), (height, width) = chosen.block, shape
     cores = sums.reshape(height // down, down, width // right, right, -1, chosen.codes).swapaxes(1, 2)
     cores = cores.reshape(height // down * width // right, down * right, -1, chosen.codes)
-    return spatial_sum(cores, np.full((down * right, chosen.codes), 127)).reshape(len(cores), -1)
+    return spatial_sum(cores, np.full((down * right, chosen.codes), INT8_SCALE)).reshape(len(cores), -1)
 
 
 def _row(name: str, seconds: float, differs: np.ndarray, pixels: int, instructions: int, photons: int) -> dict:

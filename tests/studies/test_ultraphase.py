@@ -9,7 +9,7 @@ from scenes.errors import InputError
 from spad.sensor import sensor_by_name
 from studies.bench import emulate as bench
 from studies.cli import main
-from studies.ultraphase_chain import by_torch, decode, emulate, fixed_spatial, int8_temporal
+from studies.ultraphase_chain import by_torch, decode, emulate, int8_temporal
 from ultraphase import method
 from ultraphase.catalog import FOLDER, PUBLISHED
 
@@ -127,9 +127,8 @@ def test_emulated_codes_are_the_torch_paths_and_give_depth(name):
     assert emulated.counters.photons == found.sum()
     assert emulated.bits == emulated.codes.size * (8 if chosen.family == "coarse" else 16)
     sensor = sensor_by_name("reference")
-    weights = None if spatial is None else fixed_spatial(chosen.codes)
     bright = counts(4, 6, signal=150, background=50)
-    depth = decode(emulate(bright, chosen, weights).codes, chosen, sensor, weights)
+    depth = decode(emulate(bright, chosen).codes, chosen, sensor)
     # a coarse bin without its neighbours only says which bin: half a bin; codes of a few harmonics: some bins of 1024
     most_bins = {"coarse-16": 64, "coarse-64": 16, "coarse-256": 4}.get(name, 5)
     assert np.abs(depth / sensor.bin_depth_m - 401).max() < most_bins
@@ -140,9 +139,8 @@ def test_torch_and_cores_agree_where_numbers_overflow():
     found[..., 0] = 300
     for name in PUBLISHED:
         chosen = method(name)
-        spatial = None if chosen.block == (1, 1) else fixed_spatial(chosen.codes)
-        emulated = emulate(found, chosen, spatial)
-        assert np.array_equal(emulated.codes, by_torch(found, chosen, spatial))
+        emulated = emulate(found, chosen)
+        assert np.array_equal(emulated.codes, by_torch(found, chosen))
         assert (emulated.counters.wraps > 0) == (chosen.family != "coarse")
         assert emulated.counters.saturations > 0 or chosen.family == "fourier"
 
@@ -151,7 +149,7 @@ def test_images_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="512 bins"):
         emulate(np.zeros((2, 2, 512), np.int32), method("coarse-16"))
     with pytest.raises(InputError, match="3 x 2 pixels does not divide"):
-        emulate(np.zeros((2, 3, 1024), np.int32), method("separable-8"), fixed_spatial(8))
+        emulate(np.zeros((2, 3, 1024), np.int32), method("separable-8"))
 
 
 def test_the_tables_come_from_csph():
