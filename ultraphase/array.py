@@ -6,7 +6,7 @@ cores that branched apart meet again where their ways join.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -173,7 +173,8 @@ class _Run:
         self.visits[end - 1] += index.size - (0 if held is None else held.size)
         self.instructions[went] += 1
 
-    def _kind(self, one: Instruction):
+    def _kind(self, one: Instruction) -> Callable[..., np.ndarray | None]:
+        """What does it: called with instruction, word, cores and their indices; returns the cores that it holds."""
         if one.name in ALU:
             return self._alu
         if "m" in one.op.takes:
