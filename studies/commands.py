@@ -129,10 +129,10 @@ class Depth(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Common):
-    """Speed against error: beside mitransient (`bench render`), of compressive layers (`bench encode`), or the table of
-    hard cases (`bench hard-cases`)."""
+    """Speed against error: beside mitransient (`bench render`), of compressive layers (`bench encode`), of the emulator
+    and its two routes to the same bits (`bench emulate`), or the table of hard cases (`bench hard-cases`)."""
 
-    stage: Positional[Literal["render", "encode", "hard-cases"]] = "render"
+    stage: Positional[Literal["render", "encode", "emulate", "hard-cases"]] = "render"
     """What is measured."""
     scenes: tuple[Literal["flash", "lamp", "artist", "groove"], ...] = ()
     """Scenes of `bench render` (default: all)."""
@@ -159,10 +159,40 @@ class Bench(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study(Common):
-    """Figures and tables of the paper's supplement: coding tensors, their memory, depth decoded without a network."""
+class Ultraphase(Common):
+    """Compressive histograms as programs on the emulated UltraPhase processor: `table` (Supplementary Figure 5 beside
+    the emulation), `run PROGRAM`, `asm FILE`, `list FILE`, `verify PROGRAM`, `sweep`."""
 
-    name: Positional[Literal["tensors", "memory", "codes"]]
+    action: Positional[Literal["table", "run", "asm", "list", "verify", "sweep"]] = "table"
+    """What is done."""
+    program: Positional[str] = ""
+    """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s)."""
+    define: tuple[str, ...] = ()
+    """Constants of a source file, as NAME=VALUE."""
+    out: File = None
+    """File for the words (asm: one hexadecimal word a line), the listing (list) or the rows (table, sweep: .csv)."""
+    photons: tuple[float, ...] = (550.0,)
+    """Photons a pixel and frame, background included; `run` takes one number, `sweep` several."""
+    signal: float = 50.0
+    """Of these, photons of one laser return (run)."""
+    fps: tuple[float, ...] = (30.0,)
+    """Frames a second (sweep)."""
+    codes: tuple[int, ...] = ()
+    """K of the Fourier and separable programs (sweep; default: the seven of the paper)."""
+    pixels: tuple[int, ...] = (4, 1048576)
+    """Pixels of the sensor (sweep)."""
+    trace: int = 0
+    """Show this many instructions of one core (run)."""
+    watch: str = ""
+    """Show every change of this region of one core's RAM, 100 at the most (run)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study(Common):
+    """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
+    decoded from codes without a network, and the in-pixel processor's power (4, 5)."""
+
+    name: Positional[Literal["tensors", "memory", "codes", "power"]]
     """Which study."""
     checkpoints: tuple[Path, ...] = ()
     """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc)."""
@@ -176,11 +206,15 @@ class Study(Common):
     full: bool = False
     """--design is a full coding tensor instead of a separable one."""
     scene: str = "living-room"
-    """Scene of `study codes`, as `render` takes it; direct light alone, under a scanning laser."""
+    """Scene of `study codes` (direct light alone, under a scanning laser) and `study power`, as `render` takes it."""
     width: int = 64
-    """Image width of `study codes`, pixels."""
+    """Image width of these, pixels."""
     height: int = 48
-    """Image height of `study codes`, pixels."""
+    """Image height of these, pixels."""
+    signal: float = 50.0
+    """Mean signal photons per pixel of `study power`."""
+    background: float = 500.0
+    """Mean background photons per pixel of `study power`."""
     out: Path = Path("out/study")
     """Folder for the figures (.png) and tables (.csv)."""
 
@@ -191,6 +225,7 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Sense, tyro.conf.subcommand("sense")]
     | Annotated[Depth, tyro.conf.subcommand("depth")]
+    | Annotated[Ultraphase, tyro.conf.subcommand("ultraphase")]
     | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )

@@ -267,21 +267,22 @@ def run_demo(command: commands.Demo, progress: Progress) -> dict:
 
 
 def run_bench(command: commands.Bench, progress: Progress) -> dict:
-    """One stage of the bench; each is imported only when it is asked for."""
-    if command.stage == "hard-cases":
-        from studies.bench import hard_cases as stage
-    elif command.stage == "encode":
-        from studies.bench import encode as stage
-    else:
-        from studies.bench import render as stage
-    return stage.run(command, progress)
+    """One stage of the bench: the module of its name, imported only when it is asked for."""
+    return importlib.import_module(f"studies.bench.{command.stage.replace('-', '_')}").run(command, progress)
+
+
+def run_ultraphase(command: commands.Ultraphase, progress: Progress) -> dict:
+    """The emulated in-pixel processor."""
+    from studies import ultraphase_cli
+
+    return ultraphase_cli.run(command, progress)
 
 
 def run_study(command: commands.Study, progress: Progress) -> dict:
-    """One study, imported only when it is asked for."""
+    """One study: the module of its name, imported only when it is asked for."""
     if command.out.is_file():
         raise InputError(f"{command.out}: is a file, expected a folder for the figures")
-    return importlib.import_module(f"studies.{command.name}").run(command, progress)
+    return importlib.import_module(f"studies.{command.name.replace('-', '_')}").run(command, progress)
 
 
 RUNNERS: dict[type, Callable] = {
@@ -291,5 +292,6 @@ RUNNERS: dict[type, Callable] = {
     commands.Sense: run_sense,
     commands.Depth: run_depth,
     commands.Bench: run_bench,
+    commands.Ultraphase: run_ultraphase,
     commands.Study: run_study,
 }

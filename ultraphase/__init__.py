@@ -1,5 +1,27 @@
-"""The UltraPhase in-pixel processor. So far its published facts and what follows from them in closed form."""
+"""The UltraPhase in-pixel processor: assembler, cores, programs, proofs and power.
 
+UltraPhase-constrained: the chip's published limits and costs, with an instruction set of our own (`chip.ASSUMPTIONS`).
+"""
+
+from ultraphase.array import CoreArray
+from ultraphase.assembler import assemble, assemble_file
+from ultraphase.catalog import Method, method
 from ultraphase.chip import ChipSpec
+from ultraphase.core import Core
+from ultraphase.program import Program, disassemble, listing
+from ultraphase.verify import Tabulated, verify
 
-__all__ = ["ChipSpec"]
+__all__ = [
+    "ChipSpec",
+    "Core",
+    "CoreArray",
+    "Method",
+    "Program",
+    "Tabulated",
+    "assemble",
+    "assemble_file",
+    "disassemble",
+    "listing",
+    "method",
+    "verify",
+]

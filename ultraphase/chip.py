@@ -1,26 +1,63 @@
-"""What is public about the UltraPhase chip, and the rates and powers that follow from it.
+"""What is public about the UltraPhase chip, what we assume beside it, and the rates and powers that follow.
 
 Source: supplement of the ICCV 2023 paper, section S.2 and Supplementary Figure 5; efficiency from the authors' public
-plotting script.
+plotting script. The chip's instruction set is not public: the emulated one is UltraPhase-constrained, not UltraPhase's.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from scenes.errors import require
+
+ASSUMPTIONS: dict[str, str] = {
+    "instruction set": "UltraPhase-constrained, ours: the chip's is not public; logic, 32-bit arithmetic, data, links",
+    "program store": "separate from the 4,096 bits of RAM",
+    "ram access": "bytes, and aligned 16-bit words; one access, or one 16-bit read-modify-write, an instruction",
+    "registers": "16 of 32 bits, not counted as RAM",
+    "max_shift": "one instruction shifts by 1 to 4 bits",
+    "timestamp port": "one timestamp at a time; a branch tells whether one is there, another whether the frame is over",
+    "links": "one 32-bit word to each neighbour; sending to a full link and receiving from an empty one wait",
+    "energy": "every instruction costs the published energy; idle cores, links, SPADs and converters cost nothing",
+    "one core, one pixel": "as in S.2; a core shared by 4 x 4 SPADs receives their timestamps without addresses",
+}
+
 
 @dataclass(frozen=True)
 class ChipSpec:
-    """Published numbers of the chip and of its readout interface (as on SwissSPAD2)."""
+    """Published numbers of the chip and of its readout interface (as on SwissSPAD2); below them, assumed ones.
+
+    energy_per_instruction_j: 94.6 GOPS/W of the authors' script. S.2 prints its inverse as Watts; see `power`.
+    """
 
     cores: tuple[int, int] = (3, 6)
+    spads_per_core: tuple[int, int] = (4, 4)
     program_words: int = 256
     ram_bits: int = 4096
     clock_s: float = 2.38e-9
     clocks_per_instruction: int = 3
     energy_per_instruction_j: float = 1 / 94.6e9
+    timestamp_bits: int = 10
     io_voltage_v: float = 3.3
     io_load_f: float = 5e-12
+    # assumed
+    max_shift: int = 4
+
+    def __post_init__(self) -> None:
+        require(1 <= self.program_words <= 512, f"chip: {self.program_words} program words, expected 1 to 512")
+        good = self.ram_bits % 16 == 0 and 16 <= self.ram_bits <= 1 << 19
+        require(good, f"chip: {self.ram_bits} bits of RAM, expected a multiple of 16 from 16 to 524288")
+        require(1 <= self.max_shift <= 31, f"chip: max_shift {self.max_shift}, expected 1 to 31")
+        require(1 <= self.timestamp_bits <= 16, f"chip: {self.timestamp_bits} bits a timestamp, expected 1 to 16")
+
+    @property
+    def ram_bytes(self) -> int:
+        return self.ram_bits // 8
+
+    @property
+    def timestamps(self) -> int:
+        """How many different timestamps there are."""
+        return 1 << self.timestamp_bits
 
     @property
     def instructions_per_second(self) -> float:
@@ -30,6 +67,10 @@ class ChipSpec:
     def processing_time_s(self, photons: float, clocks_per_photon: float) -> float:
         """Time one core works on one frame."""
         return photons * clocks_per_photon * self.clock_s
+
+    def energy_j(self, clocks: float) -> float:
+        """Energy of the instructions that fill `clocks` clock cycles of one core."""
+        return clocks / self.clocks_per_instruction * self.energy_per_instruction_j
 
     def data_rate_bit_per_s(self, bits_per_pixel: float, pixels: int, frames_per_s: float) -> float:
         """What leaves the sensor."""

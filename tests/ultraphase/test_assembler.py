@@ -1,0 +1,211 @@
+"""Source to words and back: what the assembler takes, what it refuses, and where it says so."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scenes.errors import InputError
+from ultraphase import ChipSpec, assemble, assemble_file, disassemble, listing, method
+from ultraphase.catalog import FOLDER, PUBLISHED
+from ultraphase.isa import DIRECTIONS, OPS, Instruction, decode, encode, spelled
+
+DEFAULT = settings(deadline=None, derandomize=True, max_examples=80)
+
+
+@st.composite
+def instructions(draw, words: int = 64, max_shift: int = 4):
+    op = draw(st.sampled_from(OPS))
+    register = st.integers(0, 15)
+    fields = {"rd": draw(register) if {"d", "t"} & set(op.takes) else 0, "rs": draw(register) if "s" in op.takes else 0}
+    constant = st.integers(-(1 << 16), (1 << 16) - 1)
+    for kind in op.takes:
+        if kind == "v":
+            fields["constant"] = draw(st.booleans())
+            fields["value"] = draw(constant if fields["constant"] else register)
+        elif kind == "m":
+            fields["constant"] = draw(st.booleans())
+            fields["value"] = draw(constant)
+            fields["rs"] = 0 if fields["constant"] else draw(register)
+        elif kind == "n":
+            fields["value"] = draw(st.integers(1, max_shift))
+        elif kind == "x":
+            fields["value"] = draw(st.integers(0, len(DIRECTIONS) - 1))
+        elif kind == "l":
+            fields["target"] = draw(st.integers(0, words - 1))
+        elif kind == "b":
+            fields["bit"] = draw(st.integers(0, 31))
+    return Instruction(op.name, **fields)
+
+
+@DEFAULT
+@given(instructions())
+def test_words_are_instructions_and_back(one):
+    assert 0 <= encode(one) < 1 << 32 and decode(encode(one)) == one
+
+
+@DEFAULT
+@given(st.integers(0, (1 << 32) - 1))
+def test_a_word_is_one_instruction_or_refused(word):
+    try:
+        one = decode(word)
+    except InputError:
+        return
+    assert encode(one) == word
+
+
+@DEFAULT
+@given(st.lists(instructions(words=8), min_size=8, max_size=40))
+def test_disassembled_programs_assemble_to_the_same_words(found):
+    words = tuple(encode(one) for one in found)
+    again = assemble(disassemble(words))
+    assert again.words == words
+
+
+@pytest.mark.parametrize("name", [*PUBLISHED, "learned-1", "addressed-8", "coarse-16-shift-2"])
+def test_programs_of_the_package_survive_the_round_trip(name):
+    program = method(name).program()
+    again = assemble(disassemble(program.words, program.regions))
+    assert again.words == program.words and again.regions == program.regions
+
+
+def test_listing_has_every_word_with_its_source_line():
+    program = method("fourier-8").program()
+    text = listing(program)
+    for address, word in enumerate(program.words):
+        file, number = program.lines[address]
+        line = next(line for line in text.splitlines() if line.startswith(f"  {address:3d}  {word:08x}  3  "))
+        assert line.endswith(f"; {file}:{number}")
+        source = (FOLDER / file).read_text().splitlines()[number - 1].split(";")[0]
+        assert spelled(program.instructions[address]).split()[0] in source
+    assert "2176 of 4096 bits" in text and "table quarter: 256 x u8, 2048 bits" in text
+
+
+def test_constants_loops_names_and_regions():
+    program = assemble(
+        """
+        .equ K, 0x3
+        .table ramp, s8, 2*K, -1, 2, 3, 4, 5, 0b110   ; values given here
+        .space odd, u8, 1
+        .space sum, s16, (K + 1) % 3                  ; at an even address
+        .reg x, r4
+        top:
+        .for k in 0..K - 1
+            LDBS x, [ramp + 2*k]
+        skip{k}: BNZ x, skip{k}
+            .for n in 1..k
+            STH [sum], x
+            .end
+        .end
+        .reg x, r4 + 1
+            add x, x, #-K*2
+            jmp top
+        """
+    )
+    assert [one.name for one in program.instructions] == [
+        *("LDBS", "BNZ", "LDBS", "BNZ", "STH", "LDBS", "BNZ", "STH", "STH", "ADD", "JMP")
+    ]
+    assert [one.value for one in program.instructions if one.name == "LDBS"] == [0, 2, 4]
+    assert program.labels == {"top": 0, "skip0": 1, "skip1": 3, "skip2": 6}
+    assert program.instructions[9] == Instruction("ADD", rd=5, rs=5, constant=True, value=-6)
+    assert [(r.address, r.bits) for r in program.regions] == [(0, 48), (6, 8), (8, 16)] and program.ram_bits == 72
+    assert program.regions[0].values == (-1, 2, 3, 4, 5, 6)
+
+
+def test_given_constants_win():
+    source = ".equ K, 4\nMOV r1, #K\nHALT"
+    assert assemble(source, constants={"K": 9}).instructions[0].value == 9
+    assert assemble("MOV r1, #MAX_SHIFT", chip=ChipSpec(max_shift=7)).instructions[0].value == 7
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("MOV r1, #1\n  ADD r1, r16, #1", "2:11: 'r16' is no register"),
+        ("NOP", "1:1: unknown instruction 'NOP'"),
+        (".word 3", "1:1: unknown directive '.word'"),
+        ("MOV r1 #1", "1:8: expected ','"),
+        ("MOV r1, 1", "1:9: expected a register"),
+        ("MOV r1, #1 r2", "1:12: unexpected 'r2'"),
+        ("MOV r1, #65536", "1:10: constant 65536 is outside -65536 to 65535"),
+        ("MOV r1, #1/0", "1:11: division by zero"),
+        ("MOV r1, #size", "1:10: 'size' is not defined"),
+        ("MOV r1, $2", "1:9: unexpected '$'"),
+        ("SHR r1, r1, #5", "1:14: shift by 5 is outside 1 to 4"),
+        ("SHR r1, r1, #0", "1:14: shift by 0"),
+        ("BBS r1, #32, a", "1:10: bit 32"),
+        ("JMP nowhere", "1:5: label 'nowhere' is not defined"),
+        ("a: a: HALT", "1:4: 'a' is defined already"),
+        (".equ a, 1\na: HALT", "2:1: 'a' is defined already"),
+        (".equ r3, 1", "1:6: 'r3' is defined already"),
+        ("LDB r1, [r2 + r3]", "1:15: one base register"),
+        ("LDB r1, [4 - r3]", "1:14: one base register"),
+        ("SEND up, r1", "1:6: direction 'up'"),
+        (".space a, u9, 4", "1:11: kind 'u9'"),
+        (".space a, u8, 0", "1:8: a: 0 values"),
+        (".table a, u8, 3, 1, 2", "1:8: a: 2 values for 3 places"),
+        (".for k in 0..2\nHALT", "1:1: .for without .end"),
+        (".end", "1:1: unknown directive '.end'"),
+        ("l{k}: HALT", "1:1: 'l{k}': k is no loop variable"),
+        ('.include "x.s"', '1:11: .include "file" is not possible here'),
+        ("MOV r1, #" + "(" * 5000, "parentheses or signs deep"),
+        (".for a in 1..99999\n.equ x{a}, 1\n.end", "more than 20000 statements"),
+        ("JMP a\na:", "branches to word 1, behind the program"),
+        ("", "no instructions"),
+        ("MOV r1, #99999999999999999999", "does not fit into 32 bits"),
+    ],
+)
+def test_mistakes_are_refused_with_line_and_column(source, said):
+    with pytest.raises(InputError) as refused:
+        assemble(source, name="p.s")
+    assert said in str(refused.value) and "p.s" in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_files_that_are_missing_or_no_text(tmp_path):
+    (tmp_path / "a.s").write_text('HALT\n.include "b.s"\n')
+    with pytest.raises(InputError, match=r"a\.s:2:11: .*b\.s: file not found"):
+        assemble_file(tmp_path / "a.s")
+    (tmp_path / "b.s").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="is not text"):
+        assemble_file(tmp_path / "a.s")
+    (tmp_path / "b.s").write_text('.include "a.s"')
+    with pytest.raises(InputError, match="more than 8 times"):
+        assemble_file(tmp_path / "a.s")
+
+
+def test_the_257th_instruction_is_refused():
+    full = "MOV r1, #1\n" * 256
+    assert len(assemble(full).words) == 256
+    with pytest.raises(InputError, match="257 words, 1 over the 256"):
+        assemble(full + "HALT")
+    with pytest.raises(InputError, match=r"fourier-26: 297 words, 41 over|fourier-26: \d+ words, \d+ over the 256"):
+        method("fourier-26").program()
+
+
+@pytest.mark.parametrize(
+    ("name", "bits"),
+    [
+        ("coarse-16", 128),
+        ("coarse-64", 512),
+        ("coarse-256", 2048),
+        ("fourier-8", 2176),
+        ("fourier-16", 2304),
+        ("separable-8", 1088),
+        ("separable-16", 1664),
+        ("learned-1", 2120),
+        ("addressed-8", 4096),
+    ],
+)
+def test_ram_that_the_programs_use(name, bits):
+    assert method(name).program().ram_bits == bits
+
+
+@pytest.mark.parametrize(("codes", "bits"), [(2, 4240), (8, 16960)])
+def test_a_learned_temporal_tensor_does_not_fit(codes, bits):
+    with pytest.raises(InputError, match=f"{bits} bits of RAM, {bits - 4096} bits over the 4096"):
+        method(f"learned-{codes}").program()
+
+
+@pytest.mark.parametrize("name", ["fourier-7", "fourier-0", "coarse-12", "walsh-8", "fourier", "coarse-16-shift-0"])
+def test_names_that_are_no_program(name):
+    with pytest.raises(InputError):
+        method(name).program()

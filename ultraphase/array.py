@@ -1,0 +1,369 @@
+"""Many cores in step, as NumPy arrays: an image's worth of cores, 2 x 2 cores with links, or one timestamp a core.
+
+Every turn takes the lowest word that a runnable core stands at, and does its instruction on all cores that stand there:
+cores that branched apart meet again where their ways join.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.errors import InputError, require
+from ultraphase.chip import ChipSpec
+from ultraphase.core import PATIENCE, Counters, region_contents
+from ultraphase.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
+from ultraphase.program import Program
+
+_RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of an array.
+
+    out        (cores that put anything out, words) int64, in row-major order of the cores
+    out_cores  (row, column) of these cores
+    out_bits   (cores,) bits that left each core of the array
+    cycles     (rows, columns): clocks of each core, waiting on links included
+    stalls     (rows, columns): clocks of them spent waiting on links
+    counters   sums over the cores
+    """
+
+    out: np.ndarray
+    out_cores: np.ndarray
+    out_bits: np.ndarray
+    cycles: np.ndarray
+    stalls: np.ndarray
+    counters: Counters
+
+
+class CoreArray:
+    """rows x columns cores that run one program, each with RAM, timestamps and tables of its own.
+
+    tables   contents by name, one row (count,) for all cores or (rows, columns, count)
+
+    RAM and registers stay from frame to frame and may be set: `ram` (cores, bytes) uint8, `registers` (16, cores).
+    Raises InputError as `Core` does, and for cores that wait for each other, saying who waits where for whom.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        shape: tuple[int, int] = (2, 2),
+        tables: Mapping[str, np.ndarray] | None = None,
+        *,
+        chip: ChipSpec | None = None,
+    ) -> None:
+        self.program, self.shape, self.chip = program, shape, chip or ChipSpec()
+        program.check(self.chip)
+        require(min(shape) >= 1, f"core array of {shape[0]} x {shape[1]} cores, expected 1 x 1 or more")
+        lanes = shape[0] * shape[1]
+        flat = {n: np.asarray(t) for n, t in (tables or {}).items()}
+        flat = {n: t.reshape(lanes, -1) if t.shape[:-1] == shape else t for n, t in flat.items()}
+        self.ram = np.zeros((lanes, self.chip.ram_bytes), np.uint8)
+        image = program.image(flat, lanes)
+        self.ram[:, : image.shape[1]] = image
+        self.registers = np.zeros((REGISTERS, lanes), np.int64)
+        self._lane = np.arange(lanes)
+        self._first_byte = self._lane * self.chip.ram_bytes
+        row, column = np.divmod(self._lane, shape[1])
+        self._place = (column & 1) | (row & 1) << 1
+        self._neighbour = [_neighbours(row + down, column + right, shape) for down, right in STEPS]
+
+    def frame(self, timestamps: np.ndarray, offsets: np.ndarray, *, park: bool = False) -> Frame:
+        """One frame to HALT on every core; with `park` to where a core would wait for another timestamp.
+
+        timestamps (N,) core after core, in the order of detection; offsets (cores + 1,) where each core's begin.
+        """
+        lanes = len(self._lane)
+        offsets = np.asarray(offsets, np.int64)
+        good = offsets.shape == (lanes + 1,) and offsets[0] == 0 and offsets[-1] == len(timestamps)
+        good = good and bool((np.diff(offsets) >= 0).all())
+        require(good, f"timestamp offsets: expected {lanes + 1} that rise from 0 to the {len(timestamps)} timestamps")
+        port = np.asarray(timestamps).astype(np.int64)
+        in_range = not port.size or (port.min() >= 0 and port.max() < 1 << 16)
+        require(bool(in_range), f"timestamps are outside 0 to {(1 << 16) - 1}")
+        return _Run(self, port, offsets, park).to_end()
+
+    def contents(self, region: str) -> np.ndarray:
+        """Numbers in a region of every core's RAM, (cores, count)."""
+        return region_contents(self.program, self.ram, region)
+
+
+def _neighbours(row: np.ndarray, column: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Lane at (row, column), -1 where none is."""
+    there = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    return np.where(there, row * shape[1] + column, -1)
+
+
+def _block_ends(program: Program) -> list[int]:
+    """For every word the first one behind its basic block."""
+    starts = set(program.labels.values()) | {one.target for one in program.instructions if "l" in one.op.takes}
+    ends = [0] * len(program.instructions)
+    for word in reversed(range(len(ends))):
+        one = program.instructions[word]
+        parts = "l" in one.op.takes or one.name in ("HALT", "SEND", "RECV") or word + 1 in starts
+        ends[word] = word + 1 if parts or word + 1 == len(ends) else ends[word + 1]
+    return ends
+
+
+def _outside(value: np.ndarray, low: int, high: int) -> int:
+    """How many values are outside low .. high; one pass where none is: below low is huge as an unsigned number."""
+    raised = (value - low).view(np.uint64)
+    return int(np.count_nonzero(raised > high - low)) if int(raised.max(initial=0)) > high - low else 0
+
+
+class _Run:
+    """One frame while it runs."""
+
+    def __init__(self, array: CoreArray, port: np.ndarray, offsets: np.ndarray, park: bool) -> None:
+        self.array, self.program, self.park = array, array.program, park
+        self.registers, self.ram = array.registers, array.ram
+        self.bytes, self.halves = self.ram.reshape(-1), self.ram.view("<i2").reshape(-1)
+        lanes = self.ram.shape[0]
+        self.port, self.next, self.first, self.last = port, offsets[:-1].copy(), offsets[:-1], offsets[1:]
+        self.word = np.zeros(lanes, np.int64)
+        self.status = np.zeros(lanes, np.int8)
+        self.instructions = np.zeros(lanes, np.int64)
+        self.stalled = np.zeros(lanes, np.int64)  # in instructions
+        self.link = np.zeros((len(STEPS), lanes), np.int64)  # a core's inbox from each direction
+        self.link_full = np.zeros((len(STEPS), lanes), bool)
+        self.link_time = np.zeros((len(STEPS), lanes), np.int64)  # when it was last filled or emptied
+        self.visits = np.zeros(len(self.program.instructions), np.int64)
+        self.wraps = self.saturations = self.events = 0
+        self.out: list[tuple[np.ndarray, np.ndarray, int]] = []
+        self.ram_bytes = self.program.ram_bytes
+        self.changed = True  # the status of some core
+        self.code = [self._kind(one) for one in self.program.instructions]
+        self.block_end = _block_ends(self.program)
+
+    def to_end(self) -> Frame:
+        patience, events, live = PATIENCE, 0, self.array._lane
+        while True:
+            if self.changed:
+                live, self.changed = np.flatnonzero(self.status == _RUNS), False
+                if not live.size:
+                    break
+            words = self.word[live]
+            word = int(words.min())
+            index = live[words == word]
+            if word >= len(self.code):
+                raise InputError(f"program {self.program.name}: runs behind its last instruction")
+            self._block(word, slice(None) if index.size == self.status.size else index, index)
+            patience = PATIENCE if self.events != events else patience - 1
+            events = self.events
+            if patience == 0:
+                raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} branches")
+        self._explain_waiting()
+        return self._result()
+
+    def _block(self, first: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        """The instructions up to a branch or a label: only there do cores part or meet."""
+        end = self.block_end[first]
+        for word in range(first, end - 1):
+            self.code[word](self.program.instructions[word], word, lanes, index)
+        self.visits[first : end - 1] += index.size
+        self.instructions[lanes] += end - 1 - first
+        self.word[lanes] = end
+        held = self.code[end - 1](self.program.instructions[end - 1], end - 1, lanes, index)
+        went = lanes if held is None else np.setdiff1d(index, held, assume_unique=True)
+        self.visits[end - 1] += index.size - (0 if held is None else held.size)
+        self.instructions[went] += 1
+
+    def _kind(self, one: Instruction) -> Callable[..., np.ndarray | None]:
+        """What does it: called with instruction, word, cores and their indices; returns the cores that it holds."""
+        if one.name in ALU:
+            return self._alu
+        if "m" in one.op.takes:
+            return self._memory
+        if "l" in one.op.takes:
+            return self._branch
+        return getattr(self, f"_{one.name.lower()}")
+
+    def _value(self, one: Instruction, lanes: slice | np.ndarray) -> np.ndarray | int:
+        fixed = one.constant or "n" in one.op.takes
+        return one.value if fixed else self.registers[one.value][lanes]
+
+    def _alu(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        self.registers[one.rd][lanes] = ALU[one.name](self.registers[one.rs][lanes], self._value(one, lanes))
+
+    def _mov(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        self.registers[one.rd][lanes] = self._value(one, lanes)
+
+    def _id(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        self.registers[one.rd][lanes] = self.array._place[lanes]
+
+    def _memory(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        cells, place = self._cells(one, word, lanes, index)
+        if one.op.reads and not one.op.writes:
+            loaded = cells[place].astype(np.int64)
+            self.registers[one.rd][lanes] = loaded - (loaded >> 7 << 8) if one.name == "LDBS" else loaded
+            return
+        value = self.registers[one.rd][lanes]
+        low, high = (-128, BYTE_LIMIT) if one.op.size == 1 else (HALF_LIMITS[0], 2 * HALF_LIMITS[1] + 1)
+        if one.op.reads:
+            value = cells[place] + (value if one.name == "ADDM" else -value)
+            high = HALF_LIMITS[1]
+        self.wraps += _outside(value, low, high)
+        cells[place] = value.astype(cells.dtype)
+
+    def _cells(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> tuple:
+        """RAM in cells of the operand's size, and the cell of every core: (cells, index)."""
+        last = self.ram_bytes - one.op.size
+        at = one.value if one.constant else self.registers[one.rs][lanes] + one.value
+        if not 0 <= at <= last if one.constant else _outside(at, 0, last):
+            wrong = np.atleast_1d(at)
+            wrong = wrong[(wrong < 0) | (wrong > last)][0]
+            raise InputError(f"{self.program.where(word)}: RAM address {wrong} is outside the declared 0 to {last}")
+        if one.op.size == 1:
+            return self.bytes, self.array._first_byte[lanes] + at
+        if np.any(at & 1):
+            odd = np.atleast_1d(at)
+            raise InputError(f"{self.program.where(word)}: address {odd[odd % 2 == 1][0]} of 16 bits is odd")
+        return self.halves, (self.array._first_byte[lanes] + at) >> 1
+
+    def _branch(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> np.ndarray | None:
+        a = self.registers[one.rs][lanes]
+        if one.name in ("BNT", "BFE"):
+            empty = self.next[lanes] == self.last[lanes]
+            if one.name == "BNT" and self.park and empty.any():
+                self.status[index[empty]], self.changed = _PARKED, True
+                self.word[index[empty]] = word
+                return index[empty]
+            taken = empty & (one.name == "BNT" or not self.park)
+        elif one.name in ("BBS", "BBC"):
+            taken = (a >> one.bit & 1) == (one.name == "BBS")
+        elif one.name == "BLT":
+            taken = a < self.registers[one.rd][lanes]
+        else:
+            taken = {"JMP": np.ones(index.size, bool), "BZ": a == 0, "BNZ": a != 0}[one.name]
+        self.word[index[taken]] = one.target
+        return None
+
+    def _halt(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        self.status[lanes], self.changed = _HALTED, True
+
+    def _rdt(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        if not (self.next[lanes] < self.last[lanes]).all():
+            raise InputError(f"{self.program.where(word)}: no timestamp is there")
+        self.registers[one.rd][lanes] = self.port[self.next[lanes]]
+        self.next[lanes] += 1
+        self.events += 1
+
+    def _saturate(self, one: Instruction, lanes: slice | np.ndarray, low: int, high: int) -> None:
+        value = self.registers[one.rs][lanes]
+        self.saturations += _outside(value, low, high)
+        self.registers[one.rd][lanes] = value.clip(low, high)
+
+    def _satb(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        self._saturate(one, lanes, 0, BYTE_LIMIT)
+
+    def _sath(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        self._saturate(one, lanes, *HALF_LIMITS)
+
+    def _leave(self, one: Instruction, lanes: slice | np.ndarray, index: np.ndarray, low: int, high: int) -> None:
+        value = self.registers[one.rs][lanes]
+        self.wraps += _outside(value, low, high)
+        bits = (high - low + 1).bit_length() - 1
+        self.out.append((index.copy(), (value - low) % (high - low + 1) + low, bits))
+        self.events += 1
+
+    def _outb(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        self._leave(one, lanes, index, 0, BYTE_LIMIT)
+
+    def _outh(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
+        self._leave(one, lanes, index, *HALF_LIMITS)
+
+    def _send(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> np.ndarray:
+        to = self._linked(one, word, index)
+        side = (one.value + 2) % len(STEPS)  # the receiver sees it come from the other side
+        full = self.link_full[side, to]
+        go, to = index[~full], to[~full]
+        self._wait(go, self.link_time[side, to])
+        self.link[side, to] = self.registers[one.rs][go]
+        self.link_full[side, to] = True
+        self.link_time[side, to] = self.instructions[go] + self.stalled[go] + 1
+        return self._hold(index[full], word, to)
+
+    def _recv(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> np.ndarray:
+        self._linked(one, word, index)
+        full = self.link_full[one.value, index]
+        go = index[full]
+        self._wait(go, self.link_time[one.value, go])
+        self.registers[one.rd][go] = self.link[one.value, go]
+        self.link_full[one.value, go] = False
+        self.link_time[one.value, go] = self.instructions[go] + self.stalled[go] + 1
+        return self._hold(index[~full], word, self.array._neighbour[one.value][go])
+
+    def _linked(self, one: Instruction, word: int, index: np.ndarray) -> np.ndarray:
+        other = self.array._neighbour[one.value][index]
+        alone = index[other < 0]
+        if alone.size:
+            raise InputError(
+                f"{self.program.where(word)}: core {self._name(alone[0])} has no {DIRECTIONS[one.value]} neighbour"
+            )
+        return other
+
+    def _wait(self, lanes: np.ndarray, until: np.ndarray) -> None:
+        """Cores whose clock is behind the link's wait for it."""
+        now = self.instructions[lanes] + self.stalled[lanes]
+        self.stalled[lanes] += np.maximum(until - now, 0)
+
+    def _hold(self, lanes: np.ndarray, word: int, wake: np.ndarray) -> np.ndarray:
+        """Cores that cannot go on stay at this instruction; those at the other end of a moved word try again."""
+        self.status[lanes], self.word[lanes], self.changed = _BLOCKED, word, True
+        self.status[wake[self.status[wake] == _BLOCKED]] = _RUNS
+        self.events += bool(wake.size)
+        return lanes
+
+    def _name(self, lane: int) -> str:
+        row, column = divmod(int(lane), self.array.shape[1])
+        return f"({row}, {column})"
+
+    def _explain_waiting(self) -> None:
+        """InputError if cores wait for links that nobody will serve any more."""
+        blocked = np.flatnonzero(self.status == _BLOCKED)
+        if not blocked.size:
+            return
+        said = []
+        for lane in blocked[:4]:
+            one = self.program.instructions[self.word[lane]]
+            other = self.array._neighbour[one.value][lane]
+            verb = "to take a word" if one.name == "SEND" else "for a word"
+            does = {_HALTED: "has halted", _PARKED: "waits for a timestamp", _BLOCKED: "waits itself"}
+            said.append(
+                f"core {self._name(lane)} waits at {self.program.where(int(self.word[lane]))} for core "
+                f"{self._name(other)} {verb}, which {does[int(self.status[other])]}"
+            )
+        raise InputError(f"{blocked.size} of {len(self.status)} cores are blocked: {'; '.join(said)}")
+
+    def _result(self) -> Frame:
+        array, lanes = self.array, len(self.status)
+        shape, clocks = array.shape, array.chip.clocks_per_instruction
+        owner = np.concatenate([index for index, _, _ in self.out] or [np.zeros(0, np.int64)])
+        words = np.concatenate([words for _, words, _ in self.out] or [np.zeros(0, np.int64)])
+        bits = np.concatenate([np.full(index.size, size) for index, _, size in self.out] or [np.zeros(0, np.int64)])
+        cores, counts = np.unique(owner, return_counts=True)
+        require(counts.size == 0 or bool((counts == counts[0]).all()), "cores put out different numbers of words")
+        order = np.argsort(owner, kind="stable")
+        ops = [one.op for one in self.program.instructions]
+        instructions = int(self.instructions.sum())
+        return Frame(
+            out=words[order].reshape(len(cores), counts[0] if counts.size else 0),
+            out_cores=np.stack(np.divmod(cores, shape[1]), axis=-1),
+            out_bits=np.bincount(owner, bits, lanes).astype(np.int64).reshape(shape),
+            cycles=((self.instructions + self.stalled) * clocks).reshape(shape),
+            stalls=(self.stalled * clocks).reshape(shape),
+            counters=Counters(
+                instructions=instructions,
+                cycles=(instructions + int(self.stalled.sum())) * clocks,
+                photons=int((self.next - self.first).sum()),
+                ram_reads=int(sum(n * op.reads for n, op in zip(self.visits, ops, strict=True))),
+                ram_writes=int(sum(n * op.writes for n, op in zip(self.visits, ops, strict=True))),
+                wraps=self.wraps,
+                saturations=self.saturations,
+            ),
+        )
