@@ -180,6 +180,7 @@ def correlation_bins(counts: Tensor, sensor: Sensor) -> Tensor:
     scores = correlate(counts, taps.centred.to(counts.dtype).unsqueeze(0), int(taps.shifts[0]), sensor)
     scores = scores - counts.sum(-1, keepdim=True) * mean  # the counts' own norm is the same for every bin
     best = scores.argmax(-1)
-    shifts = torch.arange(-1, 2, device=counts.device)
-    around, _ = _around(scores, best, shifts, sensor)
-    return best + 0.5 + (grid_peak(around) - 1)
+    near, _ = _around(counts, best, taps.shifts, sensor)
+    neighbours = taps.fine[[0, len(taps.steps) // 2, -1]]  # a bin before, here, a bin after
+    total = counts.sum(-1, keepdim=True).double()
+    return best + 0.5 + (grid_peak(near @ neighbours.T - total * neighbours.sum(-1) / sensor.bins) - 1)

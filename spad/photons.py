@@ -45,18 +45,24 @@ class Events(NamedTuple):
     position: np.ndarray
 
 
+def paths_in_bins(near_m: np.ndarray, far_m: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """First arrival and length of returns, float64 in bins, of their nearest and farthest path [m]."""
+    near = near_m.astype(np.float64)
+    per_bin = SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s
+    return near / per_bin, (far_m - near) / per_bin
+
+
 def light_of(transient: Transient, sensor: Sensor, rates: Rates, pixels: slice) -> Light:
     """The returns of some pixels at a budget's rates; pixels are counted from the slice's first."""
     first, last = int(transient.offsets[pixels.start]), int(transient.offsets[pixels.stop])
     sizes = np.diff(transient.offsets[pixels.start : pixels.stop + 1])
     owner = np.repeat(np.arange(pixels.stop - pixels.start, dtype=np.int32), sizes)
-    per_bin = SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s
-    near = transient.path_near_m[first:last].astype(np.float64)
+    start, length = paths_in_bins(transient.path_near_m[first:last], transient.path_far_m[first:last], sensor)
     alive = rates.alive.reshape(-1)[pixels]
     return Light(
         owner=owner,
-        start=near / per_bin,
-        length=(transient.path_far_m[first:last] - near) / per_bin,
+        start=start,
+        length=length,
         signal=transient.radiance[first:last] * (rates.signal_scale * alive[owner]),
         background=rates.background.reshape(-1)[pixels],
     )
