@@ -1,6 +1,6 @@
 """Fresh detections for training, from transients in memory: photon level, crop and noise drawn anew for every patch.
 
-    packed = pack(transients)                                       # once
+    packed = packed_transients(transients)                          # once; a read pack file serves as `transients`
     batch = sense_patches(packed, sensor, requests, size=(32, 32))  # every step
     batch.counts                                                    # (B, 1, T, h, w) float32, for the network
 
@@ -10,7 +10,7 @@ photon on the CPU, so that a seed gives the same counts on every device; the his
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -65,8 +65,9 @@ class PackedTransients:
         return self.depth_m.shape[0]
 
 
-def pack(transients: Sequence[Transient]) -> PackedTransients:
+def packed_transients(transients: Iterable[Transient]) -> PackedTransients:
     """Transients of one size in one; InputError for none, or of different sizes."""
+    transients = list(transients)
     sizes = {(transient.height, transient.width) for transient in transients}
     if len(sizes) != 1:
         raise InputError(f"transients of sizes {sorted(sizes)} cannot be packed together")
