@@ -1,0 +1,172 @@
+"""Where things may stand: plan views as convex quadrilaterals, a room's outline, what a camera would see of both."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scenes.model import Surface
+from scenes.parts import Piece, Random, placed
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A piece that stands at (x, z), height y, turned about the vertical; its plan is 4 points (x, z)."""
+
+    surfaces: tuple[Surface, ...]
+    plan: np.ndarray
+    low: float
+    high: float
+    tops: np.ndarray  # rows of x, z, turn [deg], half width, half depth, y
+
+
+def set_down(piece: Piece, x: float, z: float, *, y: float = 0.0, turn_deg: float = 0.0, margin: float = 0.0) -> Place:
+    """The piece there; its plan is its bounding rectangle and a margin around it."""
+    low, high = piece.low, piece.high
+    x0, z0, x1, z1 = low[0] - margin, low[2] - margin, high[0] + margin, high[2] + margin
+    corners = np.array(((x0, z0), (x1, z0), (x1, z1), (x0, z1)))
+    tops = [
+        (*_turn(np.array((tx, tz)), turn_deg, (x, z)), turn_deg, half_x, half_z, y + ty)
+        for tx, tz, half_x, half_z, ty in piece.tops
+    ]
+    surfaces = placed(list(piece.surfaces), x, z, y=y, turn_deg=turn_deg)
+    rows = np.array(tops, float).reshape(-1, 6)
+    return Place(tuple(surfaces), _turn(corners, turn_deg, (x, z)), y + low[1], y + high[1], rows)
+
+
+def _turn(points: np.ndarray, turn_deg: float, by: tuple[float, float]) -> np.ndarray:
+    """Plan points turned as `placed` turns: positive from +z towards +x."""
+    c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    x, z = points[..., 0], points[..., 1]
+    return np.stack((c * x + s * z + by[0], -s * x + c * z + by[1]), axis=-1)
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two convex polygons (n, 2) share more than a border: no edge of either separates them."""
+    for polygon in (a, b):
+        edge = np.roll(polygon, -1, axis=0) - polygon
+        normal = np.column_stack((edge[:, 1], -edge[:, 0]))
+        pa, pb = a @ normal.T, b @ normal.T
+        if ((pa.max(axis=0) <= pb.min(axis=0) + 1e-6) | (pb.max(axis=0) <= pa.min(axis=0) + 1e-6)).any():
+            return False
+    return True
+
+
+@dataclass(eq=False)
+class Floor:
+    """An outline (n, 2) of points (x, z) that turns from +x towards +z, and what stands in it."""
+
+    outline: np.ndarray
+    places: list[Place] = field(default_factory=list)
+
+    def edges(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.outline, np.roll(self.outline, -1, axis=0)
+
+    def holds(self, points: np.ndarray, slack: float = 1e-3) -> bool:
+        """Whether all points lie inside the outline (even-odd rule), or within `slack` of it."""
+        a, b = self.edges()
+        for x, z in points:
+            crosses = (a[:, 1] > z) != (b[:, 1] > z)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                at = a[:, 0] + (z - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+            if (crosses & (x < at)).sum() % 2 == 0 and self.distance(np.array((x, z))) > slack:
+                return False
+        return True
+
+    def distance(self, point: np.ndarray) -> float:
+        """From a point to the outline."""
+        a, b = self.edges()
+        along = b - a
+        t = np.clip(((point - a) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
+        return float(np.linalg.norm(a + t[:, None] * along - point, axis=1).min())
+
+    def fits(self, place: Place) -> bool:
+        """Inside, and clear of everything that stands at the same height."""
+        clear = (
+            other.low >= place.high or other.high <= place.low or not overlap(place.plan, other.plan)
+            for other in self.places
+        )
+        corners_in = self.holds(np.concatenate((place.plan, place.plan.mean(axis=0, keepdims=True))))
+        inside_out = any(_inside(place.plan, corner) for corner in self.outline)
+        return corners_in and not inside_out and all(clear)
+
+    def try_at_wall(
+        self, piece: Piece, rng: Random, tries: int = 12, gap: float = 0.01, margin: float = 0.03
+    ) -> Place | None:
+        """The piece somewhere along a wall that is long enough, its back to it."""
+        a, b = self.edges()
+        low, high = piece.low, piece.high
+        long = np.linalg.norm(b - a, axis=1)
+        wide = float(high[0] - low[0])
+        usable = np.flatnonzero(long > wide + 0.02)
+        for _ in range(tries if len(usable) else 0):
+            i = int(rng.choice(usable, p=long[usable] / long[usable].sum()))
+            along = (b[i] - a[i]) / long[i]
+            inward = np.array((-along[1], along[0]))
+            s = rng.uniform(wide / 2, long[i] - wide / 2)
+            x, z = a[i] + s * along + (gap - min(float(low[2]), 0.0)) * inward
+            turn = math.degrees(math.atan2(inward[0], inward[1]))
+            place = set_down(piece, x, z, turn_deg=turn, margin=0)
+            if self.fits(place):
+                self.places.append(set_down(piece, x, z, turn_deg=turn, margin=margin))
+                return place
+        return None
+
+    def try_free(
+        self, piece: Piece, rng: Random, tries: int = 12, margin: float = 0.05, turn_deg: float | None = None
+    ) -> Place | None:
+        """The piece anywhere on the floor, turned at random."""
+        low, high = self.outline.min(axis=0), self.outline.max(axis=0)
+        for _ in range(tries):
+            turn = rng.uniform(0, 360) if turn_deg is None else turn_deg
+            x, z = rng.uniform(low + 0.1, high - 0.1)
+            place = set_down(piece, x, z, turn_deg=turn, margin=margin)
+            if self.fits(place):
+                self.places.append(place)
+                return place
+        return None
+
+
+def _inside(polygon: np.ndarray, point: np.ndarray) -> bool:
+    """Whether a point lies well inside a convex polygon."""
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    away = edge[:, 0] * (point - polygon)[:, 1] - edge[:, 1] * (point - polygon)[:, 0]
+    away = away / np.linalg.norm(edge, axis=1)
+    return bool((away > 0.02).all() or (away < -0.02).all())
+
+
+def rough_distance(floor: Floor, ceiling: float, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Distance along unit rays (n, 3) to walls, floor, ceiling, and the upright boxes around what stands there."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        level = np.where(rays[:, 1] < 0, -origin[1] / rays[:, 1], (ceiling - origin[1]) / rays[:, 1])
+        nearest = np.where(np.abs(rays[:, 1]) < 1e-9, np.inf, level)
+        start, direction = origin[[0, 2]], rays[:, [0, 2]]
+        nearest = np.minimum(nearest, _edge_hits(*floor.edges(), start, direction).min(axis=1))
+        for place in floor.places:
+            plan_hits = _edge_hits(place.plan, np.roll(place.plan, -1, axis=0), start, direction)
+            y = origin[1] + plan_hits * rays[:, 1:2]
+            seen = np.where((y >= place.low) & (y <= place.high), plan_hits, np.inf).min(axis=1)
+            for level in (place.low, place.high):
+                t = (level - origin[1]) / rays[:, 1]
+                point = start + t[:, None] * direction
+                seen = np.where((t > 0) & _all_inside(place.plan, point), np.minimum(seen, t), seen)
+            nearest = np.minimum(nearest, seen)
+    return nearest
+
+
+def _edge_hits(a: np.ndarray, b: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Distance (rays, edges) along plan rays to the segments a to b, inf where they are missed."""
+    along, to = b - a, a - start
+    det = direction[:, :1] * along[:, 1] - direction[:, 1:] * along[:, 0]
+    t = (to[:, 0] * along[:, 1] - to[:, 1] * along[:, 0]) / det
+    s = (to[:, 0] * direction[:, 1:] - to[:, 1] * direction[:, :1]) / det
+    return np.where((t > 1e-6) & (s >= 0) & (s <= 1), t, np.inf)
+
+
+def _all_inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    offset = points[:, None] - polygon
+    side = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]
+    return (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
