@@ -26,7 +26,7 @@ def pick(palette: Palette, rng: Random, family: str) -> Material:
 def repainted(palette: Palette, rng: Random) -> Palette:
     """The palette with other woods, cloths and paints under the names that the demo room's furniture asks for."""
     varied = {"wood": "wood", "varnished wood": "satin", "white paint": "paint", "sofa cloth": "cloth"}
-    varied |= {"cushion cloth": "cloth", "leather": "dark", "lamp cloth": "cloth", "rubber": "satin", "clay": "clay"}
+    varied |= {"cushion cloth": "cloth", "leather": "dark", "rubber": "satin", "clay": "clay"}
     return {**palette, **{name: pick(palette, rng, family) for name, family in varied.items()}}
 
 

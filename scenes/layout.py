@@ -45,6 +45,8 @@ def _turn(points: np.ndarray, turn_deg: float, by: tuple[float, float]) -> np.nd
 
 def overlap(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two convex polygons (n, 2) share more than a border: no edge of either separates them."""
+    if (a.max(axis=0) <= b.min(axis=0)).any() or (b.max(axis=0) <= a.min(axis=0)).any():
+        return False
     for polygon in (a, b):
         edge = np.roll(polygon, -1, axis=0) - polygon
         normal = np.column_stack((edge[:, 1], -edge[:, 0]))
@@ -140,19 +142,22 @@ def _inside(polygon: np.ndarray, point: np.ndarray) -> bool:
 def rough_distance(floor: Floor, ceiling: float, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Distance along unit rays (n, 3) to walls, floor, ceiling, and the upright boxes around what stands there."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        level = np.where(rays[:, 1] < 0, -origin[1] / rays[:, 1], (ceiling - origin[1]) / rays[:, 1])
-        nearest = np.where(np.abs(rays[:, 1]) < 1e-9, np.inf, level)
+        to_level = np.where(rays[:, 1] < 0, -origin[1] / rays[:, 1], (ceiling - origin[1]) / rays[:, 1])
+        nearest = np.where(np.abs(rays[:, 1]) < 1e-9, np.inf, to_level)
         start, direction = origin[[0, 2]], rays[:, [0, 2]]
         nearest = np.minimum(nearest, _edge_hits(*floor.edges(), start, direction).min(axis=1))
-        for place in floor.places:
-            plan_hits = _edge_hits(place.plan, np.roll(place.plan, -1, axis=0), start, direction)
-            y = origin[1] + plan_hits * rays[:, 1:2]
-            seen = np.where((y >= place.low) & (y <= place.high), plan_hits, np.inf).min(axis=1)
-            for level in (place.low, place.high):
-                t = (level - origin[1]) / rays[:, 1]
-                point = start + t[:, None] * direction
-                seen = np.where((t > 0) & _all_inside(place.plan, point), np.minimum(seen, t), seen)
-            nearest = np.minimum(nearest, seen)
+        if floor.places:
+            plans = np.array([place.plan for place in floor.places])
+            low, high = (np.array([getattr(place, end) for place in floor.places]) for end in ("low", "high"))
+            t = _edge_hits(plans.reshape(-1, 2), np.roll(plans, -1, axis=1).reshape(-1, 2), start, direction)
+            t = t.reshape(len(rays), -1, 4)
+            y = origin[1] + t * rays[:, 1, None, None]
+            side = np.where((y >= low[:, None]) & (y <= high[:, None]), t, np.inf)
+            nearest = np.minimum(nearest, side.min(axis=(1, 2)))
+            for level in (low, high):
+                t = (level - origin[1]) / rays[:, 1:2]
+                inside = _inside_all(plans, start + t[..., None] * direction[:, None])
+                nearest = np.minimum(nearest, np.where((t > 0) & inside, t, np.inf).min(axis=1))
     return nearest
 
 
@@ -165,8 +170,9 @@ def _edge_hits(a: np.ndarray, b: np.ndarray, start: np.ndarray, direction: np.nd
     return np.where((t > 1e-6) & (s >= 0) & (s <= 1), t, np.inf)
 
 
-def _all_inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
-    edge = np.roll(polygon, -1, axis=0) - polygon
-    offset = points[:, None] - polygon
-    side = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]
-    return (side >= 0).all(axis=1) | (side <= 0).all(axis=1)
+def _inside_all(polygons: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether points (n, p, 2) lie in their convex polygons (p, corners, 2), (n, p)."""
+    edge = np.roll(polygons, -1, axis=1) - polygons
+    offset = points[:, :, None] - polygons
+    side = edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0]
+    return (side >= 0).all(axis=2) | (side <= 0).all(axis=2)

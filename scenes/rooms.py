@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from scenes import clutter, furniture
-from scenes.layout import Floor, Place, rough_distance, set_down
+from scenes.layout import Floor, Place, overlap, rough_distance, set_down
+from scenes.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
 from scenes.model import Camera, Scene, Surface
 from scenes.palette import make_palette
 from scenes.parts import Palette, Piece, Random, box, joined, panel, sheet, with_normals
@@ -19,9 +20,9 @@ from scenes.patterns import on_one_sheet
 
 SPLITS = ("train", "val", "test")
 FOV_DEG = (52.0, 66.0)
-NEAREST_M, FARTHEST_M = 0.65, 6.9
+NEAREST_M, FARTHEST_M = 0.6, 6.9
 MEDIAN_M = (1.7, 3.9)  # of one view, by upright boxes; drawn evenly
-CANDIDATES, ATTEMPTS = 60, 8
+CANDIDATES, ATTEMPTS = 40, 8
 
 
 def room_view(index: int, split: str = "train", *, width: int = 64, height: int = 64) -> Scene:
@@ -50,9 +51,21 @@ def _attempt(rng: Random, width: int, height: int) -> Scene | None:
     if camera is None:
         return None
     surfaces += [surface for place in floor.places for surface in place.surfaces]
+    surfaces += one_of_each(palette)
     brightness = float(rng.uniform(0.2, 2.0))
     surfaces = [with_normals(replace(s, emission=brightness * s.emission)) for s in on_one_sheet(surfaces)]
     return Scene("rooms", tuple(surfaces), camera)
+
+
+def one_of_each(palette: Palette, y: float = -0.5) -> list[Surface]:
+    """A millimetre of every kind of material under the floor, where no light comes.
+
+    A renderer compiles its kernels for the kinds of material that are there: so all views of a set have the same.
+    """
+    kinds = ("ceiling paint", "floor", "satin 0", "gloss 0", "steel", "glass", "sky", "lamp cloth")
+    emission = {"sky": WINDOW_RADIANCE, "lamp cloth": LAMP_RADIANCE}
+    tiny = panel((0, y, 0), (5e-4, 0, 0), (0, 0, -5e-4))
+    return [joined("under the floor", palette[kind], tiny, emission=emission.get(kind, 0.0)) for kind in kinds]
 
 
 # --- The room --------------------------------------------------------------------------------------------------------
@@ -60,7 +73,7 @@ def _attempt(rng: Random, width: int, height: int) -> Scene | None:
 
 def _outline(rng: Random) -> np.ndarray:
     """A plan view, corners in order: rectangle, L, recess, cut corner, slanted wall or apse."""
-    w, d = rng.uniform((2.8, 3.2), (5.2, 6.0))
+    w, d = rng.uniform((2.8, 3.2), (5.6, 7.0))
     cut_w, cut_d = rng.uniform(0.25, 0.45) * w, rng.uniform(0.25, 0.45) * d
     kind = rng.choice(("rectangle", "L", "breast", "bevel", "slant", "apse"), p=(0.34, 0.2, 0.16, 0.12, 0.1, 0.08))
     if kind == "rectangle":
@@ -118,7 +131,9 @@ def _shell(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> list[
         ]
         surfaces.append(joined("beams", palette["wood 0"], *beams))
     elif rng.random() < 0.2:
-        knee, run = rng.uniform(1.2, 1.7), rng.uniform(0.8, 1.3)
+        knee, run = rng.uniform(1.0, 1.5), rng.uniform(0.8, 1.3)
+        # nothing stands or looks from under the slope
+        floor.places.append(_lumber(np.array((low, (low[0] + 0.6 * run, high[1]))), ceiling))
         points = np.array(
             (
                 ((low[0], knee, high[1]), (low[0], knee, low[1])),
@@ -127,6 +142,12 @@ def _shell(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> list[
         )
         surfaces.append(joined("roof", palette["ceiling paint"], sheet(points)))
     return surfaces
+
+
+def _lumber(corners: np.ndarray, ceiling: float) -> Place:
+    """A box that is not there but keeps things out."""
+    (x0, z0), (x1, z1) = corners
+    return Place((), np.array(((x0, z0), (x1, z0), (x1, z1), (x0, z1))), 0.0, ceiling, np.empty((0, 6)))
 
 
 def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: float) -> tuple:
@@ -144,14 +165,14 @@ def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: flo
 
 def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None:
     """Windows and a door, then large things along the walls, then the middle, then what is small."""
-    for kind, count in (("window", int(rng.integers(1, 4))), ("door", int(rng.random() < 0.7))):
+    for kind, count in (("window", int(rng.integers(1, 3))), ("door", int(rng.random() < 0.7))):
         for _ in range(count):
             make = furniture.wall_window if kind == "window" else furniture.door
             floor.try_at_wall(make(palette, rng), rng, 8)
     if rng.random() < 0.5:
         floor.try_free(furniture.rug(palette, rng), rng, 6, turn_deg=float(rng.choice((0, 90)) + rng.normal(0, 4)))
         floor.places[-1:] = [replace(place, high=0.0) for place in floor.places[-1:]] if floor.places else []
-    for kind in rng.permutation(list(furniture.AT_WALL))[: int(rng.integers(4, 9))]:
+    for kind in rng.permutation(list(furniture.AT_WALL))[: int(rng.integers(5, 10))]:
         floor.try_at_wall(furniture.AT_WALL[kind](palette, rng), rng)
     table = (
         floor.try_free(furniture.ON_FLOOR["dining table"](palette, rng), rng, 10, 0.1) if rng.random() < 0.6 else None
@@ -162,7 +183,7 @@ def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None
         floor.try_free(furniture.ON_FLOOR[kind](palette, rng), rng, 8)
     for _ in range(int(rng.integers(2, 7))):
         floor.try_at_wall(furniture.ON_WALL[str(rng.choice(list(furniture.ON_WALL)))](palette, rng), rng, 8)
-    for kind in rng.choice(list(clutter.LOW), int(rng.integers(2, 8))):
+    for kind in rng.choice(list(clutter.LOW), int(rng.integers(3, 10))):
         piece = clutter.LOW[kind](palette, rng)
         _ = floor.try_at_wall(piece, rng, 6, gap=0.05) if rng.random() < 0.6 else floor.try_free(piece, rng, 6)
     for place in list(floor.places):
@@ -189,7 +210,7 @@ def _chairs_around(palette: Palette, rng: Random, floor: Floor, table: Place) ->
             floor.places.append(chair)
 
 
-def litter(palette: Palette, rng: Random, floor: Floor, top: np.ndarray, most: int = 7) -> None:
+def litter(palette: Palette, rng: Random, floor: Floor, top: np.ndarray, most: int = 9) -> None:
     """Small things on a level place: as many as fit of a random few, and now and then one on top of another."""
     x, z, turn, half_x, half_z, y = top
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
@@ -215,8 +236,6 @@ def litter(palette: Palette, rng: Random, floor: Floor, top: np.ndarray, most: i
 
 
 def overlap_in_height(a: Place, b: Place) -> bool:
-    from scenes.layout import overlap
-
     return a.low < b.high and b.low < a.high and overlap(a.plan, b.plan)
 
 
@@ -231,7 +250,7 @@ def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) 
     for _ in range(CANDIDATES):
         x, z = rng.uniform(low + 0.3, high - 0.3)
         y, heading = rng.uniform(0.9, 1.75), rng.uniform(0, 2 * np.pi)
-        pitch, roll, fov = math.radians(rng.normal(-13, 8)), rng.normal(0, 0.02), rng.uniform(*FOV_DEG)
+        pitch, roll, fov = math.radians(rng.normal(-17, 8)), rng.normal(0, 0.02), rng.uniform(*FOV_DEG)
         point = np.array((x, z))
         if not floor.holds(point[None], 0.0) or floor.distance(point) < 0.25 or _too_near(floor, point, y):
             continue
@@ -243,8 +262,8 @@ def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) 
         if distance.min() < NEAREST_M or np.quantile(distance, 0.99) > FARTHEST_M:
             continue
         bare = rough_distance(Floor(floor.outline), ceiling, origin, rays)
-        busy = float((distance < bare - 0.05).mean())
-        score = abs(float(np.median(distance)) - wanted) + 1.5 * max(0.0, 0.45 - busy)
+        busy = float((distance < bare - 0.2).mean())
+        score = abs(float(np.median(distance)) - wanted) + 2.5 * max(0.0, 0.7 - busy)
         if score < best_score:
             best, best_score = (
                 Camera.look_at(origin, origin + ahead, fov_deg=fov, width=width, height=height, up=up),
@@ -256,8 +275,6 @@ def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) 
 def _too_near(floor: Floor, point: np.ndarray, y: float) -> bool:
     """Whether a head there would be in or right beside something."""
     around = point + 0.28 * np.array(((-1, -1), (1, -1), (1, 1), (-1, 1)))
-    from scenes.layout import overlap
-
     return any(p.high > 0.5 * y and p.low < y + 0.2 and overlap(p.plan, around) for p in floor.places)
 
 

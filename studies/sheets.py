@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from render.engine import Progress, render
 from render.settings import RenderSettings
 from render.transient import Transient
-from scenes.model import Scene
+from scenes.model import Ambient, Scene
 from studies.figures import DEPTH_COLOURS, display, plt, save
 
 DRAFT = RenderSettings(bounces=1, grid=2)
@@ -19,13 +20,18 @@ DEPTH_SHOWN_M = (0.5, 7.0)
 
 
 def draw_sheet(scenes: Sequence[Scene], path: Path, *, columns: int = 8, progress: Progress | None = None) -> Path:
-    """Render every scene's direct and ambient light, coarsely, and draw photograph above depth (0.5 to 7 m) for each."""
+    """Render every scene's direct light, coarsely, and draw photograph above depth (0.5 to 7 m) for each."""
     say = progress or (lambda what, share: None)
     views = []
     for i, scene in enumerate(scenes):
         say(scene.name, i / len(scenes))
-        views.append(render(scene, DRAFT))
+        views.append(render(_unlit(scene), DRAFT))
     return draw_views(views, path, columns=columns)
+
+
+def _unlit(scene: Scene) -> Scene:
+    """Without ambient light, which a draft has no time for."""
+    return replace(scene, surfaces=tuple(replace(s, emission=0.0) for s in scene.surfaces), ambient=Ambient())
 
 
 def draw_views(views: Sequence[Transient], path: Path, *, columns: int = 8) -> Path:
@@ -46,11 +52,10 @@ def draw_views(views: Sequence[Transient], path: Path, *, columns: int = 8) -> P
         above.set_title(str(view.meta.get("scene", "")), fontsize=6, pad=2)
         shown = below.imshow(view.depth_m, cmap=DEPTH_COLOURS, vmin=DEPTH_SHOWN_M[0], vmax=DEPTH_SHOWN_M[1])
     bar = figure.colorbar(shown, ax=axes, location="bottom", fraction=0.02, aspect=60, pad=0.005)
-    bar.set_label("depth [m]; above it laser light without its falloff, and ambient light", fontsize=8)
+    bar.set_label("depth [m]; above it laser light, its falloff with distance mostly removed", fontsize=8)
     return save(figure, path)
 
 
 def photograph(view: Transient) -> np.ndarray:
-    """(H, W) in [0, 1]: flash light without its fall-off with distance, and ambient light, each to its own scale."""
-    flash = view.total_radiance() * np.nan_to_num(view.depth_m) ** 2
-    return 0.5 * display(flash) + 0.5 * display(view.ambient)
+    """(H, W) in [0, 1] for looking: the laser's light without its fall-off with distance."""
+    return display(view.total_radiance() * np.nan_to_num(view.depth_m) ** 1.5)
