@@ -75,17 +75,17 @@ def stone(rng: Random, height: float) -> shapes.Shape:
 
 def branching(rng: Random, height: float, tines: int = 5, thick: float = 0.05) -> shapes.Shape:
     """An antler or a root: a bent beam with tines, ever thinner, of overlapping balls."""
-    t = np.linspace(0, 1, 26)
+    t = np.linspace(0, 1, 60)
     bend = rng.uniform(0.25, 0.5)
     beam = np.column_stack((bend * t**2, t, 0.2 * np.sin(2.5 * t) * rng.uniform(-1, 1)))
-    points, radii = [beam], [thick * (1.15 - 0.65 * t)]
+    points, radii = [beam], [thick * (1.0 - 0.6 * t)]
     for _ in range(tines):
-        root = int(rng.integers(4, 22))
+        root = int(rng.integers(9, 50))
         direction = rng.normal(0, 1, 3) * (1, 0.3, 1) + (0.3, 0.9, 0)
         direction *= rng.uniform(0.22, 0.42) / np.linalg.norm(direction)
-        s = np.linspace(0, 1, 11)[1:, None]
+        s = np.linspace(0, 1, 34)[1:, None]
         points.append(beam[root] + s * direction + s**2 * (0, 0.1, 0))
-        radii.append(thick * (0.85 - 0.5 * s[:, 0]))
+        radii.append(thick * (0.7 - 0.35 * s[:, 0]))
     return standing(blend(np.concatenate(points), np.concatenate(radii), 64), height)
 
 

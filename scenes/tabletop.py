@@ -25,8 +25,8 @@ from scenes.rooms import one_of_each
 
 FOV_DEG = 32.0
 EYE_M, PITCH_DEG = 0.5, -11.0  # above the table's top
-WALL_M = 2.45
-STAGE = np.array(((-0.62, -2.25), (0.62, -2.25), (0.36, -1.3), (-0.36, -1.3)))  # where things stand, (x, z)
+WALL_M = 2.7
+STAGE = np.array(((-0.7, -2.55), (0.7, -2.55), (0.36, -1.3), (-0.36, -1.3)))  # where things stand, (x, z)
 
 
 def spikes(palette: Palette, rng: Random) -> Piece:
@@ -112,7 +112,7 @@ def crate(palette: Palette, rng: Random) -> Piece:
 
 Maker = Callable[[Palette, Random], Piece]
 C = clutter
-# What a scene is made of, largest first: how often each maker is tried.
+# What a scene is made of, largest first: half as often as each maker is tried.
 RECIPES: dict[str, tuple[tuple[Maker, int], ...]] = {
     "antlers": ((antlers, 4), (figure, 2), (C.candles, 2), (C.vase, 2), (C.book_stack, 2), (C.toy_bricks, 2)),
     "spikes": ((spikes, 3), (C.parcel, 2), (C.globe, 1), (C.plant, 1), (sticks, 3), (C.candles, 3)),
@@ -133,7 +133,7 @@ def tabletop(name: str, *, width: int = 88, height: int = 72) -> Scene:
     palette = make_palette(rng)
     floor = Floor(STAGE)
     for make, count in RECIPES[name]:
-        for _ in range(count):
+        for _ in range(2 * count):
             _stand(make(palette, rng), floor, rng)
     surfaces = _table(palette, rng) + [s for place in floor.places for s in place.surfaces] + one_of_each(palette)
     pitch = math.radians(PITCH_DEG)
