@@ -29,6 +29,7 @@ HAIR_PX = 2e-3
 OFF_CENTRE_PX = 0.01
 SPANS_PX = (16, 8, 4, 2, 1)  # dequantising: distances over which straight lines are sought, and how often
 PASSES = 12
+MOST_LEVEL = 0.485
 DATA_VARIABLE = "SCENE2SPAD_DATA"
 DEPTH_EXTENSIONS = (".png", ".exr")
 IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -166,13 +167,13 @@ def filled(levels: np.ndarray, known: np.ndarray, *, near_is_high: bool) -> np.n
 
 
 def dequantised(levels: np.ndarray) -> np.ndarray:
-    """Whole levels made smooth: straight lines through the steps, never more than half a level from the given value.
+    """Whole levels made smooth: straight lines through the steps, never half a level from the given value.
 
     Each pass replaces a pixel by the mean of what lies opposite each other, `span` pixels to both sides along rows or
-    columns, where both are within the span's slope of the pixel (no edge between), and clips to +- 1/2 of the level.
-    Straight slopes are left as they are, steps of one level become slopes, edges stay.
+    columns, where both are within the span's slope of the pixel (no edge between), and clips to MOST_LEVEL from the
+    given value. Straight slopes are left as they are, steps of one level become slopes, edges stay.
     """
-    low, high = levels - 0.5, levels + 0.5
+    low, high = levels - MOST_LEVEL, levels + MOST_LEVEL
     smooth = levels.astype(np.float64)
     for span in SPANS_PX:
         if span >= min(levels.shape) // 2:
@@ -210,6 +211,12 @@ def middlebury_folder(name: str) -> Path:
         folder.is_dir(), f"middlebury/{name}: folder {folder} not found; set {DATA_VARIABLE} to what holds middlebury/"
     )
     return folder
+
+
+def middlebury_names() -> list[str]:
+    """The Middlebury scenes that are there, sorted."""
+    parent = middlebury_folder("")
+    return sorted(path.name for path in parent.iterdir() if (path / "disp1.png").is_file())
 
 
 def middlebury(folder: Path, *, cosine: bool = False, width: int | None = None, height: int | None = None) -> Scene:

@@ -25,12 +25,12 @@ MEDIAN_M = (1.7, 3.9)  # of one view, by upright boxes; drawn evenly
 CANDIDATES, ATTEMPTS = 40, 8
 
 
-def room_view(index: int, split: str = "train", *, width: int = 64, height: int = 64) -> Scene:
+def room_view(index: int, split: str = "train", *, seed: int = 0, width: int = 64, height: int = 64) -> Scene:
     """View `index` of a split, a room of its own; equal arguments give equal scenes, byte for byte.
 
     Splits draw from streams of their own and share no room.
     """
-    stream = np.random.SeedSequence(index, spawn_key=(SPLITS.index(split),))
+    stream = np.random.SeedSequence(seed, spawn_key=(SPLITS.index(split), index))
     for attempt in stream.spawn(ATTEMPTS):
         scene = _attempt(np.random.default_rng(attempt), width, height)
         if scene is not None:
@@ -38,7 +38,7 @@ def room_view(index: int, split: str = "train", *, width: int = 64, height: int 
     name = f"rooms/{split}/{index}"
     if scene is None:
         raise RuntimeError(f"{name}: no view of {ATTEMPTS} rooms has depths of {NEAREST_M} to {FARTHEST_M} m")
-    return replace(scene, name=name, notes=(f"procedural, {split} view {index}",))
+    return replace(scene, name=name, notes=(f"procedural, {split} view {index} of seed {seed}",))
 
 
 def _attempt(rng: Random, width: int, height: int) -> Scene | None:
