@@ -1,7 +1,7 @@
 """A set of transients in one HDF5 file, small enough to carry to where a network is trained. No renderer, no OpenEXR.
 
 Numbers are rounded to steps far below what a sensor resolves, so that they compress: paths to 2^-11 m (0.49 mm), depths
-to 2^-13 m, radiances to 2^(1/1024) (0.07 %), ambient light to 2^(1/64), albedo to 1/255. Normals and error estimates
+to 2^-13 m, radiances to 2^(1/1000) (0.07 %), ambient light to 2^(1/64), albedo to 1/255. Normals and error estimates
 stay behind in the EXR files.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -21,7 +21,7 @@ from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 
 PATH_STEP_M, DEPTH_STEP_M = 2.0**-11, 2.0**-13
-RADIANCE_STEPS, AMBIENT_STEPS = 1024, 64  # per octave
+RADIANCE_STEPS, AMBIENT_STEPS = 1000, 64  # per octave
 OCTAVES = 32  # below and above 1; codes are uint16, 0 is 0
 NO_DEPTH = np.iinfo(np.int32).min
 PER_VIEW = {"count": np.uint16, "depth": np.int32, "mixed": np.uint8, "albedo": np.uint8, "ambient": np.uint16}
@@ -31,9 +31,9 @@ CHUNK = 1 << 16  # returns
 
 @dataclass(frozen=True, eq=False)
 class Pack:
-    """A read pack: `len(pack)` views, `pack[i]` the i-th as a `Transient` (normals and errors are 0), `metas[i]` its record.
+    """A read pack: `len(pack)` views, `pack[i]` the i-th as a `Transient`, `metas[i]` its record.
 
-    The compact arrays stay in memory as they are in the file; a view's floats are made when it is asked for.
+    Normals and errors are 0. The compact arrays stay in memory as they are in the file; floats are made on demand.
     """
 
     arrays: dict[str, np.ndarray]
@@ -73,15 +73,35 @@ class Pack:
         )
 
 
+def rounded(view: Transient) -> Transient:
+    """The transient with path lengths in whole steps of a pack and radiances of 12 bits, for a smaller EXR file."""
+    near = np.rint(view.path_near_m.astype(np.float64) / PATH_STEP_M) * PATH_STEP_M
+    far = np.rint(view.path_far_m.astype(np.float64) / PATH_STEP_M) * PATH_STEP_M
+    return replace(
+        view,
+        path_near_m=near.astype(np.float32),
+        path_far_m=far.astype(np.float32),
+        radiance=_short(view.radiance),
+        ambient=_short(view.ambient),
+        error=_short(view.error),
+    )
+
+
+def _short(values: np.ndarray) -> np.ndarray:
+    """float32 rounded to 12 bits of mantissa."""
+    mantissa, exponent = np.frexp(values.astype(np.float64))
+    return np.ldexp(np.rint(mantissa * 4096) / 4096, exponent).astype(np.float32)
+
+
 def _encoded(values: np.ndarray, steps: int) -> np.ndarray:
     """Values as uint16 on a scale of `steps` per octave, from 2^-32 to 2^32; 0 stays 0."""
     with np.errstate(divide="ignore"):
-        code = np.rint((np.log2(values, dtype=np.float64) + OCTAVES) * min(steps, 65535 // (2 * OCTAVES)))
+        code = np.rint((np.log2(values, dtype=np.float64) + OCTAVES) * steps)
     return np.where(values > 0, np.clip(code, 1, 65535), 0).astype(np.uint16)
 
 
 def _decoded(codes: np.ndarray, steps: int) -> np.ndarray:
-    value = np.exp2(codes / min(steps, 65535 // (2 * OCTAVES)) - OCTAVES)
+    value = np.exp2(codes / steps - OCTAVES)
     return np.where(codes > 0, value, 0).astype(np.float32)
 
 

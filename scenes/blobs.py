@@ -9,6 +9,7 @@ from scenes.parts import Random
 
 CELLS = 26  # marching-cubes cells along the longest edge
 LEVEL = 1.0
+REACH = 1.8  # there a ball's field is 1e-4
 
 
 def blend(points: np.ndarray, radii: np.ndarray, cells: int = CELLS) -> shapes.Shape:
@@ -26,9 +27,12 @@ def blend(points: np.ndarray, radii: np.ndarray, cells: int = CELLS) -> shapes.S
     axes = [low[i] + step * np.arange(counts[i]) for i in range(3)]
     field = np.zeros(counts)
     for centre, radius in zip(points, radii, strict=True):
-        # one ball's field is a product of three one-dimensional ones
-        x, y, z = (np.exp(-4 * ((axis - c) / radius) ** 2) for axis, c in zip(axes, centre, strict=True))
-        field += np.exp(4.0) * x[:, None, None] * y[None, :, None] * z[None, None, :]
+        # one ball's field is a product of three one-dimensional ones, and next to nothing beyond REACH radii
+        first = np.maximum(np.floor((centre - REACH * radius - low) / step), 0).astype(int)
+        last = np.ceil((centre + REACH * radius - low) / step).astype(int) + 1
+        x, y, z = (np.exp(-4 * ((axes[i][first[i] : last[i]] - centre[i]) / radius) ** 2) for i in range(3))
+        window = tuple(slice(first[i], first[i] + n) for i, n in enumerate((len(x), len(y), len(z))))
+        field[window] += np.exp(4.0) * x[:, None, None] * y[None, :, None] * z[None, None, :]
     vertices, faces, _, _ = marching_cubes(field, LEVEL, spacing=(step, step, step), gradient_direction="ascent")
     vertices = vertices.astype(np.float64) + low
     middle = vertices.mean(axis=0)
@@ -86,7 +90,7 @@ def branching(rng: Random, height: float, tines: int = 5, thick: float = 0.05) -
         s = np.linspace(0, 1, 34)[1:, None]
         points.append(beam[root] + s * direction + s**2 * (0, 0.1, 0))
         radii.append(thick * (0.7 - 0.35 * s[:, 0]))
-    return standing(blend(np.concatenate(points), np.concatenate(radii), 64), height)
+    return standing(blend(np.concatenate(points), np.concatenate(radii), 48), height)
 
 
 def rounded_box(

@@ -13,13 +13,32 @@ from scenes.parts import Piece, Random, placed
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A piece that stands at (x, z), height y, turned about the vertical; its plan is 4 points (x, z)."""
+    """A piece that stands at (x, z), height y, turned about the vertical; its plan is 4 points (x, z).
 
-    surfaces: tuple[Surface, ...]
+    The surfaces are moved only when they are asked for: most places that are tried are taken already.
+    """
+
+    piece: Piece
+    at: tuple[float, float, float]  # x, y, z
+    turn_deg: float
     plan: np.ndarray
     low: float
     high: float
-    tops: np.ndarray  # rows of x, z, turn [deg], half width, half depth, y
+
+    @property
+    def surfaces(self) -> list[Surface]:
+        x, y, z = self.at
+        return placed(list(self.piece.surfaces), x, z, y=y, turn_deg=self.turn_deg)
+
+    @property
+    def tops(self) -> np.ndarray:
+        """Rows of x, z, turn [deg], half width, half depth and y of the level places on it."""
+        x, y, z = self.at
+        rows = [
+            (*_turn(np.array((tx, tz)), self.turn_deg, (x, z)), self.turn_deg, half_x, half_z, y + ty)
+            for tx, tz, half_x, half_z, ty in self.piece.tops
+        ]
+        return np.array(rows, float).reshape(-1, 6)
 
 
 def set_down(piece: Piece, x: float, z: float, *, y: float = 0.0, turn_deg: float = 0.0, margin: float = 0.0) -> Place:
@@ -27,13 +46,8 @@ def set_down(piece: Piece, x: float, z: float, *, y: float = 0.0, turn_deg: floa
     low, high = piece.low, piece.high
     x0, z0, x1, z1 = low[0] - margin, low[2] - margin, high[0] + margin, high[2] + margin
     corners = np.array(((x0, z0), (x1, z0), (x1, z1), (x0, z1)))
-    tops = [
-        (*_turn(np.array((tx, tz)), turn_deg, (x, z)), turn_deg, half_x, half_z, y + ty)
-        for tx, tz, half_x, half_z, ty in piece.tops
-    ]
-    surfaces = placed(list(piece.surfaces), x, z, y=y, turn_deg=turn_deg)
-    rows = np.array(tops, float).reshape(-1, 6)
-    return Place(tuple(surfaces), _turn(corners, turn_deg, (x, z)), y + low[1], y + high[1], rows)
+    at = (float(x), float(y), float(z))
+    return Place(piece, at, turn_deg, _turn(corners, turn_deg, (x, z)), y + low[1], y + high[1])
 
 
 def _turn(points: np.ndarray, turn_deg: float, by: tuple[float, float]) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -29,11 +30,11 @@ class Piece:
     surfaces: tuple[Surface, ...]
     tops: tuple[tuple[float, float, float, float, float], ...] = ()
 
-    @property
+    @cached_property
     def low(self) -> np.ndarray:
         return np.min([s.vertices.min(axis=0) for s in self.surfaces], axis=0)
 
-    @property
+    @cached_property
     def high(self) -> np.ndarray:
         return np.max([s.vertices.max(axis=0) for s in self.surfaces], axis=0)
 

@@ -147,7 +147,8 @@ def _shell(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> list[
 def _lumber(corners: np.ndarray, ceiling: float) -> Place:
     """A box that is not there but keeps things out."""
     (x0, z0), (x1, z1) = corners
-    return Place((), np.array(((x0, z0), (x1, z0), (x1, z1), (x0, z1))), 0.0, ceiling, np.empty((0, 6)))
+    plan = np.array(((x0, z0), (x1, z0), (x1, z1), (x0, z1)))
+    return Place(Piece(()), (0.0, 0.0, 0.0), 0.0, plan, 0.0, ceiling)
 
 
 def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: float) -> tuple:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from render.engine import Progress, render
 from render.settings import RenderSettings
 from render.transient import Transient
-from scenes.model import Ambient, Scene
+from scenes.model import Scene
 from studies.figures import DEPTH_COLOURS, display, plt, save
 
 DRAFT = RenderSettings(bounces=1, grid=2)
@@ -25,13 +24,8 @@ def draw_sheet(scenes: Sequence[Scene], path: Path, *, columns: int = 8, progres
     views = []
     for i, scene in enumerate(scenes):
         say(scene.name, i / len(scenes))
-        views.append(render(_unlit(scene), DRAFT))
+        views.append(render(scene.without_lights(), DRAFT))
     return draw_views(views, path, columns=columns)
-
-
-def _unlit(scene: Scene) -> Scene:
-    """Without ambient light, which a draft has no time for."""
-    return replace(scene, surfaces=tuple(replace(s, emission=0.0) for s in scene.surfaces), ambient=Ambient())
 
 
 def draw_views(views: Sequence[Transient], path: Path, *, columns: int = 8) -> Path:
