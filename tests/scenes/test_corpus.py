@@ -1,4 +1,4 @@
-"""Broken and odd files: each ends in one clear line or in a scene that says what was done; none in a traceback or hang."""
+"""Broken and odd files: each ends in one clear line, or in a scene that says what was done; none in a traceback."""
 
 import json
 import struct
@@ -122,7 +122,7 @@ MM = "comment units: mm\n"
 REPAIRED = {
     "degenerate among others": (text("d.obj", f"{TWO}f 1 2 3\nf 1 1 2\n"), "degenerate faces dropped: 1"),
     "face twice": (text("t.obj", f"{TWO}f 1 2 3\nf 3 2 1\n"), "duplicate faces dropped: 1"),
-    "stray vertices": (text("u.obj", f"{TWO}v 9 9 9\nf 1 2 3\nf 2 4 3\n"), "unreferenced vertices"),
+    "stray vertex": (text("u.ply", ply("9 9 9\n0 0 0\n1 0 0\n0 1 0", "3 1 2 3").replace("x 3", "x 4")), "unref"),
     "negative indices as OBJ allows": (text("r.obj", TRIANGLE + "f -3 -2 -1\n"), "m kept"),
     "self-intersecting": (text("s.obj", f"{CROSSED}f 1 2 3\nf 4 5 6\n"), "no colour"),
     "millimetres": (text("mm.obj", "v 0 0 0\nv 900 0 0\nv 0 400 0\nf 1 2 3\n"), "looks like millimetres"),
