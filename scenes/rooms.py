@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from scenes import clutter, furniture
+from scenes import clutter, fittings, furniture
 from scenes.layout import Floor, Place, overlap, rough_distance, set_down
 from scenes.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
 from scenes.model import Camera, Scene, Surface
-from scenes.palette import make_palette
+from scenes.palette import make_palette, pick
 from scenes.parts import Palette, Piece, Random, box, joined, panel, sheet, with_normals
 from scenes.patterns import on_one_sheet
 
@@ -121,9 +121,7 @@ def _shell(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> list[
     ]
     if rng.random() < 0.7:
         skirting = [_along(start, end, 0.0, rng.uniform(0.06, 0.12), 0.015) for start, end in boards]
-        surfaces.append(
-            joined("skirting", furniture.pick(palette, rng, "paint" if rng.random() < 0.7 else "wood"), *skirting)
-        )
+        surfaces.append(joined("skirting", pick(palette, rng, "paint" if rng.random() < 0.7 else "wood"), *skirting))
     if rng.random() < 0.18:
         beams = [
             box((low[0], ceiling - 0.16, z), (high[0], ceiling, z + 0.14))
@@ -168,7 +166,7 @@ def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None
     """Windows and a door, then large things along the walls, then the middle, then what is small."""
     for kind, count in (("window", int(rng.integers(1, 3))), ("door", int(rng.random() < 0.7))):
         for _ in range(count):
-            make = furniture.wall_window if kind == "window" else furniture.door
+            make = fittings.wall_window if kind == "window" else fittings.door
             floor.try_at_wall(make(palette, rng), rng, 8)
     if rng.random() < 0.5:
         floor.try_free(furniture.rug(palette, rng), rng, 6, turn_deg=float(rng.choice((0, 90)) + rng.normal(0, 4)))
@@ -183,7 +181,7 @@ def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None
     for kind in rng.permutation(list(furniture.ON_FLOOR)[1:])[: int(rng.integers(1, 5))]:
         floor.try_free(furniture.ON_FLOOR[kind](palette, rng), rng, 8)
     for _ in range(int(rng.integers(2, 7))):
-        floor.try_at_wall(furniture.ON_WALL[str(rng.choice(list(furniture.ON_WALL)))](palette, rng), rng, 8)
+        floor.try_at_wall(fittings.ON_WALL[str(rng.choice(list(fittings.ON_WALL)))](palette, rng), rng, 8)
     for kind in rng.choice(list(clutter.LOW), int(rng.integers(3, 10))):
         piece = clutter.LOW[kind](palette, rng)
         _ = floor.try_at_wall(piece, rng, 6, gap=0.05) if rng.random() < 0.6 else floor.try_free(piece, rng, 6)
@@ -192,7 +190,7 @@ def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None
             litter(palette, rng, floor, top)
     if rng.random() < 0.6:
         centre = floor.outline.mean(axis=0) + rng.normal(0, 0.4, 2)
-        lamp = set_down(furniture.pendant(palette, rng, ceiling), *centre)
+        lamp = set_down(fittings.pendant(palette, rng, ceiling), *centre)
         if floor.fits(lamp):
             floor.places.append(lamp)
 

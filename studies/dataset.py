@@ -89,7 +89,7 @@ def render_view(job: Job, view: int) -> Done:
     """Render one view to EXR bytes. A view that cannot be rendered is a record with `failed`, not an exception."""
     start = time.perf_counter()
     where = f"{os.uname().nodename}/{os.getpid()}"
-    with _ONE_AT_A_TIME, _quiet():
+    with _ONE_AT_A_TIME, quiet():
         try:
             record, exr = _rendered(job, view)
         except Exception as error:  # one odd scene of thousands must not end the run
@@ -100,7 +100,7 @@ def render_view(job: Job, view: int) -> Done:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """The plan of each of thousands of views goes into the index, not to the screen."""
     logger = logging.getLogger("render")
     level = logger.level
