@@ -21,8 +21,9 @@ from scenes.patterns import on_one_sheet
 SPLITS = ("train", "val", "test")
 FOV_DEG = (52.0, 66.0)
 NEAREST_M, FARTHEST_M = 0.6, 6.9
-MEDIAN_M = (1.7, 3.9)  # of one view, by upright boxes; drawn evenly
+MEDIAN_M = (1.9, 3.9)  # of one view, by upright boxes; drawn evenly
 CANDIDATES, ATTEMPTS = 40, 8
+FLAT = ("window", "door", "picture", "clock", "radiator", "rug")  # an image should show more than these
 
 
 def room_view(index: int, split: str = "train", *, seed: int = 0, width: int = 64, height: int = 64) -> Scene:
@@ -245,6 +246,8 @@ def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) 
     """A hand-held view with the wanted median distance and enough to see; judged on boxes, in a 16 x 12 image."""
     wanted = rng.uniform(*MEDIAN_M)
     low, high = floor.outline.min(axis=0), floor.outline.max(axis=0)
+    standing = [p for p in floor.places if p.piece.surfaces and not p.piece.surfaces[0].name.startswith(FLAT)]
+    furnished, bare = Floor(floor.outline, standing), Floor(floor.outline)
     best, best_score = None, math.inf
     for _ in range(CANDIDATES):
         x, z = rng.uniform(low + 0.3, high - 0.3)
@@ -260,9 +263,10 @@ def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) 
         distance = rough_distance(floor, ceiling, origin, rays)
         if distance.min() < NEAREST_M or np.quantile(distance, 0.99) > FARTHEST_M:
             continue
-        bare = rough_distance(Floor(floor.outline), ceiling, origin, rays)
-        busy = float((distance < bare - 0.2).mean())
-        score = abs(float(np.median(distance)) - wanted) + 2.5 * max(0.0, 0.7 - busy)
+        to_walls = rough_distance(bare, ceiling, origin, rays)
+        busy = float((rough_distance(furnished, ceiling, origin, rays) < to_walls - 0.1).mean())
+        low_end, middle, high_end = np.quantile(distance, (0.05, 0.5, 0.95))
+        score = abs(middle - wanted) + 3.0 * max(0.0, 0.6 - busy) + 2.0 * max(0.0, 0.6 - (high_end - low_end) / middle)
         if score < best_score:
             best, best_score = (
                 Camera.look_at(origin, origin + ahead, fov_deg=fov, width=width, height=height, up=up),
