@@ -74,23 +74,28 @@ class Pack:
 
 
 def rounded(view: Transient) -> Transient:
-    """The transient with path lengths in whole steps of a pack and radiances of 12 bits, for a smaller EXR file."""
-    near = np.rint(view.path_near_m.astype(np.float64) / PATH_STEP_M) * PATH_STEP_M
-    far = np.rint(view.path_far_m.astype(np.float64) / PATH_STEP_M) * PATH_STEP_M
+    """The transient with lengths in whole steps of a pack, radiances of 11 bits, ambient light and errors of 8, normals
+    in steps of 1/256: for a smaller EXR file."""
+
+    def stepped(lengths: np.ndarray, step: float) -> np.ndarray:
+        return (np.rint(lengths.astype(np.float64) / step) * step).astype(np.float32)
+
     return replace(
         view,
-        path_near_m=near.astype(np.float32),
-        path_far_m=far.astype(np.float32),
-        radiance=_short(view.radiance),
-        ambient=_short(view.ambient),
-        error=_short(view.error),
+        path_near_m=stepped(view.path_near_m, PATH_STEP_M),
+        path_far_m=stepped(view.path_far_m, PATH_STEP_M),
+        depth_m=stepped(view.depth_m, DEPTH_STEP_M),
+        normal=(np.rint(view.normal.astype(np.float32) * 256) / 256).astype(np.float16),
+        radiance=_short(view.radiance, 11),
+        ambient=_short(view.ambient, 8),
+        error=_short(view.error, 8),
     )
 
 
-def _short(values: np.ndarray) -> np.ndarray:
-    """float32 rounded to 12 bits of mantissa."""
+def _short(values: np.ndarray, bits: int) -> np.ndarray:
+    """float32 rounded to that many bits of mantissa."""
     mantissa, exponent = np.frexp(values.astype(np.float64))
-    return np.ldexp(np.rint(mantissa * 4096) / 4096, exponent).astype(np.float32)
+    return np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits).astype(np.float32)
 
 
 def _encoded(values: np.ndarray, steps: int) -> np.ndarray:
