@@ -51,6 +51,7 @@ class Traced(NamedTuple):
     """Light of a planned render before it is packed: direct and specular samples, indirect light or None, counts."""
 
     direct: Samples
+    specular: Samples
     indirect: IndirectLight | None
     origin_m: np.ndarray
     mixed: np.ndarray
@@ -66,7 +67,8 @@ class Traced(NamedTuple):
 
     @property
     def samples(self) -> Samples:
-        return self.direct if self.indirect is None else concatenate([self.direct, self.indirect.samples])
+        parts = [self.direct, self.specular]
+        return concatenate(parts if self.indirect is None else [*parts, self.indirect.samples])
 
 
 def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
@@ -101,7 +103,7 @@ def render(
         traced = _traced_on(world, plan, settings, traced, more, seed, checked, say)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
         error = _estimated(world, plan, settings, traced, checked)
-    for line in (*scene.notes, *plan.reasons) if len(traced.direct.pixel) else ():
+    for line in (*scene.notes, *plan.reasons) if len(traced.samples.pixel) else ():
         log.info("%s", line)
     noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
 
@@ -144,14 +146,15 @@ def trace(
     direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, least_share=plan.least_share)
     origin_m, brightest = _mean_path(direct.samples, len(pixels))
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
-    exact = concatenate([direct.samples, specular.samples])
     rays, indirect, schedule, reasons = direct.rays, None, None, ()
     if plan.bounces > 1 and brightest > 0:
         schedule, reasons = _schedule(world, plan, settings, direct.samples, seed)
         indirect = _indirect(world, plan, settings, schedule, STAGE_INDIRECT, seed, origin_m, brightest, checked, say)
         rays += schedule.paths * (2 * plan.bounces - 1) + schedule.connections
     reasons = (*specular.notes, *reasons)
-    return Traced(exact, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
+    return Traced(
+        direct.samples, specular.samples, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons
+    )
 
 
 def _indirect(
@@ -210,7 +213,7 @@ def _traced_on(
 
     These follow the first paths' noise; the bias of such a stop is of second order in it.
     """
-    _, brightest = _mean_path(select(traced.direct, traced.direct.bounces == 1), len(traced.origin_m))
+    _, brightest = _mean_path(traced.direct, len(traced.origin_m))
     added = _indirect(world, plan, settings, more, STAGE_MORE, seed, traced.origin_m, brightest, checked, say)
     before = traced.schedule
     share = np.ones(len(traced.origin_m))
@@ -259,9 +262,11 @@ def _estimated(
     world: World, plan: Plan, settings: RenderSettings, traced: Traced, checked: np.ndarray
 ) -> ErrorEstimate:
     """The error of a trace, from the checked pixels' batches and from finer direct light there."""
-    coarse = response(_of_pixels(select(traced.direct, traced.direct.bounces == 1), checked), checked)
+    coarse = response(_of_pixels(traced.direct, checked), checked)
+    glints = response(_of_pixels(traced.specular, checked), checked)
     finer = direct_light(world, checked, FINER * plan.grid, least_share=plan.least_share / FINER)
-    fine = response(finer.samples, checked)
+    fine = response(finer.samples, checked) + glints
+    coarse += glints
     if traced.indirect is None:
         none = np.zeros(len(checked))
         return estimate(coarse, fine, np.zeros_like(fine), none, none)

@@ -49,15 +49,13 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
     share = least_share_of(grid) if settings.least_share is None else settings.least_share
     bounces, spp, whys = _indirect(world, settings, pixels, fine, target, seed)
     reasons += whys
-    if world.scene.has_ambient:
-        reasons.append("ambient light: rendered, the scene has environment or area lights")
-    else:
-        reasons.append("ambient light: none in the scene; a sensor's background will be uniform")
+    ambient, why = _ambient(world, settings)
+    reasons.append(why)
     return Plan(
         bounces,
         spp,
         grid,
-        world.scene.has_ambient,
+        ambient,
         tuple(reasons),
         least_share=share,
         direct_tolerance_m=tolerance_m,
@@ -65,6 +63,17 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         target=target,
         adaptive=settings.adaptive and mode_is_flood,
     )
+
+
+def _ambient(world: World, settings: RenderSettings) -> tuple[bool, str]:
+    """Whether steady light is rendered: only if there is any, and a photon budget has room for it."""
+    if not world.scene.has_ambient:
+        return False, "ambient light: none in the scene; a sensor's background will be uniform"
+    if settings.ambient is not None:
+        return settings.ambient, f"ambient light: {'rendered' if settings.ambient else 'left out'}, as asked"
+    if settings.budget is not None and settings.budget[1] == 0:
+        return False, "ambient light: left out, the photon budget has no background"
+    return True, "ambient light: rendered, the scene has environment or area lights"
 
 
 def _limits(world: World) -> list[str]:

@@ -21,6 +21,7 @@ class RenderSettings:
     spp         work on indirect light, in paths per pixel; spent where the noise is, and partly on sharing paths
     adaptive    whether it is spent so, or evenly and without sharing
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
+    ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
     least_share edges of surfaces and shadows are followed where they could change this share of a cell or more;
@@ -33,6 +34,7 @@ class RenderSettings:
     spp: int | None = None
     adaptive: bool = True
     grid: int | None = None
+    ambient: bool | None = None
     error: float | None = None
     budget: tuple[float, float] | None = None
     least_share: float | None = None

@@ -88,6 +88,8 @@ class Render(Common):
     """Target of the relative error: nRMSE of the expected counts on the reference sensor (default: 0.02)."""
     budget: Annotated[tuple[float, float] | None, _open("SIGNAL BACKGROUND")] = None
     """Mean SIGNAL and BACKGROUND photons: render no finer than their shot noise can show, instead of --error."""
+    ambient: Literal["auto", "on", "off"] = "auto"
+    """Steady ambient light; auto renders it if the scene has any and the budget has background."""
     offset: float = 0.0
     """Move the scene this many metres away."""
     offset_mode: Offset = "time"

@@ -162,7 +162,12 @@ def run_dataset(command: commands.Dataset, progress: Progress) -> dict:
 def run_render(command: commands.Render, progress: Progress) -> dict:
     """Scene -> .exr and a picture of its layers."""
     settings = RenderSettings(
-        bounces=command.bounces, spp=command.spp, grid=command.grid, error=command.error, budget=command.budget
+        bounces=command.bounces,
+        spp=command.spp,
+        grid=command.grid,
+        ambient={"auto": None, "on": True, "off": False}[command.ambient],
+        error=command.error,
+        budget=command.budget,
     )
     check_offset(command.offset)
     if command.out is not None:

@@ -1,13 +1,19 @@
 """The whole render: determinism, the plan and its reasons, the error estimate, hard and empty cases."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from render import engine
 from render.engine import render
 from render.error import BIN_M, SIGMA_M, response
+from render.planning import make_plan
 from render.returns import Samples
 from render.settings import RenderSettings
+from render.world import World
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
+from scenes.hard_cases import hard_case
 from scenes.shapes import box, sphere
 from studies.bench import oracles
 
@@ -47,6 +53,48 @@ def test_plan_gives_a_reason_for_every_choice_and_can_be_forced():
     coarse = render(room(), RenderSettings(budget=(10, 1000))).meta["plan"]
     fine = render(room(), RenderSettings(budget=(1000, 0))).meta["plan"]
     assert fine["spp"] > 4 * coarse["spp"], "more photons show more of the render's error"
+
+
+def test_ambient_light_is_rendered_only_where_a_budget_has_room_for_it():
+    dark = room()
+    lit = replace(dark, surfaces=(replace(dark.surfaces[0], emission=0.3), dark.surfaces[1]))
+    asked = {
+        RenderSettings(bounces=1): True,
+        RenderSettings(bounces=1, budget=(10, 0)): False,
+        RenderSettings(bounces=1, budget=(10, 50)): True,
+        RenderSettings(bounces=1, ambient=False): False,
+        RenderSettings(bounces=1, budget=(10, 0), ambient=True): True,
+    }
+    for settings, wanted in asked.items():
+        transient = render(lit, settings)
+        assert transient.meta["plan"]["ambient"] == wanted == bool(transient.ambient.any()), settings
+
+
+def test_a_glint_is_no_error_of_the_direct_light():
+    """A window's own return is exact, and brighter than all the rest: it must not count as a difference."""
+    transient = render(hard_case("window"), RenderSettings(bounces=1, grid=4))
+    assert transient.radiance.max() > 100 * np.median(transient.radiance)
+    assert transient.meta["relative_error"]["total"] < 0.01
+
+
+def test_a_missed_target_is_made_good():
+    """Where the first paths' own noise tells that the pilot was too hopeful, more are traced: the mean stays right."""
+    scene, pixels = room(), np.arange(24 * 18)
+    fine = as_response(render(scene, RenderSettings(spp=8192, grid=16, bounces=4), seed=99), pixels)
+    world, settings = World(scene), RenderSettings(bounces=4, error=0.02)
+    plan = replace(make_plan(world, settings, 1), noise=0.1)  # a pilot that promises five times too much
+    first = engine.trace(world, plan, settings, seed=1, checked=pixels)
+    error = engine._estimated(world, plan, settings, first, pixels)
+    more = engine._missing(plan, settings, first, error)
+    assert error.total > 0.02 and more is not None
+    both = engine._traced_on(world, plan, settings, first, more, 1, pixels, lambda what, share: None)
+    assert both.spp > first.spp
+
+    def true(traced: engine.Traced) -> float:
+        return np.linalg.norm(response(traced.samples, pixels) - fine) / np.linalg.norm(fine)
+
+    assert true(both) < true(first)
+    assert engine._estimated(world, plan, settings, both, pixels).total < error.total
 
 
 def test_error_target_is_met_and_the_estimate_is_honest():
