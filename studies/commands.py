@@ -306,7 +306,7 @@ class Study(Common):
     """Number K of codes of --design."""
     full: bool = False
     """--design is a full coding tensor instead of a separable one."""
-    scene: str = "living-room"
+    scene: str = "tabletop/kitchen"
     """Scene of `study codes` (direct light alone, under a scanning laser) and `study power`, as `render` takes it."""
     width: int = 64
     """Image width of these, pixels."""

@@ -153,6 +153,7 @@ def test_units_make_the_size_in_metres(tmp_path, content, extent_m):
     assert np.ptp(model.vertices, axis=0).max() == pytest.approx(extent_m)
 
 
+@pytest.mark.slow
 def test_a_million_triangles_are_read(tmp_path):
     big = million_triangles().surfaces[0]
     trimesh.Trimesh(big.vertices, big.faces, process=False).export(tmp_path / "big.stl")

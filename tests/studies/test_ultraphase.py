@@ -170,6 +170,7 @@ def test_a_megapixel_frame_equals_the_integer_product():
     assert row["error"] == 0 and row["pixels"] == 1 << 20 and row["photons"] == pytest.approx(550 << 20, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_study_power(capfd, folder):
     argv = ("study", "power", "--scene", "plane", "--width", "8", "--height", "8", "--out", "study")
     result = run(capfd, *argv)
