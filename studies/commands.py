@@ -119,8 +119,8 @@ class Depth(Common):
     """The depth map (.exr) to write (default: the histogram's and the method's name)."""
     method: Literal["argmax", "matched", "log-matched", "compressive"] = "log-matched"
     """Estimator; log-matched is the Poisson maximum likelihood."""
-    code: Literal["fourier"] = "fourier"
-    """Coding tensor of `--method compressive`: truncated Fourier."""
+    code: Literal["fourier", "gray", "coarse", "hadamard", "random"] = "fourier"
+    """Temporal code of `--method compressive`: truncated Fourier, Gray Fourier, coarse histogram, Walsh-Hadamard."""
     codes: int = 16
     """Number K of codes kept per pixel by `--method compressive`."""
     figure: bool = True
@@ -129,9 +129,10 @@ class Depth(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Common):
-    """Speed against error beside mitransient (`bench render`), or the table of hard cases (`bench hard-cases`)."""
+    """Speed against error: beside mitransient (`bench render`), of compressive layers (`bench encode`), or the table of
+    hard cases (`bench hard-cases`)."""
 
-    stage: Positional[Literal["render", "hard-cases"]] = "render"
+    stage: Positional[Literal["render", "encode", "hard-cases"]] = "render"
     """What is measured."""
     scenes: tuple[Literal["flash", "lamp", "artist", "groove"], ...] = ()
     """Scenes of `bench render` (default: all)."""
@@ -157,11 +158,39 @@ class Bench(Common):
     """Folder for the table (.csv) and the pictures (.png)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Study(Common):
+    """Figures and tables of the paper's supplement: coding tensors, their memory, depth decoded without a network."""
+
+    name: Positional[Literal["tensors", "memory", "codes"]]
+    """Which study."""
+    checkpoints: tuple[Path, ...] = ()
+    """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc)."""
+    design: str = ""
+    """A design that `study tensors` draws instead of the paper's: learned, fourier, gray, coarse, hadamard or random,
+    with +learned for a fixed temporal code and a learned spatial part."""
+    block: tuple[int, int, int] = (256, 4, 4)
+    """Block of --design: time bins, rows, columns."""
+    codes: int = 32
+    """Number K of codes of --design."""
+    full: bool = False
+    """--design is a full coding tensor instead of a separable one."""
+    scene: str = "living-room"
+    """Scene of `study codes`, as `render` takes it; direct light alone, under a scanning laser."""
+    width: int = 64
+    """Image width of `study codes`, pixels."""
+    height: int = 48
+    """Image height of `study codes`, pixels."""
+    out: Path = Path("out/study")
+    """Folder for the figures (.png) and tables (.csv)."""
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Sense, tyro.conf.subcommand("sense")]
     | Annotated[Depth, tyro.conf.subcommand("depth")]
+    | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )

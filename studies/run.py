@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import logging
 import mmap
 import os
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from csph import CodingTensor, decode_depth, encode, truncated_fourier
+from csph import CodingTensor, decode_depth, encode, temporal_code
 from render.engine import Progress, render
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
@@ -170,14 +171,15 @@ def run_sense(command: commands.Sense, progress: Progress) -> dict:
     return result
 
 
-def depth_map(histogram: Histogram, method: str, codes: int = 16) -> np.ndarray:
-    """Depth [m] of every pixel by a method's name, (H, W) float32; `compressive` is truncated Fourier with K codes.
+def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:
+    """Depth [m] of every pixel by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code.
 
     With a displaced laser the arrival time is a path on an ellipsoid, and becomes a distance by the scene's geometry.
     """
     counts = torch.from_numpy(histogram.counts)
     if method == "compressive":
-        coding = CodingTensor(f"fourier-{codes}", truncated_fourier(codes, histogram.sensor.bins))
+        temporal = temporal_code(code, codes, histogram.sensor.bins, histogram.sensor, seed)
+        coding = CodingTensor(f"{code}-{codes}", temporal)
         depth = decode_depth(encode(counts, coding), coding, histogram.sensor).numpy()
     else:
         depth = estimate_depth(counts, histogram.sensor, method).numpy()
@@ -197,7 +199,7 @@ def run_depth(command: commands.Depth, progress: Progress) -> dict:
     histogram = read_histogram(source)
     progress(command.method, 0.1)
     start = time.perf_counter()
-    depth = depth_map(histogram, command.method, command.codes)
+    depth = depth_map(histogram, command.method, command.codes, command.code, command.seed)
     seconds = time.perf_counter() - start
     range_m = histogram.sensor.range_m
     errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
@@ -268,9 +270,18 @@ def run_bench(command: commands.Bench, progress: Progress) -> dict:
     """One stage of the bench; each is imported only when it is asked for."""
     if command.stage == "hard-cases":
         from studies.bench import hard_cases as stage
+    elif command.stage == "encode":
+        from studies.bench import encode as stage
     else:
         from studies.bench import render as stage
     return stage.run(command, progress)
+
+
+def run_study(command: commands.Study, progress: Progress) -> dict:
+    """One study, imported only when it is asked for."""
+    if command.out.is_file():
+        raise InputError(f"{command.out}: is a file, expected a folder for the figures")
+    return importlib.import_module(f"studies.{command.name}").run(command, progress)
 
 
 RUNNERS: dict[type, Callable] = {
@@ -280,4 +291,5 @@ RUNNERS: dict[type, Callable] = {
     commands.Sense: run_sense,
     commands.Depth: run_depth,
     commands.Bench: run_bench,
+    commands.Study: run_study,
 }

@@ -68,8 +68,12 @@ def test_coding_tensor_knows_its_size() -> None:
     for bad in (torch.zeros(5), torch.zeros(0, 5), torch.full((2, 4), math.nan)):
         with pytest.raises(InputError, match="coding tensor bad"):
             CodingTensor("bad", bad)
-    with pytest.raises(InputError, match="2 x 2"):
-        CodingTensor("block", torch.zeros(2, 4), rows=2, columns=2)
+    with pytest.raises(InputError, match="temporal part \\(2, 4\\) and spatial part \\(3, 2, 2\\)"):
+        CodingTensor("block", torch.zeros(2, 4), torch.zeros(3, 2, 2))
+    with pytest.raises(InputError, match="5 codes of a block of 4 counts"):
+        CodingTensor("many", torch.zeros(5, 4))
+    with pytest.raises(InputError, match="2 x 2 pixels"):
+        encode(torch.zeros(3, 4), CodingTensor("block", torch.zeros(2, 4), torch.zeros(2, 2, 2)))
 
 
 @settings(deadline=None, max_examples=20)
@@ -129,7 +133,7 @@ def test_a_decoder_that_answers_late_is_put_right(monkeypatch: pytest.MonkeyPatc
     counts = torch.from_numpy(np.random.default_rng(6).poisson(2.0, (20, 64)))
     codes = truncated_fourier(8, 64)
     right = decode_depth(encode(counts, CodingTensor("right", codes)), CodingTensor("right", codes), SMALL)
-    monkeypatch.setattr("csph.coding.grid_peak", lambda scores: grid_peak(scores) + 5)
+    monkeypatch.setattr("csph.decode.grid_peak", lambda scores: grid_peak(scores) + 5)
     late = CodingTensor("late", codes)
     assert torch.allclose(decode_depth(encode(counts, late), late, SMALL), right, atol=1e-6)
 

@@ -1,0 +1,123 @@
+"""Temporal codes: K rows over Mt time bins, each a function of nothing but its numbers (and a pulse, or a seed).
+
+fourier   cos and sin of harmonics 1, 2, 3, ...
+gray      cos and sin of harmonics 1, 2, 4, 8, ... as far as the pulse's band reaches, then of those left out
+coarse    K gates of Mt/K bins: a histogram of wider bins
+hadamard  Walsh functions by number of sign changes, 1, 2, 3, ...
+random    uniform numbers, as learned codes begin
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from scenes.errors import InputError, require
+from spad.sensor import Sensor
+from spad.template import binned_pulse
+
+FIXED_CODES = ("fourier", "gray", "coarse", "hadamard", "random")
+BAND_LIMIT = 0.2  # of the pulse's spectrum at harmonic 1: what Gray Fourier keeps
+
+
+def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 0) -> Tensor:
+    """(K, Mt) float32 of one of FIXED_CODES; the sensor lends its pulse to `gray`, the seed is `random`'s.
+
+    Raises InputError for another name and for K that does not fit the code.
+    """
+    makers = {
+        "fourier": lambda: truncated_fourier(codes, bins),
+        "gray": lambda: gray_fourier(codes, bins, block_pulse(bins, sensor)),
+        "coarse": lambda: coarse_gates(codes, bins),
+        "hadamard": lambda: walsh_hadamard(codes, bins),
+        "random": lambda: uniform_start((codes, bins), bins, seed),
+    }
+    require(name in makers, f"temporal code {name!r} is unknown, expected one of {', '.join(FIXED_CODES)}")
+    require(codes >= 1, f"{name} code: {codes} codes, expected 1 or more")
+    return makers[name]()
+
+
+def _waves(harmonics: Tensor, bins: int) -> Tensor:
+    """(2F, Mt) float32, cos and sin in turn of each harmonic f: cos(2 pi f (i + 1/2) / Mt) at the bin centres."""
+    # The phase in half bins, an integer reduced before it becomes an angle: exact for every harmonic.
+    half_bins = (harmonics.unsqueeze(-1) * (2 * torch.arange(bins) + 1)) % (2 * bins)
+    angle = half_bins.double() * (math.pi / bins)
+    return torch.stack([angle.cos(), angle.sin()], dim=1).reshape(-1, bins).float()
+
+
+def truncated_fourier(codes: int, bins: int) -> Tensor:
+    """(K, T) float32, rows cos and sin in turn of harmonics f = 1 .. K/2: cos(2 pi f (i + 1/2) / T), and sin.
+
+    No harmonic 0, so that rows sum to zero and a uniform background leaves no trace; none from T/2 on, where the sine
+    or the cosine vanishes at the bin centres. Raises InputError unless K is even and 2 <= K <= T - 2.
+    """
+    if codes % 2 or not 2 <= codes <= bins - 2:
+        raise InputError(
+            f"truncated Fourier: {codes} codes, expected an even number from 2 to {bins - 2} for {bins} bins"
+        )
+    return _waves(torch.arange(1, codes // 2 + 1), bins)
+
+
+def block_pulse(bins: int, sensor: Sensor) -> Tensor:
+    """(Mt,) float64: the binned pulse of an arrival at the centre of bin 0, on a circle of Mt of the sensor's bins."""
+    return binned_pulse(torch.tensor(0.5 * sensor.bin_width_s), circle_of(bins, sensor))
+
+
+def circle_of(bins: int, sensor: Sensor) -> Sensor:
+    """The sensor on a period of `bins` bins: what a block of that many bins sees of a periodic pulse."""
+    return replace(sensor, name=f"{sensor.name}, {bins} bins", bins=bins, period_s=bins * sensor.bin_width_s)
+
+
+def gray_frequencies(pulse: Tensor) -> list[int]:
+    """Harmonics in the order that Gray Fourier takes them, for a pulse (Mt,) sampled on a circle of Mt bins.
+
+    Usable are those below Mt/2 where the pulse's spectrum is at least 0.2 of that at harmonic 1; among them the powers
+    of two come first, then the others, ascending (Gutierrez-Barragan et al., CVPR 2022, as published for ICCV 2023).
+    """
+    spectrum = torch.fft.rfft(pulse.double()).abs()
+    inside = spectrum[1 : (len(pulse) + 1) // 2] >= BAND_LIMIT * spectrum[1]
+    usable = [f for f, kept in enumerate(inside.tolist(), start=1) if kept]
+    return sorted(usable, key=lambda f: (f & (f - 1) != 0, f))
+
+
+def gray_fourier(codes: int, bins: int, pulse: Tensor) -> Tensor:
+    """(K, Mt) float32: cos and sin in turn of the first K/2 of `gray_frequencies`. InputError where there are fewer."""
+    frequencies = gray_frequencies(pulse)
+    if codes % 2 or not 2 <= codes <= 2 * len(frequencies):
+        raise InputError(
+            f"Gray Fourier: {codes} codes, expected an even number from 2 to {2 * len(frequencies)}: the pulse's band "
+            f"holds {len(frequencies)} harmonics of {bins} bins"
+        )
+    return _waves(torch.tensor(frequencies[: codes // 2]), bins)
+
+
+def coarse_gates(codes: int, bins: int) -> Tensor:
+    """(K, Mt) float32: row k is 1 in bins k Mt/K to (k + 1) Mt/K, else 0. InputError unless K divides Mt."""
+    require(1 <= codes <= bins and bins % codes == 0, f"coarse histogram: {codes} gates do not divide {bins} bins")
+    return torch.eye(codes).repeat_interleave(bins // codes, dim=1)
+
+
+def walsh_hadamard(codes: int, bins: int) -> Tensor:
+    """(K, Mt) float32 of +-1: the Walsh functions with 1 .. K sign changes, so that every row sums to zero.
+
+    Entry (s, i) is (-1)^popcount(i & r), r the bit-reversed Gray code of s. Raises InputError unless Mt is a power of
+    two and K <= Mt - 1.
+    """
+    bits = bins.bit_length() - 1
+    require(bins == 1 << bits and bits >= 1, f"Walsh-Hadamard: {bins} bins, expected a power of two from 2 on")
+    require(1 <= codes <= bins - 1, f"Walsh-Hadamard: {codes} codes, expected 1 to {bins - 1} for {bins} bins")
+    rows = [int(f"{s ^ (s >> 1):0{bits}b}"[::-1], 2) for s in range(1, codes + 1)]
+    common = torch.tensor(rows).unsqueeze(-1) & torch.arange(bins)
+    parity = torch.zeros_like(common)
+    for bit in range(bits):
+        parity ^= common >> bit & 1
+    return (1 - 2 * parity).float()
+
+
+def uniform_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
+    """Uniform in +-1/sqrt(taps), float32: where learned factors begin; taps is the number of entries of one code."""
+    generator = torch.Generator().manual_seed(seed)
+    return (2 * torch.rand(shape, generator=generator) - 1) / math.sqrt(taps)

@@ -1,0 +1,192 @@
+"""The compressive-histogram layer: encoder, and the unfiltered back-projection with the same weights.
+
+    y = C~ n in every block           C~ = C - mean of C over its own time axis
+    x = ZN(C~)^T ZN(y)                ZN(v) = (v - mean_K v) / (|v - mean_K v|_2 + 1e-5), over the K codes
+
+so that x is Pearson's correlation over K between the codes kept and those that a lone detection leaves (supplement
+S.5.2; a convolution and a transposed convolution with stride = kernel there, matrix products over blocks here).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from csph import blocks
+from csph.codes import circle_of, temporal_code, uniform_start
+from csph.coding import CodingTensor, full_tensor
+from csph.design import Design
+from csph.photons import encode_photons, photon_table
+from scenes.errors import require
+from spad.sensor import Sensor
+from spad.template import binned_pulse
+
+KEEP_MEAN_UP_TO = 4  # codes; see LayerOptions
+
+
+@dataclass(frozen=True)
+class LayerOptions:
+    """Switches of the layer; the defaults are the published layer.
+
+    zero_mean         rows of C are held to sum to zero over Mt: a uniform background then encodes to zero
+    per_pixel_norm    one norm for all time blocks of a pixel (or block of pixels): which time block holds the return
+                      is then not lost, and blocks without signal are not amplified
+    keep_mean         no removal of the mean over K from 1 to 4 codes: of K = 2 it leaves one sign bit, of K = 1 nothing
+    pulse_in_decoder  back-project with the codes of a returning pulse, C h(tau), instead of those of one bin
+    pulse_in_codes    encode and back-project with codes smoothed by the pulse
+    """
+
+    zero_mean: bool = True
+    per_pixel_norm: bool = False
+    keep_mean: bool = False
+    pulse_in_decoder: bool = False
+    pulse_in_codes: bool = False
+
+
+def make_coding(design: Design, sensor: Sensor | None = None, seed: int = 0) -> CodingTensor:
+    """The coding tensor that a design begins with: fixed codes, and learned parts uniform in +-1/sqrt(n), n the entries
+    of one code of that part. `sensor` (default: the reference) lends its pulse to Gray Fourier.
+
+    Raises InputError where K does not fit the code.
+    """
+    (bins, rows, columns), codes = design.block, design.codes
+    if design.full:
+        start = uniform_start((codes, bins, rows, columns), design.size, seed)
+        return CodingTensor(design.name, start)
+    if design.code in ("learned", "random"):
+        temporal = uniform_start((codes, bins), bins, seed)
+    else:
+        temporal = temporal_code(design.code, codes, bins, sensor or Sensor())
+    # a seed of its own: the two factors must not be slices of one stream
+    spatial = uniform_start((codes, rows, columns), rows * columns, seed + (1 << 32)) if design.has_spatial else None
+    return CodingTensor(design.name, temporal, spatial, computed=design.computed)
+
+
+class CompressiveLayer(nn.Module):
+    """Counts (B, 1, T, R, C) -> codes (B, K, T/Mt, R/Mr, C/Mc) -> (B, 1, T, R, C) in [-1, 1].
+
+    coding      where the weights begin; its parts named in `learned` ("temporal", "spatial") are parameters, the others
+                buffers, both under these names in `state_dict`
+    sensor      whose pulse the pulse switches use (default: the reference)
+    background  (T,) shape in time of a background that is not uniform (a gate, pile-up), any scale: the direction that
+                it takes among the codes of each time block is projected out of codes and weights before normalisation
+
+    Sums are in float32 whatever the counts' type and autocast, in float64 where the weights are.
+    """
+
+    def __init__(
+        self,
+        coding: CodingTensor,
+        *,
+        learned: tuple[str, ...] = (),
+        options: LayerOptions | None = None,
+        sensor: Sensor | None = None,
+        background: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        parts = {"temporal": coding.temporal, "spatial": coding.spatial}
+        unknown = [name for name in learned if parts.get(name) is None]
+        require(not unknown, f"coding tensor {coding.name} has no part {', '.join(unknown)} to learn")
+        self.name, self.block, self.codes, self.computed = coding.name, coding.block, coding.codes, coding.computed
+        self.options = options or LayerOptions()
+        for name, part in parts.items():
+            if name in learned:
+                self.register_parameter(name, nn.Parameter(part.clone()))
+            else:
+                self.register_buffer(name, None if part is None else part.clone())
+        self.register_buffer("pulse", self._pulse(sensor or Sensor()), persistent=False)
+        self.register_buffer("background", self._background(background), persistent=False)
+
+    @classmethod
+    def of(cls, design: Design, *, sensor: Sensor | None = None, seed: int = 0, **options: bool) -> CompressiveLayer:
+        """The layer of a design at its start; `options` are switches of LayerOptions."""
+        switches = LayerOptions(zero_mean=design.zero_mean)
+        return cls(
+            make_coding(design, sensor, seed),
+            learned=design.learned,
+            options=replace(switches, **options),
+            sensor=sensor,
+        )
+
+    def _pulse(self, sensor: Sensor) -> Tensor | None:
+        """(Mt, Mt) float32: h_i(tau) on a circle of Mt bins, column tau the arrival at a bin centre."""
+        if not (self.options.pulse_in_codes or self.options.pulse_in_decoder):
+            return None
+        circle = circle_of(self.block[0], sensor)
+        arrival = (torch.arange(circle.bins, dtype=torch.float64) + 0.5) * circle.bin_width_s
+        return binned_pulse(arrival, circle).T.float()
+
+    def _background(self, shape: Tensor | None) -> Tensor | None:
+        if shape is None:
+            return None
+        good = shape.ndim == 1 and bool(shape.isfinite().all()) and len(shape) % self.block[0] == 0 and shape.any()
+        said = f"background of shape {tuple(shape.shape)}: expected finite values over time, a multiple of"
+        require(bool(good), f"{said} {self.block[0]} bins, not all zero")
+        return (shape / shape.abs().max()).float()
+
+    def _blurred(self, weights: Tensor) -> Tensor:
+        """sum_i C[k, i, ...] h_i(tau): the codes of a pulse that arrives at each bin centre."""
+        flat = weights.reshape(*weights.shape[:2], -1)
+        return (self.pulse.to(weights.dtype).T @ flat).view(weights.shape)
+
+    def _temporal_part(self) -> Tensor:
+        part = blocks.centred(self.temporal, 1) if self.options.zero_mean else self.temporal
+        return self._blurred(part) if self.options.pulse_in_codes else part
+
+    def weights(self) -> Tensor:
+        """(K, Mt, Mr, Mc) that counts are encoded with: the constraint and the pulse applied."""
+        return full_tensor(self._temporal_part(), self.spatial)
+
+    def coding(self) -> CodingTensor:
+        """The weights as they are now, constraint and pulse applied; separable ones stay so."""
+        return CodingTensor(self.name, self._temporal_part(), self.spatial, computed=self.computed)
+
+    def encode(self, counts: Tensor) -> Tensor:
+        """Codes of a histogram. Raises InputError for counts of another shape or type, or that blocks do not tile."""
+        with torch.autocast(counts.device.type, enabled=False):
+            return blocks.encode_blocks(counts, self.weights())
+
+    def encode_timestamps(self, timestamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
+        """The same codes from detections; size (T, R, C) of the histogram that is not built. See `encode_photons`."""
+        with torch.autocast(timestamps.device.type, enabled=False):
+            return encode_photons(timestamps, offsets, photon_table(self.weights()), self.block, size, name=self.name)
+
+    def decode(self, codes: Tensor) -> Tensor:
+        """ZN(C~)^T ZN(y). Raises InputError for codes of another shape."""
+        good = codes.ndim == 5 and codes.shape[1] == self.codes
+        require(good, f"codes of shape {tuple(codes.shape)}: expected (batch, {self.codes}, time, rows, columns)")
+        options = self.options
+        with torch.autocast(codes.device.type, enabled=False):
+            weights = self.weights()
+            codes = codes.to(weights.dtype)
+            direction = None if self.background is None else self._direction(weights, codes.shape[2])
+            if options.pulse_in_decoder:
+                weights = self._blurred(weights)
+            if direction is not None:
+                codes = (
+                    codes - (codes * direction.T[..., None, None]).sum(1, keepdim=True) * direction.T[..., None, None]
+                )
+                flat = weights.flatten(1)
+                weights = (flat - direction.unsqueeze(-1) * (direction @ flat).unsqueeze(1)).view(-1, *weights.shape)
+            centre = not (options.keep_mean and self.codes <= KEEP_MEAN_UP_TO)
+            over = (2,) if options.per_pixel_norm else ()
+            unit = blocks.zero_normalised(codes, 1, centre=centre, over=over)
+            axis = 0 if direction is None else 1
+            return blocks.back_project(unit, blocks.zero_normalised(weights, axis, centre=centre))
+
+    def _direction(self, weights: Tensor, times: int) -> Tensor:
+        """(T/Mt, K) unit vectors along what the background leaves in the codes of each time block; 0 where nothing."""
+        shape = self.background.to(weights.dtype).view(-1, self.block[0])
+        require(len(shape) == times, f"background of {shape.numel()} bins, codes of {times * self.block[0]}")
+        per_bin = weights.sum((2, 3))
+        left = shape @ per_bin.T
+        # what rounding leaves of codes that cancel this background is no direction
+        seen = left.abs() > 1e-5 * (shape.abs() @ per_bin.abs().T)
+        left = torch.where(seen, left, 0.0)
+        return left / left.norm(dim=1, keepdim=True).clamp(min=torch.finfo(left.dtype).tiny)
+
+    def forward(self, counts: Tensor) -> Tensor:
+        """`decode(encode(counts))`, the input of the depth network."""
+        return self.decode(self.encode(counts))

@@ -1,0 +1,119 @@
+"""Temporal codes by their defining properties."""
+
+import math
+
+import pytest
+import torch
+
+from csph.codes import (
+    FIXED_CODES,
+    block_pulse,
+    coarse_gates,
+    gray_fourier,
+    gray_frequencies,
+    temporal_code,
+    truncated_fourier,
+    uniform_start,
+    walsh_hadamard,
+)
+from scenes.errors import InputError
+from spad.sensor import Pulse, Sensor
+
+REFERENCE = Sensor()
+# mean over image rows of the published training pulse, 16 taps of 80 ps (physics of the ICCV 2023 data set)
+PUBLISHED_TAPS = (
+    *(0.0013, 0.0016, 0.0038, 0.0232, 0.0906, 0.1705, 0.2091, 0.1812),
+    *(0.1327, 0.0842, 0.0478, 0.0248, 0.0131, 0.0075, 0.0050, 0.0037),
+)
+
+
+def published_pulse(bins: int) -> torch.Tensor:
+    return torch.nn.functional.pad(torch.tensor(PUBLISHED_TAPS, dtype=torch.float64), (0, bins - 16))
+
+
+def test_gray_frequencies_of_the_published_pulse_are_the_published_ones():
+    long, short = gray_frequencies(published_pulse(1024)), gray_frequencies(published_pulse(256))
+    assert long[:17] == [1, 2, 4, 8, 16, 32, 64, 128, 3, 5, 6, 7, 9, 10, 11, 12, 13]
+    assert max(long) == 159 and sorted(long) == list(range(1, 160))
+    assert short[:11] == [1, 2, 4, 8, 16, 32, 3, 5, 6, 7, 9]
+
+
+def test_gray_band_limit_of_a_gaussian_is_its_closed_form():
+    # |F(f)| = exp(-2 (pi sigma f / T)^2) sinc(f / N), T the period and N its bins: the width of a bin blurs too
+    for bins in (256, 1024):
+        sigma, last = REFERENCE.pulse.sigma_s / REFERENCE.bin_width_s, 0
+
+        def spectrum(f: int, n: int = bins, s: float = sigma) -> float:
+            return math.exp(-2 * (math.pi * s * f / n) ** 2) * math.sin(math.pi * f / n) / (math.pi * f / n)
+
+        while last + 1 < bins / 2 and spectrum(last + 1) >= 0.2 * spectrum(1):
+            last += 1
+        assert max(gray_frequencies(block_pulse(bins, REFERENCE))) == last
+
+
+def test_a_narrow_pulse_keeps_more_harmonics():
+    wide = gray_frequencies(block_pulse(256, Sensor(pulse=Pulse(1e-9))))
+    narrow = gray_frequencies(block_pulse(256, Sensor(pulse=Pulse(1e-12))))
+    assert len(wide) < 20 and narrow[:8] == [1, 2, 4, 8, 16, 32, 64, 3] and len(narrow) == 127
+
+
+def test_gray_rows_are_fourier_rows_in_another_order():
+    frequencies = gray_frequencies(block_pulse(256, REFERENCE))[:8]
+    gray, fourier = temporal_code("gray", 16, 256, REFERENCE), truncated_fourier(254, 256)
+    assert torch.equal(gray, torch.cat([fourier[2 * f - 2 : 2 * f] for f in frequencies]))
+
+
+@pytest.mark.parametrize("bins", [2, 8, 64])
+def test_walsh_functions_are_orthogonal_and_ordered_by_sign_changes(bins):
+    rows = walsh_hadamard(bins - 1, bins)
+    assert set(rows.unique().tolist()) == {-1, 1} and (rows.sum(1) == 0).all()
+    assert torch.equal(rows @ rows.T, bins * torch.eye(bins - 1))
+    assert ((rows.diff(dim=1) != 0).sum(1) == torch.arange(1, bins)).all()
+    import scipy.linalg
+
+    hadamard = torch.from_numpy(scipy.linalg.hadamard(bins)).float()
+    assert {tuple(row) for row in rows.tolist()} == {tuple(row) for row in hadamard.tolist()[1:]}
+
+
+def test_coarse_gates_partition_the_bins():
+    rows = coarse_gates(8, 64)
+    assert torch.equal(rows.sum(0), torch.ones(64)) and (rows.sum(1) == 8).all()
+    assert torch.equal(rows.argmax(0), torch.arange(64) // 8)
+
+
+def test_random_codes_follow_their_seed_and_range():
+    one, same, other = (uniform_start((8, 1024), 1024, seed) for seed in (1, 1, 2))
+    assert torch.equal(one, same) and not torch.equal(one, other)
+    # 8192 draws: the largest is within 1 % of the limit but for a chance of e^-41 a side
+    assert 0.99 / 32 < one.abs().max() <= 1 / 32
+    assert abs(one.mean()) < 5 / 32 / math.sqrt(3 * one.numel())
+
+
+@pytest.mark.parametrize(
+    ("name", "codes", "bins", "said"),
+    [
+        ("coarse", 3, 64, "3 gates do not divide 64 bins"),
+        ("coarse", 128, 64, "128 gates"),
+        ("hadamard", 64, 64, "1 to 63"),
+        ("hadamard", 8, 60, "power of two"),
+        ("gray", 7, 64, "even number"),
+        ("gray", 60, 64, "holds 12 harmonics of 64 bins"),
+        ("fourier", 63, 64, "even number"),
+        ("fourier", 0, 64, "1 or more"),
+        ("haar", 4, 64, "'haar' is unknown"),
+    ],
+)
+def test_codes_that_do_not_fit_end_in_one_line(name, codes, bins, said):
+    with pytest.raises(InputError, match=said) as caught:
+        temporal_code(name, codes, bins, REFERENCE)
+    assert "\n" not in str(caught.value)
+
+
+def test_all_codes_but_coarse_and_random_sum_to_zero():
+    for name in FIXED_CODES:
+        total = temporal_code(name, 8, 64, REFERENCE).double().sum(1).abs().max()
+        assert (total < 1e-5) == (name not in ("coarse", "random"))
+
+
+def test_gray_fourier_takes_any_pulse():
+    assert gray_fourier(4, 16, torch.eye(16)[0]).shape == (4, 16)
