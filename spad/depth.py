@@ -7,6 +7,10 @@ noise-free pulse, `noise_free_bias_m`.
     argmax       centre of the fullest bin, first of equals
     matched      peak of the zero-normalised circular correlation with the binned pulse
     log-matched  Poisson maximum likelihood: argmax over tau of sum_i n_i log(S h_i(tau) + B) - S sum_i h_i(tau)
+    correlation  the same as matched over whole bins, with a parabola: zero-normalised cross-correlation
+    lmf-published   argmax over whole bins of the correlation with log(1 + h), the filter of the ICCV 2023 code
+    coates       log-matched, after the pile-up of the sensor's detector is undone: Coates' correction of first
+                 photons, or the dead-time correction of a free-running detector
 """
 
 from __future__ import annotations
@@ -21,142 +25,50 @@ from torch import Tensor
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError
+from spad.laws import linearised
+from spad.matching import (
+    argmax_bins,
+    correlate,
+    correlation_bins,
+    grid_peak,
+    is_circular,
+    likelihood,
+    log_matched_bins,
+    matched_bins,
+    published_log_matched_bins,
+)
 from spad.sensor import Sensor
-from spad.template import FINE_STEP, Taps, binned_pulse, binned_pulse_slope, pulse_taps
+from spad.template import binned_pulse, binned_pulse_slope, pulse_taps
 
-METHODS: tuple[str, ...] = ("argmax", "matched", "log-matched")
+__all__ = [
+    "ESTIMATORS",
+    "METHODS",
+    "by_pixels",
+    "checked_histogram",
+    "confidence",
+    "correlate",
+    "cramer_rao_m",
+    "depth_errors",
+    "depth_in_range",
+    "estimate_depth",
+    "grid_peak",
+    "noise_free_bias_m",
+    "radial_depth_m",
+]
 
 _BIAS_PHASES = 16
 _BIAS_SIGNAL = 1e4
 _CHUNK = {"cpu": 1 << 20, "cuda": 1 << 24}  # counts per chunk: a few MB a tensor on a CPU, which its cache holds
-_MAX_DIRECT_TAPS = 128
 
-
-def _is_circular(sensor: Sensor) -> bool:
-    return sensor.bins == sensor.bins_per_period
-
-
-def correlate(counts: Tensor, weights: Tensor, first: int, sensor: Sensor) -> Tensor:
-    """sum_l weights[., l] counts[., j + first + l] for every bin j: (P, T), (P or 1, L) -> (P, T), circular if the
-    sensor is. By direct sums, whose rounding does not depend on where a pixel's counts lie, unless L is large."""
-    bins, taps = counts.shape[-1], weights.shape[-1]
-    before, after = -first, taps - 1 + first
-    if _is_circular(sensor):
-        ring = torch.cat([counts[:, bins - before :], counts, counts[:, :after]], dim=-1)
-    else:
-        ring = torch.nn.functional.pad(counts, (before, after))
-    if taps > _MAX_DIRECT_TAPS:
-        size = ring.shape[-1]
-        spectrum = torch.fft.rfft(ring.double()) * torch.fft.rfft(weights.double(), n=size).conj()
-        return torch.fft.irfft(spectrum, n=size)[:, :bins]
-    if counts.device.type == "cpu":  # one kernel a pixel: three to five times faster than the sum below
-        kernels = weights.expand(len(counts), taps).unsqueeze(1)
-        return torch.nn.functional.conv1d(ring.unsqueeze(0), kernels, groups=len(counts)).squeeze(0)
-    scores = weights[:, :1] * ring[:, :bins]  # not by convolution: that rounds to 10 bits (TF32) on recent GPUs
-    for tap in range(1, taps):
-        scores.addcmul_(weights[:, tap : tap + 1], ring[:, tap : tap + bins])
-    return scores
-
-
-def _around(counts: Tensor, peak: Tensor, shifts: Tensor, sensor: Sensor) -> tuple[Tensor, Tensor]:
-    """Counts of the bins around a peak, and whether the bins exist: (P, T), (P,) -> (P, L) float64 twice."""
-    index = peak.unsqueeze(-1) + shifts
-    exists = torch.ones_like(index, dtype=torch.bool)
-    if not _is_circular(sensor):
-        exists = (index >= 0) & (index < sensor.bins)
-    near = counts.gather(-1, torch.remainder(index, sensor.bins)).double()
-    return near * exists, exists.double()
-
-
-def grid_peak(scores: Tensor) -> Tensor:
-    """Position of the maximum of (..., G) scores in grid steps, (...,) float64: a parabola through the largest score
-    and its neighbours; the middle of the first and last of equal maxima, where scores are flat."""
-    size = scores.shape[-1]
-    first = scores.argmax(-1)
-    last = size - 1 - scores.flip(-1).argmax(-1)
-    middle = first.clamp(1, size - 2).unsqueeze(-1)
-    left, top, right = (scores.gather(-1, middle + step).squeeze(-1).double() for step in (-1, 0, 1))
-    bend = left - 2 * top + right
-    shift = torch.where(bend < 0, 0.5 * (left - right) / bend, 0.0).clamp(-1, 1)
-    return torch.where(first == last, middle.squeeze(-1) + shift, (first + last) / 2)
-
-
-def _argmax_bins(counts: Tensor, sensor: Sensor) -> Tensor:
-    return counts.argmax(-1).double() + 0.5
-
-
-def _matched_peak(counts: Tensor, sensor: Sensor, taps: Taps) -> Tensor:
-    """Bin (P,) in whose centre the correlation with the pulse is largest."""
-    weights = taps.centred[taps.coarse].to(counts.dtype).unsqueeze(0)
-    return correlate(counts, weights, int(taps.shifts[taps.coarse][0]), sensor).argmax(-1)
-
-
-def _matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Peak of <n - mean n, h(tau)> / |h(tau) - mean h|: the mean takes a uniform background out, the norm makes the
-    noise-free pulse score highest at its true arrival (Cauchy-Schwarz) also where |h| depends on the sub-bin phase."""
-    taps = pulse_taps(sensor, str(counts.device))
-    peak = _matched_peak(counts, sensor, taps)
-    near, _ = _around(counts, peak, taps.shifts, sensor)
-    mean_h = taps.fine.sum(-1) / sensor.bins
-    square = (taps.fine**2).sum(-1) - sensor.bins * mean_h**2
-    total = counts.sum(-1).double().unsqueeze(-1)
-    scores = (near @ taps.fine.T - total * mean_h) / square.clamp(min=1e-30).sqrt()
-    return peak + 0.5 + (grid_peak(scores) * FINE_STEP - 1)
-
-
-def _signal_and_background(near: Tensor, exists: Tensor, total: Tensor, sensor: Sensor, taps: Taps) -> tuple:
-    """Signal S and background B per bin, (P,) each, by two moments: counts inside a window of +-2 sigma around the peak
-    = m S + W B, all counts = M S + T B, where m and M are the pulse's shares in the window and in all bins (M = 1 but
-    at the edge of bins that do not cover the period), W the window's bins.
-
-    Floors of half a count on S and on T B (the mean of Jeffreys' prior after no count) keep pixels without background
-    or without signal finite: at B = 0 a single stray count would otherwise have likelihood zero.
-    """
-    inside = (near * taps.window).sum(-1)
-    share = (exists * taps.window * taps.centred).sum(-1)
-    width = (exists * taps.window).sum(-1)
-    whole = exists @ taps.centred
-    background = (share * total - whole * inside) / (share * sensor.bins - whole * width).clamp(min=1e-6 * sensor.bins)
-    background = background.clamp(min=0.5 / sensor.bins)
-    return (total - sensor.bins * background).clamp(min=0.5) / whole, background
-
-
-def _log_matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Maximum likelihood with S and B estimated at the matched filter's peak, then searched over all bins.
-
-    The weights depend on S / B through a logarithm, so rough estimates serve: with the true S and B the share of
-    outliers changes by less than 0.3 % of the pixels and the others' rms by less than 1.3 %, at six levels from
-    (2, 2) to (50, 5000) detections (measured). One pass is enough.
-    """
-    taps = pulse_taps(sensor, str(counts.device))
-    total = counts.sum(-1).double()
-    peak = _matched_peak(counts, sensor, taps)
-    near, exists = _around(counts, peak, taps.shifts, sensor)
-    signal, background = _signal_and_background(near, exists, total, sensor, taps)
-
-    # log(S h + B) = log B + log(1 + S h / B), and sum_i n_i log B does not depend on tau: only taps with h > 0 count.
-    ratio = (signal / background).unsqueeze(-1)
-    weights = torch.log1p(ratio * taps.centred[taps.coarse]).to(counts.dtype)
-    first = int(taps.shifts[taps.coarse][0])
-    scores = correlate(counts, weights, first, sensor)
-    if not _is_circular(sensor):
-        # What falls outside the bins is not expected there: the term S sum_i h_i(tau) is no longer constant.
-        seen = correlate(torch.ones_like(counts[:1]), taps.centred[taps.coarse].to(counts.dtype)[None], first, sensor)
-        scores = scores - signal.to(counts.dtype).unsqueeze(-1) * seen
-    peak = scores.argmax(-1)
-
-    near, exists = _around(counts, peak, taps.shifts, sensor)
-    _, background = _signal_and_background(near, exists, total, sensor, taps)
-    # S at its most likely for each tau, the signal counted over the share of the pulse that the bins see: the term
-    # S sum_i h_i(tau) is then the same for every tau, and a pulse half outside the bins is not pulled inwards.
-    counted = (total - sensor.bins * background).clamp(min=0.5).unsqueeze(-1)
-    seen = (exists @ taps.fine.T).clamp(min=1e-3)
-    ratio = (counted / seen / background.unsqueeze(-1)).unsqueeze(-1)
-    scores = (torch.log1p(ratio * taps.fine) @ near.unsqueeze(-1)).squeeze(-1)
-    return peak + 0.5 + (grid_peak(scores) * FINE_STEP - 1)
-
-
-ESTIMATORS = dict(zip(METHODS, (_argmax_bins, _matched_bins, _log_matched_bins), strict=True))
+ESTIMATORS: dict[str, Callable[[Tensor, Sensor], Tensor]] = {
+    "argmax": argmax_bins,
+    "matched": matched_bins,
+    "log-matched": log_matched_bins,
+    "correlation": correlation_bins,
+    "lmf-published": published_log_matched_bins,
+    "coates": log_matched_bins,  # of counts without pile-up
+}
+METHODS: tuple[str, ...] = tuple(ESTIMATORS)
 
 
 def checked_histogram(counts: Tensor, bins: int) -> Tensor:
@@ -180,7 +92,7 @@ def by_pixels(function: Callable[[Tensor], Tensor], rows: Tensor, per_pixel: int
 
 def depth_in_range(depth_m: Tensor, sensor: Sensor) -> Tensor:
     """Float32 depth in [0, range): wrapped where the bins cover the period, else clamped to the bins."""
-    if _is_circular(sensor):
+    if is_circular(sensor):
         depth_m = torch.remainder(depth_m, sensor.range_m)
     else:
         depth_m = depth_m.clamp(0, sensor.bins * sensor.bin_depth_m)
@@ -226,14 +138,47 @@ def _require_method(method: str) -> None:
 def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched") -> Tensor:
     """Depth [m] of a histogram of counts, (..., T) -> (...,) float32 in [0, range); NaN where a pixel has no count.
 
-    Raises InputError for an unknown method, a wrong number of bins, and negative or non-finite counts.
+    Raises InputError for an unknown method, a wrong number of bins, negative or non-finite counts, and with `coates`
+    for counts that the sensor's detector cannot have made.
     """
     _require_method(method)
     rows = checked_histogram(counts, sensor.bins)
     if not len(rows):
         return torch.empty(counts.shape[:-1], dtype=torch.float32, device=counts.device)
+    if method == "coates":
+        rows = by_pixels(lambda part: linearised(part, sensor), rows)
     depth = _raw_depth(rows, sensor, method) - noise_free_bias_m(method, sensor)
     return depth_in_range(depth, sensor).reshape(counts.shape[:-1])
+
+
+def confidence(counts: Tensor, depth_m: Tensor, sensor: Sensor) -> Tensor:
+    """Probability that an estimated depth is the pulse's and not a chance peak, (..., T), (...,) -> (...,) float32.
+
+    The posterior share of arrivals within two pulse widths (the window that holds 95 % of a Gaussian) of the estimate,
+    with every bin as likely before as any other: softmax of the log-likelihood over bins, S and B as `log-matched`
+    estimates them. NaN where the depth is. Of any method's depth; raises InputError as `estimate_depth` does.
+    """
+    rows = checked_histogram(counts, sensor.bins)
+    if depth_m.shape != counts.shape[:-1]:
+        raise InputError(f"depth of shape {tuple(depth_m.shape)} for counts of shape {tuple(counts.shape)}")
+    taps = pulse_taps(sensor, str(rows.device))
+    reach = taps.shifts[taps.window]
+    estimate = (depth_m.reshape(-1, 1).double() / sensor.bin_depth_m).floor().nan_to_num(0).clamp(0, sensor.bins - 1)
+
+    def one(part: Tensor) -> Tensor:
+        part = part if part.dtype == torch.float64 else part.float()
+        return likelihood(part, sensor).double().softmax(-1)
+
+    def near(part: Tensor) -> Tensor:
+        posterior, index = one(part[:, :-1]), part[:, -1:].long() + reach
+        inside = (
+            torch.ones_like(index, dtype=torch.bool) if is_circular(sensor) else (index >= 0) & (index < sensor.bins)
+        )
+        # no bin twice, where the window is as wide as the period
+        return (posterior.gather(-1, index.remainder(sensor.bins)) * inside).sum(-1).clamp(max=1)
+
+    share = by_pixels(near, torch.cat([rows.double(), estimate], dim=-1)).float()
+    return torch.where(depth_m.isnan(), math.nan, share.reshape(depth_m.shape))
 
 
 def cramer_rao_m(arrival_s: Tensor, signal: Tensor, background_per_bin: Tensor, sensor: Sensor) -> Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from spad.sensor import PhotonBudget, Sensor
+from spad.timestamps import counts_from_timestamps, timestamps_from_counts
 
 TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
 
@@ -53,10 +54,7 @@ class Histogram:
 
     def timestamps(self) -> tuple[np.ndarray, np.ndarray]:
         """Sparse form: time bin of every detection (uint16, ascending in a pixel), and (H*W + 1,) int64 offsets."""
-        flat = self.counts.reshape(-1, self.sensor.bins)
-        pixel, time_bin = np.nonzero(flat)
-        stamps = np.repeat(time_bin.astype(np.uint16), flat[pixel, time_bin])
-        return stamps, np.concatenate(([0], np.cumsum(flat.sum(axis=1, dtype=np.int64))))
+        return timestamps_from_counts(self.counts)
 
     def sha256(self) -> str:
         """SHA-256 over counts and truth."""
@@ -64,13 +62,6 @@ class Histogram:
         for array in (self.counts, *(getattr(self, name) for name in TRUTH)):
             sha.update(np.ascontiguousarray(array).tobytes())
         return sha.hexdigest()
-
-
-def counts_from_timestamps(stamps: np.ndarray, offsets: np.ndarray, bins: int) -> np.ndarray:
-    """Dense (pixels, T) int32 counts of sparse detections; the inverse of `Histogram.timestamps`."""
-    pixels = len(offsets) - 1
-    owner = np.repeat(np.arange(pixels), np.diff(offsets))
-    return np.bincount(owner * bins + stamps, minlength=pixels * bins).reshape(pixels, bins).astype(np.int32)
 
 
 def write_histogram(histogram: Histogram, path: Path) -> None:

@@ -1,35 +1,21 @@
-"""What the single-photon camera is: `Sensor`, its `Pulse`, and the `PhotonBudget` it is used at. Needs no torch."""
+"""What the single-photon camera is: `Sensor`, and the `PhotonBudget` it is used at. Needs no torch."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from typing import Literal
 
-from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, REFERENCE_PULSE_SIGMA_S, SPEED_OF_LIGHT_M_PER_S
+import numpy as np
+
+from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
+from spad.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
+from spad.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_from_dict
 
-
-@dataclass(frozen=True)
-class Pulse:
-    """The system's impulse response, unit area and centred: its centroid is the arrival time.
-
-    A Gaussian of standard deviation `sigma_s` (laser pulse and timing jitter together); FWHM = 2 sqrt(2 ln 2) sigma.
-    """
-
-    sigma_s: float = REFERENCE_PULSE_SIGMA_S
-
-    def __post_init__(self) -> None:
-        good = math.isfinite(self.sigma_s) and 0 < self.sigma_s < 1e-3
-        require(good, f"pulse sigma {self.sigma_s:g} s is outside (0, 1e-3)")
-
-    @property
-    def fwhm_s(self) -> float:
-        return 2 * math.sqrt(2 * math.log(2)) * self.sigma_s
-
-    @property
-    def reach_s(self) -> float:
-        """Half the window outside which the pulse holds less than 1e-11 of its area."""
-        return 7 * self.sigma_s
+STAGE_PIXELS = 21
+Reset = Literal["synchronous", "free-running"]
 
 
 @dataclass(frozen=True)
@@ -37,18 +23,35 @@ class Sensor:
     """A SPAD pixel array with one time-to-digital converter a pixel. With its defaults a perfect photon counter.
 
     bins, bin_width_s     the histogram: bin i covers [i, i+1) bin widths after the laser's emission
+    pulse, jitter         the laser's pulse and the detector's timing jitter, a second kernel; `response` is both
     period_s              laser period, a whole number of bin widths (None: the histogram covers it); time wraps at it
     exposure_s            exposure of one frame; cycles = exposure / period
-    dark_count_rate_hz    dark counts per second and pixel, uniform in time
+    pde                   photon detection efficiency at the laser's wavelength: radiometric budgets count with it
+    dark_count_rate_hz    dark counts per second and pixel, uniform in time: a number, or one for each image row, used
+                          again from the first where the image has more rows
+    hot_share, hot_rate_hz   share of pixels, drawn at random, that have this dark count rate instead
+    dead_share            share of pixels, drawn at random, that never detect anything
+    reset                 what the detector does after a detection. `synchronous`: it is armed at the start of every
+                          laser cycle and detects the first photon; `free-running`: it is armed again after dead_time_s
+    dead_time_s           dead time after a detection, not prolonged by photons that arrive in it
+    crosstalk             probability that a detection fires a given one of the four neighbours, at the same time
     """
 
     name: str = "reference"
     bins: int = REFERENCE_BINS
     bin_width_s: float = REFERENCE_PERIOD_S / REFERENCE_BINS
-    pulse: Pulse = field(default_factory=Pulse)
+    pulse: AnyPulse = field(default_factory=Pulse)
     period_s: float | None = None
     exposure_s: float = 1 / 30
-    dark_count_rate_hz: float = 0.0
+    dark_count_rate_hz: float | tuple[float, ...] = 0.0
+    jitter: AnyPulse | None = None
+    pde: float = 1.0
+    hot_share: float = 0.0
+    hot_rate_hz: float = 0.0
+    dead_share: float = 0.0
+    reset: Reset = "synchronous"
+    dead_time_s: float = 0.0
+    crosstalk: float = 0.0
 
     def __post_init__(self) -> None:
         where = f"sensor {self.name}"
@@ -67,8 +70,34 @@ class Sensor:
             math.isfinite(self.exposure_s) and self.exposure_s >= self.period_s,
             f"{where}: exposure {self.exposure_s:g} s is shorter than the period {self.period_s:g} s",
         )
+        self._check_detector(where)
+
+    def _check_detector(self, where: str) -> None:
+        if isinstance(self.dark_count_rate_hz, Iterable):
+            object.__setattr__(self, "dark_count_rate_hz", tuple(map(float, self.dark_count_rate_hz)))
+            require(len(self.dark_count_rate_hz) > 0, f"{where}: dark count rates of no row")
+        for rate in (*self._dark_rows, self.hot_rate_hz):
+            require(
+                math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite"
+            )
+        for label in ("hot_share", "dead_share"):
+            share = getattr(self, label)
+            require(0 <= share <= 1, f"{where}: {label} {share:g} is outside 0 to 1")
+        require(0 < self.pde <= 1, f"{where}: PDE {self.pde:g} is outside (0, 1]")
+        require(0 <= self.crosstalk < 0.25, f"{where}: crosstalk {self.crosstalk:g} is outside [0, 0.25)")
+        require(self.reset in ("synchronous", "free-running"), f"{where}: reset {self.reset!r} is unknown")
+        dead = self.dead_time_s
+        require(math.isfinite(dead) and 0 <= dead <= 1, f"{where}: dead time {dead:g} s is outside 0 to 1")
+
+    @property
+    def _dark_rows(self) -> tuple[float, ...]:
         rate = self.dark_count_rate_hz
-        require(math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite")
+        return rate if isinstance(rate, tuple) else (rate,)
+
+    @property
+    def response(self) -> AnyPulse:
+        """The pulse with the jitter: what one detection looks like in time."""
+        return convolved(self.pulse, self.jitter)
 
     @property
     def bins_per_period(self) -> int:
@@ -89,15 +118,51 @@ class Sensor:
         """Depth that one bin spans, c bin_width / 2."""
         return SPEED_OF_LIGHT_M_PER_S * self.bin_width_s / 2
 
+    @property
+    def timestamp_bits(self) -> int:
+        """Bits of one timestamp: 10 for 1024 bins."""
+        return max(1, (self.bins - 1).bit_length())
+
+    def dark_rate_map_hz(self, height: int, width: int, seed: int = 0) -> np.ndarray:
+        """Dark counts per second of every pixel, (H, W) float64: rows, then hot pixels at random by the seed."""
+        rows = np.resize(np.asarray(self._dark_rows, dtype=np.float64), height)
+        rate = np.repeat(rows[:, None], width, axis=1)
+        rate[self._chosen(self.hot_share, height, width, seed, 0)] = self.hot_rate_hz
+        return rate
+
+    def dead_pixels(self, height: int, width: int, seed: int = 0) -> np.ndarray:
+        """Pixels that detect nothing, (H, W) bool, at random by the seed."""
+        return self._chosen(self.dead_share, height, width, seed, 1)
+
+    @staticmethod
+    def _chosen(share: float, height: int, width: int, seed: int, what: int) -> np.ndarray:
+        chosen = np.zeros(height * width, dtype=bool)
+        if share > 0:
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_PIXELS, what, 0)))
+            chosen[rng.choice(chosen.size, round(share * chosen.size), replace=False)] = True
+        return chosen.reshape(height, width)
+
     def to_dict(self) -> dict:
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict) -> Sensor:
-        return cls(**{**values, "pulse": Pulse(**values["pulse"])})
+        pulses = {"pulse": pulse_from_dict(values["pulse"]), "jitter": pulse_from_dict(values.get("jitter"))}
+        return cls(**{**values, **pulses})
 
 
-PRESETS: dict[str, Sensor] = {"reference": Sensor()}
+PRESETS: dict[str, Sensor] = {
+    "reference": Sensor(),
+    "iccv2023-train": Sensor(
+        name="iccv2023-train",
+        bin_width_s=TRAIN_BIN_WIDTH_S,
+        pulse=SampledPulse(TRAIN_PULSE, TRAIN_BIN_WIDTH_S),
+        dark_count_rate_hz=tuple(30 * counts for counts in TRAIN_DARK_COUNTS),
+    ),
+    "linospad": Sensor(
+        name="linospad", bins=1536, bin_width_s=26e-12, pulse=Pulse(LINOSPAD_FWHM_S / (2 * math.sqrt(2 * math.log(2))))
+    ),
+}
 
 
 def sensor_by_name(name: str) -> Sensor:
@@ -110,8 +175,8 @@ def sensor_by_name(name: str) -> Sensor:
 class PhotonBudget:
     """Mean signal and mean background primary detections per pixel per exposure, averaged over all pixels.
 
-    Signal sums direct and indirect light, what wraps included. Background is dark counts, as the sensor has them, and
-    ambient light scaled to fill the asked mean.
+    Primary: PDE included, dead time, pile-up and crosstalk not. Signal sums direct and indirect light, what wraps
+    included. Background is dark counts, as the sensor has them, and ambient light scaled to fill the asked mean.
     """
 
     signal: float = 50.0

@@ -21,6 +21,9 @@ GATED = Sensor(name="gated", bins=512, period_s=REFERENCE.period_s)
 NARROW = Sensor(name="narrow", pulse=Pulse(0.25 * WIDTH))
 WIDE = Sensor(name="wide", pulse=Pulse(30 * WIDTH))
 SUB_BIN = ("matched", "log-matched")
+LINEAR = tuple(method for method in METHODS if method != "coates")  # which takes more counts for pile-up
+# Half a bin where whole bins are searched; over whole bins with a parabola a share of a bin, measured 0.05.
+WHOLE_BIN = {"argmax": 0.51, "lmf-published": 0.51, "correlation": 0.07}
 
 
 def wrapped_error(depth: torch.Tensor, arrival_s: torch.Tensor, sensor: Sensor) -> torch.Tensor:
@@ -40,7 +43,7 @@ def drawn(signal: float, background: float, pixels: int, seed: int, sensor: Sens
 
 
 @pytest.mark.parametrize("sensor", [REFERENCE, NARROW, WIDE, GATED, SMALL], ids=lambda sensor: sensor.name)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", LINEAR)
 def test_noise_free_answer_is_the_truth(method: str, sensor: Sensor) -> None:
     # Other phases and another place than the ones the subtraction is averaged over, same spacing: the mean is zero
     # as far as the answer repeats with the bin.
@@ -48,15 +51,16 @@ def test_noise_free_answer_is_the_truth(method: str, sensor: Sensor) -> None:
     arrival = (20 + phases) * WIDTH if sensor is SMALL else (200 + phases) * WIDTH
     error_mm = 1e3 * wrapped_error(estimate_depth(1e4 * binned_pulse(arrival, sensor), sensor, method), arrival, sensor)
     # Measured: 0.0006 mm on `reference` (parabola over eighths of a bin), float32 depth rounds to 0.0002 mm at 3 m.
-    # A pulse of a quarter bin is two steps of the grid wide, too few for a parabola: measured 0.71 mm, 0.05 bin.
-    limit = 1.0 if sensor is NARROW else 0.005
-    bin_mm = 1e3 * sensor.bin_depth_m
-    assert error_mm.abs().max() < (0.5 * bin_mm + 0.01 if method == "argmax" else limit)
-    assert abs(error_mm.mean()) < (0.01 if method == "argmax" else limit / 2)
+    # A pulse of a quarter bin is searched in steps of 1/64 bin.
+    limit = 0.1 if sensor is NARROW else 0.005
+    if method in WHOLE_BIN and not (method == "correlation" and sensor is WIDE):
+        limit = 1e3 * sensor.bin_depth_m * (0.51 if sensor is NARROW else WHOLE_BIN[method])
+    assert error_mm.abs().max() < limit
+    assert abs(error_mm.mean()) < (0.05 if method in WHOLE_BIN else limit / 2)
 
 
 def test_subtracted_answer_of_a_method_and_of_a_function_agree() -> None:
-    for method in METHODS:
+    for method in LINEAR:
         assert abs(noise_free_bias_m(lambda counts, m=method: estimate_depth(counts, REFERENCE, m), REFERENCE)) < 1e-6
     # A function that is 7 mm off says so.
     shifted = noise_free_bias_m(lambda counts: estimate_depth(counts, REFERENCE) + 0.007, REFERENCE)
@@ -202,7 +206,7 @@ def test_bad_input_is_refused_in_one_line() -> None:
         "0 or more": (-counts, "matched"),
         "nan": (counts * math.nan, "argmax"),
         "inf": (counts * math.inf, "argmax"),
-        "argmax, matched, log-matched": (counts, "median"),
+        "argmax, matched, log-matched, correlation, lmf-published, coates": (counts, "median"),
     }
     for expected, (histogram, method) in bad.items():
         with pytest.raises(InputError, match=expected) as caught:
@@ -218,7 +222,7 @@ def test_bad_input_is_refused_in_one_line() -> None:
 
 
 @settings(deadline=None, max_examples=20)
-@given(st.sampled_from(METHODS), st.integers(-200, 200), st.integers(0, 2**32 - 1), st.integers(1, 50))
+@given(st.sampled_from(LINEAR), st.integers(-200, 200), st.integers(0, 2**32 - 1), st.integers(1, 50))
 def test_shifting_the_histogram_shifts_the_depth(method: str, shift: int, seed: int, factor: int) -> None:
     counts, _ = drawn(300, 20, 4, seed=seed, sensor=SMALL)
     if method == "argmax":  # no two equal maxima: the first of them depends on where bin 0 is

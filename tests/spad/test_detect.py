@@ -13,8 +13,9 @@ from test_flux import transient_of
 from scenes import InputError
 from spad.detect import expected_in_pixel, sense
 from spad.flux import expected_counts, rates_for
-from spad.histogram import Histogram, counts_from_timestamps, read_histogram, write_histogram
+from spad.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor import PhotonBudget, Sensor
+from spad.timestamps import counts_from_timestamps
 
 REFERENCE = Sensor()
 
@@ -69,17 +70,6 @@ def test_same_seed_same_bytes_with_one_and_two_threads():
     assert sense(row_of_walls(2048), REFERENCE, PhotonBudget(40, 60), seed=4).sha256() not in hashes
 
 
-def test_the_work_may_be_cut_anywhere(monkeypatch):
-    transient = row_of_walls(64)
-    tall = replace(transient, height=8, width=8, **{
-        name: getattr(transient, name).reshape(8, 8, *getattr(transient, name).shape[2:])
-        for name in ("depth_m", "normal", "albedo", "ambient", "mixed", "error")
-    })  # fmt: skip
-    whole = sense(tall, REFERENCE, PhotonBudget(5, 5)).sha256()
-    monkeypatch.setattr("spad.detect.BLOCK_BINS", 1)
-    assert sense(tall, REFERENCE, PhotonBudget(5, 5)).sha256() == whole
-
-
 def test_plan_reports_pile_up_wrap_and_dark_counts():
     dark = replace(REFERENCE, dark_count_rate_hz=300.0)
     meta = sense(transient_of([(31.0, 31.0, 1.0)]), dark, PhotonBudget(1e4, 20)).meta
@@ -87,7 +77,7 @@ def test_plan_reports_pile_up_wrap_and_dark_counts():
     assert meta["pile_up"] == pytest.approx(10020 / dark.cycles, rel=1e-6)
     assert any("pile-up" in reason for reason in meta["plan"]) and any("wraps" in reason for reason in meta["plan"])
     with pytest.raises(InputError, match="model"):
-        sense(transient_of([(1, 1, 1.0)]), REFERENCE, PhotonBudget(), model="first-photon")
+        sense(transient_of([(1, 1, 1.0)]), REFERENCE, PhotonBudget(), model="magic")
 
 
 @pytest.mark.parametrize(
@@ -95,7 +85,7 @@ def test_plan_reports_pile_up_wrap_and_dark_counts():
 )
 def test_hard_budgets(signal, background):
     transient = transient_of([(4.0, 4.0, 1.0)])
-    histogram = sense(transient, REFERENCE, PhotonBudget(signal, background), seed=2)
+    histogram = sense(transient, REFERENCE, PhotonBudget(signal, background), seed=2, model="poisson")
     mean = signal + background
     assert abs(histogram.counts.sum(dtype=np.int64) - mean) <= 5 * np.sqrt(mean) + 5
     assert np.isfinite(histogram.expected_signal).all() and (histogram.expected_signal >= 0).all()
@@ -107,7 +97,7 @@ def test_counts_beyond_what_a_bin_holds_are_refused():
     assert expected_counts(transient, narrow, rates, slice(0, 1))[0].sum() == pytest.approx(2e9)
     four = transient_of([(4.0, 4.0, 1.0)], [], [], [])
     with pytest.raises(InputError, match="a bin holds"):
-        sense(four, narrow, PhotonBudget(1e9, 0))
+        sense(four, narrow, PhotonBudget(1e9, 0), model="poisson")
 
 
 # The file
@@ -120,7 +110,9 @@ def made() -> Histogram:
 
 @pytest.mark.parametrize("signal", [20, 1e5])
 def test_histogram_reads_back_bit_for_bit(tmp_path, signal):
-    histogram = sense(transient_of(*[[(4.0, 4.02, 1.0)]] * 30), REFERENCE, PhotonBudget(signal, 20), seed=5)
+    histogram = sense(
+        transient_of(*[[(4.0, 4.02, 1.0)]] * 30), REFERENCE, PhotonBudget(signal, 20), seed=5, model="poisson"
+    )
     write_histogram(histogram, tmp_path / "h.h5")
     again = read_histogram(tmp_path / "h.h5")
     assert again.sha256() == histogram.sha256() and (again.counts == histogram.counts).all()

@@ -1,0 +1,170 @@
+"""Fresh detections for training, from transients in memory: photon level, crop and noise drawn anew for every patch.
+
+    packed = pack(transients)                                       # once
+    batch = sense_patches(packed, sensor, requests, size=(32, 32))  # every step
+    batch.counts                                                    # (B, 1, T, h, w) float32, for the network
+
+Detections follow the independent Poisson law (training levels lie far below 1 % detections a cycle), drawn photon by
+photon on the CPU, so that a seed gives the same counts on every device; the histogram is summed on `device`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from render.transient import Transient
+from scenes.errors import InputError
+from spad.flux import fill_background
+from spad.photons import Light, draw_primaries, paths_in_bins
+from spad.sensor import PhotonBudget, Sensor
+
+STAGE_FLY = 23
+
+
+@dataclass(frozen=True, eq=False)
+class PackedTransients:
+    """Transients of one size, one after the other, as a pack file holds them (numpy, read only).
+
+    offsets       (S*H*W + 1,) int64: pixel p = (s H + i) W + j has the returns [offsets[p], offsets[p + 1])
+    path_near_m, path_far_m, radiance   (N,) float32, as in `Transient`
+    depth_m       (S, H, W) float32 label, NaN for none
+    ambient       (S, H, W) float32, any scale
+    mixed         (S, H, W) bool
+    """
+
+    offsets: np.ndarray
+    path_near_m: np.ndarray
+    path_far_m: np.ndarray
+    radiance: np.ndarray
+    depth_m: np.ndarray
+    ambient: np.ndarray
+    mixed: np.ndarray
+
+    def __post_init__(self) -> None:
+        shape, returns = self.depth_m.shape, len(self.radiance)
+        good = len(shape) == 3 and self.ambient.shape == self.mixed.shape == shape
+        good = good and self.offsets.shape == (self.depth_m.size + 1,) and int(self.offsets[-1]) == returns
+        if not (good and len(self.path_near_m) == len(self.path_far_m) == returns):
+            raise InputError(
+                f"packed transients: layers {shape}, {self.ambient.shape}, {self.mixed.shape}, {self.offsets.shape} "
+                f"offsets and {returns} returns do not belong together"
+            )
+        sums = np.add.reduceat(np.append(self.radiance, 0), self.offsets[:: shape[1] * shape[2]][:-1], dtype=np.float64)
+        pixels = self.offsets[:: shape[1] * shape[2]]
+        sums[np.diff(pixels) == 0] = 0  # reduceat gives an empty scene its neighbour's first
+        object.__setattr__(self, "mean_radiance", sums / (shape[1] * shape[2]))
+
+    @property
+    def scenes(self) -> int:
+        return self.depth_m.shape[0]
+
+
+def pack(transients: Sequence[Transient]) -> PackedTransients:
+    """Transients of one size in one; InputError for none, or of different sizes."""
+    sizes = {(transient.height, transient.width) for transient in transients}
+    if len(sizes) != 1:
+        raise InputError(f"transients of sizes {sorted(sizes)} cannot be packed together")
+    starts = np.cumsum([0, *(transient.returns for transient in transients)])
+    offsets = [transient.offsets[:-1] + start for transient, start in zip(transients, starts[:-1], strict=True)]
+    columns = {
+        name: np.concatenate([getattr(transient, name) for transient in transients])
+        for name in ("path_near_m", "path_far_m", "radiance")
+    }
+    layers = {
+        name: np.stack([getattr(transient, name) for transient in transients])
+        for name in ("depth_m", "ambient", "mixed")
+    }
+    return PackedTransients(np.concatenate([*offsets, starts[-1:]]), **columns, **layers)
+
+
+class Patch(NamedTuple):
+    """One patch to sense. The seed is what the caller keys by (epoch, sample), never by worker."""
+
+    scene: int
+    row: int
+    column: int
+    signal: float
+    background: float
+    seed: int | Sequence[int]
+    time_offset_m: float = 0.0  # moves the scene away in time alone; recorded by who asks for it
+
+
+class Batch(NamedTuple):
+    """Sensed patches and their labels, all on one device."""
+
+    counts: Tensor  # (B, 1, T, h, w) float32
+    depth_m: Tensor  # (B, h, w) float32, time offset included; NaN where nothing is
+    mixed: Tensor  # (B, h, w) bool
+    valid: Tensor  # (B, h, w) bool: there is a depth, and within the sensor's range
+
+
+def sense_patches(
+    packed: PackedTransients,
+    sensor: Sensor,
+    patches: Sequence[Patch],
+    *,
+    size: tuple[int, int],
+    device: str | torch.device = "cpu",
+) -> Batch:
+    """Counts and labels of patches (h, w) of stored transients.
+
+    Mean signal and background are fixed on the scene's full frame before the crop, by means as in `flux.rates_for`.
+    Labels stay continuous. Raises InputError for a patch outside its scene, and a scene without light to scale.
+    """
+    height, width = size
+    pixels, bins = height * width, sensor.bins
+    places, depth, mixed = [], [], []
+    for number, patch in enumerate(patches):
+        light = _light_of_patch(packed, sensor, patch, height, width)
+        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(patch.seed, spawn_key=(STAGE_FLY,))))
+        events = draw_primaries(light, sensor, rng)
+        # bin before pixel: the order of (T, h, w)
+        places.append((events.position + np.int32(number * bins)) * np.int64(pixels) + events.pixel)
+        rows, columns = slice(patch.row, patch.row + height), slice(patch.column, patch.column + width)
+        depth.append(packed.depth_m[patch.scene, rows, columns] + np.float32(patch.time_offset_m))
+        mixed.append(packed.mixed[patch.scene, rows, columns])
+    where = torch.from_numpy(np.concatenate(places)).to(device)
+    counts = torch.zeros(len(patches) * bins * pixels, device=device)
+    counts.scatter_add_(0, where, torch.ones(1, device=device).expand(len(where)))
+    labels = torch.from_numpy(np.stack(depth)).to(device)
+    return Batch(
+        counts.reshape(len(patches), 1, bins, height, width),
+        labels,
+        torch.from_numpy(np.stack(mixed)).to(device),
+        labels < sensor.range_m,  # false for NaN
+    )
+
+
+def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, height: int, width: int) -> Light:
+    scenes, rows, columns = packed.depth_m.shape
+    inside = 0 <= patch.scene < scenes and 0 <= patch.row <= rows - height and 0 <= patch.column <= columns - width
+    if not inside:
+        raise InputError(
+            f"patch of {height} x {width} at scene {patch.scene}, row {patch.row}, column {patch.column} is outside "
+            f"{scenes} scenes of {rows} x {columns}"
+        )
+    budget = PhotonBudget(patch.signal, patch.background)
+    mean = float(packed.mean_radiance[patch.scene])
+    if mean <= 0 and budget.signal > 0:
+        raise InputError(f"scene {patch.scene}: no light returns, {budget.signal:g} signal photons cannot be had")
+    dark = sensor.dark_rate_map_hz(rows, columns) * sensor.exposure_s
+    background = fill_background(packed.ambient[patch.scene], dark, budget.background).background
+    pixel = (patch.scene * rows + patch.row + np.arange(height)[:, None]) * columns + patch.column + np.arange(width)
+    first = packed.offsets[pixel].ravel()
+    number = packed.offsets[pixel + 1].ravel() - first
+    # each pixel's returns are a run: start of its run minus where the run goes, plus a running index
+    index = np.repeat(first - np.cumsum(number) + number, number) + np.arange(int(number.sum()))
+    start, length = paths_in_bins(packed.path_near_m[index], packed.path_far_m[index], sensor)
+    return Light(
+        owner=np.repeat(np.arange(height * width, dtype=np.int32), number),
+        start=start + patch.time_offset_m / sensor.bin_depth_m,
+        length=length,
+        signal=packed.radiance[index] * (budget.signal / mean if mean > 0 else 0.0),
+        background=background[patch.row : patch.row + height, patch.column : patch.column + width].ravel(),
+    )

@@ -1,0 +1,98 @@
+"""Measured constants of the presets. Facts of the ICCV 2023 prototype's calibration, as its training set uses them."""
+
+# Steps of the prototype's histogram in the training set: 1024 of them, 81.92 ns, 12.28 m.
+TRAIN_BIN_WIDTH_S = 80e-12
+
+# fmt: off
+# Mean over 64 image rows of the measured pulse in steps of 80 ps, unit sum: each row's bright image rolled so that its
+# peak has index 9, the first 16 samples, reversed in time.
+TRAIN_PULSE = (
+    0.001301,
+    0.001559,
+    0.003767,
+    0.023171,
+    0.090579,
+    0.170521,
+    0.209137,
+    0.181160,
+    0.132715,
+    0.084178,
+    0.047805,
+    0.024846,
+    0.013136,
+    0.007482,
+    0.004955,
+    0.003686,
+)
+
+# Dark counts in one exposure, mean over the dark image's 50 lines, for each of 64 image rows: some rows are hot.
+TRAIN_DARK_COUNTS = (
+    2.58,
+    2.32,
+    2.38,
+    2.84,
+    1.76,
+    1.96,
+    1.86,
+    2.46,
+    2.36,
+    3.48,
+    2.24,
+    2.28,
+    2.56,
+    2.64,
+    6.64,
+    19.54,
+    3.28,
+    2.62,
+    2.24,
+    37.02,
+    3.18,
+    2.96,
+    99.50,
+    2.82,
+    2.50,
+    2.74,
+    2.20,
+    2.10,
+    5.06,
+    298.54,
+    5.30,
+    97.80,
+    2.48,
+    2.08,
+    1.80,
+    3.14,
+    1.60,
+    3.10,
+    2.66,
+    2.30,
+    3.06,
+    282.86,
+    6.06,
+    2.88,
+    2.08,
+    13.62,
+    2.42,
+    3.20,
+    210.94,
+    5.90,
+    6.20,
+    2.50,
+    4.60,
+    172.92,
+    43.98,
+    42.50,
+    338.10,
+    5.02,
+    215.66,
+    4.64,
+    2.04,
+    2.66,
+    14.46,
+    2.58,
+)
+
+# fmt: on
+# Laser pulse of the LinoSPAD recordings.
+LINOSPAD_FWHM_S = 440e-12

@@ -1,0 +1,215 @@
+"""Pulses: what one detection looks like in time. Gaussian, with an exponential tail, or measured. Needs no torch.
+
+Every pulse has unit area and is centred: its centroid is the arrival time, t = 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import erfc, ndtr
+
+from scenes.constants import REFERENCE_PULSE_SIGMA_S
+from scenes.errors import InputError, require
+
+MOST_SAMPLES = 1 << 16
+# Steps of a table that stands for two kernels in one, per standard deviation of the narrower: the table widens the
+# pulse's variance by 1 / (12 * 16^2) of that one's, 0.03 %.
+_STEPS_PER_STD = 16
+_TABLE_SIGMAS = 8.5
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """A Gaussian, or with `tail_s` a Gaussian convolved with an exponential decay (exponentially modified Gaussian).
+
+    sigma_s   standard deviation of the Gaussian; its FWHM is 2 sqrt(2 ln 2) sigma
+    tail_s    time constant of the decay, as of the carriers that diffuse into a SPAD's junction; 0 for none
+    """
+
+    sigma_s: float = REFERENCE_PULSE_SIGMA_S
+    tail_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        good = math.isfinite(self.sigma_s) and 0 < self.sigma_s < 1e-3
+        require(good, f"pulse sigma {self.sigma_s:g} s is outside (0, 1e-3)")
+        good = math.isfinite(self.tail_s) and 0 <= self.tail_s < 1e-3
+        require(good, f"pulse tail {self.tail_s:g} s is outside [0, 1e-3)")
+
+    @property
+    def fwhm_s(self) -> float:
+        """Full width at half maximum of the Gaussian part."""
+        return 2 * math.sqrt(2 * math.log(2)) * self.sigma_s
+
+    @property
+    def reach_s(self) -> float:
+        """Half the window outside which the pulse holds less than 1e-11 of its area."""
+        return max(self.window_s(7))
+
+    @property
+    def std_s(self) -> float:
+        return math.hypot(self.sigma_s, self.tail_s)
+
+    def window_s(self, sigmas: float) -> tuple[float, float]:
+        """Time before and after the centroid outside which lies about what a Gaussian has beyond `sigmas`."""
+        decay = self.tail_s * sigmas**2 / 2  # exp(-sigmas^2 / 2) is left
+        return sigmas * self.sigma_s + self.tail_s, sigmas * self.sigma_s + decay
+
+    def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        """Delays of `size` detections after their arrival [s]."""
+        delay = rng.standard_normal(size) * self.sigma_s
+        return delay + (rng.standard_exponential(size) - 1) * self.tail_s if self.tail_s else delay
+
+    def shares(self, edges_s: np.ndarray) -> np.ndarray:
+        """Share of the pulse between neighbouring edges: (n + 1,) -> (n,) float64."""
+        x = edges_s + self.tail_s
+        arrived = ndtr(x / self.sigma_s)
+        if self.tail_s:
+            arrived = arrived - _decayed(x, self.sigma_s, self.tail_s)
+        return np.clip(np.diff(arrived), 0, None)
+
+
+def _decayed(x: np.ndarray, sigma: float, tail: float) -> np.ndarray:
+    """exp(s^2 / 2 tau^2 - x / tau) Phi(x / s - s / tau) where the exponent cannot overflow: below, Phi itself is 0."""
+    exponent = sigma**2 / (2 * tail**2) - x / tail
+    return np.where(exponent < 500, np.exp(np.minimum(exponent, 500)), 0) * (
+        0.5 * erfc((sigma / tail - x / sigma) / math.sqrt(2))
+    )
+
+
+@dataclass(frozen=True)
+class SampledPulse:
+    """A measured pulse: `samples` counts (any scale) in steps of `sample_s`, uniform within each step.
+
+    Its own rate is kept: bins of any width integrate it exactly.
+    """
+
+    samples: tuple[float, ...]
+    sample_s: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "samples", tuple(float(value) for value in self.samples))
+        count = len(self.samples)
+        require(1 <= count <= MOST_SAMPLES, f"measured pulse: {count} samples, expected 1 to {MOST_SAMPLES}")
+        good = all(math.isfinite(value) and value >= 0 for value in self.samples) and sum(self.samples) > 0
+        require(good, "measured pulse: samples must be finite, 0 or more, and not all 0")
+        good = math.isfinite(self.sample_s) and 0 < self.sample_s < 1e-3
+        require(good, f"measured pulse: sample step {self.sample_s:g} s is outside (0, 1e-3)")
+        object.__setattr__(self, "_hash", hash((self.samples, self.sample_s)))
+
+    def __hash__(self) -> int:  # computed once: a sensor is looked up in a cache by every estimator
+        return self._hash
+
+    @property
+    def reach_s(self) -> float:
+        """Half the window outside which the pulse is zero."""
+        return max(self.window_s(math.inf))
+
+    @property
+    def std_s(self) -> float:
+        table = pulse_table(self)
+        centres = (table.edges_s[1:] + table.edges_s[:-1]) / 2
+        return math.sqrt(float(table.share @ centres**2) + self.sample_s**2 / 12)
+
+    def window_s(self, sigmas: float) -> tuple[float, float]:
+        """Time before and after the centroid outside which lies at most what a Gaussian has beyond `sigmas`."""
+        table = pulse_table(self)
+        outside = float(ndtr(-sigmas))
+        first = int(np.searchsorted(table.arrived, outside, side="right")) - 1
+        last = int(np.searchsorted(table.arrived, 1 - outside, side="left"))
+        return max(0.0, -float(table.edges_s[first])), max(0.0, float(table.edges_s[min(last, len(self.samples))]))
+
+    def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
+        """Delays of `size` detections after their arrival [s], by the inverse of the CDF."""
+        table = pulse_table(self)
+        return np.interp(rng.random(size), table.arrived, table.edges_s)
+
+    def shares(self, edges_s: np.ndarray) -> np.ndarray:
+        """Share of the pulse between neighbouring edges: (n + 1,) -> (n,) float64."""
+        table = pulse_table(self)
+        return np.diff(np.interp(edges_s, table.edges_s, table.arrived))
+
+
+AnyPulse = Pulse | SampledPulse
+
+
+class PulseTable(NamedTuple):
+    """A measured pulse centred and integrated: n steps between n + 1 edges."""
+
+    edges_s: np.ndarray  # (n + 1,) after the centroid
+    share: np.ndarray  # (n,) of each step, sums to 1
+    arrived: np.ndarray  # (n + 1,) CDF at the edges, 0 to 1
+    integral_s: np.ndarray  # (n + 1,) the CDF's integral up to the edges
+
+
+@lru_cache(maxsize=64)
+def pulse_table(pulse: SampledPulse) -> PulseTable:
+    """Centred edges, shares, CDF (linear within a step) and its integral (quadratic within a step)."""
+    share = np.asarray(pulse.samples)
+    share = share / share.sum()
+    centroid = float(share @ (np.arange(len(share)) + 0.5))
+    edges = (np.arange(len(share) + 1) - centroid) * pulse.sample_s
+    arrived = np.concatenate(([0.0], np.cumsum(share)))
+    arrived /= arrived[-1]
+    steps = (arrived[1:] + arrived[:-1]) / 2 * pulse.sample_s
+    return PulseTable(edges, share, arrived, np.concatenate(([0.0], np.cumsum(steps))))
+
+
+@lru_cache(maxsize=64)
+def convolved(pulse: AnyPulse, kernel: AnyPulse | None) -> AnyPulse:
+    """The pulse blurred by a second kernel (timing jitter): exactly where both are Gaussian or one has a tail.
+
+    Otherwise as a table in steps of a sixteenth of the narrower one's standard deviation. Raises InputError where
+    that takes more than 65,536 steps.
+    """
+    if kernel is None:
+        return pulse
+    if isinstance(pulse, Pulse) and isinstance(kernel, Pulse) and not (pulse.tail_s and kernel.tail_s):
+        return Pulse(math.hypot(pulse.sigma_s, kernel.sigma_s), pulse.tail_s + kernel.tail_s)
+    step = min(pulse.std_s, kernel.std_s) / _STEPS_PER_STD
+    tables = []
+    for part in (pulse, kernel):
+        before, after = part.window_s(_TABLE_SIGMAS)
+        count = math.ceil(before / step) + math.ceil(after / step)
+        require(count <= MOST_SAMPLES, f"pulse and jitter differ too much in width ({part.std_s:g} s and the other)")
+        tables.append(part.shares((np.arange(count + 1) - math.ceil(before / step)) * step))
+    both = np.convolve(*tables)
+    require(len(both) <= MOST_SAMPLES, f"pulse and jitter together take {len(both)} steps of {step:g} s")
+    return SampledPulse(tuple(np.clip(both, 0, None).tolist()), step)
+
+
+def pulse_from_dict(values: dict | None) -> AnyPulse | None:
+    """The pulse that `dataclasses.asdict` made."""
+    if values is None:
+        return None
+    return SampledPulse(**values) if "samples" in values else Pulse(**values)
+
+
+def read_pulse(path: Path, sample_s: float) -> SampledPulse:
+    """A measured pulse from a .npy file of samples, one dimension, in steps of `sample_s`. InputError in one line.
+
+    A peak in the first or last hundredth of the samples means that they were recorded around a laser period: they are
+    rolled until their circular centroid is in the middle.
+    """
+    path = Path(path)
+    require(path.is_file(), f"{path}: file not found")
+    try:
+        samples = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: not a readable .npy file ({' '.join(str(error).split())[:80]})") from None
+    good = samples.ndim == 1 and samples.dtype.kind in "fiu"
+    require(good, f"{path}: {samples.dtype}{samples.shape}, expected one dimension of numbers")
+    samples = samples.astype(np.float64)
+    if len(samples) and not 0.01 <= samples.argmax() / len(samples) < 0.99:
+        turn = np.exp(2j * np.pi * np.arange(len(samples)) / len(samples))
+        centroid = np.angle(samples @ turn) / (2 * np.pi) * len(samples)
+        samples = np.roll(samples, len(samples) // 2 - round(float(centroid)))
+    try:
+        return SampledPulse(tuple(samples.tolist()), sample_s)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

@@ -1,0 +1,108 @@
+"""`Timestamps`: a SPAD's native output, the time bin of every detection, pixel after pixel. Needs no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scenes.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Timestamps:
+    """Time bins of an image's detections.
+
+    stamps    (N,) uint16, ascending within a pixel
+    offsets   (H*W + 1,) int64: the detections of pixel p are [offsets[p], offsets[p + 1])
+    bins      T; a stamp takes ceil(log2 T) bits, 10 for the reference sensor
+    meta      seed, plan: anything JSON holds
+    """
+
+    height: int
+    width: int
+    bins: int
+    stamps: np.ndarray
+    offsets: np.ndarray
+    meta: dict = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.stamps.dtype != np.uint16 or self.stamps.ndim != 1:
+            raise InputError(f"timestamps are {self.stamps.dtype}{self.stamps.shape}, expected uint16 (N,)")
+        if self.offsets.dtype != np.int64 or self.offsets.shape != (self.height * self.width + 1,):
+            raise InputError(
+                f"timestamp offsets are {self.offsets.dtype}{self.offsets.shape}, "
+                f"expected int64 ({self.height * self.width + 1},)"
+            )
+        whole = self.offsets[0] == 0 and self.offsets[-1] == len(self.stamps) and (np.diff(self.offsets) >= 0).all()
+        if not whole:
+            raise InputError(f"timestamp offsets must rise from 0 to the {len(self.stamps)} timestamps")
+        if len(self.stamps) and int(self.stamps.max()) >= self.bins:
+            raise InputError(f"timestamp {self.stamps.max()} is outside the {self.bins} bins")
+
+    @property
+    def bits(self) -> int:
+        """Bits of one stamp."""
+        return max(1, (self.bins - 1).bit_length())
+
+    def counts(self) -> np.ndarray:
+        """The dense form, (H, W, T) int32."""
+        return counts_from_timestamps(self.stamps, self.offsets, self.bins).reshape(self.height, self.width, self.bins)
+
+    @classmethod
+    def of_counts(cls, counts: np.ndarray, meta: dict | None = None) -> Timestamps:
+        """The sparse form of counts (H, W, T)."""
+        height, width, bins = counts.shape
+        stamps, offsets = timestamps_from_counts(counts)
+        return cls(height, width, bins, stamps, offsets, meta or {})
+
+    @classmethod
+    def merged(cls, parts: Iterable[Timestamps]) -> Timestamps:
+        """One exposure of several: the detections of all, ascending again in every pixel."""
+        parts = list(parts)
+        first = parts[0]
+        if any((p.height, p.width, p.bins) != (first.height, first.width, first.bins) for p in parts):
+            raise InputError("timestamps of different sizes cannot be merged")
+        places = np.sort(np.concatenate([part.places() for part in parts]))
+        return cls.of_places(places, first.height, first.width, first.bins, first.meta)
+
+    def places(self) -> np.ndarray:
+        """Pixel x T + bin of every detection, (N,) int64: its index in the flat dense form."""
+        pixel = np.repeat(np.arange(self.height * self.width), np.diff(self.offsets))
+        return pixel * self.bins + self.stamps
+
+    @classmethod
+    def of_places(cls, places: np.ndarray, height: int, width: int, bins: int, meta: dict) -> Timestamps:
+        """From ascending indices in the flat dense form."""
+        offsets = np.searchsorted(places, np.arange(height * width + 1) * bins)
+        return cls(height, width, bins, (places % bins).astype(np.uint16), offsets.astype(np.int64), meta)
+
+    def packed(self) -> np.ndarray:
+        """All stamps as one stream of `bits` bits each, most significant first, (ceil(N bits / 8),) uint8."""
+        shifts = np.arange(self.bits - 1, -1, -1, dtype=np.uint16)
+        return np.packbits(((self.stamps[:, None] >> shifts) & 1).astype(np.uint8))
+
+    def unpacked(self, stream: np.ndarray) -> Timestamps:
+        """These offsets with the stamps of a stream that `packed` made; InputError if it is too short."""
+        count = int(self.offsets[-1])
+        if len(stream) * 8 < count * self.bits:
+            raise InputError(f"{len(stream)} bytes hold fewer than {count} stamps of {self.bits} bits")
+        digits = np.unpackbits(stream, count=count * self.bits).reshape(count, self.bits)
+        stamps = digits @ (1 << np.arange(self.bits - 1, -1, -1, dtype=np.int64))
+        return Timestamps(self.height, self.width, self.bins, stamps.astype(np.uint16), self.offsets, self.meta)
+
+
+def counts_from_timestamps(stamps: np.ndarray, offsets: np.ndarray, bins: int) -> np.ndarray:
+    """Dense (pixels, T) int32 counts of sparse detections; the inverse of `timestamps_from_counts`."""
+    pixels = len(offsets) - 1
+    owner = np.repeat(np.arange(pixels), np.diff(offsets))
+    return np.bincount(owner * bins + stamps, minlength=pixels * bins).reshape(pixels, bins).astype(np.int32)
+
+
+def timestamps_from_counts(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Time bin of every detection of counts (..., T): (N,) uint16, ascending in a pixel, and (P + 1,) int64 offsets."""
+    flat = counts.reshape(-1, counts.shape[-1])
+    pixel, time_bin = np.nonzero(flat)
+    stamps = np.repeat(time_bin.astype(np.uint16), flat[pixel, time_bin])
+    return stamps, np.concatenate(([0], np.cumsum(flat.sum(axis=1, dtype=np.int64))))

@@ -1,0 +1,324 @@
+"""The laws of detection, by statistics whose tolerance comes from the sample size, and by a second route each."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from test_flux import transient_of
+
+from spad.detect import expected_in_pixel, sense, sense_timestamps, stream_timestamps
+from spad.laws import (
+    Detected,
+    add_crosstalk,
+    coates,
+    crosstalk_events,
+    first_of_each_cycle,
+    first_photon_counts,
+    first_photon_shares,
+    free_running_flux,
+    live_detections,
+)
+from spad.sensor import PhotonBudget, Pulse, Sensor
+from spad.timestamps import Timestamps
+
+REFERENCE = Sensor()
+SMALL = Sensor(name="small", bins=64)
+
+
+def sidak(alpha: float, tests: int) -> float:
+    """Level of each of `tests` tests that are `alpha` together."""
+    return 1 - (1 - alpha) ** (1 / tests)
+
+
+def same(pixels: int, *returns: tuple[float, float, float]):
+    """An image row whose pixels all see the same."""
+    transient = transient_of(*[list(returns)] * pixels)
+    return replace(transient, ambient=np.ones((1, pixels), np.float32))
+
+
+# Poisson
+
+
+@pytest.mark.parametrize("rate", [1e-6, 1e-3, 0.1, 1.0, 10.0, 1e3, 1e6])
+@pytest.mark.parametrize("dense_from", [0.0, 4.0])
+def test_poisson_dispersion(rate: float, dense_from: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`rate` detections a bin in 4000 pixels, photon by photon and bin by bin: mean and variance are the rate."""
+    monkeypatch.setattr("spad.exposure.DENSE_FROM", dense_from)
+    bins, pixels = (4, 4000) if rate < 1e5 else (1, 400)
+    if dense_from and rate > 100:
+        pytest.skip("more than 4 detections a bin are never drawn photon by photon")
+    sensor = Sensor(bins=bins, bin_width_s=1e-9)
+    counts = sense(same(pixels, (1.0, 1.0, 1.0)), sensor, PhotonBudget(0, rate * bins), seed=3, model="poisson").counts
+    counts = counts.astype(float)
+    number = counts.size
+    # sum of n is Poisson(number rate): 1e-4 two-sided, exact; (n - rate)^2 has mean rate, variance rate + 2 rate^2
+    total = counts.sum()
+    low, high = stats.poisson.ppf([5e-5, 1 - 5e-5], number * rate)
+    assert low <= total <= high
+    spread = ((counts - rate) ** 2).sum() - number * rate
+    assert abs(spread) < 4.5 * np.sqrt(number * (rate + 2 * rate**2)) + 1
+
+
+def test_photon_by_photon_and_bin_by_bin_are_one_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two routes to the Poisson law: totals of 3000 pixels in every bin, chi-square of homogeneity."""
+    pulse, jitter = Pulse(100e-12, 150e-12), Pulse(80e-12)
+    sensor = Sensor(bins=64, pulse=pulse, jitter=jitter)
+    scene, budget = same(3000, (0.3, 0.5, 1.0), (1.85, 1.85, 0.5)), PhotonBudget(8, 4)
+    by_photon = sense(scene, sensor, budget, seed=1, model="poisson").counts[0].sum(axis=0)
+    monkeypatch.setattr("spad.exposure.DENSE_FROM", 0.0)
+    by_bin = sense(scene, sensor, budget, seed=2, model="poisson").counts[0].sum(axis=0)
+    both = np.stack([by_photon, by_bin])
+    assert stats.chi2_contingency(both[:, both.sum(axis=0) > 20]).pvalue > 1e-3
+    expected = 3000 * expected_in_pixel(scene, sensor, budget, 0, 0)
+    for counts in both:
+        assert stats.chisquare(counts, expected * counts.sum() / expected.sum()).pvalue > 1e-3
+        assert abs(counts.sum() - expected.sum()) < 4 * np.sqrt(expected.sum())
+
+
+# First photon
+
+
+def by_hand(flux: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
+    """Cycle after cycle: photons are drawn in every bin, the first bin that has one is counted."""
+    counts = np.zeros(len(flux), dtype=int)
+    for _ in range(cycles):
+        fired = np.flatnonzero(rng.poisson(flux) > 0)
+        if len(fired):
+            counts[fired[0]] += 1
+    return counts
+
+
+@pytest.mark.parametrize("mean", [0.05, 1.0, 3.0])
+def test_first_photon_is_the_event_by_event_simulation(mean: float) -> None:
+    shape = np.full(64, 0.3 / 64)
+    shape[20:24] += np.array([0.1, 0.3, 0.2, 0.1])
+    flux, cycles = mean * shape / shape.sum(), 20000
+    rng = np.random.default_rng(5)
+    simulated = by_hand(flux, cycles, rng)
+    counts = first_photon_counts(flux[None], cycles, rng)[0]
+    shares = first_photon_shares(flux[None])[0]
+    assert shares.sum() == pytest.approx(1, abs=1e-12) and shares[-1] == pytest.approx(np.exp(-mean), rel=1e-12)
+    for drawn in (simulated, counts):
+        seen = np.append(drawn, cycles - drawn.sum())
+        assert stats.chisquare(seen, cycles * shares).pvalue > 1e-3
+    # the joint law is multinomial: a bin's variance over pixels is N p (1 - p), no Poisson variance
+    many = first_photon_counts(np.repeat(flux[None], 4000, axis=0), 200, rng)
+    variance = (200 * shares * (1 - shares))[:-1]
+    # a sample variance of n pixels has standard error sqrt((2 + kurtosis) / n), the bin's excess kurtosis 1 / (N p)
+    error = variance * np.sqrt((2 + 1 / np.maximum(variance, 1e-12)) / 4000)
+    assert (np.abs(many.var(axis=0) - variance) < stats.norm.isf(sidak(1e-3, 64) / 2) * error).all()
+
+
+@pytest.mark.parametrize("dense_from", [0.0, 1e9])
+def test_sense_draws_first_photons_by_either_route(dense_from: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("spad.exposure.DENSE_FROM", dense_from)
+    cycles = 500
+    sensor = replace(SMALL, exposure_s=cycles * SMALL.period_s)
+    scene, budget = same(600, (0.6, 0.7, 1.0)), PhotonBudget(600, 300)  # 1.8 detections a cycle
+    histogram = sense(scene, sensor, budget, seed=9)
+    assert histogram.meta["model"] == "first-photon" and "pile-up" in " ".join(histogram.meta["plan"])
+    shares = first_photon_shares(expected_in_pixel(scene, sensor, budget, 0, 0)[None] / cycles)[0]
+    counts = histogram.counts[0]
+    assert counts.sum(axis=1).max() <= cycles
+    totals = np.append(counts.sum(axis=0), 600 * cycles - counts.sum())
+    assert stats.chisquare(totals, 600 * cycles * shares / shares.sum()).pvalue > 1e-3
+    detected = 1 - shares[-1]
+    # binomial over cycles, not Poisson: the relative error of a variance over 600 pixels is sqrt(2 / 600)
+    assert counts.sum(axis=1).var() == pytest.approx(cycles * detected * (1 - detected), rel=4.5 * np.sqrt(2 / 600))
+
+
+@pytest.mark.parametrize("mean", [0.1, 1.0, 3.0])
+def test_coates_recovers_the_flux(mean: float) -> None:
+    """Within 4 standard errors, Sidak-corrected over the bins with at least 25 expected counts."""
+    shape = np.full(128, 0.5 / 128)
+    shape[40:48] += 0.5 / 8
+    flux, cycles, pixels = mean * shape, 200000, 40
+    counts = first_photon_counts(np.repeat(flux[None], pixels, axis=0), cycles, np.random.default_rng(8))
+    recovered = coates(torch.from_numpy(counts), cycles).numpy()
+    armed = cycles * np.exp(-(np.cumsum(flux) - flux))
+    kept = armed * (1 - np.exp(-flux)) >= 25
+    assert kept.sum() > 100
+    # mu = -ln(1 - q), q binomial over the armed cycles: var mu = q / ((1 - q) armed) = expm1(mu) / armed
+    error = np.sqrt(np.expm1(flux) / armed)
+    score = np.abs(recovered - flux)[:, kept] / error[kept]
+    together = 1 - (1 - 2 * stats.norm.sf(4)) ** kept.sum()  # what 4 standard errors leave in one pixel's bins
+    assert (score.max(axis=1) > 4).mean() <= together + 4 * np.sqrt(together / pixels)
+    assert score.max() < stats.norm.isf(sidak(1e-3, score.size) / 2) + 0.5
+    assert (score**2).mean() == pytest.approx(1, abs=5 * np.sqrt(2 / score.size))
+
+
+def test_coates_undoes_no_pile_up_at_low_flux_and_full_cycles() -> None:
+    counts = torch.tensor([[3.0, 0.0, 5.0]])
+    assert torch.allclose(coates(counts, 1e9), counts.double() / 1e9, rtol=1e-6)
+    full = coates(torch.tensor([[60.0, 40.0, 0.0]]), 100)
+    assert full[0, 0] == pytest.approx(np.log(100 / 40)) and full[0, 1] == pytest.approx(np.log(40 / 0.5))
+    assert full[0, 2] == 0
+
+
+# Dead time
+
+
+def slowly(times: np.ndarray, dead: float) -> np.ndarray:
+    """One photon after the other, the definition."""
+    kept, ready = [], -np.inf
+    for index in np.argsort(times, kind="stable"):
+        if times[index] >= ready:
+            kept.append(index)
+            ready = times[index] + dead
+    return np.array(kept, dtype=int)
+
+
+@pytest.mark.parametrize("dead", [0.0, 0.3, 5.0, 300.0])
+def test_dead_time_photon_by_photon(dead: float) -> None:
+    rng = np.random.default_rng(2)
+    pixel, time = rng.integers(0, 7, 3000), rng.uniform(0, 1000, 3000)
+    ready = np.zeros(7)
+    kept = live_detections(pixel, time, dead, ready)
+    for number in range(7):
+        own = np.flatnonzero(pixel == number)
+        assert (np.sort(kept[pixel[kept] == number]) == np.sort(own[slowly(time[own], dead)])).all()
+        assert ready[number] == time[kept[pixel[kept] == number]].max() + dead
+    # in two parts, the second armed when the first says
+    ready, parts = np.zeros(7), []
+    for part in (np.flatnonzero(time < 500), np.flatnonzero(time >= 500)):
+        parts.append(part[live_detections(pixel[part], time[part], dead, ready)])
+    assert (np.sort(np.concatenate(parts)) == np.sort(kept)).all()
+
+
+@pytest.mark.parametrize("tau_periods", [0.05, 0.7, 2.5])
+def test_dead_time_rate(tau_periods: float) -> None:
+    """m = r / (1 + r tau) within 0.5 % at homogeneous flux and 1e6 detections."""
+    per_cycle, cycles, pixels = 0.8, 4000, 600
+    sensor = Sensor(
+        bins=64, reset="free-running", dead_time_s=tau_periods * SMALL.period_s, exposure_s=cycles * SMALL.period_s
+    )
+    histogram = sense(same(pixels, (0.5, 0.5, 1.0)), sensor, PhotonBudget(0, per_cycle * cycles), seed=4)
+    assert histogram.meta["model"] == "free-running"
+    expected = per_cycle / (1 + per_cycle * tau_periods)
+    detected = histogram.counts.sum() / (pixels * cycles)
+    assert histogram.counts.sum() > 6e5
+    # armed at the start of each pixel's exposure: (r tau)^2 / 2 (1 + r tau)^2 detections more a pixel, 1e-4 here
+    assert detected == pytest.approx(expected, rel=5e-3)
+    # a renewal process: the count's variance is m / (1 + r tau)^2 a unit of time
+    variance = expected * cycles / (1 + per_cycle * tau_periods) ** 2
+    assert histogram.counts.sum(axis=(0, 2)).var() == pytest.approx(variance, rel=5 * np.sqrt(2 / pixels))
+
+
+@pytest.mark.parametrize("tau_periods", [0.004, 0.3, 1.7])
+def test_free_running_correction_recovers_the_flux(tau_periods: float) -> None:
+    cycles, pixels = 3000, 500
+    sensor = Sensor(
+        bins=64, reset="free-running", dead_time_s=tau_periods * SMALL.period_s, exposure_s=cycles * SMALL.period_s
+    )
+    scene, budget = same(pixels, (0.6, 0.7, 1.0)), PhotonBudget(0.6 * cycles, 0.3 * cycles)
+    counts = sense(scene, sensor, budget, seed=6, model="free-running").counts[0].sum(axis=0)
+    flux = expected_in_pixel(scene, sensor, budget, 0, 0) / cycles
+    recovered = free_running_flux(torch.from_numpy(counts), cycles * pixels, sensor).numpy()
+    fullest = counts > 0.2 * counts.max()
+    # counting errors, and 0.5 % for photons that are not uniform within their bin
+    error = np.sqrt(1 / counts[fullest]) * 4.5 + 5e-3
+    assert (np.abs(recovered[fullest] / flux[fullest] - 1) < error).all()
+    raw = counts[fullest] / (cycles * pixels)
+    if tau_periods > 0.1:
+        assert np.abs(raw / flux[fullest] - 1).max() > 0.2, "there was something to correct"
+
+
+# Crosstalk
+
+
+def test_crosstalk_rate_and_where_it_goes() -> None:
+    rng = np.random.default_rng(1)
+    share, height, width = 0.02, 40, 50
+    pixel = rng.integers(0, height * width, 200000)
+    cause, fired = crosstalk_events(pixel, share, height, width, rng)
+    rows, columns = np.divmod(pixel, width)
+    neighbours = 4 - (rows == 0) - (rows == height - 1) - (columns == 0) - (columns == width - 1)
+    expected = share * neighbours.sum()
+    assert abs(len(fired) - expected) < 4 * np.sqrt(expected)
+    apart = np.abs(np.stack(np.divmod(fired, width)) - np.stack(np.divmod(pixel[cause], width))).sum(axis=0)
+    assert (apart == 1).all()
+
+
+@pytest.mark.parametrize("model", ["poisson", "first-photon", "free-running"])
+def test_crosstalk_correlates_neighbours_only(model: str) -> None:
+    share, cycles = 0.05, 2000
+    sensor = Sensor(bins=4, bin_width_s=1e-9, crosstalk=share, exposure_s=cycles * 4e-9, dead_time_s=1e-9)
+    side = 64
+    flat = replace(
+        same(side * side, (0.3, 0.3, 1.0)),
+        height=side,
+        width=side,
+        **{
+            name: np.zeros((side, side, *tail), dtype)
+            for name, tail, dtype in (
+                ("normal", (3,), np.float16),
+                ("albedo", (), np.float16),
+                ("mixed", (), bool),
+                ("error", (), np.float32),
+                ("depth_m", (), np.float32),
+            )
+        },
+        ambient=np.ones((side, side), np.float32),
+    )
+    counts = sense(flat, sensor, PhotonBudget(0, 20), seed=3, model=model).counts.sum(axis=2).astype(float)
+    inner = counts[1:-1, 1:-1]
+    mean = 20 * (1 + 4 * share)
+    assert inner.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(mean * (1 + 8 * share) / inner.size) + 0.15)
+    spread = counts - counts.mean()
+    near, far = (spread[:, :-1] * spread[:, 1:]).mean(), (spread[:, :-5] * spread[:, 5:]).mean()
+    # each detection adds p to either neighbour: covariance 2 p n to first order
+    error = 4.5 * mean / np.sqrt(counts.size)
+    assert near == pytest.approx(2 * share * 20, abs=error + 0.2) and abs(far) < error and near > error
+
+
+def test_crosstalk_of_counts_is_binomial() -> None:
+    counts = np.zeros((3, 3, 2), np.int32)
+    counts[1, 1, 0] = 100000
+    add_crosstalk(counts, 0.01, np.random.default_rng(2))
+    around = counts[[0, 2, 1, 1], [1, 1, 0, 2], 0]
+    assert (np.abs(around - 1000) < 4.5 * np.sqrt(990)).all()
+    assert counts[1, 1, 0] == 100000 and counts[..., 1].sum() == 0 and counts[::2, ::2].sum() == 0
+
+
+def test_first_of_each_cycle_keeps_the_earliest() -> None:
+    events = Detected(np.array([1, 0, 1, 1, 0]), np.array([3, 0, 3, 4, 0]), np.array([9, 5, 2, 7, 5]))
+    first = first_of_each_cycle(events, SMALL)
+    assert [tuple(map(int, event)) for event in zip(*first, strict=True)] == [(0, 0, 5), (1, 3, 2), (1, 4, 7)]
+
+
+# Forms
+
+
+@pytest.mark.parametrize(
+    ("model", "signal"), [("poisson", 30), ("poisson", 1e4), ("first-photon", 30), ("free-running", 30)]
+)
+@pytest.mark.parametrize("crosstalk", [0.0, 0.01])
+def test_timestamps_and_histogram_are_one_draw(model: str, signal: float, crosstalk: float) -> None:
+    sensor = replace(REFERENCE, crosstalk=crosstalk, dead_time_s=2e-8)
+    scene, budget = same(1500, (4.0, 4.1, 1.0)), PhotonBudget(signal, 20)
+    stamps = sense_timestamps(scene, sensor, budget, seed=2, model=model)
+    counts = sense(scene, sensor, budget, seed=2, model=model).counts
+    assert (stamps.counts() == counts).all() and stamps.bits == 10 == sensor.timestamp_bits
+    again = Timestamps.of_counts(counts)
+    assert (again.stamps == stamps.stamps).all() and (again.offsets == stamps.offsets).all()
+    assert (stamps.unpacked(stamps.packed()).stamps == stamps.stamps).all()
+    assert len(stamps.packed()) == -(-len(stamps.stamps) * 10 // 8)
+
+
+@pytest.mark.parametrize("model", ["poisson", "first-photon", "free-running"])
+def test_parts_of_an_exposure_are_the_exposure(model: str) -> None:
+    cycles = 400
+    sensor = replace(SMALL, exposure_s=cycles * SMALL.period_s, dead_time_s=2.2 * SMALL.period_s)
+    if model == "first-photon":
+        sensor = replace(sensor, dead_time_s=0.0)
+    scene, budget = same(400, (0.5, 0.6, 1.0)), PhotonBudget(0.5 * cycles, 0.3 * cycles)
+    parts = list(stream_timestamps(scene, sensor, budget, parts=40, seed=1, model=model))
+    assert len(parts) == 40 and len({part.stamps.tobytes() for part in parts}) == 40
+    merged = Timestamps.merged(parts).counts()[0]
+    whole = sense(scene, sensor, budget, seed=1, model=model).counts[0]
+    both = np.stack([merged.sum(axis=0), whole.sum(axis=0)])
+    assert stats.chi2_contingency(both[:, both.sum(axis=0) > 20]).pvalue > 1e-3
+    # forgetting the dead time at 40 seams would add 0.5 tau's worth of detections at each: 10 % here
+    assert both.sum(axis=1)[0] == pytest.approx(both.sum(axis=1)[1], rel=5 * np.sqrt(2 / both[1].sum()))
