@@ -23,12 +23,15 @@ SCENES: dict[str, str] = {
 }
 EXTENSIONS = (*MESH_EXTENSIONS, ".xml")
 HARD = "hard-cases/"
+FAMILIES = (HARD, "tabletop/", "middlebury/", "rooms/")
 WIDTH, HEIGHT = 128, 96  # pixels, where neither the caller nor the file says
 
 
 def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
-    """The scene of that name (a key of SCENES, or `hard-cases/NAME`) or in that file (.obj .ply .stl .glb, or
-    Mitsuba .xml).
+    """The scene of that name, or in that file (.obj .ply .stl .glb, or Mitsuba .xml).
+
+    Names: a key of SCENES, `hard-cases/NAME`, `tabletop/NAME`, `middlebury/NAME`, `rooms/SPLIT/NUMBER`; a folder with
+    view1.png, disp1.png and dmin.txt is a Middlebury scene too.
 
     width, height: pixels; None is 128 x 96, or the film size of an .xml; one alone keeps the proportions. The seed
     matters to procedural scenes only. Raises InputError in one line for an unknown name or extension, or a bad file.
@@ -37,9 +40,17 @@ def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: in
     kind = Path(spec).suffix.lower()
     if spec.startswith(HARD):
         return _hard_case(spec.removeprefix(HARD), width, height)
+    if spec.startswith(FAMILIES[1:]) and not Path(spec).exists():
+        return _of_a_set(spec, seed, width, height)
+    if (Path(spec) / "disp1.png").is_file():
+        from scenes.relief import middlebury
+
+        return middlebury(Path(spec), width=width or (None if height else WIDTH), height=height)
     if spec not in SCENES and kind not in EXTENSIONS:
+        families = ", ".join(f"{family}NAME" for family in FAMILIES)
         raise InputError(
-            f"scene {spec!r}: expected one of {', '.join(SCENES)}, or a file with extension {' '.join(EXTENSIONS)}"
+            f"scene {spec!r}: expected one of {', '.join(SCENES)}, {families}, "
+            f"or a file with extension {' '.join(EXTENSIONS)}"
         )
     if kind == ".xml":
         from scenes.mitsuba_xml import load_mitsuba_xml
@@ -52,6 +63,27 @@ def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: in
         return living_room(seed, width=size.width, height=size.height)
     make = {"plane": _plane, "sphere": _sphere, "corner": _corner}[spec]
     return Scene(spec, make(), size)
+
+
+def _of_a_set(spec: str, seed: int, width: int | None, height: int | None) -> Scene:
+    """A scene by the name that its set gives it: `rooms/train/17`, `tabletop/spikes`, `middlebury/Art`."""
+    from scenes.relief import middlebury, middlebury_folder
+    from scenes.sets import scene_set
+    from scenes.tabletop import SCENES as TABLETOP
+    from scenes.tabletop import tabletop
+
+    family, _, name = spec.partition("/")
+    if family == "middlebury":
+        return middlebury(middlebury_folder(name), width=width or (None if height else WIDTH), height=height)
+    if family == "tabletop":
+        if name not in TABLETOP:
+            raise InputError(f"scene {spec!r}: expected tabletop/ and one of {', '.join(TABLETOP)}")
+        scene = tabletop(name)
+        return replace(scene, camera=scene.camera.resized(width, height))
+    split, _, number = name.partition("/")
+    if not number.isdecimal():
+        raise InputError(f"scene {spec!r}: expected rooms/train, rooms/val or rooms/test, / and the number of a view")
+    return scene_set(f"rooms/{split}").view(int(number), seed=seed, width=width, height=height)
 
 
 def _hard_case(name: str, width: int | None, height: int | None) -> Scene:

@@ -2,14 +2,12 @@
 
 The room lies around the origin with the floor at y = 0; the camera looks along -z, turned left towards the
 far corner. Every piece of furniture is a small function that builds it around its own origin, standing on y = 0 with
-its front towards +z; `_placed` turns it and sets it down. Lengths are metres.
+its front towards +z; `placed` turns it and sets it down. Lengths are metres.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from itertools import pairwise
 from numbers import Integral
 
@@ -18,6 +16,8 @@ import numpy as np
 from scenes import shapes
 from scenes.errors import InputError
 from scenes.model import Camera, Material, Scene, Surface, Texture
+from scenes.parts import Palette, Random, box, joined, panel, placed, post, smooth_normals
+from scenes.patterns import grain, landscape, mottled, planks, rug_pattern
 
 LOW, HIGH = np.array((-2.05, 0.0, -3.2)), np.array((1.85, 2.5, 3.0))  # the room's corners
 TILE_M = 2.0  # edge of the square that one floor or wall texture covers
@@ -28,10 +28,6 @@ RUG_M = 0.012  # thickness of the rug
 # 0.25 m^2 of cloth is 600 to 1,200 cd/m^2, about 0.01 to 0.02.
 WINDOW_RADIANCE = 0.05
 LAMP_RADIANCE = 0.02
-
-Random = np.random.Generator
-Vector = Sequence[float]
-Palette = dict[str, Material]  # one object per paint, cloth or wood, shared by all that is made of it
 
 
 def living_room(seed: int = 0, *, width: int = 128, height: int = 96) -> Scene:
@@ -55,63 +51,15 @@ def _streams(seed: int) -> Callable[[str], Random]:
     return lambda name: np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=(purposes.index(name),)))
 
 
-def _box(low: Vector, high: Vector) -> shapes.Shape:
-    """An axis-aligned box between two corners."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    vertices, faces, uv = shapes.box(high - low)
-    return vertices + (low + high) / 2, faces, uv
-
-
-def _post(x: float, z: float, half: float, bottom: float, top: float) -> shapes.Shape:
-    """An upright square post around (x, z)."""
-    return _box((x - half, bottom, z - half), (x + half, top, z + half))
-
-
-def _panel(centre: Vector, half_right: Vector, half_up: Vector, tile_m: float | None = None) -> shapes.Shape:
-    """A rectangle seen from the side where its first half edge points right and its second up.
-
-    Its texture fills it once, or repeats every `tile_m` metres.
-    """
-    right, up = np.asarray(half_right, float), np.asarray(half_up, float)
-    square, faces, uv = shapes.rectangle()
-    if tile_m is not None:
-        uv = uv * (2 * np.linalg.norm(right) / tile_m, 2 * np.linalg.norm(up) / tile_m)
-    return np.asarray(centre, float) + square[:, :1] * right + square[:, 1:2] * up, faces, uv
-
-
-def _surface(name: str, material: Material, *parts: shapes.Shape, emission: float = 0.0) -> Surface:
-    """Several shapes as one surface."""
-    starts = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts[:-1]])
-    return Surface(
-        np.concatenate([vertices for vertices, _, _ in parts]),
-        np.concatenate([faces + start for start, (_, faces, _) in zip(starts, parts, strict=True)]),
-        material,
-        uv=np.concatenate([uv for _, _, uv in parts]),
-        emission=emission,
-        name=name,
-    )
-
-
-def _placed(surfaces: list[Surface], x: float, z: float, *, y: float = 0.0, turn_deg: float = 0.0) -> list[Surface]:
-    """A piece of furniture turned about the vertical (positive: its front from +z towards +x) and set down."""
-    c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
-    pose = np.array(((c, 0, s, x), (0, 1, 0, y), (-s, 0, c, z), (0, 0, 0, 1)))
-    moved = []
-    for surface in surfaces:
-        normals = None if surface.normals is None else shapes.transform_normals(surface.normals, pose)
-        moved.append(replace(surface, vertices=shapes.transform(surface.vertices, pose), normals=normals))
-    return moved
-
-
 def room(palette: Palette) -> list[Surface]:
     """Floor, ceiling and four walls, all facing inwards."""
     x, y, z = np.diag((HIGH - LOW) / 2)
     centre = (LOW + HIGH) / 2
     walls = ((-z, x), (z, -x), (-x, -z), (x, z))
     return [
-        _surface("floor", palette["oak planks"], _panel(centre - y, x, -z, TILE_M)),
-        _surface("ceiling", palette["ceiling paint"], _panel(centre + y, x, z)),
-        _surface("walls", palette["plaster"], *(_panel(centre + out, right, y, TILE_M) for out, right in walls)),
+        joined("floor", palette["oak planks"], panel(centre - y, x, -z, TILE_M)),
+        joined("ceiling", palette["ceiling paint"], panel(centre + y, x, z)),
+        joined("walls", palette["plaster"], *(panel(centre + out, right, y, TILE_M) for out, right in walls)),
     ]
 
 
@@ -120,23 +68,23 @@ def window(palette: Palette, width: float = 1.3, height: float = 1.15) -> list[S
     left, right, bottom, top = -0.45 - width / 2, -0.45 + width / 2, 0.95, 0.95 + height
     x, y, z, bar = (left + right) / 2, (bottom + top) / 2, LOW[2], 0.05
     frame = (
-        _box((left - bar, bottom, z), (left, top, z + 0.05)),
-        _box((right, bottom, z), (right + bar, top, z + 0.05)),
-        _box((left - bar, top, z), (right + bar, top + bar, z + 0.05)),
-        _box((left - 0.1, bottom - bar, z), (right + 0.1, bottom, z + 0.12)),
-        _box((x - 0.02, bottom, z), (x + 0.02, top, z + 0.04)),
-        _box((left, y - 0.02, z), (x - 0.02, y + 0.02, z + 0.04)),
-        _box((x + 0.02, y - 0.02, z), (right, y + 0.02, z + 0.04)),
+        box((left - bar, bottom, z), (left, top, z + 0.05)),
+        box((right, bottom, z), (right + bar, top, z + 0.05)),
+        box((left - bar, top, z), (right + bar, top + bar, z + 0.05)),
+        box((left - 0.1, bottom - bar, z), (right + 0.1, bottom, z + 0.12)),
+        box((x - 0.02, bottom, z), (x + 0.02, top, z + 0.04)),
+        box((left, y - 0.02, z), (x - 0.02, y + 0.02, z + 0.04)),
+        box((x + 0.02, y - 0.02, z), (right, y + 0.02, z + 0.04)),
     )
     half = ((width / 2 - 0.02) / 2, 0, 0), (0, (height / 2 - 0.02) / 2, 0)
     panes = (
-        _panel((sx, sy, z + 0.02), *half)
+        panel((sx, sy, z + 0.02), *half)
         for sx in ((left + x - 0.02) / 2, (right + x + 0.02) / 2)
         for sy in ((bottom + y - 0.02) / 2, (top + y + 0.02) / 2)
     )
     return [
-        _surface("window: frame", palette["white paint"], *frame),
-        _surface("window: panes", palette["white paint"], *panes, emission=WINDOW_RADIANCE),
+        joined("window: frame", palette["white paint"], *frame),
+        joined("window: panes", palette["white paint"], *panes, emission=WINDOW_RADIANCE),
     ]
 
 
@@ -149,28 +97,28 @@ def furniture(palette: Palette, places: Random, books: Random, form: Random) -> 
     left, back = LOW[0], LOW[2]
     table_x, table_z, radius = near(-0.1, 0.08), near(0.2, 0.1), near(0.16, 0.04)
     table_turn, table_top = near(0, 5), 0.74
-    pieces = _placed(bookshelf(palette, books), left, near(0.45, 0.1), turn_deg=90)
-    pieces += _placed(sofa(palette, 1.7, palette["sofa cloth"]), left + 0.03, near(-1.65, 0.08), turn_deg=90)
-    pieces += _placed(picture(palette), left, near(-1.6, 0.1), y=near(1.15, 0.05), turn_deg=90)
-    pieces += _placed(sofa(palette, 0.95, palette["leather"]), near(0.0, 0.12), back + 0.15, turn_deg=near(0, 3))
-    pieces += _placed(floor_lamp(palette), near(-1.05, 0.06), near(-0.45, 0.08))
-    pieces += _placed(rug(palette), -1.23, near(0.6, 0.05))
-    pieces += _placed(ball(palette, radius), near(-1.15, 0.1), near(0.45, 0.15), y=RUG_M)
-    pieces += _placed(table(palette, table_top), table_x, table_z, turn_deg=table_turn)
-    pieces += _placed(sculpture(palette, form), table_x + near(-0.2, 0.08), table_z + near(-0.05, 0.06), y=table_top)
-    pieces += _placed(chair(palette), near(-0.12, 0.06), near(1.22, 0.02), turn_deg=180 + near(0, 8))
+    pieces = placed(bookshelf(palette, books), left, near(0.45, 0.1), turn_deg=90)
+    pieces += placed(sofa(palette, 1.7, palette["sofa cloth"]), left + 0.03, near(-1.65, 0.08), turn_deg=90)
+    pieces += placed(picture(palette), left, near(-1.6, 0.1), y=near(1.15, 0.05), turn_deg=90)
+    pieces += placed(sofa(palette, 0.95, palette["leather"]), near(0.0, 0.12), back + 0.15, turn_deg=near(0, 3))
+    pieces += placed(floor_lamp(palette), near(-1.05, 0.06), near(-0.45, 0.08))
+    pieces += placed(rug(palette), -1.23, near(0.6, 0.05))
+    pieces += placed(ball(palette, radius), near(-1.15, 0.1), near(0.45, 0.15), y=RUG_M)
+    pieces += placed(table(palette, table_top), table_x, table_z, turn_deg=table_turn)
+    pieces += placed(sculpture(palette, form), table_x + near(-0.2, 0.08), table_z + near(-0.05, 0.06), y=table_top)
+    pieces += placed(chair(palette), near(-0.12, 0.06), near(1.22, 0.02), turn_deg=180 + near(0, 8))
     return pieces
 
 
 def table(palette: Palette, top: float, width: float = 1.05, depth: float = 0.75) -> list[Surface]:
     """A varnished board with an apron on four square legs."""
     x, z, leg, board = width / 2 - 0.07, depth / 2 - 0.07, 0.0275, top - 0.03
-    plate = _box((-width / 2, board, -depth / 2), (width / 2, top, depth / 2))
-    legs = [_post(sx, sz, leg, 0, board) for sx in (-x, x) for sz in (-z, z)]
-    rails = [_box((leg - x, board - 0.08, sz - 0.01), (x - leg, board, sz + 0.01)) for sz in (-z, z)]
+    plate = box((-width / 2, board, -depth / 2), (width / 2, top, depth / 2))
+    legs = [post(sx, sz, leg, 0, board) for sx in (-x, x) for sz in (-z, z)]
+    rails = [box((leg - x, board - 0.08, sz - 0.01), (x - leg, board, sz + 0.01)) for sz in (-z, z)]
     return [
-        _surface("table: board", palette["varnished wood"], plate),
-        _surface("table: legs", palette["wood"], *legs, *rails),
+        joined("table: board", palette["varnished wood"], plate),
+        joined("table: legs", palette["wood"], *legs, *rails),
     ]
 
 
@@ -178,17 +126,17 @@ def chair(palette: Palette, seat: float = 0.45, top: float = 1.0) -> list[Surfac
     """A wooden chair whose back (at -z) has upright slats between two rails."""
     half, post = 0.21, 0.032
     inner = half - post
-    posts = [_box((-half, 0, -half), (-inner, top, -inner)), _box((inner, 0, -half), (half, top, -inner))]
-    legs = [_box((x, 0, inner), (x + post, seat - 0.03, half)) for x in (-half, inner)]
-    rails = [_box((-inner, y - 0.05, -half), (inner, y, -half + 0.022)) for y in (top - 0.005, seat + 0.16)]
+    posts = [box((-half, 0, -half), (-inner, top, -inner)), box((inner, 0, -half), (half, top, -inner))]
+    legs = [box((x, 0, inner), (x + post, seat - 0.03, half)) for x in (-half, inner)]
+    rails = [box((-inner, y - 0.05, -half), (inner, y, -half + 0.022)) for y in (top - 0.005, seat + 0.16)]
     slats = [
-        _box((x - 0.014, seat + 0.16, -half + 0.004), (x + 0.014, top - 0.055, -half + 0.018))
+        box((x - 0.014, seat + 0.16, -half + 0.004), (x + 0.014, top - 0.055, -half + 0.018))
         for x in np.linspace(-inner, inner, 7)[1:-1]
     ]
-    cushion = _box((-half, seat - 0.03, -inner), (half, seat, half))
+    cushion = box((-half, seat - 0.03, -inner), (half, seat, half))
     return [
-        _surface("chair: frame", palette["wood"], *posts, *legs, *rails, *slats),
-        _surface("chair: seat", palette["varnished wood"], cushion),
+        joined("chair: frame", palette["wood"], *posts, *legs, *rails, *slats),
+        joined("chair: seat", palette["varnished wood"], cushion),
     ]
 
 
@@ -198,18 +146,18 @@ def sofa(palette: Palette, width: float, cover: Material, depth: float = 0.82) -
     name = "sofa" if seats > 1 else "armchair"
     x, arm, foot, base, seat = width / 2, 0.18, 0.09, 0.28, 0.44
     body = (
-        _box((-x, foot, 0), (x, base, depth)),
-        _box((-x, base, 0), (arm - x, 0.6, depth)),
-        _box((x - arm, base, 0), (x, 0.6, depth)),
-        _box((arm - x, base, 0), (x - arm, 0.84, 0.2)),
+        box((-x, foot, 0), (x, base, depth)),
+        box((-x, base, 0), (arm - x, 0.6, depth)),
+        box((x - arm, base, 0), (x, 0.6, depth)),
+        box((arm - x, base, 0), (x - arm, 0.84, 0.2)),
     )
     edges = np.linspace(arm - x, x - arm, seats + 1)
-    cushions = [_box((a + 0.005, base, 0.2), (b - 0.005, seat, depth + 0.02)) for a, b in pairwise(edges)]
-    feet = [_post(sx, sz, 0.03, 0, foot) for sx in (0.1 - x, x - 0.1) for sz in (0.1, depth - 0.1)]
+    cushions = [box((a + 0.005, base, 0.2), (b - 0.005, seat, depth + 0.02)) for a, b in pairwise(edges)]
+    feet = [post(sx, sz, 0.03, 0, foot) for sx in (0.1 - x, x - 0.1) for sz in (0.1, depth - 0.1)]
     return [
-        _surface(f"{name}: body", cover, *body),
-        _surface(f"{name}: cushions", palette["cushion cloth"], *cushions),
-        _surface(f"{name}: feet", palette["wood"], *feet),
+        joined(f"{name}: body", cover, *body),
+        joined(f"{name}: cushions", palette["cushion cloth"], *cushions),
+        joined(f"{name}: feet", palette["wood"], *feet),
     ]
 
 
@@ -218,22 +166,22 @@ def bookshelf(palette: Palette, rng: Random, width: float = 1.5, height: float =
     depth, board, x = 0.28, 0.025, width / 2
     floors = np.linspace(0.06, height - board, 6)
     case = [
-        _box((-x, 0, 0), (board - x, height, depth)),
-        _box((x - board, 0, 0), (x, height, depth)),
-        _box((board - x, 0.06, 0), (x - board, height, 0.012)),
+        box((-x, 0, 0), (board - x, height, depth)),
+        box((x - board, 0, 0), (x, height, depth)),
+        box((board - x, 0.06, 0), (x - board, height, 0.012)),
     ]
-    case += [_box((board - x, y, 0.012), (x - board, y + board, depth - 0.005)) for y in floors]
+    case += [box((board - x, y, 0.012), (x - board, y + board, depth - 0.005)) for y in floors]
     covers = [material for name, material in palette.items() if name.startswith("book cover")]
     books: list[list[shapes.Shape]] = [[] for _ in covers]
     for y in floors[:-1] + board:
         at, end = board - x + 0.004, (x - board) - rng.uniform(0.0, 0.5)
         while at + 0.06 < end:
             thick, tall, deep = rng.uniform((0.018, 0.2, 0.13), (0.055, 0.32, 0.2))
-            books[rng.integers(len(books))].append(_box((at, y, 0.02), (at + thick, y + tall, 0.02 + deep)))
+            books[rng.integers(len(books))].append(box((at, y, 0.02), (at + thick, y + tall, 0.02 + deep)))
             at += thick + rng.choice((0.001, 0.001, 0.001, 0.04))
     shelved = zip(covers, books, strict=True)
-    spines = [_surface(f"bookshelf: books, {cover.name}", cover, *parts) for cover, parts in shelved if parts]
-    return [_surface("bookshelf: case", palette["white paint"], *case), *spines]
+    spines = [joined(f"bookshelf: books, {cover.name}", cover, *parts) for cover, parts in shelved if parts]
+    return [joined("bookshelf: case", palette["white paint"], *case), *spines]
 
 
 def floor_lamp(palette: Palette) -> list[Surface]:
@@ -243,10 +191,10 @@ def floor_lamp(palette: Palette) -> list[Surface]:
     foot = shapes.cylinder((0, 0, 0), (0, 0.025, 0), 0.14, caps=True)
     stand = shapes.cylinder((0, 0.025, 0), (0, 1.42, 0), 0.009, segments=24)
     reach = float(np.interp(1.43, (1.36, 1.66), (0.2, 0.12))) - 0.002
-    bar = _box((-reach, 1.42, -0.005), (reach, 1.43, 0.005))
+    bar = box((-reach, 1.42, -0.005), (reach, 1.43, 0.005))
     return [
-        _surface("lamp: stand", palette["brushed steel"], foot, stand, bar),
-        _surface("lamp: shade", palette["lamp cloth"], (wall, faces, uv), emission=LAMP_RADIANCE),
+        joined("lamp: stand", palette["brushed steel"], foot, stand, bar),
+        joined("lamp: shade", palette["lamp cloth"], (wall, faces, uv), emission=LAMP_RADIANCE),
     ]
 
 
@@ -254,19 +202,19 @@ def picture(palette: Palette, width: float = 0.9, height: float = 0.62, bar: flo
     """A framed painting whose back is on z = 0 and whose lower edge is on y = 0."""
     x, board = width / 2, 0.015
     frame = (
-        *(_box((-x, y, 0), (x, y + bar, 0.03)) for y in (0, height - bar)),
-        *(_box((left, bar, 0), (left + bar, height - bar, 0.03)) for left in (-x, x - bar)),
+        *(box((-x, y, 0), (x, y + bar, 0.03)) for y in (0, height - bar)),
+        *(box((left, bar, 0), (left + bar, height - bar, 0.03)) for left in (-x, x - bar)),
     )
-    canvas = _panel((0, height / 2, board), (x - bar, 0, 0), (0, height / 2 - bar, 0))
+    canvas = panel((0, height / 2, board), (x - bar, 0, 0), (0, height / 2 - bar, 0))
     return [
-        _surface("picture: frame", palette["wood"], *frame),
-        _surface("picture: canvas", palette["painting"], canvas),
+        joined("picture: frame", palette["wood"], *frame),
+        joined("picture: canvas", palette["painting"], canvas),
     ]
 
 
 def rug(palette: Palette, width: float = 0.9, length: float = 1.4) -> list[Surface]:
     x, z = width / 2, length / 2
-    return [_surface("rug: wool", palette["rug wool"], _box((-x, 0, -z), (x, RUG_M, z)))]
+    return [joined("rug: wool", palette["rug wool"], box((-x, 0, -z), (x, RUG_M, z)))]
 
 
 def ball(palette: Palette, radius: float) -> list[Surface]:
@@ -291,20 +239,8 @@ def sculpture(palette: Palette, rng: Random, height: float = 0.4) -> list[Surfac
     points[:, 1] = np.maximum(points[:, 1], foot)
     points = (points - (0, foot, 0)) * (height / (high - foot))
     points[:, ::2] -= points[points[:, 1] <= 0][:, ::2].mean(axis=0)
-    normals = _smooth_normals(points, directions, faces)
+    normals = smooth_normals(points, directions, faces)
     return [Surface(points, faces, palette["clay"], uv, normals, name="sculpture: clay")]
-
-
-def _smooth_normals(points: np.ndarray, key: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted normals per vertex; vertices of equal `key` (the doubled seam of a sphere) share one normal."""
-    _, same = np.unique(np.round(key, 9) + 0.0, axis=0, return_inverse=True)
-    a, b, c = points[faces].transpose(1, 0, 2)
-    across = np.cross(b - a, c - a)
-    total = np.zeros((same.max() + 1, 3))
-    for corner in faces.T:
-        np.add.at(total, same.ravel()[corner], across)
-    normals = total[same.ravel()]
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def _palette(colours: Random, textures: Random) -> Palette:
@@ -319,16 +255,16 @@ def _palette(colours: Random, textures: Random) -> Palette:
     gloss = {"kind": "roughplastic", "ior": 1.5}
     wood = float(colours.uniform(0.25, 0.42))
     made = {
-        "oak planks": printed(_planks(textures, wood)),
-        "plaster": printed(_mottled(textures, colours.uniform(0.55, 0.72), 0.03, 6)),
+        "oak planks": printed(planks(textures, wood)),
+        "plaster": printed(mottled(textures, colours.uniform(0.55, 0.72), 0.03, 6)),
         "ceiling paint": {"albedo": 0.9},
-        "varnished wood": printed(_grain(textures, 0.8 * wood)) | gloss | {"roughness": 0.2},
+        "varnished wood": printed(grain(textures, 0.8 * wood)) | gloss | {"roughness": 0.2},
         "wood": plain(0.15, 0.35),
         "white paint": plain(0.75, 0.85),
-        "sofa cloth": printed(_mottled(textures, colours.uniform(0.25, 0.5), 0.05, 2)),
+        "sofa cloth": printed(mottled(textures, colours.uniform(0.25, 0.5), 0.05, 2)),
         "cushion cloth": plain(0.3, 0.65),
-        "rug wool": printed(_rug_pattern(textures)),
-        "painting": printed(_landscape(textures)),
+        "rug wool": printed(rug_pattern(textures)),
+        "painting": printed(landscape(textures)),
         "brushed steel": {"kind": "roughconductor", "roughness": 0.3, "eta": 2.9, "k": 3.1},
         "lamp cloth": plain(0.65, 0.8),
         "rubber": plain(0.3, 0.7) | gloss | {"roughness": 0.3},
@@ -337,63 +273,3 @@ def _palette(colours: Random, textures: Random) -> Palette:
     }
     made |= {f"book cover {a:g}": {"albedo": a} for a in (0.06, 0.12, 0.22, 0.35, 0.5, 0.7)}
     return {name: Material(**values, name=name) for name, values in made.items()}
-
-
-def _soft_noise(rng: Random, shape: tuple[int, int], size_px: tuple[float, float]) -> np.ndarray:
-    """Gaussian noise of unit variance blurred to blobs of `size_px` (rows, columns); periodic, so that it tiles."""
-    rows, columns = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
-    blur = np.exp(-2 * np.pi**2 * ((rows * size_px[0]) ** 2 + (columns * size_px[1]) ** 2))
-    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal(shape)) * blur, s=shape)
-    return (noise - noise.mean()) / noise.std()
-
-
-def _mottled(rng: Random, mean: float, spread: float, size_px: float, side: int = 256) -> np.ndarray:
-    """An even paint or cloth with soft spots."""
-    return np.clip(mean + spread * _soft_noise(rng, (side, side), (size_px, size_px)), 0.05, 0.9)
-
-
-def _grain(rng: Random, mean: float, side: int = 256) -> np.ndarray:
-    """Wood grain along the columns of the image."""
-    streaks = _soft_noise(rng, (side, side), (40, 1)) + 0.6 * _soft_noise(rng, (side, side), (60, 5))
-    return np.clip(mean * (1 + 0.16 * streaks), 0.05, 0.9)
-
-
-def _planks(rng: Random, mean: float, side: int = 512, across: int = 14) -> np.ndarray:
-    """Floor boards running up the image: each has its own brightness and joints, dark gaps between them."""
-    image = _grain(rng, mean, side)
-    edges = np.round(np.linspace(0, side, across + 1)).astype(int)
-    for left, right in pairwise(edges):
-        joint = int(rng.integers(side))
-        board = np.roll(image[:, left:right], joint, axis=0)
-        half = side // 2 + int(rng.integers(-side // 8, side // 8))
-        board[:half] *= rng.uniform(0.75, 1.3)
-        board[half:] *= rng.uniform(0.75, 1.3)
-        board[[0, half]] *= 0.35
-        board[:, 0] *= 0.35
-        image[:, left:right] = np.roll(board, -joint, axis=0)
-    return np.clip(image, 0.05, 0.9)
-
-
-def _rug_pattern(rng: Random, side: int = 256) -> np.ndarray:
-    """A border of bands around a field of diamonds, with the nap of wool."""
-    centred = np.abs(np.linspace(-1, 1, side))
-    rows, columns = centred[:, None], centred[None]
-    inset = 1 - np.maximum(rows, columns)
-    dark, light = rng.uniform(0.08, 0.2), rng.uniform(0.5, 0.75)
-    across, along = np.pi * rng.integers(3, 6, 2)
-    waves = np.cos(across * (rows + columns)) + np.cos(along * (rows - columns))
-    image = np.where(waves > 0, light, (dark + light) / 2)
-    image = np.where(inset < 0.22, np.where(inset % 0.11 < 0.06, dark, light), image)
-    return np.clip(image * (1 + 0.08 * _soft_noise(rng, (side, side), (1, 1))), 0.05, 0.9)
-
-
-def _landscape(rng: Random, height: int = 192, width: int = 288) -> np.ndarray:
-    """A painting: a sun in a sky that pales towards the horizon, before it ever darker ranges of hills."""
-    y, x = np.linspace(1, 0, height)[:, None], np.linspace(0, 1.5, width)[None]
-    image = 0.75 - 0.3 * y + 0 * x
-    sun_x, sun_y = rng.uniform(0.3, 1.2), rng.uniform(0.7, 0.85)
-    image = np.where(np.hypot(x - sun_x, y - sun_y) < 0.09, 0.9, image)
-    for crest, albedo in ((0.58, 0.4), (0.42, 0.22), (0.24, 0.08)):
-        ridge = crest + 0.07 * _soft_noise(rng, (1, width), (1, 18))
-        image = np.where(y < ridge, albedo, image)
-    return np.clip(image * (1 + 0.05 * _soft_noise(rng, (height, width), (1, 3))), 0.05, 0.9)

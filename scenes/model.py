@@ -357,6 +357,10 @@ class Scene:
         lit = self.ambient.radiance > 0 or self.ambient.environment is not None
         return lit or any(surface.emission > 0 for surface in self.surfaces)
 
+    def without_lights(self) -> Scene:
+        """The same scene under no light but the laser's."""
+        return replace(self, surfaces=tuple(replace(s, emission=0.0) for s in self.surfaces), ambient=Ambient())
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner of all surfaces, metres."""
         low = np.min([s.vertices.min(axis=0) for s in self.surfaces], axis=0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import cache
 
 import numpy as np
 
@@ -26,14 +27,19 @@ def box(size: Iterable[float] = (2.0, 2.0, 2.0)) -> Shape:
 
     Each side has its own four vertices and uv 0 to 1, upright along +y on the walls.
     """
-    half = np.asarray(tuple(size), dtype=np.float64) / 2
+    vertices, faces, uv = _unit_box()
+    return vertices * (np.asarray(tuple(size), dtype=np.float64) / 2), faces.copy(), uv.copy()
+
+
+@cache
+def _unit_box() -> Shape:
     square, faces, uv = rectangle()
     x, y, z = np.eye(3)
     # Image right and image up of each side; right x up points outwards.
     sides = ((x, y), (-x, y), (-z, y), (z, y), (x, -z), (x, z))
     corners = [square[:, :1] * right + square[:, 1:2] * up + np.cross(right, up) for right, up in sides]
     quads = np.concatenate([faces + 4 * side for side in range(6)])
-    return np.concatenate(corners) * half, quads, np.tile(uv, (6, 1))
+    return np.concatenate(corners), quads, np.tile(uv, (6, 1))
 
 
 def disk(radius: float = 1.0, segments: int = 64) -> Shape:
@@ -91,6 +97,12 @@ def sphere(radius: float = 1.0, subdivisions: int = 5) -> Shape:
     Vertices are doubled along the seam u = 0 and at the poles. With 5 subdivisions (20,480 faces) the area is too
     small by 3.0e-4, the volume by 5.4e-4, and no point of a face lies deeper than 2.9e-4 radii under the true sphere.
     """
+    points, faces, uv = _unit_sphere(subdivisions)
+    return radius * points, faces.copy(), uv.copy()
+
+
+@cache
+def _unit_sphere(subdivisions: int) -> Shape:
     points, faces = _icosphere(subdivisions)
     u = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) % 1.0
     v = 1 - np.arccos(np.clip(points[:, 2], -1, 1)) / np.pi
@@ -105,7 +117,7 @@ def sphere(radius: float = 1.0, subdivisions: int = 5) -> Shape:
     keys = np.column_stack((faces.ravel(), np.round(corner_u.ravel() * 1e9).astype(np.int64)))
     unique, inverse = np.unique(keys, axis=0, return_inverse=True)
     uv = np.column_stack((unique[:, 1] * 1e-9, v[unique[:, 0]]))
-    return radius * points[unique[:, 0]], inverse.reshape(-1, 3).astype(np.int64), uv
+    return points[unique[:, 0]], inverse.reshape(-1, 3).astype(np.int64), uv
 
 
 def axis_frame(direction: np.ndarray) -> np.ndarray:

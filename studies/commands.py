@@ -20,6 +20,7 @@ Pixels = Annotated[int | None, _open("PIXELS")]
 Count = Annotated[int | None, _open("N")]
 Number = Annotated[float | None, _open("X")]
 Mode = Annotated[Literal["flood", "line", "scan"] | None, _open("{flood,line,scan}")]
+Offset = Literal["time", "ray", "rigid"]
 File = Annotated[Path | None, _open("FILE")]
 
 
@@ -51,10 +52,16 @@ class Demo(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes(Common):
-    """List the built-in scenes, or describe one: size, triangles, camera, laser, lights, and what a loader changed."""
+    """List the built-in scenes and sets, or describe one: size, triangles, camera, lights, what a loader changed."""
 
     scene: Positional[str] = ""
-    """A scene as `render` takes it; none lists the names."""
+    """A scene as `render` takes it, or with --sheet a set; none lists the names."""
+    sheet: File = None
+    """Draw a contact sheet of the set's first views to this .png."""
+    count: int = 48
+    """Views on the sheet, or all of a smaller set."""
+    width: Pixels = None
+    """Width of the sheet's views, pixels (default: 128 in 4:3 of rooms, the scene's own of others)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +69,7 @@ class Render(Common):
     """Render a scene's time-resolved radiance to a deep EXR file, with a picture beside it."""
 
     scene: Positional[str] = "living-room"
-    """A name (see `scenes`), a mesh (.obj .ply .stl .glb) or a Mitsuba scene (.xml)."""
+    """A name (see `scenes`), a mesh (.obj .ply .stl .glb), a Mitsuba scene (.xml), or a photograph with --depth."""
     out: File = None
     """The .exr file (default: the scene's name in this folder)."""
     width: Pixels = None
@@ -82,9 +89,55 @@ class Render(Common):
     budget: Annotated[tuple[float, float] | None, _open("SIGNAL BACKGROUND")] = None
     """Mean SIGNAL and BACKGROUND photons: render no finer than their shot noise can show, instead of --error."""
     offset: float = 0.0
-    """Move the scene this many metres away in time alone: identical counts per pixel, later."""
+    """Move the scene this many metres away."""
+    offset_mode: Offset = "time"
+    """time: identical counts, later; ray: every point along its camera ray; rigid: all of it, field of view matched."""
+    depth: Annotated[Path | None, _open("FILE")] = None
+    """Depth image (.png or .exr) of an RGB-D pair whose photograph is SCENE."""
+    depth_scale: Annotated[float | None, _open("METRES")] = None
+    """Metres per level of the depth image; a .png needs it, an .exr is taken in metres."""
+    focal: Annotated[float | None, _open("PIXELS")] = None
+    """Focal length of the depth image, pixels; an RGB-D pair needs it."""
+    cosine: bool = False
+    """RGB-D: apply the cosine of the surface to the photograph, which already holds shading of its own."""
     figure: bool = True
     """Draw a picture of the layers beside the file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset(Common):
+    """Render a scene set to a folder of EXR files with an index; stopped at any moment, it goes on where it was."""
+
+    set: Positional[str] = "rooms"
+    """rooms, rooms/val, rooms/test, tabletop, middlebury or hard-cases."""
+    count: Count = None
+    """Views (default: all of a finite set, 100 rooms)."""
+    out: Annotated[Path | None, _open("FOLDER")] = None
+    """Folder of the set (default: out/ and the set's name)."""
+    workers: int = 1
+    """Processes on this machine."""
+    scheduler: Annotated[str | None, _open("ADDRESS")] = None
+    """Address of a running Dask scheduler, tcp://HOST:PORT, instead of processes here."""
+    pack: File = None
+    """Make one .h5 file of the finished set, which training reads without a renderer."""
+    width: Pixels = None
+    """Image width, pixels (default: 64 of rooms, the scenes' own of others)."""
+    height: Pixels = None
+    """Image height, pixels."""
+    bounces: Count = None
+    """Surfaces light may meet, 1 = direct only (default: planned for each view)."""
+    spp: Count = None
+    """Indirect light paths per pixel (default: planned for each view)."""
+    grid: Count = None
+    """Direct rays per pixel side (default: planned for each view)."""
+    error: Number = None
+    """Target of the relative error (default: 0.01 with 1 bounce, 0.03 with more)."""
+    ambient: bool = True
+    """Render ambient light."""
+    offset: float = 0.0
+    """Move every scene this many metres away."""
+    offset_mode: Offset = "time"
+    """As of `render`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,6 +242,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[Sense, tyro.conf.subcommand("sense")]
     | Annotated[Depth, tyro.conf.subcommand("depth")]
     | Annotated[Study, tyro.conf.subcommand("study")]

@@ -40,7 +40,7 @@ def _image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: obje
     bar.ax.tick_params(labelsize=8)
 
 
-def _display(radiance: np.ndarray) -> np.ndarray:
+def display(radiance: np.ndarray) -> np.ndarray:
     """Radiance for looking: relative to its 99th percentile, display gamma."""
     top = np.quantile(radiance[radiance > 0], 0.99) if (radiance > 0).any() else 1.0
     return np.clip(radiance / top, 0, 1) ** (1 / 2.2)
@@ -61,7 +61,7 @@ def draw_transient(transient: Transient, path: Path) -> Path:
     pixel = transient.return_pixel[later]
     indirect = np.bincount(pixel, weights=transient.radiance[later], minlength=total.size).reshape(total.shape)
     share = np.divide(indirect, total, out=np.full(total.shape, np.nan), where=total > 0)
-    _image(axes[0, 0], _display(total), "laser light, all paths", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
+    _image(axes[0, 0], display(total), "laser light, all paths", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
     _image(
         axes[0, 1],
         transient.depth_m,
@@ -74,7 +74,7 @@ def draw_transient(transient: Transient, path: Path) -> Path:
     axes[1, 0].imshow(np.abs(transient.normal.astype(float)))
     axes[1, 0].set(title="|normal|, world x y z as red green blue", xticks=[], yticks=[])
     axes[1, 0].title.set_fontsize(10)
-    _image(axes[1, 1], _display(transient.ambient), "ambient light", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
+    _image(axes[1, 1], display(transient.ambient), "ambient light", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
     _mean_transient(axes[1, 2], transient)
     error = transient.meta.get("relative_error", {}).get("total", float("nan"))
     figure.suptitle(f"{transient.meta.get('scene', '')}: {transient.returns:,} returns, estimated error {error:.2%}")

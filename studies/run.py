@@ -20,8 +20,10 @@ from render.engine import Progress, render
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
 from scenes import Camera, InputError, Laser, Scene
-from scenes.catalog import SCENES, load_scene
+from scenes.catalog import SCENES, WIDTH, load_scene
 from scenes.files import ATTRIBUTE, seal, whole_file
+from scenes.offsets import check_offset
+from scenes.sets import SETS, scene_set
 from spad.depth import depth_errors, estimate_depth, radial_depth_m
 from spad.detect import sense
 from spad.histogram import Histogram, read_histogram, write_histogram
@@ -71,7 +73,19 @@ def _picture(path: Path, kind: str) -> Path:
 
 
 def _load(command: commands.Render | commands.Demo) -> Scene:
+    if isinstance(command, commands.Render) and (command.depth or command.focal or command.depth_scale):
+        return _rgbd(command)
     return load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
+
+
+def _rgbd(command: commands.Render) -> Scene:
+    """The relief of a photograph and its depth image."""
+    from scenes.relief import RgbdFiles, rgbd
+
+    if command.depth is None or command.focal is None:
+        raise InputError(f"{command.scene}: an RGB-D pair needs --depth FILE and --focal PIXELS (and --depth-scale)")
+    files = RgbdFiles(Path(command.scene), command.depth, command.focal, command.depth_scale, command.cosine)
+    return rgbd(files, width=command.width or (None if command.height else WIDTH), height=command.height)
 
 
 def _in_view(transient: Transient) -> Transient:
@@ -82,8 +96,10 @@ def _in_view(transient: Transient) -> Transient:
 
 def run_scenes(command: commands.Scenes, progress: Progress) -> dict:
     """List or describe."""
+    if command.sheet is not None:
+        return _sheet(command, progress)
     if not command.scene:
-        return {"scenes": dict(SCENES)}
+        return {"scenes": dict(SCENES), "sets": dict(SETS)}
     scene = load_scene(command.scene, seed=command.seed)
     low, high = scene.bounds()
     camera, laser = scene.camera, scene.laser
@@ -104,13 +120,51 @@ def run_scenes(command: commands.Scenes, progress: Progress) -> dict:
     return {"scenes": {scene.name: described}}
 
 
+def _sheet(command: commands.Scenes, progress: Progress) -> dict:
+    """A contact sheet of a set."""
+    from studies.sheets import draw_sheet
+
+    path = command.sheet
+    if path.suffix.lower() != ".png" or not path.parent.is_dir():
+        raise InputError(f"{path}: expected a .png in a folder that exists")
+    of = scene_set(command.scene or "rooms")
+    if command.count < 1:
+        raise InputError(f"count {command.count} is less than 1")
+    count = command.count if of.size is None else min(of.size, command.count)
+    width, height = (command.width or 128, None) if of.size is None else (command.width, None)
+    height = round(0.75 * width) if of.size is None else None
+    scenes = [of.view(i, seed=command.seed, width=width, height=height) for i in range(count)]
+    draw_sheet(scenes, path, progress=progress)
+    return {"scenes": [scene.name for scene in scenes], "figure": str(path)}
+
+
+def run_dataset(command: commands.Dataset, progress: Progress) -> dict:
+    """A scene set -> a folder of .exr files, and one .h5 of them all."""
+    from studies.dataset import Job, make_set, pack_set
+
+    of = scene_set(command.set)
+    error = command.error or (0.01 if command.bounces == 1 else 0.03)
+    job = Job(
+        of.name, command.seed, command.width, command.height, command.bounces, command.spp, command.grid, error,
+        command.offset, command.offset_mode, command.ambient,
+    )  # fmt: skip
+    if command.pack is not None:
+        _output(command.pack, ".h5", "pack")
+    out = command.out or Path("out") / of.name.replace("/", "-")
+    count = command.count if command.count is not None else of.size or 100
+    options = {"workers": command.workers, "scheduler": command.scheduler, "progress": progress}
+    result = make_set(job, count, out, **options)
+    if command.pack is not None:
+        result |= {"pack_bytes": pack_set(out, command.pack, progress), "pack": str(command.pack)}
+    return result
+
+
 def run_render(command: commands.Render, progress: Progress) -> dict:
     """Scene -> .exr and a picture of its layers."""
     settings = RenderSettings(
         bounces=command.bounces, spp=command.spp, grid=command.grid, error=command.error, budget=command.budget
     )
-    if not 0 <= command.offset <= 1e4:
-        raise InputError(f"offset {command.offset:g} m is outside 0 to 10000")
+    check_offset(command.offset)
     if command.out is not None:
         _output(command.out, ".exr", "transient")
     scene = _load(command)
@@ -118,9 +172,13 @@ def run_render(command: commands.Render, progress: Progress) -> dict:
     if command.laser is not None:
         scene = replace(scene, laser=Laser(command.laser, scene.laser.baseline_m))
     start = time.perf_counter()
+    if command.offset and command.offset_mode != "time":
+        from studies.moving import moved
+
+        scene = moved(scene, command.offset, command.offset_mode)
     transient = _in_view(render(scene, settings, seed=command.seed, progress=progress))
     seconds = time.perf_counter() - start
-    if command.offset:
+    if command.offset and command.offset_mode == "time":
         transient = transient.delayed(command.offset)
     write_transient(transient, out)
     error, plan = transient.meta["relative_error"], transient.meta["plan"]
@@ -288,6 +346,7 @@ RUNNERS: dict[type, Callable] = {
     commands.Demo: run_demo,
     commands.Scenes: run_scenes,
     commands.Render: run_render,
+    commands.Dataset: run_dataset,
     commands.Sense: run_sense,
     commands.Depth: run_depth,
     commands.Bench: run_bench,

@@ -1,0 +1,287 @@
+"""Procedural indoor views: a room of random shape, furnished along its walls, cluttered, and seen as a person would.
+
+Depths follow NYUv2's: 0.5 to 7 m, median 2 to 3.5 m. The room is closed: no ray leaves it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from scenes import clutter, furniture
+from scenes.layout import Floor, Place, overlap, rough_distance, set_down
+from scenes.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
+from scenes.model import Camera, Scene, Surface
+from scenes.palette import make_palette
+from scenes.parts import Palette, Piece, Random, box, joined, panel, sheet, with_normals
+from scenes.patterns import on_one_sheet
+
+SPLITS = ("train", "val", "test")
+FOV_DEG = (52.0, 66.0)
+NEAREST_M, FARTHEST_M = 0.6, 6.9
+MEDIAN_M = (1.7, 3.9)  # of one view, by upright boxes; drawn evenly
+CANDIDATES, ATTEMPTS = 40, 8
+
+
+def room_view(index: int, split: str = "train", *, seed: int = 0, width: int = 64, height: int = 64) -> Scene:
+    """View `index` of a split, a room of its own; equal arguments give equal scenes, byte for byte.
+
+    Splits draw from streams of their own and share no room.
+    """
+    stream = np.random.SeedSequence(seed, spawn_key=(SPLITS.index(split), index))
+    for attempt in stream.spawn(ATTEMPTS):
+        scene = _attempt(np.random.default_rng(attempt), width, height)
+        if scene is not None:
+            break
+    name = f"rooms/{split}/{index}"
+    if scene is None:
+        raise RuntimeError(f"{name}: no view of {ATTEMPTS} rooms has depths of {NEAREST_M} to {FARTHEST_M} m")
+    return replace(scene, name=name, notes=(f"procedural, {split} view {index} of seed {seed}",))
+
+
+def _attempt(rng: Random, width: int, height: int) -> Scene | None:
+    """One random room, and the best of some views of it; None if none is good."""
+    palette = make_palette(rng)
+    floor, ceiling = Floor(_outline(rng)), float(rng.uniform(2.3, 3.0))
+    surfaces = _shell(palette, rng, floor, ceiling)
+    furnish(palette, rng, floor, ceiling)
+    camera = _camera(rng, floor, ceiling, width, height)
+    if camera is None:
+        return None
+    surfaces += [surface for place in floor.places for surface in place.surfaces]
+    surfaces += one_of_each(palette)
+    brightness = float(rng.uniform(0.2, 2.0))
+    surfaces = [with_normals(replace(s, emission=brightness * s.emission)) for s in on_one_sheet(surfaces)]
+    return Scene("rooms", tuple(surfaces), camera)
+
+
+def one_of_each(palette: Palette, y: float = -0.5) -> list[Surface]:
+    """A millimetre of every kind of material under the floor, where no light comes.
+
+    A renderer compiles its kernels for the kinds of material that are there: so all views of a set have the same.
+    """
+    kinds = ("ceiling paint", "floor", "satin 0", "gloss 0", "steel", "glass", "sky", "lamp cloth")
+    emission = {"sky": WINDOW_RADIANCE, "lamp cloth": LAMP_RADIANCE}
+    tiny = panel((0, y, 0), (5e-4, 0, 0), (0, 0, -5e-4))
+    return [joined("under the floor", palette[kind], tiny, emission=emission.get(kind, 0.0)) for kind in kinds]
+
+
+# --- The room --------------------------------------------------------------------------------------------------------
+
+
+def _outline(rng: Random) -> np.ndarray:
+    """A plan view, corners in order: rectangle, L, recess, cut corner, slanted wall or apse."""
+    w, d = rng.uniform((2.8, 3.2), (5.6, 7.0))
+    cut_w, cut_d = rng.uniform(0.25, 0.45) * w, rng.uniform(0.25, 0.45) * d
+    kind = rng.choice(("rectangle", "L", "breast", "bevel", "slant", "apse"), p=(0.34, 0.2, 0.16, 0.12, 0.1, 0.08))
+    if kind == "rectangle":
+        points = [(0, 0), (w, 0), (w, d), (0, d)]
+    elif kind == "L":
+        points = [(0, 0), (w - cut_w, 0), (w - cut_w, cut_d), (w, cut_d), (w, d), (0, d)]
+    elif kind == "breast":
+        a, out = rng.uniform(0.3, 0.5) * w, rng.uniform(0.25, 0.5)
+        points = [(0, 0), (a, 0), (a, out), (a + cut_w, out), (a + cut_w, 0), (w, 0), (w, d), (0, d)]
+    elif kind == "bevel":
+        points = [(0, 0), (w - cut_w, 0), (w, cut_w), (w, d), (0, d)]
+    elif kind == "slant":
+        points = [(0, 0), (w, 0.2 * cut_d), (w - 0.3 * cut_w, d), (0, d)]
+    else:
+        turn = np.linspace(-np.pi / 2, np.pi / 2, 11)
+        points = [(0, 0), *((w + 0.3 * d * math.cos(a), d / 2 + d / 2 * math.sin(a)) for a in turn), (0, d)]
+    outline = np.array(points, float)
+    if rng.random() < 0.5:
+        outline = outline[::-1] * (-1, 1)
+    quarter = int(rng.integers(4))
+    for _ in range(quarter):
+        outline = np.column_stack((-outline[:, 1], outline[:, 0]))
+    return outline - (outline.min(axis=0) + outline.max(axis=0)) / 2
+
+
+def _shell(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> list[Surface]:
+    """Floor, walls, ceiling, sometimes a slope of the roof, skirting boards, beams or a picture rail."""
+    low, high = floor.outline.min(axis=0) - 0.05, floor.outline.max(axis=0) + 0.05
+    middle, half = (low + high) / 2, (high - low) / 2
+    a, b = floor.edges()
+    walls, boards = [], []
+    for start, end in zip(a, b, strict=True):
+        centre, along = (start + end) / 2, (end - start) / 2
+        walls.append(panel((centre[0], ceiling / 2, centre[1]), (along[0], 0, along[1]), (0, ceiling / 2, 0)))
+        if np.linalg.norm(along) > 0.1:
+            boards.append((start, end))
+    surfaces = [
+        joined("floor", palette["floor"], panel((middle[0], 0, middle[1]), (half[0], 0, 0), (0, 0, -half[1]))),
+        joined(
+            "ceiling",
+            palette["ceiling paint"],
+            panel((middle[0], ceiling, middle[1]), (half[0], 0, 0), (0, 0, half[1])),
+        ),
+        joined("walls", palette["wall"], *walls),
+    ]
+    if rng.random() < 0.7:
+        skirting = [_along(start, end, 0.0, rng.uniform(0.06, 0.12), 0.015) for start, end in boards]
+        surfaces.append(
+            joined("skirting", furniture.pick(palette, rng, "paint" if rng.random() < 0.7 else "wood"), *skirting)
+        )
+    if rng.random() < 0.18:
+        beams = [
+            box((low[0], ceiling - 0.16, z), (high[0], ceiling, z + 0.14))
+            for z in np.arange(low[1] + 0.4, high[1], 0.9)
+        ]
+        surfaces.append(joined("beams", palette["wood 0"], *beams))
+    elif rng.random() < 0.2:
+        knee, run = rng.uniform(1.0, 1.5), rng.uniform(0.8, 1.3)
+        # nothing stands or looks from under the slope
+        floor.places.append(_lumber(np.array((low, (low[0] + 0.6 * run, high[1]))), ceiling))
+        points = np.array(
+            (
+                ((low[0], knee, high[1]), (low[0], knee, low[1])),
+                ((low[0] + run, ceiling, high[1]), (low[0] + run, ceiling, low[1])),
+            )
+        )
+        surfaces.append(joined("roof", palette["ceiling paint"], sheet(points)))
+    return surfaces
+
+
+def _lumber(corners: np.ndarray, ceiling: float) -> Place:
+    """A box that is not there but keeps things out."""
+    (x0, z0), (x1, z1) = corners
+    plan = np.array(((x0, z0), (x1, z0), (x1, z1), (x0, z1)))
+    return Place(Piece(()), (0.0, 0.0, 0.0), 0.0, plan, 0.0, ceiling)
+
+
+def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: float) -> tuple:
+    """A board along a wall from start to end (x, z), on the inside."""
+    along = (end - start) / np.linalg.norm(end - start)
+    inward = thick * np.array((-along[1], along[0]))
+    line = np.array((start, start + inward, start + inward, start))
+    lift = np.array((y + tall, y + tall, y, y))
+    ring = lambda shift: np.column_stack((line[:, 0] + shift[0], lift, line[:, 1] + shift[1]))  # noqa: E731
+    return sheet(np.stack((ring(np.zeros(2)), ring(end - start)), axis=1)[::-1])
+
+
+# --- What stands in it -----------------------------------------------------------------------------------------------
+
+
+def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None:
+    """Windows and a door, then large things along the walls, then the middle, then what is small."""
+    for kind, count in (("window", int(rng.integers(1, 3))), ("door", int(rng.random() < 0.7))):
+        for _ in range(count):
+            make = furniture.wall_window if kind == "window" else furniture.door
+            floor.try_at_wall(make(palette, rng), rng, 8)
+    if rng.random() < 0.5:
+        floor.try_free(furniture.rug(palette, rng), rng, 6, turn_deg=float(rng.choice((0, 90)) + rng.normal(0, 4)))
+        floor.places[-1:] = [replace(place, high=0.0) for place in floor.places[-1:]] if floor.places else []
+    for kind in rng.permutation(list(furniture.AT_WALL))[: int(rng.integers(5, 10))]:
+        floor.try_at_wall(furniture.AT_WALL[kind](palette, rng), rng)
+    table = (
+        floor.try_free(furniture.ON_FLOOR["dining table"](palette, rng), rng, 10, 0.1) if rng.random() < 0.6 else None
+    )
+    if table is not None:
+        _chairs_around(palette, rng, floor, table)
+    for kind in rng.permutation(list(furniture.ON_FLOOR)[1:])[: int(rng.integers(1, 5))]:
+        floor.try_free(furniture.ON_FLOOR[kind](palette, rng), rng, 8)
+    for _ in range(int(rng.integers(2, 7))):
+        floor.try_at_wall(furniture.ON_WALL[str(rng.choice(list(furniture.ON_WALL)))](palette, rng), rng, 8)
+    for kind in rng.choice(list(clutter.LOW), int(rng.integers(3, 10))):
+        piece = clutter.LOW[kind](palette, rng)
+        _ = floor.try_at_wall(piece, rng, 6, gap=0.05) if rng.random() < 0.6 else floor.try_free(piece, rng, 6)
+    for place in list(floor.places):
+        for top in place.tops:
+            litter(palette, rng, floor, top)
+    if rng.random() < 0.6:
+        centre = floor.outline.mean(axis=0) + rng.normal(0, 0.4, 2)
+        lamp = set_down(furniture.pendant(palette, rng, ceiling), *centre)
+        if floor.fits(lamp):
+            floor.places.append(lamp)
+
+
+def _chairs_around(palette: Palette, rng: Random, floor: Floor, table: Place) -> None:
+    """Chairs at the table's sides, facing it, pushed in by chance."""
+    piece = furniture.chair(palette, rng)
+    centre, corners = table.plan.mean(axis=0), table.plan
+    for i in rng.permutation(4)[: int(rng.integers(1, 5))]:
+        side = (corners[i] + corners[(i + 1) % 4]) / 2
+        out = (side - centre) / np.linalg.norm(side - centre)
+        x, z = side + out * rng.uniform(0.12, 0.4)
+        facing = math.degrees(math.atan2(-out[0], -out[1])) + rng.normal(0, 10)
+        chair = set_down(piece, x, z, turn_deg=facing)
+        if floor.fits(chair):
+            floor.places.append(chair)
+
+
+def litter(palette: Palette, rng: Random, floor: Floor, top: np.ndarray, most: int = 9) -> None:
+    """Small things on a level place: as many as fit of a random few, and now and then one on top of another."""
+    x, z, turn, half_x, half_z, y = top
+    c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    taken: list[Place] = []
+    for _ in range(int(rng.integers(0, most) * min(1.0, 0.4 + 2 * half_x))):
+        piece = clutter.SMALL[str(rng.choice(list(clutter.SMALL)))](palette, rng)
+        size = piece.high - piece.low
+        if size[0] > 2 * half_x + 0.02 or size[2] > 2 * half_z + 0.06 or size[1] > 0.75:
+            continue
+        u = rng.uniform(-1, 1) * max(half_x - size[0] / 2, 0)
+        v = rng.uniform(-1, 1) * max(half_z - size[2] / 2, 0)
+        place = set_down(
+            piece, x + c * u + s * v, z - s * u + c * v, y=y + 1e-4, turn_deg=turn + rng.normal(0, 12), margin=0.005
+        )
+        if any(overlap_in_height(place, other) for other in taken) or not floor.holds(place.plan):
+            continue
+        taken.append(place)
+    floor.places.extend(taken)
+    for place in list(taken):
+        for upper in place.tops[:1]:
+            if rng.random() < 0.4:
+                litter(palette, rng, floor, upper, 2)
+
+
+def overlap_in_height(a: Place, b: Place) -> bool:
+    return a.low < b.high and b.low < a.high and overlap(a.plan, b.plan)
+
+
+# --- The camera ------------------------------------------------------------------------------------------------------
+
+
+def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) -> Camera | None:
+    """A hand-held view with the wanted median distance and enough to see; judged on boxes, in a 16 x 12 image."""
+    wanted = rng.uniform(*MEDIAN_M)
+    low, high = floor.outline.min(axis=0), floor.outline.max(axis=0)
+    best, best_score = None, math.inf
+    for _ in range(CANDIDATES):
+        x, z = rng.uniform(low + 0.3, high - 0.3)
+        y, heading = rng.uniform(0.9, 1.75), rng.uniform(0, 2 * np.pi)
+        pitch, roll, fov = math.radians(rng.normal(-17, 8)), rng.normal(0, 0.02), rng.uniform(*FOV_DEG)
+        point = np.array((x, z))
+        if not floor.holds(point[None], 0.0) or floor.distance(point) < 0.25 or _too_near(floor, point, y):
+            continue
+        ahead = np.array((math.cos(pitch) * math.sin(heading), math.sin(pitch), math.cos(pitch) * math.cos(heading)))
+        up = (roll * math.cos(heading), 1.0, -roll * math.sin(heading))
+        origin = np.array((x, y, z))
+        rays = Camera.look_at(origin, origin + ahead, fov_deg=fov, width=16, height=12, up=up).rays().reshape(-1, 3)
+        distance = rough_distance(floor, ceiling, origin, rays)
+        if distance.min() < NEAREST_M or np.quantile(distance, 0.99) > FARTHEST_M:
+            continue
+        bare = rough_distance(Floor(floor.outline), ceiling, origin, rays)
+        busy = float((distance < bare - 0.2).mean())
+        score = abs(float(np.median(distance)) - wanted) + 2.5 * max(0.0, 0.7 - busy)
+        if score < best_score:
+            best, best_score = (
+                Camera.look_at(origin, origin + ahead, fov_deg=fov, width=width, height=height, up=up),
+                score,
+            )
+    return best
+
+
+def _too_near(floor: Floor, point: np.ndarray, y: float) -> bool:
+    """Whether a head there would be in or right beside something."""
+    around = point + 0.28 * np.array(((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    return any(p.high > 0.5 * y and p.low < y + 0.2 and overlap(p.plan, around) for p in floor.places)
+
+
+def pieces(scene: Scene) -> set[str]:
+    """Kinds of things in a scene: what stands before the colon in its surfaces' names."""
+    return {surface.name.split(":")[0] for surface in scene.surfaces if ":" in surface.name}
+
+
+__all__ = ["Piece", "furnish", "litter", "pieces", "room_view"]

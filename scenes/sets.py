@@ -1,0 +1,76 @@
+"""Scene sets by name: what a data set is rendered from. A set gives its view `index` by itself, in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from scenes.errors import InputError, require
+from scenes.model import Scene
+
+SETS: dict[str, str] = {
+    "rooms/train": "procedural furnished rooms, one room a view, without end (short: rooms)",
+    "rooms/val": "rooms that are not in rooms/train",
+    "rooms/test": "rooms that are in neither",
+    "tabletop": "eight still lifes with fine structure, 1.1 to 2.9 m",
+    "middlebury": "reliefs of the Middlebury 2006 scenes found beside the project",
+    "hard-cases": "scenes that break renderers",
+}
+LARGEST = 1_000_000
+
+
+@dataclass(frozen=True)
+class SceneSet:
+    """`size` views (None: as many as one likes); `make(index, seed, width, height)` builds one, None sizes its own."""
+
+    name: str
+    size: int | None
+    make: Callable[[int, int, int | None, int | None], Scene]
+
+    def view(self, index: int, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
+        most = LARGEST if self.size is None else self.size
+        require(0 <= index < most, f"set {self.name}: view {index} is outside 0 to {most - 1}")
+        return self.make(index, seed, width, height)
+
+
+def scene_set(name: str) -> SceneSet:
+    """The set of that name, `rooms` for `rooms/train`; InputError in one line for another name."""
+    name = "rooms/train" if name == "rooms" else name
+    if name not in SETS:
+        raise InputError(f"scene set {name!r}: expected one of {', '.join(SETS)}")
+    if name.startswith("rooms/"):
+        return SceneSet(name, None, _room_maker(name.removeprefix("rooms/")))
+    names, load = _named(name)
+
+    def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
+        scene = load(names[index])
+        if (width, height) == (None, None):
+            return scene
+        return replace(scene, camera=scene.camera.resized(width, height))
+
+    return SceneSet(name, len(names), make)
+
+
+def _room_maker(split: str) -> Callable[[int, int, int | None, int | None], Scene]:
+    def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
+        from scenes.rooms import room_view
+
+        return room_view(index, split, seed=seed, width=width or height or 64, height=height or width or 64)
+
+    return make
+
+
+def _named(name: str) -> tuple[list[str], Callable[[str], Scene]]:
+    """The scenes of a set of named ones, and what loads one of them."""
+    if name == "tabletop":
+        from scenes.tabletop import SCENES, tabletop
+
+        return list(SCENES), tabletop
+    if name == "hard-cases":
+        from scenes.hard_cases import SCENES as CASES
+        from scenes.hard_cases import hard_case
+
+        return list(CASES), hard_case
+    from scenes.relief import middlebury, middlebury_folder, middlebury_names
+
+    return middlebury_names(), lambda scene: middlebury(middlebury_folder(scene), width=88)

@@ -1,0 +1,383 @@
+"""Render a scene set to a folder: one EXR a view, one index, on one process, several, or a Dask cluster.
+
+    set.json      what was asked for; a folder is continued only with the same
+    views/*.exr   one transient a view, written beside and renamed, so that a file is whole or not there
+    journal.jsonl one line a view as it ends, in whatever order; gone once the index is written
+    index.jsonl   one line a view in the order of the views: scene, plan, error, depth statistics, or why it failed
+    timings.jsonl seconds and places, kept out of the index so that two runs are the same byte for byte
+
+Every view is a function of the set, the seed and its number: who renders it, when, and after what, changes no byte.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.settings import RenderSettings
+from scenes.errors import InputError, require
+from scenes.files import whole_file
+from scenes.offsets import OffsetMode, check_offset
+from scenes.sets import scene_set
+
+log = logging.getLogger("scene2spad")
+
+Progress = Callable[[str, float], None]
+STAGE_VIEW = 20
+TRIES = 3  # of a view whose worker process died
+DIRECT_TOLERANCE_M = (
+    0.06  # of path: merged returns keep energy, centroid and variance, and the error estimate sees them
+)
+_ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that decides the bytes of a set's views, but for their number."""
+
+    set: str
+    seed: int = 0
+    width: int | None = None
+    height: int | None = None
+    bounces: int | None = None
+    spp: int | None = None
+    grid: int | None = None
+    error: float | None = None
+    offset_m: float = 0.0
+    offset_mode: OffsetMode = "time"
+    ambient: bool = True
+
+    def __post_init__(self) -> None:
+        scene_set(self.set)
+        check_offset(self.offset_m)
+        self.settings()
+
+    def settings(self) -> RenderSettings:
+        return RenderSettings(
+            bounces=self.bounces,
+            spp=self.spp,
+            grid=self.grid,
+            error=self.error,
+            direct_tolerance_m=DIRECT_TOLERANCE_M,
+        )
+
+
+class Done(NamedTuple):
+    """A finished view: its record for the index, the bytes of its EXR (None: it failed), seconds, and by whom."""
+
+    record: dict
+    exr: bytes | None
+    seconds: float
+    where: str
+
+
+def render_view(job: Job, view: int) -> Done:
+    """Render one view to EXR bytes. A view that cannot be rendered is a record with `failed`, not an exception."""
+    start = time.perf_counter()
+    where = f"{os.uname().nodename}/{os.getpid()}"
+    with _ONE_AT_A_TIME:
+        try:
+            record, exr = _rendered(job, view)
+        except Exception as error:  # one odd scene of thousands must not end the run
+            told = " ".join(str(error).split()) or type(error).__name__
+            name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            record, exr = {"view": view, "failed": f"{name}{told}"[:500]}, None
+    return Done(record, exr, time.perf_counter() - start, where)
+
+
+def _rendered(job: Job, view: int) -> tuple[dict, bytes]:
+    # heavy imports only where a view is really rendered: the process that collects needs none of them
+    from render.engine import render
+    from render.pack import rounded
+    from render.transient import write_transient
+    from studies.moving import moved
+
+    scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
+    if not job.ambient:
+        scene = scene.without_lights()
+    if job.offset_m and job.offset_mode != "time":
+        scene = moved(scene, job.offset_m, job.offset_mode)
+    seed = int(np.random.SeedSequence(job.seed, spawn_key=(STAGE_VIEW, view)).generate_state(1)[0])
+    transient = render(scene, job.settings(), seed=seed)
+    if job.offset_m and job.offset_mode == "time":
+        transient = transient.delayed(job.offset_m)
+    require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
+    transient = rounded(transient)
+    with tempfile.TemporaryDirectory(prefix="scene2spad-") as folder:
+        path = Path(folder) / "view.exr"
+        write_transient(transient, path)
+        exr = path.read_bytes()
+    depth = transient.depth_m[np.isfinite(transient.depth_m)]
+    quantiles = np.quantile(depth, (0, 0.01, 0.5, 0.99, 1)) if depth.size else np.full(5, np.nan)
+    plan = transient.meta["plan"]
+    record = {
+        "view": view,
+        "scene": scene.name,
+        "file": file_name(view),
+        "bytes": len(exr),
+        "seed": seed,
+        "plan": {key: plan[key] for key in ("bounces", "spp", "grid", "ambient")},
+        "error": transient.meta["relative_error"]["total"],
+        "depth_m": dict(zip(("min", "q01", "median", "q99", "max"), np.round(quantiles, 4).tolist(), strict=True)),
+        "empty": round(1 - depth.size / transient.depth_m.size, 6),
+        "returns": transient.returns,
+        "indirect_fraction": round(transient.indirect_fraction, 6),
+        "triangles": scene.triangles,
+    }
+    return record, exr
+
+
+def file_name(view: int) -> str:
+    return f"views/{view:06d}.exr"
+
+
+# --- The folder ------------------------------------------------------------------------------------------------------
+
+
+class Folder:
+    """A set's folder: what is there already, and where finished views go."""
+
+    def __init__(self, path: Path, job: Job) -> None:
+        self.path, self.job = path, job
+        asked = json.dumps(asdict(job) | {"schema": 1}, sort_keys=True, indent=1) + "\n"
+        config = path / "set.json"
+        if config.is_file():
+            if config.read_text() != asked:
+                raise InputError(f"{path}: holds a set that was made with other options; choose another --out")
+        else:
+            require(
+                not path.exists() or not any(path.iterdir()),
+                f"{path}: is not empty and holds no set; choose another --out",
+            )
+            (path / "views").mkdir(parents=True, exist_ok=True)
+            with whole_file(config) as beside:
+                beside.write_text(asked)
+        (path / "views").mkdir(exist_ok=True)
+        for left in (*path.glob(".*.part*"), *(path / "views").glob(".*.part*")):
+            left.unlink()  # of a run that was killed while it wrote
+        self.records = {r["view"]: r for r in self._known() if self._stands(r)}
+
+    def _known(self) -> Iterator[dict]:
+        for name in ("index.jsonl", "journal.jsonl"):
+            path = self.path / name
+            for line in path.read_text().splitlines() if path.is_file() else ():
+                try:
+                    record = json.loads(line)
+                except ValueError:
+                    continue  # a line that was cut when the process was killed
+                if isinstance(record, dict) and isinstance(record.get("view"), int):
+                    yield record
+
+    def _stands(self, record: dict) -> bool:
+        """Whether the view of a record is there in full; failed ones are tried again."""
+        path = self.path / str(record.get("file", ""))
+        return "failed" not in record and path.is_file() and path.stat().st_size == record.get("bytes")
+
+    def add(self, done: Done) -> None:
+        """The file first, then the line that vouches for it."""
+        view = done.record["view"]
+        if done.exr is not None:
+            with whole_file(self.path / file_name(view)) as beside:
+                beside.write_bytes(done.exr)
+        self.records[view] = done.record
+        self._append("journal.jsonl", done.record)
+        self._append("timings.jsonl", {"view": view, "seconds": round(done.seconds, 4), "where": done.where})
+
+    def _append(self, name: str, value: dict) -> None:
+        path = self.path / name
+        with path.open("ab+") as file:
+            if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
+                file.write(b"\n")  # after a line that was cut
+            file.write(json.dumps(value, sort_keys=True).encode() + b"\n")
+
+    def close(self) -> None:
+        """The index in the order of the views, then no journal."""
+        with whole_file(self.path / "index.jsonl") as beside:
+            lines = (json.dumps(self.records[view], sort_keys=True) + "\n" for view in sorted(self.records))
+            beside.write_text("".join(lines))
+        (self.path / "journal.jsonl").unlink(missing_ok=True)
+
+
+def read_index(folder: Path) -> list[dict]:
+    """The finished views of a set's folder in order, failed ones left out; InputError if there is no index."""
+    path = Path(folder) / "index.jsonl"
+    require(path.is_file(), f"{path}: no index; run `scene2spad dataset` to its end first")
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    return [record for record in records if "failed" not in record]
+
+
+# --- Running ---------------------------------------------------------------------------------------------------------
+
+
+def make_set(
+    job: Job, count: int, out: Path, *, workers: int = 1, scheduler: str | None = None, progress: Progress | None = None
+) -> dict:
+    """Render views 0 to count - 1 of a set into a folder; what is there already stays.
+
+    workers: processes on this machine; scheduler: address of a running Dask scheduler instead, whose workers send the
+    files back, so that no file system need be shared. Returns numbers for the command line.
+    """
+    size = scene_set(job.set).size
+    require(
+        count >= 1 and (size is None or count <= size), f"set {job.set}: count {count} is outside 1 to {size or 'any'}"
+    )
+    require(1 <= workers <= 256, f"workers {workers} is outside 1 to 256")
+    folder = Folder(out, job)
+    todo = [view for view in range(count) if view not in folder.records]
+    say = progress or (lambda what, share: None)
+    start = time.perf_counter()
+    with _executor(workers, scheduler, len(todo)) as run:
+        for number, done in enumerate(run(job, todo), 1):
+            folder.add(done)
+            if "failed" in done.record:
+                log.warning("view %d failed: %s", done.record["view"], done.record["failed"])
+            say(f"view {count - len(todo) + number} of {count}", (count - len(todo) + number) / count)
+    folder.close()
+    seconds = time.perf_counter() - start
+    records = [folder.records[view] for view in range(count)]
+    good = [record for record in records if "failed" not in record]
+    return {
+        "scenes": len(good),
+        "failed": [record["view"] for record in records if "failed" in record],
+        "rendered_now": len(todo),
+        "seconds": seconds,
+        "scenes_per_second": len(todo) / seconds if todo else 0.0,
+        "bytes_per_scene": sum(record["bytes"] for record in good) / max(len(good), 1),
+        "error_median": float(np.median([record["error"] for record in good])) if good else float("nan"),
+        "out": str(out),
+    }
+
+
+Run = Callable[[Job, Iterable[int]], Iterator[Done]]
+
+
+@contextmanager
+def _executor(workers: int, scheduler: str | None, todo: int) -> Iterator[Run]:
+    if todo == 0 or (workers == 1 and scheduler is None):
+        yield lambda job, views: (render_view(job, view) for view in views)
+    elif scheduler is not None:
+        with _dask_client(scheduler) as client:
+            yield lambda job, views: _on_dask(client, job, views)
+    else:
+        yield lambda job, views: _on_processes(min(workers, todo), job, views)
+
+
+def _on_processes(workers: int, job: Job, views: Iterable[int]) -> Iterator[Done]:
+    """Several processes of ours. One that dies takes the pool with it: a new one goes on, and retries what was lost."""
+    waiting, tries = list(views)[::-1], dict.fromkeys(views, 0)
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    while waiting:
+        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads,)) as pool:
+            running: dict[Future, int] = {}
+            try:
+                while waiting or running:
+                    while waiting and len(running) < 2 * workers:
+                        view = waiting.pop()
+                        running[pool.submit(render_view, job, view)] = view
+                    for future in wait(running, return_when=FIRST_COMPLETED).done:
+                        done = future.result()
+                        del running[future]
+                        yield done
+            except BrokenProcessPool:
+                for view in running.values():
+                    tries[view] += 1
+                for view in sorted(running.values(), reverse=True):
+                    if tries[view] < TRIES:
+                        waiting.append(view)
+                    else:
+                        yield Done({"view": view, "failed": f"its process died {TRIES} times"}, None, 0.0, "")
+                log.warning("a worker process died; starting others")
+
+
+def _start_worker(threads: int) -> None:
+    """In a new process: as many threads as its share of the cores; it ends when the one that started it does."""
+    Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    from render.llvm import start_mitsuba
+
+    start_mitsuba()
+    import drjit
+
+    drjit.set_thread_count(threads)
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+@contextmanager
+def _dask_client(address: str) -> Iterator[Any]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--scheduler needs the package `distributed`: pip install 'scene2spad[cluster]'") from None
+    try:
+        client = Client(address, timeout=20)
+    except (OSError, ValueError, TypeError) as error:
+        told = " ".join(str(error).split())[:120]
+        raise InputError(f"scheduler {address}: cannot be reached ({told or type(error).__name__})") from None
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def _on_dask(client: Any, job: Job, views: Iterable[int]) -> Iterator[Done]:
+    """A cluster's workers, a few tasks each in flight, so that results do not heap up; a dead worker's move on."""
+    from distributed import as_completed
+
+    waiting = list(views)[::-1]
+    lanes = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+    first = [waiting.pop() for _ in range(min(len(waiting), 3 * lanes))]
+    submitted = {client.submit(render_view, job, view, pure=False, retries=TRIES): view for view in first}
+    pending = as_completed(submitted)
+    for future in pending:
+        view = submitted.pop(future)
+        if future.status == "error":
+            told = " ".join(str(future.exception()).split())[:300]
+            yield Done({"view": view, "failed": f"its workers died: {told}"}, None, 0.0, "")
+        else:
+            yield future.result()
+        future.release()
+        if waiting:
+            view = waiting.pop()
+            new = client.submit(render_view, job, view, pure=False, retries=TRIES)
+            submitted[new] = view
+            pending.add(new)
+
+
+# --- Packing ---------------------------------------------------------------------------------------------------------
+
+
+def pack_set(folder: Path, path: Path, progress: Progress | None = None) -> int:
+    """All finished views of a set's folder as one file (`render.pack`); returns its size in bytes."""
+    from render.pack import write_pack
+    from render.transient import read_transient
+
+    records = read_index(folder)
+    say = progress or (lambda what, share: None)
+
+    def views() -> Iterator[tuple]:
+        for i, record in enumerate(records):
+            say("pack", i / len(records))
+            transient = read_transient(folder / record["file"])
+            kept = {key: transient.meta[key] for key in ("camera", "laser", "scene_sha256")}
+            yield transient, record | kept | {"time_offset_m": transient.meta.get("time_offset_m", 0.0)}
+
+    write_pack(views(), path)
+    return path.stat().st_size
