@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,6 +25,10 @@ EXTENSIONS = (".obj", ".ply", ".stl", ".glb")
 DEFAULT_ALBEDO = 0.6
 BACKDROP_ALBEDO = 0.55
 SENSIBLE_EXTENT_M = (0.2, 2.5)  # a model whose largest extent lies in here is taken to be in metres already
+UNITS_M = {"mm": 1e-3, "millimet": 1e-3, "cm": 1e-2, "centimet": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
+UNITS_M |= {"in": 0.0254, "ft": 0.3048, "met": 1.0, "m": 1.0}
+HEADER_BYTES = 4096  # where a comment may name the unit
+MAGIC = {b"ply": ".ply", b"glTF": ".glb", b"solid": ".stl"}
 WALL_GAP_M = 1.0
 FOV_DEG = 40.0
 ELEVATION_DEG, AZIMUTH_DEG = 15.0, 30.0  # a little from above, and from the side: what faces away shows its flank
@@ -46,7 +51,9 @@ class _Part:
 def load_mesh(path: Path, *, width: int = 128, height: int = 96) -> Scene:
     """The scene of one mesh file, metres, y up: floor at y = 0, wall behind, camera before the model's +z side.
 
-    The model keeps its size if its largest extent is 0.2 to 2.5 m and is scaled to 1 m otherwise. Every surface is
+    The model keeps its size if its largest extent is 0.2 to 2.5 m. Otherwise the unit that the file names is taken (a
+    comment or header such as "units: mm"), else millimetres or inches where these make 0.2 to 2.5 m of it, else it is
+    scaled to 1 m; each with a warning in the notes. Every surface is
     diffuse with the file's colour as albedo (luminance of linear colour), 0.6 where the file has none. Raises
     InputError in one line for a file that is missing, of another kind, broken, empty, without faces or with NaNs.
     """
@@ -137,6 +144,11 @@ def _load(path: Path, kind: str) -> Any:
     import trimesh
 
     content = path.read_bytes()
+    if not content.strip():
+        raise InputError("the file is empty")
+    actual = next((ext for magic, ext in MAGIC.items() if content.startswith(magic)), kind)
+    if actual != kind:
+        raise InputError(f"holds {actual} data, its extension says {kind}; rename it")
     if kind == ".obj":
         # Comments and names in an old encoding must not stop the geometry from being read.
         content = content.decode("utf-8", errors="replace").encode()
@@ -187,10 +199,11 @@ def _stand(path: Path, parts: list[_Part], notes: list[str]) -> list[_Part]:
         extent = float((high - low).max())
     if not 0 < extent < math.inf:
         raise InputError(f"{path}: its largest extent is {extent:g}, expected a solid body of finite size")
-    fits = SENSIBLE_EXTENT_M[0] <= extent <= SENSIBLE_EXTENT_M[1]
-    scale = 1.0 if fits else 1.0 / extent
-    size = f"{extent:.4g} m kept" if fits else f"scaled by {scale:.3g}: {extent:.4g} to 1.0 m"
-    notes.append(f"largest extent {size}")
+    scale, warning = _scale(path, extent)
+    size = (
+        f"{extent:.4g} m kept" if scale == 1 else f"scaled by {scale:.3g}: {extent:.4g} to {round(scale * extent, 4)} m"
+    )
+    notes += [f"largest extent {size}", *warning]
     pose = scale * turn
     pose[:, 3] = -scale * (low[0] + high[0]) / 2, -scale * low[1], -scale * (low[2] + high[2]) / 2, 1
     if scale * (high[1] - low[1]) < 1e-6:
@@ -201,6 +214,24 @@ def _stand(path: Path, parts: list[_Part], notes: list[str]) -> list[_Part]:
     if not sound:
         raise InputError(f"{path}: all of its faces are degenerate")
     return sound
+
+
+def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
+    """Metres per unit of the file, and what to warn of."""
+    low, high = SENSIBLE_EXTENT_M
+    with path.open("rb") as file:
+        header = file.read(HEADER_BYTES).decode("latin-1")
+    names = "|".join(sorted(UNITS_M, key=len, reverse=True))
+    told = re.search(rf"\bunits?\b[^a-z0-9\n]{{0,9}}(?:are |in )?({names})", header, re.IGNORECASE)
+    if told is not None and path.suffix.lower() != ".glb":
+        unit = told[1].lower()
+        return UNITS_M[unit], [f"warning: unit {unit!r} taken from the file's own words"]
+    if low <= extent <= high:
+        return 1.0, []
+    for name, metres in (("millimetres", 1e-3), ("inches (or centimetres)", 0.0254)):
+        if low <= metres * extent <= high and path.suffix.lower() != ".glb":
+            return metres, [f"warning: no unit in the file, {extent:.4g} looks like {name}"]
+    return 1.0 / extent, ["warning: no unit makes a sensible size of it, so its size is made up"]
 
 
 def _moved(part: _Part, pose: np.ndarray) -> _Part:

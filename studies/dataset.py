@@ -89,7 +89,7 @@ def render_view(job: Job, view: int) -> Done:
     """Render one view to EXR bytes. A view that cannot be rendered is a record with `failed`, not an exception."""
     start = time.perf_counter()
     where = f"{os.uname().nodename}/{os.getpid()}"
-    with _ONE_AT_A_TIME:
+    with _ONE_AT_A_TIME, _quiet():
         try:
             record, exr = _rendered(job, view)
         except Exception as error:  # one odd scene of thousands must not end the run
@@ -97,6 +97,18 @@ def render_view(job: Job, view: int) -> Done:
             name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
             record, exr = {"view": view, "failed": f"{name}{told}"[:500]}, None
     return Done(record, exr, time.perf_counter() - start, where)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The plan of each of thousands of views goes into the index, not to the screen."""
+    logger = logging.getLogger("render")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _rendered(job: Job, view: int) -> tuple[dict, bytes]:

@@ -1,0 +1,111 @@
+"""RGB-D reliefs: dequantising, holes, cuts, and depth in every pixel."""
+
+import numpy as np
+import pytest
+
+from scenes import Texture
+from scenes.relief import RgbdFiles, dequantised, filled, middlebury, middlebury_names, read_levels, relief, rgbd
+
+GREY = Texture(np.full((40, 60), 0.4, np.float32), "grey")
+
+
+def layers(scene):
+    from render.direct import centre_layers
+    from render.world import World
+
+    found = centre_layers(World(scene))
+    shape = scene.camera.height, scene.camera.width
+    axial = (scene.camera.rays() @ scene.camera.rotation)[..., 2]
+    return found.depth_m.reshape(shape) * axial, found
+
+
+@pytest.mark.parametrize("slope", [(0.03, 0.0), (0.21, -0.11), (-0.4, 0.07)])
+def test_dequantising_finds_the_plane_between_its_steps(slope):
+    y, x = np.mgrid[:60, :80]
+    plane = 100 + slope[0] * x + slope[1] * y
+    smooth = dequantised(np.rint(plane))
+    assert np.abs(smooth - np.rint(plane)).max() < 0.5
+    inner = np.abs(smooth - plane)[12:-12, 12:-12]
+    assert inner.mean() < 0.4 * np.abs(np.rint(plane) - plane).mean()
+    wanted = np.abs(slope[0])
+    assert np.abs(np.diff(smooth, axis=1)[12:-12, 12:-12] - slope[0]).mean() < max(0.35 * wanted, 0.03)
+
+
+def test_dequantising_leaves_edges_where_they_are():
+    levels = np.where(np.arange(80) < 40, 100.0, 160.0) * np.ones((50, 1))
+    assert dequantised(levels) == pytest.approx(levels)
+
+
+def test_holes_are_filled_from_the_farther_side():
+    levels = np.array([[5, 0, 0, 9], [0, 0, 0, 0], [0, 7, 0, 0]], float)
+    assert filled(levels, levels > 0, near_is_high=True).tolist() == [[5, 5, 5, 9], [5, 5, 5, 9], [7, 7, 7, 7]]
+    assert filled(levels, levels > 0, near_is_high=False)[0].tolist() == [5, 9, 9, 9]
+
+
+def test_depth_edges_are_cut_and_nothing_gapes_or_stretches():
+    """A step of 1 m: every pixel has its own depth, and none something in between."""
+    depth = np.where(np.arange(60) < 31, 2.0, 3.0) * np.ones((40, 1))
+    scene = relief("step", depth, GREY, 60.0)
+    axial, _ = layers(scene)
+    assert axial == pytest.approx(depth, abs=1e-5)
+    for width in (47, 203):
+        seen, _ = layers(relief("step", depth, GREY, 60.0, width=width))
+        assert np.isfinite(seen).all() and np.isin(np.round(seen, 4), (2.0, 3.0)).all()
+
+
+def test_a_steep_slope_is_not_cut():
+    depth = 2 + 0.05 * np.arange(60) * np.ones((40, 1))  # 1.5 to 2.5 pixels deep for one to the side
+    axial, _ = layers(relief("slope", depth, GREY, 60.0))
+    assert axial == pytest.approx(depth, rel=1e-3)
+
+
+def test_the_cosine_is_a_switch():
+    from render.engine import render
+    from render.settings import RenderSettings
+
+    depth = 2 + 0.02 * np.arange(60) * np.ones((40, 1))
+    settings = RenderSettings(bounces=1, grid=4)
+    plain, shaded = (render(relief("slope", depth, GREY, 60.0, cosine=cosine), settings) for cosine in (False, True))
+    scene = relief("slope", depth, GREY, 60.0)
+    distance, intensity = plain.depth_m.astype(float), scene.laser.intensity(scene.camera)
+    inner = (slice(2, -2), slice(2, -2))
+    expected = 0.4 * intensity / (np.pi * distance**2)
+    assert plain.total_radiance()[inner] == pytest.approx(expected[inner], rel=0.01)
+    rays = scene.camera.rays()
+    # the slope's own normal: dz = 0.02 a pixel, a pixel is z / 60 wide
+    z = depth
+    x = (np.arange(60) + 0.5 - 30) / 60
+    along_x = np.stack((z / 60 + x * 0.02, 0 * z, -0.02 + 0 * z), axis=-1)
+    along_y = np.stack((0 * z, z / 60, 0 * z), axis=-1)
+    normal = np.cross(along_x, along_y)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    cosine = np.abs((normal * rays).sum(axis=-1))
+    assert shaded.total_radiance()[inner] == pytest.approx((expected * cosine)[inner], rel=0.02)
+
+
+def test_a_users_pair_has_its_depth_scale_and_focal_length(tmp_path):
+    from PIL import Image
+
+    Image.fromarray(np.full((30, 40), 188, np.uint8)).save(tmp_path / "photo.png")
+    level = np.full((30, 40), 1500, np.uint16)
+    level[10:12, 10:12] = 0
+    Image.fromarray(level).save(tmp_path / "depth.png")
+    scene = rgbd(RgbdFiles(tmp_path / "photo.png", tmp_path / "depth.png", focal_px=50.0, scale_m=1e-3))
+    assert scene.camera.focal_px == pytest.approx(50) and scene.name == "photo"
+    assert layers(scene)[0] == pytest.approx(1.5, abs=6e-4)
+    assert scene.surfaces[0].material.albedo.image == pytest.approx(((188 / 255 + 0.055) / 1.055) ** 2.4)
+    assert any("holes: 0.33%" in note for note in scene.notes)
+
+
+def test_middlebury_reliefs_keep_their_disparities(shared_data, monkeypatch):
+    """At least 95 % of the known pixels within half a level of disp1."""
+    monkeypatch.setenv("SCENE2SPAD_DATA", str(shared_data))
+    assert len(middlebury_names()) == 5
+    folder = shared_data / "middlebury" / "Art"
+    scene = middlebury(folder)
+    assert scene.camera.fov_deg == pytest.approx(21.05, abs=0.05)
+    axial, _ = layers(scene)
+    levels = read_levels(folder / "disp1.png")
+    known = levels > 0
+    off = np.abs(3740 * 0.160 / axial - float((folder / "dmin.txt").read_text()) - levels)[known]
+    assert (off <= 0.5).mean() >= 0.95 and np.isfinite(axial).all()
