@@ -1,4 +1,4 @@
-"""Radiometric photon budget: from joules and lenses to detections. Needs no torch.
+"""Radiometric photon budget: from joules and lenses to detections.
 
 Expected signal detections of a pixel = pulse energy x sum(radiance) x aperture area x pixel solid angle x transmission
 x PDE x wavelength / (h c) x cycles; background = ambient spectral radiance x filter width x the same x exposure.
@@ -14,6 +14,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
+from spad.flux import detector_maps
 from spad.sensor import PhotonBudget, Sensor
 
 PLANCK_J_S = 6.62607015e-34
@@ -73,15 +74,18 @@ class Optics:
         """Expected signal detections per exposure and unit of a transient's radiance (which is per joule emitted)."""
         return self.pulse_energy_j * self.detections_per_radiance(sensor) * sensor.cycles
 
-    def budget(self, transient: Transient, sensor: Sensor, *, seed: int = 0) -> PhotonBudget:
+    def budget(
+        self, transient: Transient, sensor: Sensor, *, seed: int = 0, dark_map_hz: np.ndarray | None = None
+    ) -> PhotonBudget:
         """Mean signal and mean background of a scene: the budget by means that gives these very expected counts.
 
-        Background is ambient light through the filter and the sensor's dark counts.
+        Background is ambient light through the filter and dark counts, the sensor's or a measured map's.
         """
         pixels = transient.height * transient.width
         signal = self.signal_scale(sensor) * float(transient.radiance.sum(dtype=np.float64)) / pixels
         ambient = float(transient.ambient.mean(dtype=np.float64)) * self.filter_nm * sensor.exposure_s
-        dark = float(sensor.dark_rate_map_hz(transient.height, transient.width, seed).mean()) * sensor.exposure_s
+        dark_hz, _ = detector_maps(sensor, (transient.height, transient.width), dark_map_hz, seed)
+        dark = float(dark_hz.mean()) * sensor.exposure_s
         return PhotonBudget(signal, ambient * self.detections_per_radiance(sensor) + dark)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -23,6 +24,7 @@ Model = Literal["auto", "poisson", "first-photon", "free-running"]
 MODELS: tuple[str, ...] = ("auto", "poisson", "first-photon", "free-running")
 # Below 1 % detections per cycle dead time and pile-up change nothing that counts could show.
 LOW_FLUX = 0.01
+_HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
 
 
 def sense(
@@ -136,7 +138,7 @@ def _planned(
         "pile_up": pile_up,
         "wrapped": share,
         "dark_share": rates.dark_share,
-        "transient": {**transient.meta, "sha256": transient.sha256()},
+        "transient": {**transient.meta, "sha256": _sha256(transient)},
         "versions": _versions(),
     }
     truth = {
@@ -148,6 +150,13 @@ def _planned(
         "meta": meta,
     }
     return replace(exposure, model=chosen), truth
+
+
+def _sha256(transient: Transient) -> str:
+    """Its hash, computed once: one render is sensed many times, and cannot be written to."""
+    if transient not in _HASHES:
+        _HASHES[transient] = transient.sha256()
+    return _HASHES[transient]
 
 
 @lru_cache(maxsize=1)

@@ -1,6 +1,6 @@
 """Fresh detections for training, from transients in memory: photon level, crop and noise drawn anew for every patch.
 
-    packed = pack(transients)                                       # once
+    packed = packed_transients(transients)                          # once; a read pack file serves as `transients`
     batch = sense_patches(packed, sensor, requests, size=(32, 32))  # every step
     batch.counts                                                    # (B, 1, T, h, w) float32, for the network
 
@@ -10,7 +10,8 @@ photon on the CPU, so that a seed gives the same counts on every device; the his
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -65,8 +66,9 @@ class PackedTransients:
         return self.depth_m.shape[0]
 
 
-def pack(transients: Sequence[Transient]) -> PackedTransients:
+def packed_transients(transients: Iterable[Transient]) -> PackedTransients:
     """Transients of one size in one; InputError for none, or of different sizes."""
+    transients = list(transients)
     sizes = {(transient.height, transient.width) for transient in transients}
     if len(sizes) != 1:
         raise InputError(f"transients of sizes {sorted(sizes)} cannot be packed together")
@@ -119,25 +121,31 @@ def sense_patches(
     """
     height, width = size
     pixels, bins = height * width, sensor.bins
-    places, depth, mixed = [], [], []
-    for number, patch in enumerate(patches):
+    counts = torch.zeros((len(patches), bins * pixels), device=device)
+    labels = np.empty((len(patches), height, width), np.float32)
+    mixed = np.empty((len(patches), height, width), bool)
+
+    def draw(number: int) -> None:
+        patch = patches[number]
         light = _light_of_patch(packed, sensor, patch, height, width)
-        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(patch.seed, spawn_key=(STAGE_FLY,))))
+        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(patch.seed, spawn_key=(STAGE_FLY, 0, 0))))
         events = draw_primaries(light, sensor, rng)
         # bin before pixel: the order of (T, h, w)
-        places.append((events.position + np.int32(number * bins)) * np.int64(pixels) + events.pixel)
+        places = torch.from_numpy(events.position * np.int64(pixels) + events.pixel).to(device)
+        one = torch.from_numpy(np.ones(len(places), np.float32)).to(device)
+        counts[number].scatter_add_(0, places, one)  # whole numbers: no order of additions shows
         rows, columns = slice(patch.row, patch.row + height), slice(patch.column, patch.column + width)
-        depth.append(packed.depth_m[patch.scene, rows, columns] + np.float32(patch.time_offset_m))
-        mixed.append(packed.mixed[patch.scene, rows, columns])
-    where = torch.from_numpy(np.concatenate(places)).to(device)
-    counts = torch.zeros(len(patches) * bins * pixels, device=device)
-    counts.scatter_add_(0, where, torch.ones(1, device=device).expand(len(where)))
-    labels = torch.from_numpy(np.stack(depth)).to(device)
+        labels[number] = packed.depth_m[patch.scene, rows, columns] + np.float32(patch.time_offset_m)
+        mixed[number] = packed.mixed[patch.scene, rows, columns]
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        list(pool.map(draw, range(len(patches))))
+    depth = torch.from_numpy(labels).to(device)
     return Batch(
         counts.reshape(len(patches), 1, bins, height, width),
-        labels,
-        torch.from_numpy(np.stack(mixed)).to(device),
-        labels < sensor.range_m,  # false for NaN
+        depth,
+        torch.from_numpy(mixed).to(device),
+        depth < sensor.range_m,  # false for NaN
     )
 
 

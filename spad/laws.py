@@ -75,7 +75,7 @@ def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.
     span = float(when.max()) + 2 * dead + 1
     axis = when + where * span
     sure = new_pixel | np.concatenate(([True], np.diff(axis) >= dead))
-    following = np.searchsorted(axis, axis + dead)
+    following = np.maximum(np.searchsorted(axis, axis + dead), np.arange(1, len(axis) + 1))  # also without dead time
     detected = sure.copy()
     chain = np.flatnonzero(sure)
     ends = np.concatenate((chain[1:], [len(axis)]))

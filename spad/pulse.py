@@ -61,9 +61,11 @@ class Pulse:
         return sigmas * self.sigma_s + self.tail_s, sigmas * self.sigma_s + decay
 
     def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Delays of `size` detections after their arrival [s]."""
-        delay = rng.standard_normal(size) * self.sigma_s
-        return delay + (rng.standard_exponential(size) - 1) * self.tail_s if self.tail_s else delay
+        """Delays of `size` detections after their arrival [s], (size,) float32: 1e-7 of the pulse's width is enough."""
+        delay = rng.standard_normal(size, dtype=np.float32) * np.float32(self.sigma_s)
+        if self.tail_s:
+            delay += (rng.standard_exponential(size, dtype=np.float32) - 1) * np.float32(self.tail_s)
+        return delay
 
     def shares(self, edges_s: np.ndarray) -> np.ndarray:
         """Share of the pulse between neighbouring edges: (n + 1,) -> (n,) float64."""
@@ -125,9 +127,9 @@ class SampledPulse:
         return max(0.0, -float(table.edges_s[first])), max(0.0, float(table.edges_s[min(last, len(self.samples))]))
 
     def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Delays of `size` detections after their arrival [s], by the inverse of the CDF."""
+        """Delays of `size` detections after their arrival [s], (size,) float32, by the inverse of the CDF."""
         table = pulse_table(self)
-        return np.interp(rng.random(size), table.arrived, table.edges_s)
+        return np.interp(rng.random(size), table.arrived, table.edges_s).astype(np.float32)
 
     def shares(self, edges_s: np.ndarray) -> np.ndarray:
         """Share of the pulse between neighbouring edges: (n + 1,) -> (n,) float64."""

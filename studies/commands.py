@@ -148,16 +148,60 @@ class Sense(Common):
     """A transient written by `render` (.exr)."""
     out: File = None
     """The .h5 file (default: the transient's name)."""
-    sensor: str = "reference"
+    sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
     """Sensor preset."""
-    signal: float = 50.0
-    """Mean signal photons per pixel and exposure."""
-    background: float = 50.0
-    """Mean background photons per pixel and exposure, dark counts included."""
+    signal: Number = None
+    """Mean signal photons per pixel and exposure (default: 50, or what the --radiometric optics give)."""
+    background: Number = None
+    """Mean background photons per pixel and exposure, dark counts included (default: as --signal)."""
     dark_count_rate: Number = None
     """Dark counts per second and pixel [Hz] (default: the preset's)."""
-    model: Literal["auto", "poisson"] = "auto"
+    dark_map: File = None
+    """Measured dark counts per second of every pixel [Hz] (.npy), NaN in dead pixels, instead."""
+    model: Literal["auto", "poisson", "first-photon", "free-running"] = "auto"
     """Detection law; auto says why it chose."""
+    reset: Annotated[Literal["synchronous", "free-running"] | None, _open("{synchronous,free-running}")] = None
+    """Armed at every laser cycle, or again after the dead time (default: the preset's)."""
+    dead_time: Number = None
+    """Dead time after a detection [s] (default: the preset's)."""
+    exposure: Number = None
+    """Exposure of the frame [s] (default: the preset's)."""
+    jitter: Number = None
+    """Standard deviation of the detector's timing jitter [s], a second kernel beside the pulse."""
+    jitter_tail: float = 0.0
+    """Time constant of the jitter's exponential tail [s]; needs --jitter."""
+    pulse: File = None
+    """Measured pulse (.npy, one dimension) in steps of --pulse-step, instead of the preset's."""
+    pulse_step: Number = None
+    """Time step of --pulse [s]."""
+    pde: Number = None
+    """Photon detection efficiency, 0 to 1: a --radiometric budget counts with it (default: the preset's)."""
+    crosstalk: float = 0.0
+    """Probability that a detection fires a given neighbour."""
+    hot_pixels: float = 0.0
+    """Share of hot pixels, placed by the seed."""
+    hot_rate: float = 1e4
+    """Dark counts per second of a hot pixel [Hz]."""
+    dead_pixels: float = 0.0
+    """Share of dead pixels, placed by the seed."""
+    radiometric: bool = False
+    """Compute the photon budget from the optics below, instead of --signal and --background."""
+    pulse_energy: float = 10e-9
+    """Energy of one laser pulse [J], over the whole cone."""
+    focal_length: float = 10e-3
+    """Focal length of the lens [m]."""
+    f_number: float = 2.0
+    """Focal length over aperture diameter."""
+    pixel_pitch: float = 20e-6
+    """Side of a pixel's active square [m]."""
+    transmission: float = 0.8
+    """Transmission of lens and filter."""
+    filter_width: float = 10.0
+    """Width of the band that the filter lets through [nm]."""
+    wavelength: float = 850e-9
+    """Wavelength of the laser [m]."""
+    export: Annotated[Literal["mat"] | None, _open("mat")] = None
+    """Write the published .mat layout, and its pulse, beside the .h5 file."""
     figure: bool = True
     """Draw a picture of the counts beside the file."""
 
@@ -170,8 +214,10 @@ class Depth(Common):
     """A histogram written by `sense` (.h5)."""
     out: File = None
     """The depth map (.exr) to write (default: the histogram's and the method's name)."""
-    method: Literal["argmax", "matched", "log-matched", "compressive"] = "log-matched"
-    """Estimator; log-matched is the Poisson maximum likelihood."""
+    method: Literal["argmax", "matched", "log-matched", "correlation", "lmf-published", "coates", "compressive"] = (
+        "log-matched"
+    )
+    """Estimator; log-matched is the Poisson maximum likelihood, coates the same after the pile-up is undone."""
     code: Literal["fourier", "gray", "coarse", "hadamard", "random"] = "fourier"
     """Temporal code of `--method compressive`: truncated Fourier, Gray Fourier, coarse histogram, Walsh-Hadamard."""
     codes: int = 16
@@ -182,10 +228,10 @@ class Depth(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Common):
-    """Speed against error: beside mitransient (`bench render`), of compressive layers (`bench encode`), or the table of
-    hard cases (`bench hard-cases`)."""
+    """Speed against error: `render` beside mitransient, `sense` beside dense Poisson draws, `encode` of compressive
+    layers; tables of `hard-cases`."""
 
-    stage: Positional[Literal["render", "encode", "hard-cases"]] = "render"
+    stage: Positional[Literal["render", "sense", "encode", "hard-cases"]] = "render"
     """What is measured."""
     scenes: tuple[Literal["flash", "lamp", "artist", "groove"], ...] = ()
     """Scenes of `bench render` (default: all)."""
@@ -204,7 +250,7 @@ class Bench(Common):
     memory: bool = False
     """Compare peak memory in fresh processes instead."""
     data: Annotated[Path | None, _open("FOLDER")] = None
-    """Folder with the artist's scene (default: SCENE2SPAD_DATA, else ../shared/data)."""
+    """Folder with the artist's scene and the Middlebury images (default: SCENE2SPAD_DATA, else ../shared/data)."""
     cache: Annotated[Path | None, _open("FOLDER")] = None
     """Folder that keeps references from run to run (default: ~/.cache/scene2spad)."""
     out: Path = Path("out/bench")

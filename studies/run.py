@@ -18,7 +18,7 @@ import torch
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from render.engine import Progress, render
 from render.settings import RenderSettings
-from render.transient import Transient, read_transient, write_transient
+from render.transient import Transient, write_transient
 from scenes import Camera, InputError, Laser, Scene
 from scenes.catalog import SCENES, WIDTH, load_scene
 from scenes.files import ATTRIBUTE, seal, whole_file
@@ -28,7 +28,7 @@ from spad.depth import depth_errors, estimate_depth, radial_depth_m
 from spad.detect import sense
 from spad.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor import PhotonBudget, sensor_by_name
-from studies import commands, figures
+from studies import commands, figures, sensing
 
 log = logging.getLogger("scene2spad")
 
@@ -200,33 +200,8 @@ def run_render(command: commands.Render, progress: Progress) -> dict:
 
 
 def run_sense(command: commands.Sense, progress: Progress) -> dict:
-    """Transient -> .h5 and a picture of its counts."""
-    sensor, budget = sensor_by_name(command.sensor), PhotonBudget(command.signal, command.background)
-    if command.dark_count_rate is not None:
-        sensor = replace(sensor, dark_count_rate_hz=command.dark_count_rate)
-    source = _input(command.file)
-    out = _output(command.out or source.with_suffix(".h5"), ".h5", "histogram")
-    transient = read_transient(source)
-    start = time.perf_counter()
-    histogram = sense(transient, sensor, budget, seed=command.seed, model=command.model, progress=progress)
-    seconds = time.perf_counter() - start
-    for reason in histogram.meta["plan"]:
-        log.info("%s", reason)
-    write_histogram(histogram, out)
-    result = {
-        "seconds": seconds,
-        "mean_signal": float(histogram.expected_signal.mean(dtype=np.float64)),
-        "mean_background": float(histogram.expected_background.mean(dtype=np.float64)),
-        "mean_counts": float(histogram.counts.sum(dtype=np.int64) / histogram.depth_m.size),
-        "pile_up": histogram.meta["pile_up"],
-        "model": histogram.meta["model"],
-        "wrapped": histogram.meta["wrapped"],
-        "dark_share": histogram.meta["dark_share"],
-        "out": str(out),
-    }
-    if command.figure:
-        result["figure"] = str(figures.draw_histogram(histogram, _picture(out, "histogram")))
-    return result
+    """Transient -> .h5, a picture of its counts, and with --export the .mat layout."""
+    return sensing.run(command, progress, input_file=_input, output_file=_output, picture=_picture)
 
 
 def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:
@@ -259,6 +234,7 @@ def run_depth(command: commands.Depth, progress: Progress) -> dict:
     start = time.perf_counter()
     depth = depth_map(histogram, command.method, command.codes, command.code, command.seed)
     seconds = time.perf_counter() - start
+    sure = sensing.mean_confidence(histogram, depth)
     range_m = histogram.sensor.range_m
     errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
     _write_depth(depth, out, {"method": label, "histogram_sha256": histogram.sha256()})
@@ -266,6 +242,7 @@ def run_depth(command: commands.Depth, progress: Progress) -> dict:
         "seconds": seconds,
         "method": label,
         **errors,
+        "confidence": sure,
         "unmixed": depth_errors(depth, histogram.depth_m, range_m=range_m, exclude=histogram.mixed),
         "out": str(out),
     }
@@ -326,12 +303,7 @@ def run_demo(command: commands.Demo, progress: Progress) -> dict:
 
 def run_bench(command: commands.Bench, progress: Progress) -> dict:
     """One stage of the bench; each is imported only when it is asked for."""
-    if command.stage == "hard-cases":
-        from studies.bench import hard_cases as stage
-    elif command.stage == "encode":
-        from studies.bench import encode as stage
-    else:
-        from studies.bench import render as stage
+    stage = importlib.import_module(f"studies.bench.{command.stage.replace('-', '_')}")
     return stage.run(command, progress)
 
 

@@ -47,8 +47,6 @@ def test_poisson_dispersion(rate: float, dense_from: float, monkeypatch: pytest.
     """`rate` detections a bin in 4000 pixels, photon by photon and bin by bin: mean and variance are the rate."""
     monkeypatch.setattr("spad.exposure.DENSE_FROM", dense_from)
     bins, pixels = (4, 4000) if rate < 1e5 else (1, 400)
-    if dense_from and rate > 100:
-        pytest.skip("more than 4 detections a bin are never drawn photon by photon")
     sensor = Sensor(bins=bins, bin_width_s=1e-9)
     counts = sense(same(pixels, (1.0, 1.0, 1.0)), sensor, PhotonBudget(0, rate * bins), seed=3, model="poisson").counts
     counts = counts.astype(float)
@@ -190,7 +188,7 @@ def test_dead_time_photon_by_photon(dead: float) -> None:
 @pytest.mark.parametrize("tau_periods", [0.05, 0.7, 2.5])
 def test_dead_time_rate(tau_periods: float) -> None:
     """m = r / (1 + r tau) within 0.5 % at homogeneous flux and 1e6 detections."""
-    per_cycle, cycles, pixels = 0.8, 4000, 600
+    per_cycle, cycles, pixels = 0.8, 4000, 1000
     sensor = Sensor(
         bins=64, reset="free-running", dead_time_s=tau_periods * SMALL.period_s, exposure_s=cycles * SMALL.period_s
     )
@@ -198,7 +196,7 @@ def test_dead_time_rate(tau_periods: float) -> None:
     assert histogram.meta["model"] == "free-running"
     expected = per_cycle / (1 + per_cycle * tau_periods)
     detected = histogram.counts.sum() / (pixels * cycles)
-    assert histogram.counts.sum() > 6e5
+    assert histogram.counts.sum() > 1e6
     # armed at the start of each pixel's exposure: (r tau)^2 / 2 (1 + r tau)^2 detections more a pixel, 1e-4 here
     assert detected == pytest.approx(expected, rel=5e-3)
     # a renewal process: the count's variance is m / (1 + r tau)^2 a unit of time
@@ -297,7 +295,7 @@ def test_first_of_each_cycle_keeps_the_earliest() -> None:
 @pytest.mark.parametrize("crosstalk", [0.0, 0.01])
 def test_timestamps_and_histogram_are_one_draw(model: str, signal: float, crosstalk: float) -> None:
     sensor = replace(REFERENCE, crosstalk=crosstalk, dead_time_s=2e-8)
-    scene, budget = same(1500, (4.0, 4.1, 1.0)), PhotonBudget(signal, 20)
+    scene, budget = same(1500 if signal < 100 else 20, (4.0, 4.1, 1.0)), PhotonBudget(signal, 20)
     stamps = sense_timestamps(scene, sensor, budget, seed=2, model=model)
     counts = sense(scene, sensor, budget, seed=2, model=model).counts
     assert (stamps.counts() == counts).all() and stamps.bits == 10 == sensor.timestamp_bits

@@ -1,0 +1,148 @@
+"""The command `sense`: the sensor and the budget that its options ask for, the draw, and the files."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from render.transient import Transient, read_transient
+from scenes.errors import InputError, require
+from spad.budget import Optics
+from spad.depth import confidence
+from spad.detect import sense
+from spad.histogram import Histogram, write_histogram
+from spad.mat import write_mat
+from spad.pulse import Pulse, read_pulse
+from spad.sensor import PhotonBudget, Sensor, sensor_by_name
+from studies import commands, figures
+
+log = logging.getLogger("scene2spad")
+
+DEFAULT_PHOTONS = 50.0
+
+
+def sensor_of(command: commands.Sense) -> Sensor:
+    """The preset with what the options change."""
+    asked = {
+        "dark_count_rate_hz": command.dark_count_rate,
+        "reset": command.reset,
+        "dead_time_s": command.dead_time,
+        "exposure_s": command.exposure,
+        "pde": command.pde,
+    }
+    changes = {name: value for name, value in asked.items() if value is not None}
+    require(command.jitter is not None or not command.jitter_tail, "--jitter-tail needs --jitter")
+    require((command.pulse is None) == (command.pulse_step is None), "--pulse and --pulse-step go together")
+    if command.jitter is not None:
+        changes["jitter"] = Pulse(command.jitter, command.jitter_tail)
+    if command.pulse is not None:
+        changes["pulse"] = read_pulse(command.pulse, command.pulse_step)
+    return replace(
+        sensor_by_name(command.sensor),
+        crosstalk=command.crosstalk,
+        hot_share=command.hot_pixels,
+        hot_rate_hz=command.hot_rate if command.hot_pixels else 0.0,
+        dead_share=command.dead_pixels,
+        **changes,
+    )
+
+
+def optics_of(command: commands.Sense) -> Optics | None:
+    """The optics of a radiometric budget, None without one."""
+    if not command.radiometric:
+        return None
+    given = command.signal is not None or command.background is not None
+    require(not given, "--radiometric computes the photon budget: leave out --signal and --background")
+    return Optics(
+        pulse_energy_j=command.pulse_energy,
+        focal_length_m=command.focal_length,
+        f_number=command.f_number,
+        pixel_pitch_m=command.pixel_pitch,
+        transmission=command.transmission,
+        filter_nm=command.filter_width,
+        wavelength_m=command.wavelength,
+    )
+
+
+def budget_of(command: commands.Sense) -> PhotonBudget:
+    """The budget by means that the options ask for."""
+    asked = (DEFAULT_PHOTONS if value is None else value for value in (command.signal, command.background))
+    return PhotonBudget(*asked)
+
+
+def run(
+    command: commands.Sense,
+    progress: Callable[[str, float], None],
+    *,
+    input_file: Callable[[Path], Path],
+    output_file: Callable[[Path, str, str], Path],
+    picture: Callable[[Path, str], Path],
+) -> dict:
+    """Transient -> histogram, its picture, and the .mat layout where asked."""
+    sensor, optics = sensor_of(command), optics_of(command)
+    budget = budget_of(command) if optics is None else None
+    source = input_file(command.file)
+    out = output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
+    transient = read_transient(source)
+    dark_map = _dark_map(command.dark_map, transient)
+    if optics is not None:
+        budget = optics.budget(transient, sensor, seed=command.seed, dark_map_hz=dark_map)
+    start = time.perf_counter()
+    histogram = sense(
+        transient, sensor, budget, seed=command.seed, model=command.model, dark_map_hz=dark_map, progress=progress
+    )
+    seconds = time.perf_counter() - start
+    for reason in histogram.meta["plan"]:
+        log.info("%s", reason)
+    write_histogram(histogram, out)
+    result = {"seconds": seconds, **summary(histogram), "out": str(out)}
+    if command.export == "mat":
+        mat = out.with_suffix(".mat")
+        result.update({"pulse_file": str(write_mat(histogram, mat)), "export": str(mat)})
+    if command.figure:
+        result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram")))
+    return result
+
+
+def summary(histogram: Histogram) -> dict:
+    """What the command reports of a histogram."""
+    meta = histogram.meta
+    return {
+        "mean_signal": float(histogram.expected_signal.mean(dtype=np.float64)),
+        "mean_background": float(histogram.expected_background.mean(dtype=np.float64)),
+        "mean_counts": float(histogram.counts.sum(dtype=np.int64) / histogram.depth_m.size),
+        **{name: meta[name] for name in ("pile_up", "model", "wrapped", "dark_share")},
+    }
+
+
+def _dark_map(path: Path | None, transient: Transient) -> np.ndarray | None:
+    if path is None:
+        return None
+    require(path.is_file(), f"{path}: file not found")
+    try:
+        rates = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path}: not a readable .npy file ({' '.join(str(error).split())[:80]})") from None
+    shape = (transient.height, transient.width)
+    good = rates.dtype.kind in "fiu" and rates.shape == shape
+    require(good, f"{path}: {rates.dtype}{rates.shape}, expected numbers {shape}")
+    return rates
+
+
+def mean_confidence(histogram: Histogram, depth_m: np.ndarray) -> float:
+    """Mean probability that an estimate is no chance peak, over the pixels that have one; NaN with a baseline.
+
+    There the distance is not the arrival time that the probability is of.
+    """
+    baseline = histogram.meta.get("transient", {}).get("laser", {}).get("baseline_m", (0, 0, 0))
+    if any(baseline) or np.isnan(depth_m).all():
+        return math.nan
+    share = confidence(torch.from_numpy(histogram.counts), torch.from_numpy(depth_m), histogram.sensor)
+    return float(share.nanmean())

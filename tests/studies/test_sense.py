@@ -1,0 +1,132 @@
+"""The commands `sense`, `depth` and `bench sense` with the sensor's wider options."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import scipy.io
+
+from render.transient import write_transient
+from spad.histogram import read_histogram
+from spad.mat import read_mat
+from spad.rgbd import transient_from_rgbd
+from studies.bench import estimators
+from studies.bench.sense import alternating, one_law, relief
+from studies.cli import main
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    depth = np.linspace(2, 6, 8 * 10).reshape(8, 10)
+    transient = transient_from_rgbd(depth, np.full_like(depth, 0.5), np.full_like(depth, 0.02))
+    write_transient(transient, tmp_path / "s.exr")
+    return transient
+
+
+def run(capfd, *argv: str) -> tuple[int, dict, str]:
+    status = main([*argv, "--json", "--no-figure"] if argv[0] in ("sense", "depth") else [*argv, "--json"])
+    out, err = capfd.readouterr()
+    return status, json.loads(out.splitlines()[-1]) if out.strip() else {}, err
+
+
+def test_laws_and_inverses_by_command(scene, capfd):
+    status, said, err = run(capfd, "sense", "s.exr", "--signal", "4e5", "--background", "4e5")
+    assert status == 0 and said["model"] == "first-photon" and said["pile_up"] > 0.5 and "pile-up" in err
+    assert said["mean_counts"] < 0.95 * 8e5
+    errors = {}
+    for method in ("log-matched", "coates", "lmf-published", "correlation"):
+        status, depth, _ = run(capfd, "depth", "s.h5", "--method", method)
+        assert status == 0 and 0 <= depth["confidence"] <= 1
+        errors[method] = depth["mae_mm"]
+    assert errors["coates"] < 0.5 < errors["log-matched"]
+    options = ("--model", "free-running", "--dead-time", "3e-7", "--exposure", "1e-3")
+    status, said, _ = run(capfd, "sense", "s.exr", "--signal", "1e3", "--background", "1e3", *options)
+    assert status == 0 and said["model"] == "free-running" and said["mean_counts"] < 1e-3 / 3e-7 + 1
+
+
+def test_detector_options_reach_the_sensor(scene, capfd, tmp_path):
+    np.save(tmp_path / "p.npy", np.exp(-np.arange(40) / 8))
+    np.save(tmp_path / "d.npy", np.full((8, 10), 90.0))
+    options = "--jitter 5e-11 --jitter-tail 1e-10 --pde 0.3 --crosstalk 0.002 --dead-pixels 0.1 --hot-pixels 0.05"
+    status, said, err = run(
+        capfd, "sense", "s.exr", *options.split(), "--pulse", "p.npy", "--pulse-step", "2e-11", "--sensor", "linospad"
+    )
+    sensor = read_histogram(tmp_path / "s.h5").sensor
+    assert status == 0 and said["mean_signal"] == pytest.approx(45, rel=0.05) and "crosstalk" in err
+    assert (sensor.name, sensor.bins, sensor.pde, sensor.crosstalk) == ("linospad", 1536, 0.3, 0.002)
+    assert sensor.jitter.tail_s == 1e-10 and len(sensor.pulse.samples) == 40 and sensor.hot_rate_hz == 1e4
+    status, said, _ = run(capfd, "sense", "s.exr", "--dark-map", "d.npy")
+    assert status == 0 and said["dark_share"] == pytest.approx(3 / 50)
+
+
+def test_radiometric_budget_by_command(scene, capfd):
+    status, said, _ = run(capfd, "sense", "s.exr", "--radiometric", "--pde", "0.2", "--pulse-energy", "1e-9")
+    assert status == 0 and said["mean_signal"] > 0 and said["mean_background"] > 0
+    _, twice, _ = run(capfd, "sense", "s.exr", "--radiometric", "--pde", "0.4", "--pulse-energy", "1e-9")
+    assert twice["mean_signal"] == pytest.approx(2 * said["mean_signal"], rel=1e-5)
+
+
+def test_export_by_command(scene, capfd, tmp_path):
+    status, said, _ = run(capfd, "sense", "s.exr", "--export", "mat")
+    assert status == 0 and (tmp_path / "s.mat").is_file() and said["export"] == "s.mat"
+    assert (read_mat(tmp_path / "s.mat").counts == read_histogram(tmp_path / "s.h5").counts).all()
+    assert scipy.io.loadmat(said["pulse_file"])["PSF_img"].shape[:2] == (8, 10)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--jitter-tail", "1e-10"], "needs --jitter"),
+        (["--pulse", "p.npy"], "go together"),
+        (["--pulse", "none.npy", "--pulse-step", "1e-11"], "none.npy"),
+        (["--dark-map", "none.npy"], "none.npy"),
+        (["--radiometric", "--signal", "3"], "leave out --signal"),
+        (["--pde", "2"], "PDE 2"),
+        (["--dead-time", "1e-6", "--model", "first-photon"], "use free-running"),
+        (["--exposure", "1e-12"], "shorter than the period"),
+        (["--sensor", "retina"], "retina"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(scene, capfd, tmp_path, options, words):
+    status, _, err = run(capfd, "sense", "s.exr", *options)
+    lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
+    assert status == 2 and len(lines) == 1 and words in lines[0] and not (tmp_path / "s.h5").exists()
+
+
+def test_table_of_estimators():
+    rows = estimators.table([("a", relief(6, 7))], estimators.sensor_by_name("reference"), [(500, 10)], seed=1)
+    assert len(rows) == 6 * 3 and {row["group"] for row in rows} == {"all", "unmixed", "mixed"}
+    summary = estimators.summary(rows)
+    assert summary["log-matched"]["unmixed"]["mae_mm"] < summary["argmax"]["unmixed"]["mae_mm"]
+    for group in ("unmixed", "mixed"):
+        assert sum(row["pixels"] for row in rows if row["group"] == group) <= 6 * 42
+    assert len(set(estimators.LEVELS)) == 16
+
+
+def test_middlebury_pairs_become_transients(shared_data):
+    transient = estimators.middlebury(shared_data / "middlebury" / "Art")
+    assert (transient.height, transient.width) == (69, 86) and 0 < transient.mixed.mean() < 0.5
+    assert 1.3 < np.nanmin(transient.depth_m) < np.nanmax(transient.depth_m) < 2.3
+
+
+def test_measuring_tools():
+    calls = []
+    seconds = alternating({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 3)
+    assert calls == ["a", "b"] * 4 and set(seconds) == {"a", "b"}
+    rng = np.random.default_rng(0)
+    counts = [rng.poisson(rate, (500, 8)) for rate in (3.0, 3.0)]
+    assert one_law(*counts) > 1e-3
+    assert one_law(counts[0], rng.poisson(np.linspace(2, 4, 8), (500, 8))) < 1e-6
+
+
+@pytest.mark.slow
+def test_bench_sense(tmp_path, capfd):
+    status, said, _ = run(capfd, "bench", "sense", "--quick", "--out", str(tmp_path / "b"), "--data", str(tmp_path))
+    assert status == 0 and "estimators" not in said
+    names = [row["name"] for row in said["rows"]]
+    assert sum("numpy" in name for name in names) == 2 and any("training batch" in name for name in names)
+    assert all(row["same_law_p"] is None or row["same_law_p"] > 1e-4 for row in said["rows"])
+    with (tmp_path / "b" / "bench-sense.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(said["rows"])
