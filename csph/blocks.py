@@ -117,25 +117,30 @@ def centred(values: Tensor, axis: int) -> Tensor:
     return _Centre.apply(values, axis)
 
 
-class _Normalise(torch.autograd.Function):
-    """v / (|v| + eps) over axes; derivative g / (n + eps) - u <u, g> / n with u = v / (n + eps), and 0 where n = 0."""
+class _ZeroNormalise(torch.autograd.Function):
+    """u = v / (n + eps), v = w - mean w, n = |v|; its derivative is (g / (n + eps) - u <u, g> / n) less its mean, and
+    g / (n + eps) less its mean where n = 0. In place where it can be: the weights are megabytes, and memory is what
+    takes time."""
 
     @staticmethod
-    def forward(ctx: object, values: Tensor, axes: tuple[int, ...]) -> Tensor:
-        norm = (values * values).sum(axes, keepdim=True).sqrt_()
-        unit = values / (norm + EPSILON)
+    def forward(ctx: object, values: Tensor, axis: int, centre: bool, over: tuple[int, ...]) -> Tensor:
+        unit = values - mean_over(values, axis) if centre else values.clone()
+        norm = (unit * unit).sum((axis, *over), keepdim=True).sqrt_()
+        unit.div_(norm + EPSILON)
         ctx.save_for_backward(unit, norm)
-        ctx.axes = axes
+        ctx.axis, ctx.centre, ctx.over = axis, centre, over
         return unit
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: object, grad: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: object, grad: Tensor) -> tuple[Tensor, None, None, None]:
         unit, norm = ctx.saved_tensors
-        along = (unit * grad).sum(ctx.axes, keepdim=True)
-        scale = 1 / (norm + EPSILON)
+        along = (unit * grad).sum((ctx.axis, *ctx.over), keepdim=True)
         slope = torch.where(norm > 0, along / norm.clamp(min=torch.finfo(norm.dtype).tiny), 0.0)
-        return torch.addcmul(grad * scale, unit, slope, value=-1), None
+        change = (grad / (norm + EPSILON)).addcmul_(unit, slope, value=-1)
+        if ctx.centre:
+            change.sub_(mean_over(change, ctx.axis))
+        return change, None, None, None
 
 
 def zero_normalised(values: Tensor, axis: int, *, centre: bool = True, over: tuple[int, ...] = ()) -> Tensor:
@@ -143,8 +148,7 @@ def zero_normalised(values: Tensor, axis: int, *, centre: bool = True, over: tup
 
     `centre` = False leaves the mean in; the norm is taken over the axes `over` too.
     """
-    values = centred(values, axis) if centre else values
-    return _Normalise.apply(values, (axis, *over))
+    return _ZeroNormalise.apply(values, axis, centre, over)
 
 
 def encode_blocks(counts: Tensor, weights: Tensor) -> Tensor:

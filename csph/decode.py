@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,18 +14,12 @@ from spad.depth import by_pixels, correlate, depth_in_range, grid_peak, noise_fr
 from spad.sensor import Sensor
 from spad.template import FINE_STEP, pulse_taps
 
-_FLAT = 1e-9  # of a unit template: neighbours nearer than this cannot be told apart
-
-
-class _Templates(NamedTuple):
-    fine: Tensor  # (T, G, K) float64 unit vectors: arrivals at T bin centres, G steps of -1 to 1 bin around each
-    coarse: Tensor  # (K, T) float32, those of the bin centres
-    has_plateaus: bool  # arrivals in neighbouring bins that give the same codes, as within the gates of `coarse`
+_TIE = 1e-6  # of the largest score: what float32 sums cannot tell apart
 
 
 @lru_cache(maxsize=8)
-def _templates(coding: CodingTensor, sensor: Sensor, device: str) -> _Templates:
-    """Unit vectors P C h(tau).
+def _templates(coding: CodingTensor, sensor: Sensor, device: str) -> Tensor:
+    """(T, G, K) float64: unit vectors P C h(tau) for arrivals at T bin centres and G steps of -1 to 1 bin around each.
 
     P removes the direction C 1 that a uniform background takes: nothing where rows sum to zero (Fourier), the mean
     over K for a coarse histogram. The mean over K is not removed where C 1 = 0: it would carry depth there, and of
@@ -40,32 +33,32 @@ def _templates(coding: CodingTensor, sensor: Sensor, device: str) -> _Templates:
     uniform = torch.where(uniform.abs() > 1e-5 * matrix.abs().sum(-1), uniform, 0.0)
     if uniform.any():
         templates = templates - (templates @ uniform).unsqueeze(-1) * uniform / (uniform @ uniform)
-    templates = templates / templates.norm(dim=-1, keepdim=True).clamp(min=1e-30)
-    centred = templates[:, templates.shape[1] // 2]
-    return _Templates(templates, centred.float().T, bool(((centred.diff(dim=0)).abs().amax(-1) < _FLAT).any()))
+    return templates / templates.norm(dim=-1, keepdim=True).clamp(min=1e-30)
 
 
-def _plateau_middle(scores: Tensor) -> Tensor:
-    """Middle of the bins that share the largest of (P, T) scores, where they are neighbours; else the first of them."""
-    top = scores >= scores.amax(-1, keepdim=True) - 1e-6 * scores.abs().amax(-1, keepdim=True)
-    first = top.int().argmax(-1)
-    last = scores.shape[-1] - 1 - top.flip(-1).int().argmax(-1)
-    return torch.where(top.sum(-1) == last - first + 1, (first + last) // 2, first)
+def _first_peak(scores: Tensor) -> Tensor:
+    """Bin of the largest of (P, T) scores; the first of equals, not whichever rounding favours, and the middle of a
+    run of equals, as within the gates of a coarse histogram."""
+    top = scores >= scores.amax(-1, keepdim=True) - _TIE * scores.abs().amax(-1, keepdim=True)
+    first = top.byte().argmax(-1, keepdim=True)
+    beyond = ~top & (torch.arange(scores.shape[-1], device=scores.device) > first)
+    end = torch.where(beyond.any(-1), beyond.byte().argmax(-1), scores.shape[-1])
+    return (first.squeeze(-1) + end - 1) // 2
 
 
 def _raw_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
     templates = _templates(coding, sensor, str(codes.device))
-    centre = templates.fine.shape[1] // 2
+    centre = templates.shape[1] // 2
+    coarse = templates[:, centre].float().T
 
     def one(part: Tensor) -> Tensor:
-        coarse = part.float() @ templates.coarse
-        peak = _plateau_middle(coarse) if templates.has_plateaus else coarse.argmax(-1)
+        peak = _first_peak(part.float() @ coarse)
         # In float64: of K = 2 codes the score changes by 3e-7 over an eighth of one of 1024 bins.
-        scores = (templates.fine[peak] @ part.double().unsqueeze(-1)).squeeze(-1)
+        scores = (templates[peak] @ part.double().unsqueeze(-1)).squeeze(-1)
         bins = peak + 0.5 + (grid_peak(scores) - centre) * FINE_STEP
         return torch.where(part.any(-1), bins, math.nan)
 
-    return by_pixels(one, codes, max(coding.bins, templates.fine[0].numel())) * sensor.bin_depth_m
+    return by_pixels(one, codes, max(coding.bins, templates[0].numel())) * sensor.bin_depth_m
 
 
 @lru_cache(maxsize=32)
@@ -76,9 +69,10 @@ def _bias_m(coding: CodingTensor, sensor: Sensor) -> float:
 def decode_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
     """Depth [m] at the highest score <y, C h(tau)> / |C h(tau)| over arrivals tau, (..., K) -> (...,) float32.
 
-    h(tau) is the binned pulse. Searched over the bin centres, then over a grid of eighths of a bin and a parabola; the
-    middle where neighbouring arrivals score alike; the noise-free answer is subtracted as in `spad.depth`. NaN where
-    all codes are zero. Raises InputError for another number of codes or bins, and codes that are not finite.
+    h(tau) is the binned pulse. Searched over the bin centres, then over a grid of eighths of a bin and a parabola; of
+    equal scores the first, of neighbours that score alike their middle; the noise-free answer is subtracted as in
+    `spad.depth`. NaN where all codes are zero. Raises InputError for another number of codes or bins, and codes that
+    are not finite.
     """
     if coding.bins != sensor.bins:
         raise InputError(f"coding tensor {coding.name} has {coding.bins} bins, sensor {sensor.name} has {sensor.bins}")

@@ -60,6 +60,7 @@ class Design:
         """
         code, plus, second = name.partition("+")
         require(not plus or second == "learned", f"design {name!r}: expected CODE or CODE+learned")
+        require(code in CODES, f"design {name!r} is unknown, expected one of {', '.join(CODES)}, or CODE+learned")
         alone = code in ("learned", "random") or plus or math.prod(block[1:]) == 1
         require(bool(alone), f"design {name!r} over {block[1]} x {block[2]} pixels has no spatial part: {code}+learned")
         if (codes is None) == (compression is None):

@@ -157,24 +157,30 @@ class CompressiveLayer(nn.Module):
         """ZN(C~)^T ZN(y). Raises InputError for codes of another shape."""
         good = codes.ndim == 5 and codes.shape[1] == self.codes
         require(good, f"codes of shape {tuple(codes.shape)}: expected (batch, {self.codes}, time, rows, columns)")
-        options = self.options
         with torch.autocast(codes.device.type, enabled=False):
             weights = self.weights()
-            codes = codes.to(weights.dtype)
-            direction = None if self.background is None else self._direction(weights, codes.shape[2])
-            if options.pulse_in_decoder:
-                weights = self._blurred(weights)
-            if direction is not None:
-                codes = (
-                    codes - (codes * direction.T[..., None, None]).sum(1, keepdim=True) * direction.T[..., None, None]
-                )
-                flat = weights.flatten(1)
-                weights = (flat - direction.unsqueeze(-1) * (direction @ flat).unsqueeze(1)).view(-1, *weights.shape)
-            centre = not (options.keep_mean and self.codes <= KEEP_MEAN_UP_TO)
-            over = (2,) if options.per_pixel_norm else ()
-            unit = blocks.zero_normalised(codes, 1, centre=centre, over=over)
-            axis = 0 if direction is None else 1
-            return blocks.back_project(unit, blocks.zero_normalised(weights, axis, centre=centre))
+            return self._projected(codes.to(weights.dtype), weights)
+
+    def forward(self, counts: Tensor) -> Tensor:
+        """`decode(encode(counts))`, the input of the depth network; the constraint is applied once for both."""
+        with torch.autocast(counts.device.type, enabled=False):
+            weights = self.weights()
+            return self._projected(blocks.encode_blocks(counts, weights), weights)
+
+    def _projected(self, codes: Tensor, weights: Tensor) -> Tensor:
+        direction = None if self.background is None else self._direction(weights, codes.shape[2])
+        if self.options.pulse_in_decoder:
+            weights = self._blurred(weights)
+        if direction is not None:
+            along = direction.T[..., None, None]
+            codes = codes - (codes * along).sum(1, keepdim=True) * along
+            flat = weights.flatten(1)
+            weights = (flat - direction.unsqueeze(-1) * (direction @ flat).unsqueeze(1)).view(-1, *weights.shape)
+        centre = not (self.options.keep_mean and self.codes <= KEEP_MEAN_UP_TO)
+        over = (2,) if self.options.per_pixel_norm else ()
+        unit = blocks.zero_normalised(codes, 1, centre=centre, over=over)
+        axis = 0 if direction is None else 1
+        return blocks.back_project(unit, blocks.zero_normalised(weights, axis, centre=centre))
 
     def _direction(self, weights: Tensor, times: int) -> Tensor:
         """(T/Mt, K) unit vectors along what the background leaves in the codes of each time block; 0 where nothing."""
@@ -186,7 +192,3 @@ class CompressiveLayer(nn.Module):
         seen = left.abs() > 1e-5 * (shape.abs() @ per_bin.abs().T)
         left = torch.where(seen, left, 0.0)
         return left / left.norm(dim=1, keepdim=True).clamp(min=torch.finfo(left.dtype).tiny)
-
-    def forward(self, counts: Tensor) -> Tensor:
-        """`decode(encode(counts))`, the input of the depth network."""
-        return self.decode(self.encode(counts))

@@ -47,7 +47,7 @@ class Quantised:
 
 
 def _to_int8(values: Tensor, top: float | None) -> tuple[np.ndarray, float, int]:
-    array = values.double().numpy()
+    array = values.double().cpu().numpy()
     top = float(np.abs(array).max()) if top is None else top
     scale = top / LEVELS if top > 0 else 1.0
     steps = np.rint(array / scale)

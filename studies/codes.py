@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
@@ -44,6 +45,7 @@ LEVELS = (
     *((50, background) for background in (50, 200, 500, 1000)),
 )
 LOW_SBR = 0.1  # the paper's two groups: at most, and above
+GROUPS = ("all", "high_sbr", "low_sbr")
 CODES = ("fourier", "gray", "coarse", "hadamard")
 NUMBERS = (4, 8, 16, 32, 64, 128, 256)
 UNCOMPRESSED = "log-matched"
@@ -63,6 +65,7 @@ class Row:
     signal: float
     background: float
     mae_mm: float
+    median_abs_mm: float
     within_10mm: float
     bound_mm: float
     pixels: int
@@ -139,9 +142,19 @@ def _truth(histogram: Histogram) -> _Truth:
 def _row(method: str, codes: int, truth: _Truth, depth_m: Tensor, sensor: Sensor) -> Row:
     # a pixel without a detection is missing for every method alike: it does not count
     errors = depth_errors(depth_m, truth.depth_m, range_m=sensor.range_m, exclude=truth.left_out)
-    budget = truth.budget
-    figures = (errors["mae_mm"], errors["within_10mm"], truth.bound_mm, errors["pixels"])
-    return Row(method, codes, budget.signal, budget.background, *figures)
+    absolute = 1e3 * np.abs(depth_m.numpy() - truth.depth_m)[~truth.left_out]
+    median = float(np.nanmedian(absolute)) if np.isfinite(absolute).any() else math.nan
+    return Row(
+        method,
+        codes,
+        truth.budget.signal,
+        truth.budget.background,
+        mae_mm=errors["mae_mm"],
+        median_abs_mm=median,
+        within_10mm=errors["within_10mm"],
+        bound_mm=truth.bound_mm,
+        pixels=errors["pixels"],
+    )
 
 
 def sensed(transient: Transient, sensor: Sensor, seed: int, progress: Progress) -> Iterator[Histogram]:
@@ -164,7 +177,7 @@ def by_group(rows: list[Row]) -> list[dict]:
         }
         line: dict = {"method": method, "codes": codes}
         for group, members in groups.items():
-            for key in ("mae_mm", "within_10mm", "bound_mm"):
+            for key in ("mae_mm", "median_abs_mm", "within_10mm", "bound_mm"):
                 values = [getattr(row, key) for row in members]
                 line[f"{key}_{group}"] = float(np.mean(values)) if values else math.nan
         found.append(line)
@@ -195,37 +208,45 @@ def run(command: Study, progress: Progress) -> dict:
 
 
 def _lines(groups: list[dict]) -> list[str]:
-    said = [f"{'method':<12} {'K':>4} {'MAE mm, all':>12} {'SBR > 0.1':>10} {'SBR <= 0.1':>11} {'within 10 mm':>13}"]
+    heads = ("MAE mm, all", "SBR > 0.1", "SBR <= 0.1", "median |error|", "within 10 mm")
+    said = [" ".join([f"{'method':<12} {'K':>4}", *(f"{head:>14}" for head in heads)])]
     for g in groups:
-        said.append(
-            f"{g['method']:<12} {g['codes'] or '-':>4} {g['mae_mm_all']:>12.1f} {g['mae_mm_high_sbr']:>10.1f} "
-            f"{g['mae_mm_low_sbr']:>11.1f} {g['within_10mm_all']:>13.1%}"
-        )
-    bound = groups[0]
-    name = "Cramer-Rao"
-    said.append(
-        f"{name:<12} {'-':>4} {bound['bound_mm_all']:>12.1f} {bound['bound_mm_high_sbr']:>10.1f} "
-        f"{bound['bound_mm_low_sbr']:>11.1f}"
-    )
+        values = (*(g[f"mae_mm_{group}"] for group in GROUPS), g["median_abs_mm_all"])
+        numbers = " ".join(f"{value:>14.1f}" for value in values)
+        said.append(f"{g['method']:<12} {g['codes'] or '-':>4} {numbers} {g['within_10mm_all']:>14.1%}")
+    bounds = " ".join(f"{groups[0][f'bound_mm_{group}']:>14.1f}" for group in GROUPS)
+    said.append(f"{'Cramer-Rao':<12} {'-':>4} {bounds}")
     return said
 
 
 def draw(groups: list[dict], scene: str, path: Path) -> Path:
-    """MAE against K, a panel a group of photon levels; the uncompressed histogram and its bound as lines."""
-    figure, panels = plt.subplots(1, 2, figsize=(12, 4.8), layout="constrained", sharey=True)
+    """MAE and median error against K, a column a group of photon levels; the uncompressed histogram as lines."""
+    figure, panels = plt.subplots(2, 2, figsize=(12, 8), layout="constrained", sharex=True, sharey="row")
     titles = {"high_sbr": "signal / background above 0.1 (9 levels)", "low_sbr": "at most 0.1 (7 levels)"}
-    for axes, (group, title) in zip(panels, titles.items(), strict=True):
-        for method in dict.fromkeys(line["method"] for line in groups):
-            mine = [line for line in groups if line["method"] == method]
-            if method == UNCOMPRESSED:
-                axes.axhline(mine[0][f"mae_mm_{group}"], color="k", lw=1, label="log-matched, uncompressed")
-                axes.axhline(mine[0][f"bound_mm_{group}"], color="k", lw=1, ls=":", label="Cramer-Rao, uncompressed")
-            else:
-                axes.plot([m["codes"] for m in mine], [m[f"mae_mm_{group}"] for m in mine], "o-", ms=4, label=method)
-        axes.set(xscale="log", yscale="log", title=title, xlabel="codes per pixel K")
-        axes.set_xscale("log", base=2)
-        axes.grid(alpha=0.3, which="both")
-        axes.legend(fontsize=8)
-    panels[0].set_ylabel("mean absolute depth error [mm]")
+    kinds = {"mae_mm": "mean absolute depth error [mm]", "median_abs_mm": "median absolute depth error [mm]"}
+    for row, (kind, label) in zip(panels, kinds.items(), strict=True):
+        for axes, (group, title) in zip(row, titles.items(), strict=True):
+            _curves(axes, groups, kind, group)
+            if kind == "mae_mm":
+                bound = groups[0][f"bound_mm_{group}"]
+                axes.axhline(bound, color="k", lw=1, ls=":", label="Cramer-Rao, uncompressed")
+            axes.set_title(title, fontsize=10)
+        row[0].set_ylabel(label)
+    panels[0, 0].legend(fontsize=8)
+    for axes in panels[1]:
+        axes.set_xlabel("codes per pixel K")
     figure.suptitle(f"Depth decoded by correlation over K, no network: {scene}")
     return save(figure, path)
+
+
+def _curves(axes: Axes, groups: list[dict], kind: str, group: str) -> None:
+    for method in dict.fromkeys(line["method"] for line in groups):
+        mine = [line for line in groups if line["method"] == method]
+        values = [line[f"{kind}_{group}"] for line in mine]
+        if method == UNCOMPRESSED:
+            axes.axhline(values[0], color="k", lw=1, label=f"{method}, uncompressed")
+        else:
+            axes.plot([line["codes"] for line in mine], values, "o-", ms=4, label=method)
+    axes.set_yscale("log")
+    axes.set_xscale("log", base=2)
+    axes.grid(alpha=0.3, which="both")

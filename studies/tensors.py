@@ -128,8 +128,9 @@ def draw(codings: list[CodingTensor], path: Path) -> Path:
 
 def _column(part: SubFigure, coding: CodingTensor, with_scale: bool) -> None:
     matrix = temporal_matrix(coding)
+    scaled = row_scaled(matrix).numpy()
     above, below = part.subplots(2, 1, height_ratios=(1.4, 1))
-    shown = above.imshow(row_scaled(matrix), cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto", interpolation="nearest")
+    shown = above.imshow(scaled, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto", interpolation="nearest")
     block = " x ".join(map(str, coding.block))
     pixel = ", first pixel" if coding.is_full and coding.rows * coding.columns > 1 else ""
     name = coding.name.split(" ")[0].rstrip(",")
@@ -139,7 +140,6 @@ def _column(part: SubFigure, coding: CodingTensor, with_scale: bool) -> None:
     if with_scale:
         part.colorbar(shown, ax=above, pad=0.02).set_label("every row scaled to ±1", fontsize=8)
     rows = np.unique(np.linspace(0, coding.codes - 1, min(CURVES, coding.codes)).astype(int))
-    scaled = row_scaled(matrix)
     for place, row in enumerate(rows):  # one above the other: rows of noise would hide each other
         below.plot(scaled[row] - 2.5 * place, lw=0.7)
     below.set(xlabel="time bin of the block", yticks=-2.5 * np.arange(len(rows)))

@@ -172,6 +172,16 @@ def test_coarse_codes_decode_over_any_background() -> None:
     assert (lit - bare).abs().max() < 1e-3  # codes of 4000 + 5000 rounded to 5e-4, where the score is flat
 
 
+@pytest.mark.parametrize("codes", [4, 8, 16, 32])
+def test_tied_gates_give_the_middle_of_the_first(codes: int) -> None:
+    coding, width = coarse(codes, 64), 64 // codes
+    for gates in ((1,), (1, 3), (0, 2), (codes - 1,)):
+        counts = torch.zeros(64)
+        counts[[gate * width + width // 2 for gate in gates]] = 3
+        depth = float(decode_depth(encode(counts, coding), coding, SMALL)) / SMALL.bin_depth_m
+        assert abs(depth - (gates[0] + 0.5) * width) < 1
+
+
 def test_empty_pixels_are_missing_and_shapes_are_kept() -> None:
     coding = fourier(8, 64)
     counts = torch.zeros((2, 3, 64), dtype=torch.int32)
