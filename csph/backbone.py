@@ -21,7 +21,7 @@ _UP_INIT_STD = 1e-3  # of the last transposed convolution, as published
 
 
 class DenseBlock(nn.Module):
-    """c -> c + 8 channels: 1x1x1 to 16, then two pairs of 3^3 convolutions of dilations 1, 2 and 2, 1, and 1x1x1 to 8."""
+    """c -> c + 8 channels: 1x1x1 to 16, two pairs of 3^3 convolutions of dilations 1, 2 and 2, 1, and 1x1x1 to 8."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -120,8 +120,7 @@ def doubled(x: Tensor, weight: Tensor) -> Tensor:
     taps = weight.view(inputs, outputs, 3, 2, 3, 3).flip(2, 4, 5)
     kernel = taps.permute(1, 3, 0, 2, 4, 5).reshape(2 * outputs, inputs, 3, 3, 3)
     pairs = functional.conv3d(x, kernel, padding=1)
-    batch, _, times, rows, columns = pairs.shape
-    return pairs.view(batch, outputs, 2, times, rows, columns).transpose(2, 3).reshape(batch, outputs, -1, rows, columns)
+    return pairs.unflatten(1, (outputs, 2)).transpose(2, 3).flatten(2, 3)
 
 
 def check_input(x: Tensor, factor: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +89,7 @@ def bias_by_depth(
     What soft-argmax draws towards mid-range shows as a mean that falls with depth while the median stays.
     """
     found = []
-    for near, far in zip(edges_m[:-1], edges_m[1:], strict=True):
+    for near, far in pairwise(edges_m):
         outside = ~((truth >= near) & (truth < far))
         error = _error_mm(estimate, truth, math.inf, outside if exclude is None else outside | exclude)
         if error.size:

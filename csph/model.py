@@ -40,7 +40,7 @@ class DepthModel(nn.Module):
         return parameters_of(self)
 
     def seen(self, counts: Tensor) -> Tensor:
-        """What the network is given, (B, 1, T, R, C) float32: back-projection, counts, or 1 at the first fullest bin."""
+        """What the network is given, (B, 1, T, R, C): back-projection, counts, or 1 at the first fullest bin."""
         if self.layer is not None:
             return self.layer(counts)
         if self.config.front == "counts":

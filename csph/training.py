@@ -30,9 +30,10 @@ from torchmetrics import MeanMetric
 
 from csph.backbone import soft_argmax
 from csph.config import TrainConfig
-from csph.data import SetData, Views, packed_sha256, packed_views
+from csph.data import SetData
 from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
+from csph.views import Views, packed_sha256, packed_views
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from spad.fly import Batch

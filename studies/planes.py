@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from csph.data import Views
+from csph.views import Views
 from render.transient import Transient
 from scenes.errors import require
 
