@@ -11,8 +11,6 @@ Devices, precision and several GPUs are Lightning's; nothing here knows how many
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import logging
 import time
@@ -35,13 +33,12 @@ from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
 from csph.views import Views, packed_sha256, packed_views
 from scenes.errors import InputError, require
-from scenes.files import whole_file
+from scenes.files import whole_file, write_csv
 from spad.fly import Batch
 
 log = logging.getLogger("csph")
 
 Progress = Callable[[str, float], None]
-LOG_COLUMNS = ("epoch", "step", "rate", "train_loss", "val_rmse_mm", "val_mae_mm")
 
 
 class DepthTraining(pl.LightningModule):
@@ -118,21 +115,12 @@ class Record(pl.Callback):
         if trainer.is_global_zero:
             if row["val_rmse_mm"] < best or not (self.folder / "model.safetensors").is_file():
                 save_model(module.model, module.config, row, self.folder / "model.safetensors")
-            _write_csv(self.rows, self.folder / "log.csv")
+            write_csv(self.rows, self.folder / "log.csv")
             log.info(
                 "step %d of %d: loss %.4f, validation RMSE %.1f mm, MAE %.1f mm",
                 *(row["step"], module.config.steps, row["train_loss"], row["val_rmse_mm"], row["val_mae_mm"]),
             )
         trainer.save_checkpoint(self.folder / "resume.ckpt")  # on all devices; Lightning writes it whole
-
-
-def _write_csv(rows: list[dict[str, float]], path: Path) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, LOG_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    with whole_file(path) as beside:
-        beside.write_text(text.getvalue())
 
 
 def _claim(folder: Path, config: TrainConfig) -> None:
@@ -207,6 +195,9 @@ def train(
                 reload_dataloaders_every_n_epochs=1,
                 **trainer,
             )
+            on_cpu = runner.strategy.root_device.type == "cpu"
+            # weights' gradients of narrow images read memory that was never written (torch 2.13)
+            require(config.precision == "32-true" or not on_cpu, f"precision {config.precision} needs a GPU")
             runner.fit(module, module_data, ckpt_path=str(resume) if resume.is_file() else None, weights_only=True)
         if runner.interrupted:
             raise KeyboardInterrupt

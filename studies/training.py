@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +14,13 @@ import torch
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.config import ModelConfig, TrainConfig, preset
 from csph.design import Design
-from csph.evaluation import Evaluation, Method, Row, as_dicts, evaluate
+from csph.evaluation import Evaluation, Method, as_dicts, evaluate
 from csph.metrics import PHOTON_LEVELS
 from csph.model import DepthModel, load_model
 from csph.views import Views, read_views, split_views
 from render.engine import Progress
 from scenes.errors import InputError, require
-from scenes.files import whole_file
+from scenes.files import write_csv
 from spad.depth import METHODS, estimate_depth
 from spad.histogram import Histogram
 from spad.sensor import sensor_by_name
@@ -156,7 +154,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         methods, views, sensor, levels=PHOTON_LEVELS, offset_m=command.offset, seed=command.seed, progress=progress
     )
     command.out.mkdir(parents=True, exist_ok=True)
-    table = _write_rows(found, command.out / "evaluation.csv")
+    table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
     return {**results(found, command), "overflows": sum(overflows), "csv": str(table)}
 
 
@@ -197,13 +195,3 @@ def _bias(summary: dict) -> list[str]:
         f"{b['pixels']} pixels"
         for b in summary["bias_by_depth"]
     ]
-
-
-def _write_rows(found: Evaluation, path: Path) -> Path:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [item.name for item in fields(Row)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(as_dicts(found.rows))
-    with whole_file(path) as beside:
-        beside.write_text(text.getvalue())
-    return path
