@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 from csph.design import Design
@@ -159,4 +159,4 @@ def preset(name: str, model: ModelConfig, **changes: Any) -> TrainConfig:
     given = {key: value for key, value in changes.items() if value is not None}
     require(given.keys() <= known, f"unknown options {', '.join(sorted(given.keys() - known))}")
     oracle = {"rate": 1e-4, "tv_weight": PUBLISHED_TV} if name == "paper" and model.front != "codes" else {}
-    return replace(TrainConfig(model=model, preset=name), **{**PRESETS[name], **oracle, **given})
+    return TrainConfig(**{"model": model, "preset": name, **PRESETS[name], **oracle, **given})
