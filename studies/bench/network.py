@@ -32,6 +32,7 @@ from studies.planes import random_planes
 
 PATCH = (1, 1, 1024, 32, 32)  # what multiply-accumulates are counted for
 FRAME = (1, 1, 1024, 72, 88)  # a published test frame
+PRESET = "laptop"  # whose batch, crop and learning rate a step has
 DESIGN = Design("learned", (256, 4, 4), 32)
 SCENES, VIEW_PIXELS, TEST_SCENES = 200, 64, 4
 LEVELS = ((10.0, 10.0), (10.0, 200.0))
@@ -115,7 +116,7 @@ def run(command: Bench, progress: Progress) -> dict:
 def measure(name: str, limit_s: float, repeats: int, seed: int) -> Row:
     """One network behind learned 256x4x4 codes at 128x: its costs, and its error after `limit_s` of training."""
     require(name in NETWORKS, f"network {name!r} is unknown")
-    config = preset("laptop", ModelConfig(design=DESIGN, network=name), seed=seed)
+    config = preset(PRESET, ModelConfig(design=DESIGN, network=name), seed=seed)
     model = DepthModel(config.model, seed)
     patches = torch.rand(config.batch, 1, 1024, config.crop, config.crop)
     frame = torch.rand(FRAME)
@@ -132,7 +133,7 @@ def train_for(model: DepthModel, limit_s: float, seed: int) -> tuple[int, float,
     """Steps, seconds and final error [mm] of training on random planes until the time is up, at least one step."""
     training, rest = split_views(random_planes(SCENES, size=VIEW_PIXELS, seed=seed))
     packed, sensor = packed_views(training), model.config.sensor
-    config = preset("laptop", model.config, seed=seed)
+    config = preset(PRESET, model.config, seed=seed)
     adam = torch.optim.Adam(model.parameters(), lr=config.rate)
     from csph.data import Samples  # and Lightning, which takes seconds to import
 
@@ -156,7 +157,7 @@ def measure_plain(repeats: int, seed: int) -> Row:
     torch.manual_seed(seed)
     ours, plain = DeepBoosting(can_die=False), PlainDeepBoosting(can_die=False)
     plain.load_state_dict(ours.state_dict())
-    config = preset("laptop", ModelConfig(design=DESIGN, network="published"))
+    config = preset(PRESET, ModelConfig(design=DESIGN, network="published"))
     patches, frame = torch.rand(config.batch, 1, 1024, config.crop, config.crop), torch.rand(FRAME)
     with torch.no_grad():
         reference, logits = plain(patches[:1]), ours(patches[:1])

@@ -151,10 +151,17 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
     assert "file not found" in refused(capfd, "evaluate", "nowhere", "--set", str(packed))
 
 
-def test_bench_network_rows():
-    """The plain layers give what ours give; training until the time is up takes at least one step."""
-    row = bench.measure_plain(1, 0)
-    assert row.error < 1e-4 and row.gmac > bench.gmac(bench.DeepBoosting())
+def test_bench_network(capfd, tmp_path, monkeypatch):
+    """At a small size: the plain layers give what ours give, and training takes a step even when its time is up."""
+    small = {"PRESET": "smoke", "FRAME": (1, 1, 1024, 8, 8), "SCENES": 10, "VIEW_PIXELS": 16, "QUICK_SECONDS": 0.0}
+    for name, value in small.items():
+        monkeypatch.setattr(bench, name, value)
+    found = run(capfd, "bench", "network", "--quick", "--repeats", "1", "--out", str(tmp_path))
+    compact, published, plain = found["rows"]
+    assert compact["gmac"] <= 1.5 and published["parameters"] == plain["parameters"] == 568_278
+    assert compact["trained_steps"] == published["trained_steps"] == 1 and compact["error"] > 0
+    assert plain["error"] < 1e-4 and plain["gmac"] > published["gmac"]
+    assert len((tmp_path / "network.csv").read_text().splitlines()) == 4
 
 
 @pytest.mark.slow
