@@ -71,40 +71,43 @@ class Evaluation:
     rows: list[Row] = field(default_factory=list)
     depths: dict[str, list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
 
-    def values(self, method: str, group: str = "all", levels: str = "all", figure: str = "mae_mm") -> dict:
-        """{(scene, view, signal, background): figure} of one method."""
-        chosen = LEVEL_GROUPS[levels]
-        return {
-            (row.scene, row.view, row.signal, row.background): getattr(row, figure)
-            for row in self.rows
-            if row.method == method and row.group == group and chosen(row.signal, row.background)
-        }
+    def values(
+        self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
+    ) -> dict[str, np.ndarray]:
+        """{scene: (methods, images)} of a figure; several methods are trainings of one design by different seeds."""
+        chosen, found = LEVEL_GROUPS[levels], {}
+        for row in self.rows:
+            if row.method in methods and row.group == group and chosen(row.signal, row.background):
+                by_method = found.setdefault(row.scene, {name: [] for name in methods})
+                by_method[row.method].append(getattr(row, figure))
+        return {scene: np.array([*by_method.values()]) for scene, by_method in found.items()}
 
-    def interval(self, method: str, group: str = "all", levels: str = "all", figure: str = "mae_mm") -> Interval | None:
+    def interval(
+        self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
+    ) -> Interval | None:
         """Mean over scenes with its bootstrap interval; None where there is no finite value."""
-        by_scene: dict[str, list[float]] = {}
-        for key, value in self.values(method, group, levels, figure).items():
-            if math.isfinite(value):
-                by_scene.setdefault(key[0], []).append(value)
-        return bootstrap_mean(by_scene) if by_scene else None
+        found = self.values(methods, group, levels, figure)
+        return bootstrap_mean(found) if any(np.isfinite(v).any() for v in found.values()) else None
 
-    def difference(self, first: str, second: str, levels: str = "all") -> Interval:
+    def difference(self, first: Sequence[str], second: Sequence[str], levels: str = "all") -> Interval:
         """Paired difference of MAE [mm], first - second, over scenes and levels."""
         return paired_difference(self.values(first, levels=levels), self.values(second, levels=levels))
 
-    def summary(self, method: str) -> dict[str, Any]:
+    def summary(self, methods: Sequence[str]) -> dict[str, Any]:
         """Figures by level group and pixel group (means over scenes), intervals of the MAE, and the bias by depth."""
         table: dict[str, Any] = {}
         for levels in LEVEL_GROUPS:
             table[levels] = {}
             for group in PIXELS:
                 figures = (*FIGURES, "ssim") if group == "all" else FIGURES
-                found = {name: self.interval(method, group, levels, name) for name in figures}
+                found = {name: self.interval(methods, group, levels, name) for name in figures}
                 line: dict[str, Any] = {name: None if i is None else i.mean for name, i in found.items()}
                 mae = found["mae_mm"]
                 line["mae_interval_mm"] = None if mae is None else [mae.low, mae.high]
                 table[levels][group] = line
-        estimate, truth = (np.concatenate(parts) for parts in zip(*self.depths[method], strict=True))
+        estimate, truth = (
+            np.concatenate(parts) for parts in zip(*(pair for m in methods for pair in self.depths[m]), strict=True)
+        )
         far = math.ceil(float(np.nanmax(truth, initial=1.0)))
         return {**table, "bias_by_depth": [b._asdict() for b in bias_by_depth(estimate, truth, range(far + 1))]}
 

@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from scenes.errors import require
 from spad.depth import depth_errors
@@ -105,33 +106,44 @@ class Interval(NamedTuple):
     high: float
 
 
-def bootstrap_mean(values: Mapping[str, Sequence[float]], *, draws: int = 2000, seed: int = 0) -> Interval:
-    """Mean of the scenes' means, and its interval: scenes are drawn with replacement, and within each its values.
+def bootstrap_mean(values: Mapping[str, ArrayLike], *, draws: int = 2000, seed: int = 0) -> Interval:
+    """Mean of the scenes' means, and its interval: seeds, scenes, and each scene's values are drawn with replacement.
 
-    values: scene -> the values of that scene (photon levels, seeds). NaN values are left out. Pixels and levels of one
-    scene are not independent, so that scenes are what is drawn. One scene gives an interval of NaN.
+    values: scene -> (values,) or (seeds, values), the photon levels of that scene under one or several trainings.
+    Levels of one scene are not independent, and one training is the same in all scenes: scenes and seeds are what is
+    drawn first. NaN values are left out. One scene gives an interval of NaN.
     """
-    kept = [np.asarray(v, float)[np.isfinite(np.asarray(v, float))] for v in values.values()]
-    kept = [v for v in kept if v.size]
+    kept = [np.atleast_2d(np.asarray(v, float)) for v in values.values()]
+    kept = [v for v in kept if np.isfinite(v).any()]
     require(bool(kept), "bootstrap: no finite value")
-    mean = float(np.mean([v.mean() for v in kept]))
+    require(len({len(v) for v in kept}) == 1, "bootstrap: scenes with different numbers of seeds")
+    mean = float(np.mean([np.nanmean(v) for v in kept]))
     if len(kept) < 2:
         return Interval(mean, math.nan, math.nan)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
-    # every scene's own resampled mean in each draw, then the scenes
-    inner = np.stack([v[rng.integers(0, v.size, (draws, v.size))].mean(1) for v in kept], axis=1)
+    seeds = rng.integers(0, len(kept[0]), (draws, len(kept[0]), 1))
+    means = np.empty((draws, len(kept)))
+    for column, v in enumerate(kept):
+        drawn = v[seeds, rng.integers(0, v.shape[1], (draws, 1, v.shape[1]))]
+        known = np.isfinite(drawn)
+        total = np.where(known, drawn, 0.0).sum((1, 2))
+        means[:, column] = total / np.maximum(known.sum((1, 2)), 1)
+        means[~known.any((1, 2)), column] = np.nanmean(v)
     chosen = rng.integers(0, len(kept), (draws, len(kept)))
-    means = np.take_along_axis(inner, chosen, axis=1).mean(1)
-    low, high = np.quantile(means, (0.025, 0.975))
+    low, high = np.quantile(np.take_along_axis(means, chosen, axis=1).mean(1), (0.025, 0.975))
     return Interval(mean, float(low), float(high))
 
 
-def paired_difference(
-    first: Mapping[tuple[str, object], float], second: Mapping[tuple[str, object], float], **bootstrap: int
-) -> Interval:
-    """Mean of first - second over what both have, keyed by (scene, level, ...), with its interval over scenes."""
-    by_scene: dict[str, list[float]] = {}
-    for key in first.keys() & second.keys():
-        by_scene.setdefault(key[0], []).append(first[key] - second[key])
-    require(bool(by_scene), "paired difference: the two have no scene and level in common")
-    return bootstrap_mean({scene: by_scene[scene] for scene in sorted(by_scene)}, **bootstrap)
+def paired_difference(first: Mapping[str, ArrayLike], second: Mapping[str, ArrayLike], **bootstrap: int) -> Interval:
+    """Mean of first - second, value by value, with its interval; both as in `bootstrap_mean`.
+
+    What makes a scene or a level hard is in both and cancels. Other numbers of seeds: of the means over seeds.
+    """
+    scenes = [scene for scene in first if scene in second]
+    require(bool(scenes), "paired difference: the two have no scene in common")
+    differences = {}
+    for scene in scenes:
+        a, b = (np.atleast_2d(np.asarray(v[scene], float)) for v in (first, second))
+        require(a.shape[1] == b.shape[1], f"paired difference: scene {scene} has other levels in the two")
+        differences[scene] = a - b if len(a) == len(b) else a.mean(0) - b.mean(0)
+    return bootstrap_mean(differences, **bootstrap)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -32,7 +33,7 @@ from csph.data import SetData
 from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
 from csph.views import Views, packed_sha256, packed_views
-from scenes.errors import InputError, require
+from scenes.errors import require
 from scenes.files import whole_file, write_csv
 from spad.fly import Batch
 
@@ -203,10 +204,11 @@ def train(
             raise KeyboardInterrupt
         if runner.is_global_zero:
             save_model(module.model, config, record.rows[-1], folder / "last.safetensors")
+        runner.strategy.barrier()
     _, _, best = load_model(folder)
     _, _, last = load_model(folder / "last.safetensors")
-    if not best["val_rmse_mm"] <= last["val_rmse_mm"]:
-        raise InputError(f"{folder}: the weights kept are not the best of the run; the folder was altered")
+    diverged = f"{folder}: the run diverged, its validation error is no number; use a lower --rate"
+    require(math.isfinite(best["val_rmse_mm"]), diverged)
     return {
         "steps": last["step"],
         "seconds": time.perf_counter() - start,

@@ -14,7 +14,7 @@ import torch
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.config import ModelConfig, TrainConfig, preset
 from csph.design import Design
-from csph.evaluation import Evaluation, Method, as_dicts, evaluate
+from csph.evaluation import LEVEL_GROUPS, Evaluation, Method, as_dicts, evaluate
 from csph.metrics import PHOTON_LEVELS
 from csph.model import DepthModel, load_model
 from csph.views import Views, read_views, split_views
@@ -145,31 +145,40 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         views = Views(views.transients[: command.views], views.scenes[: command.views])
     overflows: list[int] = []
     methods: dict[str, Method] = {}
+    groups: dict[str, list[str]] = {}  # trainings of one design by different seeds are one group
     for path, model in zip(command.checkpoints, models, strict=True):
-        methods[str(path)] = network_method(model)
-        if command.int8:
-            methods[f"{path} int8"] = network_method(model, int8=True, overflows=overflows)
+        for suffix, int8 in (("", False), (" int8", True))[: 1 + command.int8]:
+            methods[f"{path}{suffix}"] = network_method(model, int8=int8, overflows=overflows)
+            groups.setdefault(f"{model.config.name}{suffix}", []).append(f"{path}{suffix}")
     methods |= {name: baseline(name) for name in command.baselines}
+    groups |= {name: [name] for name in command.baselines}
     found = evaluate(
         methods, views, sensor, levels=PHOTON_LEVELS, offset_m=command.offset, seed=command.seed, progress=progress
     )
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
-    return {**results(found, command), "overflows": sum(overflows), "csv": str(table)}
+    first = f"{models[0].config.name}{' int8' if command.int8 else ''}"
+    return {**results(found, groups, first, command.json), "overflows": sum(overflows), "csv": str(table)}
 
 
-def results(found: Evaluation, command: Evaluate) -> dict[str, Any]:
-    """Headline figures of the first checkpoint, every method by group of levels, differences from the first."""
-    first = f"{command.checkpoints[0]} int8" if command.int8 else str(command.checkpoints[0])
-    summaries = {name: found.summary(name) for name in found.depths}
+def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> dict[str, Any]:
+    """Headline figures of the `first` group, every group by levels, paired differences of MAE from the first."""
+    summaries = {name: found.summary(members) for name, members in groups.items()}
     everything = summaries[first]["all"]["all"]
-    by_sbr = {name: {group: summary[group]["all"] for group in ("low_sbr", "high_sbr")}
-              for name, summary in summaries.items()}  # fmt: skip
-    differences = {name: found.difference(first, name)._asdict() for name in summaries if name != first}
     head = {key: everything[key] for key in ("mae_mm", "rmse_mm", "within_10mm", "ssim", "mae_interval_mm")}
-    if command.json:
-        return {**head, "by_sbr": by_sbr, "methods": summaries, "mae_difference_mm": differences}
-    return {**head, "table": _lines(summaries), "bias_by_depth": _bias(summaries[first])}
+    differences = {
+        levels: {
+            name: found.difference(groups[first], groups[name], levels)._asdict() for name in groups if name != first
+        }
+        for levels in LEVEL_GROUPS
+    }
+    head = {"method": first, "trainings": len(groups[first]), **head}
+    if not full:
+        return {**head, "table": _lines(summaries), "bias_by_depth": _bias(summaries[first])}
+    by_sbr = {
+        name: {group: summary[group]["all"] for group in ("low_sbr", "high_sbr")} for name, summary in summaries.items()
+    }
+    return {**head, "by_sbr": by_sbr, "methods": summaries, "mae_difference_mm": differences}
 
 
 def _lines(summaries: dict[str, dict]) -> list[str]:

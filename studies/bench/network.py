@@ -148,7 +148,7 @@ def train_for(model: DepthModel, limit_s: float, seed: int) -> tuple[int, float,
     taken = time.perf_counter() - start
     views = rest._replace(transients=rest.transients[:TEST_SCENES], scenes=rest.scenes[:TEST_SCENES])
     found = evaluate({"network": lambda h: model.depth_of(h)[0]}, views, sensor, levels=LEVELS, seed=seed)
-    interval = found.interval("network")
+    interval = found.interval(["network"])
     return step, taken, float("nan") if interval is None else interval.mean
 
 

@@ -105,16 +105,29 @@ def test_bootstrap_is_by_scene_not_by_value():
     assert wide.mean == same.mean == 0.5
     assert wide.high - wide.low == pytest.approx(same.high - same.low, abs=0.13)  # a hundred copies say no more
     assert math.isnan(bootstrap_mean({"one": [1.0, 2.0]}).low)
-    assert bootstrap_mean({"a": [1.0, math.nan], "b": [3.0]}).mean == 2
+    assert bootstrap_mean({"a": [1.0, math.nan], "b": [3.0], "c": [math.nan]}).mean == 2
     with pytest.raises(InputError, match="no finite value"):
         bootstrap_mean({"a": [math.nan]})
 
 
+def test_bootstrap_sees_what_seeds_share():
+    # two trainings, one 1 mm off in every scene: no number of scenes tells which is usual
+    seeds = {str(i): [[0.0] * 16, [1.0] * 16] for i in range(50)}
+    one = {str(i): [0.5] * 16 for i in range(50)}
+    assert bootstrap_mean(one) == (0.5, 0.5, 0.5)
+    assert bootstrap_mean(seeds) == (0.5, 0.0, 1.0)
+    with pytest.raises(InputError, match="different numbers of seeds"):
+        bootstrap_mean({"a": [[1.0], [2.0]], "b": [[1.0]]})
+
+
 def test_paired_differences_cancel_what_scenes_share():
     rng = np.random.default_rng(0)
-    hard = {f"scene-{i}": rng.uniform(1, 100) for i in range(8)}
-    first = {(scene, level): v + 1 for scene, v in hard.items() for level in range(4)}
-    second = {(scene, level): v for scene, v in hard.items() for level in range(5)}
+    second = {f"scene-{i}": rng.uniform(1, 100, 4) for i in range(8)}
+    first = {scene: values + 1 for scene, values in second.items()}
     assert paired_difference(first, second) == pytest.approx((1, 1, 1))
-    with pytest.raises(InputError, match="no scene and level in common"):
-        paired_difference({("a", 1): 1.0}, {("b", 1): 1.0})
+    trained = {scene: np.stack([values, values + 2]) for scene, values in second.items()}
+    assert paired_difference(trained, second) == pytest.approx((1, 1, 1))
+    with pytest.raises(InputError, match="no scene in common"):
+        paired_difference({"a": [1.0]}, {"b": [1.0]})
+    with pytest.raises(InputError, match="scene a has other levels"):
+        paired_difference({"a": [1.0, 2.0]}, {"a": [1.0]})

@@ -83,7 +83,9 @@ def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
 
     found = run(capfd, "evaluate", "run", "--set", str(packed), "--views", "2", "--int8", "--out", "table")
     assert {"mae_mm", "rmse_mm", "within_10mm", "by_sbr", "methods", "overflows"} <= found.keys()
-    assert set(found["methods"]) == {"run", "run int8", "argmax", "log-matched", "fourier-8"}
+    name = "learned 256x4x4 K32, compact"
+    assert set(found["methods"]) == {name, f"{name} int8", "argmax", "log-matched", "fourier-8"}
+    assert found["method"] == f"{name} int8" and found["trainings"] == 1
     rows = Path("table/evaluation.csv").read_text().splitlines()
     assert len(rows) == 1 + 2 * len(PHOTON_LEVELS) * 5 * 3
     by_sbr = found["by_sbr"]["log-matched"]
