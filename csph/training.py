@@ -155,6 +155,26 @@ def _quiet() -> Any:
             logger.setLevel(level)
 
 
+def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
+    """Lightning's Trainer without what `Record` does instead. InputError for mixed precision on a CPU."""
+    runner = pl.Trainer(
+        max_epochs=config.epochs,
+        precision=config.precision,
+        callbacks=[record],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        reload_dataloaders_every_n_epochs=1,
+        **more,
+    )
+    # there, weights' gradients in bf16 read memory that was never written (torch 2.13)
+    on_cpu = runner.strategy.root_device.type == "cpu"
+    require(config.precision == "32-true" or not on_cpu, f"precision {config.precision} needs a GPU")
+    return runner
+
+
 def train(
     config: TrainConfig,
     training: Views,
@@ -175,33 +195,21 @@ def train(
     data = {name: packed_sha256(packed) for name, packed in zip(("training", "validation"), sets, strict=True)}
     config = replace(config, data={**config.data, **{f"{name}_sha256": sha for name, sha in data.items()}})
     module_data = SetData(*sets, config, workers)
+    record = Record(folder, progress or (lambda what, share: None))
+    with _quiet():
+        runner = _trainer(config, record, **trainer)
     _claim(folder, config)
     if config.threads:
         torch.set_num_threads(config.threads)
-    record = Record(folder, progress or (lambda what, share: None))
     start = time.perf_counter()
     module = DepthTraining(config)
     resume = folder / "resume.ckpt"
     if not (folder / "last.safetensors").is_file():
         with _quiet():
-            runner = pl.Trainer(
-                max_epochs=config.epochs,
-                precision=config.precision,
-                callbacks=[record],
-                logger=False,
-                enable_checkpointing=False,
-                enable_progress_bar=False,
-                enable_model_summary=False,
-                num_sanity_val_steps=0,
-                reload_dataloaders_every_n_epochs=1,
-                **trainer,
-            )
-            on_cpu = runner.strategy.root_device.type == "cpu"
-            # weights' gradients of narrow images read memory that was never written (torch 2.13)
-            require(config.precision == "32-true" or not on_cpu, f"precision {config.precision} needs a GPU")
-            runner.fit(module, module_data, ckpt_path=str(resume) if resume.is_file() else None, weights_only=True)
-        if runner.interrupted:
-            raise KeyboardInterrupt
+            try:
+                runner.fit(module, module_data, ckpt_path=str(resume) if resume.is_file() else None, weights_only=True)
+            except SystemExit:  # what Lightning makes of Ctrl-C
+                raise KeyboardInterrupt from None
         if runner.is_global_zero:
             save_model(module.model, config, record.rows[-1], folder / "last.safetensors")
         runner.strategy.barrier()
