@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from csph.metrics import (
 from csph.views import Views
 from scenes.errors import require
 from spad.detect import sense
-from spad.histogram import Histogram
+from spad.histogram import TRUTH, Histogram
 from spad.sensor import PhotonBudget, Sensor
 
 STAGE_EVALUATE = 34
@@ -118,14 +118,16 @@ def evaluate(
     sensor: Sensor,
     *,
     levels: Sequence[tuple[float, float]] = PHOTON_LEVELS,
+    tile: tuple[int, int] = (1, 1),
     offset_m: float = 0.0,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Evaluation:
     """Sense every view at every level and apply all methods to it.
 
-    `offset_m` moves the scenes away in time alone (`Transient.delayed`); sets rendered with other offsets are given as
-    they are. Raises InputError for an empty set or no method, and what the methods raise.
+    After sensing, images are cut to what tiles of `tile` rows and columns cover. `offset_m` moves the scenes away in
+    time alone (`Transient.delayed`); sets rendered with other offsets are given as they are. Raises InputError for an
+    empty set or no method, an image smaller than a tile, and what the methods raise.
     """
     require(bool(views.transients) and bool(methods), "evaluation: no view or no method")
     say, result = progress or (lambda what, share: None), Evaluation(depths={name: [] for name in methods})
@@ -136,12 +138,23 @@ def evaluate(
             say(f"{scene}, {signal:g} + {background:g} photons", (view * len(levels) + number) / total)
             draw = np.random.SeedSequence(seed, spawn_key=(STAGE_EVALUATE, view, number)).generate_state(1)[0]
             histogram = sense(moved, sensor, PhotonBudget(signal, background), seed=int(draw), model="poisson")
+            histogram = _tiled(histogram, tile)
             for name, method in methods.items():
                 estimate = method(histogram)
                 result.rows += _rows(name, scene, view, (signal, background), estimate, histogram)
                 known = np.isfinite(histogram.depth_m) & (histogram.depth_m < sensor.range_m)
                 result.depths[name].append((estimate[known], histogram.depth_m[known]))
     return result
+
+
+def _tiled(histogram: Histogram, tile: tuple[int, int]) -> Histogram:
+    """Its first rows and columns, as many as tiles cover; InputError where not one fits."""
+    size = histogram.depth_m.shape
+    rows, columns = (side // part * part for side, part in zip(size, tile, strict=True))
+    fits = rows > 0 and columns > 0
+    require(fits, f"image of {size[1]} x {size[0]} pixels is smaller than a block of {tile[1]} x {tile[0]}")
+    cut = {name: getattr(histogram, name)[:rows, :columns].copy() for name in ("counts", *TRUTH)}
+    return histogram if (rows, columns) == size else replace(histogram, **cut)
 
 
 def _rows(

@@ -153,7 +153,14 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     methods |= {name: baseline(name) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
     found = evaluate(
-        methods, views, sensor, levels=PHOTON_LEVELS, offset_m=command.offset, seed=command.seed, progress=progress
+        methods,
+        views,
+        sensor,
+        levels=PHOTON_LEVELS,
+        tile=tuple(math.lcm(*sides) for sides in zip(*(m.config.block[1:] for m in models), strict=True)),
+        offset_m=command.offset,
+        seed=command.seed,
+        progress=progress,
     )
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")

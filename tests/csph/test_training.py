@@ -2,6 +2,7 @@
 
 import json
 import math
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from csph.config import PUBLISHED_TV, ModelConfig, TrainConfig, preset
 from csph.data import Frames, Samples, SetData
 from csph.design import Design
+from csph.evaluation import evaluate
 from csph.loss import kl_divergence, pulse_target, total_variation
 from csph.model import DepthModel, load_model, save_model, weights_sha256
 from csph.training import train
@@ -133,6 +135,30 @@ def test_split_is_by_scene():
 
 class Stopped(Exception):
     pass
+
+
+def test_interruption_is_passed_on(tmp_path):
+    def stop(what: str, share: float) -> None:
+        raise KeyboardInterrupt
+
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train(preset("smoke", MODEL, **FEW), *split_views(near_planes(3)), tmp_path / "run", progress=stop)
+    finally:
+        signal.signal(signal.SIGINT, handler)  # Lightning leaves it ignored
+
+
+def test_images_are_cut_to_whole_blocks():
+    model = DepthModel(MODEL).eval()
+    views = random_planes(1, size=17, seed=2)
+    found = evaluate({"n": lambda h: model.depth_of(h)[0]}, views, SMALL, levels=[(20, 20)], tile=(2, 2))
+    row = found.rows[0]
+    assert (
+        row.group == "all" and row.pixels + row.beyond_range == np.isfinite(views.transients[0].depth_m[:16, :16]).sum()
+    )
+    with pytest.raises(InputError, match="image of 17 x 17 pixels is smaller than a block of 32 x 32"):
+        evaluate({"n": lambda h: h.depth_m}, views, SMALL, levels=[(20, 20)], tile=(32, 32))
 
 
 def test_a_run_that_stops_goes_on_to_the_same_weights(tmp_path):
@@ -258,6 +284,7 @@ def test_bad_configurations(change, said, tmp_path):
         train(
             preset("smoke", MODEL, **{**FEW, **change}), *split_views(near_planes(3)), tmp_path / "x", accelerator="cpu"
         )
+    assert not (tmp_path / "x").exists()
 
 
 def test_histograms_that_do_not_fit():
