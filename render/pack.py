@@ -1,8 +1,8 @@
 """A set of transients in one HDF5 file, small enough to carry to where a network is trained. No renderer, no OpenEXR.
 
-Numbers are rounded to steps far below what a sensor resolves, so that they compress: paths to 2^-11 m (0.49 mm), depths
-to 2^-13 m, radiances to 2^(1/1000) (0.07 %), ambient light to 2^(1/64), albedo to 1/255. Normals and error estimates
-stay behind in the EXR files.
+Numbers are rounded to steps far below what a sensor resolves, so that they compress: paths to 2^-9 m (2 mm), depths
+to 2^-12 m (0.24 mm), radiances to 2^(1/125) (0.55 %), ambient light to 2^(1/16), albedo to 1/255. Normals and error
+estimates stay behind in the EXR files.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from render.transient import Transient
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 
-PATH_STEP_M, DEPTH_STEP_M = 2.0**-11, 2.0**-13
-RADIANCE_STEPS, AMBIENT_STEPS = 1000, 64  # per octave
+PATH_STEP_M, DEPTH_STEP_M = 2.0**-9, 2.0**-12
+RADIANCE_STEPS, AMBIENT_STEPS = 125, 16  # per octave
+FINER = 4  # an EXR file of a set keeps lengths in steps that much smaller
 OCTAVES = 32  # below and above 1; codes are uint16, 0 is 0
 NO_DEPTH = np.iinfo(np.int32).min
 PER_VIEW = {"count": np.uint16, "depth": np.int32, "mixed": np.uint8, "albedo": np.uint8, "ambient": np.uint16}
@@ -74,23 +75,28 @@ class Pack:
 
 
 def rounded(view: Transient) -> Transient:
-    """The transient with path lengths in whole steps of a pack and radiances of 12 bits, for a smaller EXR file."""
-    near = np.rint(view.path_near_m.astype(np.float64) / PATH_STEP_M) * PATH_STEP_M
-    far = np.rint(view.path_far_m.astype(np.float64) / PATH_STEP_M) * PATH_STEP_M
+    """The transient rounded for a smaller EXR file: lengths in quarter steps of a pack, radiances of 11 bits, ambient
+    light and errors of 8, normals in steps of 1/256."""
+
+    def stepped(lengths: np.ndarray, step: float) -> np.ndarray:
+        return (np.rint(lengths.astype(np.float64) / step) * step).astype(np.float32)
+
     return replace(
         view,
-        path_near_m=near.astype(np.float32),
-        path_far_m=far.astype(np.float32),
-        radiance=_short(view.radiance),
-        ambient=_short(view.ambient),
-        error=_short(view.error),
+        path_near_m=stepped(view.path_near_m, PATH_STEP_M / FINER),
+        path_far_m=stepped(view.path_far_m, PATH_STEP_M / FINER),
+        depth_m=stepped(view.depth_m, DEPTH_STEP_M / FINER),
+        normal=(np.rint(view.normal.astype(np.float32) * 256) / 256).astype(np.float16),
+        radiance=_short(view.radiance, 11),
+        ambient=_short(view.ambient, 8),
+        error=_short(view.error, 8),
     )
 
 
-def _short(values: np.ndarray) -> np.ndarray:
-    """float32 rounded to 12 bits of mantissa."""
+def _short(values: np.ndarray, bits: int) -> np.ndarray:
+    """float32 rounded to that many bits of mantissa."""
     mantissa, exponent = np.frexp(values.astype(np.float64))
-    return np.ldexp(np.rint(mantissa * 4096) / 4096, exponent).astype(np.float32)
+    return np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits).astype(np.float32)
 
 
 def _encoded(values: np.ndarray, steps: int) -> np.ndarray:

@@ -72,3 +72,16 @@ def make_palette(rng: Random) -> Palette:
     gloss["gloss dark"] = Material(albedo=DARKEST, roughness=0.15, name="gloss dark", **GLOSS)
     steel = Material("roughconductor", roughness=0.3, eta=2.9, k=3.1, name="steel")
     return made | satin | gloss | {"steel": steel, "glass": Material("thindielectric", ior=1.5, name="glass")}
+
+
+def pick(palette: Palette, rng: Random, family: str) -> Material:
+    """One of the palette's materials named `family` and a number or word."""
+    names = [name for name in palette if name.startswith(f"{family} ")]
+    return palette[names[int(rng.integers(len(names)))]]
+
+
+def repainted(palette: Palette, rng: Random) -> Palette:
+    """The palette with other woods, cloths and paints under the names that the demo room's furniture asks for."""
+    varied = {"wood": "wood", "varnished wood": "satin", "white paint": "paint", "sofa cloth": "cloth"}
+    varied |= {"cushion cloth": "cloth", "leather": "dark", "rubber": "satin", "clay": "clay"}
+    return {**palette, **{name: pick(palette, rng, family) for name, family in varied.items()}}

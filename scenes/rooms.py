@@ -10,19 +10,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from scenes import clutter, furniture
+from scenes import clutter, fittings, furniture
 from scenes.layout import Floor, Place, overlap, rough_distance, set_down
 from scenes.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
 from scenes.model import Camera, Scene, Surface
-from scenes.palette import make_palette
+from scenes.palette import make_palette, pick
 from scenes.parts import Palette, Piece, Random, box, joined, panel, sheet, with_normals
 from scenes.patterns import on_one_sheet
 
 SPLITS = ("train", "val", "test")
 FOV_DEG = (52.0, 66.0)
 NEAREST_M, FARTHEST_M = 0.6, 6.9
-MEDIAN_M = (1.7, 3.9)  # of one view, by upright boxes; drawn evenly
+MEDIAN_M = (1.9, 3.9)  # of one view, by upright boxes; drawn evenly
 CANDIDATES, ATTEMPTS = 40, 8
+FLAT = ("window", "door", "picture", "clock", "radiator", "rug")  # an image should show more than these
 
 
 def room_view(index: int, split: str = "train", *, seed: int = 0, width: int = 64, height: int = 64) -> Scene:
@@ -121,9 +122,7 @@ def _shell(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> list[
     ]
     if rng.random() < 0.7:
         skirting = [_along(start, end, 0.0, rng.uniform(0.06, 0.12), 0.015) for start, end in boards]
-        surfaces.append(
-            joined("skirting", furniture.pick(palette, rng, "paint" if rng.random() < 0.7 else "wood"), *skirting)
-        )
+        surfaces.append(joined("skirting", pick(palette, rng, "paint" if rng.random() < 0.7 else "wood"), *skirting))
     if rng.random() < 0.18:
         beams = [
             box((low[0], ceiling - 0.16, z), (high[0], ceiling, z + 0.14))
@@ -168,7 +167,7 @@ def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None
     """Windows and a door, then large things along the walls, then the middle, then what is small."""
     for kind, count in (("window", int(rng.integers(1, 3))), ("door", int(rng.random() < 0.7))):
         for _ in range(count):
-            make = furniture.wall_window if kind == "window" else furniture.door
+            make = fittings.wall_window if kind == "window" else fittings.door
             floor.try_at_wall(make(palette, rng), rng, 8)
     if rng.random() < 0.5:
         floor.try_free(furniture.rug(palette, rng), rng, 6, turn_deg=float(rng.choice((0, 90)) + rng.normal(0, 4)))
@@ -183,7 +182,7 @@ def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None
     for kind in rng.permutation(list(furniture.ON_FLOOR)[1:])[: int(rng.integers(1, 5))]:
         floor.try_free(furniture.ON_FLOOR[kind](palette, rng), rng, 8)
     for _ in range(int(rng.integers(2, 7))):
-        floor.try_at_wall(furniture.ON_WALL[str(rng.choice(list(furniture.ON_WALL)))](palette, rng), rng, 8)
+        floor.try_at_wall(fittings.ON_WALL[str(rng.choice(list(fittings.ON_WALL)))](palette, rng), rng, 8)
     for kind in rng.choice(list(clutter.LOW), int(rng.integers(3, 10))):
         piece = clutter.LOW[kind](palette, rng)
         _ = floor.try_at_wall(piece, rng, 6, gap=0.05) if rng.random() < 0.6 else floor.try_free(piece, rng, 6)
@@ -192,7 +191,7 @@ def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None
             litter(palette, rng, floor, top)
     if rng.random() < 0.6:
         centre = floor.outline.mean(axis=0) + rng.normal(0, 0.4, 2)
-        lamp = set_down(furniture.pendant(palette, rng, ceiling), *centre)
+        lamp = set_down(fittings.pendant(palette, rng, ceiling), *centre)
         if floor.fits(lamp):
             floor.places.append(lamp)
 
@@ -247,6 +246,8 @@ def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) 
     """A hand-held view with the wanted median distance and enough to see; judged on boxes, in a 16 x 12 image."""
     wanted = rng.uniform(*MEDIAN_M)
     low, high = floor.outline.min(axis=0), floor.outline.max(axis=0)
+    standing = [p for p in floor.places if p.piece.surfaces and not p.piece.surfaces[0].name.startswith(FLAT)]
+    furnished, bare = Floor(floor.outline, standing), Floor(floor.outline)
     best, best_score = None, math.inf
     for _ in range(CANDIDATES):
         x, z = rng.uniform(low + 0.3, high - 0.3)
@@ -262,9 +263,10 @@ def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) 
         distance = rough_distance(floor, ceiling, origin, rays)
         if distance.min() < NEAREST_M or np.quantile(distance, 0.99) > FARTHEST_M:
             continue
-        bare = rough_distance(Floor(floor.outline), ceiling, origin, rays)
-        busy = float((distance < bare - 0.2).mean())
-        score = abs(float(np.median(distance)) - wanted) + 2.5 * max(0.0, 0.7 - busy)
+        to_walls = rough_distance(bare, ceiling, origin, rays)
+        busy = float((rough_distance(furnished, ceiling, origin, rays) < to_walls - 0.1).mean())
+        low_end, middle, high_end = np.quantile(distance, (0.05, 0.5, 0.95))
+        score = abs(middle - wanted) + 3.0 * max(0.0, 0.6 - busy) + 2.0 * max(0.0, 0.6 - (high_end - low_end) / middle)
         if score < best_score:
             best, best_score = (
                 Camera.look_at(origin, origin + ahead, fov_deg=fov, width=width, height=height, up=up),

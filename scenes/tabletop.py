@@ -15,10 +15,9 @@ import numpy as np
 from scenes import clutter, shapes
 from scenes.blobs import branching, stone, toy
 from scenes.errors import require
-from scenes.furniture import pick
 from scenes.layout import Floor, set_down
 from scenes.model import Camera, Scene, Surface
-from scenes.palette import make_palette
+from scenes.palette import make_palette, pick
 from scenes.parts import Palette, Piece, Random, box, joined, lathe, moved, panel, tube, turned, with_normals
 from scenes.patterns import on_one_sheet
 from scenes.rooms import one_of_each

@@ -39,9 +39,8 @@ log = logging.getLogger("scene2spad")
 Progress = Callable[[str, float], None]
 STAGE_VIEW = 20
 TRIES = 3  # of a view whose worker process died
-DIRECT_TOLERANCE_M = (
-    0.06  # of path: merged returns keep energy, centroid and variance, and the error estimate sees them
-)
+# Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
+DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 _ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
 
 
@@ -73,6 +72,8 @@ class Job:
             grid=self.grid,
             error=self.error,
             direct_tolerance_m=DIRECT_TOLERANCE_M,
+            indirect_tolerance_m=INDIRECT_TOLERANCE_M,
+            indirect_growth=INDIRECT_GROWTH,
         )
 
 
@@ -89,7 +90,7 @@ def render_view(job: Job, view: int) -> Done:
     """Render one view to EXR bytes. A view that cannot be rendered is a record with `failed`, not an exception."""
     start = time.perf_counter()
     where = f"{os.uname().nodename}/{os.getpid()}"
-    with _ONE_AT_A_TIME, _quiet():
+    with _ONE_AT_A_TIME, quiet():
         try:
             record, exr = _rendered(job, view)
         except Exception as error:  # one odd scene of thousands must not end the run
@@ -100,7 +101,7 @@ def render_view(job: Job, view: int) -> Done:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """The plan of each of thousands of views goes into the index, not to the screen."""
     logger = logging.getLogger("render")
     level = logger.level
@@ -165,7 +166,8 @@ class Folder:
 
     def __init__(self, path: Path, job: Job) -> None:
         self.path, self.job = path, job
-        asked = json.dumps(asdict(job) | {"schema": 1}, sort_keys=True, indent=1) + "\n"
+        stored = {"schema": 1, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH]}
+        asked = json.dumps(asdict(job) | stored, sort_keys=True, indent=1) + "\n"
         config = path / "set.json"
         if config.is_file():
             if config.read_text() != asked:

@@ -12,6 +12,7 @@ from render.engine import Progress, render
 from render.settings import RenderSettings
 from render.transient import Transient
 from scenes.model import Scene
+from studies.dataset import quiet
 from studies.figures import DEPTH_COLOURS, display, plt, save
 
 DRAFT = RenderSettings(bounces=1, grid=2)
@@ -24,7 +25,8 @@ def draw_sheet(scenes: Sequence[Scene], path: Path, *, columns: int = 8, progres
     views = []
     for i, scene in enumerate(scenes):
         say(scene.name, i / len(scenes))
-        views.append(render(scene.without_lights(), DRAFT))
+        with quiet():
+            views.append(render(scene.without_lights(), DRAFT))
     return draw_views(views, path, columns=columns)
 
 

@@ -298,12 +298,12 @@ def test_refuses_a_missing_file_a_folder_and_an_unknown_kind(tmp_path):
         ("needle.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "all of its faces are degenerate"),
         ("dot.obj", "v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "largest extent is 0"),
         ("vast.obj", "v -1e308 0 0\nv 1e308 0 0\nv 0 1 0\nf 1 2 3\n", "largest extent is inf"),
-        ("empty.ply", "", "broken .ply"),
+        ("empty.ply", "", "empty"),
         ("garbage.ply", "no mesh\n", "broken .ply"),
         ("garbage.stl", "no mesh\n", "empty"),
         ("empty.stl", "", "empty"),
         ("garbage.glb", "no mesh, but long enough for a header\n", "broken .glb"),
-        ("empty.glb", "", "broken .glb"),
+        ("empty.glb", "", "empty"),
     ],
 )
 def test_refuses_bad_content_in_one_line(tmp_path, name, text, words):
