@@ -16,14 +16,13 @@ from scenes.errors import InputError
 from spad.exposure import Exposure, Progress, counts_of, timestamps_of
 from spad.flux import expected_counts, rates_for
 from spad.histogram import Histogram
+from spad.laws import LOW_FLUX
 from spad.photons import expected_signal, light_of
 from spad.sensor import PhotonBudget, Sensor
 from spad.timestamps import Timestamps
 
 Model = Literal["auto", "poisson", "first-photon", "free-running"]
 MODELS: tuple[str, ...] = ("auto", "poisson", "first-photon", "free-running")
-# Below 1 % detections per cycle dead time and pile-up change nothing that counts could show.
-LOW_FLUX = 0.01
 _HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
 
 

@@ -16,6 +16,9 @@ from torch import Tensor
 from scenes.errors import InputError
 from spad.sensor import Sensor
 
+# Below 1 % detections per cycle dead time and pile-up change nothing that counts could show.
+LOW_FLUX = 0.01
+
 
 def first_photon_shares(flux: np.ndarray) -> np.ndarray:
     """p_k, the share of cycles whose first photon falls into bin k, and last the share without one.
@@ -175,7 +178,16 @@ def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
 
 
 def linearised(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Counts as they would be without pile-up, (..., T) float64: `coates`, or `free_running_flux`, times the cycles."""
+    """Counts as they would be without pile-up, (..., T) float64: `coates`, or `free_running_flux`, times the cycles.
+
+    Pixels with at most 1 % detections per cycle (or dead time, if longer) keep their counts: what would change is a
+    hundredth of one, which does nothing but decide between equal maxima.
+    """
+    counts = counts.double()
     if sensor.reset == "synchronous":
-        return coates(counts, sensor.cycles) * sensor.cycles
-    return free_running_flux(counts, sensor.cycles, sensor) * sensor.cycles
+        corrected = coates(counts, sensor.cycles) * sensor.cycles
+    else:
+        corrected = free_running_flux(counts, sensor.cycles, sensor) * sensor.cycles
+    blind = max(1.0, sensor.dead_time_s / sensor.period_s)
+    few = counts.sum(-1, keepdim=True) * blind <= LOW_FLUX * sensor.cycles
+    return torch.where(few, counts, corrected)

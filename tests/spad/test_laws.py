@@ -18,6 +18,7 @@ from spad.laws import (
     first_photon_counts,
     first_photon_shares,
     free_running_flux,
+    linearised,
     live_detections,
 )
 from spad.sensor import PhotonBudget, Pulse, Sensor
@@ -153,6 +154,16 @@ def test_coates_undoes_no_pile_up_at_low_flux_and_full_cycles() -> None:
     full = coates(torch.tensor([[60.0, 40.0, 0.0]]), 100)
     assert full[0, 0] == pytest.approx(np.log(100 / 40)) and full[0, 1] == pytest.approx(np.log(40 / 0.5))
     assert full[0, 2] == 0
+
+
+def test_few_detections_are_left_as_they_are() -> None:
+    counts = torch.zeros((2, 64))
+    counts[0, [3, 50]] = 1
+    counts[1] = 10
+    sensor = replace(SMALL, exposure_s=1000 * SMALL.period_s)
+    kept = linearised(counts, sensor)
+    assert torch.equal(kept[0], counts[0].double())
+    assert torch.allclose(kept[1], coates(counts[1], 1000) * 1000) and kept[1, 60] > 20
 
 
 # Dead time
