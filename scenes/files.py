@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import ctypes
 import hashlib
 import io
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 
 from scenes.errors import InputError
 
 ATTRIBUTE = "scene2spad"
-SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 1}
+SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 1, "network": 1}
 
 
 @contextmanager
@@ -39,6 +40,17 @@ def whole_file(path: Path) -> Iterator[Path]:
             beside.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or str(error).splitlines()[0]})") from None
+
+
+def write_csv(rows: Sequence[Mapping[str, object]], path: Path) -> Path:
+    """Rows of the same keys as a table, whole or not at all; returns the path."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*rows[0]], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with whole_file(path) as beside:
+        beside.write_text(text.getvalue())
+    return path
 
 
 def seal(meta: dict, kind: str, arrays_sha256: str) -> str:

@@ -31,6 +31,9 @@ def main(argv: list[str]) -> int:
         command = _parse(argv)
     except SystemExit as stop:
         return int(stop.code or 0)
+    except BrokenPipeError:  # --help into a reader that has gone
+        sys.stdout = None
+        return 0
     _log_to_stderr()
     if command.seed < 0:
         return _refuse(f"seed {command.seed} is negative, expected 0 or more")

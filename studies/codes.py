@@ -22,6 +22,8 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
+from csph.metrics import LOW_SBR
+from csph.metrics import PHOTON_LEVELS as LEVELS
 from render.engine import Progress, render
 from render.settings import RenderSettings
 from render.transient import Transient
@@ -39,12 +41,6 @@ from studies.figures import save
 
 log = logging.getLogger("scene2spad")
 
-LEVELS = (
-    *((signal, background) for signal in (10, 5, 2) for background in (2, 10, 50)),
-    *((10, background) for background in (200, 500, 1000)),
-    *((50, background) for background in (50, 200, 500, 1000)),
-)
-LOW_SBR = 0.1  # the paper's two groups: at most, and above
 GROUPS = ("all", "high_sbr", "low_sbr")
 CODES = ("fourier", "gray", "coarse", "hadamard")
 NUMBERS = (4, 8, 16, 32, 64, 128, 256)

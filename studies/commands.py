@@ -216,10 +216,14 @@ class Depth(Common):
     """A histogram written by `sense` (.h5)."""
     out: File = None
     """The depth map (.exr) to write (default: the histogram's and the method's name)."""
-    method: Literal["argmax", "matched", "log-matched", "correlation", "lmf-published", "coates", "compressive"] = (
-        "log-matched"
-    )
+    method: Literal[
+        "argmax", "matched", "log-matched", "correlation", "lmf-published", "coates", "compressive", "network"
+    ] = "log-matched"
     """Estimator; log-matched is the Poisson maximum likelihood, coates the same after the pile-up is undone."""
+    checkpoint: File = None
+    """A checkpoint of `train`, or its folder, for `--method network`."""
+    int8: bool = False
+    """Codes of `--method network` in 8 bits, summed in 16."""
     code: Literal["fourier", "gray", "coarse", "hadamard", "random"] = "fourier"
     """Temporal code of `--method compressive`: truncated Fourier, Gray Fourier, coarse histogram, Walsh-Hadamard."""
     codes: int = 16
@@ -229,11 +233,87 @@ class Depth(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Train(Common):
+    """Train a depth network, with or without compressive codes, on a rendered set; a run that was killed goes on."""
+
+    design: str = "learned"
+    """learned, fourier, gray, coarse, hadamard or random; with +learned for a fixed temporal code and a learned spatial
+    part; none for the counts themselves, peak for their fullest bins."""
+    block: tuple[int, int, int] = (256, 4, 4)
+    """Block of the codes: time bins, rows, columns."""
+    compression: float = 128.0
+    """Counts of a block for one code that is kept."""
+    codes: Count = None
+    """Number K of codes, instead of --compression."""
+    full: bool = False
+    """A full coding tensor instead of a separable one."""
+    layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes"], ...] = ()
+    """Switches of the layer that differ from the published one."""
+    set: Path = Path("planes")
+    """Folder of a set that `dataset` rendered, or its pack (.h5); planes: random planes, no renderer needed."""
+    validation: Annotated[Path | None, _open("SET")] = None
+    """Set to validate on (default: the last tenth of the scenes)."""
+    preset: Literal["smoke", "laptop", "paper"] = "laptop"
+    """smoke: seconds; laptop: 3,000 steps of the compact network; paper: the published network and schedule (GPU)."""
+    network: Annotated[
+        Literal["compact", "published", "published-signed"] | None, _open("{compact,published,published-signed}")
+    ] = None
+    """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
+    sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
+    """Sensor preset."""
+    steps: Count = None
+    """Steps of the whole run (default: the preset's)."""
+    batch: Count = None
+    """Patches a step (default: the preset's)."""
+    crop: Pixels = None
+    """Side of a patch (default: the preset's)."""
+    rate: Number = None
+    """Learning rate at the start (default: the preset's)."""
+    tv: Number = None
+    """Weight of the mean total variation of depth / range; 41.9 is the published 1e-5 (default: 0, or the preset's)."""
+    tv_start: Count = None
+    """Step at which the total variation comes in (default: 500)."""
+    time_offset: Number = None
+    """Delay every patch at random by up to this many metres of depth (default: 0, as published)."""
+    precision: Annotated[Literal["32-true", "bf16-mixed", "16-mixed"] | None, _open("{32-true,bf16-mixed}")] = None
+    """Lightning's name of the arithmetic (default: 32-true)."""
+    threads: Count = None
+    """CPU threads; the same number gives the same bytes (default: all)."""
+    workers: int = 0
+    """Processes that sense ahead; the same patches, whatever their number."""
+    devices: Count = None
+    """GPUs (default: all there are)."""
+    out: Annotated[Path | None, _open("FOLDER")] = None
+    """Folder of the run (default: out/train and a name from the options)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Common):
+    """Trained networks beside classical estimators on a rendered set, at the paper's 16 photon levels."""
+
+    checkpoints: Positional[tuple[Path, ...]]
+    """Checkpoints of `train`, or their folders; the first is the one that the others are compared with."""
+    set: Path
+    """Folder of a set that `dataset` rendered, or its pack (.h5)."""
+    baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
+    """Estimators of `depth`, and CODE-K decoded without a network."""
+    views: Count = None
+    """Only the first N views (default: all)."""
+    offset: float = 0.0
+    """Move every scene this many metres away in time alone; other offsets are rendered: `dataset --offset-mode`."""
+    int8: bool = False
+    """Codes in 8 bits as well, summed in 16."""
+    out: Path = Path("out/evaluate")
+    """Folder for the table (.csv)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Bench(Common):
     """Speed against error: `render` beside mitransient, `sense` beside dense Poisson draws, `encode` of compressive
-    layers, `emulate` of the in-pixel processor and its two routes to the same bits; the table of `hard-cases`."""
+    layers, `network` of depth networks, `emulate` of the in-pixel processor and its two routes to the same bits; the
+    table of `hard-cases`."""
 
-    stage: Positional[Literal["render", "sense", "encode", "emulate", "hard-cases"]] = "render"
+    stage: Positional[Literal["render", "sense", "encode", "network", "emulate", "hard-cases"]] = "render"
     """What is measured."""
     scenes: tuple[Literal["flash", "lamp", "artist", "groove"], ...] = ()
     """Scenes of `bench render` (default: all)."""
@@ -327,6 +407,8 @@ Command = (
     | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[Sense, tyro.conf.subcommand("sense")]
     | Annotated[Depth, tyro.conf.subcommand("depth")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Ultraphase, tyro.conf.subcommand("ultraphase")]
     | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]

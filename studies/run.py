@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
+from csph.model import DepthModel, load_model
 from render.engine import Progress, render
 from render.settings import RenderSettings
 from render.transient import Transient, write_transient
@@ -209,13 +210,25 @@ def run_sense(command: commands.Sense, progress: Progress) -> dict:
     return sensing.run(command, progress, input_file=_input, output_file=_output, picture=_picture)
 
 
-def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:
+def depth_map(
+    histogram: Histogram,
+    method: str,
+    codes: int = 16,
+    code: str = "fourier",
+    seed: int = 0,
+    network: DepthModel | None = None,
+    int8: bool = False,
+) -> np.ndarray:
     """Depth [m] of every pixel by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code.
 
     With a displaced laser the arrival time is a path on an ellipsoid, and becomes a distance by the scene's geometry.
     """
     counts = torch.from_numpy(histogram.counts)
-    if method == "compressive":
+    if network is not None:
+        depth, overflows = network.depth_of(histogram, int8=int8)
+        if overflows:
+            log.warning("%d sums of 16 bits wrapped around", overflows)
+    elif method == "compressive":
         temporal = temporal_code(code, codes, histogram.sensor.bins, histogram.sensor, seed)
         coding = CodingTensor(f"{code}-{codes}", temporal)
         depth = decode_depth(encode(counts, coding), coding, histogram.sensor).numpy()
@@ -236,8 +249,9 @@ def run_depth(command: commands.Depth, progress: Progress) -> dict:
     out = _output(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
     histogram = read_histogram(source)
     progress(command.method, 0.1)
+    network = _network(command)
     start = time.perf_counter()
-    depth = depth_map(histogram, command.method, command.codes, command.code, command.seed)
+    depth = depth_map(histogram, command.method, command.codes, command.code, command.seed, network, command.int8)
     seconds = time.perf_counter() - start
     sure = sensing.mean_confidence(histogram, depth)
     range_m = histogram.sensor.range_m
@@ -254,6 +268,15 @@ def run_depth(command: commands.Depth, progress: Progress) -> dict:
     if command.figure:
         result["figure"] = str(figures.draw_depth(histogram, depth, label, errors, _picture(out, "depth")))
     return result
+
+
+def _network(command: commands.Depth) -> DepthModel | None:
+    wanted = command.method == "network"
+    if wanted != (command.checkpoint is not None) or (command.int8 and not wanted):
+        raise InputError("depth: --method network and --checkpoint go together, and --int8 with both")
+    if not wanted:
+        return None
+    return load_model(command.checkpoint)[0]
 
 
 def _write_depth(depth_m: np.ndarray, path: Path, meta: dict) -> None:
@@ -325,6 +348,20 @@ def run_study(command: commands.Study, progress: Progress) -> dict:
     return importlib.import_module(f"studies.{command.name.replace('-', '_')}").run(command, progress)
 
 
+def run_train(command: commands.Train, progress: Progress) -> dict:
+    """Set -> checkpoint; Lightning is imported only when it is asked for."""
+    from studies import training
+
+    return training.run_train(command, progress)
+
+
+def run_evaluate(command: commands.Evaluate, progress: Progress) -> dict:
+    """Checkpoints and a set -> errors."""
+    from studies import training
+
+    return training.run_evaluate(command, progress)
+
+
 RUNNERS: dict[type, Callable] = {
     commands.Demo: run_demo,
     commands.Scenes: run_scenes,
@@ -332,6 +369,8 @@ RUNNERS: dict[type, Callable] = {
     commands.Dataset: run_dataset,
     commands.Sense: run_sense,
     commands.Depth: run_depth,
+    commands.Train: run_train,
+    commands.Evaluate: run_evaluate,
     commands.Bench: run_bench,
     commands.Ultraphase: run_ultraphase,
     commands.Study: run_study,

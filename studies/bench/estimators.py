@@ -12,6 +12,7 @@ import torch
 from matplotlib import pyplot as plt
 from PIL import Image
 
+from csph.metrics import PHOTON_LEVELS as LEVELS
 from render.transient import Transient
 from spad.depth import METHODS, depth_errors, estimate_depth
 from spad.detect import sense
@@ -19,12 +20,6 @@ from spad.rgbd import transient_from_rgbd
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
 from studies.figures import save
 
-# signal and background of the published test set
-LEVELS = (
-    *((signal, background) for signal in (10, 5, 2) for background in (2, 10, 50)),
-    *((10, background) for background in (200, 500, 1000)),
-    *((50, background) for background in (50, 200, 500, 1000)),
-)
 QUICK_LEVELS = ((50, 50), (10, 1000))
 # Middlebury 2006 at half size: depth = 3740 px x 0.16 m / (disparity + dmin), focal length 1870 px
 DEPTH_SCALE_M = 3740 * 0.16

@@ -1,0 +1,146 @@
+"""`DepthModel`: counts -> codes -> back-projection -> network -> depth; and its checkpoint, a safetensors file."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from csph.backbone import DeepBoosting, parameters_of, soft_argmax
+from csph.compact import Compact
+from csph.config import ModelConfig, TrainConfig
+from csph.layer import CompressiveLayer
+from csph.quantise import encode_int16, quantised
+from scenes.errors import InputError, require
+from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from spad.histogram import Histogram
+
+KIND = "network"
+
+
+class DepthModel(nn.Module):
+    """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin."""
+
+    def __init__(self, config: ModelConfig, seed: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.layer = None
+        if config.design is not None:
+            self.layer = CompressiveLayer.of(config.design, sensor=config.sensor, seed=seed, **config.layer)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            compact = config.network == "compact"
+            self.network = Compact() if compact else DeepBoosting(can_die=config.network == "published")
+
+    @property
+    def parameters_count(self) -> int:
+        return parameters_of(self)
+
+    def seen(self, counts: Tensor) -> Tensor:
+        """What the network is given, (B, 1, T, R, C): back-projection, counts, or 1 at the first fullest bin."""
+        if self.layer is not None:
+            return self.layer(counts)
+        if self.config.front == "counts":
+            return counts.float()
+        return torch.zeros(counts.shape, device=counts.device).scatter_(2, counts.argmax(2, keepdim=True), 1.0)
+
+    def forward(self, counts: Tensor) -> Tensor:
+        return self.network(self.seen(counts))
+
+    def depth_m(self, counts: Tensor) -> Tensor:
+        """Soft-argmax on bin centres, (B, R, C) [m]."""
+        return soft_argmax(self(counts)) * self.config.sensor.bin_depth_m
+
+    def depth_int8_m(self, counts: Tensor) -> tuple[Tensor, int]:
+        """Depth from codes of 8-bit weights summed in 16 bits, and how many sums wrapped; the decoder keeps float32."""
+        if self.layer is None:
+            raise InputError(f"{self.config.name}: has no codes to hold in 8 bits")
+        tensor = quantised(self.layer.coding())
+        codes, overflows = encode_int16(counts, tensor)
+        logits = self.network(self.layer.decode(codes.float() * tensor.scale))
+        return soft_argmax(logits) * self.config.sensor.bin_depth_m, overflows
+
+    def check_histogram(self, histogram: Histogram) -> None:
+        """InputError unless the histogram is of the sensor that the model was trained for, and tiled by its blocks."""
+        mine, other = self.config.sensor, histogram.sensor
+        alike = (mine.bins, mine.bin_width_s, mine.response) == (other.bins, other.bin_width_s, other.response)
+        told = ", ".join(f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps)" for s in (mine, other))
+        require(alike, f"the network was trained for another sensor or pulse than the histogram's: {told}")
+        size, block = histogram.counts.shape[:2], self.config.block[1:]
+        tiled = all(side >= part and side % part == 0 for side, part in zip(size, block, strict=True))
+        said = f"image of {size[1]} x {size[0]} pixels is not tiled by the network's blocks of"
+        require(tiled, f"{said} {block[1]} x {block[0]}")
+
+    @torch.no_grad()
+    def depth_of(self, histogram: Histogram, *, int8: bool = False) -> tuple[np.ndarray, int]:
+        """Depth map (H, W) float32 [m] of a histogram, and how many 16-bit sums wrapped (0 without int8)."""
+        self.check_histogram(histogram)
+        device = next(self.parameters()).device
+        counts = torch.from_numpy(histogram.counts).permute(2, 0, 1)[None, None].contiguous()
+        if int8:
+            depth, overflows = self.depth_int8_m(counts)
+        else:
+            depth, overflows = self.depth_m(counts.to(device, torch.float32)), 0
+        return depth[0].cpu().numpy(), overflows
+
+
+def _weights_sha256(weights: dict[str, Tensor]) -> str:
+    sha = hashlib.sha256()
+    for name in sorted(weights):
+        array = weights[name].detach().cpu().contiguous()
+        sha.update(f"{name}{array.dtype}{tuple(array.shape)}".encode())
+        sha.update(array.numpy().tobytes())
+    return sha.hexdigest()
+
+
+def weights_sha256(model: nn.Module) -> str:
+    """SHA-256 over names, shapes and values of all weights."""
+    return _weights_sha256(model.state_dict())
+
+
+def save_model(model: DepthModel, config: TrainConfig, state: dict, path: Path) -> None:
+    """Weights as safetensors, whole or not at all; configuration and `state` (step, validation) in its header."""
+    from safetensors.torch import save
+
+    weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
+    header = seal({"config": config.to_dict(), "state": state}, KIND, _weights_sha256(weights))
+    with whole_file(path) as beside:
+        beside.write_bytes(save(weights, {ATTRIBUTE: header}))
+
+
+def checkpoint_file(path: Path) -> Path:
+    """The checkpoint that a path names: the file, or `model.safetensors` in the folder of a run."""
+    path = Path(path)
+    path = path / "model.safetensors" if path.is_dir() else path
+    require(path.is_file(), f"{path}: file not found")
+    return path
+
+
+def load_model(path: Path) -> tuple[DepthModel, TrainConfig, dict]:
+    """A model as it was saved, in evaluation mode, its configuration, and the state it was saved in.
+
+    Raises InputError in one line for a missing, foreign or altered file, a newer schema, or weights of another design.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = checkpoint_file(path)
+    try:
+        with safe_open(path, "pt") as file:
+            header = (file.metadata() or {}).get(ATTRIBUTE)
+            require(header is not None, "is no checkpoint of scene2spad")
+            meta, sha256 = open_seal(header, KIND)
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+        meta = check_seal(meta, sha256, _weights_sha256(weights))
+        config = TrainConfig.from_dict(meta["config"])
+        model = DepthModel(config.model, config.seed)
+        model.load_state_dict(weights)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: not a readable checkpoint ({' '.join(str(error).split())[:120]})") from None
+    except RuntimeError:
+        raise InputError(f"{path}: its weights are of another design than {config.model.name}") from None
+    return model.eval(), config, meta["state"]

@@ -1,0 +1,228 @@
+"""Training by Lightning: a run is a folder with one configuration, a log, the best weights, and what it resumes from.
+
+    config.json         every number of the run, written before its first step
+    log.csv             one row an epoch: step, learning rate, training loss, validation RMSE and MAE
+    model.safetensors   weights of the lowest validation RMSE, with the configuration in the header
+    last.safetensors    weights after the last step
+    resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
+
+Devices, precision and several GPUs are Lightning's; nothing here knows how many there are.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor
+from torchmetrics import MeanMetric
+
+from csph.backbone import soft_argmax
+from csph.config import TrainConfig
+from csph.data import SetData
+from csph.loss import kl_divergence, total_variation
+from csph.model import DepthModel, load_model, save_model
+from csph.views import Views, packed_sha256, packed_views
+from scenes.errors import require
+from scenes.files import whole_file, write_csv
+from spad.fly import Batch
+
+log = logging.getLogger("csph")
+
+Progress = Callable[[str, float], None]
+
+
+class DepthTraining(pl.LightningModule):
+    """KL divergence to the pulse at the label, plus total variation where asked; Adam with a rate that steps down."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.model = DepthModel(config.model, config.seed)
+        self.train_loss = MeanMetric()
+        self.squared_m2, self.absolute_m = MeanMetric(), MeanMetric()
+
+    def loss(self, batch: Batch) -> Tensor:
+        logits = self.model(batch.counts)
+        loss = kl_divergence(logits, batch.depth_m, batch.valid, self.config.model.sensor)
+        if self.config.tv_weight and self.global_step >= self.config.tv_start:
+            loss = loss + self.config.tv_weight * total_variation(soft_argmax(logits) / logits.shape[1])
+        return loss
+
+    def training_step(self, batch: Batch, _: int) -> Tensor:
+        loss = self.loss(batch)
+        self.train_loss.update(loss.detach())
+        return loss
+
+    def validation_step(self, batch: Batch, _: int) -> None:
+        depth = self.model.depth_m(batch.counts)
+        # pixels without a truth have weight 0
+        error = torch.where(batch.valid, depth - batch.depth_m, 0.0)
+        weight = batch.valid.float()
+        self.squared_m2.update(error**2, weight)
+        self.absolute_m.update(error.abs(), weight)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        adam = torch.optim.Adam(self.parameters(), lr=self.config.rate)
+        # a function of the step alone: nothing about it has to be restored
+        steps = torch.optim.lr_scheduler.LambdaLR(adam, lambda s: self.config.decay ** (s // self.config.decay_steps))
+        return {"optimizer": adam, "lr_scheduler": {"scheduler": steps, "interval": "step"}}
+
+
+class Record(pl.Callback):
+    """At the end of each epoch: a row of the log, the weights if they are the best so far, and what to resume from."""
+
+    def __init__(self, folder: Path, progress: Progress) -> None:
+        self.folder, self.progress = folder, progress
+        self.rows: list[dict[str, float]] = []
+
+    @property
+    def best_mm(self) -> float:
+        return min((row["val_rmse_mm"] for row in self.rows), default=float("inf"))
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.rows = state["rows"]
+
+    def on_train_batch_end(self, trainer: pl.Trainer, module: DepthTraining, *_: object) -> None:
+        step = trainer.global_step
+        self.progress(f"step {step} of {module.config.steps}", step / module.config.steps)
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, module: DepthTraining) -> None:
+        best = self.best_mm
+        row = {
+            "epoch": trainer.current_epoch + 1,
+            "step": trainer.global_step,
+            "rate": trainer.optimizers[0].param_groups[0]["lr"],
+            "train_loss": float(module.train_loss.compute()),
+            "val_rmse_mm": float(module.squared_m2.compute()) ** 0.5 * 1e3,
+            "val_mae_mm": float(module.absolute_m.compute()) * 1e3,
+        }
+        for metric in (module.train_loss, module.squared_m2, module.absolute_m):
+            metric.reset()
+        self.rows = [*self.rows, row]
+        if trainer.is_global_zero:
+            if row["val_rmse_mm"] < best or not (self.folder / "model.safetensors").is_file():
+                save_model(module.model, module.config, row, self.folder / "model.safetensors")
+            write_csv(self.rows, self.folder / "log.csv")
+            log.info(
+                "step %d of %d: loss %.4f, validation RMSE %.1f mm, MAE %.1f mm",
+                *(row["step"], module.config.steps, row["train_loss"], row["val_rmse_mm"], row["val_mae_mm"]),
+            )
+        trainer.save_checkpoint(self.folder / "resume.ckpt")  # on all devices; Lightning writes it whole
+
+
+def _claim(folder: Path, config: TrainConfig) -> None:
+    """Write the configuration, or see that the folder holds the same; InputError for another one's folder."""
+    text = json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n"
+    path = folder / "config.json"
+    if path.is_file():
+        same = path.read_text() == text
+        require(same, f"{folder}: holds a run with other options or another set; choose another --out")
+        return
+    empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    require(empty, f"{folder}: is not an empty folder and holds no run; choose another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as beside:
+        beside.write_text(text)
+
+
+@contextmanager
+def _quiet() -> Any:
+    """Lightning's advice on workers and devices is not the user's business: what is said here goes to the log."""
+    loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning.pytorch")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
+    """Lightning's Trainer without what `Record` does instead. InputError for mixed precision on a CPU."""
+    runner = pl.Trainer(
+        max_epochs=config.epochs,
+        precision=config.precision,
+        callbacks=[record],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        reload_dataloaders_every_n_epochs=1,
+        **more,
+    )
+    # there, weights' gradients in bf16 read memory that was never written (torch 2.13)
+    on_cpu = runner.strategy.root_device.type == "cpu"
+    require(config.precision == "32-true" or not on_cpu, f"precision {config.precision} needs a GPU")
+    return runner
+
+
+def train(
+    config: TrainConfig,
+    training: Views,
+    validation: Views,
+    folder: Path,
+    *,
+    workers: int = 0,
+    progress: Progress | None = None,
+    **trainer: Any,
+) -> dict[str, Any]:
+    """Run a configuration to its end in a folder, or go on where an interrupted run of the same configuration stopped.
+
+    `trainer` holds further arguments of Lightning's Trainer (accelerator, devices, strategy). Returns steps, seconds
+    (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of parameters. Raises InputError
+    for sets that do not fit, and a folder of another run.
+    """
+    sets = [packed_views(views) for views in (training, validation)]
+    data = {name: packed_sha256(packed) for name, packed in zip(("training", "validation"), sets, strict=True)}
+    config = replace(config, data={**config.data, **{f"{name}_sha256": sha for name, sha in data.items()}})
+    module_data = SetData(*sets, config, workers)
+    record = Record(folder, progress or (lambda what, share: None))
+    with _quiet():
+        runner = _trainer(config, record, **trainer)
+    _claim(folder, config)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    start = time.perf_counter()
+    module = DepthTraining(config)
+    resume = folder / "resume.ckpt"
+    if not (folder / "last.safetensors").is_file():
+        with _quiet():
+            try:
+                runner.fit(module, module_data, ckpt_path=str(resume) if resume.is_file() else None, weights_only=True)
+            except SystemExit:  # what Lightning makes of Ctrl-C
+                raise KeyboardInterrupt from None
+        if runner.is_global_zero:
+            save_model(module.model, config, record.rows[-1], folder / "last.safetensors")
+        runner.strategy.barrier()
+    _, _, best = load_model(folder)
+    _, _, last = load_model(folder / "last.safetensors")
+    diverged = f"{folder}: the run diverged, its validation error is no number; use a lower --rate"
+    require(math.isfinite(best["val_rmse_mm"]), diverged)
+    return {
+        "steps": last["step"],
+        "seconds": time.perf_counter() - start,
+        "val_rmse_mm": best["val_rmse_mm"],
+        "val_mae_mm": best["val_mae_mm"],
+        "best_step": best["step"],
+        "checkpoint": str(folder / "model.safetensors"),
+        "parameters": module.model.parameters_count,
+    }

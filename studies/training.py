@@ -1,0 +1,213 @@
+"""`train` and `evaluate`: from the command line's words to csph's configuration, and results to files."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from csph import CodingTensor, decode_depth, encode, temporal_code
+from csph.config import ModelConfig, TrainConfig, preset
+from csph.design import Design
+from csph.evaluation import LEVEL_GROUPS, Evaluation, Method, as_dicts, evaluate
+from csph.metrics import PHOTON_LEVELS
+from csph.model import DepthModel, load_model
+from csph.views import Views, read_views, split_views
+from render.engine import Progress
+from scenes.errors import InputError, require
+from scenes.files import write_csv
+from spad.depth import METHODS, estimate_depth
+from spad.histogram import Histogram
+from spad.sensor import sensor_by_name
+from studies.commands import Evaluate, Train
+from studies.planes import random_planes
+
+log = logging.getLogger("scene2spad")
+
+PLANES = "planes"  # the set that needs no renderer
+PLANE_SCENES = {"smoke": 20, "laptop": 2000, "paper": 13851}
+SMOKE_PIXELS = 32
+
+
+def config_of(command: Train) -> TrainConfig:
+    """The preset with what the command line changes. Raises InputError for options that do not fit together."""
+    sensor = sensor_by_name(command.sensor)
+    front = {"none": "counts", "peak": "peak"}.get(command.design, "codes")
+    design = None
+    if front == "codes":
+        compression = command.compression if command.codes is None else None
+        design = Design.named(
+            command.design, command.block, codes=command.codes, compression=compression, full=command.full
+        )
+    network = command.network or ("published" if command.preset == "paper" else "compact")
+    layer = dict.fromkeys(command.layer, True)
+    model = ModelConfig(front=front, design=design, layer=layer, network=network, sensor=sensor)
+    config = preset(
+        command.preset,
+        model,
+        seed=command.seed,
+        batch=command.batch,
+        crop=command.crop,
+        rate=command.rate,
+        tv_weight=command.tv,
+        tv_start=command.tv_start,
+        precision=command.precision,
+        threads=command.threads,
+        time_offset_m=command.time_offset,
+    )
+    if command.steps is None:
+        return config
+    # as many epochs, each shorter, and the rate steps down at the same shares of the run
+    require(command.steps >= 1, f"steps {command.steps} is below 1")
+    epochs = min(config.epochs, command.steps)
+    each = -(-command.steps // epochs)
+    decay_steps = max(1, round(config.decay_steps * each / config.steps_per_epoch))
+    return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps)
+
+
+def views_of(command: Train) -> tuple[Views, Views, dict[str, Any]]:
+    """Training and validation views, and the words that say which they are."""
+    if str(command.set) == PLANES:
+        pixels = SMOKE_PIXELS if command.preset == "smoke" else 64
+        views = random_planes(PLANE_SCENES[command.preset], size=pixels, seed=command.seed)
+    else:
+        views = read_views(command.set)
+    said = {"training": str(command.set), "validation": str(command.validation or "its last scenes")}
+    if command.validation is not None:
+        return views, read_views(command.validation), said
+    return *split_views(views), said
+
+
+def run_train(command: Train, progress: Progress) -> dict:
+    """Train one model, or go on with an interrupted run in the same folder."""
+    from csph.training import train  # and Lightning, which takes seconds to import
+
+    config = config_of(command)
+    training, validation, said = views_of(command)
+    name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
+    folder = command.out or Path("out/train") / name
+    result = train(
+        replace(config, data=said),
+        training,
+        validation,
+        folder,
+        workers=command.workers,
+        progress=progress,
+        devices=command.devices or "auto",
+    )
+    return {"model": config.model.name, "views": len(training.transients), **result}
+
+
+def network_method(model: DepthModel, *, int8: bool = False, overflows: list[int] | None = None) -> Method:
+    """Depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`."""
+
+    def method(histogram: Histogram) -> np.ndarray:
+        depth, wrapped = model.depth_of(histogram, int8=int8)
+        if overflows is not None:
+            overflows.append(wrapped)
+        return depth
+
+    return method
+
+
+def baseline(name: str) -> Method:
+    """A method without a network: one of `spad.depth.METHODS`, or CODE-K decoded by correlation, as in "fourier-8"."""
+    if name in METHODS:
+        return lambda h: estimate_depth(torch.from_numpy(h.counts), h.sensor, name).numpy()
+    code, _, number = name.rpartition("-")
+    require(code != "" and number.isdigit(), f"baseline {name!r}: expected {', '.join(METHODS)}, or CODE-K")
+
+    def compressive(histogram: Histogram) -> np.ndarray:
+        temporal = temporal_code(code, int(number), histogram.sensor.bins, histogram.sensor)
+        coding = CodingTensor(name, temporal)
+        return decode_depth(encode(torch.from_numpy(histogram.counts), coding), coding, histogram.sensor).numpy()
+
+    return compressive
+
+
+def run_evaluate(command: Evaluate, progress: Progress) -> dict:
+    """Networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
+    models = [load_model(path)[0] for path in command.checkpoints]
+    require(bool(models), "evaluate: give at least one checkpoint")
+    sensor = models[0].config.sensor
+    others = [model.config.sensor.name for model in models if model.config.sensor != sensor]
+    require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
+    if not 0 <= command.offset < sensor.range_m:
+        raise InputError(f"offset {command.offset:g} m is outside 0 to the sensor's range {sensor.range_m:.4f} m")
+    views = read_views(command.set)
+    if command.views is not None:
+        require(command.views >= 1, f"views {command.views} is below 1")
+        views = Views(views.transients[: command.views], views.scenes[: command.views])
+    overflows: list[int] = []
+    methods: dict[str, Method] = {}
+    groups: dict[str, list[str]] = {}  # trainings of one design by different seeds are one group
+    for path, model in zip(command.checkpoints, models, strict=True):
+        for suffix, int8 in (("", False), (" int8", True))[: 1 + command.int8]:
+            methods[f"{path}{suffix}"] = network_method(model, int8=int8, overflows=overflows)
+            groups.setdefault(f"{model.config.name}{suffix}", []).append(f"{path}{suffix}")
+    methods |= {name: baseline(name) for name in command.baselines}
+    groups |= {name: [name] for name in command.baselines}
+    found = evaluate(
+        methods,
+        views,
+        sensor,
+        levels=PHOTON_LEVELS,
+        tile=tuple(math.lcm(*sides) for sides in zip(*(m.config.block[1:] for m in models), strict=True)),
+        offset_m=command.offset,
+        seed=command.seed,
+        progress=progress,
+    )
+    command.out.mkdir(parents=True, exist_ok=True)
+    table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
+    first = f"{models[0].config.name}{' int8' if command.int8 else ''}"
+    return {**results(found, groups, first, command.json), "overflows": sum(overflows), "csv": str(table)}
+
+
+def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> dict[str, Any]:
+    """Headline figures of the `first` group, every group by levels, paired differences of MAE from the first."""
+    summaries = {name: found.summary(members) for name, members in groups.items()}
+    everything = summaries[first]["all"]["all"]
+    head = {key: everything[key] for key in ("mae_mm", "rmse_mm", "within_10mm", "ssim", "mae_interval_mm")}
+    differences = {
+        levels: {
+            name: found.difference(groups[first], groups[name], levels)._asdict() for name in groups if name != first
+        }
+        for levels in LEVEL_GROUPS
+    }
+    head = {"method": first, "trainings": len(groups[first]), **head}
+    if not full:
+        return {**head, "table": _lines(summaries), "bias_by_depth": _bias(summaries[first])}
+    by_sbr = {
+        name: {group: summary[group]["all"] for group in ("low_sbr", "high_sbr")} for name, summary in summaries.items()
+    }
+    return {**head, "by_sbr": by_sbr, "methods": summaries, "mae_difference_mm": differences}
+
+
+def _lines(summaries: dict[str, dict]) -> list[str]:
+    said = [
+        f"{'method':<40} {'MAE mm':>8} {'SBR > 0.1':>10} {'SBR <= 0.1':>11} {'mixed':>8} {'< 10 mm':>8} {'SSIM':>6}"
+    ]
+    for name, s in summaries.items():
+        every = s["all"]["all"]
+        mae = (every, s["high_sbr"]["all"], s["low_sbr"]["all"], s["all"]["mixed"])
+        cells = [_cell(line["mae_mm"], f"{width}.1f") for line, width in zip(mae, (8, 10, 11, 8), strict=True)]
+        cells += [_cell(every["within_10mm"], "8.1%"), _cell(every["ssim"], "6.3f")]
+        said.append(f"{name[-40:]:<40} {' '.join(cells)}")
+    return said
+
+
+def _cell(value: float | None, form: str) -> str:
+    return f"{math.nan if value is None else value:>{form}}"
+
+
+def _bias(summary: dict) -> list[str]:
+    return [
+        f"{b['near_m']:g} to {b['far_m']:g} m: mean {b['mean_mm']:+.1f}, median {b['median_mm']:+.1f} mm, "
+        f"{b['pixels']} pixels"
+        for b in summary["bias_by_depth"]
+    ]

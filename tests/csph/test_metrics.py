@@ -1,0 +1,133 @@
+"""Figures of merit against cases worked out by hand, intervals against what statistics say."""
+
+import math
+
+import numpy as np
+import pytest
+
+from csph.metrics import (
+    PHOTON_LEVELS,
+    TRAIN_LEVELS,
+    bias_by_depth,
+    bootstrap_mean,
+    grouped_errors,
+    image_errors,
+    is_low_sbr,
+    paired_difference,
+    ssim,
+)
+from scenes import InputError
+
+
+def test_levels_and_groups():
+    assert len(PHOTON_LEVELS) == len(set(PHOTON_LEVELS)) == 16
+    assert len(TRAIN_LEVELS) == 9 and max(TRAIN_LEVELS) == (10, 50)
+    assert sum(is_low_sbr(*level) for level in PHOTON_LEVELS) == 7  # as published
+    assert is_low_sbr(5, 50) and not is_low_sbr(10, 50) and not is_low_sbr(1, 0)
+
+
+def test_errors_by_hand():
+    truth = np.array([[1.0, 2.0, np.nan, 16.0], [3.0, 4.0, 5.0, 6.0]])
+    estimate = np.array([[1.003, 1.99, 1.0, 3.0], [3.0, 4.05, np.nan, 6.0005]])
+    errors = image_errors(estimate, truth, 15.0)
+    assert errors["pixels"] == 5 and (errors["empty"], errors["beyond_range"], errors["missing"]) == (1, 1, 1)
+    absolute = np.array([3, 10, 0, 50, 0.5])
+    assert errors["mae_mm"] == pytest.approx(absolute.mean())
+    assert errors["rmse_mm"] == pytest.approx(np.sqrt((absolute**2).mean()))
+    shares = [errors[f"within_{t}mm"] for t in (1, 5, 20)]
+    assert shares == pytest.approx([0.4, 0.6, 0.8])
+    # 10 mm to within rounding: strictly under it or not, no other pixel is near
+    assert errors["within_10mm"] in (0.6, 0.8)
+
+
+def test_groups_by_hand():
+    truth = np.full((8, 8), 2.0)
+    truth[0] = np.linspace(1, 3, 8)
+    mixed = np.zeros((8, 8), bool)
+    mixed[4:] = True
+    estimate = truth + np.where(mixed, 0.1, 0.002)
+    groups = grouped_errors(estimate, truth, mixed, 15.0)
+    assert groups["mixed"]["mae_mm"] == pytest.approx(100) and groups["unmixed"]["mae_mm"] == pytest.approx(2)
+    assert groups["all"]["mae_mm"] == pytest.approx(51) and groups["all"]["pixels"] == 64
+    assert grouped_errors(estimate, truth, np.zeros_like(mixed), 15.0)["mixed"]["pixels"] == 0
+
+
+def test_ssim_by_hand():
+    truth = np.tile(np.linspace(1, 2, 16), (16, 1))
+    assert ssim(truth, truth, 15.0) == pytest.approx(1)
+    # a constant shift: every window has the same variances and covariance, only the means differ
+    shift, span = 0.2, 1.0
+    c1 = (0.01 * span) ** 2
+    means = np.stack([truth[0, i - 3 : i + 4].mean() for i in range(3, 13)])
+    expected = (2 * means * (means + shift) + c1) / (means**2 + (means + shift) ** 2 + c1)
+    inner = np.zeros((16, 16), bool)
+    inner[3:13, 3:13] = True
+    from skimage.metrics import structural_similarity
+
+    _, local = structural_similarity(truth, truth + shift, win_size=7, data_range=span, full=True)
+    np.testing.assert_allclose(local[inner].reshape(10, 10)[0], expected, rtol=1e-6)
+    known = truth.copy()
+    known[0, 0] = np.nan
+    assert 0 < ssim(truth + shift, known, 15.0) < 1
+    wild = truth.copy()
+    wild[8, 8] = 14.0  # a wild pixel cannot widen the data range and so raise the score
+    assert ssim(wild, truth, 15.0) < 0.9
+    assert math.isnan(ssim(truth, np.ones((16, 16)), 15.0)) and math.isnan(ssim(truth[:3], truth[:3], 15.0))
+
+
+def test_bias_by_depth_sees_a_pull_towards_mid_range():
+    truth = np.linspace(0.5, 14.5, 1401)
+    found = bias_by_depth(truth + 0.01 * (7.5 - truth), truth, range(16))
+    assert sum(b.pixels for b in found) == truth.size and len(found) == 15
+    for b in found:
+        middle = truth[(truth >= b.near_m) & (truth < b.far_m)].mean()
+        assert b.mean_mm == pytest.approx(10 * (7.5 - middle), abs=1e-6)
+    assert bias_by_depth(truth, truth, [20, 30]) == []
+    assert bias_by_depth(truth, truth, [0, 15], exclude=truth > 1)[0].pixels == 51
+
+
+def test_bootstrap_covers_the_mean_as_often_as_it_says():
+    rng = np.random.default_rng(5)
+    covered = 0
+    for trial in range(200):
+        values = {str(i): rng.normal(rng.normal(3, 1), 0.2, 8) for i in range(20)}
+        interval = bootstrap_mean(values, draws=400, seed=trial)
+        assert interval.low <= interval.mean <= interval.high
+        covered += interval.low <= 3 <= interval.high
+    # of 200 intervals of 95 %, less what percentile intervals of 20 clusters lack: 4 standard deviations of 0.93
+    assert 0.93 - 4 * (0.93 * 0.07 / 200) ** 0.5 < covered / 200 <= 1
+
+
+def test_bootstrap_is_by_scene_not_by_value():
+    many = {str(i): [float(i % 2)] * 100 for i in range(8)}
+    few = {str(i): [float(i % 2)] for i in range(8)}
+    wide, same = bootstrap_mean(many), bootstrap_mean(few)
+    assert wide.mean == same.mean == 0.5
+    assert wide.high - wide.low == pytest.approx(same.high - same.low, abs=0.13)  # a hundred copies say no more
+    assert math.isnan(bootstrap_mean({"one": [1.0, 2.0]}).low)
+    assert bootstrap_mean({"a": [1.0, math.nan], "b": [3.0], "c": [math.nan]}).mean == 2
+    with pytest.raises(InputError, match="no finite value"):
+        bootstrap_mean({"a": [math.nan]})
+
+
+def test_bootstrap_sees_what_seeds_share():
+    # two trainings, one 1 mm off in every scene: no number of scenes tells which is usual
+    seeds = {str(i): [[0.0] * 16, [1.0] * 16] for i in range(50)}
+    one = {str(i): [0.5] * 16 for i in range(50)}
+    assert bootstrap_mean(one) == (0.5, 0.5, 0.5)
+    assert bootstrap_mean(seeds) == (0.5, 0.0, 1.0)
+    with pytest.raises(InputError, match="different numbers of seeds"):
+        bootstrap_mean({"a": [[1.0], [2.0]], "b": [[1.0]]})
+
+
+def test_paired_differences_cancel_what_scenes_share():
+    rng = np.random.default_rng(0)
+    second = {f"scene-{i}": rng.uniform(1, 100, 4) for i in range(8)}
+    first = {scene: values + 1 for scene, values in second.items()}
+    assert paired_difference(first, second) == pytest.approx((1, 1, 1))
+    trained = {scene: np.stack([values, values + 2]) for scene, values in second.items()}
+    assert paired_difference(trained, second) == pytest.approx((1, 1, 1))
+    with pytest.raises(InputError, match="no scene in common"):
+        paired_difference({"a": [1.0]}, {"b": [1.0]})
+    with pytest.raises(InputError, match="scene a has other levels"):
+        paired_difference({"a": [1.0, 2.0]}, {"a": [1.0]})

@@ -1,0 +1,299 @@
+"""The loss against its definition, samples that depend on nothing but their key, runs that go on where they stopped."""
+
+import json
+import math
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from csph.config import PUBLISHED_TV, ModelConfig, TrainConfig, preset
+from csph.data import Frames, Samples, SetData
+from csph.design import Design
+from csph.evaluation import evaluate
+from csph.loss import kl_divergence, pulse_target, total_variation
+from csph.model import DepthModel, load_model, save_model, weights_sha256
+from csph.training import train
+from csph.views import Views, packed_views, split_views
+from scenes import InputError
+from scenes.files import ATTRIBUTE
+from spad.detect import sense
+from spad.pulse import Pulse
+from spad.sensor import PhotonBudget, Sensor, sensor_by_name
+from spad.template import binned_pulse
+from studies.planes import random_planes
+
+SPEED = 299_792_458.0
+# a small sensor: 64 bins over 6.4 ns, 0.96 m
+SMALL = Sensor(name="small", bins=64, bin_width_s=1e-10, pulse=Pulse(1.4e-10))
+GATED = replace(SMALL, name="gated", period_s=80e-10)
+MODEL = ModelConfig(design=Design("learned", (32, 2, 2), 8), sensor=SMALL)
+FEW = {"epochs": 3, "steps_per_epoch": 3, "batch": 2, "crop": 4, "validation_views": 2, "threads": 1}
+
+
+def near_planes(count: int, seed: int = 0) -> Views:
+    """Random planes within the small sensor's range: a tenth of their distance."""
+    views = random_planes(count, size=16, seed=seed)
+    scaled = [
+        replace(t, path_near_m=t.path_near_m / 20, path_far_m=t.path_far_m / 20, depth_m=t.depth_m / 20)
+        for t in views.transients
+    ]
+    return Views(tuple(scaled), views.scenes)
+
+
+@pytest.mark.parametrize("sensor", [SMALL, GATED, Sensor(), sensor_by_name("iccv2023-train")], ids=lambda s: s.name)
+def test_the_target_is_the_sensor_pulse(sensor):
+    rng = np.random.default_rng(0)
+    depth = torch.from_numpy(rng.uniform(0, sensor.range_m, 50)).float()
+    depth[:3] = torch.tensor([0.0, 0.4 * sensor.bin_depth_m, sensor.range_m * (1 - 1e-7)])
+    depth = depth[depth * 2 / SPEED < sensor.bins * sensor.bin_width_s]
+    target = pulse_target(depth, sensor)
+    dense = torch.zeros(len(depth), sensor.bins).scatter_add_(1, target.bins, target.share)
+    expected = binned_pulse(depth.double() * 2 / SPEED, sensor)
+    expected = expected / expected.sum(-1, keepdim=True)
+    assert float((dense - expected).abs().max()) < 1e-5  # float32 depths of 15 m: a third of a thousandth of a bin
+    torch.testing.assert_close(target.share.sum(-1), torch.ones(len(depth)))
+
+
+def test_kl_divergence_is_its_definition():
+    rng = np.random.default_rng(1)
+    depth = torch.from_numpy(rng.uniform(0.05, 0.9, (2, 3, 4)).astype(np.float32))
+    valid = torch.ones(2, 3, 4, dtype=torch.bool)
+    valid[0, 0, 0] = False
+    depth[0, 0, 0] = math.nan
+    logits = torch.randn(2, 64, 3, 4, requires_grad=True)
+    loss = kl_divergence(logits, depth, valid, SMALL)
+    loss.backward()
+    fast = logits.grad.clone()
+    h = binned_pulse(depth[valid].double() * 2 / SPEED, SMALL)
+    h = h / h.sum(-1, keepdim=True)
+    logits.grad = None
+    logp = logits.movedim(1, -1)[valid].double().log_softmax(-1)
+    expected = (torch.xlogy(h, h) - h * logp).sum(-1).mean()
+    expected.backward()
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+    torch.testing.assert_close(fast, logits.grad, rtol=1e-4, atol=1e-7)
+    assert not fast[0, :, 0, 0].any()
+
+
+def test_kl_divergence_by_hand():
+    depth, valid = torch.full((1, 1, 1), 0.5), torch.ones(1, 1, 1, dtype=torch.bool)
+    h = binned_pulse(torch.tensor([0.5 * 2 / SPEED]), SMALL)[0]
+    h = (h / h.sum()).clamp(min=1e-30)
+    entropy = float(-(h * h.log()).sum())
+    flat = torch.zeros(1, 64, 1, 1)
+    assert float(kl_divergence(flat, depth, valid, SMALL)) == pytest.approx(math.log(64) - entropy, rel=1e-6)
+    best = h.log().float().view(1, 64, 1, 1)
+    assert float(kl_divergence(best, depth, valid, SMALL)) == pytest.approx(0, abs=2e-6)
+    assert float(kl_divergence(flat, depth, ~valid, SMALL)) == 0
+
+
+def test_total_variation_by_hand():
+    values = torch.tensor([[[1.0, 2.0, 4.0], [1.0, 0.0, 0.0]]])
+    assert float(total_variation(values)) == pytest.approx((1 + 2 + 1 + 0 + 0 + 2 + 4) / 6)
+    assert float(total_variation(torch.ones(2, 5, 5))) == 0
+    # the published weight: 1e-5 of a sum over the batch, beside a divergence divided by 1024 bins
+    depth, patches = torch.rand(4, 32, 32), 4 * 32 * 32
+    published = 1e-5 * (depth.diff(dim=1).abs().sum() + depth.diff(dim=2).abs().sum())
+    assert float(PUBLISHED_TV * total_variation(depth) / 1024) == pytest.approx(float(published), rel=1e-5)
+    assert patches == 4096
+
+
+def test_samples_depend_on_their_key_alone():
+    packed = packed_views(near_planes(4))
+    config = preset("smoke", MODEL, **FEW)
+    first, again, later = (Samples(packed, config, epoch) for epoch in (0, 0, 1))
+    assert [first[i] for i in range(6)] == [again[i] for i in range(6)] != [later[i] for i in range(6)]
+    assert {p.signal for p in map(first.__getitem__, range(6))} <= {10, 5, 2}
+    levels = {(p.signal, p.background) for p in (first[i] for i in range(200))}
+    assert len(levels) == 9
+    alone, ahead = (SetData(packed, packed, config, workers).train_dataloader() for workers in (0, 2))
+    for one, other in zip(alone, ahead, strict=True):
+        assert all(torch.equal(torch.nan_to_num(a), torch.nan_to_num(b)) for a, b in zip(one, other, strict=True))
+
+
+def test_validation_frames_are_whole_and_spread():
+    packed = packed_views(near_planes(5))
+    frames = Frames(packed, preset("smoke", MODEL, **{**FEW, "validation_views": 45}))
+    requests = [frames[i] for i in range(45)]
+    assert frames.size == (16, 16) and {r.scene for r in requests} == set(range(5))
+    few = Frames(packed, preset("smoke", MODEL, **{**FEW, "validation_views": 5}))
+    assert len({few[i].scene for i in range(5)}) == 5
+
+
+def test_split_is_by_scene():
+    views = near_planes(6)
+    doubled = Views(views.transients * 2, views.scenes * 2)
+    training, validation = split_views(doubled)
+    assert not set(training.scenes) & set(validation.scenes)
+    assert len(training.transients) == 10 and len(validation.transients) == 2
+    with pytest.raises(InputError, match="a set of one scene"):
+        split_views(Views(views.transients[:1], views.scenes[:1]))
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_interruption_is_passed_on(tmp_path):
+    def stop(what: str, share: float) -> None:
+        raise KeyboardInterrupt
+
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train(preset("smoke", MODEL, **FEW), *split_views(near_planes(3)), tmp_path / "run", progress=stop)
+    finally:
+        signal.signal(signal.SIGINT, handler)  # Lightning leaves it ignored
+
+
+def test_images_are_cut_to_whole_blocks():
+    model = DepthModel(MODEL).eval()
+    views = random_planes(1, size=17, seed=2)
+    found = evaluate({"n": lambda h: model.depth_of(h)[0]}, views, SMALL, levels=[(20, 20)], tile=(2, 2))
+    row = found.rows[0]
+    assert (
+        row.group == "all" and row.pixels + row.beyond_range == np.isfinite(views.transients[0].depth_m[:16, :16]).sum()
+    )
+    with pytest.raises(InputError, match="image of 17 x 17 pixels is smaller than a block of 32 x 32"):
+        evaluate({"n": lambda h: h.depth_m}, views, SMALL, levels=[(20, 20)], tile=(32, 32))
+
+
+def test_a_run_that_stops_goes_on_to_the_same_weights(tmp_path):
+    views = split_views(near_planes(6))
+    config = preset("smoke", MODEL, **FEW, tv_weight=1.0, tv_start=2, time_offset_m=0.01)
+    whole = train(config, *views, tmp_path / "whole")
+    assert whole["steps"] == 9
+
+    def stop(what: str, share: float) -> None:
+        if what == "step 5 of 9":
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        train(config, *views, tmp_path / "parts", progress=stop)
+    assert not (tmp_path / "parts" / "last.safetensors").exists()
+    parts = train(config, *views, tmp_path / "parts")
+    assert parts["steps"] == 9
+    for name in ("last.safetensors", "model.safetensors", "log.csv", "config.json"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
+    rows = (tmp_path / "whole" / "log.csv").read_text().splitlines()
+    assert [row.split(",")[1] for row in rows] == ["step", "3", "6", "9"]
+    best = min(float(row.split(",")[4]) for row in rows[1:])
+    assert whole["val_rmse_mm"] == pytest.approx(best)
+    # the same folder, other numbers or another set
+    with pytest.raises(InputError, match="holds a run with other options or another set"):
+        train(replace(config, rate=1e-4), *views, tmp_path / "whole")
+    with pytest.raises(InputError, match="holds a run with other options or another set"):
+        train(config, *split_views(near_planes(6, seed=1)), tmp_path / "whole")
+
+
+def test_training_learns(tmp_path):
+    """A few steps on bright planes of 64 bins: the error falls to a small part of what the start gives."""
+    views = split_views(near_planes(12))
+    changes = {"epochs": 2, "steps_per_epoch": 60, "batch": 4, "crop": 8, "rate": 5e-3, "levels": ((200.0, 5.0),)}
+    config = preset("smoke", MODEL, **{**FEW, **changes}, decay=0.2, decay_steps=60)
+    train(config, *views, tmp_path / "run")
+    model, _, state = load_model(tmp_path / "run")
+    assert state["train_loss"] < 1.0  # an even guess has log 64 - entropy = 2.4
+    histogram = sense(views[1].transients[0], SMALL, PhotonBudget(200, 5), seed=3)
+    errors = []
+    for candidate in (DepthModel(MODEL, config.seed).eval(), model):
+        depth, _ = candidate.depth_of(histogram)
+        errors.append(float(np.nanmean(np.abs(depth - histogram.depth_m))))
+    assert errors[1] < errors[0] / 3
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        MODEL,
+        replace(MODEL, design=Design("fourier", (64, 2, 2), 4), layer={"per_pixel_norm": True}),
+        replace(MODEL, design=None, front="counts", network="published"),
+        replace(MODEL, design=None, front="peak", network="published-signed"),
+    ],
+    ids=lambda m: m.name,
+)
+def test_checkpoints_come_back(model, tmp_path):
+    config = preset("smoke", model, **FEW)
+    saved = DepthModel(model, 3)
+    save_model(saved, config, {"step": 7, "val_rmse_mm": 1.5}, tmp_path / "model.safetensors")
+    loaded, same, state = load_model(tmp_path)
+    assert same == config and state == {"step": 7, "val_rmse_mm": 1.5}
+    assert weights_sha256(loaded) == weights_sha256(saved)
+    histogram = sense(near_planes(1).transients[0], SMALL, PhotonBudget(20, 20))
+    assert np.array_equal(loaded.depth_of(histogram)[0], saved.depth_of(histogram)[0])
+    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_peaks_and_codes_of_8_bits():
+    histogram = sense(near_planes(1).transients[0], SMALL, PhotonBudget(20, 20))
+    counts = torch.from_numpy(histogram.counts).permute(2, 0, 1)[None, None]
+    peak = DepthModel(replace(MODEL, design=None, front="peak")).seen(counts)
+    assert torch.equal(peak.sum(2), torch.ones(1, 1, 16, 16))
+    assert torch.equal(peak.argmax(2), counts.argmax(2))  # the first of equals
+    model = DepthModel(MODEL, 1).eval()
+    depth, overflows = model.depth_of(histogram, int8=True)
+    exact, none = model.depth_of(histogram)
+    assert overflows == none == 0
+    assert 0 < np.abs(depth - exact).max() < 0.05 * SMALL.range_m
+    with pytest.raises(InputError, match="no codes to hold in 8 bits"):
+        DepthModel(replace(MODEL, design=None, front="counts")).depth_of(histogram, int8=True)
+
+
+def test_damaged_and_foreign_checkpoints(tmp_path):
+    path = tmp_path / "model.safetensors"
+    config = preset("smoke", MODEL, **FEW)
+    save_model(DepthModel(MODEL), config, {}, path)
+    good = path.read_bytes()
+
+    def refused(contents: bytes) -> str:
+        path.write_bytes(contents)
+        with pytest.raises(InputError) as caught:
+            load_model(path)
+        assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+        return str(caught.value)
+
+    assert "not a readable checkpoint" in refused(good[:-20])
+    assert "not a readable checkpoint" in refused(b"nothing")
+    assert "do not match their SHA-256" in refused(good[:-1] + bytes([good[-1] ^ 1]))
+    newer = good.replace(b'\\"schema\\": 1', b'\\"schema\\": 9')
+    assert newer != good and "network of schema 9, this program reads 1" in refused(newer)
+    foreign = good.replace(ATTRIBUTE.encode(), b"somethings"[: len(ATTRIBUTE)].ljust(len(ATTRIBUTE), b"x"))
+    assert "no checkpoint of scene2spad" in refused(foreign)
+    other = preset("smoke", replace(MODEL, design=Design("learned", (32, 2, 2), 16)), **FEW)
+    save_model(DepthModel(MODEL), other, {}, path)
+    assert "of another design than learned 32x2x2 K16" in refused(path.read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"crop": 5}, "not tiled by blocks of 2 x 2"),
+        ({"crop": 32}, "do not fit views of 16"),
+        ({"rate": 0.0}, "learning rate 0 is outside"),
+        ({"precision": "bf16"}, "expected 32-true"),
+        ({"precision": "bf16-mixed"}, "needs a GPU"),
+        ({"epochs": 0}, "epochs 0 is below 1"),
+        ({"levels": ()}, "no photon level"),
+    ],
+)
+def test_bad_configurations(change, said, tmp_path):
+    with pytest.raises(InputError, match=said):
+        train(
+            preset("smoke", MODEL, **{**FEW, **change}), *split_views(near_planes(3)), tmp_path / "x", accelerator="cpu"
+        )
+    assert not (tmp_path / "x").exists()
+
+
+def test_histograms_that_do_not_fit():
+    model = DepthModel(MODEL).eval()
+    planes = near_planes(1).transients[0]
+    with pytest.raises(InputError, match="trained for another sensor"):
+        model.depth_of(sense(planes, replace(SMALL, pulse=Pulse(3e-10)), PhotonBudget(5, 5)))
+    narrow = DepthModel(replace(MODEL, design=Design("learned", (32, 32, 32), 8)))
+    with pytest.raises(InputError, match="image of 16 x 16 pixels is not tiled by the network's blocks of 32 x 32"):
+        narrow.depth_of(sense(planes, SMALL, PhotonBudget(5, 5)))
+    with pytest.raises(InputError, match="blocks of 48 bins do not divide the sensor's 64"):
+        replace(MODEL, design=Design("learned", (48, 2, 2), 8))
