@@ -52,8 +52,8 @@ def run(command: Bench, progress: Progress) -> dict:
         from studies.bench import memory
 
         return memory.run(command, progress)
-    with_peer = _peer_wanted(command)
     cases = _cases(command)
+    with_peer = _peer_wanted(command)
     if command.out.exists() and not command.out.is_dir():
         raise InputError(f"{command.out}: is a file, expected a folder for the results")
     command.out.mkdir(parents=True, exist_ok=True)
