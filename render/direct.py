@@ -12,7 +12,7 @@ from render.quadtree import MOST_CELLS, CellTree
 from render.returns import Samples, concatenate, merge
 from render.world import Bool, Float, UInt32, World, camera_rays, dr, first_opaque
 
-LANES = 1 << 19
+LANES = 1 << 21
 REFINE = 4
 # A footprint whose smaller half span is below this is as good as uniform: a thirtieth of the reference sensor's bin.
 NARROW_M = 1e-3

@@ -13,7 +13,7 @@ from render.returns import Samples, concatenate, no_samples
 from render.settings import BATCHES
 from render.world import World
 
-MOST_CELLS = 1 << 20  # of one launch: 16 MB of accumulators
+MOST_CELLS = 1 << 22  # of one launch: 64 MB of accumulators
 # Seconds of one path with its tail in units of one connection, on 2 cores. Only the choice of who shares depends on it.
 PATH_COST = 9.0
 

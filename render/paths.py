@@ -39,7 +39,7 @@ from render.world import (
 )
 
 BLOCK = 16  # pixels that share their paths
-LANES = 1 << 18  # connections, or paths, of one launch
+LANES = 1 << 20  # connections, or paths, of one launch
 # Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32
 GOLDEN = (3242174889, 2447445414)
 
