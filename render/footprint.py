@@ -29,6 +29,7 @@ from render.world import (
     mi,
     shape_index,
     to_camera,
+    upload,
 )
 
 SMALL = 1 / 32
@@ -71,19 +72,10 @@ def trace(world: World, column: np.ndarray, row: np.ndarray, level: np.ndarray, 
     if len(column) == 1:  # arrays of one entry are scalars to Dr.Jit: another kernel
         alone = trace(world, np.repeat(column, 2), np.repeat(row, 2), np.repeat(level, 2), grid, clip=clip)
         return Footprints(*(values[:1] for values in alone))
-    columns = UInt32(_aligned(column)), UInt32(_aligned(packed)), dr.opaque(UInt32, grid)
+    columns = upload(UInt32, column), upload(UInt32, packed), dr.opaque(UInt32, grid)
     found = recorded[clip](_arrays(world), *columns)
     dr.eval(found)
     return Footprints(*(values.numpy() for values in found))
-
-
-def _aligned(values: np.ndarray) -> np.ndarray:
-    """A copy, as uint32, that starts on 64 bytes: Dr.Jit compiles another kernel for memory that does not."""
-    memory = np.empty(len(values) + 16, np.uint32)
-    start = -memory.ctypes.data % 64 // 4
-    aligned = memory[start : start + len(values)]
-    aligned[:] = values
-    return aligned
 
 
 def _arrays(world: World) -> dict[str, Any]:
