@@ -10,6 +10,7 @@ import numpy as np
 
 from scenes import shapes
 from scenes.errors import InputError
+from scenes.gallery import gallery
 from scenes.living_room import living_room
 from scenes.meshes import EXTENSIONS as MESH_EXTENSIONS
 from scenes.meshes import load_mesh
@@ -20,6 +21,7 @@ SCENES: dict[str, str] = {
     "plane": "a frontal Lambertian wall at 3 m, albedo 0.5",
     "sphere": "a Lambertian sphere of radius 0.5 m whose centre is 3 m away, albedo 0.5, nothing behind it",
     "corner": "a V-groove: two walls of 2 x 4 m, albedo 0.5, that meet at 90 degrees on an upright edge 3 m away",
+    "gallery": "a bare closed room with six finely meshed bodies, 123,000 triangles",
 }
 EXTENSIONS = (*MESH_EXTENSIONS, ".xml")
 HARD = "hard-cases/"
@@ -61,6 +63,8 @@ def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: in
         return load_mesh(Path(spec), width=size.width, height=size.height)
     if spec == "living-room":
         return living_room(seed, width=size.width, height=size.height)
+    if spec == "gallery":
+        return gallery(width=size.width, height=size.height)
     make = {"plane": _plane, "sphere": _sphere, "corner": _corner}[spec]
     return Scene(spec, make(), size)
 

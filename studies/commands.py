@@ -315,10 +315,10 @@ class Bench(Common):
 
     stage: Positional[Literal["render", "sense", "encode", "network", "emulate", "hard-cases"]] = "render"
     """What is measured."""
-    scenes: tuple[Literal["flash", "lamp", "artist", "groove"], ...] = ()
+    scenes: tuple[Literal["flash", "lamp", "artist", "gallery", "groove"], ...] = ()
     """Scenes of `bench render` (default: all)."""
     sizes: tuple[int, ...] = ()
-    """Image sides, pixels (default: 64 128 256 of flash and lamp, 64 128 of artist and groove)."""
+    """Image sides, pixels (default: 64 128 256 of flash and lamp, and gallery, 64 128 of artist and groove)."""
     only: tuple[str, ...] = ()
     """Cases of `bench hard-cases` (default: all)."""
     quick: bool = False

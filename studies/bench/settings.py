@@ -19,10 +19,19 @@ SCENES = {
     "flash": "the built-in living room, 34 degrees, lit by a flash that fills the field of view",
     "lamp": "the built-in living room, its own camera, lit by an isotropic lamp at the camera",
     "artist": "an artist's living room (Mitsuba XML), 34 degrees, lit by the same flash",
+    "gallery": "a bare room with six finely meshed bodies, 60 degrees, lit by an isotropic lamp at the camera",
     "groove": "a 90-degree V-groove, 34 degrees, lit by the same flash",
 }
-SIZES = {"flash": (64, 128, 256), "lamp": (64, 128, 256), "artist": (64, 128), "groove": (64, 128)}
-QUICK_SIZES = {"flash": (64, 128), "lamp": (64, 128), "artist": (64,), "groove": (64,)}
+SIZES = {
+    "flash": (64, 128, 256),
+    "lamp": (64, 128, 256),
+    "artist": (64, 128),
+    "gallery": (64, 128, 256),
+    "groove": (64, 128),
+}
+QUICK_SIZES = {"flash": (64, 128), "lamp": (64, 128), "artist": (64,), "gallery": (64,), "groove": (64,)}
+LAMPS = ("lamp", "gallery")
+_BUILT_IN = {"groove": "corner", "gallery": "gallery"}
 ARTIST_FILE = Path("scenes/living-room/scene.xml")  # below the data folder
 MIRROR_ALBEDO = 0.5
 
@@ -91,8 +100,8 @@ def bench_scene(name: str, size: int, data: Path | None = None) -> Scene:
             raise InputError(f"{path}: file not found (--data or SCENE2SPAD_DATA tell the folder)")
         scene = load_scene(str(path), width=size, height=size)
     else:
-        scene = load_scene("corner" if name == "groove" else "living-room", width=size, height=size)
-    if name == "lamp":
+        scene = load_scene(_BUILT_IN.get(name, "living-room"), width=size, height=size)
+    if name in LAMPS:
         scene = replace(scene, laser=Laser("flood", cone_deg=360))
     else:
         scene = replace(scene, camera=replace(scene.camera, fov_deg=FLASH_FOV_DEG), laser=Laser("flood"))
