@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.returns import Samples
+from render.returns import Samples, packed
 from render.world import Float, UInt32, dr, mi
 
 UInt64 = mi.UInt64
@@ -110,7 +110,7 @@ def cell_samples(
 ) -> Samples:
     """Samples of filled cells, `share` of the cell's width being the centroid's place in it."""
     low, width = cells.edges_m[cell], cells.width_of_m[cell]
-    return Samples(
+    return packed(
         pixel,
         origin_m + low + share * width,
         np.minimum(share, 1 - share) * width,
@@ -123,7 +123,7 @@ def coarsened(samples: Samples, cells: Cells, origin_m: np.ndarray) -> Samples:
     """Samples merged into cells counted from their pixels' origins, as `Rows` would; radiance may be negative."""
     x = samples.path_m - origin_m[samples.pixel]
     cell = np.clip(np.searchsorted(cells.edges_m, x, side="right") - 1, 0, cells.count - 1)
-    key, place = np.unique(samples.pixel * cells.count + cell, return_inverse=True)
+    key, place = np.unique(samples.pixel * np.int64(cells.count) + cell, return_inverse=True)
     energy = np.bincount(place, weights=samples.radiance)
     moment = np.bincount(place, weights=samples.radiance * (x - cells.edges_m[cell]) / cells.width_of_m[cell])
     pixel, cell = np.divmod(key, cells.count)

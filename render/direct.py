@@ -9,7 +9,7 @@ import numpy as np
 
 from render.footprint import albedo
 from render.quadtree import MOST_CELLS, CellTree
-from render.returns import Samples, concatenate, merge
+from render.returns import Samples, concatenate, merge, packed
 from render.world import Bool, Float, UInt32, World, camera_rays, dr, first_opaque
 
 LANES = 1 << 21
@@ -63,8 +63,11 @@ def direct_light(
     thinner than a cell is followed from wherever a ray hit it. All cuts of a pass are traced in one launch. Footprints
     not small at the end are clipped to the face they lie on, and counted if that changes them.
 
-    Pixels are treated in groups of whole rows, about LANES rays each. Neither edges between groups nor, where not all
-    pixels are asked for, edges between pixels start a refinement.
+    Small cells that are not cut, and whose neighbours lie on the same surface, take their spread of path lengths from
+    them instead of from the tangent plane (`CellTree._follow_neighbours`).
+
+    Pixels are treated in groups of whole rows, about LANES rays each. Neither across edges of groups nor, where not all
+    pixels are asked for, across edges of pixels are cells compared.
     """
     least_share = least_share_of(grid) if least_share is None else least_share
     width = world.scene.camera.width
@@ -96,18 +99,18 @@ def _chunk(
 
 
 def _samples(tree: CellTree, cells: np.ndarray, pitch: np.ndarray | float, tolerance_m: float) -> Samples:
-    """What cells of that width, in pixels, return; float64.
+    """What cells of that width, in pixels, return.
 
     A cell with half spans a > b is a trapezoid of path lengths, which one uniform return describes badly at the edges
     of bins. Where b is above the tolerance two returns do it better, without another ray: its halves along the smaller
     span, at p +- b/2 with half width sqrt(a^2 + b^2 / 4).
     """
     rank = tree.rank[cells]
-    path, half_width = tree.path_m[cells].astype(np.float64), tree.half_width_m[cells].astype(np.float64)
-    radiance = tree.radiance[cells] * np.square(pitch, dtype=np.float64)
+    path, half_width = tree.path_m[cells], tree.half_width_m[cells]
+    radiance = tree.radiance[cells] * np.square(pitch, dtype=np.float32)
     wide = np.flatnonzero(tree.minor_m[cells] > max(tolerance_m, NARROW_M))
     if len(wide):
-        minor = tree.minor_m[cells[wide]].astype(np.float64)
+        minor = tree.minor_m[cells[wide]]
         radiance[wide] /= 2
         half_width[wide] = np.sqrt(half_width[wide] ** 2 - 0.75 * minor**2)
         other_half = path[wide] + minor / 2
@@ -116,7 +119,7 @@ def _samples(tree: CellTree, cells: np.ndarray, pitch: np.ndarray | float, toler
         path = np.concatenate((path, other_half))
         half_width = np.concatenate((half_width, half_width[wide]))
         radiance = np.concatenate((radiance, radiance[wide]))
-    return Samples(tree.pixels[rank], path, half_width, radiance, np.ones(len(path), np.uint8))
+    return packed(tree.pixels[rank], path, half_width, radiance, np.ones(len(path), np.uint8))
 
 
 def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Samples:
@@ -127,7 +130,7 @@ def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Sampl
     cells = tree.grid**2
     index = ranks[:, None] * cells + np.arange(cells)
     share = 1 / cells
-    if cells > 16:
+    if cells > 16 or tolerance_m == 0:
         return merge(_samples(tree, index.ravel(), 1 / tree.grid, tolerance_m), tolerance_m)
     radiance = tree.radiance[index]
     lit = radiance > 0
@@ -164,7 +167,7 @@ def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, share: 
     centroid = sum(weight * path) / total if len(total) else total
     variance = sum(weight * ((path - centroid) ** 2 + half_width**2 / 3)) / total if len(total) else total
     pixel = tree.pixels[tree.rank[index[:, 0]]]
-    return Samples(pixel, centroid, np.sqrt(3 * variance), total, np.ones(len(index), np.uint8))
+    return packed(pixel, centroid, np.sqrt(3 * variance), total, np.ones(len(index), np.uint8))
 
 
 def centre_layers(world: World) -> Layers:

@@ -15,7 +15,10 @@ from render.world import World
 STEP_M = 0.0025
 CREASE_M = 0.03
 CREASE_COSINE = 0.05
+
 MIXED_GAP_M = 0.05
+# A cell follows its neighbours if its tangent plane is off the mean step to them by no more, a bent surface apart [m].
+FOLLOWED_M = 1e-3
 # Refinement ends at this many cells a side of a pixel, however fine the grid it started from.
 MOST_CELLS = 64
 # A wire that runs through the image is followed by at most this many launches.
@@ -139,17 +142,61 @@ class CellTree:
 
         Raster images of the cells where whole rows were asked for; else one small image for each pixel.
         """
-        grid, cells = self.grid, self.used
-        images = [getattr(self, name)[:cells].reshape(-1, grid, grid) for name in _COMPARED]
-        if self.whole_rows:
-            by_row = (-1, self.width, grid, grid)
-            flat = (-1, self.width * grid)
-            images = [image.reshape(by_row).transpose(0, 2, 1, 3).reshape(flat) for image in images]
+        images = [self._image(getattr(self, name)) for name in _COMPARED]
         reasons = (images[-2] & LARGE) != 0
-        self._compare_images(images, np.float32(1 / grid), reasons)
+        joined = self._compare_images(images, np.float32(1 / self.grid), reasons)
+        self._follow_neighbours(joined, images)
+        return self._column(reasons)
+
+    def _image(self, column: np.ndarray) -> np.ndarray:
+        """A property of the cells of level 0 as raster images (..., rows, columns): of whole rows, or of each pixel."""
+        grid = self.grid
+        image = column[: len(self.pixels) * grid**2].reshape(-1, grid, grid)
         if self.whole_rows:
-            reasons = reasons.reshape(-1, grid, self.width, grid).transpose(0, 2, 1, 3)
-        return reasons.reshape(cells)
+            image = image.reshape(-1, self.width, grid, grid).transpose(0, 2, 1, 3).reshape(-1, self.width * grid)
+        return image
+
+    def _column(self, image: np.ndarray) -> np.ndarray:
+        """The inverse of `_image`."""
+        if self.whole_rows:
+            image = image.reshape(-1, self.grid, self.width, self.grid).transpose(0, 2, 1, 3)
+        return image.reshape(-1)
+
+    def _follow_neighbours(self, joined: list[np.ndarray], images: list[np.ndarray]) -> None:
+        """Spread small cells of level 0 between their neighbours on the same surface instead of on the tangent plane.
+
+        Along each axis p = p_0 + s x + c x^2 / 2 and r = r_0 + g x, with s, g the mean of the steps to both neighbours
+        (the one step where the other neighbour lies across an edge) and c their difference. Then the half span is
+        |s| / 2 (c adds c^2 / 720 to the variance), and the mean path p_0 + c / 24 + g s / (12 r_0), summed over the
+        axes: second order in the cell's width where the tangent plane is first, and blind to facets of a curved
+        surface. At a crease the tangent plane agrees with one of the steps instead of their mean, and is kept.
+        """
+        distance, slope_x, slope_y, _, radiance, flags, _ = images
+        path, pitch = self._image(self.path_m), np.float32(1 / self.grid)
+        follows = ((flags & (HIT | LARGE)) == HIT) & (radiance > 0)
+        per_radiance = np.divide(np.float32(1), radiance, out=np.zeros_like(radiance), where=follows)
+        mean, halves, variance = path.copy(), [], np.zeros_like(path)
+        for both, tangent, along in zip(joined, (slope_x, slope_y), (_ALONG_X, _ALONG_Y), strict=True):
+            number = np.zeros(path.shape, np.float32)
+            for side in along:
+                number[side] += both
+            share, two = 1 / np.maximum(number, 1), number == 2
+            rise, bend = _steps(distance, both, along)
+            off = np.abs(tangent * pitch - rise * share)
+            follows &= (number > 0) & (off <= np.maximum(np.abs(bend) * two / 4, FOLLOWED_M))
+            slope, bend = _steps(path, both, along)
+            slope, bend = slope * share, bend * two
+            gain = np.clip(_steps(radiance, both, along)[0] * share * per_radiance, -2, 2)
+            mean += bend / 24 + gain * slope / 12
+            halves.append(np.abs(slope) / 2)
+            variance += np.square(slope) / 4 + np.square(bend) / 240
+        chosen = np.flatnonzero(self._column(follows))
+        for column, image in (
+            (self.path_m, mean),
+            (self.half_width_m, np.sqrt(variance)),
+            (self.minor_m, np.minimum(*halves)),
+        ):
+            column[chosen] = self._column(image)[chosen]
 
     def _cut(self, parents: np.ndarray, levels: int) -> np.ndarray:
         """Cut cells in four; the cells (children, and older leaves beside them) that now need cutting, sorted."""
@@ -206,12 +253,13 @@ class CellTree:
             found = np.where(down, child + 2 * (row >> deeper & 1) + (column >> deeper & 1), found)
         return found
 
-    def _compare_images(self, images: list[np.ndarray], pitch: np.ndarray | np.float32, reasons: np.ndarray) -> None:
+    def _compare_images(self, images: list[np.ndarray], pitch: np.ndarray | np.float32, reasons: np.ndarray) -> list[np.ndarray]:
         """Compare cells with their neighbours in images (..., rows, columns) of `_COMPARED`; adds to `reasons` to cut.
 
         Marks `mixed` pixels among them.
         """
         distance, slope_x, slope_y, facing, radiance, flags, rank = images
+        joined = []
         energy = radiance * np.square(pitch)
         for slope, (before, after) in ((slope_x, _ALONG_X), (slope_y, _ALONG_Y)):
             rise = slope * pitch
@@ -225,6 +273,8 @@ class CellTree:
             worth = pairs.differ & (np.maximum(energy[before], energy[after]) * pairs.contrast >= self.least)
             reasons[before] |= worth
             reasons[after] |= worth
+            joined.append(pairs.joined)
+        return joined
 
     def _worth_cutting(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         """`_compare` pairs of cells of any size: which are worth cutting; marks the `mixed` pixels among them."""
@@ -257,13 +307,26 @@ class CellTree:
         self.mixed[pixel[apart & (pixel == rank[1][chosen])]] = True
 
 
+def _steps(image: np.ndarray, both: np.ndarray, along: tuple) -> Two:
+    """Sum and difference of each cell's steps to the cell after and from the cell before, where `both` are joined."""
+    before, after = along
+    step = np.where(both, image[after] - image[before], np.float32(0))
+    total, change = np.zeros_like(image), np.zeros_like(image)
+    total[before] = change[before] = step
+    total[after] += step
+    change[after] -= step
+    return total, change
+
+
 class _Pairs(NamedTuple):
     """What lies between neighbouring cells: whether an edge, the gap between their surfaces [m] (0 unless both hit),
-    and the share of the brighter one's radiance that misplacing the edge between them can change."""
+    the share of the brighter one's radiance that misplacing the edge between them can change, and whether both are hits
+    on one surface, bent or not."""
 
     differ: np.ndarray
     gap_m: np.ndarray
     contrast: np.ndarray
+    joined: np.ndarray
 
 
 def _compare(flags: Two, facing: Two, step: np.ndarray, rise: Two) -> _Pairs:
@@ -277,4 +340,4 @@ def _compare(flags: Two, facing: Two, step: np.ndarray, rise: Two) -> _Pairs:
     gap = np.where(both, np.maximum(step - most, least - step), np.float32(0))
     edge = (gap > STEP_M) | (both & (most - least > CREASE_M)) | (((flags[0] ^ flags[1]) & (HIT | LIT)) != 0)
     bend = np.abs(facing[0] - facing[1])
-    return _Pairs(edge | (both & (bend > CREASE_COSINE)), gap, np.where(edge, np.float32(1), bend))
+    return _Pairs(edge | (both & (bend > CREASE_COSINE)), gap, np.where(edge, np.float32(1), bend), both & ~edge)

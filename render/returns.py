@@ -8,13 +8,19 @@ import numpy as np
 
 
 class Samples(NamedTuple):
-    """Unsorted samples: flat pixel index, path centre and half width [m], radiance, number of bounces."""
+    """Unsorted samples: flat pixel index, path centre and half width [m], radiance, number of bounces.
+
+    Lists of millions are kept as `COLUMN_TYPES`; sums over them run in float64.
+    """
 
     pixel: np.ndarray
     path_m: np.ndarray
     half_width_m: np.ndarray
     radiance: np.ndarray
     bounces: np.ndarray
+
+
+COLUMN_TYPES = (np.int32, np.float32, np.float32, np.float32, np.uint8)
 
 
 class Returns(NamedTuple):
@@ -32,8 +38,13 @@ def select(samples: Samples, kept: np.ndarray) -> Samples:
     return Samples(*(column[kept] for column in samples))
 
 
+def packed(*columns: np.ndarray) -> Samples:
+    """Samples of columns of any type, as `COLUMN_TYPES`."""
+    return Samples(*(column.astype(kind, copy=False) for column, kind in zip(columns, COLUMN_TYPES, strict=True)))
+
+
 def concatenate(parts: list[Samples]) -> Samples:
-    return Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return packed(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def merge(samples: Samples, tolerance_m: float) -> Samples:
@@ -41,13 +52,13 @@ def merge(samples: Samples, tolerance_m: float) -> Samples:
 
     Cells are `tolerance_m` wide. Energy, centroid and variance of the path length are kept: the merged sample is
     uniform over centroid +- sqrt(3 variance), where one uniform over c +- h has variance h^2 / 3, and has the fewest
-    bounces of its parts. Samples without energy go. The sums run over a stable sort in float64, so that the result
+    bounces of its parts. Samples without energy go; with a tolerance of 0 that is all. The sums run over a stable sort in float64, so that the result
     depends on the samples' order alone.
     """
     lit = samples.radiance > 0
     if not lit.all():
         samples = select(samples, lit)
-    if len(samples.pixel) == 0:
+    if len(samples.pixel) == 0 or tolerance_m == 0:
         return samples
     cell = samples.path_m / tolerance_m
     cell = np.clip(np.floor(cell) + (1 << 27), 0, (1 << 28) - 1).astype(np.int64)
@@ -64,7 +75,7 @@ def merge(samples: Samples, tolerance_m: float) -> Samples:
     spread = (path - np.repeat(centroid, length)) ** 2 + half_width**2 / 3
     variance = np.add.reduceat(energy * spread, first) / total
     bounces = np.minimum.reduceat(samples.bounces[order], first)
-    return Samples(samples.pixel[order[first]], centroid, np.sqrt(3 * variance), total, bounces)
+    return packed(samples.pixel[order[first]], centroid, np.sqrt(3 * variance), total, bounces)
 
 
 def to_returns(samples: Samples, pixels: int) -> Returns:
@@ -85,4 +96,4 @@ def to_returns(samples: Samples, pixels: int) -> Returns:
 
 def no_samples() -> Samples:
     """An empty list of samples."""
-    return Samples(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.uint8))
+    return Samples(*(np.empty(0, kind) for kind in COLUMN_TYPES))

@@ -26,7 +26,8 @@ class RenderSettings:
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
     least_share edges of surfaces and shadows are followed where they could change this share of a cell or more;
                 0 follows all of them
-    direct_tolerance_m, indirect_tolerance_m   returns of one pixel closer than this in path length merge
+    direct_tolerance_m, indirect_tolerance_m   returns of one pixel closer than this in path length merge; direct ones
+                do not with 0
     indirect_growth  that width grows by this share of the path behind the direct light
     """
 
@@ -64,9 +65,11 @@ class RenderSettings:
             raise InputError("render: give an error target or a photon budget, not both")
         if not 0 <= self.indirect_growth <= 1:
             raise InputError(f"render: indirect_growth {self.indirect_growth:g} is outside 0 to 1")
-        for name in ("direct_tolerance_m", "indirect_tolerance_m"):
-            if getattr(self, name) is not None and not 1e-4 <= getattr(self, name) <= 10:
-                raise InputError(f"render: {name} {getattr(self, name):g} is outside 1e-4 to 10")
+        if not 1e-4 <= self.indirect_tolerance_m <= 10:
+            raise InputError(f"render: indirect_tolerance_m {self.indirect_tolerance_m:g} is outside 1e-4 to 10")
+        tolerance = self.direct_tolerance_m
+        if tolerance is not None and tolerance != 0 and not 1e-4 <= tolerance <= 10:
+            raise InputError(f"render: direct_tolerance_m {tolerance:g} is neither 0 nor 1e-4 to 10")
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from render.mirrors import (
     planes_of,
     specular_points,
 )
-from render.returns import Samples, concatenate, merge
+from render.returns import Samples, concatenate, merge, no_samples
 from render.world import (
     OPACITY,
     Bool,
@@ -72,20 +72,16 @@ def specular_light(world: World, grid: int = 4, tolerance_m: float = 1e-4) -> Sp
     """
     notes = check_slabs(world)
     if not any(surface.material.kind in COATED for surface in world.scene.surfaces):
-        return SpecularLight(_no_samples(), tuple(notes))
+        return SpecularLight(no_samples(), tuple(notes))
     mirrors, more = find_mirrors(world)
     notes += more
     tables = _Tables(world, mirrors)
-    parts = [_no_samples()]
+    parts = [no_samples()]
     for sequence in glint_sequences(mirrors, notes):
         parts.append(_glints(world, tables, mirrors, sequence))
     for sequence in image_sequences(mirrors, notes):
         parts += _mirrored(world, tables, mirrors, sequence, grid)
     return SpecularLight(merge(concatenate(parts), tolerance_m), tuple(notes))
-
-
-def _no_samples() -> Samples:
-    return Samples(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.uint8))
 
 
 # ---- tracing ----

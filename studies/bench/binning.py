@@ -2,57 +2,39 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from render.returns import Samples
+from render.world import Float, UInt32, dr, mi, upload
 
 
-def binned(samples: Samples, pixels: int, bins: int, bin_m: float, *, out: np.ndarray | None = None) -> np.ndarray:
+def binned(samples: Samples, pixels: int, bins: int, bin_m: float) -> np.ndarray:
     """Radiance per pixel and bin, (pixels, bins) float32; bin i covers path lengths [i, i + 1) * bin_m.
 
-    A sample is uniform over path +- half width (a point where that is 0) and gives each bin its share of the interval,
-    exactly; what lies outside [0, bins * bin_m) is dropped. `out` is an array to fill again instead of a new one, as
-    Dr.Jit keeps the memory of the peer's tensor from call to call.
+    A sample is uniform over path +- half width (a point where that is 0) and gives each bin its share of the interval;
+    what lies outside [0, bins * bin_m) is dropped. Scattered by as many threads as the peer scatters with.
     """
-    if out is None:
-        out = np.zeros((pixels, bins), np.float32)
-    else:
-        out.fill(0)
-    flat = out.reshape(-1)
-    near = (samples.path_m - samples.half_width_m) / bin_m
-    far = (samples.path_m + samples.half_width_m) / bin_m
-    first, last = np.floor(near).astype(np.int64), np.floor(far).astype(np.int64)
-    row = samples.pixel * np.int64(bins)
-    _add(flat, row, first, samples.radiance, bins, first == last)
-    wide = np.flatnonzero(first != last)
-    if len(wide):
-        near, far, first, last, row = near[wide], far[wide], first[wide], last[wide], row[wide]
-        density = samples.radiance[wide] / (far - near)  # per bin
-        _add(flat, row, first, density * (first + 1 - near), bins)
-        _add(flat, row, last, density * (far - last), bins)
-        _add_inner(flat, row, first + 1, last, density, bins)
-    return out
+    out = dr.zeros(Float, pixels * bins)
+    if len(samples.pixel) > 0:
+        # a point on an edge belongs to the bin above it: the division must not round it down
+        near = ((samples.path_m - samples.half_width_m) / bin_m).astype(np.float32)
+        far = ((samples.path_m + samples.half_width_m) / bin_m).astype(np.float32)
+        first = upload(UInt32, samples.pixel), upload(Float, near), upload(Float, far), upload(Float, samples.radiance)
+        _scatter(out, *first, dr.opaque(UInt32, bins))
+        dr.eval(out)
+    return out.numpy().reshape(pixels, bins)
 
 
-def _add(
-    flat: np.ndarray, row: np.ndarray, bin_: np.ndarray, energy: np.ndarray, bins: int, chosen: np.ndarray | bool = True
-) -> None:
-    """Add to one bin each, where it is inside."""
-    inside = (bin_ >= 0) & (bin_ < bins) & chosen
-    if not inside.all():
-        inside = np.flatnonzero(inside)  # numpy picks by index much faster than by mask
-        row, bin_, energy = row[inside], bin_[inside], energy[inside]
-    np.add.at(flat, row + bin_, energy.astype(np.float32))
-
-
-def _add_inner(
-    flat: np.ndarray, row: np.ndarray, start: np.ndarray, stop: np.ndarray, density: np.ndarray, bins: int
-) -> None:
-    """Add `density` to every bin of [start, stop), the bins that an interval covers whole."""
-    start, stop = np.maximum(start, 0), np.minimum(stop, bins)
-    some = np.flatnonzero(stop > start)
-    start, length = start[some], (stop - start)[some]
-    ends = np.cumsum(length)
-    total = int(ends[-1]) if len(ends) else 0
-    index = np.arange(total) + np.repeat(row[some] + start - (ends - length), length)
-    np.add.at(flat, index, np.repeat(density[some].astype(np.float32), length))
+@dr.syntax
+def _scatter(out: Any, pixel: Any, near: Any, far: Any, radiance: Any, bins: Any) -> None:
+    place = dr.maximum(mi.Int32(dr.floor(near)), 0)
+    last = dr.minimum(mi.Int32(dr.floor(far)), mi.Int32(bins) - 1)
+    point = far == near
+    density = dr.select(point, radiance, radiance / (far - near))
+    while place <= last:
+        overlap = dr.minimum(far, Float(place) + 1) - dr.maximum(near, Float(place))
+        share = dr.select(point, 1, overlap)
+        dr.scatter_reduce(dr.ReduceOp.Add, out, density * share, pixel * bins + UInt32(place))
+        place += 1

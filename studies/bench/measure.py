@@ -72,18 +72,14 @@ class Runner:
 
 
 def our_runner(world: World, method: Method, transport: str) -> Runner:
-    """Trace and bin; the dense array is filled again from run to run, as Dr.Jit does with its own."""
+    """Trace and bin."""
     camera = world.scene.camera
-    pixels = camera.width * camera.height
-    kept: list[np.ndarray] = []
 
     def run(quality: int, seed: int) -> np.ndarray:
         samples = ours.trace(world, method, BOUNCES[transport], quality, seed)
-        histogram = binned(samples, pixels, BINS, BIN_M, out=kept.pop() if kept else None)
-        kept.append(histogram)
-        return histogram
+        return binned(samples, camera.width * camera.height, BINS, BIN_M)
 
-    return Runner(method, run, kept.clear)
+    return Runner(method, run)
 
 
 def peer_runner(peer: Peer, method: Method) -> Runner:

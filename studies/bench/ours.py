@@ -11,7 +11,7 @@ from render.settings import Plan, RenderSettings
 from render.world import World
 from studies.bench.settings import Method, grid_beside
 
-MERGED_M = 1e-3  # a bin of the comparison is 14.6 mm wide
+MERGED_M = 0.0  # nothing is merged: a histogram follows at once
 HAS_FILTER = "filter" in {f.name for f in fields(RenderSettings)}
 
 
