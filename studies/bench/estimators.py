@@ -18,7 +18,7 @@ from render.transient import Transient
 from spad.depth import METHODS, depth_errors, estimate_depth
 from spad.detect import sense
 from spad.rgbd import transient_from_rgbd
-from spad.sensor import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor import PhotonBudget, Sensor
 from studies.figures import save
 
 QUICK_LEVELS = ((50, 50), (10, 1000))

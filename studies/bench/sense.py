@@ -47,7 +47,8 @@ def relief(height: int, width: int) -> Transient:
 def run(command: Any, progress: Progress) -> dict:
     """Rows of `name`, `seconds`, `error` and what they are compared with; tables and picture in `command.out`.
 
-    `command` has `seed`, `repeats`, `quick` (two levels and one image in the table of estimators), `set`, `data`, `out`.
+    `command` has `seed`, `repeats`, `quick` (two levels and one image in the table of estimators), `set`, `data` and
+    `out`.
     """
     out: Path = command.out
     require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
@@ -135,13 +136,15 @@ def first_photons(seed: int, repeats: int) -> list[dict]:
     rows = []
     for cycles in CYCLES:
         speed = seconds[CYCLES[0]] / seconds[cycles]
-        rows.append(_row(f"first photon, {cycles:,} cycles, 10 + 50 photons", seconds[cycles], speed))
+        rows.append(
+            _row(f"first photon, {cycles:,} cycles, the same 10 + 50 photons an exposure", seconds[cycles], speed)
+        )
     flux = expected_counts(transient, sensors[CYCLES[0]], rates_for(transient, Sensor(), budget), slice(0, 1024))[0]
     flux = flux.numpy() * (FLUX_PER_CYCLE / flux.sum(dim=1).mean().item())
     rng = np.random.default_rng(seed)
     dense = alternating({n: lambda n=n: first_photon_counts(flux, n, rng) for n in CYCLES}, repeats)
     for cycles in CYCLES:
-        name = f"first photon, {cycles:,} cycles, 1024 pixels, every bin, {FLUX_PER_CYCLE:g} photons a cycle"
+        name = f"first photon, {cycles:,} cycles, the same {FLUX_PER_CYCLE:g} photons a cycle, every bin"
         rows.append(_row(name, dense[cycles], dense[CYCLES[0]] / dense[cycles]))
     return rows
 
