@@ -95,7 +95,8 @@ def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Fill
     ambient, counted = ambient.astype(np.float64), float(dark.mean())
     if counted > asked:
         reason = f"background: {counted:g} dark counts a pixel exceed the asked {asked:g}, scaled down to it"
-        return Filled(dark * (asked / counted), 1.0 if asked > 0 else 0.0, reason)
+        _, dark_scale = background_scales(1.0, counted, asked)
+        return Filled(dark * dark_scale, 1.0 if asked > 0 else 0.0, reason)
     share = counted / asked if asked > 0 else 0.0
     if counted > 0:
         reason = f"background: {share:.1%} dark counts ({counted:g} a pixel), the rest ambient light"
@@ -105,7 +106,15 @@ def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Fill
         reason = "background: uniform over the image, the scene has no ambient light"
     if ambient.sum() <= 0:
         ambient = np.ones_like(ambient)
-    return Filled(dark + ambient * ((asked - counted) / ambient.mean()), share, reason)
+    ambient_scale, _ = background_scales(float(ambient.mean()), counted, asked)
+    return Filled(dark + ambient * ambient_scale, share, reason)
+
+
+def background_scales(ambient_mean: float, dark_mean: float, asked: float) -> tuple[float, float]:
+    """Factors of ambient light and of dark counts, whose means are given, that bring their sum to the asked mean."""
+    if dark_mean > asked:
+        return 0.0, asked / dark_mean
+    return (asked - dark_mean) / ambient_mean, 1.0
 
 
 def _odd_pixels(sensor: Sensor, dead: np.ndarray) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +22,8 @@ from torch import Tensor
 
 from render.transient import Transient
 from scenes.errors import InputError
-from spad.flux import fill_background
-from spad.photons import Light, draw_primaries, paths_in_bins
+from spad.flux import background_scales
+from spad.photons import Events, Light, draw_primaries, paths_in_bins
 from spad.sensor import PhotonBudget, Sensor
 
 STAGE_FLY = 23
@@ -60,6 +61,7 @@ class PackedTransients:
         pixels = self.offsets[:: shape[1] * shape[2]]
         sums[np.diff(pixels) == 0] = 0  # reduceat gives an empty scene its neighbour's first
         object.__setattr__(self, "mean_radiance", sums / (shape[1] * shape[2]))
+        object.__setattr__(self, "mean_ambient", self.ambient.mean(axis=(1, 2), dtype=np.float64))
 
     @property
     def scenes(self) -> int:
@@ -121,7 +123,7 @@ def sense_patches(
     """
     height, width = size
     pixels, bins = height * width, sensor.bins
-    counts = torch.zeros((len(patches), bins * pixels), device=device)
+    counts = torch.empty((len(patches), bins * pixels), device=device)
     labels = np.empty((len(patches), height, width), np.float32)
     mixed = np.empty((len(patches), height, width), bool)
 
@@ -130,10 +132,7 @@ def sense_patches(
         light = _light_of_patch(packed, sensor, patch, height, width)
         rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(patch.seed, spawn_key=(STAGE_FLY, 0, 0))))
         events = draw_primaries(light, sensor, rng)
-        # bin before pixel: the order of (T, h, w)
-        places = torch.from_numpy(events.position * np.int64(pixels) + events.pixel).to(device)
-        one = torch.from_numpy(np.ones(len(places), np.float32)).to(device)
-        counts[number].scatter_add_(0, places, one)  # whole numbers: no order of additions shows
+        _count(events, counts[number].view(bins, pixels))
         rows, columns = slice(patch.row, patch.row + height), slice(patch.column, patch.column + width)
         labels[number] = packed.depth_m[patch.scene, rows, columns] + np.float32(patch.time_offset_m)
         mixed[number] = packed.mixed[patch.scene, rows, columns]
@@ -149,6 +148,27 @@ def sense_patches(
     )
 
 
+def _count(events: Events, counts: Tensor) -> None:
+    """Detections of each bin and pixel, into `counts` (T, P); whole numbers, so that no order of additions shows.
+
+    On a CPU in the narrowest type that holds the fullest pixel, so that a core's cache holds the patch, and then wide.
+    """
+    pixels = counts.shape[1]
+    places = events.position * np.int64(pixels)
+    places += events.pixel
+    index = torch.from_numpy(places).to(counts.device)
+    most = int(np.bincount(events.pixel, minlength=1).max())
+    if counts.device.type != "cpu" or most >= 1 << 15:
+        one = torch.from_numpy(np.ones(len(places), np.float32)).to(counts.device)
+        counts.zero_().view(-1).scatter_add_(0, index, one)
+        return
+    # Filled, cleared and copied by numpy: torch would do it on threads of its own, which wait for each other here
+    kind = np.uint8 if most < 1 << 8 else np.int16
+    narrow = np.zeros(counts.shape, kind)
+    torch.from_numpy(narrow).view(-1).scatter_add_(0, index, torch.from_numpy(np.ones(len(places), kind)))
+    np.copyto(counts.numpy(), narrow)
+
+
 def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, height: int, width: int) -> Light:
     scenes, rows, columns = packed.depth_m.shape
     inside = 0 <= patch.scene < scenes and 0 <= patch.row <= rows - height and 0 <= patch.column <= columns - width
@@ -161,8 +181,12 @@ def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, heig
     mean = float(packed.mean_radiance[patch.scene])
     if mean <= 0 and budget.signal > 0:
         raise InputError(f"scene {patch.scene}: no light returns, {budget.signal:g} signal photons cannot be had")
-    dark = sensor.dark_rate_map_hz(rows, columns) * sensor.exposure_s
-    background = fill_background(packed.ambient[patch.scene], dark, budget.background).background
+    crop = (slice(patch.row, patch.row + height), slice(patch.column, patch.column + width))
+    dark, ambient = _dark_counts(sensor, rows, columns), packed.ambient[patch.scene][crop].astype(np.float64)
+    mean_ambient = float(packed.mean_ambient[patch.scene])
+    if mean_ambient <= 0:
+        ambient, mean_ambient = np.ones_like(ambient), 1.0  # uniform, as in `flux.fill_background`
+    ambient_scale, dark_scale = background_scales(mean_ambient, float(dark.mean()), budget.background)
     pixel = (patch.scene * rows + patch.row + np.arange(height)[:, None]) * columns + patch.column + np.arange(width)
     first = packed.offsets[pixel].ravel()
     number = packed.offsets[pixel + 1].ravel() - first
@@ -174,5 +198,13 @@ def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, heig
         start=start + patch.time_offset_m / sensor.bin_depth_m,
         length=length,
         signal=packed.radiance[index] * (budget.signal / mean if mean > 0 else 0.0),
-        background=background[patch.row : patch.row + height, patch.column : patch.column + width].ravel(),
+        background=(dark[crop] * dark_scale + ambient * ambient_scale).ravel(),
     )
+
+
+@lru_cache(maxsize=16)
+def _dark_counts(sensor: Sensor, rows: int, columns: int) -> np.ndarray:
+    """Expected dark counts of an exposure, (H, W) float64, read only."""
+    dark = sensor.dark_rate_map_hz(rows, columns) * sensor.exposure_s
+    dark.flags.writeable = False
+    return dark

@@ -77,41 +77,49 @@ def draw_primaries(
     """
     period = sensor.bins_per_period
     number = rng.poisson(light.signal * share)
-    which = np.repeat(np.arange(len(number)), number)
-    position = light.start[which]
+    position = np.repeat(light.start, number)  # which is grouped, and then costs less than a look-up per detection
+    total = len(position)
     if light.length.any():
-        position += rng.random(len(which), dtype=np.float32) * light.length[which]
+        spread = np.repeat(light.length, number)
+        spread *= rng.random(total, dtype=np.float32)
+        position += spread
     for kernel in (sensor.pulse, sensor.jitter):
         if kernel is not None:
-            position += kernel.draw(rng, len(which)) * np.float32(1 / sensor.bin_width_s)
+            delay = kernel.draw(rng, total)
+            delay *= np.float32(1 / sensor.bin_width_s)
+            position += delay
     steady = rng.poisson(light.background * share)
-    pixel = np.concatenate((light.owner[which], np.repeat(np.arange(light.pixels, dtype=np.int32), steady)))
-    total = len(pixel) - len(which)
+    owner = np.concatenate((light.owner, np.arange(light.pixels, dtype=np.int32)))
+    pixel = np.repeat(owner, np.concatenate((number, steady)))
+    rest = len(pixel) - total
     if fractional:
-        at = np.concatenate((np.mod(position, period), rng.random(total) * period))
+        at = np.concatenate((np.mod(position, period), rng.random(rest) * period))
         at[at >= period] = 0  # a tiny negative position rounds up to the period itself
     else:
-        at = np.concatenate((_folded(position, period), _uniform_bins(rng, period, total)))
+        at = np.empty(len(pixel), np.int32)
+        _fold(position, period, at[:total])
+        at[total:] = _uniform_bins(rng, period, rest)
     if sensor.bins == period:
         return Events(pixel, at)
     seen = at < sensor.bins  # the rest of the period has no bins: nothing is detected there
     return Events(pixel[seen], at[seen])
 
 
-def _folded(position: np.ndarray, period: int) -> np.ndarray:
-    """The bin within the period of positions in bins, (N,) int32."""
+def _fold(position: np.ndarray, period: int, out: np.ndarray) -> None:
+    """The bin within the period of positions in bins, (N,), into `out`; positions are overwritten."""
     whole = np.floor(position, out=position).astype(np.int64)
     if period & (period - 1):
-        return (whole % period).astype(np.int32)
-    return (whole & (period - 1)).astype(np.int32)  # the same of a power of two, also below 0, and much faster
+        np.mod(whole, period, out=out, casting="same_kind")
+    else:  # the same of a power of two, also below 0, and much faster
+        np.bitwise_and(whole, period - 1, out=out, casting="same_kind")
 
 
 def _uniform_bins(rng: np.random.Generator, period: int, size: int) -> np.ndarray:
-    """Uniform integers from 0 to period - 1, (size,) int32; powers of two to 2^16 from a quarter of a random word."""
+    """Uniform integers from 0 to period - 1, (size,); powers of two to 2^16 from a quarter of a random word."""
     if period & (period - 1) or period > 1 << 16:
         return rng.integers(0, period, size, dtype=np.int32)
     words = rng.integers(0, 1 << 64, -(-size // 4), dtype=np.uint64)
-    return (words.view(np.uint16)[:size] & np.uint16(period - 1)).astype(np.int32)
+    return words.view(np.uint16)[:size] & np.uint16(period - 1)
 
 
 def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: Light) -> tuple[np.ndarray, float]:

@@ -333,6 +333,8 @@ class Bench(Common):
     """Compare peak memory in fresh processes instead."""
     data: Annotated[Path | None, _open("FOLDER")] = None
     """Folder with the artist's scene and the Middlebury images (default: SCENE2SPAD_DATA, else ../shared/data)."""
+    set: Annotated[Path | None, _open("SET")] = None
+    """Rendered set whose views the estimators of `bench sense` are compared on (default: the Middlebury images)."""
     cache: Annotated[Path | None, _open("FOLDER")] = None
     """Folder that keeps references from run to run (default: ~/.cache/scene2spad)."""
     out: Path = Path("out/bench")

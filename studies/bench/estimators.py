@@ -13,11 +13,12 @@ from matplotlib import pyplot as plt
 from PIL import Image
 
 from csph.metrics import PHOTON_LEVELS as LEVELS
+from csph.views import read_views
 from render.transient import Transient
 from spad.depth import METHODS, depth_errors, estimate_depth
 from spad.detect import sense
 from spad.rgbd import transient_from_rgbd
-from spad.sensor import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor import PhotonBudget, Sensor
 from studies.figures import save
 
 QUICK_LEVELS = ((50, 50), (10, 1000))
@@ -72,15 +73,18 @@ def table(
     return rows
 
 
-def run(command: Any, progress: Callable[[str, float], None]) -> list[dict]:
-    """The table on the Middlebury images of the data folder; none where they are not there."""
+def scenes_of(command: Any) -> list[tuple[str, Transient]]:
+    """Views of the rendered set that is asked for, else the Middlebury images of the data folder; none without both.
+
+    Only the first where it is to be quick. Raises InputError as `read_views` does.
+    """
+    most = 1 if command.quick else None
+    if command.set is not None:
+        views = read_views(command.set)
+        return list(zip(views.scenes, views.transients, strict=True))[:most]
     data = command.data or Path(os.environ.get("SCENE2SPAD_DATA", "../shared/data"))
     folders = sorted(path.parent for path in (data / "middlebury").glob("*/disp1.png"))
-    if command.quick:
-        folders = folders[:1]
-    scenes = ((folder.name, middlebury(folder)) for folder in folders)
-    levels = QUICK_LEVELS if command.quick else LEVELS
-    return table(scenes, sensor_by_name("reference"), levels, seed=command.seed, progress=progress)
+    return [(folder.name, middlebury(folder)) for folder in folders[:most]]
 
 
 def mean_over(rows: list[dict], key: str, **where: object) -> float:
@@ -97,6 +101,28 @@ def summary(rows: list[dict]) -> dict:
         method: {group: {key: mean_over(rows, key, method=method, group=group) for key in keys} for group in GROUPS}
         for method in dict.fromkeys(row["method"] for row in rows)
     }
+
+
+def markdown(rows: list[dict]) -> list[str]:
+    """Two tables: MAE of every estimator at every level, and all figures over all levels; all, unmixed, mixed pixels.
+
+    A cell of the first is the mean over scenes; one of the second also over levels.
+    """
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    found = [f"| signal / background | {' | '.join(methods)} |", f"|---|{'---|' * len(methods)}"]
+    for signal, background in sorted({(row["signal"], row["background"]) for row in rows}):
+        where = {"signal": signal, "background": background}
+        cells = [_cell(rows, "mae_mm", ".0f", method=method, **where) for method in methods]
+        found.append(f"| {signal:g} / {background:g} | {' | '.join(cells)} |")
+    found += ["", "| estimator | MAE [mm] | RMSE [mm] | within 10 mm [%] |", "|---|---|---|---|"]
+    for method in methods:
+        cells = [_cell(rows, key, ".0f", method=method) for key in ("mae_mm", "rmse_mm")]
+        found.append(f"| {method} | {' | '.join(cells)} | {_cell(rows, 'within_10mm', '.1f', 100, method=method)} |")
+    return found
+
+
+def _cell(rows: list[dict], key: str, digits: str, scale: float = 1, **where: object) -> str:
+    return " / ".join(f"{scale * mean_over(rows, key, group=group, **where):{digits}}" for group in GROUPS)
 
 
 def draw(rows: list[dict], path: Path) -> Path:

@@ -6,8 +6,6 @@ stands the p-value of a chi-square test that both drew from one law: totals over
 
 from __future__ import annotations
 
-import csv
-import io
 import statistics
 import time
 from collections.abc import Callable
@@ -20,7 +18,7 @@ from scipy import stats
 
 from render.transient import Transient
 from scenes.errors import require
-from scenes.files import whole_file
+from scenes.files import whole_file, write_csv
 from spad.detect import sense, sense_timestamps
 from spad.flux import expected_counts, rates_for
 from spad.fly import Patch, packed_transients, sense_patches
@@ -49,11 +47,12 @@ def relief(height: int, width: int) -> Transient:
 def run(command: Any, progress: Progress) -> dict:
     """Rows of `name`, `seconds`, `error` and what they are compared with; tables and picture in `command.out`.
 
-    `command` has `seed`, `repeats`, `quick` (two levels and one image in the table of estimators), `data` and `out`.
+    `command` has `seed`, `repeats`, `quick` (two levels and one image in the table of estimators), `set`, `data` and
+    `out`.
     """
     out: Path = command.out
     require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
-    repeats = max(3, command.repeats)
+    repeats, scenes = max(3, command.repeats), estimators.scenes_of(command)
     progress("seconds", 0.0)
     rows = [
         *against_dense(command.seed, repeats),
@@ -63,23 +62,21 @@ def run(command: Any, progress: Progress) -> dict:
     result: dict = {"rows": rows}
     out.mkdir(parents=True, exist_ok=True)
     result["out"] = str(write_csv(rows, out / "bench-sense.csv"))
-    table = estimators.run(command, lambda what, share: progress(what, 0.3 + 0.7 * share))
-    if table:
-        result["estimators"] = estimators.summary(table)
+    if scenes:
+        table = estimators.table(
+            scenes,
+            sensor_by_name("reference"),
+            estimators.QUICK_LEVELS if command.quick else estimators.LEVELS,
+            seed=command.seed,
+            progress=lambda what, share: progress(what, 0.3 + 0.7 * share),
+        )
+        said = estimators.markdown(table)
+        result["estimators"] = estimators.summary(table) if command.json else said
+        with whole_file(out / "bench-estimators.md") as beside:
+            beside.write_text("\n".join(said) + "\n", encoding="utf-8")
         result["table"] = str(write_csv(table, out / "bench-estimators.csv"))
         result["figure"] = str(estimators.draw(table, out / "bench-estimators.png"))
     return result
-
-
-def write_csv(rows: list[dict], path: Path) -> Path:
-    """Rows of equal keys, whole or not at all."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [*dict.fromkeys(key for row in rows for key in row)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    with whole_file(path) as beside:
-        beside.write_text(text.getvalue())
-    return path
 
 
 def alternating(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
@@ -139,13 +136,15 @@ def first_photons(seed: int, repeats: int) -> list[dict]:
     rows = []
     for cycles in CYCLES:
         speed = seconds[CYCLES[0]] / seconds[cycles]
-        rows.append(_row(f"first photon, {cycles:,} cycles, 10 + 50 photons", seconds[cycles], speed))
+        rows.append(
+            _row(f"first photon, {cycles:,} cycles, the same 10 + 50 photons an exposure", seconds[cycles], speed)
+        )
     flux = expected_counts(transient, sensors[CYCLES[0]], rates_for(transient, Sensor(), budget), slice(0, 1024))[0]
     flux = flux.numpy() * (FLUX_PER_CYCLE / flux.sum(dim=1).mean().item())
     rng = np.random.default_rng(seed)
     dense = alternating({n: lambda n=n: first_photon_counts(flux, n, rng) for n in CYCLES}, repeats)
     for cycles in CYCLES:
-        name = f"first photon, {cycles:,} cycles, 1024 pixels, every bin, {FLUX_PER_CYCLE:g} photons a cycle"
+        name = f"first photon, {cycles:,} cycles, the same {FLUX_PER_CYCLE:g} photons a cycle, every bin"
         rows.append(_row(name, dense[cycles], dense[CYCLES[0]] / dense[cycles]))
     return rows
 

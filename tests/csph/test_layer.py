@@ -163,6 +163,19 @@ def test_timestamps_and_histogram_give_the_same_codes(layer, seed, mean, shuffle
 
 
 @LAWS
+@given(layers, st.integers(0, 2**32 - 1), st.booleans())
+def test_order_by_place_and_counts_of_many_time_blocks_change_nothing(layer, seed, shuffled):
+    """Both ways through `encode_photons` that tables beyond the cache and many time blocks take."""
+    counts = counts_from(seed)
+    stamps, offsets = photons_of(counts, seed if shuffled else None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("csph.photons.CACHE_BYTES", 0)
+        patch.setattr("csph.photons.MARKED_TIMES", 1)
+        sparse = layer.encode_timestamps(stamps, offsets, SIZE)
+    assert (sparse - layer.encode(counts)).abs().max() <= 2 * rounding(counts, layer)
+
+
+@LAWS
 @given(layers, st.floats(0.5, 1000))
 def test_uniform_background_encodes_to_zero_where_codes_are_zero_mean(layer, level):
     counts = torch.full((1, 1, *SIZE), level)

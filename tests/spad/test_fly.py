@@ -82,6 +82,16 @@ def test_time_offset_moves_counts_and_label_only_when_asked() -> None:
     assert torch.allclose(there.depth_m, here.depth_m + offset, equal_nan=True)
 
 
+@pytest.mark.parametrize("signal", [300.0, 40_000.0])
+def test_full_pixels_are_counted_in_wider_types(signal: float) -> None:
+    """More detections a pixel than a byte and than 16 bits hold: the totals stay."""
+    packed = packed_transients(scenes())
+    counts = sense_patches(packed, SENSOR, [Patch(0, 0, 0, signal, 0.0, 6)], size=(12, 10)).counts
+    expected = signal * 120
+    assert abs(float(counts.sum(dtype=torch.float64)) - expected) < 4.5 * np.sqrt(expected)
+    assert float(counts.sum(dim=2).max()) > signal and float(counts.min()) == 0
+
+
 def test_bad_patches_are_refused() -> None:
     packed = packed_transients(scenes())
     for patch in (Patch(3, 0, 0, 1, 1, 0), Patch(0, 9, 0, 1, 1, 0), Patch(0, 0, -1, 1, 1, 0)):

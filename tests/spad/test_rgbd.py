@@ -293,6 +293,18 @@ def test_worked_example_number_by_number() -> None:
         "background detections per exposure": background + 125 / 30,
         "detections per cycle": (per_pulse * cycles + background + 125 / 30) / cycles,
     }
+    c4, pupil = 10 ** (0.002 * (850 - 700)), math.pi / 4 * 0.007**2 / (0.1**2 * CONE_SR)
+    said |= {
+        "class-1 mean power": 3.9e-4 * c4,
+        "share through the pupil": pupil,
+        "mean power through the pupil": 1e-9 / 100e-9 * pupil,
+        "class-1 energy within 5 us": 7.7e-8 * c4,
+        "energy through the pupil within 5 us": 5e-6 / 100e-9 * 1e-9 * pupil,
+    }
+    assert said["mean power through the pupil"] / said["class-1 mean power"] == pytest.approx(0.41, abs=0.005)
+    # the standard's three branches meet: at 10 s to its two digits, at 5 us to its rounding
+    middle_w, middle_j = 7e-4 * 10**0.75 / 10, 7e-4 * 5e-6**0.75
+    assert middle_w == pytest.approx(3.9e-4, rel=0.02) and middle_j == pytest.approx(7.7e-8, rel=0.05)
     text = DOCUMENT.read_text(encoding="utf-8")
     for name, value in said.items():
         row = re.search(rf"^\| {re.escape(name)} \|.*\| ([-+.\de]+) [^|]*\|$", text, re.MULTILINE)

@@ -11,6 +11,7 @@ from render.transient import write_transient
 from spad.histogram import read_histogram
 from spad.mat import read_mat
 from spad.rgbd import transient_from_rgbd
+from spad.sensor import sensor_by_name
 from studies.bench import estimators
 from studies.bench.sense import alternating, one_law, relief
 from studies.cli import main
@@ -96,13 +97,15 @@ def test_bad_options_are_refused_in_one_line(scene, capfd, tmp_path, options, wo
 
 
 def test_table_of_estimators():
-    rows = estimators.table([("a", relief(6, 7))], estimators.sensor_by_name("reference"), [(30, 300)], seed=1)
+    rows = estimators.table([("a", relief(6, 7))], sensor_by_name("reference"), [(30, 300)], seed=1)
     assert len(rows) == 6 * 3 and {row["group"] for row in rows} == {"all", "unmixed", "mixed"}
     summary = estimators.summary(rows)
     assert summary["log-matched"]["all"]["rmse_mm"] < summary["argmax"]["all"]["rmse_mm"]
     for group in ("unmixed", "mixed"):
         assert sum(row["pixels"] for row in rows if row["group"] == group) <= 6 * 42
     assert len(set(estimators.LEVELS)) == 16
+    said = estimators.markdown(rows)
+    assert said[2].startswith("| 30 / 300 | ") and said[-1].startswith("| coates | ") and len(said) == 3 + 1 + 2 + 6
 
 
 def test_middlebury_pairs_become_transients(shared_data):
