@@ -11,9 +11,11 @@ Devices, precision and several GPUs are Lightning's; nothing here knows how many
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
 import math
+import platform
 import time
 import warnings
 from collections.abc import Callable
@@ -73,7 +75,7 @@ class DepthTraining(pl.LightningModule):
         self.absolute_m.update(error.abs(), weight)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        adam = torch.optim.Adam(self.parameters(), lr=self.config.rate)
+        adam = torch.optim.Adam(self.parameters(), lr=self.config.rate, fused=True)
         # a function of the step alone: nothing about it has to be restored
         steps = torch.optim.lr_scheduler.LambdaLR(adam, lambda s: self.config.decay ** (s // self.config.decay_steps))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": steps, "interval": "step"}}
@@ -139,6 +141,24 @@ def _claim(folder: Path, config: TrainConfig) -> None:
         beside.write_text(text)
 
 
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of glibc's malloc.h
+_LARGEST_MMAP_THRESHOLD = 32 << 20  # that glibc takes; a tensor of a training step has a few MB
+
+
+def keep_freed_memory() -> None:
+    """Have glibc's malloc keep freed tensors for the next step instead of giving them back to the system.
+
+    Returned pages come back zeroed, one page fault per 4 KiB: a fifth of a training step on a CPU. For the whole
+    process and for good; nothing happens with another C library.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _LARGEST_MMAP_THRESHOLD)
+        mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
+
+
 @contextmanager
 def _quiet() -> Any:
     """Lightning's advice on workers and devices is not the user's business: what is said here goes to the log."""
@@ -201,6 +221,7 @@ def train(
     _claim(folder, config)
     if config.threads:
         torch.set_num_threads(config.threads)
+    keep_freed_memory()
     start = time.perf_counter()
     module = DepthTraining(config)
     resume = folder / "resume.ckpt"
