@@ -11,11 +11,9 @@ Devices, precision and several GPUs are Lightning's; nothing here knows how many
 
 from __future__ import annotations
 
-import ctypes
 import json
 import logging
 import math
-import platform
 import time
 import warnings
 from collections.abc import Callable
@@ -29,6 +27,7 @@ import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
 
+from csph.allocation import keep_freed_memory
 from csph.backbone import soft_argmax
 from csph.config import TrainConfig
 from csph.data import SetData
@@ -139,24 +138,6 @@ def _claim(folder: Path, config: TrainConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as beside:
         beside.write_text(text)
-
-
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of glibc's malloc.h
-_LARGEST_MMAP_THRESHOLD = 32 << 20  # that glibc takes; a tensor of a training step has a few MB
-
-
-def keep_freed_memory() -> None:
-    """Have glibc's malloc keep freed tensors for the next step instead of giving them back to the system.
-
-    Returned pages come back zeroed, one page fault per 4 KiB: a fifth of a training step on a CPU. For the whole
-    process and for good; nothing happens with another C library.
-    """
-    if platform.libc_ver()[0] != "glibc":
-        return
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _LARGEST_MMAP_THRESHOLD)
-        mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 @contextmanager
