@@ -136,7 +136,8 @@ class _ReadOut(torch.autograd.Function):
     @staticmethod
     def forward(ctx: object, features: Tensor, slices: Tensor, *weights: Tensor) -> Tensor:
         matrix, bias, trust, trust_bias = weights
-        views, across = tuple(v.flatten(2) for v in (slices, *averages(slices))), features.transpose(1, 2)
+        views = tuple(v.flatten(2).to(slices.dtype) for v in (slices, *averages(slices)))
+        across = features.transpose(1, 2)
         total = torch.baddbmm(bias.unsqueeze(-1), matrix.expand(len(features), -1, -1), across).to(slices.dtype)
         gates = torch.baddbmm(trust_bias.unsqueeze(-1), trust.expand(len(features), -1, -1), across).to(slices.dtype)
         for number, view in enumerate(views):
