@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
 
+from csph.allocation import keep_freed_memory
 from csph.backbone import soft_argmax
 from csph.config import TrainConfig
 from csph.data import SetData
@@ -73,7 +74,7 @@ class DepthTraining(pl.LightningModule):
         self.absolute_m.update(error.abs(), weight)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        adam = torch.optim.Adam(self.parameters(), lr=self.config.rate)
+        adam = torch.optim.Adam(self.parameters(), lr=self.config.rate, fused=True)
         # a function of the step alone: nothing about it has to be restored
         steps = torch.optim.lr_scheduler.LambdaLR(adam, lambda s: self.config.decay ** (s // self.config.decay_steps))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": steps, "interval": "step"}}
@@ -201,6 +202,7 @@ def train(
     _claim(folder, config)
     if config.threads:
         torch.set_num_threads(config.threads)
+    keep_freed_memory()
     start = time.perf_counter()
     module = DepthTraining(config)
     resume = folder / "resume.ckpt"

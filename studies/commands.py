@@ -373,12 +373,14 @@ class Ultraphase(Common):
 @dataclass(frozen=True, kw_only=True)
 class Study(Common):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
-    decoded from codes without a network, and the in-pixel processor's power (4, 5)."""
+    decoded from codes without a network, and the in-pixel processor's power (4, 5); and how much the error of a
+    rendered set itself matters to depth."""
 
-    name: Positional[Literal["tensors", "memory", "codes", "power"]]
+    name: Positional[Literal["tensors", "memory", "codes", "power", "render-error"]]
     """Which study."""
     checkpoints: tuple[Path, ...] = ()
-    """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc)."""
+    """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc); trained
+    networks of `study render-error`."""
     design: str = ""
     """A design that `study tensors` draws instead of the paper's: learned, fourier, gray, coarse, hadamard or random,
     with +learned for a fixed temporal code and a learned spatial part."""
@@ -398,6 +400,12 @@ class Study(Common):
     """Mean signal photons per pixel of `study power`."""
     background: float = 500.0
     """Mean background photons per pixel of `study power`."""
+    set: str = "tabletop"
+    """Scene set of `study render-error`, as `dataset` takes it."""
+    views: int = 3
+    """Its first N views, at --width x --height."""
+    cache: Annotated[Path | None, _open("FOLDER")] = None
+    """Folder that keeps its renders from run to run (default: ~/.cache/scene2spad)."""
     out: Path = Path("out/study")
     """Folder for the figures (.png) and tables (.csv)."""
 

@@ -86,13 +86,16 @@ class Done(NamedTuple):
     where: str
 
 
-def render_view(job: Job, view: int) -> Done:
-    """Render one view to EXR bytes. A view that cannot be rendered is a record with `failed`, not an exception."""
+def render_view(job: Job, view: int, again: int = 0) -> Done:
+    """Render one view to EXR bytes. A view that cannot be rendered is a record with `failed`, not an exception.
+
+    `again` from 1 on renders the same scene with other noise than the set's.
+    """
     start = time.perf_counter()
     where = f"{os.uname().nodename}/{os.getpid()}"
     with _ONE_AT_A_TIME, quiet():
         try:
-            record, exr = _rendered(job, view)
+            record, exr = _rendered(job, view, again)
         except Exception as error:  # one odd scene of thousands must not end the run
             told = " ".join(str(error).split()) or type(error).__name__
             name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
@@ -112,7 +115,7 @@ def quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _rendered(job: Job, view: int) -> tuple[dict, bytes]:
+def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     # heavy imports only where a view is really rendered: the process that collects needs none of them
     from render.engine import render
     from render.pack import rounded
@@ -124,7 +127,8 @@ def _rendered(job: Job, view: int) -> tuple[dict, bytes]:
         scene = scene.without_lights()
     if job.offset_m and job.offset_mode != "time":
         scene = moved(scene, job.offset_m, job.offset_mode)
-    seed = int(np.random.SeedSequence(job.seed, spawn_key=(STAGE_VIEW, view)).generate_state(1)[0])
+    key = (STAGE_VIEW, view, *((again,) if again else ()))
+    seed = int(np.random.SeedSequence(job.seed, spawn_key=key).generate_state(1)[0])
     transient = render(scene, job.settings(), seed=seed)
     if job.offset_m and job.offset_mode == "time":
         transient = transient.delayed(job.offset_m)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,13 @@ def baseline(name: str) -> Method:
     return compressive
 
 
+def common_tile(models: Sequence[DepthModel]) -> tuple[int, int]:
+    """Rows and columns of the smallest tile that the blocks of all networks tile; 1 x 1 of none."""
+    blocks = [(1, 1), *(model.config.block[1:] for model in models)]
+    rows, columns = (math.lcm(*sides) for sides in zip(*blocks, strict=True))
+    return rows, columns
+
+
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     """Networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
     models = [load_model(path)[0] for path in command.checkpoints]
@@ -157,7 +165,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         views,
         sensor,
         levels=PHOTON_LEVELS,
-        tile=tuple(math.lcm(*sides) for sides in zip(*(m.config.block[1:] for m in models), strict=True)),
+        tile=common_tile(models),
         offset_m=command.offset,
         seed=command.seed,
         progress=progress,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from csph.backbone import DeepBoosting, doubled, parameters_of, soft_argmax
-from csph.compact import Compact, averages, fold, unfold
+from csph.compact import Compact, averages, enlarged, fold, read_out
 from scenes import InputError
 from studies.bench.network import PlainDeepBoosting, gmac
 
@@ -147,16 +147,44 @@ def test_soft_argmax_reads_bin_centres():
 
 
 def test_folding_and_averaging():
-    x = torch.randn(2, 1, 48, 5, 6)
-    folded = fold(x)
-    assert folded.shape == (2, 16, 3, 5, 6)
-    assert folded[1, 7, 2, 3, 4] == x[1, 0, 2 * 16 + 7, 3, 4]
-    torch.testing.assert_close(unfold(folded), x[:, 0])
-    near, wide = averages(folded)
-    torch.testing.assert_close(near[0, 3, 1, 2, 2], folded[0, 3, 1, 1:4, 1:4].mean())
-    torch.testing.assert_close(near[0, 3, 1, 0, 0], folded[0, 3, 1, :2, :2].mean())
-    torch.testing.assert_close(wide[0, 3, 1, 2, 2], wide[0, 3, 1, 3, 3])  # the square of 2 x 2 around it
-    torch.testing.assert_close(wide[0, 3, 1, 0, 0], folded[0, 3, 1, :4, :4].mean())
+    slices = torch.randn(6, 16, 5, 6)
+    folded = fold(slices)
+    assert torch.equal(folded, slices) and folded.is_contiguous(memory_format=torch.channels_last)
+    near, wide = averages(slices)
+    torch.testing.assert_close(near[1, 3, 2, 2], slices[1, 3, 1:4, 1:4].mean())
+    torch.testing.assert_close(near[1, 3, 0, 0], slices[1, 3, :2, :2].mean())
+    torch.testing.assert_close(wide[1, 3, 2, 2], wide[1, 3, 3, 3])  # the square of 2 x 2 around it
+    torch.testing.assert_close(wide[1, 3, 0, 0], slices[1, 3, :4, :4].mean())
+    # the last row is a square of its own, of half the pixels
+    bottom = nn.functional.pad(slices[:, :, 2:].unflatten(3, (3, 2)).mean(4), (0, 0, 0, 1), mode="replicate")
+    torch.testing.assert_close(wide[:, :, 4, 0], bottom.unflatten(2, (2, 2)).mean(3)[..., :2].mean((2, 3)))
+
+
+def test_enlarging():
+    coarse, fine = torch.randn(2, 3, 2, 3), torch.randn(2, 3, 4, 5)
+    expected = fine + coarse.repeat_interleave(2, 2).repeat_interleave(2, 3)[..., :5]
+    torch.testing.assert_close(enlarged(coarse, fine, (2, 3)), expected)
+
+
+def test_derivatives_written_by_hand():
+    generator = torch.Generator().manual_seed(0)
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, dtype=torch.float64, generator=generator, requires_grad=True)
+
+    check = torch.autograd.gradcheck
+    assert check(fold, (drawn(2, 16, 3, 2),)) and check(fold, (drawn(2, 16, 5, 4),))
+    assert check(lambda c, f: enlarged(c, f, (2, 3, 4)), (drawn(2, 2, 2, 1, 3), drawn(2, 2, 3, 2, 5)))
+    assert check(read_out, (drawn(2, 6, 3), drawn(2, 4, 2, 3), drawn(4, 3), drawn(4), drawn(3, 3), drawn(3)))
+
+
+def test_reading_out():
+    features, slices = torch.randn(2, 15, 3), torch.randn(2, 4, 3, 5)
+    fine, gates = nn.Linear(3, 4), nn.Linear(3, 3)
+    found = read_out(features, slices, *fine.parameters(), *gates.parameters())
+    views = torch.stack([slices, *averages(slices)], 1).flatten(3)
+    expected = fine(features).transpose(1, 2) + (gates(features).transpose(1, 2).unsqueeze(2) * views).sum(1)
+    torch.testing.assert_close(found, expected)
 
 
 def test_the_compact_network_begins_with_the_back_projection():

@@ -2,7 +2,10 @@
 
 import json
 import math
+import platform
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -297,3 +300,22 @@ def test_histograms_that_do_not_fit():
         narrow.depth_of(sense(planes, SMALL, PhotonBudget(5, 5)))
     with pytest.raises(InputError, match="blocks of 48 bins do not divide the sensor's 64"):
         replace(MODEL, design=Design("learned", (48, 2, 2), 8))
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library than glibc")
+def test_freed_memory_is_kept():
+    script = (
+        "import resource, numpy as np\n"
+        "from csph.allocation import keep_freed_memory\n"
+        "def faults():\n"
+        "    start = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "    for _ in range(20):\n"
+        "        np.ones(1 << 21)\n"
+        "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - start\n"
+        "keep_freed_memory()\n"
+        "print(faults(), faults())\n"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    pages = (8 << 21) // 4096
+    first, later = map(int, said.split())
+    assert first < 2 * pages and later < pages / 4  # once, not twenty times
