@@ -16,11 +16,12 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Lock, Thread
@@ -140,6 +141,7 @@ def _rendered(job: Job, view: int) -> tuple[dict, bytes]:
     record = {
         "view": view,
         "scene": scene.name,
+        "place": scene_set(job.set).place(view),
         "file": file_name(view),
         "bytes": len(exr),
         "seed": seed,
@@ -290,28 +292,43 @@ def _executor(workers: int, scheduler: str | None, todo: int) -> Iterator[Run]:
         yield lambda job, views: _on_processes(min(workers, todo), job, views)
 
 
+def render_views(job: Job, views: Sequence[int]) -> list[Done]:
+    """Views that one process renders in a row, since they show one place."""
+    return [render_view(job, view) for view in views]
+
+
+def _runs(job: Job, views: Iterable[int]) -> list[tuple[int, ...]]:
+    """Views of one place together, in order."""
+    chosen = scene_set(job.set)
+    return [tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place)]
+
+
 def _on_processes(workers: int, job: Job, views: Iterable[int]) -> Iterator[Done]:
-    """Several processes of ours. One that dies takes the pool with it: a new one goes on, and retries what was lost."""
-    waiting, tries = list(views)[::-1], dict.fromkeys(views, 0)
+    """Several processes of ours. One that dies takes the pool with it: a new one goes on, and retries what was lost.
+
+    Views that were lost together are tried again one by one.
+    """
+    waiting = _runs(job, views)[::-1]
+    tries = {view: 0 for run in waiting for view in run}
     threads = max(1, (os.cpu_count() or 1) // workers)
     while waiting:
         with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads,)) as pool:
-            running: dict[Future, int] = {}
+            running: dict[Future, tuple[int, ...]] = {}
             try:
                 while waiting or running:
                     while waiting and len(running) < 2 * workers:
-                        view = waiting.pop()
-                        running[pool.submit(render_view, job, view)] = view
+                        run = waiting.pop()
+                        running[pool.submit(render_views, job, run)] = run
                     for future in wait(running, return_when=FIRST_COMPLETED).done:
                         done = future.result()
                         del running[future]
-                        yield done
+                        yield from done
             except BrokenProcessPool:
-                for view in running.values():
+                lost = sorted((view for run in running.values() for view in run), reverse=True)
+                for view in lost:
                     tries[view] += 1
-                for view in sorted(running.values(), reverse=True):
                     if tries[view] < TRIES:
-                        waiting.append(view)
+                        waiting.append((view,))
                     else:
                         yield Done({"view": view, "failed": f"its process died {TRIES} times"}, None, 0.0, "")
                 log.warning("a worker process died; starting others")
@@ -355,24 +372,29 @@ def _on_dask(client: Any, job: Job, views: Iterable[int]) -> Iterator[Done]:
     """A cluster's workers, a few tasks each in flight, so that results do not heap up; a dead worker's move on."""
     from distributed import as_completed
 
-    waiting = list(views)[::-1]
+    waiting = _runs(job, views)[::-1]
     lanes = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    first = [waiting.pop() for _ in range(min(len(waiting), 3 * lanes))]
-    submitted = {client.submit(render_view, job, view, pure=False, retries=TRIES): view for view in first}
-    pending = as_completed(submitted)
+    submitted: dict[Any, tuple[int, ...]] = {}
+
+    def submit() -> Any:
+        run = waiting.pop()
+        future = client.submit(render_views, job, run, pure=False, retries=TRIES)
+        submitted[future] = run
+        return future
+
+    pending = as_completed([submit() for _ in range(min(len(waiting), 3 * lanes))])
     for future in pending:
-        view = submitted.pop(future)
-        if future.status == "error":
-            told = " ".join(str(future.exception()).split())[:300]
-            yield Done({"view": view, "failed": f"its workers died: {told}"}, None, 0.0, "")
+        run = submitted.pop(future)
+        if future.status != "error":
+            yield from future.result()
+        elif len(run) > 1:  # one of them may be to blame: each by itself
+            waiting.extend((view,) for view in reversed(run))
         else:
-            yield future.result()
+            told = " ".join(str(future.exception()).split())[:300]
+            yield Done({"view": run[0], "failed": f"its workers died: {told}"}, None, 0.0, "")
         future.release()
-        if waiting:
-            view = waiting.pop()
-            new = client.submit(render_view, job, view, pure=False, retries=TRIES)
-            submitted[new] = view
-            pending.add(new)
+        while waiting and len(submitted) < 3 * lanes:
+            pending.add(submit())
 
 
 # --- Packing ---------------------------------------------------------------------------------------------------------
