@@ -42,6 +42,7 @@ STAGE_VIEW = 20
 TRIES = 3  # of a view whose worker process died
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
+THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
 _ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
 
 
@@ -60,6 +61,7 @@ class Job:
     offset_m: float = 0.0
     offset_mode: OffsetMode = "time"
     ambient: bool = True
+    ambient_spp: int = 8
 
     def __post_init__(self) -> None:
         scene_set(self.set)
@@ -72,6 +74,7 @@ class Job:
             spp=self.spp,
             grid=self.grid,
             error=self.error,
+            ambient_spp=self.ambient_spp,
             direct_tolerance_m=DIRECT_TOLERANCE_M,
             indirect_tolerance_m=INDIRECT_TOLERANCE_M,
             indirect_growth=INDIRECT_GROWTH,
@@ -117,6 +120,7 @@ def _rendered(job: Job, view: int) -> tuple[dict, bytes]:
     # heavy imports only where a view is really rendered: the process that collects needs none of them
     from render.engine import render
     from render.pack import rounded
+    from render.thinning import thinned
     from render.transient import write_transient
     from studies.moving import moved
 
@@ -130,7 +134,7 @@ def _rendered(job: Job, view: int) -> tuple[dict, bytes]:
     if job.offset_m and job.offset_mode == "time":
         transient = transient.delayed(job.offset_m)
     require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
-    transient = rounded(transient)
+    transient = rounded(thinned(transient, THINNED))
     with tempfile.TemporaryDirectory(prefix="scene2spad-") as folder:
         path = Path(folder) / "view.exr"
         write_transient(transient, path)
@@ -168,12 +172,14 @@ class Folder:
 
     def __init__(self, path: Path, job: Job) -> None:
         self.path, self.job = path, job
-        stored = {"schema": 1, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH]}
+        stored = {"schema": 2, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED]}
         asked = json.dumps(asdict(job) | stored, sort_keys=True, indent=1) + "\n"
         config = path / "set.json"
         if config.is_file():
             if config.read_text() != asked:
-                raise InputError(f"{path}: holds a set that was made with other options; choose another --out")
+                raise InputError(
+                    f"{path}: holds a set that was made with other options or another version; choose another --out"
+                )
         else:
             require(
                 not path.exists() or not any(path.iterdir()),
