@@ -1,7 +1,7 @@
 """Steady light of environment and area lights: paths from the camera to lights, whose way may lead through glass.
 
-A window's light reaches a room through its panes, which stop the shadow rays of Mitsuba's own integrators: those find it
-by chance alone. Here a straight line passes thin panes and the holes of cut-outs, to lights as to what is seen.
+A window's light reaches a room through its panes, which stop the shadow rays of Mitsuba's own integrators: those find
+it by chance alone. Here a straight line passes thin panes and the holes of cut-outs, to lights as to what is seen.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MOST_LIKELY = 0.95
 
 
 class AmbientLight(NamedTuple):
-    """Radiance of each pixel [W/(m^2 sr nm)], (H, W) float32, and its noise: rms over the pixels by the image's mean."""
+    """Radiance of each pixel [W/(m^2 sr nm)], (H, W) float32, and its noise: rms over pixels by the image's mean."""
 
     radiance: np.ndarray
     error: float

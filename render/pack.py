@@ -2,7 +2,7 @@
 
 Numbers are rounded to steps far below what a sensor resolves, so that they compress: centres of returns to 2^-10 m of
 path (error at most 0.49 mm), their widths to 2^-8 m (2 mm), depths to 2^-12 m (0.12 mm), radiances to 2^(1/125)
-(0.28 %), ambient light to 2^(1/6) (6 %), albedo to 1/255. Normals and error estimates stay behind in the EXR files.
+(0.28 %), ambient light to 2^(1/4) (9 %), albedo to 1/255. Normals and error estimates stay behind in the EXR files.
 The file holds differences: of depths from the plane through their neighbours, of centres from twice the depth or the
 pixel's return before, of radiances from the return before.
 """
@@ -23,7 +23,7 @@ from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 
 PATH_STEP_M, WIDTH_STEP_M, DEPTH_STEP_M = 2.0**-10, 2.0**-8, 2.0**-12
-RADIANCE_STEPS, AMBIENT_STEPS = 125, 6  # per octave
+RADIANCE_STEPS, AMBIENT_STEPS = 125, 4  # per octave
 FINER = 4  # an EXR file of a set keeps lengths in steps that much smaller
 OCTAVES = 32  # below and above 1; codes are uint16, 0 is 0
 NO_DEPTH = 0

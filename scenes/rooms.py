@@ -25,7 +25,8 @@ SPLITS = ("train", "val", "test")
 FOV_DEG = (52.0, 66.0)
 NEAREST_M, FARTHEST_M = 0.6, 6.9
 MEDIAN_M = (1.9, 3.9)  # of one view, by upright boxes; drawn evenly
-CANDIDATES, ATTEMPTS = 100, 8  # views of a room, rooms
+CANDIDATES, ATTEMPTS = 120, 8  # views of a room, rooms
+LEAST_BUSY = 0.3  # of a view, by upright boxes: what stands before the walls
 VIEWS_PER_ROOM = 4
 APART_M, APART_DEG = 0.5, 30.0  # any two cameras of a room, at least
 HEAD = np.array(((-1, -1), (1, -1), (1, 1), (-1, 1)))
@@ -318,6 +319,8 @@ def _candidates(rng: Random, floor: Floor, ceiling: float) -> list[Seen]:
         if distance.min() < NEAREST_M or np.quantile(distance, 0.99) > FARTHEST_M:
             continue
         busy = float((to_boxes[:, standing].min(axis=1, initial=np.inf) < to_walls - 0.1).mean())
+        if busy < LEAST_BUSY:
+            continue
         found.append(Seen(camera, np.quantile(distance, (0.05, 0.5, 0.95)), max(0.0, 0.6 - busy)))
     return found
 

@@ -16,16 +16,14 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import groupby
-from multiprocessing import get_context
 from pathlib import Path
-from threading import Lock, Thread
-from typing import Any, NamedTuple
+from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,12 +32,12 @@ from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.offsets import OffsetMode, check_offset
 from scenes.sets import scene_set
+from studies.workers import executor
 
 log = logging.getLogger("scene2spad")
 
 Progress = Callable[[str, float], None]
 STAGE_VIEW = 20
-TRIES = 3  # of a view whose worker process died
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
@@ -102,6 +100,15 @@ def render_view(job: Job, view: int) -> Done:
             name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
             record, exr = {"view": view, "failed": f"{name}{told}"[:500]}, None
     return Done(record, exr, time.perf_counter() - start, where)
+
+
+def render_views(job: Job, views: Sequence[int]) -> list[Done]:
+    """Views that one process renders in a row, since they show one place."""
+    return [render_view(job, view) for view in views]
+
+
+def _lost(view: int, why: str) -> Done:
+    return Done({"view": view, "failed": why}, None, 0.0, "")
 
 
 @contextmanager
@@ -245,6 +252,12 @@ def read_index(folder: Path) -> list[dict]:
 # --- Running ---------------------------------------------------------------------------------------------------------
 
 
+def _runs(job: Job, views: Sequence[int]) -> list[tuple[int, ...]]:
+    """Views of one place together, in order."""
+    chosen = scene_set(job.set)
+    return [tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place)]
+
+
 def make_set(
     job: Job, count: int, out: Path, *, workers: int = 1, scheduler: str | None = None, progress: Progress | None = None
 ) -> dict:
@@ -262,8 +275,9 @@ def make_set(
     todo = [view for view in range(count) if view not in folder.records]
     say = progress or (lambda what, share: None)
     start = time.perf_counter()
-    with _executor(workers, scheduler, len(todo)) as run:
-        for number, done in enumerate(run(job, todo), 1):
+    runs, work = _runs(job, todo), partial(render_views, job)
+    with executor(workers if todo else 1, scheduler if todo else None) as run:
+        for number, done in enumerate(run(work, runs, _lost), 1):
             folder.add(done)
             if "failed" in done.record:
                 log.warning("view %d failed: %s", done.record["view"], done.record["failed"])
@@ -282,125 +296,6 @@ def make_set(
         "error_median": float(np.median([record["error"] for record in good])) if good else float("nan"),
         "out": str(out),
     }
-
-
-Run = Callable[[Job, Iterable[int]], Iterator[Done]]
-
-
-@contextmanager
-def _executor(workers: int, scheduler: str | None, todo: int) -> Iterator[Run]:
-    if todo == 0 or (workers == 1 and scheduler is None):
-        yield lambda job, views: (render_view(job, view) for view in views)
-    elif scheduler is not None:
-        with _dask_client(scheduler) as client:
-            yield lambda job, views: _on_dask(client, job, views)
-    else:
-        yield lambda job, views: _on_processes(min(workers, todo), job, views)
-
-
-def render_views(job: Job, views: Sequence[int]) -> list[Done]:
-    """Views that one process renders in a row, since they show one place."""
-    return [render_view(job, view) for view in views]
-
-
-def _runs(job: Job, views: Iterable[int]) -> list[tuple[int, ...]]:
-    """Views of one place together, in order."""
-    chosen = scene_set(job.set)
-    return [tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place)]
-
-
-def _on_processes(workers: int, job: Job, views: Iterable[int]) -> Iterator[Done]:
-    """Several processes of ours. One that dies takes the pool with it: a new one goes on, and retries what was lost.
-
-    Views that were lost together are tried again one by one.
-    """
-    waiting = _runs(job, views)[::-1]
-    tries = {view: 0 for run in waiting for view in run}
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    while waiting:
-        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads,)) as pool:
-            running: dict[Future, tuple[int, ...]] = {}
-            try:
-                while waiting or running:
-                    while waiting and len(running) < 2 * workers:
-                        run = waiting.pop()
-                        running[pool.submit(render_views, job, run)] = run
-                    for future in wait(running, return_when=FIRST_COMPLETED).done:
-                        done = future.result()
-                        del running[future]
-                        yield from done
-            except BrokenProcessPool:
-                lost = sorted((view for run in running.values() for view in run), reverse=True)
-                for view in lost:
-                    tries[view] += 1
-                    if tries[view] < TRIES:
-                        waiting.append((view,))
-                    else:
-                        yield Done({"view": view, "failed": f"its process died {TRIES} times"}, None, 0.0, "")
-                log.warning("a worker process died; starting others")
-
-
-def _start_worker(threads: int) -> None:
-    """In a new process: as many threads as its share of the cores; it ends when the one that started it does."""
-    Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    from render.llvm import start_mitsuba
-
-    start_mitsuba()
-    import drjit
-
-    drjit.set_thread_count(threads)
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
-
-
-@contextmanager
-def _dask_client(address: str) -> Iterator[Any]:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError("--scheduler needs the package `distributed`: pip install 'scene2spad[cluster]'") from None
-    try:
-        client = Client(address, timeout=20)
-    except (OSError, ValueError, TypeError) as error:
-        told = " ".join(str(error).split())[:120]
-        raise InputError(f"scheduler {address}: cannot be reached ({told or type(error).__name__})") from None
-    try:
-        yield client
-    finally:
-        client.close()
-
-
-def _on_dask(client: Any, job: Job, views: Iterable[int]) -> Iterator[Done]:
-    """A cluster's workers, a few tasks each in flight, so that results do not heap up; a dead worker's move on."""
-    from distributed import as_completed
-
-    waiting = _runs(job, views)[::-1]
-    lanes = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    submitted: dict[Any, tuple[int, ...]] = {}
-
-    def submit() -> Any:
-        run = waiting.pop()
-        future = client.submit(render_views, job, run, pure=False, retries=TRIES)
-        submitted[future] = run
-        return future
-
-    pending = as_completed([submit() for _ in range(min(len(waiting), 3 * lanes))])
-    for future in pending:
-        run = submitted.pop(future)
-        if future.status != "error":
-            yield from future.result()
-        elif len(run) > 1:  # one of them may be to blame: each by itself
-            waiting.extend((view,) for view in reversed(run))
-        else:
-            told = " ".join(str(future.exception()).split())[:300]
-            yield Done({"view": run[0], "failed": f"its workers died: {told}"}, None, 0.0, "")
-        future.release()
-        while waiting and len(submitted) < 3 * lanes:
-            pending.add(submit())
 
 
 # --- Packing ---------------------------------------------------------------------------------------------------------
