@@ -7,7 +7,7 @@ from render.ambient import ambient_light
 from render.world import World, mi
 from scenes.model import Material, Scene, Surface
 from scenes.shapes import box, sphere
-from tests.render import oracles
+from studies.bench import oracles
 
 GLASS = Material("thindielectric", ior=1.5)
 
@@ -20,7 +20,10 @@ def windowed_room() -> Scene:
     light = [(-0.8, -0.6, -2.8), (0.8, -0.6, -2.8), (0.8, 0.6, -2.8), (-0.8, 0.6, -2.8)]
     sky = Surface(np.array(light, float), [[0, 1, 2], [0, 2, 3]], Material(albedo=0.3), emission=1.0)
     balls = []
-    for x, material in ((-1.0, Material("roughconductor", roughness=0.3, eta=2.9, k=3.1)), (1.0, Material("dielectric"))):
+    for x, material in (
+        (-1.0, Material("roughconductor", roughness=0.3, eta=2.9, k=3.1)),
+        (1.0, Material("dielectric")),
+    ):
         points, triangles, _ = sphere(0.4, 3)
         balls.append(Surface(points + (x, -0.6, -1.2), triangles, material, normals=points / 0.4))
     return Scene("windowed room", (walls, pane, sky, *balls), oracles.camera(8, 6, 70))
