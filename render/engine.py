@@ -6,6 +6,7 @@ import importlib.metadata
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -327,5 +328,10 @@ def _meta(scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: 
         "rays": int(traced.rays),
         "clipped_footprints": traced.clipped,
         "relative_error": error.to_dict(),
-        "versions": {name: importlib.metadata.version(name) for name in ("scene2spad", "mitsuba", "drjit", "numpy")},
+        "versions": dict(_versions()),
     }
+
+
+@cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    return tuple((name, importlib.metadata.version(name)) for name in ("scene2spad", "mitsuba", "drjit", "numpy"))
