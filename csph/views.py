@@ -55,7 +55,8 @@ def _from_folder(path: Path) -> tuple[list[Transient], list[str]]:
 
 
 def _scene(meta: dict, number: int) -> str:
-    return str(meta.get("scene", number))
+    """What a view shows: views of one place are not independent, whatever their numbers."""
+    return str(meta.get("place", meta.get("scene", number)))
 
 
 def split_views(views: Views, share: float = VALIDATION_SHARE) -> tuple[Views, Views]:

@@ -6,11 +6,12 @@ import importlib.metadata
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from render.ambient import ambient_light
+from render.ambient import AmbientLight, ambient_light
 from render.cells import coarsened
 from render.direct import centre_layers, direct_light
 from render.error import ErrorEstimate, estimate, noise_power, power_of, response
@@ -38,8 +39,7 @@ log = logging.getLogger(__name__)
 STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT, STAGE_PILOT, STAGE_MORE = 10, 11, 12, 13, 14
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
 MOST_SPP, MOST_SPP_BY_DEFAULT = 16384, 1024
-AMBIENT_SPP = 64
-AMBIENT_BOUNCES = 6
+AMBIENT_BOUNCES = 16  # most paths end long before, by chance
 # Paths traced on top aim at the target's square times MARGIN, and are at most MOST_MORE times those traced before.
 MARGIN, MOST_MORE = 0.75, 3.0
 FINER = 2  # direct light is checked, on the pilot's pixels, against this many times the cells a side
@@ -107,10 +107,10 @@ def render(
         log.info("%s", line)
     noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
 
-    ambient = np.zeros((camera.height, camera.width), np.float32)
+    ambient = AmbientLight(np.zeros((camera.height, camera.width), np.float32), 0.0)
     if plan.ambient:
         say("ambient light", 0.9)
-        ambient = ambient_light(world, AMBIENT_SPP, AMBIENT_BOUNCES, derived_seed(seed, STAGE_AMBIENT))
+        ambient = ambient_light(world, settings.ambient_spp, AMBIENT_BOUNCES, derived_seed(seed, STAGE_AMBIENT))
     say("done", 1.0)
     return Transient(
         camera.height,
@@ -119,10 +119,10 @@ def render(
         depth_m=layers.depth_m,
         normal=layers.normal,
         albedo=layers.albedo,
-        ambient=ambient,
+        ambient=ambient.radiance,
         mixed=traced.mixed.reshape(camera.height, camera.width),
         error=noise.reshape(camera.height, camera.width).astype(np.float32),
-        meta=_meta(scene, settings, plan, seed, error, traced),
+        meta=_meta(scene, settings, plan, seed, error, traced) | _of_ambient(plan, settings, ambient),
     )
 
 
@@ -300,6 +300,10 @@ def _mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:
     return np.divide(moment, total, out=np.zeros(pixels), where=total > 0), float(total.max(initial=0))
 
 
+def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> dict:
+    return {"ambient_spp": settings.ambient_spp, "ambient_error": round(ambient.error, 6)} if plan.ambient else {}
+
+
 def _meta(scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: ErrorEstimate, traced: Traced) -> dict:
     camera, laser = scene.camera, scene.laser
     return {
@@ -324,5 +328,10 @@ def _meta(scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: 
         "rays": int(traced.rays),
         "clipped_footprints": traced.clipped,
         "relative_error": error.to_dict(),
-        "versions": {name: importlib.metadata.version(name) for name in ("scene2spad", "mitsuba", "drjit", "numpy")},
+        "versions": dict(_versions()),
     }
+
+
+@cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    return tuple((name, importlib.metadata.version(name)) for name in ("scene2spad", "mitsuba", "drjit", "numpy"))

@@ -1,8 +1,10 @@
 """A set of transients in one HDF5 file, small enough to carry to where a network is trained. No renderer, no OpenEXR.
 
-Numbers are rounded to steps far below what a sensor resolves, so that they compress: paths to 2^-9 m (2 mm), depths
-to 2^-12 m (0.24 mm), radiances to 2^(1/125) (0.55 %), ambient light to 2^(1/16), albedo to 1/255. Normals and error
-estimates stay behind in the EXR files.
+Numbers are rounded to steps far below what a sensor resolves, so that they compress: centres of returns to 2^-10 m of
+path (error at most 0.49 mm), their widths to 2^-8 m (2 mm), depths to 2^-12 m (0.12 mm), radiances to 2^(1/125)
+(0.28 %), ambient light to 2^(1/4) (9 %), albedo to 1/255. Normals and error estimates stay behind in the EXR files.
+The file holds differences: of depths from the plane through their neighbours, of centres from twice the depth or the
+pixel's return before, of radiances from the return before.
 """
 
 from __future__ import annotations
@@ -20,14 +22,19 @@ from render.transient import Transient
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 
-PATH_STEP_M, DEPTH_STEP_M = 2.0**-9, 2.0**-12
-RADIANCE_STEPS, AMBIENT_STEPS = 125, 16  # per octave
+PATH_STEP_M, WIDTH_STEP_M, DEPTH_STEP_M = 2.0**-10, 2.0**-8, 2.0**-12
+RADIANCE_STEPS, AMBIENT_STEPS = 125, 4  # per octave
 FINER = 4  # an EXR file of a set keeps lengths in steps that much smaller
 OCTAVES = 32  # below and above 1; codes are uint16, 0 is 0
-NO_DEPTH = np.iinfo(np.int32).min
+NO_DEPTH = 0
 PER_VIEW = {"count": np.uint16, "depth": np.int32, "mixed": np.uint8, "albedo": np.uint8, "ambient": np.uint16}
-PER_RETURN = {"near": np.int32, "width": np.uint16, "radiance": np.uint16, "bounces": np.uint8}
+PER_RETURN = {"centre": np.int32, "width": np.uint16, "radiance": np.uint16, "bounces": np.uint8}
+# the first returns of pixels, and further ones, compress better apart
+PARTS = ("first", "further")
+# differences have their sign in the lowest bit
+STORED_VIEW, STORED = PER_VIEW | {"depth": np.uint32}, PER_RETURN | {"centre": np.uint32}
 CHUNK = 1 << 16  # returns
+PACKED = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "track_times": False}
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +59,18 @@ class Pack:
             raise IndexError(f"view {index} of {len(self)}")
         view = {name: self.arrays[name][index] for name in PER_VIEW}
         rows = slice(self.starts[index], self.starts[index + 1])
-        near, width, radiance, bounces = (self.arrays[name][rows] for name in PER_RETURN)
+        centre, width, radiance, bounces = (self.arrays[name][rows] for name in PER_RETURN)
         height, columns = view["count"].shape
-        depth = np.where(view["depth"] == NO_DEPTH, np.nan, view["depth"] * DEPTH_STEP_M)
-        near_m = (near * PATH_STEP_M).astype(np.float32)
+        near_m, far_m = _interval(centre, width)
         return Transient(
             height,
             columns,
             np.concatenate(([0], np.cumsum(view["count"].ravel(), dtype=np.int64))),
             near_m,
-            np.maximum(((near + width.astype(np.int32)) * PATH_STEP_M).astype(np.float32), near_m),
+            far_m,
             _decoded(radiance, RADIANCE_STEPS),
             bounces,
-            depth_m=depth.astype(np.float32),
+            depth_m=np.where(view["depth"] == NO_DEPTH, np.nan, view["depth"] * DEPTH_STEP_M).astype(np.float32),
             normal=np.zeros((height, columns, 3), np.float16),
             albedo=(view["albedo"] / 255).astype(np.float16),
             ambient=_decoded(view["ambient"], AMBIENT_STEPS),
@@ -72,6 +78,11 @@ class Pack:
             error=np.zeros((height, columns), np.float32),
             meta=self.metas[index],
         )
+
+
+def _interval(centre: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    middle, half = centre * PATH_STEP_M, width * (WIDTH_STEP_M / 2)
+    return np.maximum(middle - half, 0).astype(np.float32), (middle + half).astype(np.float32)
 
 
 def rounded(view: Transient) -> Transient:
@@ -112,28 +123,88 @@ def _decoded(codes: np.ndarray, steps: int) -> np.ndarray:
 
 
 def _arrays(view: Transient) -> dict[str, np.ndarray]:
-    """A transient in the pack's whole numbers."""
-    near = np.rint(view.path_near_m.astype(np.float64) / PATH_STEP_M)
-    far = np.rint(view.path_far_m.astype(np.float64) / PATH_STEP_M)
-    depth = np.where(np.isnan(view.depth_m), NO_DEPTH, np.rint(np.nan_to_num(view.depth_m) / DEPTH_STEP_M))
-    limits = (("path", near, 2**30), ("width of a return", far - near, 65535), ("depth", depth, 2**30))
+    """A transient in the pack's whole numbers, in the types that they have in memory."""
+    near, far = view.path_near_m.astype(np.float64), view.path_far_m.astype(np.float64)
+    centre, width = np.rint((near + far) / (2 * PATH_STEP_M)), np.rint((far - near) / WIDTH_STEP_M)
+    depth = np.maximum(np.rint(np.nan_to_num(view.depth_m) / DEPTH_STEP_M), 1)
+    limits = (("path", centre, 2**30), ("width of a return", width, 65535), ("depth", depth, 2**30))
     for name, values, most in limits:
         require(
             bool(values.size == 0 or values.max() <= most), f"{name} of {values.max(initial=0):g} steps is over {most}"
         )
     counts = np.diff(view.offsets).reshape(view.height, view.width)
     require(bool(counts.max() <= 65535), f"{counts.max()} returns in one pixel, a pack holds 65535")
-    return {
+    order = np.lexsort((_interval(centre, width)[0], view.return_pixel))  # rounding may swap neighbours
+    arrays = {
         "count": counts,
-        "depth": depth,
+        "depth": np.where(np.isnan(view.depth_m), NO_DEPTH, depth),
         "mixed": view.mixed,
         "albedo": np.rint(np.clip(view.albedo.astype(np.float64), 0, 1) * 255),
         "ambient": _encoded(view.ambient, AMBIENT_STEPS),
-        "near": near,
-        "width": far - near,
-        "radiance": _encoded(view.radiance, RADIANCE_STEPS),
-        "bounces": view.bounces,
+        "centre": centre[order],
+        "width": width[order],
+        "radiance": _encoded(view.radiance, RADIANCE_STEPS)[order],
+        "bounces": view.bounces[order],
     }
+    return {name: arrays[name].astype(dtype) for name, dtype in (PER_VIEW | PER_RETURN).items()}
+
+
+def _is_first(counts: np.ndarray) -> np.ndarray:
+    """Of every return, whether it is its pixel's first."""
+    counts = counts.ravel().astype(np.int64)
+    first = np.zeros(int(counts.sum()), bool)
+    first[(np.cumsum(counts) - counts)[counts > 0]] = True
+    return first
+
+
+def _expected_centre(depth: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Where the first return of each pixel that has one is expected, in steps: twice the depth."""
+    return (2 * depth.astype(np.int64) * DEPTH_STEP_M / PATH_STEP_M).astype(np.int64)[counts > 0]
+
+
+def _unsigned(differences: np.ndarray) -> np.ndarray:
+    return ((differences << 1) ^ (differences >> 63)).astype(np.uint32)
+
+
+def _signed(stored: np.ndarray) -> np.ndarray:
+    value = stored.astype(np.int64)
+    return (value >> 1) ^ -(value & 1)
+
+
+def _differences(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the file holds of a view: differences from what is known already, and returns in two parts."""
+    first = _is_first(arrays["count"])
+    centre, radiance = arrays["centre"].astype(np.int64), arrays["radiance"]
+    step = np.diff(centre, prepend=0)
+    step[first] = centre[first] - _expected_centre(arrays["depth"], arrays["count"])
+    rise = np.diff(radiance, prepend=np.uint16(0))  # modulo 2^16
+    rise[first] = np.diff(radiance[first], prepend=np.uint16(0))
+    columns = {**arrays, "centre": _unsigned(step), "radiance": rise}
+    bent = np.diff(np.diff(arrays["depth"], axis=0, prepend=np.int32(0)), axis=1, prepend=np.int32(0))
+    stored = {**arrays, "depth": _unsigned(bent.astype(np.int64))}
+    for part, chosen in zip(PARTS, (first, ~first), strict=True):
+        stored |= {f"{part} {name}": columns[name][chosen] for name in PER_RETURN}
+    return stored
+
+
+def _summed(stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The whole numbers of a view from what the file holds of it; ValueError if its parts do not fit."""
+    arrays = {name: stored[name] for name in PER_VIEW}
+    arrays["depth"] = _signed(stored["depth"]).cumsum(axis=1).cumsum(axis=0).astype(np.int32)
+    first = _is_first(arrays["count"])
+    for name, dtype in STORED.items():
+        arrays[name] = np.empty(len(first), dtype)
+        for part, chosen in zip(PARTS, (first, ~first), strict=True):
+            arrays[name][chosen] = stored[f"{part} {name}"]
+    starts = np.flatnonzero(first)[np.cumsum(first) - 1]
+    step = _signed(arrays["centre"])
+    step[first] += _expected_centre(arrays["depth"], arrays["count"])
+    rise = arrays["radiance"].astype(np.int64)
+    rise[first] = np.cumsum(rise[first])
+    for name, differences in (("centre", step), ("radiance", rise)):
+        total = np.cumsum(differences)
+        arrays[name] = (total - total[starts] + differences[starts]).astype(PER_RETURN[name])
+    return arrays
 
 
 def write_pack(views: Iterable[tuple[Transient, dict]], path: Path) -> int:
@@ -152,39 +223,61 @@ def write_pack(views: Iterable[tuple[Transient, dict]], path: Path) -> int:
                 sets = _datasets(file, view.height, view.width)
             same = arrays["count"].shape == sets["count"].shape[1:]
             require(same, f"view {len(metas)} is {view.width} x {view.height} pixels, those before it are not")
-            for name, dtype in PER_VIEW.items():
-                value = arrays[name].astype(dtype)
-                sets[name].resize(len(metas) + 1, axis=0)
-                sets[name][len(metas)] = value
-                sha.update(np.ascontiguousarray(value).tobytes())
-            for name, dtype in PER_RETURN.items():
-                value = arrays[name].astype(dtype)
-                sets[name].resize(starts[-1] + len(value), axis=0)
-                sets[name][starts[-1] :] = value
-                sha.update(np.ascontiguousarray(value).tobytes())
+            stored = _differences(arrays)
+            for name, dataset in sets.items():
+                rows = stored[name][None] if name in PER_VIEW else stored[name]
+                dataset.resize(len(dataset) + len(rows), axis=0)
+                dataset[len(dataset) - len(rows) :] = rows
+            for name in (*PER_VIEW, *PER_RETURN):
+                sha.update(np.ascontiguousarray(arrays[name]).tobytes())
             starts.append(starts[-1] + view.returns)
             metas.append(meta)
         require(bool(metas), "there is no view to pack")
         file.create_dataset("start", data=np.array(starts, np.int64), track_times=False)
-        file.create_dataset("meta", data=[json.dumps(m, sort_keys=True) for m in metas], track_times=False)
-        sha.update(json.dumps(metas, sort_keys=True).encode())
+        records = json.dumps(metas, sort_keys=True).encode()
+        file.create_dataset("meta", data=np.frombuffer(records, np.uint8), **PACKED)
+        sha.update(records)
         file.attrs[ATTRIBUTE] = seal({"views": len(metas)}, "pack", sha.hexdigest())
     return len(metas)
 
 
 def _datasets(file: h5py.File, height: int, width: int) -> dict[str, h5py.Dataset]:
-    packed = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "track_times": False}
     sets = {
         name: file.create_dataset(
-            name, (0, height, width), dtype, maxshape=(None, height, width), chunks=(16, height, width), **packed
+            name, (0, height, width), dtype, maxshape=(None, height, width), chunks=(16, height, width), **PACKED
         )
-        for name, dtype in PER_VIEW.items()
+        for name, dtype in STORED_VIEW.items()
     }
     sets |= {
-        name: file.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(CHUNK,), **packed)
-        for name, dtype in PER_RETURN.items()
+        f"{part} {name}": file.create_dataset(
+            f"{part} {name}", (0,), dtype, maxshape=(None,), chunks=(CHUNK,), **PACKED
+        )
+        for part in PARTS
+        for name, dtype in STORED.items()
     }
     return sets
+
+
+def _all_views(file: h5py.File) -> dict[str, np.ndarray]:
+    """The whole numbers of all views of a pack, those of returns one after the other."""
+    stored = {name: np.asarray(file[name][:], dtype) for name, dtype in STORED_VIEW.items()}
+    stored |= {
+        f"{part} {name}": np.asarray(file[f"{part} {name}"][:], dtype)
+        for part in PARTS
+        for name, dtype in STORED.items()
+    }
+    counts = stored["count"].reshape(len(stored["count"]), -1)
+    ends = {"first": (counts > 0).sum(axis=1).cumsum()}
+    ends["further"] = counts.sum(axis=1, dtype=np.int64).cumsum() - ends["first"]
+    views = []
+    for i in range(len(counts)):
+        view = {name: stored[name][i] for name in PER_VIEW}
+        for part in PARTS:
+            rows = slice(ends[part][i - 1] if i else 0, ends[part][i])
+            view |= {f"{part} {name}": stored[f"{part} {name}"][rows] for name in STORED}
+        views.append(_summed(view))
+    arrays = {name: np.stack([view[name] for view in views]) for name in PER_VIEW}
+    return arrays | {name: np.concatenate([view[name] for view in views]) for name in PER_RETURN}
 
 
 def read_pack(path: Path) -> Pack:
@@ -198,15 +291,16 @@ def read_pack(path: Path) -> Pack:
         with h5py.File(path, "r") as file:
             require(ATTRIBUTE in file.attrs, f"no pack of scene2spad (no attribute {ATTRIBUTE})")
             meta, sha256 = open_seal(file.attrs[ATTRIBUTE], "pack")
-            arrays = {name: np.asarray(file[name][:], dtype) for name, dtype in (PER_VIEW | PER_RETURN).items()}
+            arrays = _all_views(file)
             starts = np.asarray(file["start"][:], np.int64)
-            metas = tuple(json.loads(text) for text in file["meta"].asstr()[:])
-        rises = len(starts) == len(metas) + 1 and starts[0] == 0 and bool((np.diff(starts) >= 0).all())
-        require(rises, "its views do not fit its returns")
+            metas = tuple(json.loads(np.asarray(file["meta"][:], np.uint8).tobytes()))
+        returns = arrays["count"].sum(axis=(1, 2), dtype=np.int64)
+        fits = len(returns) == len(metas) and np.array_equal(starts, np.concatenate(([0], returns.cumsum())))
+        require(fits, "its views do not fit its returns")
         check_seal(meta, sha256, _sha256(arrays, starts, metas))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
         told = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a readable pack ({told or type(error).__name__})") from None
     for array in arrays.values():

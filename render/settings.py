@@ -22,6 +22,7 @@ class RenderSettings:
     adaptive    whether it is spent so, or evenly and without sharing
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
+    ambient_spp paths per pixel of ambient light
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
     least_share edges of surfaces and shadows are followed where they could change this share of a cell or more;
@@ -36,6 +37,7 @@ class RenderSettings:
     adaptive: bool = True
     grid: int | None = None
     ambient: bool | None = None
+    ambient_spp: int = 64
     error: float | None = None
     budget: tuple[float, float] | None = None
     least_share: float | None = None
@@ -50,6 +52,7 @@ class RenderSettings:
             ("grid", 1, 64),
             ("error", 1e-4, 1.0),
             ("least_share", 0, 1),
+            ("ambient_spp", 1, 1 << 16),
         )
         for name, low, high in limits:
             value = getattr(self, name)

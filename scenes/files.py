@@ -16,7 +16,7 @@ from pathlib import Path
 from scenes.errors import InputError
 
 ATTRIBUTE = "scene2spad"
-SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 1, "network": 1}
+SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 2, "network": 1}
 
 
 @contextmanager

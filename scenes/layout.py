@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -29,6 +31,12 @@ class Place:
     def surfaces(self) -> list[Surface]:
         x, y, z = self.at
         return placed(list(self.piece.surfaces), x, z, y=y, turn_deg=self.turn_deg)
+
+    @cached_property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Lowest and highest x and z of the plan, as plain numbers: most pairs of places are told apart by these."""
+        (x0, z0), (x1, z1) = self.plan.min(axis=0).tolist(), self.plan.max(axis=0).tolist()
+        return x0, z0, x1, z1
 
     @property
     def tops(self) -> np.ndarray:
@@ -82,14 +90,13 @@ class Floor:
 
     def holds(self, points: np.ndarray, slack: float = 1e-3) -> bool:
         """Whether all points lie inside the outline (even-odd rule), or within `slack` of it."""
-        a, b = self.edges()
-        for x, z in points:
-            crosses = (a[:, 1] > z) != (b[:, 1] > z)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                at = a[:, 0] + (z - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
-            if (crosses & (x < at)).sum() % 2 == 0 and self.distance(np.array((x, z))) > slack:
-                return False
-        return True
+        (ax, az), (bx, bz) = (corners.T for corners in self.edges())
+        x, z = points[:, :1], points[:, 1:]
+        crosses = (az > z) != (bz > z)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = ax + (z - az) / (bz - az) * (bx - ax)
+        inside = (crosses & (x < at)).sum(axis=1) % 2 == 1
+        return all(self.distance(point) <= slack for point in points[~inside])
 
     def distance(self, point: np.ndarray) -> float:
         """From a point to the outline."""
@@ -100,13 +107,10 @@ class Floor:
 
     def fits(self, place: Place) -> bool:
         """Inside, and clear of everything that stands at the same height."""
-        clear = (
-            other.low >= place.high or other.high <= place.low or not overlap(place.plan, other.plan)
-            for other in self.places
-        )
+        if any(in_each_other(place, other) for other in self.places):
+            return False
         corners_in = self.holds(np.concatenate((place.plan, place.plan.mean(axis=0, keepdims=True))))
-        inside_out = any(_inside(place.plan, corner) for corner in self.outline)
-        return corners_in and not inside_out and all(clear)
+        return corners_in and not _inside_any(place.plan, self.outline)
 
     def try_at_wall(
         self, piece: Piece, rng: Random, tries: int = 12, gap: float = 0.01, margin: float = 0.03
@@ -145,34 +149,56 @@ class Floor:
         return None
 
 
-def _inside(polygon: np.ndarray, point: np.ndarray) -> bool:
-    """Whether a point lies well inside a convex polygon."""
+def in_each_other(a: Place, b: Place) -> bool:
+    """Whether two places share heights and ground."""
+    if a.low >= b.high or b.low >= a.high:
+        return False
+    (x0, z0, x1, z1), (u0, w0, u1, w1) = a.extent, b.extent
+    return x0 < u1 and u0 < x1 and z0 < w1 and w0 < z1 and overlap(a.plan, b.plan)
+
+
+def _inside_any(polygon: np.ndarray, points: np.ndarray) -> bool:
+    """Whether any of the points lies well inside a convex polygon."""
     edge = np.roll(polygon, -1, axis=0) - polygon
-    away = edge[:, 0] * (point - polygon)[:, 1] - edge[:, 1] * (point - polygon)[:, 0]
-    away = away / np.linalg.norm(edge, axis=1)
-    return bool((away > 0.02).all() or (away < -0.02).all())
+    offset = points[:, None] - polygon
+    away = (edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]) / np.linalg.norm(edge, axis=1)
+    return bool(((away > 0.02).all(axis=1) | (away < -0.02).all(axis=1)).any())
 
 
-def rough_distance(floor: Floor, ceiling: float, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Distance along unit rays (n, 3) to walls, floor, ceiling, and the upright boxes around what stands there."""
+def to_shell(floor: Floor, ceiling: float, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Distance along unit rays (n, 3) to walls, floor and ceiling."""
     with np.errstate(divide="ignore", invalid="ignore"):
         to_level = np.where(rays[:, 1] < 0, -origin[1] / rays[:, 1], (ceiling - origin[1]) / rays[:, 1])
         nearest = np.where(np.abs(rays[:, 1]) < 1e-9, np.inf, to_level)
-        start, direction = origin[[0, 2]], rays[:, [0, 2]]
-        nearest = np.minimum(nearest, _edge_hits(*floor.edges(), start, direction).min(axis=1))
-        if floor.places:
-            plans = np.array([place.plan for place in floor.places])
-            low, high = (np.array([getattr(place, end) for place in floor.places]) for end in ("low", "high"))
-            t = _edge_hits(plans.reshape(-1, 2), np.roll(plans, -1, axis=1).reshape(-1, 2), start, direction)
-            t = t.reshape(len(rays), -1, 4)
-            y = origin[1] + t * rays[:, 1, None, None]
-            side = np.where((y >= low[:, None]) & (y <= high[:, None]), t, np.inf)
-            nearest = np.minimum(nearest, side.min(axis=(1, 2)))
-            for level in (low, high):
-                t = (level - origin[1]) / rays[:, 1:2]
-                inside = _inside_all(plans, start + t[..., None] * direction[:, None])
-                nearest = np.minimum(nearest, np.where((t > 0) & inside, t, np.inf).min(axis=1))
-    return nearest
+        return np.minimum(nearest, _edge_hits(*floor.edges(), origin[[0, 2]], rays[:, [0, 2]]).min(axis=1))
+
+
+class Boxes:
+    """Upright boxes around what stands in a room: all their plans are rectangles."""
+
+    def __init__(self, places: Sequence[Place]) -> None:
+        plans = np.array([place.plan for place in places]).reshape(-1, 4, 2)
+        sides = (plans[:, 1] - plans[:, 0]) / 2, (plans[:, 3] - plans[:, 0]) / 2
+        self.centre = plans.mean(axis=1)
+        # a point p of the plan has (p - centre) . axis in -1 to 1, for both axes
+        self.axes = tuple(side / np.maximum((side**2).sum(axis=1, keepdims=True), 1e-12) for side in sides)
+        self.low, self.high = (np.array([getattr(place, end) for place in places]) for end in ("low", "high"))
+
+    def distance(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Distance along unit rays (n, 3) to each box, (n, boxes), inf where it is missed: three slabs a box."""
+        ground, flat = origin[[0, 2]], rays[:, [0, 2]]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            enter, leave = _sorted((self.low - origin[1]) / rays[:, 1:2], (self.high - origin[1]) / rays[:, 1:2])
+            for axis in self.axes:
+                at, rate = ((ground - self.centre) * axis).sum(axis=1), flat @ axis.T
+                first, last = _sorted((-1 - at) / rate, (1 - at) / rate)
+                enter, leave = np.maximum(enter, first), np.minimum(leave, last)
+        t = np.where(enter > 1e-6, enter, leave)
+        return np.where((leave >= enter) & (t > 1e-6), t, np.inf)
+
+
+def _sorted(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.minimum(a, b), np.maximum(a, b)
 
 
 def _edge_hits(a: np.ndarray, b: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -182,11 +208,3 @@ def _edge_hits(a: np.ndarray, b: np.ndarray, start: np.ndarray, direction: np.nd
     t = (to[:, 0] * along[:, 1] - to[:, 1] * along[:, 0]) / det
     s = (to[:, 0] * direction[:, 1:] - to[:, 1] * direction[:, :1]) / det
     return np.where((t > 1e-6) & (s >= 0) & (s <= 1), t, np.inf)
-
-
-def _inside_all(polygons: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether points (n, p, 2) lie in their convex polygons (p, corners, 2), (n, p)."""
-    edge = np.roll(polygons, -1, axis=1) - polygons
-    offset = points[:, :, None] - polygons
-    side = edge[..., 0] * offset[..., 1] - edge[..., 1] * offset[..., 0]
-    return (side >= 0).all(axis=2) | (side <= 0).all(axis=2)

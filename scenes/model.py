@@ -25,9 +25,14 @@ LASER_MODES: tuple[str, ...] = LaserMode.__args__
 
 
 def _frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: str) -> np.ndarray:
-    """`value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError."""
+    """`value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError.
+
+    A read-only array that owns its memory is kept as it is: copies of big meshes were most of a room's time.
+    """
+    kept = isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable
+    kept = kept and value.dtype == dtype and value.flags.c_contiguous
     try:
-        array = np.array(value, dtype=dtype, order="C")
+        array = value if kept else np.array(value, dtype=dtype, order="C")
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what}: not an array of numbers ({error})") from None
     tail = array.shape[array.ndim - len(shape_tail) :] if array.ndim >= len(shape_tail) else None
@@ -158,8 +163,9 @@ class Surface:
         faces = _frozen_array(self.faces, np.int64, (3,), f"{where}: faces")
         require(vertices.ndim == 2 and faces.ndim == 2, f"{where}: vertices and faces must be tables of three columns")
         require(len(faces) > 0 and len(vertices) > 0, f"{where}: has no faces")
-        bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-        require(bad == 0, f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
+        if not np.isfinite(vertices).all():
+            bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+            raise InputError(f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
         check_faces(faces, len(vertices), where)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
@@ -367,23 +373,31 @@ class Scene:
         return low, np.max([s.vertices.max(axis=0) for s in self.surfaces], axis=0)
 
     def digest(self) -> str:
-        """SHA-256 over everything that decides what is rendered; names and notes do not count."""
-        sha = hashlib.sha256()
-        _digest(sha, (self.surfaces, self.camera, self.laser, self.ambient))
-        return sha.hexdigest()
+        """SHA-256 over everything that decides what is rendered; names and notes do not count.
+
+        It is the hash of the parts' hashes, which textures, materials and surfaces keep: views share them.
+        """
+        return _digest((self.surfaces, self.camera, self.laser, self.ambient)).hex()
 
 
-def _digest(sha: hashlib._Hash, value: object) -> None:
+def _digest(value: object) -> bytes:
+    """SHA-256 of a part of a scene, kept in the objects that never change."""
+    kept = value.__dict__.get("_digest") if isinstance(value, (Texture, Material, Surface)) else None
+    if kept is not None:
+        return kept
+    sha = hashlib.sha256(type(value).__name__.encode())
     if isinstance(value, tuple):
-        sha.update(f"({len(value)}".encode())
         for item in value:
-            _digest(sha, item)
+            sha.update(_digest(item))
     elif isinstance(value, np.ndarray):
         sha.update(f"{value.dtype.str}{value.shape}".encode())
-        sha.update(np.ascontiguousarray(value).tobytes())
+        sha.update(np.ascontiguousarray(value).data)
     elif isinstance(value, (Texture, Material, Surface, Camera, Laser, Ambient)):
         for item in fields(value):
             if item.name != "name":
-                _digest(sha, getattr(value, item.name))
+                sha.update(_digest(getattr(value, item.name)))
+        if isinstance(value, (Texture, Material, Surface)):
+            object.__setattr__(value, "_digest", sha.digest())
     else:
-        sha.update(f"{type(value).__name__}:{value!r};".encode())
+        sha.update(repr(value).encode())
+    return sha.digest()

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from scipy import fft
 
 from scenes.model import Surface, Texture
 from scenes.parts import Random
@@ -14,9 +15,12 @@ from scenes.parts import Random
 
 def soft_noise(rng: Random, shape: tuple[int, int], size_px: tuple[float, float]) -> np.ndarray:
     """Gaussian noise of unit variance blurred to blobs of `size_px` (rows, columns); periodic, so that it tiles."""
-    rows, columns = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
-    blur = np.exp(-2 * np.pi**2 * ((rows * size_px[0]) ** 2 + (columns * size_px[1]) ** 2))
-    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal(shape)) * blur, s=shape)
+    rows, columns = (
+        np.exp(-2 * np.pi**2 * (frequency * size) ** 2).astype(np.float32)
+        for frequency, size in zip((np.fft.fftfreq(shape[0]), np.fft.rfftfreq(shape[1])), size_px, strict=True)
+    )
+    white = rng.standard_normal(shape, np.float32)
+    noise = fft.irfft2(fft.rfft2(white) * rows[:, None] * columns, s=shape)
     return (noise - noise.mean()) / noise.std()
 
 

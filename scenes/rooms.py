@@ -1,17 +1,20 @@
 """Procedural indoor views: a room of random shape, furnished along its walls, cluttered, and seen as a person would.
 
+A room is seen by a few cameras, as in data sets of real rooms: views n V to n V + V - 1 of a split show room n.
 Depths follow NYUv2's: 0.5 to 7 m, median 2 to 3.5 m. The room is closed: no ray leaves it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from scenes import clutter, fittings, furniture
-from scenes.layout import Floor, Place, overlap, rough_distance, set_down
+from scenes.layout import Boxes, Floor, Place, in_each_other, set_down, to_shell
 from scenes.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
 from scenes.model import Camera, Scene, Surface
 from scenes.palette import make_palette, pick
@@ -22,40 +25,62 @@ SPLITS = ("train", "val", "test")
 FOV_DEG = (52.0, 66.0)
 NEAREST_M, FARTHEST_M = 0.6, 6.9
 MEDIAN_M = (1.9, 3.9)  # of one view, by upright boxes; drawn evenly
-CANDIDATES, ATTEMPTS = 40, 8
+CANDIDATES, ATTEMPTS = 120, 8  # views of a room, rooms
+LEAST_BUSY = 0.3  # of a view, by upright boxes: what stands before the walls
+VIEWS_PER_ROOM = 4
+APART_M, APART_DEG = 0.5, 30.0  # any two cameras of a room, at least
+HEAD = np.array(((-1, -1), (1, -1), (1, 1), (-1, 1)))
 FLAT = ("window", "door", "picture", "clock", "radiator", "rug")  # an image should show more than these
 
 
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A furnished room and its cameras, whose image size is whatever."""
+
+    surfaces: tuple[Surface, ...]
+    cameras: tuple[Camera, ...]
+
+
 def room_view(index: int, split: str = "train", *, seed: int = 0, width: int = 64, height: int = 64) -> Scene:
-    """View `index` of a split, a room of its own; equal arguments give equal scenes, byte for byte.
+    """View `index` of a split: room `index // VIEWS_PER_ROOM`; equal arguments give equal scenes, byte for byte.
 
-    Splits draw from streams of their own and share no room.
+    Splits draw from streams of their own and share no room. The last rooms are kept: their other views cost nothing.
     """
-    stream = np.random.SeedSequence(seed, spawn_key=(SPLITS.index(split), index))
+    number, which = divmod(index, VIEWS_PER_ROOM)
+    room = _room(split, number, seed)
+    camera = replace(room.cameras[which], width=width, height=height)
+    notes = (f"procedural, {split} view {index} of seed {seed}: camera {which} of room {number}",)
+    return Scene(f"rooms/{split}/{index}", room.surfaces, camera, notes=notes)
+
+
+def room_name(index: int, split: str) -> str:
+    """The room that a view shows."""
+    return f"rooms/{split}/room {index // VIEWS_PER_ROOM}"
+
+
+@lru_cache(maxsize=2)
+def _room(split: str, number: int, seed: int) -> Room:
+    stream = np.random.SeedSequence(seed, spawn_key=(SPLITS.index(split), number))
     for attempt in stream.spawn(ATTEMPTS):
-        scene = _attempt(np.random.default_rng(attempt), width, height)
-        if scene is not None:
-            break
-    name = f"rooms/{split}/{index}"
-    if scene is None:
-        raise RuntimeError(f"{name}: no view of {ATTEMPTS} rooms has depths of {NEAREST_M} to {FARTHEST_M} m")
-    return replace(scene, name=name, notes=(f"procedural, {split} view {index} of seed {seed}",))
+        room = _attempt(np.random.default_rng(attempt))
+        if room is not None:
+            return room
+    name = f"rooms/{split}: room {number}"
+    raise RuntimeError(f"{name}: none of {ATTEMPTS} has {VIEWS_PER_ROOM} views of {NEAREST_M} to {FARTHEST_M} m")
 
 
-def _attempt(rng: Random, width: int, height: int) -> Scene | None:
-    """One random room, and the best of some views of it; None if none is good."""
+def _attempt(rng: Random) -> Room | None:
+    """One random room, and the best of some views of it; None if too few are good."""
     palette = make_palette(rng)
     floor, ceiling = Floor(_outline(rng)), float(rng.uniform(2.3, 3.0))
     surfaces = _shell(palette, rng, floor, ceiling)
     furnish(palette, rng, floor, ceiling)
-    camera = _camera(rng, floor, ceiling, width, height)
-    if camera is None:
+    cameras = _cameras(rng, floor, ceiling)
+    if cameras is None:
         return None
     surfaces += [surface for place in floor.places for surface in place.surfaces]
     surfaces += one_of_each(palette)
-    brightness = float(rng.uniform(0.2, 2.0))
-    surfaces = [with_normals(replace(s, emission=brightness * s.emission)) for s in on_one_sheet(surfaces)]
-    return Scene("rooms", tuple(surfaces), camera)
+    return Room(tuple(with_normals(on_one_sheet(surfaces), float(rng.uniform(0.2, 2.0)))), cameras)
 
 
 def one_of_each(palette: Palette, y: float = -0.5) -> list[Surface]:
@@ -225,7 +250,7 @@ def litter(palette: Palette, rng: Random, floor: Floor, top: np.ndarray, most: i
         place = set_down(
             piece, x + c * u + s * v, z - s * u + c * v, y=y + 1e-4, turn_deg=turn + rng.normal(0, 12), margin=0.005
         )
-        if any(overlap_in_height(place, other) for other in taken) or not floor.holds(place.plan):
+        if any(in_each_other(place, other) for other in taken) or not floor.holds(place.plan):
             continue
         taken.append(place)
     floor.places.extend(taken)
@@ -235,20 +260,48 @@ def litter(palette: Palette, rng: Random, floor: Floor, top: np.ndarray, most: i
                 litter(palette, rng, floor, upper, 2)
 
 
-def overlap_in_height(a: Place, b: Place) -> bool:
-    return a.low < b.high and b.low < a.high and overlap(a.plan, b.plan)
-
-
 # --- The camera ------------------------------------------------------------------------------------------------------
 
 
-def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) -> Camera | None:
-    """A hand-held view with the wanted median distance and enough to see; judged on boxes, in a 16 x 12 image."""
-    wanted = rng.uniform(*MEDIAN_M)
+class Seen(NamedTuple):
+    """A candidate for a camera, what it sees by boxes: 5, 50 and 95 % distances, and how much lacks to be busy."""
+
+    camera: Camera
+    quantiles_m: np.ndarray
+    bare: float
+
+
+def _cameras(rng: Random, floor: Floor, ceiling: float) -> tuple[Camera, ...] | None:
+    """Hand-held views, far enough from each other, with the wanted median distances and enough to see."""
+    seen = _candidates(rng, floor, ceiling)
+    chosen: list[Camera] = []
+    for wanted in rng.uniform(*MEDIAN_M, VIEWS_PER_ROOM):
+        free = [other for other in seen if all(_apart(other.camera, camera) for camera in chosen)]
+        if not free:
+            return None
+        chosen.append(min(free, key=lambda one: _score(one, wanted)).camera)
+    return tuple(chosen)
+
+
+def _apart(a: Camera, b: Camera) -> bool:
+    """Whether two cameras of a room differ clearly, in place and in direction."""
+    turned = a.rotation[:, 2] @ b.rotation[:, 2] < math.cos(math.radians(APART_DEG))
+    return bool(turned and np.linalg.norm(a.origin - b.origin) > APART_M)
+
+
+def _score(seen: Seen, wanted: float) -> float:
+    low_end, middle, high_end = seen.quantiles_m
+    flat = 2.0 * max(0.0, 0.6 - (high_end - low_end) / middle)
+    return abs(middle - wanted) + 3.0 * seen.bare + flat
+
+
+def _candidates(rng: Random, floor: Floor, ceiling: float) -> list[Seen]:
+    """Random views from free places whose distances are in range; judged on boxes, in a 16 x 12 image."""
     low, high = floor.outline.min(axis=0), floor.outline.max(axis=0)
-    standing = [p for p in floor.places if p.piece.surfaces and not p.piece.surfaces[0].name.startswith(FLAT)]
-    furnished, bare = Floor(floor.outline, standing), Floor(floor.outline)
-    best, best_score = None, math.inf
+    boxes = Boxes(floor.places)
+    has_body = [bool(p.piece.surfaces) and not p.piece.surfaces[0].name.startswith(FLAT) for p in floor.places]
+    standing = np.flatnonzero(has_body)
+    found = []
     for _ in range(CANDIDATES):
         x, z = rng.uniform(low + 0.3, high - 0.3)
         y, heading = rng.uniform(0.9, 1.75), rng.uniform(0, 2 * np.pi)
@@ -259,26 +312,23 @@ def _camera(rng: Random, floor: Floor, ceiling: float, width: int, height: int) 
         ahead = np.array((math.cos(pitch) * math.sin(heading), math.sin(pitch), math.cos(pitch) * math.cos(heading)))
         up = (roll * math.cos(heading), 1.0, -roll * math.sin(heading))
         origin = np.array((x, y, z))
-        rays = Camera.look_at(origin, origin + ahead, fov_deg=fov, width=16, height=12, up=up).rays().reshape(-1, 3)
-        distance = rough_distance(floor, ceiling, origin, rays)
+        camera = Camera.look_at(origin, origin + ahead, fov_deg=fov, width=16, height=12, up=up)
+        rays = camera.rays().reshape(-1, 3)
+        to_walls, to_boxes = to_shell(floor, ceiling, origin, rays), boxes.distance(origin, rays)
+        distance = np.minimum(to_walls, to_boxes.min(axis=1, initial=np.inf))
         if distance.min() < NEAREST_M or np.quantile(distance, 0.99) > FARTHEST_M:
             continue
-        to_walls = rough_distance(bare, ceiling, origin, rays)
-        busy = float((rough_distance(furnished, ceiling, origin, rays) < to_walls - 0.1).mean())
-        low_end, middle, high_end = np.quantile(distance, (0.05, 0.5, 0.95))
-        score = abs(middle - wanted) + 3.0 * max(0.0, 0.6 - busy) + 2.0 * max(0.0, 0.6 - (high_end - low_end) / middle)
-        if score < best_score:
-            best, best_score = (
-                Camera.look_at(origin, origin + ahead, fov_deg=fov, width=width, height=height, up=up),
-                score,
-            )
-    return best
+        busy = float((to_boxes[:, standing].min(axis=1, initial=np.inf) < to_walls - 0.1).mean())
+        if busy < LEAST_BUSY:
+            continue
+        found.append(Seen(camera, np.quantile(distance, (0.05, 0.5, 0.95)), max(0.0, 0.6 - busy)))
+    return found
 
 
 def _too_near(floor: Floor, point: np.ndarray, y: float) -> bool:
     """Whether a head there would be in or right beside something."""
-    around = point + 0.28 * np.array(((-1, -1), (1, -1), (1, 1), (-1, 1)))
-    return any(p.high > 0.5 * y and p.low < y + 0.2 and overlap(p.plan, around) for p in floor.places)
+    head = Place(Piece(()), (0.0, 0.0, 0.0), 0.0, point + 0.28 * HEAD, 0.0, y + 0.2)
+    return any(p.high > 0.5 * y and in_each_other(head, p) for p in floor.places)
 
 
 def pieces(scene: Scene) -> set[str]:

@@ -9,7 +9,7 @@ from scenes.errors import InputError, require
 from scenes.model import Scene
 
 SETS: dict[str, str] = {
-    "rooms/train": "procedural furnished rooms, one room a view, without end (short: rooms)",
+    "rooms/train": "procedural furnished rooms, each seen by four cameras, without end (short: rooms)",
     "rooms/val": "rooms that are not in rooms/train",
     "rooms/test": "rooms that are in neither",
     "tabletop": "eight still lifes with fine structure, 1.1 to 2.9 m",
@@ -21,11 +21,17 @@ LARGEST = 1_000_000
 
 @dataclass(frozen=True)
 class SceneSet:
-    """`size` views (None: as many as one likes); `make(index, seed, width, height)` builds one, None sizes its own."""
+    """`size` views (None: as many as one likes); `make(index, seed, width, height)` builds one, None sizes its own.
+
+    `place(index)` names what a view shows: views of one place, `views_per_place` in a row, are not independent, and are
+    quickly made one after the other.
+    """
 
     name: str
     size: int | None
     make: Callable[[int, int, int | None, int | None], Scene]
+    place: Callable[[int], str]
+    views_per_place: int = 1
 
     def view(self, index: int, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
         most = LARGEST if self.size is None else self.size
@@ -39,7 +45,7 @@ def scene_set(name: str) -> SceneSet:
     if name not in SETS:
         raise InputError(f"scene set {name!r}: expected one of {', '.join(SETS)}")
     if name.startswith("rooms/"):
-        return SceneSet(name, None, _room_maker(name.removeprefix("rooms/")))
+        return _rooms(name, name.removeprefix("rooms/"))
     names, load = _named(name)
 
     def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
@@ -48,16 +54,16 @@ def scene_set(name: str) -> SceneSet:
             return scene
         return replace(scene, camera=scene.camera.resized(width, height))
 
-    return SceneSet(name, len(names), make)
+    return SceneSet(name, len(names), make, lambda index: f"{name}/{names[index]}")
 
 
-def _room_maker(split: str) -> Callable[[int, int, int | None, int | None], Scene]:
+def _rooms(name: str, split: str) -> SceneSet:
+    from scenes.rooms import VIEWS_PER_ROOM, room_name, room_view
+
     def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
-        from scenes.rooms import room_view
-
         return room_view(index, split, seed=seed, width=width or height or 64, height=height or width or 64)
 
-    return make
+    return SceneSet(name, None, make, lambda index: room_name(index, split), VIEWS_PER_ROOM)
 
 
 def _named(name: str) -> tuple[list[str], Callable[[str], Scene]]:

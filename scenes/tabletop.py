@@ -138,7 +138,7 @@ def tabletop(name: str, *, width: int = 88, height: int = 72) -> Scene:
     pitch = math.radians(PITCH_DEG)
     ahead = (0.0, EYE_M + math.sin(pitch), -math.cos(pitch))
     camera = Camera.look_at((0, EYE_M, 0), ahead, fov_deg=FOV_DEG, width=width, height=height)
-    surfaces = [with_normals(surface) for surface in on_one_sheet(surfaces)]
+    surfaces = with_normals(on_one_sheet(surfaces))
     return Scene(f"tabletop/{name}", tuple(surfaces), camera, notes=("procedural, fixed seed",))
 
 

@@ -113,7 +113,7 @@ class Dataset(Common):
     set: Positional[str] = "rooms"
     """rooms, rooms/val, rooms/test, tabletop, middlebury or hard-cases."""
     count: Count = None
-    """Views (default: all of a finite set, 100 rooms)."""
+    """Views (default: all of a finite set, 100 of rooms)."""
     out: Annotated[Path | None, _open("FOLDER")] = None
     """Folder of the set (default: out/ and the set's name)."""
     workers: int = 1
@@ -136,6 +136,8 @@ class Dataset(Common):
     """Target of the relative error (default: 0.01 with 1 bounce, 0.03 with more)."""
     ambient: bool = True
     """Render ambient light."""
+    ambient_spp: int = 8
+    """Paths per pixel of ambient light."""
     offset: float = 0.0
     """Move every scene this many metres away."""
     offset_mode: Offset = "time"

@@ -16,15 +16,14 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from functools import partial
+from itertools import groupby
 from pathlib import Path
-from threading import Lock, Thread
-from typing import Any, NamedTuple
+from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,14 +32,15 @@ from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.offsets import OffsetMode, check_offset
 from scenes.sets import scene_set
+from studies.workers import executor
 
 log = logging.getLogger("scene2spad")
 
 Progress = Callable[[str, float], None]
 STAGE_VIEW = 20
-TRIES = 3  # of a view whose worker process died
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
+THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
 _ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
 
 
@@ -59,6 +59,7 @@ class Job:
     offset_m: float = 0.0
     offset_mode: OffsetMode = "time"
     ambient: bool = True
+    ambient_spp: int = 8
 
     def __post_init__(self) -> None:
         scene_set(self.set)
@@ -71,6 +72,7 @@ class Job:
             spp=self.spp,
             grid=self.grid,
             error=self.error,
+            ambient_spp=self.ambient_spp,
             direct_tolerance_m=DIRECT_TOLERANCE_M,
             indirect_tolerance_m=INDIRECT_TOLERANCE_M,
             indirect_growth=INDIRECT_GROWTH,
@@ -103,6 +105,15 @@ def render_view(job: Job, view: int, again: int = 0) -> Done:
     return Done(record, exr, time.perf_counter() - start, where)
 
 
+def render_views(job: Job, views: Sequence[int]) -> list[Done]:
+    """Views that one process renders in a row, since they show one place."""
+    return [render_view(job, view) for view in views]
+
+
+def _lost(view: int, why: str) -> Done:
+    return Done({"view": view, "failed": why}, None, 0.0, "")
+
+
 @contextmanager
 def quiet() -> Iterator[None]:
     """The plan of each of thousands of views goes into the index, not to the screen."""
@@ -119,6 +130,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     # heavy imports only where a view is really rendered: the process that collects needs none of them
     from render.engine import render
     from render.pack import rounded
+    from render.thinning import thinned
     from render.transient import write_transient
     from studies.moving import moved
 
@@ -133,7 +145,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     if job.offset_m and job.offset_mode == "time":
         transient = transient.delayed(job.offset_m)
     require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
-    transient = rounded(transient)
+    transient = rounded(thinned(transient, THINNED))
     with tempfile.TemporaryDirectory(prefix="scene2spad-") as folder:
         path = Path(folder) / "view.exr"
         write_transient(transient, path)
@@ -144,6 +156,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     record = {
         "view": view,
         "scene": scene.name,
+        "place": scene_set(job.set).place(view),
         "file": file_name(view),
         "bytes": len(exr),
         "seed": seed,
@@ -170,12 +183,14 @@ class Folder:
 
     def __init__(self, path: Path, job: Job) -> None:
         self.path, self.job = path, job
-        stored = {"schema": 1, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH]}
+        stored = {"schema": 2, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED]}
         asked = json.dumps(asdict(job) | stored, sort_keys=True, indent=1) + "\n"
         config = path / "set.json"
         if config.is_file():
             if config.read_text() != asked:
-                raise InputError(f"{path}: holds a set that was made with other options; choose another --out")
+                raise InputError(
+                    f"{path}: holds a set that was made with other options or another version; choose another --out"
+                )
         else:
             require(
                 not path.exists() or not any(path.iterdir()),
@@ -241,6 +256,12 @@ def read_index(folder: Path) -> list[dict]:
 # --- Running ---------------------------------------------------------------------------------------------------------
 
 
+def _runs(job: Job, views: Sequence[int]) -> list[tuple[int, ...]]:
+    """Views of one place together, in order."""
+    chosen = scene_set(job.set)
+    return [tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place)]
+
+
 def make_set(
     job: Job, count: int, out: Path, *, workers: int = 1, scheduler: str | None = None, progress: Progress | None = None
 ) -> dict:
@@ -258,8 +279,9 @@ def make_set(
     todo = [view for view in range(count) if view not in folder.records]
     say = progress or (lambda what, share: None)
     start = time.perf_counter()
-    with _executor(workers, scheduler, len(todo)) as run:
-        for number, done in enumerate(run(job, todo), 1):
+    runs, work = _runs(job, todo), partial(render_views, job)
+    with executor(workers if todo else 1, scheduler if todo else None) as run:
+        for number, done in enumerate(run(work, runs, _lost), 1):
             folder.add(done)
             if "failed" in done.record:
                 log.warning("view %d failed: %s", done.record["view"], done.record["failed"])
@@ -278,105 +300,6 @@ def make_set(
         "error_median": float(np.median([record["error"] for record in good])) if good else float("nan"),
         "out": str(out),
     }
-
-
-Run = Callable[[Job, Iterable[int]], Iterator[Done]]
-
-
-@contextmanager
-def _executor(workers: int, scheduler: str | None, todo: int) -> Iterator[Run]:
-    if todo == 0 or (workers == 1 and scheduler is None):
-        yield lambda job, views: (render_view(job, view) for view in views)
-    elif scheduler is not None:
-        with _dask_client(scheduler) as client:
-            yield lambda job, views: _on_dask(client, job, views)
-    else:
-        yield lambda job, views: _on_processes(min(workers, todo), job, views)
-
-
-def _on_processes(workers: int, job: Job, views: Iterable[int]) -> Iterator[Done]:
-    """Several processes of ours. One that dies takes the pool with it: a new one goes on, and retries what was lost."""
-    waiting, tries = list(views)[::-1], dict.fromkeys(views, 0)
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    while waiting:
-        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads,)) as pool:
-            running: dict[Future, int] = {}
-            try:
-                while waiting or running:
-                    while waiting and len(running) < 2 * workers:
-                        view = waiting.pop()
-                        running[pool.submit(render_view, job, view)] = view
-                    for future in wait(running, return_when=FIRST_COMPLETED).done:
-                        done = future.result()
-                        del running[future]
-                        yield done
-            except BrokenProcessPool:
-                for view in running.values():
-                    tries[view] += 1
-                for view in sorted(running.values(), reverse=True):
-                    if tries[view] < TRIES:
-                        waiting.append(view)
-                    else:
-                        yield Done({"view": view, "failed": f"its process died {TRIES} times"}, None, 0.0, "")
-                log.warning("a worker process died; starting others")
-
-
-def _start_worker(threads: int) -> None:
-    """In a new process: as many threads as its share of the cores; it ends when the one that started it does."""
-    Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    from render.llvm import start_mitsuba
-
-    start_mitsuba()
-    import drjit
-
-    drjit.set_thread_count(threads)
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
-
-
-@contextmanager
-def _dask_client(address: str) -> Iterator[Any]:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError("--scheduler needs the package `distributed`: pip install 'scene2spad[cluster]'") from None
-    try:
-        client = Client(address, timeout=20)
-    except (OSError, ValueError, TypeError) as error:
-        told = " ".join(str(error).split())[:120]
-        raise InputError(f"scheduler {address}: cannot be reached ({told or type(error).__name__})") from None
-    try:
-        yield client
-    finally:
-        client.close()
-
-
-def _on_dask(client: Any, job: Job, views: Iterable[int]) -> Iterator[Done]:
-    """A cluster's workers, a few tasks each in flight, so that results do not heap up; a dead worker's move on."""
-    from distributed import as_completed
-
-    waiting = list(views)[::-1]
-    lanes = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    first = [waiting.pop() for _ in range(min(len(waiting), 3 * lanes))]
-    submitted = {client.submit(render_view, job, view, pure=False, retries=TRIES): view for view in first}
-    pending = as_completed(submitted)
-    for future in pending:
-        view = submitted.pop(future)
-        if future.status == "error":
-            told = " ".join(str(future.exception()).split())[:300]
-            yield Done({"view": view, "failed": f"its workers died: {told}"}, None, 0.0, "")
-        else:
-            yield future.result()
-        future.release()
-        if waiting:
-            view = waiting.pop()
-            new = client.submit(render_view, job, view, pure=False, retries=TRIES)
-            submitted[new] = view
-            pending.add(new)
 
 
 # --- Packing ---------------------------------------------------------------------------------------------------------

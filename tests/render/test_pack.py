@@ -8,9 +8,20 @@ import h5py
 import numpy as np
 import pytest
 
-from render.pack import AMBIENT_STEPS, DEPTH_STEP_M, PATH_STEP_M, RADIANCE_STEPS, read_pack, rounded, write_pack
+from render.pack import (
+    AMBIENT_STEPS,
+    DEPTH_STEP_M,
+    FINER,
+    PATH_STEP_M,
+    RADIANCE_STEPS,
+    WIDTH_STEP_M,
+    read_pack,
+    rounded,
+    write_pack,
+)
 from render.transient import Transient
 from scenes import InputError
+from scenes.files import ATTRIBUTE
 
 
 def transient(seed: int, height: int = 6, width: int = 5) -> Transient:
@@ -54,8 +65,10 @@ def test_views_come_back_within_half_a_step(packed):
     for given, got in zip(VIEWS, pack, strict=True):
         assert (got.offsets == given.offsets).all() and (got.bounces == given.bounces).all()
         assert (got.mixed == given.mixed).all() and (np.isnan(got.depth_m) == np.isnan(given.depth_m)).all()
-        for name in ("path_near_m", "path_far_m"):
-            assert getattr(got, name) == pytest.approx(getattr(given, name), abs=0.51 * PATH_STEP_M)
+        centre, expected = ((v.path_near_m.astype(float) + v.path_far_m) / 2 for v in (got, given))
+        assert centre == pytest.approx(expected, abs=0.51 * PATH_STEP_M)
+        width, expected = (v.path_far_m.astype(float) - v.path_near_m for v in (got, given))
+        assert width == pytest.approx(expected, abs=0.51 * WIDTH_STEP_M)
         assert got.radiance == pytest.approx(given.radiance, rel=2 ** (0.51 / RADIANCE_STEPS) - 1)
         assert got.depth_m == pytest.approx(given.depth_m, abs=0.51 * DEPTH_STEP_M, nan_ok=True)
         assert got.ambient == pytest.approx(given.ambient, rel=2 ** (0.51 / AMBIENT_STEPS) - 1)
@@ -73,7 +86,7 @@ def test_rounding_changes_little_and_only_once():
     once = rounded(VIEWS[0])
     assert rounded(once).sha256() == once.sha256()
     assert once.radiance == pytest.approx(VIEWS[0].radiance, rel=2**-11)
-    assert once.path_near_m == pytest.approx(VIEWS[0].path_near_m, abs=0.51 * PATH_STEP_M)
+    assert once.path_near_m == pytest.approx(VIEWS[0].path_near_m, abs=0.51 * PATH_STEP_M / FINER)
 
 
 def test_a_pack_is_read_without_renderer_exr_or_command_line(packed):
@@ -90,8 +103,12 @@ def test_damage_is_refused_in_one_line(packed, tmp_path):
         with pytest.raises(InputError, match=r"^[^\n]*cut\.h5[^\n]*$"):
             read_pack(tmp_path / "cut.h5")
     with h5py.File(packed, "r+") as file:
-        file["radiance"][3] += 1
+        file["first radiance"][3] += 1
     with pytest.raises(InputError, match="SHA-256"):
+        read_pack(packed)
+    with h5py.File(packed, "r+") as file:
+        file.attrs[ATTRIBUTE] = file.attrs[ATTRIBUTE].replace('"schema": 2', '"schema": 1')
+    with pytest.raises(InputError, match="pack of schema 1, this program reads 2"):
         read_pack(packed)
     with pytest.raises(InputError, match="not found"):
         read_pack(tmp_path / "none.h5")

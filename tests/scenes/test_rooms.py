@@ -1,5 +1,6 @@
 """Rooms: closed, furnished, varied, the same bytes for the same number, depths of an indoor data set."""
 
+import itertools
 from functools import cache
 
 import numpy as np
@@ -7,13 +8,14 @@ import pytest
 
 from scenes import InputError, Scene, Texture
 from scenes.catalog import load_scene
+from scenes.layout import Boxes, set_down
 from scenes.model import Material
-from scenes.parts import joined, panel
+from scenes.parts import Piece, box, joined, panel
 from scenes.patterns import on_one_sheet
-from scenes.rooms import pieces, room_view
+from scenes.rooms import VIEWS_PER_ROOM, _room, pieces, room_view
 from scenes.sets import scene_set
 
-VIEWS = range(4)
+VIEWS = (0, 5, 10, 15)  # of four rooms
 
 
 @cache
@@ -34,6 +36,43 @@ def test_equal_numbers_give_equal_bytes_and_others_other_rooms():
     digests = {view(i).digest() for i in VIEWS} | {view(i, "val").digest() for i in VIEWS}
     assert len(digests) == 2 * len(VIEWS)
     assert room_view(3, seed=1, width=32, height=24).digest() != view(3).digest()
+
+
+def test_a_room_is_seen_by_cameras_that_differ_clearly():
+    """Its surfaces are the same objects; any two cameras are half a metre and 30 degrees apart."""
+    chosen = scene_set("rooms")
+    for room in range(3):
+        numbers = range(room * VIEWS_PER_ROOM, (room + 1) * VIEWS_PER_ROOM)
+        views = [chosen.view(i, width=16, height=12) for i in numbers]
+        assert len({chosen.place(i) for i in numbers}) == 1 and len({v.digest() for v in views}) == len(views)
+        for a, b in itertools.combinations(views, 2):
+            assert a.surfaces is b.surfaces
+            assert np.linalg.norm(a.camera.origin - b.camera.origin) > 0.5
+            assert a.camera.rotation[:, 2] @ b.camera.rotation[:, 2] < np.cos(np.radians(30))
+    assert chosen.place(0) != chosen.place(VIEWS_PER_ROOM) and chosen.views_per_place == VIEWS_PER_ROOM
+    assert scene_set("rooms/val").place(0) != chosen.place(0)
+
+
+def test_a_view_does_not_depend_on_what_was_made_before():
+    _room.cache_clear()
+    alone = room_view(6, width=16, height=12).digest()
+    for i in (0, 9, 13):
+        room_view(i, width=16, height=12)
+    assert room_view(6, width=16, height=12).digest() == alone
+
+
+def test_boxes_are_hit_where_rays_enter_them():
+    """Slabs against the closed form: a turned square box ahead, beside, above, and around the origin."""
+    place = set_down(Piece((joined("box", Material(), box((-1, 0, -1), (1, 2, 1))),)), 0, 5, turn_deg=45)
+    boxes = Boxes([place])
+    rays = np.array([(0, 0, 1), (1, 0, 0), (0, 1, 0), (0.1, 0, 1)], float)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    distance = boxes.distance(np.array((0, 1.0, 0)), rays)[:, 0]
+    edge = 5 - np.sqrt(2)
+    # the side from (0, edge) to (sqrt 2, 5) is x - z = -edge
+    assert distance == pytest.approx([edge, np.inf, np.inf, edge / 0.9 * np.hypot(0.1, 1)])
+    inside = boxes.distance(np.array((0, 1.0, 5.0)), rays)[:, 0]
+    assert inside[:3] == pytest.approx([np.sqrt(2), np.sqrt(2), 1])
 
 
 @pytest.mark.parametrize("index", VIEWS)
