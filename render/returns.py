@@ -52,15 +52,15 @@ def merge(samples: Samples, tolerance_m: float) -> Samples:
 
     Cells are `tolerance_m` wide. Energy, centroid and variance of the path length are kept: the merged sample is
     uniform over centroid +- sqrt(3 variance), where one uniform over c +- h has variance h^2 / 3, and has the fewest
-    bounces of its parts. Samples without energy go; with a tolerance of 0 that is all. The sums run over a stable sort in float64, so that the result
-    depends on the samples' order alone.
+    bounces of its parts. Samples without energy go; with a tolerance of 0 that is all. The sums
+    run over a stable sort in float64, so that the result depends on the samples' order alone.
     """
     lit = samples.radiance > 0
     if not lit.all():
         samples = select(samples, lit)
     if len(samples.pixel) == 0 or tolerance_m == 0:
         return samples
-    cell = samples.path_m / tolerance_m
+    cell = samples.path_m.astype(np.float64) / tolerance_m
     cell = np.clip(np.floor(cell) + (1 << 27), 0, (1 << 28) - 1).astype(np.int64)
     key = (samples.pixel.astype(np.int64) << 1 | (samples.bounces > 1)) << 28 | cell
     order = np.argsort(key, kind="stable")

@@ -65,3 +65,11 @@ def test_returns_are_sorted_and_ragged():
 def test_no_samples_give_no_returns():
     empty = Samples(np.empty(0, int), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.uint8))
     assert to_returns(merge(empty, 0.01), 3).offsets.tolist() == [0, 0, 0, 0]
+
+
+def test_far_apart_in_float32_stays_apart():
+    # cells are counted from far below zero: in float32 that number would swallow the path
+    path = np.array([3.0, 3.05, 3.1, 900.0, 900.05])
+    one = packed(np.zeros(5, int), path, np.zeros(5), np.ones(5), np.ones(5, int))
+    assert merge(one, 0.01).path_m == pytest.approx(path, rel=1e-6)
+    assert len(merge(one, 0.5).path_m) == 2
