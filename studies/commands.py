@@ -371,9 +371,10 @@ class Ultraphase(Common):
 @dataclass(frozen=True, kw_only=True)
 class Study(Common):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
-    decoded from codes without a network, and the in-pixel processor's power (4, 5)."""
+    decoded from codes without a network, the in-pixel processor's power (4, 5), and trained models on scenes moved
+    out of their training depths (1, 2, 3, 17)."""
 
-    name: Positional[Literal["tensors", "memory", "codes", "power"]]
+    name: Positional[Literal["tensors", "memory", "codes", "power", "depth-offset"]]
     """Which study."""
     checkpoints: tuple[Path, ...] = ()
     """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc)."""
@@ -385,7 +386,20 @@ class Study(Common):
     codes: int = 32
     """Number K of codes of --design."""
     full: bool = False
-    """--design is a full coding tensor instead of a separable one."""
+    """--design is a full coding tensor instead of a separable one; of `study depth-offset`, all 16 photon levels and
+    compressions of 32x to 256x."""
+    preset: Literal["smoke", "laptop", "paper"] = "laptop"
+    """Of `study depth-offset`: smoke trains two models for seconds and tests them on two small views; laptop and paper
+    say how models are trained with --retrain."""
+    models: Annotated[Path | None, _open("FOLDER")] = None
+    """Folder of runs of `train`, each under its model's name, looked in before the models that come with the package
+    (default: models in --out)."""
+    retrain: bool = False
+    """Train what is not finished in --models, and use no model that came with the package."""
+    set: Annotated[Path | None, _open("SET")] = None
+    """What --retrain trains on, as of `train` (default: 2,000 rooms, rendered into --out)."""
+    ship: bool = False
+    """Put the models found into the package in half precision, with configuration and training log."""
     scene: str = "tabletop/kitchen"
     """Scene of `study codes` (direct light alone, under a scanning laser) and `study power`, as `render` takes it."""
     width: int = 64
