@@ -16,6 +16,7 @@ from scenes.errors import require
 from scenes.files import whole_file
 
 WEIGHTS = Path(__file__).parent / "weights"
+RUN_WEIGHTS = ("model", "last")  # files of a run; shipped ones have the models' names
 _BESIDE = {"log.csv": ".csv", "energy.csv": ".energy.csv"}
 
 
@@ -49,5 +50,4 @@ def ship(run: Path, name: str, folder: Path = WEIGHTS) -> Path:
 
 def beside(checkpoint: Path, kind: str) -> Path:
     """`log.csv` or `energy.csv` of a checkpoint, in its run's folder or as shipped; it need not exist."""
-    in_run = checkpoint.stem in ("model", "last")
-    return checkpoint.with_name(kind if in_run else f"{checkpoint.stem}{_BESIDE[kind]}")
+    return checkpoint.with_name(kind if checkpoint.stem in RUN_WEIGHTS else f"{checkpoint.stem}{_BESIDE[kind]}")

@@ -18,6 +18,7 @@ from typing import Any
 from csph.evaluation import Row, as_dicts
 from csph.metrics import PHOTON_LEVELS
 from csph.model import DepthModel, weights_sha256
+from csph.shipped import WEIGHTS
 from render.engine import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv
@@ -161,7 +162,7 @@ class Session:
 def run(command: Study, progress: Progress) -> dict:
     """Find or train the models, measure, draw; figures, two tables and one JSON of all numbers in `command.out`."""
     plan, folder = plan_of(command.preset, command.full), command.out / command.preset
-    library = Library(command.models or folder / "models", shipped=not command.retrain)
+    library = Library(command.models or folder / "models", None if command.retrain else WEIGHTS)
     training = command.set or Path(PLANES)
     if command.retrain or command.preset == "smoke":
         if command.set is None and command.preset != "smoke":

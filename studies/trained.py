@@ -16,7 +16,7 @@ import torch
 from csph.config import ModelConfig, TrainConfig
 from csph.design import Design
 from csph.model import DepthModel, load_model, weights_sha256
-from csph.shipped import WEIGHTS, beside, ship, shipped_file
+from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, ship, shipped_file
 from render.engine import Progress
 from scenes.errors import InputError, require
 from studies.commands import Train
@@ -114,7 +114,7 @@ class Trained:
 
     @property
     def shipped(self) -> bool:
-        return self.path.parent == WEIGHTS
+        return self.path.stem not in RUN_WEIGHTS
 
     def table(self, kind: str) -> list[dict[str, float]]:
         """`log.csv` or `energy.csv` of its training; empty where there is none."""
@@ -164,23 +164,23 @@ def _sensor(model: ModelConfig) -> str:
 
 @dataclass(frozen=True)
 class Library:
-    """Where models are looked for: `folder/NAME` as `train --out` fills it, then those that come with the package."""
+    """Where models are looked for: `folder/NAME` as `train --out` fills it, then among those that come with the package
+    (`shipped`; None: not there)."""
 
     folder: Path
-    shipped: bool = True
+    shipped: Path | None = WEIGHTS
 
     def find(self, wanted: Wanted) -> Trained | None:
         """The model if it is there and its training came to its end. Raises InputError for another under its name."""
-        run, packaged = self.folder / wanted.name / "model.safetensors", shipped_file(wanted.name)
+        run = self.folder / wanted.name / "model.safetensors"
         if run.is_file():
             found = _loaded(wanted, run)
             if _finished(found):
                 return found
             log.warning("%s: its training has not come to its end; left out", run.parent)
             return None
-        if self.shipped and packaged.is_file():
-            return _loaded(wanted, packaged)
-        return None
+        packaged = None if self.shipped is None else shipped_file(wanted.name, self.shipped)
+        return _loaded(wanted, packaged) if packaged is not None and packaged.is_file() else None
 
     def gather(self, wanted: Sequence[Wanted]) -> dict[Wanted, Trained]:
         """Those that are there, in the order asked for."""
@@ -220,9 +220,9 @@ def _finished(found: Trained) -> bool:
     return bool(rows) and rows[-1]["step"] >= found.config.steps
 
 
-def ship_all(models: Sequence[Trained]) -> list[str]:
+def ship_all(models: Sequence[Trained], folder: Path = WEIGHTS) -> list[str]:
     """Put models into the package in half precision; those that came from there stay. Returns the files."""
-    return [str(ship(one.path.parent, one.wanted.name)) for one in models if not one.shipped]
+    return [str(ship(one.path.parent, one.wanted.name, folder)) for one in models if not one.shipped]
 
 
 def refuse_none(found: dict[Wanted, Trained], wanted: Sequence[Wanted], folder: Path) -> None:
