@@ -271,10 +271,9 @@ def _relief(study: Session) -> list[dict]:
 
 
 def _reach_m(models: Iterable[Trained]) -> float | None:
-    """The 99.9 % training depth that models were trained with, where they tell it."""
-    told = {float(t.config.data["training_reach_m"]) for t in models if "training_reach_m" in t.config.data}
-    require(len(told) <= 1, f"models trained on sets of different depths are compared: {sorted(told)} m")
-    return told.pop() if told else None
+    """The 99.9 % depth of the models' training sets, the largest of them, where they tell it."""
+    told = [float(t.config.data["training_reach_m"]) for t in models if "training_reach_m" in t.config.data]
+    return max(told, default=None)
 
 
 def _sweep(study: Session, base: TestSet) -> dict[str, Any]:
