@@ -25,6 +25,7 @@ from scenes.files import whole_file, write_csv
 from studies import depth_offset_figures as figures
 from studies import depth_offset_tables as tables
 from studies import published
+from studies.cli import finite
 from studies.commands import Study
 from studies.store import Store
 from studies.testsets import TestSet, depth_map, evaluated, rendered, rooms
@@ -182,20 +183,23 @@ def run(command: Study, progress: Progress) -> dict:
         "absent": [one.name for one in absent],
         **numbers,
     }
-    table = write_csv(study.rows, command.out / "depth-offset.csv")
-    summary = write_csv(numbers["summary"], command.out / "depth-offset-summary.csv")
+    written = {"": study.rows, "-summary": numbers["summary"], "-published": numbers["published"]}
+    made = [write_csv(rows, command.out / f"depth-offset{name}.csv") for name, rows in written.items() if rows]
     with whole_file(command.out / "depth-offset.json") as beside:
-        beside.write_text(json.dumps(numbers, indent=1) + "\n")
+        beside.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
     shown = numbers if command.json else _told(numbers)
-    files = {"figures": [str(path) for path in drawn], "csv": [str(table), str(summary)]}
+    files = {"figures": [str(path) for path in drawn], "csv": [str(path) for path in made]}
     return {**shown, **files, "numbers": str(command.out / "depth-offset.json"), "shipped": shipped}
 
 
 def _alike(found: Iterable[Trained]) -> None:
     """Say so where models are compared that were not trained alike."""
-    kinds = {(t.config.preset, t.config.steps, t.config.model.network) for t in found}
+    kinds = set()
+    for one in found:
+        config, on = one.config, str(one.config.data.get("training_sha256", "unknown"))[:8]
+        kinds.add(f"{config.preset}, {config.steps} steps, {config.model.network} network, set {on}")
     if len(kinds) > 1:
-        told = "; ".join(f"{preset}, {steps} steps, {network} network" for preset, steps, network in sorted(kinds))
+        told = "; ".join(sorted(kinds))
         log.warning("models of different trainings are compared: %s", told)
 
 
@@ -385,11 +389,8 @@ def _depth_images(
     drawn = []
     levels = [level for level in SHOWN_LEVELS if level in study.plan.levels]
     for ratio in study.plan.compressions:
-        mine = [
-            w
-            for w in study.plan.headline
-            if w.seed == 0 and w in study.models and (w.compression == ratio or not w.coded)
-        ]
+        mine = [w for w in study.plan.headline if w.seed == 0 and w in study.models]
+        mine = sorted((w for w in mine if w.compression == ratio or not w.coded), key=lambda w: w.coded)
         if not any(w.coded for w in mine):
             continue
         lines = []
@@ -419,5 +420,21 @@ def _told(numbers: dict[str, Any]) -> dict[str, list[str]]:
         f"{c['label']}: {'no break' if c['breaks_at_m'] is None else format(c['breaks_at_m'], '.1f') + ' m'}"
         for c in numbers["sweep"]["curves"]
     ]
+    beside = [
+        f"{p['model']}, {p['of']}: {p['near_mae_mm_label']:.1f} mm ({_number(p['near_published_mae_mm'])} published), "
+        f"+7 m {p['far_mae_mm_label']:.1f} mm ({_number(p['far_published_mae_mm'])} published)"
+        for p in numbers["published"]
+    ]
     absent = numbers["absent"] or ["none"]
-    return {"bars": bars, "ratios": ratios, "code_energy": energy, "breaks": breaks, "absent": absent}
+    return {
+        "published": beside or ["left out"],
+        "bars": bars,
+        "ratios": ratios,
+        "code_energy": energy,
+        "breaks": breaks,
+        "absent": absent,
+    }
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.1f}"

@@ -125,9 +125,9 @@ def depth_images(
         bar = figure.colorbar(shown, ax=row[-1], fraction=0.06, pad=0.03)
         bar.set_label("depth [m]", fontsize=7)
         bar.ax.tick_params(labelsize=7)
-    figure.suptitle(
-        f"Depth at {compression}x: scenes as they are and 7 m farther in time; [signal, background] photons"
-    )
+    gap = "\n" if len(designs) < 3 else ", "
+    told = f"Depth at {compression}x: as it is{gap}and 7 m farther in time{gap}[signal, background] photons"
+    figure.suptitle(told, fontsize=11)
     return save(figure, path)
 
 
@@ -148,7 +148,8 @@ def sweep(found: dict, path: Path) -> Path:
     panel.set_xlim(found["offsets_m"][0] - 0.2, found["offsets_m"][-1] + 0.2)
     levels = ", ".join(f"[{signal:g}, {background:g}]" for signal, background in found["levels"])
     panel.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
-    panel.set_title(f"Error against offset, 128x, seed 0, {found['scenes']} scenes, photons {levels}", fontsize=10)
+    scenes = f"{found['scenes']} scene{'s' if found['scenes'] != 1 else ''}"
+    panel.set_title(f"Error against offset, 128x, seed 0, {scenes}, photons {levels}", fontsize=10)
     panel.grid(alpha=0.3, which="both")
     panel.legend(fontsize=8)
     return save(figure, path)
@@ -156,15 +157,21 @@ def sweep(found: dict, path: Path) -> Path:
 
 def bars_of(cure: Sequence[dict], swap: Sequence[dict], offset_m: float, path: Path) -> Path:
     """Left, cures: random time offsets in training, and short blocks. Right, the cause: codes and networks swapped."""
-    figure, axes = plt.subplots(1, 2, figsize=(14, 5.2), layout="constrained", sharey=True)
-    _pairs(axes[0], [row["model"].removesuffix("-s0").replace("-128x", "") for row in cure], cure, offset_m)
-    axes[0].set_title("the bias and two cures (t8: trained with time offsets to 8 m)", fontsize=10)
-    names = [f"{r['design'].split(' ')[-1]}\ncodes {r['codes']}\nnetwork {r['network']}" for r in swap]
+    widths = [max(len(rows), 1) for rows in (cure, swap)]
+    figure, axes = plt.subplots(1, 2, figsize=(14, 5.5), layout="constrained", sharey=True, width_ratios=widths)
+    names = [row["model"].removesuffix("-s0").replace("-128x", "").replace("learned-", "") for row in cure]
+    _pairs(axes[0], names, cure, offset_m)
+    axes[0].set_title("the bias and two cures", fontsize=10)
+    short = {"biased": "b", "unbiased": "t8"}
+    names = [f"{r['design'].split(' ')[-1]}\n{short[r['codes']]} codes\n{short[r['network']]} network" for r in swap]
     _pairs(axes[1], names, swap, offset_m)
-    axes[1].set_title("biased: as published; unbiased: t8", fontsize=10)
+    axes[1].set_title("codes before another model's network", fontsize=10)
     axes[0].set_ylabel("mean absolute depth error [mm]")
+    axes[0].set_ylim(None, 3 * axes[0].get_ylim()[1])
+    axes[0].legend(fontsize=8, loc="upper left", ncols=2)
     levels = ", ".join(f"[{signal:g}, {background:g}]" for signal, background in cure[0]["levels"])
-    figure.suptitle(f"Cure and cause at 128x, seed 0, photons {levels}")
+    told = "b: biased, trained as published; t8: trained with random time offsets to 8 m"
+    figure.suptitle(f"Cure and cause at 128x, seed 0, photons {levels}; {told}", fontsize=11)
     return save(figure, path)
 
 
@@ -176,7 +183,6 @@ def _pairs(panel: Axes, names: Sequence[str], rows: Sequence[dict], offset_m: fl
     panel.set_xticks(at, names, fontsize=7.5)
     panel.set_yscale("log")
     panel.grid(alpha=0.3, axis="y")
-    panel.legend(fontsize=8)
 
 
 def energy(models: Mapping[Wanted, Trained], ratios: Sequence[dict], path: Path) -> Path:
@@ -216,7 +222,9 @@ def energy(models: Mapping[Wanted, Trained], ratios: Sequence[dict], path: Path)
         title="circles 128x, squares 64x; dashed: time offsets; every seed",
         title_fontsize=8,
     )
-    figure.suptitle("Energy of learned codes over time bins while they are trained (white line: 99.9 % training depth)")
+    figure.suptitle(
+        "Energy of learned codes over time bins in training\n(white line: 99.9 % training depth)", fontsize=11
+    )
     return save(figure, path)
 
 
