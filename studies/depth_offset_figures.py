@@ -197,7 +197,7 @@ def energy(models: Mapping[Wanted, Trained], ratios: Sequence[dict], path: Path)
     top = max(float(histories[w][1].max()) for w in shown)
     for panel, one in zip(panels, shown, strict=True):
         picture = _heat(panel, *histories[one], models[one].config.model.sensor, top)
-        panel.axvline(reach, color="white", ls="--", lw=1)
+        panel.axvline(reach, color="cyan", ls="--", lw=1.2)
         panel.set_title(one.label.replace(", ", ",\n"), fontsize=9)
         panel.set_xlabel("depth of the time bin [m]")
     panels[0].set_ylabel("training step")
@@ -223,7 +223,7 @@ def energy(models: Mapping[Wanted, Trained], ratios: Sequence[dict], path: Path)
         title_fontsize=8,
     )
     figure.suptitle(
-        "Energy of learned codes over time bins in training\n(white line: 99.9 % training depth)", fontsize=11
+        "Energy of learned codes over time bins in training\n(dashed: 99.9 % training depth)", fontsize=11
     )
     return save(figure, path)
 
