@@ -16,9 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from csph.evaluation import Row, as_dicts
-from csph.metrics import PHOTON_LEVELS
 from csph.model import DepthModel, weights_sha256
-from csph.shipped import WEIGHTS
 from render.engine import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv
@@ -27,93 +25,13 @@ from studies import depth_offset_tables as tables
 from studies import published
 from studies.cli import finite
 from studies.commands import Study
+from studies.depth_offset_plan import OFFSET_M, RELIEF, SHOWN_LEVELS, SHOWN_VIEWS, TEST_SET, Level, Plan, plan_of
+from studies.obtained import obtain
 from studies.store import Store
-from studies.testsets import TestSet, depth_map, evaluated, rendered, rooms
-from studies.trained import Library, Subject, Trained, Wanted, refuse_none, ship_all
-from studies.training import PLANES
+from studies.testsets import TestSet, depth_map, evaluated, rendered
+from studies.trained import Subject, Trained, Wanted, ship_all
 
 log = logging.getLogger("scene2spad")
-
-OFFSET_M = 7.0
-CURE_M = 8.0  # random time offsets that move training depths over the whole range
-TEST_SET, RELIEF = "tabletop", "middlebury"
-LONG = (("learned", (1024, 1, 1)), ("learned", (1024, 4, 4)))
-DESIGNS = (("fourier", (1024, 1, 1)), *LONG, ("learned", (256, 4, 4)))
-SHOWN_VIEWS, SHOWN_LEVELS = (0, 1), ((10.0, 10.0), (10.0, 200.0))  # of Figure 3
-
-Level = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How much is run. `compressions` and `seeds` (at 128x; one elsewhere) decide the models; None views are all.
-
-    Beside the headline, which takes every model and level: `space_levels` of ray and rigid offsets, `relief_levels` of
-    the reliefs, `pair_levels` of the photographs, each with seed 0 alone.
-    """
-
-    compressions: tuple[int, ...] = (64, 128)
-    seeds: int = 3
-    designs: tuple[tuple[str, tuple[int, int, int]], ...] = DESIGNS
-    baselines: tuple[str, ...] = ("none", "peak")
-    cures: tuple[tuple[str, tuple[int, int, int]], ...] = LONG
-    levels: tuple[Level, ...] = tables.RATIO_LEVELS
-    views: int | None = None
-    size: tuple[int, int] | None = None
-    sweep_m: tuple[float, ...] = tuple(i / 2 for i in range(17))
-    sweep_levels: tuple[Level, ...] = SHOWN_LEVELS[:1]
-    sweep_views: int | None = 3
-    space_levels: tuple[Level, ...] = SHOWN_LEVELS[:1]
-    relief: bool = True
-    relief_levels: tuple[Level, ...] = SHOWN_LEVELS
-    pairs: int | None = None
-    pair_levels: tuple[Level, ...] = SHOWN_LEVELS
-
-    @property
-    def headline(self) -> tuple[Wanted, ...]:
-        """Every design at every compression and seed, then the lines without codes."""
-        coded = [
-            Wanted(design, block, ratio, seed)
-            for ratio in self.compressions
-            for design, block in self.designs
-            for seed in range(self.seeds if ratio == 128 else 1)
-        ]
-        return (*coded, *(Wanted(design) for design in self.baselines))
-
-    @property
-    def cured(self) -> tuple[Wanted, ...]:
-        return tuple(Wanted(design, block, 128, time_offset_m=CURE_M) for design, block in self.cures)
-
-    @property
-    def wanted(self) -> tuple[Wanted, ...]:
-        return (*self.headline, *self.cured)
-
-
-SMOKE = Plan(
-    compressions=(128,),
-    seeds=1,
-    designs=LONG[:1],
-    baselines=(),
-    cures=LONG[:1],
-    levels=SHOWN_LEVELS,
-    views=2,
-    size=(24, 20),
-    sweep_m=(0.0, 4.0, 8.0),
-    sweep_views=1,
-    relief=False,
-    pairs=1,
-    pair_levels=SHOWN_LEVELS[:1],
-)
-
-
-def plan_of(preset: str, full: bool) -> Plan:
-    """The plan of a preset; `full`: all 16 levels, 32x and 256x too, and the whole test set in the sweep."""
-    if preset == "smoke":
-        return SMOKE
-    if not full:
-        return Plan()
-    more = dict.fromkeys(("levels", "relief_levels", "pair_levels"), PHOTON_LEVELS)
-    return Plan(compressions=(32, 64, 128, 256), sweep_levels=SHOWN_LEVELS, sweep_views=None, **more)
 
 
 @dataclass
@@ -161,28 +79,13 @@ class Session:
 
 
 def run(command: Study, progress: Progress) -> dict:
-    """Find or train the models, measure, draw; figures, two tables and one JSON of all numbers in `command.out`."""
+    """Find or train the models, measure, draw; figures, tables and one JSON of all numbers in `command.out`."""
     plan, folder = plan_of(command.preset, command.full), command.out / command.preset
-    library = Library(command.models or folder / "models", None if command.retrain else WEIGHTS)
-    training = command.set or Path(PLANES)
-    if command.retrain or command.preset == "smoke":
-        if command.set is None and command.preset != "smoke":
-            training = rooms(folder / "sets", progress)
-        library.train(plan.wanted, command.preset, training, progress)
-    found = library.gather(plan.wanted)
-    refuse_none(found, plan.wanted, library.folder)
-    absent = [one for one in plan.wanted if one not in found]
-    for one in absent:
-        log.warning("absent: %s; made by: %s", one.name, one.spelled(command.preset, training, library.folder))
-    _alike(found.values())
-    shipped = ship_all([*found.values()]) if command.ship else []
-    study = Session(plan, found, Store(folder / "results"), folder / "sets", command.seed, progress)
+    models = obtain(plan.wanted, command, progress)
+    shipped = ship_all([*models.found.values()]) if command.ship else []
+    study = Session(plan, models.found, Store(folder / "results"), folder / "sets", command.seed, progress)
     numbers, drawn = _measured_and_drawn(study, command.out)
-    numbers = {
-        "models": [one.described() for one in found.values()],
-        "absent": [one.name for one in absent],
-        **numbers,
-    }
+    numbers = {**models.described(), **numbers}
     written = {"": study.rows, "-summary": numbers["summary"], "-published": numbers["published"]}
     made = [write_csv(rows, command.out / f"depth-offset{name}.csv") for name, rows in written.items() if rows]
     with whole_file(command.out / "depth-offset.json") as beside:
@@ -190,17 +93,6 @@ def run(command: Study, progress: Progress) -> dict:
     shown = numbers if command.json else _told(numbers)
     files = {"figures": [str(path) for path in drawn], "csv": [str(path) for path in made]}
     return {**shown, **files, "numbers": str(command.out / "depth-offset.json"), "shipped": shipped}
-
-
-def _alike(found: Iterable[Trained]) -> None:
-    """Say so where models are compared that were not trained alike."""
-    kinds = set()
-    for one in found:
-        config, on = one.config, str(one.config.data.get("training_sha256", "unknown"))[:8]
-        kinds.add(f"{config.preset}, {config.steps} steps, {config.model.network} network, set {on}")
-    if len(kinds) > 1:
-        told = "; ".join(sorted(kinds))
-        log.warning("models of different trainings are compared: %s", told)
 
 
 def _measured_and_drawn(study: Session, out: Path) -> tuple[dict[str, Any], list[Path]]:

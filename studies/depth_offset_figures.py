@@ -222,9 +222,7 @@ def energy(models: Mapping[Wanted, Trained], ratios: Sequence[dict], path: Path)
         title="circles 128x, squares 64x; dashed: time offsets; every seed",
         title_fontsize=8,
     )
-    figure.suptitle(
-        "Energy of learned codes over time bins in training\n(dashed: 99.9 % training depth)", fontsize=11
-    )
+    figure.suptitle("Energy of learned codes over time bins in training\n(dashed: 99.9 % training depth)", fontsize=11)
     return save(figure, path)
 
 

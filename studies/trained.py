@@ -18,7 +18,7 @@ from csph.design import Design
 from csph.model import DepthModel, load_model, weights_sha256
 from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, ship, shipped_file
 from render.engine import Progress
-from scenes.errors import InputError, require
+from scenes.errors import require
 from studies.commands import Train
 from studies.training import config_of, run_train
 
@@ -223,11 +223,3 @@ def _finished(found: Trained) -> bool:
 def ship_all(models: Sequence[Trained], folder: Path = WEIGHTS) -> list[str]:
     """Put models into the package in half precision; those that came from there stay. Returns the files."""
     return [str(ship(one.path.parent, one.wanted.name, folder)) for one in models if not one.shipped]
-
-
-def refuse_none(found: dict[Wanted, Trained], wanted: Sequence[Wanted], folder: Path) -> None:
-    """InputError where no model at all was found."""
-    if not found:
-        raise InputError(
-            f"{folder}: holds none of the {len(wanted)} models, nor does the package; give --models FOLDER or --retrain"
-        )

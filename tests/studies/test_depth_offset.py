@@ -14,14 +14,14 @@ from csph.evaluation import Row
 from spad.detect import sense
 from spad.rgbd import from_rgbd, published_taps
 from spad.sensor import PhotonBudget, Sensor
-from studies import depth_offset as study
+from studies import depth_offset_plan as plans
 from studies import depth_offset_tables as tables
 from studies import published
 from studies.cli import main
 from studies.planes import random_planes
 from studies.store import Store
 from studies.testsets import TestSet, evaluated
-from studies.trained import Subject, Wanted
+from studies.trained import Library, Subject, Wanted
 
 SENSOR = Sensor()
 
@@ -46,18 +46,18 @@ def row(name: str, mae: float, level=(10.0, 10.0), scene="a", group="all") -> Ro
 
 
 def test_plans_ask_for_the_models_that_the_bars_need():
-    headline = study.Plan().headline
+    headline = plans.Plan().headline
     for design, block in tables.BARS:
         mine = [w for w in headline if (w.design, w.block) == (design, block)]
         assert sorted((w.compression, w.seed) for w in mine) == [(64, 0), (128, 0), (128, 1), (128, 2)]
-    assert len({w.name for w in study.Plan().wanted}) == len(study.Plan().wanted) == 20
-    full = study.plan_of("laptop", True)
+    assert len({w.name for w in plans.Plan().wanted}) == len(plans.Plan().wanted) == 20
+    full = plans.plan_of("laptop", True)
     assert {w.compression for w in full.headline} == {32, 64, 128, 256} and len(full.levels) == 16
-    assert len(study.plan_of("smoke", False).wanted) == 2
+    assert len(plans.plan_of("smoke", False).wanted) == 2
 
 
 def test_bars_are_geometric_means_over_seeds_then_compressions():
-    wanted = [w for w in study.Plan().headline if w.block == (1024, 4, 4)]
+    wanted = [w for w in plans.Plan().headline if w.block == (1024, 4, 4)]
     ratios = {(64, 0): 2.0, (128, 0): 4.0, (128, 1): 8.0, (128, 2): 16.0}
     near = [row(w.name, 10.0) for w in wanted]
     far = [row(w.name, 10 * ratios[w.compression, w.seed]) for w in wanted]
@@ -197,7 +197,7 @@ def run(out: Path, *more: str) -> int:
 
 
 def test_no_model_and_bad_models_are_one_line(capfd, tmp_path, monkeypatch):
-    monkeypatch.setattr(study, "WEIGHTS", tmp_path)
+    monkeypatch.setattr("studies.obtained.WEIGHTS", tmp_path)
     assert main(["study", "depth-offset", "--out", str(tmp_path), "--models", str(tmp_path / "empty")]) == 2
     out, err = capfd.readouterr()
     assert out == "" and "holds none of the 20 models" in err.splitlines()[-1] and "Traceback" not in err
@@ -218,7 +218,7 @@ def test_interrupted_and_resumed_repeats_nothing(capfd, tmp_path, monkeypatch):
     }  # fmt: skip
 
     counts = {"put": 0, "stop": 0}
-    put, share = Store.put, study.Library.train
+    put, share = Store.put, Library.train
 
     def counted(self, *values, **key):
         counts["put"] += 1
@@ -232,9 +232,9 @@ def test_interrupted_and_resumed_repeats_nothing(capfd, tmp_path, monkeypatch):
 
     results = tmp_path / "whole/smoke/results"
     whole = sum(len(path.read_text().splitlines()) for path in results.glob("*.jsonl"))
-    monkeypatch.setattr(study.Library, "train", stopped)
+    monkeypatch.setattr(Library, "train", stopped)
     assert run(tmp_path / "cut") == 130
-    monkeypatch.setattr(study.Library, "train", share)
+    monkeypatch.setattr(Library, "train", share)
     monkeypatch.setattr(Store, "put", counted)
     for stop in (3, 8, whole):
         counts["stop"] = stop
