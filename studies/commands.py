@@ -368,13 +368,18 @@ class Ultraphase(Common):
     """Show every change of this region of one core's RAM, 100 at the most (run)."""
 
 
+ABLATIONS = ("spatial-block", "tensor-size", "fourier")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Study(Common):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
-    decoded from codes without a network, the in-pixel processor's power (4, 5), and trained models on scenes moved
-    out of their training depths (1, 2, 3, 17)."""
+    decoded from codes without a network, the in-pixel processor's power (4, 5); of trained models: scenes moved out of
+    their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12)."""
 
-    name: Positional[Literal["tensors", "memory", "codes", "power", "depth-offset"]]
+    name: Positional[
+        Literal["tensors", "memory", "codes", "power", "depth-offset", "spatial-block", "tensor-size", "fourier"]
+    ]
     """Which study."""
     checkpoints: tuple[Path, ...] = ()
     """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc)."""
@@ -386,10 +391,10 @@ class Study(Common):
     codes: int = 32
     """Number K of codes of --design."""
     full: bool = False
-    """--design is a full coding tensor instead of a separable one; of `study depth-offset`, all 16 photon levels and
-    compressions of 32x to 256x."""
+    """--design is a full coding tensor instead of a separable one; of studies of trained models, every compression of
+    the paper instead of 128x (depth-offset: 64x and 128x), of depth-offset all 16 photon levels too."""
     preset: Literal["smoke", "laptop", "paper"] = "laptop"
-    """Of `study depth-offset`: smoke trains two models for seconds and tests them on two small views; laptop and paper
+    """Of studies of trained models: smoke trains two for seconds and tests them on two small views; laptop and paper
     say how models are trained with --retrain."""
     models: Annotated[Path | None, _open("FOLDER")] = None
     """Folder of runs of `train`, each under its model's name, looked in before the models that come with the package

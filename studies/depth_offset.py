@@ -260,18 +260,10 @@ def _energies(study: Session) -> list[dict]:
 
 def _published(study: Session) -> list[dict]:
     """Our models on the Middlebury photographs in the published convention, beside what was published."""
-    photographs, missing = published.available(study.plan.pairs)
-    mine = [w for w in study.plan.headline if w.seed == 0 and w in study.models]
-    if missing:
-        log.warning("the published convention is left out: %s", missing)
-        return []
-    rows = []
-    for moved in (0.0, OFFSET_M):
-        options = {"seed": study.seed, "progress": study.progress}
-        rows += published.errors_of(
-            study.store, study.named(mine), photographs, study.plan.pair_levels, moved, **options
-        )
-    return tables.published_rows(rows, mine, OFFSET_M, len(study.plan.pair_levels))
+    plan = study.plan
+    mine = {w: study.models[w].subject for w in plan.headline if w.seed == 0 and w in study.models}
+    offsets, options = (0.0, OFFSET_M), {"seed": study.seed, "progress": study.progress}
+    return published.compared(study.store, mine, plan.pairs, plan.pair_levels, offsets, **options)
 
 
 def _depth_images(

@@ -12,7 +12,6 @@ from csph.codes import bin_energy, grouped_energy
 from csph.evaluation import LEVEL_GROUPS, Evaluation, Row
 from csph.layer import make_coding
 from spad.sensor import Sensor
-from studies.published import PUBLISHED, SCENES
 from studies.trained import Trained, Wanted
 
 # Decided before any model of the study was trained: the geometric mean over seeds and over 64x and 128x of
@@ -156,21 +155,3 @@ def break_m(offsets_m: Sequence[float], errors_mm: Sequence[float]) -> float | N
             share = (limit - errors_mm[i - 1]) / (errors_mm[i] - errors_mm[i - 1])
             return float(offsets_m[i - 1] + max(share, 0.0) * (offsets_m[i] - offsets_m[i - 1]))
     return None
-
-
-def published_rows(rows: Sequence[dict], wanted: Sequence[Wanted], offset_m: float, levels: int) -> list[dict]:
-    """Our models on the photographs beside what was published, near and far [mm]; `of`: how much of the test set."""
-    found = []
-    scenes = len({row["pair"] for row in rows})
-    for one in wanted:
-        printed = PUBLISHED.get((one.design, one.block, one.compression) if one.coded else (one.design, (1, 1, 1), 1))
-        line: dict[str, object] = {"model": one.name, "of": f"{scenes} of {SCENES} scenes, {levels} of 16 levels"}
-        for place, moved in (("near", 0.0), ("far", offset_m)):
-            mine = [row for row in rows if row["model"] == one.name and row["offset_m"] == moved]
-            for figure in ("mae_mm_label", "mae_mm_arrival", "rmse_mm_label"):
-                values = [row[figure] for row in mine]
-                line[f"{place}_{figure}"] = float(np.mean(values)) if values else math.nan
-            line[f"{place}_published_mae_mm"] = getattr(printed, f"{place}_mae", None)
-            line[f"{place}_published_rmse_mm"] = getattr(printed, f"{place}_rmse", None)
-        found.append(line)
-    return found

@@ -23,8 +23,8 @@ from studies.planes import random_planes
 DESIGN = Design("learned", (1024, 1, 1), 8)
 
 
-def run(folder, steps: int, **changes):
-    config = preset("smoke", ModelConfig(design=DESIGN), threads=1, steps_per_epoch=steps // 2, **changes)
+def run(folder, steps: int, design: Design = DESIGN):
+    config = preset("smoke", ModelConfig(design=design), threads=1, steps_per_epoch=steps // 2)
     train(config, *split_views(random_planes(12, size=16, seed=2)), folder)
     return folder
 
@@ -86,14 +86,13 @@ def test_shipping_forgets_where_the_set_lay(trained, tmp_path):
     assert b"somewhere" not in (tmp_path / "x.safetensors").read_bytes()
 
 
-@pytest.mark.slow
 def test_half_precision_changes_depths_by_far_less_than_they_err(tmp_path):
-    folder = run(tmp_path / "run", 160, batch=4, crop=16)
+    # Fourier codes decode to a few centimetres after a few steps; learned ones would take thousands
+    folder = run(tmp_path / "run", 8, Design("fourier", (1024, 1, 1), 16))
     float32, half = load_model(folder)[0], load_model(ship(folder, "half", tmp_path))[0]
-    histogram = sense(random_planes(1, size=32, seed=9).transients[0], Sensor(), PhotonBudget(10, 10), seed=1)
+    histogram = sense(random_planes(1, size=24, seed=9).transients[0], Sensor(), PhotonBudget(50, 10), seed=1)
     known = np.isfinite(histogram.depth_m)
     depths = [model.depth_of(histogram)[0][known] for model in (float32, half)]
-    errors = [np.abs(depth - histogram.depth_m[known]).mean() for depth in depths]
-    assert errors[0] < 2.0  # it has learned something: 3 to 5 m at the start
-    assert abs(errors[1] - errors[0]) < 0.01 * errors[0]
-    assert np.abs(depths[1] - depths[0]).mean() < 0.02 * errors[0]
+    errors_m = [np.abs(depth - histogram.depth_m[known]).mean() for depth in depths]
+    assert errors_m[0] < 0.2 and errors_m[1] == pytest.approx(errors_m[0], rel=0.01)
+    assert 0 < np.abs(depths[1] - depths[0]).mean() < 0.02 * errors_m[0]
