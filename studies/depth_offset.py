@@ -51,8 +51,15 @@ class Session:
         return [self.models[one].subject for one in wanted if one in self.models]
 
     def one_seed(self) -> list[Wanted]:
-        """Seed 0 of every design at 128x, and the lines without codes."""
-        return [w for w in self.plan.headline if w.seed == 0 and w.compression == 128]
+        """Seed 0 of every design at 128x."""
+        return [w for w in self.plan.headline if w.coded and w.seed == 0 and w.compression == 128]
+
+    @property
+    def reach_m(self) -> float | None:
+        """The 99.9 % depth of the training sets, the largest where they differ; None where no model tells it."""
+        data = [t.config.data for w, t in self.models.items() if not w.time_offset_m]
+        told = [float(d["training_reach_m"]) for d in data if "training_reach_m" in d]
+        return max(told, default=None)
 
     def measure(
         self,
@@ -119,6 +126,7 @@ def _measured_and_drawn(study: Session, out: Path) -> tuple[dict[str, Any], list
     }
     out.mkdir(parents=True, exist_ok=True)
     drawn = [
+        figures.every_seed(ratios, numbers["bars"], out / "depth-offset-ratios.png"),
         *figures.tensors([study.models[w] for w in here], plan.compressions, out),
         figures.against_compression(summary, plan.levels, OFFSET_M, out / "depth-offset-2.png"),
         *_depth_images(study, base, shown, near, far, out),
@@ -166,16 +174,10 @@ def _relief(study: Session) -> list[dict]:
     ]
 
 
-def _reach_m(models: Iterable[Trained]) -> float | None:
-    """The 99.9 % depth of the models' training sets, the largest of them, where they tell it."""
-    told = [float(t.config.data["training_reach_m"]) for t in models if "training_reach_m" in t.config.data]
-    return max(told, default=None)
-
-
 def _sweep(study: Session, base: TestSet) -> dict[str, Any]:
     """MAE [mm] against the offset, where each design breaks, and where its training depths ended."""
     plan, test = study.plan, base.first(study.plan.sweep_views)
-    mine = [w for w in (*study.one_seed(), *plan.cured) if w.design != "peak" and w in study.models]
+    mine = [w for w in (*study.one_seed(), Wanted("none"), *plan.cured) if w in study.models]
     rows = [study.measure("sweep", study.named(mine), test, plan.sweep_levels, metres) for metres in plan.sweep_m]
     curves = []
     for one in mine:
@@ -183,10 +185,12 @@ def _sweep(study: Session, base: TestSet) -> dict[str, Any]:
         broken = tables.break_m(plan.sweep_m, errors)
         curves.append({"model": one.name, "label": one.label, "mae_mm": errors, "breaks_at_m": broken})
     depth = sorted(float(d) for t in test.views.transients for d in t.depth_m.ravel() if d == d)
-    reach = _reach_m(study.models[w] for w in mine if not w.time_offset_m)
-    span = [depth[0], depth[len(depth) // 2], depth[-1]]
+    reach, span = study.reach_m, [depth[0], depth[len(depth) // 2], depth[-1]]
     told = {"levels": [list(level) for level in plan.sweep_levels], "scenes": len(test.views.scenes)}
-    return {"offsets_m": [*plan.sweep_m], "curves": curves, "training_reach_m": reach, "test_depths_m": span, **told}
+    # nearest, median and farthest pixel: the offset at which it leaves the training depths
+    leaves = None if reach is None else [reach - depth_m for depth_m in span]
+    ends = {"training_reach_m": reach, "test_depths_m": span, "leaves_training_at_m": leaves}
+    return {"offsets_m": [*plan.sweep_m], "curves": curves, **ends, **told}
 
 
 def _cure(study: Session, base: TestSet) -> list[dict]:
@@ -201,6 +205,7 @@ def _cure(study: Session, base: TestSet) -> list[dict]:
 
 def _near_and_far(study: Session, part: str, subjects: Sequence[Subject], base: TestSet) -> list[dict]:
     levels = [level for level in SHOWN_LEVELS if level in study.plan.levels]
+    levels = levels[:1] if part == "swap" else levels
     rows = [study.measure(part, subjects, base, levels, moved) for moved in (0.0, OFFSET_M)]
     return [
         {
@@ -244,7 +249,7 @@ def swapped(codes: Trained, network: Trained) -> Subject:
 
 def _energies(study: Session) -> list[dict]:
     """Energy of each long learned code beyond the training depths over that within, as trained and at its start."""
-    reach = _reach_m(t for w, t in study.models.items() if not w.time_offset_m)
+    reach = study.reach_m
     if reach is None:
         log.warning("the models do not tell their training depths: code energies are left out")
         return []
@@ -309,6 +314,10 @@ def _told(numbers: dict[str, Any]) -> dict[str, list[str]]:
         f"+7 m {p['far_mae_mm_label']:.1f} mm ({_number(p['far_published_mae_mm'])} published)"
         for p in numbers["published"]
     ]
+    leaves = numbers["sweep"]["leaves_training_at_m"]
+    if leaves is not None:
+        ends = "training depths end for the nearest, median and farthest pixel at {:.1f}, {:.1f} and {:.1f} m"
+        breaks.append(ends.format(*leaves))
     absent = numbers["absent"] or ["none"]
     return {
         "published": beside or ["left out"],
