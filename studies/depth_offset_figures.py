@@ -16,7 +16,7 @@ from csph.metrics import is_low_sbr
 from spad.sensor import Sensor
 from studies import tensors as tensor_figures
 from studies.depth_offset_tables import ENERGY_BAR, LEAST, boundary_bin, energy_history, energy_ratio
-from studies.figures import DEPTH_COLOURS, plt, save
+from studies.figures import DEPTH_COLOURS, plain_log, plt, save
 from studies.trained import Trained, Wanted
 
 # as in the paper: truncated Fourier blue, learned 1024 orange, 1024x4x4 green, 256x4x4 red
@@ -69,7 +69,7 @@ def every_seed(ratios: Sequence[dict], bars: Sequence[dict], path: Path) -> Path
             panel.annotate("≥" if bar["bar"].startswith(LEAST) else "<", (at + 0.42, limit), fontsize=9, va="center")
             panel.hlines(bar["geometric_mean"], at - 0.3, at + 0.3, color=colour_of(label), lw=2)
     panel.axhline(1, color="0.6", lw=0.8)
-    panel.set_yscale("log")
+    plain_log(panel)
     panel.set_xticks(range(len(labels)), [label.replace(" ", "\n", 1) for label in labels], fontsize=8.5)
     panel.set_ylabel("MAE 7 m farther in time / MAE as it is")
     told = (
@@ -102,7 +102,7 @@ def against_compression(
             place = f"{moved:g} m farther" if moved else "as it is"
             panel.set_title(f"{place}, {groups[group]}: {held}", fontsize=9)
             if figure_of == "mae_mm":
-                panel.set_yscale("log")
+                plain_log(panel)
         row[0].set_ylabel("mean absolute depth error [mm]")
         row[2].set_ylabel("share of pixels within 10 mm")
     for panel in axes[1]:
@@ -172,7 +172,7 @@ def sweep(found: dict, path: Path) -> Path:
         panel.axvline(reach - middle, color="0.5", lw=1, zorder=0)
         said = f"test depths leave the training's 99.9 % ({reach:.1f} m):\nband all pixels, line their median"
         panel.plot([], [], color="0.5", lw=1, label=said)
-    panel.set_yscale("log")
+    plain_log(panel)
     panel.set_xlim(found["offsets_m"][0] - 0.2, found["offsets_m"][-1] + 0.2)
     levels = ", ".join(f"[{signal:g}, {background:g}]" for signal, background in found["levels"])
     panel.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
@@ -195,7 +195,8 @@ def bars_of(cure: Sequence[dict], swap: Sequence[dict], offset_m: float, path: P
     _pairs(axes[1], names, swap, offset_m)
     axes[1].set_title("codes before another model's network", fontsize=10)
     axes[0].set_ylabel("mean absolute depth error [mm]")
-    axes[0].set_ylim(None, 3 * axes[0].get_ylim()[1])
+    low, high = axes[0].get_ylim()
+    axes[0].set_ylim(low / 2, 3 * high)
     axes[0].legend(fontsize=8, loc="upper left", ncols=2)
     levels = ", ".join(f"[{signal:g}, {background:g}]" for signal, background in cure[0]["levels"])
     told = "b: biased, trained as published; t8: trained with random time offsets to 8 m"
@@ -209,7 +210,7 @@ def _pairs(panel: Axes, names: Sequence[str], rows: Sequence[dict], offset_m: fl
         shown = panel.bar(at + shift, [row[key] for row in rows], 0.4, label=label)
         panel.bar_label(shown, fmt="{:,.0f}", fontsize=7)
     panel.set_xticks(at, names, fontsize=7.5)
-    panel.set_yscale("log")
+    plain_log(panel)
     panel.grid(alpha=0.3, axis="y")
 
 
@@ -239,7 +240,7 @@ def energy(models: Mapping[Wanted, Trained], ratios: Sequence[dict], path: Path)
         marker = MARKERS.get(one.compression, "^")
         axes.plot(steps, values, lw=1, marker=marker, ms=3, **style)
     axes.axhline(ENERGY_BAR, color="0.5", lw=1, ls=":")
-    axes.set_yscale("log")
+    plain_log(axes)
     axes.set(xlabel="training step", ylabel=f"energy per bin beyond {reach:.1f} m\nover that within")
     axes.grid(alpha=0.3, which="both")
     labels = {replace(w, seed=0, compression=128): w for w in models}
