@@ -12,11 +12,13 @@ import json
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from csph.evaluation import Row, as_dicts
 from csph.model import DepthModel, weights_sha256
+from csph.views import read_views, split_views
 from render.engine import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv
@@ -30,13 +32,15 @@ from studies.obtained import obtain
 from studies.store import Store
 from studies.testsets import TestSet, depth_map, evaluated, rendered
 from studies.trained import Subject, Trained, Wanted, ship_all
+from studies.training import training_reach_m
 
 log = logging.getLogger("scene2spad")
 
 
 @dataclass
 class Session:
-    """One run: what it stands on, and the rows that it has gathered so far."""
+    """One run: what it stands on, and the rows that it has gathered so far. `trained_on` is --set: where models do not
+    tell the depths of their training set, it does."""
 
     plan: Plan
     models: dict[Wanted, Trained]
@@ -44,6 +48,7 @@ class Session:
     sets: Path
     seed: int
     progress: Progress
+    trained_on: Path | None = None
     rows: list[dict] = field(default_factory=list)
 
     def named(self, wanted: Iterable[Wanted]) -> list[Subject]:
@@ -54,11 +59,13 @@ class Session:
         """Seed 0 of every design at 128x."""
         return [w for w in self.plan.headline if w.coded and w.seed == 0 and w.compression == 128]
 
-    @property
+    @cached_property
     def reach_m(self) -> float | None:
-        """The 99.9 % depth of the training sets, the largest where they differ; None where no model tells it."""
+        """The 99.9 % depth of the training sets, the largest where they differ; None where it is not told."""
         data = [t.config.data for w, t in self.models.items() if not w.time_offset_m]
         told = [float(d["training_reach_m"]) for d in data if "training_reach_m" in d]
+        if not told and self.trained_on is not None:
+            told = [training_reach_m(split_views(read_views(self.trained_on))[0])]
         return max(told, default=None)
 
     def measure(
@@ -90,7 +97,7 @@ def run(command: Study, progress: Progress) -> dict:
     plan, folder = plan_of(command.preset, command.full), command.out / command.preset
     models = obtain(plan.wanted, command, progress)
     shipped = ship_all([*models.found.values()]) if command.ship else []
-    study = Session(plan, models.found, Store(folder / "results"), folder / "sets", command.seed, progress)
+    study = Session(plan, models.found, Store(folder / "results"), folder / "sets", command.seed, progress, command.set)
     numbers, drawn = _measured_and_drawn(study, command.out)
     numbers = {**models.described(), **numbers}
     written = {"": study.rows, "-summary": numbers["summary"], "-published": numbers["published"]}
@@ -251,7 +258,7 @@ def _energies(study: Session) -> list[dict]:
     """Energy of each long learned code beyond the training depths over that within, as trained and at its start."""
     reach = study.reach_m
     if reach is None:
-        log.warning("the models do not tell their training depths: code energies are left out")
+        log.warning("the models do not tell their training depths: code energies are left out; --set SET would help")
         return []
     found = []
     for one, trained in study.models.items():

@@ -174,7 +174,7 @@ def sweep(found: dict, path: Path) -> Path:
         panel.plot([], [], color="0.5", lw=1, label=said)
     plain_log(panel)
     panel.set_xlim(found["offsets_m"][0] - 0.2, found["offsets_m"][-1] + 0.2)
-    levels = ", ".join(f"[{signal:g}, {background:g}]" for signal, background in found["levels"])
+    levels = _levels([found])
     panel.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
     scenes = f"{found['scenes']} scene{'s' if found['scenes'] != 1 else ''}"
     panel.set_title(f"Error against offset, 128x, seed 0, {scenes}, photons {levels}", fontsize=10)
@@ -189,19 +189,22 @@ def bars_of(cure: Sequence[dict], swap: Sequence[dict], offset_m: float, path: P
     figure, axes = plt.subplots(1, 2, figsize=(14, 5.5), layout="constrained", sharey=True, width_ratios=widths)
     names = [row["model"].removesuffix("-s0").replace("-128x", "").replace("learned-", "") for row in cure]
     _pairs(axes[0], names, cure, offset_m)
-    axes[0].set_title("the bias and two cures", fontsize=10)
+    axes[0].set_title(f"the bias and two cures, photons {_levels(cure)}", fontsize=10)
     short = {"biased": "b", "unbiased": "t8"}
     names = [f"{r['design'].split(' ')[-1]}\n{short[r['codes']]} codes\n{short[r['network']]} network" for r in swap]
     _pairs(axes[1], names, swap, offset_m)
-    axes[1].set_title("codes before another model's network", fontsize=10)
+    axes[1].set_title(f"codes before another model's network, photons {_levels(swap)}", fontsize=10)
     axes[0].set_ylabel("mean absolute depth error [mm]")
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(low / 2, 3 * high)
     axes[0].legend(fontsize=8, loc="upper left", ncols=2)
-    levels = ", ".join(f"[{signal:g}, {background:g}]" for signal, background in cure[0]["levels"])
     told = "b: biased, trained as published; t8: trained with random time offsets to 8 m"
-    figure.suptitle(f"Cure and cause at 128x, seed 0, photons {levels}; {told}", fontsize=11)
+    figure.suptitle(f"Cure and cause at 128x, seed 0; {told}", fontsize=11)
     return save(figure, path)
+
+
+def _levels(rows: Sequence[dict]) -> str:
+    return ", ".join(f"[{signal:g}, {background:g}]" for signal, background in (rows[0]["levels"] if rows else ()))
 
 
 def _pairs(panel: Axes, names: Sequence[str], rows: Sequence[dict], offset_m: float) -> None:
