@@ -32,7 +32,7 @@ from studies.obtained import obtain
 from studies.store import Store
 from studies.testsets import TestSet, depth_map, evaluated, rendered
 from studies.trained import Subject, Trained, Wanted, ship_all
-from studies.training import training_reach_m
+from studies.training import PLANES, training_reach_m
 
 log = logging.getLogger("scene2spad")
 
@@ -64,7 +64,7 @@ class Session:
         """The 99.9 % depth of the training sets, the largest where they differ; None where it is not told."""
         data = [t.config.data for w, t in self.models.items() if not w.time_offset_m]
         told = [float(d["training_reach_m"]) for d in data if "training_reach_m" in d]
-        if not told and self.trained_on is not None:
+        if not told and self.trained_on not in (None, Path(PLANES)):
             told = [training_reach_m(split_views(read_views(self.trained_on))[0])]
         return max(told, default=None)
 
@@ -98,6 +98,7 @@ def run(command: Study, progress: Progress) -> dict:
     models = obtain(plan.wanted, command, progress)
     shipped = ship_all([*models.found.values()]) if command.ship else []
     study = Session(plan, models.found, Store(folder / "results"), folder / "sets", command.seed, progress, command.set)
+    _ = study.reach_m  # a bad --set is told now, not after an hour
     numbers, drawn = _measured_and_drawn(study, command.out)
     numbers = {**models.described(), **numbers}
     written = {"": study.rows, "-summary": numbers["summary"], "-published": numbers["published"]}
@@ -136,7 +137,7 @@ def _measured_and_drawn(study: Session, out: Path) -> tuple[dict[str, Any], list
         figures.every_seed(ratios, numbers["bars"], out / "depth-offset-ratios.png"),
         *figures.tensors([study.models[w] for w in here], plan.compressions, out),
         figures.against_compression(summary, plan.levels, OFFSET_M, out / "depth-offset-2.png"),
-        *_depth_images(study, base, shown, near, far, out),
+        *_depth_images(study, base, shown, out),
     ]
     if numbers["sweep"]["curves"]:
         drawn.append(figures.sweep(numbers["sweep"], out / "depth-offset-sweep.png"))
@@ -278,9 +279,7 @@ def _published(study: Session) -> list[dict]:
     return published.compared(study.store, mine, plan.pairs, plan.pair_levels, offsets, **options)
 
 
-def _depth_images(
-    study: Session, base: TestSet, shown: Sequence[int], near: Sequence[Row], far: Sequence[Row], out: Path
-) -> list[Path]:
+def _depth_images(study: Session, base: TestSet, shown: Sequence[int], out: Path) -> list[Path]:
     """Figure 3 at each compression: truth and estimates, near and far."""
     drawn = []
     levels = [level for level in SHOWN_LEVELS if level in study.plan.levels]

@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from csph.evaluation import Row
+from render.pack import write_pack
 from spad.detect import sense
 from spad.rgbd import from_rgbd, published_taps
 from spad.sensor import PhotonBudget, Sensor
+from studies import depth_offset, published
 from studies import depth_offset_plan as plans
 from studies import depth_offset_tables as tables
-from studies import published
 from studies.cli import main
 from studies.planes import random_planes
 from studies.store import Store
@@ -208,6 +209,21 @@ def test_no_model_and_bad_models_are_one_line(capfd, tmp_path, monkeypatch):
     assert main(["study", "depth-offset", "--out", str(tmp_path), "--models", str(tmp_path / "empty")]) == 2
     out, err = capfd.readouterr()
     assert out == "" and "holds none of the 20 models" in err.splitlines()[-1] and "Traceback" not in err
+
+
+def test_training_depths_are_the_models_own_or_those_of_the_set_given(tmp_path):
+    packed = tmp_path / "planes.h5"
+    views = random_planes(4, size=16, seed=6)
+    write_pack(((t, {"scene": s}) for t, s in zip(views.transients, views.scenes, strict=True)), packed)
+    silent = SimpleNamespace(config=SimpleNamespace(data={}))
+    told = SimpleNamespace(config=SimpleNamespace(data={"training_reach_m": 6.5}))
+    options = (plans.SMOKE, Store(tmp_path / "r"), tmp_path, 0, None)
+    session = depth_offset.Session(options[0], {Wanted(): silent}, *options[1:], packed)
+    depth = np.concatenate([t.depth_m[np.isfinite(t.depth_m)] for t in views.transients[:3]])
+    assert session.reach_m == pytest.approx(float(np.quantile(depth, 0.999)), abs=0.5)
+    session = depth_offset.Session(options[0], {Wanted(): silent, Wanted(seed=1): told}, *options[1:], packed)
+    assert session.reach_m == 6.5
+    assert depth_offset.Session(options[0], {Wanted(): silent}, *options[1:]).reach_m is None
 
 
 @pytest.mark.slow
