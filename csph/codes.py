@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from spad.sensor import Sensor
 from spad.template import binned_pulse
 
 FIXED_CODES = ("fourier", "gray", "coarse", "hadamard", "random")
+GROUPS = 64  # of neighbouring time bins that `grouped_energy` tells apart
 BAND_LIMIT = 0.2  # of the pulse's spectrum at harmonic 1: what Gray Fourier keeps
 
 
@@ -121,3 +123,17 @@ def uniform_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
     """Uniform in +-1/sqrt(taps), float32: where learned factors begin; taps is the number of entries of one code."""
     generator = torch.Generator().manual_seed(seed)
     return (2 * torch.rand(shape, generator=generator) - 1) / math.sqrt(taps)
+
+
+def bin_energy(temporal: Tensor) -> np.ndarray:
+    """(Mt,) float64: mean over K (and pixels) of C~^2 in each time bin, C~ = C less its mean over time."""
+    code = temporal.detach().double().cpu()
+    code = code - code.mean(1, keepdim=True)
+    return code.square().transpose(0, 1).flatten(1).mean(1).numpy()
+
+
+def grouped_energy(temporal: Tensor) -> np.ndarray:
+    """`bin_energy` averaged over each of at most GROUPS groups of neighbouring bins."""
+    energy = bin_energy(temporal)
+    groups = next(n for n in range(min(GROUPS, len(energy)), 0, -1) if len(energy) % n == 0)
+    return energy.reshape(groups, -1).mean(1)

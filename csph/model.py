@@ -101,11 +101,15 @@ def weights_sha256(model: nn.Module) -> str:
     return _weights_sha256(model.state_dict())
 
 
-def save_model(model: DepthModel, config: TrainConfig, state: dict, path: Path) -> None:
-    """Weights as safetensors, whole or not at all; configuration and `state` (step, validation) in its header."""
+def save_model(model: DepthModel, config: TrainConfig, state: dict, path: Path, *, half: bool = False) -> None:
+    """Weights as safetensors, whole or not at all; configuration and `state` (step, validation) in its header.
+
+    `half` keeps them in float16, in half the space; `load_model` gives float32 again, 11 bits of each.
+    """
     from safetensors.torch import save
 
     weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
+    weights = {name: value.half() for name, value in weights.items()} if half else weights
     header = seal({"config": config.to_dict(), "state": state}, KIND, _weights_sha256(weights))
     with whole_file(path) as beside:
         beside.write_bytes(save(weights, {ATTRIBUTE: header}))

@@ -3,6 +3,7 @@
     config.json         every number of the run, written before its first step
     log.csv             one row an epoch: step, learning rate, training loss, validation RMSE and MAE
     model.safetensors   weights of the lowest validation RMSE, with the configuration in the header
+    energy.csv          energy of a learned temporal code by groups of time bins, now and then from the start on
     last.safetensors    weights after the last step
     resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
 
@@ -33,6 +34,7 @@ from csph.config import TrainConfig
 from csph.data import SetData
 from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
+from csph.snapshots import CodeEnergy
 from csph.views import Views, packed_sha256, packed_views
 from scenes.errors import require
 from scenes.files import whole_file, write_csv
@@ -161,7 +163,7 @@ def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
     runner = pl.Trainer(
         max_epochs=config.epochs,
         precision=config.precision,
-        callbacks=[record],
+        callbacks=[CodeEnergy(record.folder), record],
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,

@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
         print("interrupted; finished files stay, nothing is half-written", file=sys.stderr)
         return 130
     try:
-        print(json.dumps(_finite(result), allow_nan=False) if command.json else _prose(result), flush=True)
+        print(json.dumps(finite(result), allow_nan=False) if command.json else _prose(result), flush=True)
     except BrokenPipeError:
         sys.stdout = None  # the reader has gone: Python must not try to flush again
     return 0
@@ -87,12 +87,12 @@ def _refuse(reason: str) -> int:
     return 2
 
 
-def _finite(value: object) -> object:
+def finite(value: object) -> object:
     """JSON knows no NaN: null instead."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -372,13 +372,29 @@ class Ultraphase(Common):
     """Show every change of this region of one core's RAM, 100 at the most (run)."""
 
 
+ABLATIONS = ("spatial-block", "tensor-size", "fourier")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Study(Common):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
-    decoded from codes without a network, and the in-pixel processor's power (4, 5); and how much the error of a
-    rendered set itself matters to depth."""
+    decoded from codes without a network, and the in-pixel processor's power (4, 5); of trained models: scenes moved out
+    of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12); and
+    how much the error of a rendered set itself matters to depth."""
 
-    name: Positional[Literal["tensors", "memory", "codes", "power", "render-error"]]
+    name: Positional[
+        Literal[
+            "tensors",
+            "memory",
+            "codes",
+            "power",
+            "depth-offset",
+            "spatial-block",
+            "tensor-size",
+            "fourier",
+            "render-error",
+        ]
+    ]
     """Which study."""
     checkpoints: tuple[Path, ...] = ()
     """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc); trained
@@ -391,7 +407,20 @@ class Study(Common):
     codes: int = 32
     """Number K of codes of --design."""
     full: bool = False
-    """--design is a full coding tensor instead of a separable one."""
+    """--design is a full coding tensor instead of a separable one; of studies of trained models, every compression of
+    the paper instead of 128x (depth-offset: 64x and 128x), of depth-offset all 16 photon levels too."""
+    preset: Literal["smoke", "laptop", "paper"] = "laptop"
+    """Of studies of trained models: smoke trains two for seconds and tests them on two small views; laptop and paper
+    say how models are trained with --retrain."""
+    models: Annotated[Path | None, _open("FOLDER")] = None
+    """Folder of runs of `train`, each under its model's name, looked in before the models that come with the package
+    (default: models in --out)."""
+    retrain: bool = False
+    """Train what is not finished in --models, and use no model that came with the package."""
+    set: Annotated[Path | None, _open("SET")] = None
+    """What --retrain trains on, as of `train` (default: 2,000 rooms, rendered into --out)."""
+    ship: bool = False
+    """Put the models found into the package in half precision, with configuration and training log."""
     scene: str = "tabletop/kitchen"
     """Scene of `study codes` (direct light alone, under a scanning laser) and `study power`, as `render` takes it."""
     width: int = 64
@@ -402,7 +431,7 @@ class Study(Common):
     """Mean signal photons per pixel of `study power`."""
     background: float = 500.0
     """Mean background photons per pixel of `study power`."""
-    set: str = "tabletop"
+    scene_set: str = "tabletop"
     """Scene set of `study render-error`, as `dataset` takes it."""
     views: int = 3
     """Its first N views, at --width x --height."""

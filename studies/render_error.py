@@ -75,7 +75,7 @@ class Row:
 
 def run(command: Study, progress: Progress) -> dict:
     """Render what is not yet in the cache, evaluate, write render-error.csv, and return its rows."""
-    of = scene_set(command.set)
+    of = scene_set(command.scene_set)
     most = of.size or 100
     require(1 <= command.views <= most, f"views {command.views} is outside 1 to {most} of set {of.name}")
     models = {str(path): load_model(path)[0] for path in command.checkpoints}

@@ -348,7 +348,8 @@ def run_study(command: commands.Study, progress: Progress) -> dict:
     """One study: the module of its name, imported only when it is asked for."""
     if command.out.is_file():
         raise InputError(f"{command.out}: is a file, expected a folder for the figures")
-    return importlib.import_module(f"studies.{command.name.replace('-', '_')}").run(command, progress)
+    module = "ablations" if command.name in commands.ABLATIONS else command.name.replace("-", "_")
+    return importlib.import_module(f"studies.{module}").run(command, progress)
 
 
 def run_train(command: commands.Train, progress: Progress) -> dict:

@@ -79,9 +79,14 @@ def views_of(command: Train) -> tuple[Views, Views, dict[str, Any]]:
     else:
         views = read_views(command.set)
     said = {"training": str(command.set), "validation": str(command.validation or "its last scenes")}
-    if command.validation is not None:
-        return views, read_views(command.validation), said
-    return *split_views(views), said
+    training, validation = split_views(views) if command.validation is None else (views, read_views(command.validation))
+    return training, validation, {**said, "training_reach_m": training_reach_m(training)}
+
+
+def training_reach_m(views: Views) -> float:
+    """The depth that 99.9 % of the views' pixels do not pass [m]."""
+    depth = np.concatenate([t.depth_m[np.isfinite(t.depth_m)] for t in views.transients] or [np.zeros(0)])
+    return round(float(np.quantile(depth, 0.999)), 3) if depth.size else 0.0
 
 
 def run_train(command: Train, progress: Progress) -> dict:

@@ -81,7 +81,7 @@ def test_mistakes_end_in_one_line(capfd, tmp_path):
     out = ["--out", str(tmp_path)]
     for given, told in (
         (("--views", "9"), "views 9 is outside 1 to 8 of set tabletop"),
-        (("--set", "nowhere"), "scene set 'nowhere'"),
+        (("--scene-set", "nowhere"), "scene set 'nowhere'"),
         (("--checkpoints", str(tmp_path / "none")), "file not found"),
     ):
         status, _, said = run(capfd, *given, *out)

@@ -189,5 +189,5 @@ def test_killed_and_resumed(packed, tmp_path):
         process.wait()
         process = start(folder)
     assert process.wait(300) == 0
-    for name in ("last.safetensors", "model.safetensors", "log.csv"):
+    for name in ("last.safetensors", "model.safetensors", "log.csv", "energy.csv"):
         assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
