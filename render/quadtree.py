@@ -253,7 +253,9 @@ class CellTree:
             found = np.where(down, child + 2 * (row >> deeper & 1) + (column >> deeper & 1), found)
         return found
 
-    def _compare_images(self, images: list[np.ndarray], pitch: np.ndarray | np.float32, reasons: np.ndarray) -> list[np.ndarray]:
+    def _compare_images(
+        self, images: list[np.ndarray], pitch: np.ndarray | np.float32, reasons: np.ndarray
+    ) -> list[np.ndarray]:
         """Compare cells with their neighbours in images (..., rows, columns) of `_COMPARED`; adds to `reasons` to cut.
 
         Marks `mixed` pixels among them.
