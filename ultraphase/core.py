@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ultraphase.program import KINDS, Program
 
 PATIENCE = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
 _STOP = -1
+_SHARED = ("HALT", "SEND", "RECV", "OUTB", "OUTH")  # what a core of an array does not do alone
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Core:
         self._place = (place[1] & 1) | (place[0] & 1) << 1
         self._port: list[int] = []
         self._read = self._photons = self._wraps = self._saturations = 0
-        self._parks = False
+        self._parks = self._lent = False
         self._stopped = True
         self._code = [self._compiled(word, one) for word, one in enumerate(program.instructions)] + [self._behind]
 
@@ -114,9 +116,15 @@ class Core:
         port = [int(t) for t in timestamps]
         most = (1 << 16) - 1
         require(not port or (min(port) >= 0 and max(port) <= most), f"timestamps are outside 0 to {most}")
-        self._port, self._read, self._parks, self._stopped = port, 0, park, False
+        self._port, self._read, self._parks, self._stopped, self._lent = port, 0, park, False, False
         self.out.clear()
         self.word = 0
+
+    def resume(self, word: int, registers: list[int], ram: bytes, timestamps: list[int], place: int) -> None:
+        """Take over a core of an array in the middle of its frame; `run` brings it to where it needs the array again:
+        no timestamp left, a link, a word that leaves the sensor, the end. `place` is what ID reads."""
+        self.word, self.registers[:], self.ram[:], self._place = word, registers, ram, place
+        self._port, self._read, self._parks, self._stopped, self._lent = timestamps, 0, True, False, True
 
     def step(self) -> Step:
         """One instruction. Raises InputError after the end of the frame."""
@@ -147,19 +155,37 @@ class Core:
     def run(self) -> None:
         """To the end of the frame, at speed: no states in between."""
         require(not self._stopped, f"program {self.program.name}: no frame was started")
-        visits, code, word = self._visits, self._code, self.word
-        while word >= 0:
+        visits, word = self._visits, self.word
+        code = self._returning if self._lent else self._code
+        while True:
             progress = (self._read, len(self.out))
             for _ in range(PATIENCE):
                 visits[word] += 1
-                word = code[word]()
-                if word < 0:
-                    break
-            else:
-                stuck = progress == (self._read, len(self.out))
-                if stuck:
-                    raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} instructions")
-        self._stopped = True
+                after = code[word]()
+                if after < 0:
+                    self.word, self._stopped = word, True
+                    return
+                word = after
+            if progress == (self._read, len(self.out)):
+                raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} instructions")
+
+    @cached_property
+    def _returning(self) -> list[Callable[[], int]]:
+        """The code of a core that was taken over: it stops in front of what needs the array."""
+        code = list(self._code)
+        for word, one in enumerate(self.program.instructions):
+            if one.name in _SHARED:
+                code[word] = partial(self._not_yet, word)
+            elif one.name == "BFE":
+                code[word] = partial(self._frame_not_over, word)
+        return code
+
+    def _not_yet(self, word: int) -> int:
+        self._visits[word] -= 1
+        return _STOP
+
+    def _frame_not_over(self, word: int) -> int:
+        return word + 1 if self._read < len(self._port) else self._not_yet(word)
 
     def contents(self, region: str) -> np.ndarray:
         """Numbers in a region of RAM."""
@@ -277,10 +303,8 @@ class Core:
         def no_timestamp() -> int:
             if self._read < len(self._port):
                 return after
-            if not self._parks:
-                return go
-            self._visits[word] -= 1  # it waits, and has not executed this
-            return _STOP
+            # where it waits, it has not executed this
+            return self._not_yet(word) if self._parks else go
 
         return {
             "BNT": no_timestamp,

@@ -184,6 +184,24 @@ def test_the_sum_of_four_cores_saturates_at_16_bits():
     assert (again.out == 0).all()  # the frame's end left zeros behind
 
 
+@pytest.mark.parametrize("name", ["coarse-16", "fourier-8", "separable-8"])
+def test_bright_cores_that_go_on_alone_leave_what_they_leave_in_step(name, monkeypatch):
+    random, chosen = np.random.default_rng(8), method(name)
+    lengths = np.array([3, 900, 70, 0])  # one wraps or saturates, one is dark; separable ones wait for each other
+    stamps = np.where(random.random(lengths.sum()) < 0.7, 300, random.integers(0, 1024, lengths.sum()))
+
+    def frame(few: int) -> tuple:
+        monkeypatch.setattr("ultraphase.array._FEW", few)
+        array = CoreArray(chosen.program(), (2, 2), chosen.tables(tensor(name)))
+        return array.frame(stamps, np.concatenate([[0], np.cumsum(lengths)])), array.ram
+
+    (alone, ram), (in_step, other) = frame(96), frame(0)
+    assert np.array_equal(ram, other) and alone.counters == in_step.counters
+    assert alone.counters.wraps + alone.counters.saturations > 0
+    for field in ("out", "out_cores", "out_bits", "cycles", "stalls"):
+        assert np.array_equal(getattr(alone, field), getattr(in_step, field))
+
+
 @pytest.mark.parametrize("name", ["coarse-64", "fourier-16"])
 def test_frames_follow_each_other(name):
     chosen, random = method(name), np.random.default_rng(5)
