@@ -371,12 +371,13 @@ class Ultraphase(Common):
 @dataclass(frozen=True, kw_only=True)
 class Study(Common):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
-    decoded from codes without a network, and the in-pixel processor's power (4, 5)."""
+    decoded from codes without a network, the in-pixel processor's power (4, 5), and captures (13, 14)."""
 
-    name: Positional[Literal["tensors", "memory", "codes", "power"]]
+    name: Positional[Literal["tensors", "memory", "codes", "power", "real-data"]]
     """Which study."""
     checkpoints: tuple[Path, ...] = ()
-    """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc)."""
+    """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc). Networks of
+    `study real-data`: checkpoints."""
     design: str = ""
     """A design that `study tensors` draws instead of the paper's: learned, fourier, gray, coarse, hadamard or random,
     with +learned for a fixed temporal code and a learned spatial part."""
@@ -396,6 +397,12 @@ class Study(Common):
     """Mean signal photons per pixel of `study power`."""
     background: float = 500.0
     """Mean background photons per pixel of `study power`."""
+    preset: Literal["smoke", "laptop", "paper"] = "laptop"
+    """Of `study real-data`, how its captures are rendered: 32 x 32 pixels of direct light, 256 x 256 to 5 %, to 2 %."""
+    capture: tuple[Path, ...] = ()
+    """Captures (.mat) of the LinoSPAD prototype for `study real-data`, instead of rendered ones in their layout."""
+    frame: int = 0
+    """Frame of these files, from 0."""
     out: Path = Path("out/study")
     """Folder for the figures (.png) and tables (.csv)."""
 
