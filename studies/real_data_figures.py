@@ -13,7 +13,7 @@ from spad.sensor import Sensor
 from studies.figures import DEPTH_COLOURS, plt, save
 
 MOST_POINTS = 20000  # of a cloud: more make one colour
-YAW_DEG, PITCH_DEG = 25.0, 20.0  # of the viewer of clouds
+YAW_DEG, PITCH_DEG = -25.0, 20.0  # of the viewer of clouds
 STRONG = 5.0  # standard deviations above a pixel's mean count a bin from which a bin is a point of the raw cloud
 
 
@@ -86,6 +86,7 @@ def draw(views: list[View], labels: list[str], depths: Depths, title: str, path:
             one.set_xlabel(_error(view, depth, label), fontsize=8)
             one.set(xticks=[], yticks=[])
         figure.colorbar(picture, ax=row[2:], fraction=0.02, pad=0.01).set_label("depth [m]")
+    figure.get_layout_engine().set(hspace=0.06)
     figure.suptitle(title)
     return save(figure, path)
 
@@ -100,8 +101,13 @@ def draw_clouds(views: list[View], labels: list[str], depths: Depths, title: str
         maps = ({"truth": view.depth_m} if truth else {}) | {label: depths[view.name, label] for label in labels}
         for one, (label, depth) in zip(row, maps.items(), strict=True):
             _cloud(
-                one, _points(view, depth), limits(view, depths), f"{view.name}: {_wrapped(label)}", _frame(view, depths)
+                one,
+                _points(view, depth),
+                limits(view, depths),
+                f"{view.name}: " + _wrapped(label),
+                _frame(view, depths),
             )
+    figure.get_layout_engine().set(hspace=0.06)
     figure.suptitle(f"{title}. Orthographic, from above the camera's right shoulder; colour is depth")
     return save(figure, path)
 
@@ -144,7 +150,11 @@ def _error(view: View, depth: np.ndarray | None, label: str) -> str:
 
 
 def _wrapped(label: str) -> str:
-    return label.replace("network ", "network\n").replace(", ", ",\n")
+    """At two lines."""
+    if not label.startswith("network "):
+        return label
+    front, _, rest = label.removeprefix("network ").partition(", ")
+    return f"network ({rest})\n{front}"
 
 
 def _intensity(axes: Axes, view: View) -> None:
