@@ -19,8 +19,8 @@ from ultraphase.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, 
 from ultraphase.program import Program
 
 _RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
-# In step, a turn costs about as much for one core as for a hundred: so few finish their timestamps one after the other.
-_FEW = 96
+# In step, a turn costs about as much for one core as for hundreds: so few finish their timestamps one after the other.
+_FEW = 256
 _MANY_TIMESTAMPS = 64
 
 

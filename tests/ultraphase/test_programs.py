@@ -195,7 +195,7 @@ def test_bright_cores_that_go_on_alone_leave_what_they_leave_in_step(name, monke
         array = CoreArray(chosen.program(), (2, 2), chosen.tables(tensor(name)))
         return array.frame(stamps, np.concatenate([[0], np.cumsum(lengths)])), array.ram
 
-    (alone, ram), (in_step, other) = frame(96), frame(0)
+    (alone, ram), (in_step, other) = frame(256), frame(0)
     assert np.array_equal(ram, other) and alone.counters == in_step.counters
     assert alone.counters.wraps + alone.counters.saturations > 0
     for field in ("out", "out_cores", "out_bits", "cycles", "stalls"):
