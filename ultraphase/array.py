@@ -22,6 +22,7 @@ _RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
 # In step, a turn costs about as much for one core as for hundreds: so few finish their timestamps one after the other.
 _FEW = 256
 _MANY_TIMESTAMPS = 64
+_LOOK_EVERY = 16  # timestamps
 
 
 @dataclass(frozen=True)
@@ -145,14 +146,17 @@ class _Run:
         self.block_end = _block_ends(self.program)
 
     def to_end(self) -> Frame:
-        patience, events, live = PATIENCE, 0, self.array._lane
+        patience, events, look, live = PATIENCE, 0, 0, self.array._lane
         while True:
             if self.changed:
                 live, self.changed = np.flatnonzero(self.status == _RUNS), False
                 if not live.size:
                     break
-                if live.size <= _FEW:
-                    self._one_by_one(live[self.last[live] - self.next[live] >= _MANY_TIMESTAMPS])
+            if self.events >= look:  # cores that are done wait at the frame's end: all are live until the last is there
+                look = self.events + _LOOK_EVERY
+                many = live[self.last[live] - self.next[live] >= _MANY_TIMESTAMPS]
+                if 0 < many.size <= _FEW:
+                    self._one_by_one(many)
             words = self.word[live]
             word = int(words.min())
             index = live[words == word]
@@ -181,8 +185,6 @@ class _Run:
 
     def _one_by_one(self, lanes: np.ndarray) -> None:
         """These cores each go through their timestamps alone, to where they need the array again."""
-        if not lanes.size:
-            return
         blank = {region.name: np.zeros(region.count, np.int64) for region in self.program.regions if region.table}
         core = Core(self.program, blank, chip=self.array.chip)
         for lane in lanes:
