@@ -379,8 +379,8 @@ ABLATIONS = ("spatial-block", "tensor-size", "fourier")
 class Study(Common):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
     decoded from codes without a network, and the in-pixel processor's power (4, 5); of trained models: scenes moved out
-    of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12); and
-    how much the error of a rendered set itself matters to depth."""
+    of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
+    captures (13, 14); and how much the error of a rendered set itself matters to depth."""
 
     name: Positional[
         Literal[
@@ -392,13 +392,14 @@ class Study(Common):
             "spatial-block",
             "tensor-size",
             "fourier",
+            "real-data",
             "render-error",
         ]
     ]
     """Which study."""
     checkpoints: tuple[Path, ...] = ()
     """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc); trained
-    networks of `study render-error`."""
+    networks of `study render-error` and `study real-data`."""
     design: str = ""
     """A design that `study tensors` draws instead of the paper's: learned, fourier, gray, coarse, hadamard or random,
     with +learned for a fixed temporal code and a learned spatial part."""
@@ -411,7 +412,8 @@ class Study(Common):
     the paper instead of 128x (depth-offset: 64x and 128x), of depth-offset all 16 photon levels too."""
     preset: Literal["smoke", "laptop", "paper"] = "laptop"
     """Of studies of trained models: smoke trains two for seconds and tests them on two small views; laptop and paper
-    say how models are trained with --retrain."""
+    say how models are trained with --retrain. Of `study real-data`, how captures are rendered: 32 x 32 pixels of direct
+    light, 256 x 256 to 5 %, to 2 %."""
     models: Annotated[Path | None, _open("FOLDER")] = None
     """Folder of runs of `train`, each under its model's name, looked in before the models that come with the package
     (default: models in --out)."""
@@ -437,6 +439,10 @@ class Study(Common):
     """Its first N views, at --width x --height."""
     cache: Annotated[Path | None, _open("FOLDER")] = None
     """Folder that keeps its renders from run to run (default: ~/.cache/scene2spad)."""
+    capture: tuple[Path, ...] = ()
+    """Captures (.mat) of the LinoSPAD prototype for `study real-data`, instead of rendered ones in their layout."""
+    frame: int = 0
+    """Frame of these files, from 0."""
     out: Path = Path("out/study")
     """Folder for the figures (.png) and tables (.csv)."""
 

@@ -53,9 +53,9 @@ def _image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: obje
     bar.ax.tick_params(labelsize=8)
 
 
-def display(radiance: np.ndarray) -> np.ndarray:
-    """Radiance for looking: relative to its 99th percentile, display gamma."""
-    top = np.quantile(radiance[radiance > 0], 0.99) if (radiance > 0).any() else 1.0
+def display(radiance: np.ndarray, white: float = 0.99) -> np.ndarray:
+    """Radiance for looking: relative to the quantile `white` of what is lit, display gamma."""
+    top = np.quantile(radiance[radiance > 0], white) if (radiance > 0).any() else 1.0
     return np.clip(radiance / top, 0, 1) ** (1 / 2.2)
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import logging
+import zipfile
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +22,15 @@ from spad.sensor import PhotonBudget, sensor_by_name
 from studies import figures
 from studies.commands import Study
 from studies.figures import DEPTH_COLOURS, plt
-from studies.ultraphase_chain import by_torch, decode, emulate, shared_core_depths
+from studies.ultraphase_chain import Emulated, by_torch, decode, emulate, int8_temporal, shared_core_depths
 from studies.ultraphase_cli import all_costs
-from ultraphase import method
+from ultraphase import Method, method
 from ultraphase.catalog import PUBLISHED
+from ultraphase.core import Counters
+from ultraphase.isa import encode
 from ultraphase.power import READINGS, Cost, Load, as_csv, power, reference_bits, table
+
+log = logging.getLogger("scene2spad")
 
 SHARED_BUDGET = PhotonBudget(10.0, 10.0)  # a SPAD: sixteen of them stay within 16 bits
 SPATIAL = "all four pixels alike, standing in for learned weights"
@@ -38,13 +46,13 @@ def run(command: Study, progress: Progress) -> dict:
     scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
     transient = render(scene, seed=command.seed, progress=lambda what, share: progress(what, 0.1 * share))
     histogram = sense(transient, sensor, budget, seed=command.seed)
-    depths, rows = _depths(histogram, progress)
+    out.mkdir(parents=True, exist_ok=True)
+    depths, rows = _depths(histogram, out, progress)
     dim = sense(transient, sensor, SHARED_BUDGET, seed=command.seed)
     progress("4 x 4 SPADs a core", 0.9)
     shared = shared_core_depths(dim)
     costs = all_costs(lambda what, share: progress(what, 0.9 + 0.1 * share))
     printed = table(costs)
-    out.mkdir(parents=True, exist_ok=True)
     with whole_file(out / "ultraphase.csv") as beside:
         beside.write_text(as_csv(printed))
     errors = {name: _errors(depth, dim) for name, depth in shared.items()}
@@ -71,13 +79,13 @@ def _errors(depth: np.ndarray, histogram: Histogram) -> dict:
     }
 
 
-def _depths(histogram: Histogram, progress: Progress) -> tuple[dict[str, np.ndarray], list[dict]]:
+def _depths(histogram: Histogram, out: Path, progress: Progress) -> tuple[dict[str, np.ndarray], list[dict]]:
     """Depth of every published program's codes, and what the emulation counted beside its error."""
     depths, rows = {}, []
     for number, name in enumerate(PUBLISHED):
         progress(name, 0.1 + 0.8 * number / len(PUBLISHED))
         chosen = method(name)
-        found = emulate(histogram.counts, chosen)
+        found = _emulated(histogram, chosen, out)
         depths[name] = decode(found.codes, chosen, histogram.sensor)
         counted = found.counters
         rows.append(
@@ -93,6 +101,30 @@ def _depths(histogram: Histogram, progress: Progress) -> tuple[dict[str, np.ndar
             }
         )
     return depths, rows
+
+
+def _emulated(histogram: Histogram, chosen: Method, out: Path) -> Emulated:
+    """Every core of the image interpreted to its last photon; read back where an earlier run has finished it.
+
+    The file's name holds a hash of the photons and of all that the cores do with them.
+    """
+    program = chosen.program()
+    sha = hashlib.sha256(histogram.sha256().encode())
+    sha.update(repr([encode(one) for one in program.instructions]).encode() + repr(program.regions).encode())
+    for contents in chosen.tables(int8_temporal(chosen)).values():
+        sha.update(contents.tobytes())
+    path = out / "emulated" / f"{chosen.name}-{sha.hexdigest()[:16]}.npz"
+    if path.is_file():
+        try:
+            with np.load(path) as kept:
+                return Emulated(kept["codes"], Counters(*kept["counters"].tolist()), int(kept["bits"]))
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+            log.warning("%s cannot be read, and is made again", path)
+    found = emulate(histogram.counts, chosen)
+    path.parent.mkdir(exist_ok=True)
+    with whole_file(path) as beside:
+        np.savez(beside, codes=found.codes, counters=astuple(found.counters), bits=found.bits)
+    return found
 
 
 def draw_power(costs: dict[str, Cost], path: Path) -> Path:

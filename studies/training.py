@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.config import ModelConfig, TrainConfig, preset
@@ -24,7 +25,7 @@ from scenes.errors import InputError, require
 from scenes.files import write_csv
 from spad.depth import METHODS, estimate_depth
 from spad.histogram import Histogram
-from spad.sensor import sensor_by_name
+from spad.sensor import Sensor, sensor_by_name
 from studies.commands import Evaluate, Train
 from studies.planes import random_planes
 
@@ -121,17 +122,17 @@ def network_method(model: DepthModel, *, int8: bool = False, overflows: list[int
     return method
 
 
-def baseline(name: str) -> Method:
-    """A method without a network: one of `spad.depth.METHODS`, or CODE-K decoded by correlation, as in "fourier-8"."""
+def classical(name: str) -> Callable[[Tensor, Sensor], Tensor]:
+    """Depth [m] from counts (..., T) of a sensor without a network: by one of `spad.depth.METHODS`, or by CODE-K
+    decoded by correlation, as in "fourier-8"."""
     if name in METHODS:
-        return lambda h: estimate_depth(torch.from_numpy(h.counts), h.sensor, name).numpy()
+        return lambda counts, sensor: estimate_depth(counts, sensor, name)
     code, _, number = name.rpartition("-")
     require(code != "" and number.isdigit(), f"baseline {name!r}: expected {', '.join(METHODS)}, or CODE-K")
 
-    def compressive(histogram: Histogram) -> np.ndarray:
-        temporal = temporal_code(code, int(number), histogram.sensor.bins, histogram.sensor)
-        coding = CodingTensor(name, temporal)
-        return decode_depth(encode(torch.from_numpy(histogram.counts), coding), coding, histogram.sensor).numpy()
+    def compressive(counts: Tensor, sensor: Sensor) -> Tensor:
+        coding = CodingTensor(name, temporal_code(code, int(number), sensor.bins, sensor))
+        return decode_depth(encode(counts, coding), coding, sensor)
 
     return compressive
 
@@ -141,6 +142,12 @@ def common_tile(models: Sequence[DepthModel]) -> tuple[int, int]:
     blocks = [(1, 1), *(model.config.block[1:] for model in models)]
     rows, columns = (math.lcm(*sides) for sides in zip(*blocks, strict=True))
     return rows, columns
+
+
+def baseline(name: str) -> Method:
+    """A method without a network, by the names of `classical`."""
+    depth_of = classical(name)
+    return lambda histogram: depth_of(torch.from_numpy(histogram.counts), histogram.sensor).numpy()
 
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from types import CodeType
 
 import numpy as np
 
 from scenes.errors import InputError, require
 from ultraphase.chip import ChipSpec
-from ultraphase.isa import ALU, BYTE_LIMIT, HALF_LIMITS, REGISTERS, Instruction, spelled
+from ultraphase.isa import REGISTERS, Instruction, spelled
 from ultraphase.program import KINDS, Program
+from ultraphase.translate import source
 
 PATIENCE = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
 _STOP = -1
@@ -65,6 +68,16 @@ class Step:
         return f"{self.before.word:4d}  {spelled(self.instruction):28s} {', '.join(self.changes())}".rstrip()
 
 
+@dataclass
+class _Stretch:
+    """Instructions that always follow each other, as one function that gives the next word (or stops); the last of
+    them, and how often they ran."""
+
+    does: Callable[[], int]
+    end: int
+    times: int = 0
+
+
 class Core:
     """A core with its program and RAM; both stay from frame to frame.
 
@@ -96,10 +109,11 @@ class Core:
         self.word = 0
         self._place = (place[1] & 1) | (place[0] & 1) << 1
         self._port: list[int] = []
-        self._read = self._photons = self._wraps = self._saturations = 0
-        self._parks = False
+        self._read = self._wraps = self._saturations = 0
+        self._parks = self._lent = False
         self._stopped = True
-        self._code = [self._compiled(word, one) for word, one in enumerate(program.instructions)] + [self._behind]
+        self._stretches: dict[int, _Stretch] = {}  # by first word
+        self._singles: dict[int, _Stretch] = {}
 
     def frame(self, timestamps: Iterable[int]) -> tuple[tuple[int, ...], Counters]:
         """One frame, to HALT: what left the sensor, and what it cost."""
@@ -114,16 +128,24 @@ class Core:
         port = [int(t) for t in timestamps]
         most = (1 << 16) - 1
         require(not port or (min(port) >= 0 and max(port) <= most), f"timestamps are outside 0 to {most}")
-        self._port, self._read, self._parks, self._stopped = port, 0, park, False
+        self._port, self._read, self._parks, self._stopped, self._lent = port, 0, park, False, False
         self.out.clear()
         self.word = 0
+
+    def resume(self, word: int, registers: list[int], ram: bytes, timestamps: list[int], place: int) -> None:
+        """Take over a core of an array in the middle of its frame; `run` brings it to where it needs the array again:
+        no timestamp left, a link, a word that leaves the sensor, the end. `place` is what ID reads."""
+        self.word, self.registers[:], self.ram[:], self._place = word, registers, ram, place
+        self._port, self._read, self._parks, self._stopped, self._lent = timestamps, 0, True, False, True
 
     def step(self) -> Step:
         """One instruction. Raises InputError after the end of the frame."""
         require(not self._stopped, f"program {self.program.name}: the frame is over")
         before, word = self.state, self.word
         self._visits[word] += 1
-        after = self._code[word]()
+        if word not in self._singles:
+            self._singles[word] = self._function(word, single=True)
+        after = self._singles[word].does()
         if after < 0:
             self._stopped = True
         else:
@@ -147,19 +169,33 @@ class Core:
     def run(self) -> None:
         """To the end of the frame, at speed: no states in between."""
         require(not self._stopped, f"program {self.program.name}: no frame was started")
-        visits, code, word = self._visits, self._code, self.word
-        while word >= 0:
-            progress = (self._read, len(self.out))
-            for _ in range(PATIENCE):
-                visits[word] += 1
-                word = code[word]()
-                if word < 0:
-                    break
-            else:
-                stuck = progress == (self._read, len(self.out))
-                if stuck:
-                    raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} instructions")
-        self._stopped = True
+        stretches, word = self._stretches, self.word
+        try:
+            while True:
+                progress = (self._read, len(self.out))
+                for _ in range(PATIENCE):
+                    stretch = stretches.get(word)
+                    if stretch is None:
+                        stretch = stretches[word] = self._function(word)
+                    stretch.times += 1
+                    after = stretch.does()
+                    if after < 0:
+                        self.word, self._stopped = stretch.end, True
+                        return
+                    word = after
+                if progress == (self._read, len(self.out)):
+                    raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} branches")
+        finally:
+            for first, stretch in stretches.items():
+                for done in range(first, stretch.end + 1):
+                    self._visits[done] += stretch.times
+                stretch.times = 0
+
+    def _function(self, word: int, *, single: bool = False) -> _Stretch:
+        text, end = source(self.program, word, single=single)
+        names = {"core": self, "r": self.registers, "ram": self.ram, "halves": self._halves}
+        exec(_compiled(text), names)
+        return _Stretch(names["does"], end)
 
     def contents(self, region: str) -> np.ndarray:
         """Numbers in a region of RAM."""
@@ -178,7 +214,7 @@ class Core:
         return Counters(
             instructions=total,
             cycles=total * self.chip.clocks_per_instruction,
-            photons=self._photons,
+            photons=sum(n for n, op in zip(visits, ops, strict=True) if op.name == "RDT"),
             ram_reads=sum(n * op.reads for n, op in zip(visits, ops, strict=True)),
             ram_writes=sum(n * op.writes for n, op in zip(visits, ops, strict=True)),
             wraps=self._wraps,
@@ -189,149 +225,47 @@ class Core:
     def state(self) -> State:
         return State(self.word, tuple(self.registers), bytes(self.ram), tuple(self.out), self.counters)
 
-    def _behind(self) -> int:
+    # What the compiled instructions call
+
+    def _not_yet(self, word: int) -> int:
+        """It stops in front of this instruction, and has not executed it."""
+        self._visits[word] -= 1
+        return _STOP
+
+    def _halt(self, word: int) -> int:
+        return self._not_yet(word) if self._lent else _STOP
+
+    def _waits(self, word: int, target: int) -> int:
+        return self._not_yet(word) if self._parks else target
+
+    def _over(self, word: int, target: int) -> int:
+        if self._lent:
+            return self._not_yet(word)
+        return word + 1 if self._parks else target
+
+    def _link(self, word: int) -> int:
+        if self._lent:
+            return self._not_yet(word)
+        raise InputError(f"{self.program.where(word)}: a core alone has no neighbours; use a CoreArray")
+
+    def _no_timestamp(self, word: int) -> None:
+        raise InputError(f"{self.program.where(word)}: no timestamp is there")
+
+    def _outside(self, word: int, at: int, last: int) -> None:
+        raise InputError(f"{self.program.where(word)}: RAM address {at} is outside the declared 0 to {last}")
+
+    def _odd(self, word: int, at: int) -> None:
+        raise InputError(f"{self.program.where(word)}: address {at} of 16 bits is odd")
+
+    def _stuck(self, word: int) -> int:
         raise InputError(f"program {self.program.name}: runs behind its last instruction")
 
-    def _compiled(self, word: int, one: Instruction) -> Callable[[], int]:
-        """The instruction as a function that does it and returns the next word."""
-        name = one.name
-        if name in ALU:
-            return self._alu(one, word + 1)
-        if "m" in one.op.takes:
-            return self._memory(one, word)
-        if "l" in one.op.takes:
-            return self._branch(one, word)
-        return self._other(one, word)
 
-    def _alu(self, one: Instruction, after: int) -> Callable[[], int]:
-        r, d, s, v, does = self.registers, one.rd, one.rs, one.value, ALU[one.name]
-
-        def with_constant() -> int:
-            r[d] = does(r[s], v)
-            return after
-
-        def with_register() -> int:
-            r[d] = does(r[s], r[v])
-            return after
-
-        return with_constant if one.constant or "n" in one.op.takes else with_register
-
-    def _address(self, one: Instruction, word: int) -> Callable[[], int]:
-        """The operand's cell, in its own size from the start of RAM."""
-        r, s, offset, size = self.registers, one.rs, one.value, one.op.size
-        last = self.program.ram_bytes - size
-
-        def checked(at: int) -> int:
-            if not 0 <= at <= last:
-                raise InputError(f"{self.program.where(word)}: RAM address {at} is outside the declared 0 to {last}")
-            if at % size:
-                raise InputError(f"{self.program.where(word)}: address {at} of 16 bits is odd")
-            return at // size
-
-        if not one.constant:
-            return lambda: checked(r[s] + offset)
-        if 0 <= offset <= last and offset % size == 0:
-            return lambda: offset // size
-        return lambda: checked(offset)
-
-    def _memory(self, one: Instruction, word: int) -> Callable[[], int]:
-        r, d, after, at = self.registers, one.rd, word + 1, self._address(one, word)
-        cells = self.ram if one.op.size == 1 else self._halves
-        low, high = HALF_LIMITS
-
-        def load() -> int:
-            r[d] = cells[at()]
-            return after
-
-        def load_signed() -> int:
-            value = cells[at()]
-            r[d] = value - (value >> 7 << 8)
-            return after
-
-        def store_byte() -> int:
-            self._wraps += not -128 <= r[d] <= BYTE_LIMIT
-            cells[at()] = r[d] & BYTE_LIMIT
-            return after
-
-        def store_half() -> int:
-            self._wraps += not low <= r[d] <= 2 * high + 1
-            cells[at()] = (r[d] + high + 1 & 0xFFFF) - high - 1
-            return after
-
-        def add(sign: int) -> int:
-            cell = at()
-            value = cells[cell] + sign * r[d]
-            if not low <= value <= high:
-                self._wraps += 1
-                value = (value + high + 1 & 0xFFFF) - high - 1
-            cells[cell] = value
-            return after
-
-        names = ("LDB", "LDBS", "LDH", "STB", "STH", "ADDM", "SUBM")
-        does = (load, load_signed, load, store_byte, store_half, lambda: add(1), lambda: add(-1))
-        return dict(zip(names, does, strict=True))[one.name]
-
-    def _branch(self, one: Instruction, word: int) -> Callable[[], int]:
-        r, a, b, bit, go, after = self.registers, one.rs, one.rd, one.bit, one.target, word + 1
-
-        def no_timestamp() -> int:
-            if self._read < len(self._port):
-                return after
-            if not self._parks:
-                return go
-            self._visits[word] -= 1  # it waits, and has not executed this
-            return _STOP
-
-        return {
-            "BNT": no_timestamp,
-            "BFE": lambda: go if self._read == len(self._port) and not self._parks else after,
-            "JMP": lambda: go,
-            "BZ": lambda: go if r[a] == 0 else after,
-            "BNZ": lambda: go if r[a] else after,
-            "BLT": lambda: go if r[a] < r[b] else after,
-            "BBS": lambda: go if r[a] >> bit & 1 else after,
-            "BBC": lambda: after if r[a] >> bit & 1 else go,
-        }[one.name]
-
-    def _other(self, one: Instruction, word: int) -> Callable[[], int]:
-        r, d, s, v, after = self.registers, one.rd, one.rs, one.value, word + 1
-
-        def put(value: int) -> int:
-            r[d] = value
-            return after
-
-        def read() -> int:
-            if self._read == len(self._port):
-                raise InputError(f"{self.program.where(word)}: no timestamp is there")
-            self._read += 1
-            self._photons += 1
-            return put(self._port[self._read - 1])
-
-        def saturated(low: int, high: int) -> int:
-            value = min(max(r[s], low), high)
-            self._saturations += value != r[s]
-            return put(value)
-
-        def leave(low: int, high: int) -> int:
-            self._wraps += not low <= r[s] <= high
-            self.out.append((r[s] - low) % (high - low + 1) + low)
-            return after
-
-        def no_link() -> int:
-            raise InputError(f"{self.program.where(word)}: a core alone has no neighbours; use a CoreArray")
-
-        return {
-            "HALT": lambda: _STOP,
-            "RDT": read,
-            "ID": lambda: put(self._place),
-            "MOV": (lambda: put(v)) if one.constant else (lambda: put(r[v])),
-            "SATB": lambda: saturated(0, BYTE_LIMIT),
-            "SATH": lambda: saturated(*HALF_LIMITS),
-            "OUTB": lambda: leave(0, BYTE_LIMIT),
-            "OUTH": lambda: leave(*HALF_LIMITS),
-            "SEND": no_link,
-            "RECV": no_link,
-        }[one.name]
+@lru_cache(maxsize=4096)
+def _compiled(statements: str) -> CodeType:
+    """A function `does` of them, for any core."""
+    text = "def does():\n    " + statements.replace("\n", "\n    ")
+    return compile(text, "<instructions>", "exec")
 
 
 def region_contents(program: Program, ram: np.ndarray, region: str) -> np.ndarray:

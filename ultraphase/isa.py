@@ -82,20 +82,27 @@ _CODE = {op.name: code for code, op in enumerate(OPS)}
 
 _HALF, _MASK = 1 << 31, (1 << 32) - 1
 
-# Written so that they take Python ints and int64 arrays alike: one definition for the core and for the array.
-# (x + 2^31 & 2^32 - 1) - 2^31 is two's complement in 32 bits.
+# Expressions of two operands a and b that take Python ints and int64 arrays alike: one definition for the array, which
+# calls them, and for the core, which compiles them. Results of WRAPPING ones are brought back to 32 bits by WRAP.
+ALU_SPELLED: dict[str, str] = {
+    "ADD": "a + b",
+    "SUB": "a - b",
+    "AND": "a & b",
+    "OR": "a | b",
+    "XOR": "a ^ b",
+    "MUL": "a * b",
+    "MIN": "b + (a - b) * (a < b)",
+    "MAX": "b + (a - b) * (a > b)",
+    "SHL": "a << b",
+    "SHR": f"(a & {_MASK}) >> b",
+    "SAR": "a >> b",
+}
+WRAPPING = ("ADD", "SUB", "MUL", "SHL", "SHR")
+WORD_LIMITS = (-_HALF, _HALF - 1)
+WRAP = f"({{}} + {_HALF} & {_MASK}) - {_HALF}"
 ALU: dict[str, Callable[[Any, Any], Any]] = {
-    "ADD": lambda a, b: (a + b + _HALF & _MASK) - _HALF,
-    "SUB": lambda a, b: (a - b + _HALF & _MASK) - _HALF,
-    "AND": lambda a, b: a & b,
-    "OR": lambda a, b: a | b,
-    "XOR": lambda a, b: a ^ b,
-    "MUL": lambda a, b: (a * b + _HALF & _MASK) - _HALF,
-    "MIN": lambda a, b: b + (a - b) * (a < b),
-    "MAX": lambda a, b: b + (a - b) * (a > b),
-    "SHL": lambda a, n: ((a << n) + _HALF & _MASK) - _HALF,
-    "SHR": lambda a, n: (((a & _MASK) >> n) + _HALF & _MASK) - _HALF,
-    "SAR": lambda a, n: a >> n,
+    name: eval("lambda a, b: " + (WRAP.format(f"({spelled})") if name in WRAPPING else spelled))
+    for name, spelled in ALU_SPELLED.items()
 }
 
 

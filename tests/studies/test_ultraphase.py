@@ -180,4 +180,10 @@ def test_study_power(capfd, folder):
     for figure in result["figures"]:
         assert (folder / figure).read_bytes()[:4] == b"\x89PNG"
     assert (folder / "study" / "ultraphase.csv").is_file()
+    kept = {path: path.stat().st_mtime_ns for path in (folder / "study" / "emulated").iterdir()}
+    broken = sorted(kept)[0]
+    broken.write_bytes(b"no archive")
+    again = run(capfd, *argv)  # finished programs are not run again
+    assert again == result and len(kept) == len(PUBLISHED)
+    assert all(path.stat().st_mtime_ns == time for path, time in kept.items() if path != broken)
     assert "multiple of 4" in refused(capfd, "study", "power", "--width", "9")

@@ -166,6 +166,29 @@ def test_core_and_array_equal_the_independent_model(instructions, streams):
         assert frame.cycles[:, 0].tolist() == [3 * want["n"] for want in expected]
 
 
+@settings(deadline=None, derandomize=True, max_examples=100)
+@given(programs(), st.lists(st.lists(st.integers(0, 1023), max_size=4), min_size=3, max_size=3))
+def test_cores_that_go_on_alone_do_what_they_do_in_step(instructions, streams):
+    def frame_with(few: int) -> tuple:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("ultraphase.array._FEW", few)
+            patch.setattr("ultraphase.array._MANY_TIMESTAMPS", 0)
+            array = CoreArray(program(instructions), (1, 3))
+            offsets = np.concatenate([[0], np.cumsum([len(stream) for stream in streams])])
+            try:
+                return array, array.frame(np.concatenate([np.array(s, np.int64) for s in streams]), offsets)
+            except InputError as error:
+                return array, str(error)
+
+    (left, in_step), (right, alone) = frame_with(0), frame_with(3)
+    if isinstance(in_step, str):  # cores put out different numbers of words
+        assert in_step == alone
+        return
+    assert np.array_equal(left.ram, right.ram) and np.array_equal(left.registers, right.registers)
+    assert np.array_equal(in_step.out, alone.out) and np.array_equal(in_step.cycles, alone.cycles)
+    assert in_step.counters == alone.counters and np.array_equal(in_step.out_bits, alone.out_bits)
+
+
 @settings(deadline=None, derandomize=True, max_examples=50)
 @given(programs(), st.lists(st.integers(0, 1023), max_size=4))
 def test_steps_are_a_run_in_slow_motion(instructions, stream):

@@ -1,5 +1,6 @@
 """The programs that come with the package: proofs over all timestamps, limits of the number formats, frame ends."""
 
+import itertools
 from functools import lru_cache
 
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from scenes.errors import InputError
 from ultraphase import Core, CoreArray, assemble, method, verify
+from ultraphase.array import _Run
 from ultraphase.catalog import FOLDER, PUBLISHED
 from ultraphase.tables import block_matrix, fourier_matrix, int8_codes, quarter_wave, spatial_sum
 
@@ -182,6 +184,39 @@ def test_the_sum_of_four_cores_saturates_at_16_bits():
     assert frame.out_bits.tolist() == [[32 * 16, 0], [0, 0]]
     again = array.frame(np.zeros(0, int), np.zeros(5, int))
     assert (again.out == 0).all()  # the frame's end left zeros behind
+
+
+@pytest.mark.parametrize("name", ["coarse-16", "fourier-8", "separable-8"])
+def test_bright_cores_that_go_on_alone_leave_what_they_leave_in_step(name, monkeypatch):
+    random, chosen = np.random.default_rng(8), method(name)
+    lengths = np.array([3, 900, 70, 0])  # one wraps or saturates, one is dark; separable ones wait for each other
+    stamps = np.where(random.random(lengths.sum()) < 0.7, 300, random.integers(0, 1024, lengths.sum()))
+
+    def frame(few: int) -> tuple:
+        monkeypatch.setattr("ultraphase.array._FEW", few)
+        array = CoreArray(chosen.program(), (2, 2), chosen.tables(tensor(name)))
+        return array.frame(stamps, np.concatenate([[0], np.cumsum(lengths)])), array.ram
+
+    (alone, ram), (in_step, other) = frame(256), frame(0)
+    assert np.array_equal(ram, other) and alone.counters == in_step.counters
+    assert alone.counters.wraps + alone.counters.saturations > 0
+    for field in ("out", "out_cores", "out_bits", "cycles", "stalls"):
+        assert np.array_equal(getattr(alone, field), getattr(in_step, field))
+
+
+def test_few_bright_cores_of_many_do_not_hold_up_the_others(monkeypatch):
+    """300 cores begin in step, and the one with 500 photons goes on alone when the others' 70 are nearly done."""
+    alone = []
+    ours = _Run._one_by_one
+    monkeypatch.setattr(_Run, "_one_by_one", lambda run, lanes: (alone.append(lanes.tolist()), ours(run, lanes)))
+    lengths = np.full(300, 70)
+    lengths[17] = 500
+    stamps, chosen = np.random.default_rng(2).integers(0, 1024, lengths.sum()), method("fourier-8")
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    frame = CoreArray(chosen.program(), (1, 300), chosen.tables(tensor("fourier-8"))).frame(stamps, offsets)
+    assert alone == [[17]]
+    histograms = np.stack([np.bincount(stamps[a:b], minlength=1024) for a, b in itertools.pairwise(offsets)])
+    assert np.array_equal(frame.out, proof("fourier-8").frame(histograms))
 
 
 @pytest.mark.parametrize("name", ["coarse-64", "fourier-16"])
