@@ -34,11 +34,17 @@ def pilot_pixels(world: World, seed: int) -> np.ndarray:
 
 
 def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
-    """Plan a render: every choice that `settings` leaves open follows from a pilot; every choice gets a reason."""
+    """Plan a render: every choice that `settings` leaves open follows from a pilot; every choice gets a reason.
+
+    Where nothing is left open there is no pilot.
+    """
     pixels = pilot_pixels(world, seed)
     reasons = list(_limits(world))
     mode_is_flood = world.scene.laser.mode == "flood"
-    fine = response(direct_light(world, pixels, PILOT_GRID).samples, pixels)
+    direct_alone = settings.bounces == 1 or (settings.bounces is None and world.scene.laser.mode == "scan")
+    fine = None
+    if settings.grid is None or settings.budget is not None or not direct_alone:
+        fine = response(direct_light(world, pixels, PILOT_GRID).samples, pixels)
     target, why = _target(settings, fine)
     reasons.append(why)
     grid, why = _grid(world, settings, pixels, fine, target)
@@ -87,7 +93,7 @@ def _limits(world: World) -> list[str]:
     return said
 
 
-def _target(settings: RenderSettings, fine: np.ndarray) -> tuple[float, str]:
+def _target(settings: RenderSettings, fine: np.ndarray | None) -> tuple[float, str]:
     if settings.budget is not None:
         signal, background = settings.budget
         target = error_for_budget(fine, signal, background)
@@ -99,7 +105,7 @@ def _target(settings: RenderSettings, fine: np.ndarray) -> tuple[float, str]:
 
 
 def _grid(
-    world: World, settings: RenderSettings, pixels: np.ndarray, pilot: np.ndarray, target: float
+    world: World, settings: RenderSettings, pixels: np.ndarray, pilot: np.ndarray | None, target: float
 ) -> tuple[int, str]:
     """The smallest grid whose direct light is off by at most DIRECT_SHARE of the error target.
 
@@ -130,7 +136,7 @@ def _grid(
 
 
 def _indirect(
-    world: World, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray, target: float, seed: int
+    world: World, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray | None, target: float, seed: int
 ) -> tuple[int, int | None, list[str]]:
     mode = world.scene.laser.mode
     if settings.bounces == 1:
