@@ -82,12 +82,12 @@ def _traced(world: World, sampler: Any, ray: Any, bounces: int) -> Any:
         surface = hit & ~passing & ~mirrored
         bsdf = si.bsdf()
         going_on = met + 1 < most
-        lit = surface & (met < most) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        lit = surface & going_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         sample, emitted = scene.sample_emitter_direction(si, sampler.next_2d(lit), False, lit)
         lit &= sample.pdf > 0
         value, of_bsdf = bsdf.eval_pdf(context, si, si.to_local(sample.d), lit)
         lit &= value[0] > 0
-        share = dr.select(sample.delta | ~going_on, 1, sample.pdf / (sample.pdf + of_bsdf))
+        share = dr.select(sample.delta, 1, sample.pdf / (sample.pdf + of_bsdf))
         light += dr.select(lit, weight * value[0] * emitted[0] * share * _open(world, si, sample, lit), 0)
 
         bounce, reflected = bsdf.sample(context, si, sampler.next_1d(surface), sampler.next_2d(surface), surface)

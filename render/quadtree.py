@@ -17,8 +17,9 @@ CREASE_M = 0.03
 CREASE_COSINE = 0.05
 
 MIXED_GAP_M = 0.05
-# A cell follows its neighbours if its tangent plane is off the mean step to them by no more, a bent surface apart [m].
-FOLLOWED_M = 1e-3
+# A cell follows its neighbours if its tangent plane is off the mean step to them by no more than this share of its
+# distance, a bent surface apart.
+FOLLOWED = 3e-4
 # Refinement ends at this many cells a side of a pixel, however fine the grid it started from.
 MOST_CELLS = 64
 # A wire that runs through the image is followed by at most this many launches.
@@ -183,7 +184,7 @@ class CellTree:
             share, two = 1 / np.maximum(number, 1), number == 2
             rise, bend = _steps(distance, both, along)
             off = np.abs(tangent * pitch - rise * share)
-            follows &= (number > 0) & (off <= np.maximum(np.abs(bend) * two / 4, FOLLOWED_M))
+            follows &= (number > 0) & (off <= np.maximum(np.abs(bend) * two / 4, FOLLOWED * distance))
             slope, bend = _steps(path, both, along)
             slope, bend = slope * share, bend * two
             gain = np.clip(_steps(radiance, both, along)[0] * share * per_radiance, -2, 2)

@@ -182,7 +182,7 @@ def test_progress_is_told():
     "bad",
     [
         {"bounces": 0}, {"spp": 0}, {"grid": 0}, {"grid": 65}, {"error": 0.0}, {"error": float("nan")},
-        {"budget": (0, 10)}, {"budget": (10, -1)}, {"error": 0.1, "budget": (1, 1)}, {"direct_tolerance_m": 0.0},
+        {"budget": (0, 10)}, {"budget": (10, -1)}, {"error": 0.1, "budget": (1, 1)}, {"direct_tolerance_m": 1e-6},
         {"indirect_growth": 2.0},
     ],
 )  # fmt: skip

@@ -101,10 +101,10 @@ def test_other_options_need_another_folder(whole, tmp_path):
 def test_a_view_that_fails_is_recorded_skipped_and_tried_again(tmp_path, monkeypatch):
     real = dataset._rendered
 
-    def odd(job, view):
+    def odd(job, view, again):
         if view == 1:
             raise ValueError("an odd\nscene")
-        return real(job, view)
+        return real(job, view, again)
 
     monkeypatch.setattr(dataset, "_rendered", odd)
     result = make_set(JOB, 3, tmp_path / "set")
