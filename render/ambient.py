@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.world import MAX_LAYERS, OPACITY, Bool, Float, UInt32, World, camera_rays, dr, mi, shape_index, spawn
+from render.rays import MAX_LAYERS, camera_rays, shape_index, spawn
+from render.world import OPACITY, Bool, Float, UInt32, World, dr, mi
 
 MOST_LANES = 1 << 18  # paths of one launch, where an image is not larger by itself
 CERTAIN = 3  # surfaces that every path may meet; from then on it goes on with the probability of its weight

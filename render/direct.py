@@ -9,8 +9,9 @@ import numpy as np
 
 from render.footprint import albedo
 from render.quadtree import MOST_CELLS, CellTree
+from render.rays import camera_rays, first_opaque
 from render.returns import Samples, concatenate, merge, packed
-from render.world import Bool, Float, UInt32, World, camera_rays, dr, first_opaque
+from render.world import Bool, Float, UInt32, World, dr
 
 LANES = 1 << 21
 REFINE = 4

@@ -17,20 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.world import (
-    Bool,
-    Float,
-    UInt32,
-    World,
-    camera_rays,
-    dr,
-    first_opaque,
-    laser_leg,
-    mi,
-    shape_index,
-    to_camera,
-    upload,
-)
+from render.rays import camera_rays, first_opaque, laser_leg, shape_index, to_camera
+from render.world import Bool, Float, UInt32, World, dr, mi, upload
 
 SMALL = 1 / 32
 # beside a displaced laser: a cell's extent over its distance to the laser, second order in the laser leg

@@ -21,22 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.cells import Rows
-from render.world import (
-    Bool,
-    Float,
-    UInt32,
-    World,
-    camera_rays,
-    dr,
-    first_opaque,
-    laser_leg,
-    laser_light,
-    mi,
-    segment,
-    shape_index,
-    spawn,
-    upload,
-)
+from render.rays import camera_rays, first_opaque, laser_leg, laser_light, segment, shape_index, spawn
+from render.world import Bool, Float, UInt32, World, dr, mi, upload
 
 BLOCK = 16  # pixels that share their paths
 LANES = 1 << 20  # connections, or paths, of one launch

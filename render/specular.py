@@ -26,24 +26,9 @@ from render.mirrors import (
     planes_of,
     specular_points,
 )
+from render.rays import camera_rays, first_opaque, in_beam, passage, shape_index, spawn, spreading
 from render.returns import Samples, concatenate, merge, no_samples
-from render.world import (
-    OPACITY,
-    Bool,
-    Float,
-    UInt32,
-    World,
-    camera_rays,
-    dr,
-    first_opaque,
-    in_beam,
-    mi,
-    passage,
-    shape_index,
-    spawn,
-    spreading,
-    upload,
-)
+from render.world import OPACITY, Bool, Float, UInt32, World, dr, mi, upload
 
 LANES = 1 << 20
 # A glint is a thin cone of rays: on an edge or in the apex of a corner cube, the share of them that comes back counts.
