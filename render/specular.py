@@ -170,16 +170,17 @@ def _glints(world: World, tables: _Tables, mirrors: Mirrors, sequence: np.ndarra
     column, row = _raster(world, image)
     possible &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     possible &= _shines_on(world, last, laser_point, column, row)
-    # without a candidate the kernel runs all the same: the set's next view, which may have one, must not compile it
-    kept = np.flatnonzero(possible) if possible.any() else np.zeros(1, np.int64)
-    sequence, image, possible = sequence[kept], image[kept], possible[kept]
+    kept = np.flatnonzero(possible)
+    if len(kept) == 0:
+        return no_samples()
+    sequence, image = sequence[kept], image[kept]
     row, column = row[kept].astype(np.int64), column[kept].astype(np.int64)
     distance = np.linalg.norm(image, axis=1)
     lanes = _lobe(image).reshape(-1, 3)
     planes = [upload(UInt32, np.repeat(plane, LOBE_RAYS)) for plane in sequence.T]
     target = mi.Point3f(*(upload(Float, axis) for axis in lanes.T))
     start = dr.zeros(mi.Point3f, len(lanes))
-    active = upload(Bool, np.repeat(possible, LOBE_RAYS))
+    active = dr.full(Bool, True, len(lanes))
     weight, delay, shortening, _ = _connect(world, tables, start, mi.Vector3f(0), target, planes, active, True)
     dr.eval(weight, delay, shortening)
     weight, delay, shortening = (
