@@ -42,7 +42,7 @@ from studies.store import Store
 from studies.testsets import TestSet, evaluated
 from studies.trained import Library, Subject
 from studies.training import baseline
-from studies.transport_plan import CHECKED, LASERS, LEVELS, LIMIT, MODELS, PLANNED, PLANS, STEPS, UNCOMPRESSED, Plan
+from studies.transport_plan import CHECKED, LASERS, LEVELS, LIMIT, MODELS, PLANS, STEPS, UNCOMPRESSED, Plan
 from studies.transport_planned import Place, planned_conclusions, planned_rows
 from studies.transport_tables import Contender, Rows, conclusions, ranking, summary
 
@@ -130,25 +130,25 @@ def contenders_of(plan: Plan, models: Obtained) -> list[Contender]:
 
 
 def _scenes(plan: Plan, seed: int) -> Iterator[tuple[str, str, Scene]]:
-    """Set, laser and scene, one view a place; scenes without steady light stand under sun and sky."""
+    """Set, laser and scene of every place under every laser."""
     width, height = plan.size
-    for name, count in plan.sets:
-        of = scene_set(name)
-        for number in range(count):
+    for some in plan.places:
+        of = scene_set(some.set)
+        for number in range(some.count):
             scene = of.view(number * of.views_per_place, seed=seed, width=width, height=height)
             told = f"scene {scene.name}: its laser is not at the camera, depth is not half the path"
             require(scene.laser.is_colocated, told)
-            if not scene.has_ambient:
-                scene = replace(scene, ambient=Ambient(environment=sun_and_sky()))
+            if some.sun:
+                scene = replace(scene.without_lights(), ambient=Ambient(environment=sun_and_sky()))
             for laser in LASERS:
-                yield name, laser, replace(scene, laser=Laser(laser))
+                yield some.set, laser, replace(scene, laser=Laser(laser))
 
 
 def _place(name: str, laser: str, scene: Scene, plan: Plan, seed: int, folder: Path, progress: Progress) -> Place:
     progress(f"{scene.name}, {laser}", 0.0)
     full = _rendered(scene, plan.full, seed, "full", folder, progress)
     # its noise is its own
-    planned = _rendered(scene, PLANNED, seed + 1, "planned", folder, progress)
+    planned = _rendered(scene, plan.planned, seed + 1, "planned", folder, progress)
     return Place(scene.name, name, laser, full, planned)
 
 
