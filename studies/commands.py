@@ -449,6 +449,17 @@ class Study(Common):
     """Folder for the figures (.png) and tables (.csv)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Report(Common):
+    """One self-contained HTML page of every figure, table, configuration and version made so far: speed against error
+    first, published numbers beside ours, and what was not measured. Nothing is loaded, and it prints well."""
+
+    results: Path = Path("out")
+    """Folder that `bench`, `study`, `evaluate` and `demo` have filled, with all its subfolders."""
+    out: Path = Path("out/report.html")
+    """The page to write."""
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
@@ -461,4 +472,5 @@ Command = (
     | Annotated[Ultraphase, tyro.conf.subcommand("ultraphase")]
     | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
 )

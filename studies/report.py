@@ -1,0 +1,372 @@
+"""`report`: one self-contained HTML page of everything that benches and studies have left in a folder.
+
+What is expected stands in `report_plan`; files are found by their names, wherever they lie in the folder. A file that
+is absent or cannot be read costs a line in the page, never the page.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.metadata
+import io
+import json
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from render.engine import Progress
+from scenes.errors import InputError, require
+from scenes.files import whole_file
+from studies import report_html as html
+from studies import report_published as beside_print
+from studies.commands import Report
+from studies.report_plan import NEVER, SECTIONS, Item, Picture, Table
+
+TITLE = "scene2spad: results"
+# What studies keep for themselves: renders, sets, captures, kept results, trained models.
+INSIDE = ("sets", "renders", "captures", "results", "maps", "models", "emulated")
+ENDINGS = (".png", ".csv", ".json")
+CONFIGURATIONS = {"config.json": "Trainings", "set.json": "Rendered sets"}
+PACKAGES = ("scene2spad", "mitsuba", "drjit", "torch", "lightning", "numpy", "scipy", "OpenEXR", "h5py", "matplotlib")
+MOST_CONFIGURATIONS = 200
+
+
+@dataclass
+class Found:
+    """The results' files by name, the newest of each first, and what went wrong with them on the way."""
+
+    root: Path
+    files: dict[str, list[Path]]
+    configurations: dict[str, list[Path]]
+    problems: list[str] = field(default_factory=list)
+    missing: dict[str, list[str]] = field(default_factory=dict)  # by command
+    used: set[Path] = field(default_factory=set)
+    shown: dict[str, str] = field(default_factory=dict)  # anchors of pictures by their contents
+    tables: int = 0
+
+    def newest(self, name: str) -> Path | None:
+        """The file of that name; all of them count as used."""
+        paths = self.files.get(name, [])
+        self.used.update(paths)
+        return paths[0] if paths else None
+
+    def told(self, path: Path) -> str:
+        """Its place in the folder and its day, and how many older ones of its name were passed over."""
+        day = time.strftime("%Y-%m-%d", time.gmtime(path.stat().st_mtime))
+        older = len(self.files.get(path.name, [])) - 1
+        return f"{path.relative_to(self.root)}, {day}{f'; {older} older of that name not shown' if older > 0 else ''}"
+
+    def read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
+        """What a reader makes of a file; None, and a problem, where it cannot."""
+        try:
+            return reader(path)
+        except (OSError, ValueError, SyntaxError, TypeError, KeyError, csv.Error) as error:
+            said = " ".join(str(error).split())[:120]
+            line = f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {said})"
+            if line not in self.problems:
+                self.problems.append(line)
+            return None
+
+    def lacks(self, file: str, command: str) -> None:
+        names = self.missing.setdefault(command, [])
+        if file not in names:
+            names.append(file)
+
+
+def gather(root: Path) -> Found:
+    """All pictures, tables and configurations in a folder. Raises InputError where there is none."""
+    require(root.is_dir(), f"{root}: no folder of results; benches and studies fill one")
+    files: dict[str, list[Path]] = {}
+    configurations: dict[str, list[Path]] = {name: [] for name in CONFIGURATIONS}
+    for path in sorted(path for path in root.rglob("*") if path.is_file()):
+        inside = path.relative_to(root).parts[:-1]
+        if path.name in configurations:
+            configurations[path.name].append(path)
+        elif path.suffix in ENDINGS and not path.name.startswith(".") and not {*inside} & {*INSIDE}:
+            files.setdefault(path.name, []).append(path)
+    for paths in files.values():
+        paths.sort(key=lambda path: (-path.stat().st_mtime, path))
+    return Found(root, files, configurations)
+
+
+def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
+    """A PNG's bytes and size; ValueError or OSError where it is none or cut."""
+    data = path.read_bytes()
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        image.verify()
+    if not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
+        raise ValueError("its end is missing")
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        return data, image.size
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a table; ValueError where lines are cut."""
+    with path.open(newline="", encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines, strict=True))
+    if any(None in row or None in row.values() for row in rows):
+        raise ValueError("rows of other lengths than its head")
+    return [{key: _number(text) for key, text in row.items()} for row in rows]
+
+
+def _number(text: str) -> int | float | str:
+    """A table's cell as the number that it spells, if it does."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """An object; ValueError for anything else."""
+    found = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(found, dict):
+        raise ValueError("holds no object")
+    return found
+
+
+def run(command: Report, progress: Progress) -> dict:
+    """Gather, compose, write; says what is in the page and what is not."""
+    out = command.out
+    require(out.suffix.lower() in (".html", ".htm"), f"{out}: the report must end in .html")
+    foreign = out.is_file() and html.GENERATOR not in out.read_text(encoding="utf-8", errors="replace")[:4000]
+    if foreign:
+        raise InputError(f"{out}: exists and is no report of scene2spad; choose another --out")
+    progress("gather", 0.1)
+    found = gather(command.results)
+    progress("compose", 0.4)
+    text = compose(found)
+    with whole_file(out) as beside:
+        beside.write_text(text, encoding="utf-8")
+    missing = [{"command": made, "files": names} for made, names in found.missing.items()]
+    told = {"bytes": len(text.encode()), "figures": len(found.shown), "tables": found.tables}
+    return {"out": str(out), **told, "problems": found.problems, "missing": missing}
+
+
+def compose(found: Found) -> str:
+    """The page."""
+    body, contents = [], []
+    for part in SECTIONS:
+        body.append(html.section(part.anchor, part.title, [_item(item, found) for item in part.items]))
+        contents.append((part.anchor, part.title, [(item.anchor, item.title) for item in part.items]))
+    more = _others(found)
+    ends = (
+        ("others", "Other results", more) if more else None,
+        ("configurations", "Configurations and versions", list(_configurations(found))),
+        ("not-measured", "What was not measured", list(_not_measured(found))),
+    )
+    for anchor, title, lines in filter(None, ends):
+        body.append(html.section(anchor, title, lines))
+        contents.append((anchor, title, ()))
+    size = sum(map(len, body)) / 2**20
+    lead = [
+        html.paragraph(
+            f"{len(found.shown)} figures and {found.tables} tables from {found.root.name or 'results'}, "
+            f"{size:.1f} MiB. The page holds everything it shows and loads nothing."
+        ),
+        html.paragraph(_absent_in_words(found), "first"),
+    ]
+    return html.page(TITLE, lead, contents, body)
+
+
+def _absent_in_words(found: Found) -> str:
+    count = sum(map(len, found.missing.values()))
+    said = f"{count} files that belong here were not found" if count else "Everything that belongs here is here"
+    broken = f", and {len(found.problems)} files could not be read" if found.problems else ""
+    return f"{said}{broken}: the last section says which, and what makes them."
+
+
+# Items
+
+
+def _item(item: Item, found: Found) -> str:
+    parts = [html.paragraph(item.text)] if item.text else []
+    parts += [html.paragraph(note) for note in _notes(item, found)]
+    parts += beside_print.published_tables(item.published, lambda name: _rows_of(Table(name, ""), found)[0])
+    found.tables += sum("<table>" in part for part in parts)
+    for one in item.pictures:
+        parts.append(_picture(one, item, found))
+    for one in item.tables:
+        parts.append(_table(one, item, found))
+    parts += [_named(name, item, found) for name in item.data]
+    return html.section(item.anchor, item.title, parts, level=3)
+
+
+def _notes(item: Item, found: Found) -> Iterator[str]:
+    """What a study's own JSON says of the models that it stands on."""
+    for name in dict.fromkeys(one.file for one in item.tables if one.file.endswith(".json")):
+        path = found.newest(name)
+        numbers = None if path is None else found.read(path, read_json)
+        models = (numbers or {}).get("models") or []
+        kinds = dict.fromkeys(f"{m.get('preset')}, {m.get('steps')} steps on {m.get('trained_on')}" for m in models)
+        if kinds:
+            yield f"{len(models)} trained models: {'; '.join(kinds)}."
+        if (numbers or {}).get("absent"):
+            yield f"Models that were absent: {', '.join(numbers['absent'])}."
+
+
+def _absent(file: str, command: str, found: Found, path: Path | None) -> str:
+    """One line for a file that is not there, or could not be read."""
+    if path is not None:
+        return html.paragraph(f"{file} was found but cannot be read.", "problem")
+    found.lacks(file, command)
+    return f'<p class="missing">Not measured: {html.code(file)}, made by {html.code(command)}.</p>'
+
+
+def _picture(one: Picture, item: Item, found: Found) -> str:
+    path = found.newest(one.file)
+    read = None if path is None else found.read(path, read_png)
+    if read is None:
+        return _absent(one.file, one.command or item.command, found, path)
+    return _figure(read, f"{one.shows}.", f"{one.shows}. ({found.told(path)})", f"picture-{path.stem}", found)
+
+
+def _figure(read: tuple[bytes, tuple[int, int]], alt: str, caption: str, anchor: str, found: Found) -> str:
+    """The picture, or where the same stands already, a link to it."""
+    data, size = read
+    sha = hashlib.sha256(data).hexdigest()
+    if sha in found.shown:
+        return f"<p>{html.link(found.shown[sha], caption)}: shown above.</p>"
+    found.shown[sha] = anchor
+    return html.picture(anchor, data, size, alt, caption)
+
+
+def _rows_of(one: Table, found: Found) -> tuple[list[dict] | None, Path | None]:
+    path = found.newest(one.file)
+    read = None if path is None else found.read(path, read_json if one.file.endswith(".json") else read_rows)
+    rows = read.get(one.key) if isinstance(read, dict) else read
+    if rows is not None and not (isinstance(rows, list) and all(isinstance(row, dict) for row in rows)):
+        return None, path
+    if rows and one.columns:
+        rows = [{name: row.get(name) for name in one.columns} for row in rows if row.get("chief", True)]
+    return rows, path
+
+
+def _table(one: Table, item: Item, found: Found) -> str:
+    rows, path = _rows_of(one, found)
+    if path is None or rows is None:
+        return _absent(one.file, item.command, found, path)
+    if not rows:
+        return html.paragraph(f"{one.shows}: none in {found.told(path)}.")
+    found.tables += 1
+    return html.table(rows, f"{one.shows} ({found.told(path)})")
+
+
+def _named(name: str, item: Item, found: Found) -> str:
+    """A table too long to show: its name and length."""
+    path = found.newest(name)
+    rows = None if path is None else found.read(path, read_rows)
+    if rows is None:
+        return _absent(name, item.command, found, path)
+    return f"<p>In full: {html.code(found.told(path))}, {len(rows)} rows.</p>"
+
+
+# The rest
+
+
+def _others(found: Found) -> list[str]:
+    """Pictures and tables that no item expects; JSON and tables beside a study's are named alone."""
+    parts, names = [], []
+    for path in [paths[0] for _, paths in sorted(found.files.items())]:
+        if path in found.used:
+            continue
+        if path.suffix == ".png":
+            read = found.read(path, read_png)
+            if read is not None:
+                shows = path.stem.replace("-", " ").replace(".", ", ")
+                parts.append(_figure(read, f"{shows}.", found.told(path), f"picture-{path.stem}", found))
+        else:
+            names.append(html.code(found.told(path)))
+    return [*parts, *([html.paragraph("Named alone:"), html.bullets(names)] if names else [])]
+
+
+def _configurations(found: Found) -> Iterator[str]:
+    versions = [{"what": "Python", "version": platform.python_version()}]
+    for name in PACKAGES:
+        try:
+            versions.append({"what": name, "version": importlib.metadata.version(name)})
+        except importlib.metadata.PackageNotFoundError:
+            versions.append({"what": name, "version": "not installed"})
+    found.tables += 1
+    yield html.table(versions, "Versions that this page was made with")
+    for name in ("bench-render.json", "bench-encode.json"):
+        path = found.newest(name)
+        machine = ((found.read(path, read_json) if path else None) or {}).get("machine")
+        if machine:
+            yield html.paragraph(f"{name} was measured on: {html.spelled(machine)}.")
+    models = list(_models(found))
+    if models:
+        found.tables += 1
+        yield html.table(models, "Models that studies stood on", MOST_CONFIGURATIONS)
+    for name, title in CONFIGURATIONS.items():
+        rows = [
+            {"folder": str(path.parent.relative_to(found.root)), **_flat(numbers)}
+            for path in found.configurations[name]
+            if (numbers := found.read(path, read_json)) is not None
+        ]
+        if rows:
+            found.tables += 1
+            yield html.table(rows, f"{title} ({name} of each)", MOST_CONFIGURATIONS)
+
+
+def _models(found: Found) -> Iterator[dict]:
+    seen = set()
+    for name, paths in sorted(found.files.items()):
+        numbers = found.read(paths[0], read_json) if name.endswith(".json") else None
+        for model in (numbers or {}).get("models") or []:
+            if isinstance(model, dict) and model.get("sha256") not in seen:
+                seen.add(model.get("sha256"))
+                yield {**model, "sha256": str(model.get("sha256", ""))[:12]}
+
+
+def _flat(numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values, and those one level beneath by both names; what lies deeper is left to the file."""
+    flat: dict[str, Any] = {}
+    for key, value in numbers.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{key} {inner}": one for inner, one in value.items() if not isinstance(one, (Mapping, list))}
+        else:
+            flat[key] = value
+    return flat
+
+
+def _not_measured(found: Found) -> Iterator[str]:
+    if found.missing:
+        yield html.paragraph("Not found, and the command that makes it:")
+        yield html.bullets(
+            f"{html.code(command)}: {', '.join(map(html.code, names))}" for command, names in found.missing.items()
+        )
+    else:
+        yield html.paragraph("Every result that belongs here was found.")
+    if found.problems:
+        yield html.paragraph("Found, but not readable:")
+        yield html.bullets(html.code(line) for line in found.problems)
+    open_ = list(_undecided(found))
+    if open_:
+        yield html.paragraph("Measured, but not decided:")
+        yield html.bullets(map(html.code, open_))
+    yield html.paragraph("Not to be measured here at all:")
+    yield html.bullets(map(escape, NEVER))
+
+
+def _undecided(found: Found) -> Iterator[str]:
+    """Conclusions whose interval leaves them open, by study."""
+    for name, paths in sorted(found.files.items()):
+        numbers = found.read(paths[0], read_json) if name.endswith(".json") else None
+        for one in _rows((numbers or {}).get("conclusions")):
+            if "not decided" in (one.get("verdict"), one.get("ranking")):
+                told = one.get("claim") or f"{one.get('laser')}, {one.get('step')}, levels {one.get('levels')}"
+                yield f"{Path(name).stem}: {told}{f' ({why})' if (why := one.get('why')) else ''}"
+
+
+def _rows(value: Any) -> Sequence[Mapping[str, Any]]:
+    return [row for row in value if isinstance(row, Mapping)] if isinstance(value, list) else []
