@@ -61,8 +61,6 @@ def error_rows(wanted: Iterable[Wanted], measured: Sequence[dict], far: bool) ->
             if published and found is not None:
                 worse = " worse" if found > WORSE * published else ""
                 row[f"{place} ours / published"] = f"{found / published:.2f}{worse}"
-                    f"{found / published:.2f}{' worse' if found > WORSE * published else ''}"
-                )
         rows.append({**row, "ours over": (mine or {}).get("of", "")})
     return rows
 
