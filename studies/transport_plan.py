@@ -61,7 +61,7 @@ class Plan:
     full: RenderSettings
     planned: RenderSettings = field(default_factory=RenderSettings)
     codes: tuple[str, ...] = CODES
-    draws: int = 4
+    draws: int = 8
 
 
 def _full(bounces: int, grid: int, spp: int, ambient_spp: int) -> RenderSettings:

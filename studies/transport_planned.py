@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -33,32 +34,38 @@ class Place:
     planned: Transient
 
 
+class Expected(NamedTuple):
+    """A transient with its expected counts (H, W, T) and background (H, W), photons."""
+
+    transient: Transient
+    counts: np.ndarray
+    background: np.ndarray
+
+
+def expected(transient: Transient, sensor: Sensor, budget: PhotonBudget) -> Expected:
+    rates, pixels = rates_for(transient, sensor, budget), transient.height * transient.width
+    counts = expected_counts(transient, sensor, rates, slice(0, pixels))[0].numpy()
+    background = rates.background * (sensor.bins / sensor.bins_per_period)
+    return Expected(transient, counts.reshape(transient.height, transient.width, sensor.bins), background)
+
+
 def coupled(
-    first: Transient, second: Transient, sensor: Sensor, budget: PhotonBudget, rng: np.random.Generator
+    first: Expected, second: Expected, sensor: Sensor, budget: PhotonBudget, rng: np.random.Generator
 ) -> tuple[Histogram, Histogram]:
     """Counts of two transients, each Poisson with its own rates a and b, that share the photons of min(a, b).
 
     Poisson(min) + Poisson(a - min) is Poisson(a): the difference of two errors is then free of most of what photons
     do to both.
     """
-    rates = [_expected(transient, sensor, budget) for transient in (first, second)]
-    least = np.minimum(*(counts for counts, _ in rates))
+    least = np.minimum(first.counts, second.counts)
     shared = rng.poisson(least)
     made = []
-    for transient, (counts, background) in zip((first, second), rates, strict=True):
+    for transient, counts, background in (first, second):
         drawn = (shared + rng.poisson(np.maximum(counts - least, 0))).astype(np.int32)
         signal = np.clip(counts.sum(axis=2) - background, 0, None).astype(np.float32)
         truth = (transient.depth_m, transient.mixed, transient.albedo)
         made.append(Histogram(drawn, sensor, budget, *truth, signal, background.astype(np.float32)))
     return made[0], made[1]
-
-
-def _expected(transient: Transient, sensor: Sensor, budget: PhotonBudget) -> tuple[np.ndarray, np.ndarray]:
-    """Expected counts (H, W, T) and background (H, W)."""
-    rates, pixels = rates_for(transient, sensor, budget), transient.height * transient.width
-    counts = expected_counts(transient, sensor, rates, slice(0, pixels))[0].numpy()
-    background = rates.background * (sensor.bins / sensor.bins_per_period)
-    return counts.reshape(transient.height, transient.width, sensor.bins), background
 
 
 def planned_rows(
@@ -68,40 +75,43 @@ def planned_rows(
     found = []
     for number, place in enumerate(places):
         progress(f"planned and full, {place.name}, {place.laser}", number / len(places))
-        pair = f"{place.full.sha256()[:32]}-{place.planned.sha256()[:32]}"
-        errors = np.array([  # (draws, levels, designs, 2)
-            [_both(place, checked, store, pair, level, (seed, number, draw, at)) for at, level in enumerate(LEVELS)]
-            for draw in range(draws)
-        ])  # fmt: skip
+        keys = [[(seed, number, draw, at) for draw in range(draws)] for at in range(len(LEVELS))]
+        # (levels, draws, designs, full and planned)
+        errors = np.array([_both(place, checked, store, *one) for one in zip(LEVELS, keys, strict=True)])
         for at, one in enumerate(checked):
-            full, planned = errors[:, :, at, 0].mean(1), errors[:, :, at, 1].mean(1)
-            share, off = compared(full, planned)
+            full, planned = errors[:, :, at, 0].mean(0), errors[:, :, at, 1].mean(0)
+            share, wide = compared(full, planned)
             told = {"scene": place.name, "set": place.set, "laser": place.laser, "design": one.name}
             numbers = {"full_mm": float(full.mean()), "planned_mm": float(planned.mean()), "difference": share}
-            found.append({**told, **numbers, "uncertain": off, "verdict": within(share, off)})
+            found.append({**told, **numbers, "uncertain": wide, "verdict": within(share, wide)})
     return found
 
 
 def _both(
-    place: Place, checked: Sequence[Contender], store: Store, pair: str, level: tuple[float, float], key: tuple
-) -> list[tuple[float, float]]:
-    """(full, planned) MAE [mm] of each design on one draw of photons; what the store has is not drawn again."""
-    named = {"pair": pair, "level": list(level), "draw": list(key)}
-    missing = [one for one in checked if store.get(one.subject.digest, **named) is None]
-    if missing:
-        rng, sensor = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(STAGE_COUPLED,))), Sensor()
-        histograms = coupled(place.full, place.planned, sensor, PhotonBudget(*level), rng)
-        for one in missing:
-            depths = [one.subject.model.depth_of(histogram)[0] for histogram in histograms]
-            errors = [image_errors(depth, place.full.depth_m, sensor.range_m)["mae_mm"] for depth in depths]
-            store.put(one.subject.digest, errors, **named)
-    return [tuple(store.get(one.subject.digest, **named)) for one in checked]
+    place: Place, checked: Sequence[Contender], store: Store, level: tuple[float, float], keys: Sequence[tuple]
+) -> list[list[list[float]]]:
+    """[full, planned] MAE [mm] of each draw of photons and design; what the store has is not drawn again."""
+    pair = f"{place.full.sha256()[:32]}-{place.planned.sha256()[:32]}"
+    sensor, budget, rates, found = Sensor(), PhotonBudget(*level), None, []
+    for key in keys:
+        named = {"pair": pair, "level": list(level), "draw": list(key)}
+        missing = [one for one in checked if store.get(one.subject.digest, **named) is None]
+        if missing:
+            rates = rates or [expected(one, sensor, budget) for one in (place.full, place.planned)]
+            rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(STAGE_COUPLED,)))
+            histograms = coupled(*rates, sensor, budget, rng)
+            for one in missing:
+                depths = [one.subject.model.depth_of(histogram)[0] for histogram in histograms]
+                errors = [image_errors(depth, place.full.depth_m, sensor.range_m)["mae_mm"] for depth in depths]
+                store.put(one.subject.digest, errors, **named)
+        found.append([store.get(one.subject.digest, **named) for one in checked])
+    return found
 
 
 def compared(full: np.ndarray, planned: np.ndarray) -> tuple[float, float]:
     """mean(planned) / mean(full) - 1 over draws of photons, and the half width of its 95 % interval by Student's t."""
     each = (planned - full) / full.mean()
-    wide = float(stats.t.ppf(0.975, len(each) - 1) * stats.sem(each)) if len(each) > 1 else float("nan")
+    wide = float(stats.t.ppf(0.975, len(each) - 1) * stats.sem(each)) if len(each) > 1 else math.nan
     return float(each.mean()), wide
 
 

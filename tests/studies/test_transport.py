@@ -104,8 +104,8 @@ def test_coupled_counts_have_their_own_law_and_differ_by_what_the_rates_differ_b
     first, budget, sensor = a_render(), PhotonBudget(20, 20), Sensor()
     second = transport.direct_alone(first)
     a, b = rates_of(first, budget), rates_of(second, budget)
-    rng = np.random.default_rng(0)
-    draws = [transport_planned.coupled(first, second, sensor, budget, rng) for _ in range(20)]
+    rng, pair = np.random.default_rng(0), [transport_planned.expected(one, sensor, budget) for one in (first, second)]
+    draws = [transport_planned.coupled(*pair, sensor, budget, rng) for _ in range(20)]
     halves = slice(0, 200), slice(200, 1024)
     for part in halves:
         for place, rates in enumerate((a, b)):
@@ -122,8 +122,9 @@ def test_coupled_counts_have_their_own_law_and_differ_by_what_the_rates_differ_b
 
 
 def test_equal_renders_give_equal_counts():
-    render = a_render()
-    x, y = transport_planned.coupled(render, render, Sensor(), PhotonBudget(10, 200), np.random.default_rng(1))
+    sensor, budget = Sensor(), PhotonBudget(10, 200)
+    one = transport_planned.expected(a_render(), sensor, budget)
+    x, y = transport_planned.coupled(one, one, sensor, budget, np.random.default_rng(1))
     np.testing.assert_array_equal(x.counts, y.counts)
     assert x.counts.sum() > 0
 
