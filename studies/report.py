@@ -74,11 +74,6 @@ class Found:
                 self.problems.append(line)
             return None
 
-    def lacks(self, file: str, command: str) -> None:
-        names = self.missing.setdefault(command, [])
-        if file not in names:
-            names.append(file)
-
 
 def gather(root: Path) -> Found:
     """All pictures, tables and configurations in a folder. Raises InputError where there is none."""
@@ -147,7 +142,9 @@ def run(command: Report, progress: Progress) -> dict:
     text = compose(found)
     with whole_file(out) as beside:
         beside.write_text(text, encoding="utf-8")
-    missing = [{"command": made, "files": names} for made, names in found.missing.items()]
+    missing: list[Any] = [{"command": made, "files": names} for made, names in found.missing.items()]
+    if not command.json:
+        missing = [f"{made}: {', '.join(names)}" for made, names in found.missing.items()]
     told = {"bytes": len(text.encode()), "figures": len(found.shown), "tables": found.tables}
     return {"out": str(out), **told, "problems": found.problems, "missing": missing}
 
@@ -158,10 +155,10 @@ def compose(found: Found) -> str:
     for part in SECTIONS:
         body.append(html.section(part.anchor, part.title, [_item(item, found) for item in part.items]))
         contents.append((part.anchor, part.title, [(item.anchor, item.title) for item in part.items]))
-    more = _others(found)
+    configurations, more = list(_configurations(found)), _others(found)
     ends = (
         ("others", "Other results", more) if more else None,
-        ("configurations", "Configurations and versions", list(_configurations(found))),
+        ("configurations", "Configurations and versions", configurations),
         ("not-measured", "What was not measured", list(_not_measured(found))),
     )
     for anchor, title, lines in filter(None, ends):
@@ -181,7 +178,7 @@ def compose(found: Found) -> str:
 def _absent_in_words(found: Found) -> str:
     count = sum(map(len, found.missing.values()))
     said = f"{count} files that belong here were not found" if count else "Everything that belongs here is here"
-    broken = f", and {len(found.problems)} files could not be read" if found.problems else ""
+    broken = f", {len(found.problems)} could not be read" if found.problems else ""
     return f"{said}{broken}: the last section says which, and what makes them."
 
 
@@ -193,12 +190,17 @@ def _item(item: Item, found: Found) -> str:
     parts += [html.paragraph(note) for note in _notes(item, found)]
     parts += beside_print.published_tables(item.published, lambda name: _rows_of(Table(name, ""), found)[0])
     found.tables += sum("<table>" in part for part in parts)
+    absent: dict[str, list[str]] = {}
     for one in item.pictures:
-        parts.append(_picture(one, item, found))
+        parts.append(_picture(one, item, found, absent))
     for one in item.tables:
-        parts.append(_table(one, item, found))
-    parts += [_named(name, item, found) for name in item.data]
-    return html.section(item.anchor, item.title, parts, level=3)
+        parts.append(_table(one, item, found, absent))
+    parts += [_named(name, item, found, absent) for name in item.data]
+    for command, names in absent.items():
+        found.missing.setdefault(command, []).extend(n for n in names if n not in found.missing.get(command, []))
+    lines = [f"{', '.join(map(html.code, names))}, made by {html.code(command)}" for command, names in absent.items()]
+    parts += [f'<p class="missing">Not measured: {line}.</p>' for line in lines]
+    return html.section(item.anchor, item.title, filter(None, parts), level=3)
 
 
 def _notes(item: Item, found: Found) -> Iterator[str]:
@@ -214,19 +216,21 @@ def _notes(item: Item, found: Found) -> Iterator[str]:
             yield f"Models that were absent: {', '.join(numbers['absent'])}."
 
 
-def _absent(file: str, command: str, found: Found, path: Path | None) -> str:
-    """One line for a file that is not there, or could not be read."""
+def _absent(file: str, command: str, path: Path | None, absent: dict[str, list[str]]) -> str:
+    """One line for a file that could not be read; one that is not there is put down by the command that makes it."""
     if path is not None:
         return html.paragraph(f"{file} was found but cannot be read.", "problem")
-    found.lacks(file, command)
-    return f'<p class="missing">Not measured: {html.code(file)}, made by {html.code(command)}.</p>'
+    names = absent.setdefault(command, [])
+    if file not in names:
+        names.append(file)
+    return ""
 
 
-def _picture(one: Picture, item: Item, found: Found) -> str:
+def _picture(one: Picture, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
     path = found.newest(one.file)
     read = None if path is None else found.read(path, read_png)
     if read is None:
-        return _absent(one.file, one.command or item.command, found, path)
+        return _absent(one.file, one.command or item.command, path, absent)
     return _figure(read, f"{one.shows}.", f"{one.shows}. ({found.told(path)})", f"picture-{path.stem}", found)
 
 
@@ -251,22 +255,22 @@ def _rows_of(one: Table, found: Found) -> tuple[list[dict] | None, Path | None]:
     return rows, path
 
 
-def _table(one: Table, item: Item, found: Found) -> str:
+def _table(one: Table, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
     rows, path = _rows_of(one, found)
     if path is None or rows is None:
-        return _absent(one.file, item.command, found, path)
+        return _absent(one.file, item.command, path, absent)
     if not rows:
         return html.paragraph(f"{one.shows}: none in {found.told(path)}.")
     found.tables += 1
     return html.table(rows, f"{one.shows} ({found.told(path)})")
 
 
-def _named(name: str, item: Item, found: Found) -> str:
+def _named(name: str, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
     """A table too long to show: its name and length."""
     path = found.newest(name)
     rows = None if path is None else found.read(path, read_rows)
     if rows is None:
-        return _absent(name, item.command, found, path)
+        return _absent(name, item.command, path, absent)
     return f"<p>In full: {html.code(found.told(path))}, {len(rows)} rows.</p>"
 
 
@@ -363,8 +367,9 @@ def _undecided(found: Found) -> Iterator[str]:
     for name, paths in sorted(found.files.items()):
         numbers = found.read(paths[0], read_json) if name.endswith(".json") else None
         for one in _rows((numbers or {}).get("conclusions")):
-            if "not decided" in (one.get("verdict"), one.get("ranking")):
-                told = one.get("claim") or f"{one.get('laser')}, {one.get('step')}, levels {one.get('levels')}"
+            whole = "ranking" not in one or one.get("levels") == "all"
+            if whole and "not decided" in (one.get("verdict"), one.get("ranking")):
+                told = one.get("claim") or f"ranking of codes, {one.get('laser')} laser, step {one.get('step')}"
                 yield f"{Path(name).stem}: {told}{f' ({why})' if (why := one.get('why')) else ''}"
 
 

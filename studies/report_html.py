@@ -11,6 +11,8 @@ from typing import Any
 GENERATOR = '<meta name="generator" content="scene2spad report">'
 # nothing may be loaded, whatever a result's text says
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+SHORT = 30  # rows of a table that is not broken between pages of paper
+MANY = 12  # columns from which on its words are broken there
 STYLE = """
 :root { color-scheme: light; --line: #c9ced6; --soft: #f3f5f8; --bad: #8a1f11; }
 * { box-sizing: border-box; }
@@ -36,14 +38,19 @@ thead th { background: var(--soft); }
 code { font-size: .88em; overflow-wrap: anywhere; }
 @media print {
   @page { size: A4; margin: 14mm 12mm; }
-  body { font-size: 10pt; padding: 0; max-width: none; }
+  html { font-size: 9.5pt; }
+  body { font-size: 1rem; padding: 0; max-width: none; }
   h2 { break-before: page; margin-top: 0; }
-  h2, h3, caption, figcaption { break-after: avoid; }
-  figure, tr, .missing, .problem, .first { break-inside: avoid; }
+  h2, h3 { break-after: avoid; }
+  h2 + *, h3 + *, h3 + p + * { break-before: avoid; }
+  figure, tr, .short, .missing, .problem, .first { break-inside: avoid; }
   img { max-height: 225mm; width: auto; border: 0; }
   .wide { overflow: visible; }
   table { font-size: 7pt; max-width: 100%; }
-  th, td { padding: .5mm 1mm; overflow-wrap: anywhere; }
+  caption { font-size: 8pt; }
+  th, td { padding: .5mm 1mm; overflow-wrap: break-word; }
+  .many table { font-size: 5.5pt; }
+  .many :is(th, td) { overflow-wrap: anywhere; }
   td.n { white-space: normal; }
   thead { display: table-header-group; }
   nav { columns: 2; }
@@ -108,8 +115,9 @@ def table(rows: Sequence[Mapping[str, Any]], caption: str, most: int = 60) -> st
     head = "".join(f'<th scope="col">{escape(name.replace("_", " "))}</th>' for name in columns)
     lines = "".join(f"<tr>{''.join(_cell(row.get(name)) for name in columns)}</tr>\n" for row in rows[:most])
     rest = f" (the first {most} of {len(rows)} rows)" if len(rows) > most else ""
+    kind = f"wide{' short' * (len(rows) <= SHORT)}{' many' * (len(columns) > MANY)}"
     return (
-        f'<div class="wide"><table>\n<caption>{escape(caption + rest)}</caption>\n'
+        f'<div class="{kind}"><table>\n<caption>{escape(caption + rest)}</caption>\n'
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{lines}</tbody>\n</table></div>"
     )
 

@@ -264,7 +264,7 @@ _BEYOND = Section(
                       "planned_conclusions"),
                 Table("transport.json", "Scenes: indirect light, mixed pixels, rays", "scenes"),
             ),
-            ("transport.csv", "transport-summary.csv", "transport-ranking.csv", "transport-planned.csv"),
+            tuple(f"transport{name}.csv" for name in ("", "-summary", "-ranking", "-planned", "-scenes")),
         ),
         Item(
             "render-error",

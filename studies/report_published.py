@@ -58,11 +58,15 @@ def error_rows(wanted: Iterable[Wanted], measured: Sequence[dict], far: bool) ->
             published, found = getattr(print_, f"{place}_mae", None), _number((mine or {}).get(f"{place}_mae_mm_label"))
             row[f"{place} published"] = published
             row[f"{place} ours"] = NOT_MEASURED if found is None else found
-            if published and found is not None:
-                worse = " worse" if found > WORSE * published else ""
-                row[f"{place} ours / published"] = f"{found / published:.2f}{worse}"
+            row[f"{place} ours / published"] = _ratio(found, published)
         rows.append({**row, "ours over": (mine or {}).get("of", "")})
     return rows
+
+
+def _ratio(found: float | None, published: float | None) -> str:
+    if found is None or not published:
+        return ""
+    return f"{found / published:.2f}{' worse' if found > WORSE * published else ''}"
 
 
 def power_rows(measured: Sequence[dict]) -> list[dict[str, object]]:
