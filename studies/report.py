@@ -12,7 +12,9 @@ import importlib.metadata
 import io
 import json
 import platform
+import struct
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -33,9 +35,22 @@ TITLE = "scene2spad: results"
 # What studies keep for themselves: renders, sets, captures, kept results, trained models.
 INSIDE = ("sets", "renders", "captures", "results", "maps", "models", "emulated")
 ENDINGS = (".png", ".csv", ".json")
-CONFIGURATIONS = {"config.json": "Trainings", "set.json": "Rendered sets"}
+# Titles, and the columns that are shown, all where none is named.
+CONFIGURATIONS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "config.json": (
+        "Trainings",
+        ("preset", "seed", "epochs", "steps_per_epoch", "batch", "crop", "rate", "tv_weight", "time_offset_m",
+         "precision", "model network", "data training", "data training_reach_m"),
+    ),
+    "set.json": ("Rendered sets", ()),
+}  # fmt: skip
 PACKAGES = ("scene2spad", "mitsuba", "drjit", "torch", "lightning", "numpy", "scipy", "OpenEXR", "h5py", "matplotlib")
 MOST_CONFIGURATIONS = 200
+# what readers of tables, JSON and pictures raise for damaged files
+UNREADABLE = (
+    OSError, ValueError, TypeError, KeyError, SyntaxError, RecursionError, csv.Error, struct.error, zlib.error,
+    Image.DecompressionBombError,
+)  # fmt: skip
 
 
 @dataclass
@@ -48,7 +63,7 @@ class Found:
     problems: list[str] = field(default_factory=list)
     missing: dict[str, list[str]] = field(default_factory=dict)  # by command
     used: set[Path] = field(default_factory=set)
-    shown: dict[str, str] = field(default_factory=dict)  # anchors of pictures by their contents
+    shown: set[str] = field(default_factory=set)  # anchors of pictures, by their contents
     tables: int = 0
 
     def newest(self, name: str) -> Path | None:
@@ -67,12 +82,14 @@ class Found:
         """What a reader makes of a file; None, and a problem, where it cannot."""
         try:
             return reader(path)
-        except (OSError, ValueError, SyntaxError, TypeError, KeyError, csv.Error) as error:
+        except UNREADABLE as error:
             said = " ".join(str(error).split())[:120]
-            line = f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {said})"
-            if line not in self.problems:
-                self.problems.append(line)
+            self.problem(f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {said})")
             return None
+
+    def problem(self, line: str) -> None:
+        if line not in self.problems:
+            self.problems.append(line)
 
 
 def gather(root: Path) -> Found:
@@ -208,18 +225,18 @@ def _notes(item: Item, found: Found) -> Iterator[str]:
     for name in dict.fromkeys(one.file for one in item.tables if one.file.endswith(".json")):
         path = found.newest(name)
         numbers = None if path is None else found.read(path, read_json)
-        models = (numbers or {}).get("models") or []
+        models = _rows((numbers or {}).get("models"))
         kinds = dict.fromkeys(f"{m.get('preset')}, {m.get('steps')} steps on {m.get('trained_on')}" for m in models)
         if kinds:
             yield f"{len(models)} trained models: {'; '.join(kinds)}."
         if (numbers or {}).get("absent"):
-            yield f"Models that were absent: {', '.join(numbers['absent'])}."
+            yield f"Models that were absent: {html.spelled(numbers['absent'])}."
 
 
 def _absent(file: str, command: str, path: Path | None, absent: dict[str, list[str]]) -> str:
     """One line for a file that could not be read; one that is not there is put down by the command that makes it."""
     if path is not None:
-        return html.paragraph(f"{file} was found but cannot be read.", "problem")
+        return html.paragraph(f"{file} was found, but what should stand here cannot be read from it.", "problem")
     names = absent.setdefault(command, [])
     if file not in names:
         names.append(file)
@@ -231,16 +248,16 @@ def _picture(one: Picture, item: Item, found: Found, absent: dict[str, list[str]
     read = None if path is None else found.read(path, read_png)
     if read is None:
         return _absent(one.file, one.command or item.command, path, absent)
-    return _figure(read, f"{one.shows}.", f"{one.shows}. ({found.told(path)})", f"picture-{path.stem}", found)
+    return _figure(read, f"{one.shows}.", f"{one.shows}. ({found.told(path)})", found)
 
 
-def _figure(read: tuple[bytes, tuple[int, int]], alt: str, caption: str, anchor: str, found: Found) -> str:
+def _figure(read: tuple[bytes, tuple[int, int]], alt: str, caption: str, found: Found) -> str:
     """The picture, or where the same stands already, a link to it."""
     data, size = read
-    sha = hashlib.sha256(data).hexdigest()
-    if sha in found.shown:
-        return f"<p>{html.link(found.shown[sha], caption)}: shown above.</p>"
-    found.shown[sha] = anchor
+    anchor = f"picture-{hashlib.sha256(data).hexdigest()[:16]}"
+    if anchor in found.shown:
+        return f"<p>{html.link(anchor, caption)}: shown above.</p>"
+    found.shown.add(anchor)
     return html.picture(anchor, data, size, alt, caption)
 
 
@@ -248,7 +265,9 @@ def _rows_of(one: Table, found: Found) -> tuple[list[dict] | None, Path | None]:
     path = found.newest(one.file)
     read = None if path is None else found.read(path, read_json if one.file.endswith(".json") else read_rows)
     rows = read.get(one.key) if isinstance(read, dict) else read
-    if rows is not None and not (isinstance(rows, list) and all(isinstance(row, dict) for row in rows)):
+    good = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
+    if read is not None and not good:
+        found.problem(f"{path.relative_to(found.root)}: has no table {one.key}")
         return None, path
     if rows and one.columns:
         rows = [{name: row.get(name) for name in one.columns} for row in rows if row.get("chief", True)]
@@ -287,7 +306,7 @@ def _others(found: Found) -> list[str]:
             read = found.read(path, read_png)
             if read is not None:
                 shows = path.stem.replace("-", " ").replace(".", ", ")
-                parts.append(_figure(read, f"{shows}.", found.told(path), f"picture-{path.stem}", found))
+                parts.append(_figure(read, f"{shows}.", found.told(path), found))
         else:
             names.append(html.code(found.told(path)))
     return [*parts, *([html.paragraph("Named alone:"), html.bullets(names)] if names else [])]
@@ -311,9 +330,9 @@ def _configurations(found: Found) -> Iterator[str]:
     if models:
         found.tables += 1
         yield html.table(models, "Models that studies stood on", MOST_CONFIGURATIONS)
-    for name, title in CONFIGURATIONS.items():
+    for name, (title, columns) in CONFIGURATIONS.items():
         rows = [
-            {"folder": str(path.parent.relative_to(found.root)), **_flat(numbers)}
+            {"folder": str(path.parent.relative_to(found.root)), **_flat(numbers, columns)}
             for path in found.configurations[name]
             if (numbers := found.read(path, read_json)) is not None
         ]
@@ -326,21 +345,22 @@ def _models(found: Found) -> Iterator[dict]:
     seen = set()
     for name, paths in sorted(found.files.items()):
         numbers = found.read(paths[0], read_json) if name.endswith(".json") else None
-        for model in (numbers or {}).get("models") or []:
-            if isinstance(model, dict) and model.get("sha256") not in seen:
-                seen.add(model.get("sha256"))
-                yield {**model, "sha256": str(model.get("sha256", ""))[:12]}
+        for model in _rows((numbers or {}).get("models")):
+            digest = str(model.get("sha256", ""))
+            if digest not in seen:
+                seen.add(digest)
+                yield {**model, "sha256": digest[:12]}
 
 
-def _flat(numbers: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain values, and those one level beneath by both names; what lies deeper is left to the file."""
+def _flat(numbers: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
+    """Plain values, and those one level beneath by both names; where columns are named, these alone."""
     flat: dict[str, Any] = {}
     for key, value in numbers.items():
         if isinstance(value, Mapping):
             flat |= {f"{key} {inner}": one for inner, one in value.items() if not isinstance(one, (Mapping, list))}
         else:
             flat[key] = value
-    return flat
+    return {key: flat[key] for key in columns or flat if key in flat}
 
 
 def _not_measured(found: Found) -> Iterator[str]:
@@ -357,7 +377,7 @@ def _not_measured(found: Found) -> Iterator[str]:
     open_ = list(_undecided(found))
     if open_:
         yield html.paragraph("Measured, but not decided:")
-        yield html.bullets(map(html.code, open_))
+        yield html.bullets(map(escape, open_))
     yield html.paragraph("Not to be measured here at all:")
     yield html.bullets(map(escape, NEVER))
 

@@ -106,6 +106,7 @@ def tree(tmp_path) -> Path:
     put(root / "study/codes.png", png(5)[:-30])
     put(root / "study/copy.png", png(3))
     put(root / "study/power.json", "{")
+    put(root / "study/depth-offset.json", {"models": [1, "x"], "absent": 3, "bars": [1], "conclusions": "none"})
     put(root / "study/smoke/sets/tabletop/set.json", {"set": "tabletop", "grid": 4, "deep": {"a": 1, "b": {}}})
     put(root / "study/smoke/models/m/config.json", {"preset": "smoke", "rate": 0.001})
     put(root / "study/smoke/renders/inner.png", png(6))
@@ -171,7 +172,7 @@ def test_what_is_missing_or_broken_is_named_with_its_command(tree, capfd):
     assert missing["scene2spad study fourier --full"] == ["fourier-11-64x.png"]
     assert "codes.png" not in missing.get("scene2spad study codes", [])  # there, but broken
     broken = {line.split(":")[0] for line in told["problems"]}
-    assert broken == {"study/codes.png", "bench/bench-sense.csv", "study/power.json"}
+    assert broken == {"study/codes.png", "bench/bench-sense.csv", "study/power.json", "study/depth-offset.json"}
     end = text[text.index('id="not-measured"') :]
     for command, files in missing.items():
         assert command in end and all(name in end for name in files)
