@@ -44,7 +44,7 @@ CONFIGURATIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "set.json": ("Rendered sets", ()),
 }  # fmt: skip
-PACKAGES = ("scene2spad", "mitsuba", "drjit", "torch", "pytorch-lightning", "numpy", "scipy", "OpenEXR", "h5py", "matplotlib")
+PACKAGES = ("scene2spad", "mitsuba", "drjit", "torch", "pytorch-lightning", "numpy", "scipy", "OpenEXR", "matplotlib")
 MOST_CONFIGURATIONS = 200
 # what readers of tables, JSON and pictures raise for damaged files
 UNREADABLE = (
