@@ -134,7 +134,9 @@ def tabletop(name: str, *, width: int = 88, height: int = 72) -> Scene:
     for make, count in RECIPES[name]:
         for _ in range(2 * count):
             _stand(make(palette, rng), floor, rng)
-    surfaces = _table(palette, rng) + [s for place in floor.places for s in place.surfaces] + one_of_each(palette)
+    # dark: of a hidden lamp's light a trace would come round the table, and be all the ambient light there is
+    hidden = [replace(surface, emission=0.0) for surface in one_of_each(palette)]
+    surfaces = _table(palette, rng) + [s for place in floor.places for s in place.surfaces] + hidden
     pitch = math.radians(PITCH_DEG)
     ahead = (0.0, EYE_M + math.sin(pitch), -math.cos(pitch))
     camera = Camera.look_at((0, EYE_M, 0), ahead, fov_deg=FOV_DEG, width=width, height=height)

@@ -380,7 +380,8 @@ class Study(Common):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
     decoded from codes without a network, and the in-pixel processor's power (4, 5); of trained models: scenes moved out
     of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
-    captures (13, 14); and how much the error of a rendered set itself matters to depth."""
+    captures (13, 14); how much the error of a rendered set itself matters to depth; and what a renderer adds to RGB-D
+    simulation, step by step."""
 
     name: Positional[
         Literal[
@@ -394,6 +395,7 @@ class Study(Common):
             "fourier",
             "real-data",
             "render-error",
+            "transport",
         ]
     ]
     """Which study."""
@@ -413,7 +415,7 @@ class Study(Common):
     preset: Literal["smoke", "laptop", "paper"] = "laptop"
     """Of studies of trained models: smoke trains two for seconds and tests them on two small views; laptop and paper
     say how models are trained with --retrain. Of `study real-data`, how captures are rendered: 32 x 32 pixels of direct
-    light, 256 x 256 to 5 %, to 2 %."""
+    light, 256 x 256 to 5 %, to 2 %. Of `study transport`, 2, 12 or 24 scenes, 24, 88 or 176 pixels wide."""
     models: Annotated[Path | None, _open("FOLDER")] = None
     """Folder of runs of `train`, each under its model's name, looked in before the models that come with the package
     (default: models in --out)."""
@@ -447,6 +449,17 @@ class Study(Common):
     """Folder for the figures (.png) and tables (.csv)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Report(Common):
+    """One self-contained HTML page of every figure, table, configuration and version made so far: speed against error
+    first, published numbers beside ours, and what was not measured. Nothing is loaded, and it prints well."""
+
+    results: Path = Path("out")
+    """Folder that `bench`, `study`, `evaluate` and `demo` have filled, with all its subfolders."""
+    out: Path = Path("out/report.html")
+    """The page to write."""
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
@@ -459,4 +472,5 @@ Command = (
     | Annotated[Ultraphase, tyro.conf.subcommand("ultraphase")]
     | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
 )

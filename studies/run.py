@@ -366,6 +366,13 @@ def run_evaluate(command: commands.Evaluate, progress: Progress) -> dict:
     return training.run_evaluate(command, progress)
 
 
+def run_report(command: commands.Report, progress: Progress) -> dict:
+    """Results -> one page."""
+    from studies import report
+
+    return report.run(command, progress)
+
+
 RUNNERS: dict[type, Callable] = {
     commands.Demo: run_demo,
     commands.Scenes: run_scenes,
@@ -378,4 +385,5 @@ RUNNERS: dict[type, Callable] = {
     commands.Bench: run_bench,
     commands.Ultraphase: run_ultraphase,
     commands.Study: run_study,
+    commands.Report: run_report,
 }

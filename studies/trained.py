@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
 
 from csph.config import ModelConfig, TrainConfig
@@ -19,6 +20,7 @@ from csph.model import DepthModel, load_model, weights_sha256
 from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, ship, shipped_file
 from render.engine import Progress
 from scenes.errors import require
+from spad.histogram import Histogram
 from studies.commands import Train
 from studies.training import config_of, run_train
 
@@ -86,11 +88,17 @@ class Wanted:
         return f"scene2spad train --design {self.design}{coded}{more} {made}"
 
 
+class FindsDepth(Protocol):
+    """What evaluation asks of a model."""
+
+    def depth_of(self, histogram: Histogram, *, int8: bool = False) -> tuple[np.ndarray, int]: ...
+
+
 class Subject(NamedTuple):
-    """A model to be evaluated, under a name of its own."""
+    """A model to be evaluated, or what stands for one, under a name of its own."""
 
     name: str
-    model: DepthModel
+    model: FindsDepth
     digest: str
 
 

@@ -1,0 +1,397 @@
+"""`report`: one self-contained HTML page of everything that benches and studies have left in a folder.
+
+What is expected stands in `report_plan`; files are found by their names, wherever they lie in the folder. A file that
+is absent or cannot be read costs a line in the page, never the page.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.metadata
+import io
+import json
+import platform
+import struct
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from render.engine import Progress
+from scenes.errors import InputError, require
+from scenes.files import whole_file
+from studies import report_html as html
+from studies import report_published as beside_print
+from studies.commands import Report
+from studies.report_plan import NEVER, SECTIONS, Item, Picture, Table
+
+TITLE = "scene2spad: results"
+# What studies keep for themselves: renders, sets, captures, kept results, trained models.
+INSIDE = ("sets", "renders", "captures", "results", "maps", "models", "emulated")
+ENDINGS = (".png", ".csv", ".json")
+# Titles, and the columns that are shown, all where none is named.
+CONFIGURATIONS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "config.json": (
+        "Trainings",
+        ("preset", "seed", "epochs", "steps_per_epoch", "batch", "crop", "rate", "tv_weight", "time_offset_m",
+         "precision", "model network", "data training", "data training_reach_m"),
+    ),
+    "set.json": ("Rendered sets", ()),
+}  # fmt: skip
+PACKAGES = ("scene2spad", "mitsuba", "drjit", "torch", "pytorch-lightning", "numpy", "scipy", "OpenEXR", "matplotlib")
+MOST_CONFIGURATIONS = 200
+# what readers of tables, JSON and pictures raise for damaged files
+UNREADABLE = (
+    OSError, ValueError, TypeError, KeyError, SyntaxError, RecursionError, csv.Error, struct.error, zlib.error,
+    Image.DecompressionBombError,
+)  # fmt: skip
+
+
+@dataclass
+class Found:
+    """The results' files by name, the newest of each first, and what went wrong with them on the way."""
+
+    root: Path
+    files: dict[str, list[Path]]
+    configurations: dict[str, list[Path]]
+    problems: list[str] = field(default_factory=list)
+    missing: dict[str, list[str]] = field(default_factory=dict)  # by command
+    used: set[Path] = field(default_factory=set)
+    shown: set[str] = field(default_factory=set)  # anchors of pictures, by their contents
+    tables: int = 0
+
+    def newest(self, name: str) -> Path | None:
+        """The file of that name; all of them count as used."""
+        paths = self.files.get(name, [])
+        self.used.update(paths)
+        return paths[0] if paths else None
+
+    def told(self, path: Path) -> str:
+        """Its place in the folder and its day, and how many older ones of its name were passed over."""
+        day = time.strftime("%Y-%m-%d", time.gmtime(path.stat().st_mtime))
+        older = len(self.files.get(path.name, [])) - 1
+        return f"{path.relative_to(self.root)}, {day}{f'; {older} older of that name not shown' if older > 0 else ''}"
+
+    def read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
+        """What a reader makes of a file; None, and a problem, where it cannot."""
+        try:
+            return reader(path)
+        except UNREADABLE as error:
+            said = " ".join(str(error).split())[:120]
+            self.problem(f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {said})")
+            return None
+
+    def problem(self, line: str) -> None:
+        if line not in self.problems:
+            self.problems.append(line)
+
+
+def gather(root: Path) -> Found:
+    """All pictures, tables and configurations in a folder. Raises InputError where there is none."""
+    require(root.is_dir(), f"{root}: no folder of results; benches and studies fill one")
+    files: dict[str, list[Path]] = {}
+    configurations: dict[str, list[Path]] = {name: [] for name in CONFIGURATIONS}
+    for path in sorted(path for path in root.rglob("*") if path.is_file()):
+        inside = path.relative_to(root).parts[:-1]
+        if path.name in configurations:
+            configurations[path.name].append(path)
+        elif path.suffix in ENDINGS and not path.name.startswith(".") and not {*inside} & {*INSIDE}:
+            files.setdefault(path.name, []).append(path)
+    for paths in files.values():
+        paths.sort(key=lambda path: (-path.stat().st_mtime, path))
+    return Found(root, files, configurations)
+
+
+def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
+    """A PNG's bytes and size; ValueError or OSError where it is none or cut."""
+    data = path.read_bytes()
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        image.verify()
+    if not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
+        raise ValueError("its end is missing")
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        return data, image.size
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a table; ValueError where lines are cut."""
+    with path.open(newline="", encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines, strict=True))
+    if any(None in row or None in row.values() for row in rows):
+        raise ValueError("rows of other lengths than its head")
+    return [{key: _number(text) for key, text in row.items()} for row in rows]
+
+
+def _number(text: str) -> int | float | str:
+    """A table's cell as the number that it spells, if it does."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """An object; ValueError for anything else."""
+    found = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(found, dict):
+        raise ValueError("holds no object")
+    return found
+
+
+def run(command: Report, progress: Progress) -> dict:
+    """Gather, compose, write; says what is in the page and what is not."""
+    out = command.out
+    require(out.suffix.lower() in (".html", ".htm"), f"{out}: the report must end in .html")
+    foreign = out.is_file() and html.GENERATOR not in out.read_text(encoding="utf-8", errors="replace")[:4000]
+    if foreign:
+        raise InputError(f"{out}: exists and is no report of scene2spad; choose another --out")
+    progress("gather", 0.1)
+    found = gather(command.results)
+    progress("compose", 0.4)
+    text = compose(found)
+    with whole_file(out) as beside:
+        beside.write_text(text, encoding="utf-8")
+    missing: list[Any] = [{"command": made, "files": names} for made, names in found.missing.items()]
+    if not command.json:
+        missing = [f"{made}: {', '.join(names)}" for made, names in found.missing.items()]
+    told = {"bytes": len(text.encode()), "figures": len(found.shown), "tables": found.tables}
+    return {"out": str(out), **told, "problems": found.problems, "missing": missing}
+
+
+def compose(found: Found) -> str:
+    """The page."""
+    body, contents = [], []
+    for part in SECTIONS:
+        body.append(html.section(part.anchor, part.title, [_item(item, found) for item in part.items]))
+        contents.append((part.anchor, part.title, [(item.anchor, item.title) for item in part.items]))
+    configurations, more = list(_configurations(found)), _others(found)
+    ends = (
+        ("others", "Other results", more) if more else None,
+        ("configurations", "Configurations and versions", configurations),
+        ("not-measured", "What was not measured", list(_not_measured(found))),
+    )
+    for anchor, title, lines in filter(None, ends):
+        body.append(html.section(anchor, title, lines))
+        contents.append((anchor, title, ()))
+    size = sum(map(len, body)) / 2**20
+    lead = [
+        html.paragraph(
+            f"{len(found.shown)} figures and {found.tables} tables from {found.root.name or 'results'}, "
+            f"{size:.1f} MiB. The page holds everything it shows and loads nothing."
+        ),
+        html.paragraph(_absent_in_words(found), "first"),
+    ]
+    return html.page(TITLE, lead, contents, body)
+
+
+def _absent_in_words(found: Found) -> str:
+    count = sum(map(len, found.missing.values()))
+    said = f"{count} files that belong here were not found" if count else "Everything that belongs here is here"
+    broken = f", {len(found.problems)} could not be read" if found.problems else ""
+    return f"{said}{broken}: the last section says which, and what makes them."
+
+
+# Items
+
+
+def _item(item: Item, found: Found) -> str:
+    parts = [html.paragraph(item.text)] if item.text else []
+    parts += [html.paragraph(note) for note in _notes(item, found)]
+    parts += beside_print.published_tables(item.published, lambda name: _rows_of(Table(name, ""), found)[0])
+    found.tables += sum("<table>" in part for part in parts)
+    absent: dict[str, list[str]] = {}
+    for one in item.pictures:
+        parts.append(_picture(one, item, found, absent))
+    for one in item.tables:
+        parts.append(_table(one, item, found, absent))
+    parts += [_named(name, item, found, absent) for name in item.data]
+    for command, names in absent.items():
+        found.missing.setdefault(command, []).extend(n for n in names if n not in found.missing.get(command, []))
+    lines = [f"{', '.join(map(html.code, names))}, made by {html.code(command)}" for command, names in absent.items()]
+    parts += [f'<p class="missing">Not measured: {line}.</p>' for line in lines]
+    return html.section(item.anchor, item.title, filter(None, parts), level=3)
+
+
+def _notes(item: Item, found: Found) -> Iterator[str]:
+    """What a study's own JSON says of the models that it stands on."""
+    for name in dict.fromkeys(one.file for one in item.tables if one.file.endswith(".json")):
+        path = found.newest(name)
+        numbers = None if path is None else found.read(path, read_json)
+        models = _rows((numbers or {}).get("models"))
+        kinds = dict.fromkeys(f"{m.get('preset')}, {m.get('steps')} steps on {m.get('trained_on')}" for m in models)
+        if kinds:
+            yield f"{len(models)} trained models: {'; '.join(kinds)}."
+        if (numbers or {}).get("absent"):
+            yield f"Models that were absent: {html.spelled(numbers['absent'])}."
+
+
+def _absent(file: str, command: str, path: Path | None, absent: dict[str, list[str]]) -> str:
+    """One line for a file that could not be read; one that is not there is put down by the command that makes it."""
+    if path is not None:
+        return html.paragraph(f"{file} was found, but what should stand here cannot be read from it.", "problem")
+    names = absent.setdefault(command, [])
+    if file not in names:
+        names.append(file)
+    return ""
+
+
+def _picture(one: Picture, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
+    path = found.newest(one.file)
+    read = None if path is None else found.read(path, read_png)
+    if read is None:
+        return _absent(one.file, one.command or item.command, path, absent)
+    return _figure(read, f"{one.shows}.", f"{one.shows}. ({found.told(path)})", found)
+
+
+def _figure(read: tuple[bytes, tuple[int, int]], alt: str, caption: str, found: Found) -> str:
+    """The picture, or where the same stands already, a link to it."""
+    data, size = read
+    anchor = f"picture-{hashlib.sha256(data).hexdigest()[:16]}"
+    if anchor in found.shown:
+        return f"<p>{html.link(anchor, caption)}: shown above.</p>"
+    found.shown.add(anchor)
+    return html.picture(anchor, data, size, alt, caption)
+
+
+def _rows_of(one: Table, found: Found) -> tuple[list[dict] | None, Path | None]:
+    path = found.newest(one.file)
+    read = None if path is None else found.read(path, read_json if one.file.endswith(".json") else read_rows)
+    rows = read.get(one.key) if isinstance(read, dict) else read
+    good = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
+    if read is not None and not good:
+        found.problem(f"{path.relative_to(found.root)}: has no table {one.key}")
+        return None, path
+    if rows and one.columns:
+        rows = [{name: row.get(name) for name in one.columns} for row in rows if row.get("chief", True)]
+    return rows, path
+
+
+def _table(one: Table, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
+    rows, path = _rows_of(one, found)
+    if path is None or rows is None:
+        return _absent(one.file, item.command, path, absent)
+    if not rows:
+        return html.paragraph(f"{one.shows}: none in {found.told(path)}.")
+    found.tables += 1
+    return html.table(rows, f"{one.shows} ({found.told(path)})")
+
+
+def _named(name: str, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
+    """A table too long to show: its name and length."""
+    path = found.newest(name)
+    rows = None if path is None else found.read(path, read_rows)
+    if rows is None:
+        return _absent(name, item.command, path, absent)
+    return f"<p>In full: {html.code(found.told(path))}, {len(rows)} rows.</p>"
+
+
+# The rest
+
+
+def _others(found: Found) -> list[str]:
+    """Pictures and tables that no item expects; JSON and tables beside a study's are named alone."""
+    parts, names = [], []
+    for path in [paths[0] for _, paths in sorted(found.files.items())]:
+        if path in found.used:
+            continue
+        if path.suffix == ".png":
+            read = found.read(path, read_png)
+            if read is not None:
+                shows = path.stem.replace("-", " ").replace(".", ", ")
+                parts.append(_figure(read, f"{shows}.", found.told(path), found))
+        else:
+            names.append(html.code(found.told(path)))
+    return [*parts, *([html.paragraph("Named alone:"), html.bullets(names)] if names else [])]
+
+
+def _configurations(found: Found) -> Iterator[str]:
+    versions = [{"what": "Python", "version": platform.python_version()}]
+    for name in PACKAGES:
+        try:
+            versions.append({"what": name, "version": importlib.metadata.version(name)})
+        except importlib.metadata.PackageNotFoundError:
+            versions.append({"what": name, "version": "not installed"})
+    found.tables += 1
+    yield html.table(versions, "Versions that this page was made with")
+    for name in ("bench-render.json", "bench-encode.json"):
+        path = found.newest(name)
+        machine = ((found.read(path, read_json) if path else None) or {}).get("machine")
+        if machine:
+            yield html.paragraph(f"{name} was measured on: {html.spelled(machine)}.")
+    models = list(_models(found))
+    if models:
+        found.tables += 1
+        yield html.table(models, "Models that studies stood on", MOST_CONFIGURATIONS)
+    for name, (title, columns) in CONFIGURATIONS.items():
+        rows = [
+            {"folder": str(path.parent.relative_to(found.root)), **_flat(numbers, columns)}
+            for path in found.configurations[name]
+            if (numbers := found.read(path, read_json)) is not None
+        ]
+        if rows:
+            found.tables += 1
+            yield html.table(rows, f"{title} ({name} of each)", MOST_CONFIGURATIONS)
+
+
+def _models(found: Found) -> Iterator[dict]:
+    seen = set()
+    for name, paths in sorted(found.files.items()):
+        numbers = found.read(paths[0], read_json) if name.endswith(".json") else None
+        for model in _rows((numbers or {}).get("models")):
+            digest = str(model.get("sha256", ""))
+            if digest not in seen:
+                seen.add(digest)
+                yield {**model, "sha256": digest[:12]}
+
+
+def _flat(numbers: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
+    """Plain values, and those one level beneath by both names; where columns are named, these alone."""
+    flat: dict[str, Any] = {}
+    for key, value in numbers.items():
+        if isinstance(value, Mapping):
+            flat |= {f"{key} {inner}": one for inner, one in value.items() if not isinstance(one, (Mapping, list))}
+        else:
+            flat[key] = value
+    return {key: flat[key] for key in columns or flat if key in flat}
+
+
+def _not_measured(found: Found) -> Iterator[str]:
+    if found.missing:
+        yield html.paragraph("Not found, and the command that makes it:")
+        yield html.bullets(
+            f"{html.code(command)}: {', '.join(map(html.code, names))}" for command, names in found.missing.items()
+        )
+    else:
+        yield html.paragraph("Every result that belongs here was found.")
+    if found.problems:
+        yield html.paragraph("Found, but not readable:")
+        yield html.bullets(html.code(line) for line in found.problems)
+    open_ = list(_undecided(found))
+    if open_:
+        yield html.paragraph("Measured, but not decided:")
+        yield html.bullets(map(escape, open_))
+    yield html.paragraph("Not to be measured here at all:")
+    yield html.bullets(map(escape, NEVER))
+
+
+def _undecided(found: Found) -> Iterator[str]:
+    """Conclusions whose interval leaves them open, by study."""
+    for name, paths in sorted(found.files.items()):
+        numbers = found.read(paths[0], read_json) if name.endswith(".json") else None
+        for one in _rows((numbers or {}).get("conclusions")):
+            whole = "ranking" not in one or one.get("levels") == "all"
+            if whole and "not decided" in (one.get("verdict"), one.get("ranking")):
+                told = one.get("claim") or f"ranking of codes, {one.get('laser')} laser, step {one.get('step')}"
+                yield f"{Path(name).stem}: {told}{f' ({why})' if (why := one.get('why')) else ''}"
+
+
+def _rows(value: Any) -> Sequence[Mapping[str, Any]]:
+    return [row for row in value if isinstance(row, Mapping)] if isinstance(value, list) else []
