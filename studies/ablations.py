@@ -20,9 +20,9 @@ from studies import ablation_figures as figures
 from studies import published
 from studies.ablation_plan import ALIKE_WITHIN, BETTER, CLAIMS, LEVELS, Claim, Sheet, sheets_of
 from studies.cli import finite
-from studies.commands import Study
 from studies.depth_offset_plan import SHOWN_VIEWS, SMOKE, TEST_SET
 from studies.depth_offset_tables import summary_rows
+from studies.experiments import Study
 from studies.obtained import obtain
 from studies.store import Store
 from studies.testsets import TestSet, depth_map, evaluated, rendered

@@ -36,7 +36,7 @@ from spad.depth import cramer_rao_m, depth_errors, estimate_depth
 from spad.detect import sense
 from spad.histogram import Histogram
 from spad.sensor import PhotonBudget, Sensor
-from studies.commands import Study
+from studies.experiments import Study
 from studies.figures import save
 
 log = logging.getLogger("scene2spad")

@@ -8,28 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-Positional = tyro.conf.Positional
-
-
-def _open(metavar: str) -> object:
-    """An option that may stay open: its help says itself what happens then."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
-
-
-Pixels = Annotated[int | None, _open("PIXELS")]
-Count = Annotated[int | None, _open("N")]
-Number = Annotated[float | None, _open("X")]
-Mode = Annotated[Literal["flood", "line", "scan"] | None, _open("{flood,line,scan}")]
-Offset = Literal["time", "ray", "rigid"]
-File = Annotated[Path | None, _open("FILE")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Common:
-    seed: int = 0
-    """Seed of everything random; the same seed gives the same bytes."""
-    json: bool = False
-    """Print one JSON object as the last line of stdout, and nothing else there."""
+from studies.experiments import Bench, Report, Study
+from studies.options import Common, Count, File, Mode, Number, Offset, Pixels, Positional, may_stay_open
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +66,7 @@ class Render(Common):
     """Direct rays per pixel side (default: planned from a pilot)."""
     error: Number = None
     """Target of the relative error: nRMSE of the expected counts on the reference sensor (default: 0.02)."""
-    budget: Annotated[tuple[float, float] | None, _open("SIGNAL BACKGROUND")] = None
+    budget: Annotated[tuple[float, float] | None, may_stay_open("SIGNAL BACKGROUND")] = None
     """Mean SIGNAL and BACKGROUND photons: render no finer than their shot noise can show, instead of --error."""
     ambient: Literal["auto", "on", "off"] = "auto"
     """Steady ambient light; auto renders it if the scene has any and the budget has background."""
@@ -94,11 +74,11 @@ class Render(Common):
     """Move the scene this many metres away."""
     offset_mode: Offset = "time"
     """time: identical counts, later; ray: every point along its camera ray; rigid: all of it, field of view matched."""
-    depth: Annotated[Path | None, _open("FILE")] = None
+    depth: Annotated[Path | None, may_stay_open("FILE")] = None
     """Depth image (.png or .exr) of an RGB-D pair whose photograph is SCENE."""
-    depth_scale: Annotated[float | None, _open("METRES")] = None
+    depth_scale: Annotated[float | None, may_stay_open("METRES")] = None
     """Metres per level of the depth image; a .png needs it, an .exr is taken in metres."""
-    focal: Annotated[float | None, _open("PIXELS")] = None
+    focal: Annotated[float | None, may_stay_open("PIXELS")] = None
     """Focal length of the depth image, pixels; an RGB-D pair needs it."""
     cosine: bool = False
     """RGB-D: apply the cosine of the surface to the photograph, which already holds shading of its own."""
@@ -114,11 +94,11 @@ class Dataset(Common):
     """rooms, rooms/val, rooms/test, tabletop, middlebury or hard-cases."""
     count: Count = None
     """Views (default: all of a finite set, 100 of rooms)."""
-    out: Annotated[Path | None, _open("FOLDER")] = None
+    out: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder of the set (default: out/ and the set's name)."""
     workers: int = 1
     """Processes on this machine."""
-    scheduler: Annotated[str | None, _open("ADDRESS")] = None
+    scheduler: Annotated[str | None, may_stay_open("ADDRESS")] = None
     """Address of a running Dask scheduler, tcp://HOST:PORT, instead of processes here."""
     pack: File = None
     """Make one .h5 file of the finished set, which training reads without a renderer."""
@@ -164,7 +144,7 @@ class Sense(Common):
     """Measured dark counts per second of every pixel [Hz] (.npy), NaN in dead pixels, instead."""
     model: Literal["auto", "poisson", "first-photon", "free-running"] = "auto"
     """Detection law; auto says why it chose."""
-    reset: Annotated[Literal["synchronous", "free-running"] | None, _open("{synchronous,free-running}")] = None
+    reset: Annotated[Literal["synchronous", "free-running"] | None, may_stay_open("{synchronous,free-running}")] = None
     """Armed at every laser cycle, or again after the dead time (default: the preset's)."""
     dead_time: Number = None
     """Dead time after a detection [s] (default: the preset's)."""
@@ -204,7 +184,7 @@ class Sense(Common):
     """Width of the band that the filter lets through [nm]."""
     wavelength: float = 850e-9
     """Wavelength of the laser [m]."""
-    export: Annotated[Literal["mat"] | None, _open("mat")] = None
+    export: Annotated[Literal["mat"] | None, may_stay_open("mat")] = None
     """Write the published .mat layout, and its pulse, beside the .h5 file."""
     figure: bool = True
     """Draw a picture of the counts beside the file."""
@@ -253,12 +233,13 @@ class Train(Common):
     """Switches of the layer that differ from the published one."""
     set: Path = Path("planes")
     """Folder of a set that `dataset` rendered, or its pack (.h5); planes: random planes, no renderer needed."""
-    validation: Annotated[Path | None, _open("SET")] = None
+    validation: Annotated[Path | None, may_stay_open("SET")] = None
     """Set to validate on (default: the last tenth of the scenes)."""
     preset: Literal["smoke", "laptop", "paper"] = "laptop"
     """smoke: seconds; laptop: 3,000 steps of the compact network; paper: the published network and schedule (GPU)."""
     network: Annotated[
-        Literal["compact", "published", "published-signed"] | None, _open("{compact,published,published-signed}")
+        Literal["compact", "published", "published-signed"] | None,
+        may_stay_open("{compact,published,published-signed}"),
     ] = None
     """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
     sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
@@ -277,7 +258,9 @@ class Train(Common):
     """Step at which the total variation comes in (default: 500)."""
     time_offset: Number = None
     """Delay every patch at random by up to this many metres of depth (default: 0, as published)."""
-    precision: Annotated[Literal["32-true", "bf16-mixed", "16-mixed"] | None, _open("{32-true,bf16-mixed}")] = None
+    precision: Annotated[Literal["32-true", "bf16-mixed", "16-mixed"] | None, may_stay_open("{32-true,bf16-mixed}")] = (
+        None
+    )
     """Lightning's name of the arithmetic (default: 32-true)."""
     threads: Count = None
     """CPU threads; the same number gives the same bytes (default: all)."""
@@ -285,7 +268,7 @@ class Train(Common):
     """Processes that sense ahead; the same patches, whatever their number."""
     devices: Count = None
     """GPUs (default: all there are)."""
-    out: Annotated[Path | None, _open("FOLDER")] = None
+    out: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder of the run (default: out/train and a name from the options)."""
 
 
@@ -307,40 +290,6 @@ class Evaluate(Common):
     """Codes in 8 bits as well, summed in 16."""
     out: Path = Path("out/evaluate")
     """Folder for the table (.csv)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bench(Common):
-    """Speed against error: `render` beside mitransient, `sense` beside dense Poisson draws, `encode` of compressive
-    layers, `network` of depth networks, `emulate` of the in-pixel processor and its two routes to the same bits; the
-    table of `hard-cases`."""
-
-    stage: Positional[Literal["render", "sense", "encode", "network", "emulate", "hard-cases"]] = "render"
-    """What is measured."""
-    scenes: tuple[Literal["flash", "lamp", "artist", "gallery", "groove"], ...] = ()
-    """Scenes of `bench render` (default: all)."""
-    sizes: tuple[int, ...] = ()
-    """Image sides, pixels (default: 64 128 256 of flash and lamp, and gallery, 64 128 of artist and groove)."""
-    only: tuple[str, ...] = ()
-    """Cases of `bench hard-cases` (default: all)."""
-    quick: bool = False
-    """No 256 pixels, and artist and groove at 64 alone; no slow hard cases."""
-    peer: Literal["mitransient", "none"] = "mitransient"
-    """The renderer beside ours; none measures ours alone, against its own finer results."""
-    repeats: int = 3
-    """Warm runs of each quality; their median is reported."""
-    seeds: int = 3
-    """Runs of different seeds that the error is averaged over."""
-    memory: bool = False
-    """Compare peak memory in fresh processes instead."""
-    data: Annotated[Path | None, _open("FOLDER")] = None
-    """Folder with the artist's scene and the Middlebury images (default: SCENE2SPAD_DATA, else ../shared/data)."""
-    set: Annotated[Path | None, _open("SET")] = None
-    """Rendered set whose views the estimators of `bench sense` are compared on (default: the Middlebury images)."""
-    cache: Annotated[Path | None, _open("FOLDER")] = None
-    """Folder that keeps references from run to run (default: ~/.cache/scene2spad)."""
-    out: Path = Path("out/bench")
-    """Folder for the table (.csv) and the pictures (.png)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -370,94 +319,6 @@ class Ultraphase(Common):
     """Show this many instructions of one core (run)."""
     watch: str = ""
     """Show every change of this region of one core's RAM, 100 at the most (run)."""
-
-
-ABLATIONS = ("spatial-block", "tensor-size", "fourier")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Study(Common):
-    """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
-    decoded from codes without a network, and the in-pixel processor's power (4, 5); of trained models: scenes moved out
-    of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
-    captures (13, 14); how much the error of a rendered set itself matters to depth; and what a renderer adds to RGB-D
-    simulation, step by step."""
-
-    name: Positional[
-        Literal[
-            "tensors",
-            "memory",
-            "codes",
-            "power",
-            "depth-offset",
-            "spatial-block",
-            "tensor-size",
-            "fourier",
-            "real-data",
-            "render-error",
-            "transport",
-        ]
-    ]
-    """Which study."""
-    checkpoints: tuple[Path, ...] = ()
-    """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc); trained
-    networks of `study render-error` and `study real-data`."""
-    design: str = ""
-    """A design that `study tensors` draws instead of the paper's: learned, fourier, gray, coarse, hadamard or random,
-    with +learned for a fixed temporal code and a learned spatial part."""
-    block: tuple[int, int, int] = (256, 4, 4)
-    """Block of --design: time bins, rows, columns."""
-    codes: int = 32
-    """Number K of codes of --design."""
-    full: bool = False
-    """--design is a full coding tensor instead of a separable one; of studies of trained models, every compression of
-    the paper instead of 128x (depth-offset: 64x and 128x), of depth-offset all 16 photon levels too."""
-    preset: Literal["smoke", "laptop", "paper"] = "laptop"
-    """Of studies of trained models: smoke trains two for seconds and tests them on two small views; laptop and paper
-    say how models are trained with --retrain. Of `study real-data`, how captures are rendered: 32 x 32 pixels of direct
-    light, 256 x 256 to 5 %, to 2 %. Of `study transport`, 2, 12 or 24 scenes, 24, 88 or 176 pixels wide."""
-    models: Annotated[Path | None, _open("FOLDER")] = None
-    """Folder of runs of `train`, each under its model's name, looked in before the models that come with the package
-    (default: models in --out)."""
-    retrain: bool = False
-    """Train what is not finished in --models, and use no model that came with the package."""
-    set: Annotated[Path | None, _open("SET")] = None
-    """What --retrain trains on, as of `train` (default: 2,000 rooms, rendered into --out)."""
-    ship: bool = False
-    """Put the models found into the package in half precision, with configuration and training log."""
-    scene: str = "tabletop/kitchen"
-    """Scene of `study codes` (direct light alone, under a scanning laser) and `study power`, as `render` takes it."""
-    width: int = 64
-    """Image width of these, pixels."""
-    height: int = 48
-    """Image height of these, pixels."""
-    signal: float = 50.0
-    """Mean signal photons per pixel of `study power`."""
-    background: float = 500.0
-    """Mean background photons per pixel of `study power`."""
-    scene_set: str = "tabletop"
-    """Scene set of `study render-error`, as `dataset` takes it."""
-    views: int = 3
-    """Its first N views, at --width x --height."""
-    cache: Annotated[Path | None, _open("FOLDER")] = None
-    """Folder that keeps its renders from run to run (default: ~/.cache/scene2spad)."""
-    capture: tuple[Path, ...] = ()
-    """Captures (.mat) of the LinoSPAD prototype for `study real-data`, instead of rendered ones in their layout."""
-    frame: int = 0
-    """Frame of these files, from 0."""
-    out: Path = Path("out/study")
-    """Folder for the figures (.png) and tables (.csv)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Report(Common):
-    """One self-contained HTML page of every figure, table, configuration and version made so far: speed against error
-    first, published numbers beside ours, and what was not measured. Nothing is loaded, and it prints well."""
-
-    results: Path = Path("out")
-    """Folder that `bench`, `study`, `evaluate` and `demo` have filled, with all its subfolders."""
-    out: Path = Path("out/report.html")
-    """The page to write."""
 
 
 Command = (

@@ -26,8 +26,8 @@ from studies import depth_offset_figures as figures
 from studies import depth_offset_tables as tables
 from studies import published
 from studies.cli import finite
-from studies.commands import Study
 from studies.depth_offset_plan import OFFSET_M, RELIEF, SHOWN_LEVELS, SHOWN_VIEWS, TEST_SET, Level, Plan, plan_of
+from studies.experiments import Study
 from studies.obtained import obtain
 from studies.store import Store
 from studies.testsets import TestSet, depth_map, evaluated, rendered

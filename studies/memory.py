@@ -20,7 +20,7 @@ from csph.memory import (
     separable_factor,
 )
 from render.engine import Progress
-from studies.commands import Study
+from studies.experiments import Study
 from studies.figures import save
 
 COUNTS = 10.0 ** np.arange(6, 10)

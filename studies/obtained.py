@@ -10,7 +10,7 @@ from typing import NamedTuple
 from csph.shipped import WEIGHTS
 from render.engine import Progress
 from scenes.errors import InputError
-from studies.commands import Study
+from studies.experiments import Study
 from studies.testsets import rooms
 from studies.trained import Library, Trained, Wanted
 from studies.training import PLANES

@@ -20,7 +20,7 @@ from spad.detect import sense
 from spad.histogram import Histogram
 from spad.sensor import PhotonBudget, sensor_by_name
 from studies import figures
-from studies.commands import Study
+from studies.experiments import Study
 from studies.figures import DEPTH_COLOURS, plt
 from studies.ultraphase_chain import Emulated, by_torch, decode, emulate, int8_temporal, shared_core_depths
 from studies.ultraphase_cli import all_costs

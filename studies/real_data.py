@@ -32,7 +32,7 @@ from spad.detect import sense_timestamps
 from spad.linospad import Capture, capture_of, read_linospad, resampled, resampled_sensor, write_linospad
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
 from studies import real_data_figures as figures
-from studies.commands import Study
+from studies.experiments import Study
 from studies.figures import display
 from studies.real_data_figures import View
 from studies.training import classical

@@ -36,8 +36,8 @@ from scenes.sets import scene_set
 from spad.flux import signal_per_bin
 from spad.sensor import Sensor
 from studies.bench.references import default_folder, key_of
-from studies.commands import Study
 from studies.dataset import Job, render_view
+from studies.experiments import Study
 from studies.training import baseline, common_tile, network_method
 
 log = logging.getLogger("scene2spad")

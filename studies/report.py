@@ -28,7 +28,7 @@ from scenes.errors import InputError, require
 from scenes.files import whole_file
 from studies import report_html as html
 from studies import report_published as beside_print
-from studies.commands import Report
+from studies.experiments import Report
 from studies.report_plan import NEVER, SECTIONS, Item, Picture, Table
 
 TITLE = "scene2spad: results"

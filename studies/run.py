@@ -29,7 +29,7 @@ from spad.depth import depth_errors, estimate_depth, radial_depth_m
 from spad.detect import sense
 from spad.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor import PhotonBudget, sensor_by_name
-from studies import commands, figures, sensing
+from studies import commands, experiments, figures, sensing
 
 log = logging.getLogger("scene2spad")
 
@@ -329,7 +329,7 @@ def run_demo(command: commands.Demo, progress: Progress) -> dict:
     }
 
 
-def run_bench(command: commands.Bench, progress: Progress) -> dict:
+def run_bench(command: experiments.Bench, progress: Progress) -> dict:
     """One stage of the bench: the module of its name, imported only when it is asked for."""
     for name, value in (("seeds", command.seeds), ("repeats", command.repeats)):
         if not 1 <= value <= 1000:
@@ -344,11 +344,11 @@ def run_ultraphase(command: commands.Ultraphase, progress: Progress) -> dict:
     return ultraphase_cli.run(command, progress)
 
 
-def run_study(command: commands.Study, progress: Progress) -> dict:
+def run_study(command: experiments.Study, progress: Progress) -> dict:
     """One study: the module of its name, imported only when it is asked for."""
     if command.out.is_file():
         raise InputError(f"{command.out}: is a file, expected a folder for the figures")
-    module = "ablations" if command.name in commands.ABLATIONS else command.name.replace("-", "_")
+    module = "ablations" if command.name in experiments.ABLATIONS else command.name.replace("-", "_")
     return importlib.import_module(f"studies.{module}").run(command, progress)
 
 
@@ -366,7 +366,7 @@ def run_evaluate(command: commands.Evaluate, progress: Progress) -> dict:
     return training.run_evaluate(command, progress)
 
 
-def run_report(command: commands.Report, progress: Progress) -> dict:
+def run_report(command: experiments.Report, progress: Progress) -> dict:
     """Results -> one page."""
     from studies import report
 
@@ -382,8 +382,8 @@ RUNNERS: dict[type, Callable] = {
     commands.Depth: run_depth,
     commands.Train: run_train,
     commands.Evaluate: run_evaluate,
-    commands.Bench: run_bench,
+    experiments.Bench: run_bench,
     commands.Ultraphase: run_ultraphase,
-    commands.Study: run_study,
-    commands.Report: run_report,
+    experiments.Study: run_study,
+    experiments.Report: run_report,
 }

@@ -15,7 +15,7 @@ from torch import Tensor
 from csph import CodingTensor, Design, make_coding
 from render.engine import Progress
 from scenes.errors import InputError, require
-from studies.commands import Study
+from studies.experiments import Study
 from studies.figures import save
 
 CURVES = 4

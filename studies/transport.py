@@ -35,7 +35,7 @@ from spad.sensor import Sensor
 from studies import transport_figures as figures
 from studies.bench.references import key_of
 from studies.cli import finite
-from studies.commands import Study
+from studies.experiments import Study
 from studies.obtained import Obtained, obtain
 from studies.real_data import sun_and_sky
 from studies.store import Store

@@ -27,7 +27,7 @@ from render.engine import Progress
 from scenes.errors import require
 from scenes.files import whole_file
 from spad.histogram import counts_from_timestamps
-from studies.commands import Bench
+from studies.experiments import Bench
 
 BATCH, SIZE, PHOTONS = 4, (1024, 32, 32), 60
 DESIGNS = (

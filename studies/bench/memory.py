@@ -12,7 +12,7 @@ from render.engine import Progress
 from scenes.errors import InputError
 from studies.bench import ours, peers, settings
 from studies.bench.settings import BIN_M, BINS, BOUNCES, METHODS
-from studies.commands import Bench
+from studies.experiments import Bench
 
 SIZE, SPP = 256, 64
 

@@ -28,7 +28,7 @@ from render.engine import Progress
 from scenes.errors import require
 from scenes.files import write_csv
 from spad.fly import Patch, sense_patches
-from studies.commands import Bench
+from studies.experiments import Bench
 from studies.planes import random_planes
 
 PATCH = (1, 1, 1024, 32, 32)  # what multiply-accumulates are counted for

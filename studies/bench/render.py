@@ -27,7 +27,7 @@ from studies.bench.errors import Reference
 from studies.bench.measure import Row, curve, measure_level, our_runner, peer_runner, with_slopes
 from studies.bench.references import default_folder, reference
 from studies.bench.settings import BIN_M, BINS, BOUNCES, METHODS
-from studies.commands import Bench
+from studies.experiments import Bench
 
 log = logging.getLogger("scene2spad")
 

@@ -17,8 +17,8 @@ from scenes import InputError
 from studies import report, report_html, report_published
 from studies.ablation_plan import CLAIMS, sheets_of
 from studies.cli import main
-from studies.commands import ABLATIONS
 from studies.depth_offset_plan import plan_of
+from studies.experiments import ABLATIONS
 from studies.report_plan import SECTIONS
 from studies.trained import Wanted
 

@@ -1,0 +1,32 @@
+"""What the options of all commands are made of. No torch, no Mitsuba: --help must be quick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Positional = tyro.conf.Positional
+
+
+def may_stay_open(metavar: str) -> object:
+    """An option that may stay open: its help says itself what happens then."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
+Pixels = Annotated[int | None, may_stay_open("PIXELS")]
+Count = Annotated[int | None, may_stay_open("N")]
+Number = Annotated[float | None, may_stay_open("X")]
+Mode = Annotated[Literal["flood", "line", "scan"] | None, may_stay_open("{flood,line,scan}")]
+Offset = Literal["time", "ray", "rigid"]
+File = Annotated[Path | None, may_stay_open("FILE")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    seed: int = 0
+    """Seed of everything random; the same seed gives the same bytes."""
+    json: bool = False
+    """Print one JSON object as the last line of stdout, and nothing else there."""
