@@ -226,8 +226,10 @@ def slab_error_m(world: World) -> list[SlabError]:
     rays = camera.rays(np.array([0, 0, 1, 1]) * camera.width, np.array([0, 1, 0, 1]) * camera.height)
     errors = []
     for surface in world.scene.surfaces:
+        if surface.material.kind != "dielectric":
+            continue
         points = surface.vertices - camera.origin
-        if surface.material.kind != "dielectric" or (points @ camera.rotation[:, 2]).max() <= 0:
+        if (points @ camera.rotation[:, 2]).max() <= 0:
             continue
         planes = planes_of(surface, camera.origin)
         if planes is None:

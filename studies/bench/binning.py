@@ -16,19 +16,21 @@ def binned(samples: Samples, pixels: int, bins: int, bin_m: float) -> np.ndarray
     A sample is uniform over path +- half width (a point where that is 0) and gives each bin its share of the interval;
     what lies outside [0, bins * bin_m) is dropped. Scattered by as many threads as the peer scatters with.
     """
-    out = dr.zeros(Float, pixels * bins)
-    if len(samples.pixel) > 0:
-        # a point on an edge belongs to the bin above it: the division must not round it down
-        near = ((samples.path_m - samples.half_width_m) / bin_m).astype(np.float32)
-        far = ((samples.path_m + samples.half_width_m) / bin_m).astype(np.float32)
-        first = upload(UInt32, samples.pixel), upload(Float, near), upload(Float, far), upload(Float, samples.radiance)
-        _scatter(out, *first, dr.opaque(UInt32, bins))
-        dr.eval(out)
+    if len(samples.pixel) == 0:
+        return np.zeros((pixels, bins), np.float32)
+    # a point on an edge belongs to the bin above it: the division must not round it down
+    near = ((samples.path_m - samples.half_width_m) / bin_m).astype(np.float32)
+    far = ((samples.path_m + samples.half_width_m) / bin_m).astype(np.float32)
+    columns = upload(UInt32, samples.pixel), upload(Float, near), upload(Float, far), upload(Float, samples.radiance)
+    out = _scattered(*columns, dr.opaque(UInt32, bins), pixels * bins)
+    dr.eval(out)
     return out.numpy().reshape(pixels, bins)
 
 
+@dr.freeze
 @dr.syntax
-def _scatter(out: Any, pixel: Any, near: Any, far: Any, radiance: Any, bins: Any) -> None:
+def _scattered(pixel: Any, near: Any, far: Any, radiance: Any, bins: Any, size: int) -> Any:
+    out = dr.zeros(Float, size)
     place = dr.maximum(mi.Int32(dr.floor(near)), 0)
     last = dr.minimum(mi.Int32(dr.floor(far)), mi.Int32(bins) - 1)
     point = far == near
@@ -38,3 +40,4 @@ def _scatter(out: Any, pixel: Any, near: Any, far: Any, radiance: Any, bins: Any
         share = dr.select(point, 1, overlap)
         dr.scatter_reduce(dr.ReduceOp.Add, out, density * share, pixel * bins + UInt32(place))
         place += 1
+    return out
