@@ -39,7 +39,7 @@ def obtain(wanted: Sequence[Wanted], command: Study, progress: Progress) -> Obta
     """
     folder, retrain = command.out / command.preset, command.retrain or command.preset == "smoke"
     library = Library(command.models or folder / "models", None if retrain else WEIGHTS)
-    training = command.set or (Path(PLANES) if command.preset == "smoke" or not retrain else None)
+    training = command.set or (Path(PLANES) if command.preset == "smoke" else None)
     if retrain:
         training = training or rooms(folder / "sets", progress)
         library.train(wanted, command.preset, training, progress)
@@ -48,6 +48,9 @@ def obtain(wanted: Sequence[Wanted], command: Study, progress: Progress) -> Obta
         said = f"holds none of the {len(wanted)} models, nor does the package; give --models FOLDER or --retrain"
         raise InputError(f"{library.folder}: {said}")
     absent = [one for one in wanted if one not in found]
+    if absent and training is None:
+        training = Path("rooms.h5")
+        log.warning("%s below: scene2spad dataset rooms --count 2000 --bounces 1 --pack %s", training, training)
     for one in absent:
         log.warning("absent: %s; made by: %s", one.name, one.spelled(command.preset, training, library.folder))
     _say_if_unlike(found.values())
