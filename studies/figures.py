@@ -31,12 +31,12 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def plain_log(axes: Axes) -> None:
-    """A logarithmic y axis with plain numbers; over less than two decades at 2 and 5 of each decade too."""
+    """A logarithmic y axis with plain numbers; over less than three decades at 2 and 5 of each decade too."""
 
     def label(value: float, _: int) -> str:
         low, high = axes.get_ylim()
         leading = round(value / 10 ** np.floor(np.log10(value)), 6)
-        return f"{value:,g}" if leading == 1 or (high < 100 * low and leading in (2, 5)) else ""
+        return f"{value:,g}" if leading == 1 or (high < 1000 * low and leading in (2, 5)) else ""
 
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(label)
