@@ -15,6 +15,7 @@ from render.ambient import AmbientLight, ambient_light
 from render.cells import coarsened
 from render.direct import centre_layers, direct_light
 from render.error import ErrorEstimate, estimate, noise_power, power_of, response
+from render.heap import release
 from render.indirect import (
     IndirectLight,
     Schedule,
@@ -147,6 +148,7 @@ def trace(
     # only indirect light is counted from where direct light is
     origin_m, brightest = _mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
+    release()
     rays, indirect, schedule, reasons = direct.rays, None, None, ()
     if plan.bounces > 1 and brightest > 0:
         schedule, reasons = _schedule(world, plan, settings, direct.samples, seed)

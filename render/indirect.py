@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
-from render.paths import BLOCK, LANES, Sums, Turns, add_paths, noise_of_paths
+from render.heap import release
+from render.paths import BLOCK, LANES, PATHS, Sums, Turns, add_paths, noise_of_paths
 from render.returns import Samples, concatenate, no_samples
 from render.settings import BATCHES
 from render.world import World
 
-MOST_CELLS = 1 << 22  # of one launch: 64 MB of accumulators
+MOST_CELLS = 1 << 21  # of one launch: 64 MB of accumulators
 # Seconds of one path with its tail in units of one connection, on 2 cores. Only the choice of who shares depends on it.
 PATH_COST = 9.0
 
@@ -130,10 +131,10 @@ class Watched(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Finished rows of some pixels, and each pixel's total radiance by batch, (pixels, batches)."""
+    """Merged samples of some pixels, and each pixel's total radiance by batch, (pixels, batches)."""
 
     pixels: np.ndarray
-    rows: Rows
+    samples: Samples
     totals: np.ndarray
 
 
@@ -180,7 +181,7 @@ def collect(
     watch: tuple[np.ndarray, Rows] | None = None,
     say: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Chunk]:
-    """Trace a schedule and hand out finished rows, some blocks at a time.
+    """Trace a schedule and hand out merged samples, some blocks at a time.
 
     `origin_m` belongs to flat pixels of the image. `watch` = (row of every flat pixel or -1, rows by batch).
     """
@@ -203,16 +204,20 @@ def collect(
                 watched=None if watch is None else watch[1],
                 watch=None if watch is None else np.where(pixels >= 0, watch[0][pixels], -1),
             )
-            for turns in _turns(chosen, rounds, LANES // BLOCK**2 if shared else LANES // BLOCK):
+            for turns in _turns(chosen, rounds, LANES // BLOCK**2 if shared else PATHS // BLOCK):
                 add_paths(world, pixels, turns, bounces, seed, sums, shared=shared)
-            yield Chunk(pixels, rows, sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum)
+            totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
+            samples = rows.samples(pixels, origin_m[pixels])
+            del rows, sums  # before the next ones are there
+            release()
+            yield Chunk(pixels, samples, totals)
 
 
 def _turns(streams: np.ndarray, rounds: np.ndarray, most: int) -> Iterator[Turns]:
-    """All rounds of some blocks in launches of at most `most` turns."""
+    """All rounds of some blocks in launches of at most `most` turns, of one size: memory of another is not reused."""
     ends = np.cumsum(rounds)
-    for first in range(0, int(ends[-1]), most):
-        turn = np.arange(first, min(first + most, int(ends[-1])))
+    launches = -(-int(ends[-1]) // most)
+    for turn in np.array_split(np.arange(int(ends[-1])), launches):
         block = np.searchsorted(ends, turn, side="right")
         yield Turns(block, streams[block], turn - (ends - rounds)[block])
 
@@ -249,7 +254,7 @@ def indirect_light(
     parts, noise = [no_samples()], np.zeros(image_pixels)
     for chunk in collect(world, schedule, origin_m, cells, bounces, seed, brightest, watch=watch, say=say):
         real = chunk.pixels >= 0
-        parts.append(chunk.rows.samples(chunk.pixels, origin_m[chunk.pixels]))
+        parts.append(chunk.samples)
         if batches > 1:
             noise[chunk.pixels[real]] = chunk.totals[real].std(axis=1, ddof=1) * np.sqrt(batches)
     seen = watch[1].radiance() if watch else np.zeros((0, fine.count))

@@ -25,7 +25,9 @@ from render.rays import camera_rays, first_opaque, laser_leg, laser_light, segme
 from render.world import Bool, Float, UInt32, World, dr, mi, upload
 
 BLOCK = 16  # pixels that share their paths
-LANES = 1 << 20  # connections, or paths, of one launch
+# Of one launch: a path takes 250 bytes and a connection 40, and what Python needs for a launch takes as long as 2^16 paths
+LANES = 1 << 20  # connections
+PATHS = 1 << 18
 # Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32
 GOLDEN = (3242174889, 2447445414)
 
@@ -89,7 +91,6 @@ class _Heads(NamedTuple):
     """x1 of every path of a launch and where it belongs."""
 
     receiver: Any
-    pixel: Any
     si: Any
     transmission: Any
     path: Any
@@ -210,7 +211,7 @@ def _trace(
     si, transmission, path, _ = first_opaque(world, ray, valid)
     hit = valid & si.is_valid()
     shares = hit & (dr.gather(Float, world.shares, shape_index(si), hit) > 0)
-    heads = _Heads(receiver, pixel, si, transmission + dr.zeros(Float, lanes), path, hit, shares)
+    heads = _Heads(receiver, _kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares)
     context = mi.BSDFContext()
     sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), heads.valid)
     alive = heads.valid & (weight[0] > 0)
@@ -229,7 +230,7 @@ def _trace(
     direction = si.to_world(onward.wo)
     values, paths = _beyond(world, si, direction, alive & (onward_weight[0] > 0), pixel, random, bounces - 2)
     tails = _Tails(
-        si=si,
+        si=_kept(si),
         to_laser=to_laser,
         irradiance=dr.select(alive, irradiance, 0),
         laser_path=laser_path,
@@ -244,8 +245,18 @@ def _trace(
         paths=paths,
     )
     batch = round_index % batches
+    # one launch at a time: of those that wait, each would hold memory of its own
+    dr.sync_thread()
     dr.eval(*heads, *tails, batch)
     return heads, tails, batch
+
+
+def _kept(si: Any) -> Any:
+    """The interaction with what reflectance and rays need of it alone: most of a launch's memory is interactions."""
+    kept = dr.zeros(mi.SurfaceInteraction3f, dr.width(si.p))
+    for name in ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index"):
+        setattr(kept, name, getattr(si, name))
+    return kept
 
 
 @dr.syntax
