@@ -18,7 +18,7 @@ UInt64 = mi.UInt64
 # cell overflows only beyond 2^21 times that radiance. A single sample above 2^17 times is clipped, and counted.
 QUANTA_PER_BRIGHTEST = 2.0**43
 MOST_QUANTA = 2.0**60
-READ = 1 << 18  # cells read at a time
+READ = 1 << 16  # cells read at a time
 
 
 class Cells(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
 from render.heap import release
 from render.paths import BLOCK, LANES, PATHS, Sums, Turns, add_paths, noise_of_paths
-from render.returns import Samples, concatenate, no_samples
+from render.returns import Samples, concatenate
 from render.settings import BATCHES
 from render.world import World
 
@@ -139,25 +139,26 @@ class Chunk(NamedTuple):
 
 
 class IndirectLight(NamedTuple):
-    """Merged samples; standard error of each pixel's total; batches of the watched pixels."""
+    """Standard error of each pixel's total; batches of the watched pixels. Its samples are handed on as they come."""
 
-    samples: Samples
     noise: np.ndarray
     watched: Watched
 
 
-def combined(
-    one: IndirectLight, other: IndirectLight, share: np.ndarray, cells: Cells, origin_m: np.ndarray
-) -> IndirectLight:
-    """The weighted mean of two independent estimates in the same `cells`; `share` of the first, for every pixel."""
-    parts = [
-        light.samples._replace(radiance=light.samples.radiance * weight[light.samples.pixel])
-        for light, weight in ((one, share), (other, 1 - share))
-    ]
+def combined(one: IndirectLight, other: IndirectLight, share: np.ndarray) -> IndirectLight:
+    """The weighted mean of two independent estimates but for their samples; `share` of the first, for every pixel."""
     weight = share[one.watched.pixels][:, None, None]
     seen = one.watched._replace(radiance=weight * one.watched.radiance + (1 - weight) * other.watched.radiance)
-    noise = np.hypot(share * one.noise, (1 - share) * other.noise)
-    return IndirectLight(coarsened(concatenate(parts), cells, origin_m), noise, seen)
+    return IndirectLight(np.hypot(share * one.noise, (1 - share) * other.noise), seen)
+
+
+def combined_samples(one: Samples, other: Samples, share: np.ndarray, cells: Cells, origin_m: np.ndarray) -> Samples:
+    """The weighted mean of two estimates' samples in the same `cells`; `share` of the first, for every pixel."""
+    parts = [
+        samples._replace(radiance=samples.radiance * weight[samples.pixel])
+        for samples, weight in ((one, share), (other, 1 - share))
+    ]
+    return coarsened(concatenate(parts), cells, origin_m)
 
 
 def image_cells(world: World, width_m: float, growth: float, origin_m: np.ndarray, bounces: int) -> Cells:
@@ -206,10 +207,10 @@ def collect(
             )
             for turns in _turns(chosen, rounds, LANES // BLOCK**2 if shared else PATHS // BLOCK):
                 add_paths(world, pixels, turns, bounces, seed, sums, shared=shared)
+            release()  # what the launches took
             totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
             samples = rows.samples(pixels, origin_m[pixels])
             del rows, sums  # before the next ones are there
-            release()
             yield Chunk(pixels, samples, totals)
 
 
@@ -237,12 +238,13 @@ def indirect_light(
     origin_m: np.ndarray,
     brightest: float,
     watched: np.ndarray,
+    add: Callable[[Samples], None],
     *,
     width_m: float,
     growth: float,
     say: Callable[[float], None] = lambda share: None,
 ) -> IndirectLight:
-    """Light of 2 to `bounces` surfaces in the scheduled pixels, unbiased.
+    """Light of 2 to `bounces` surfaces in the scheduled pixels, unbiased; `add` is given its samples, part by part.
 
     `origin_m`, for every pixel of the image, is the path length from which cells widen: the direct return's.
     `brightest` sets the fixed-point scale. The `watched` pixels, sorted, must be among the scheduled.
@@ -251,12 +253,12 @@ def indirect_light(
     cells = image_cells(world, width_m, growth, origin_m, bounces)
     fine = image_cells(world, width_m / 2, growth / 2, origin_m, bounces)
     watch = watched_rows(watched, image_pixels, fine, batches, brightest) if len(watched) else None
-    parts, noise = [no_samples()], np.zeros(image_pixels)
+    noise = np.zeros(image_pixels)
     for chunk in collect(world, schedule, origin_m, cells, bounces, seed, brightest, watch=watch, say=say):
         real = chunk.pixels >= 0
-        parts.append(chunk.samples)
+        add(chunk.samples)
         if batches > 1:
             noise[chunk.pixels[real]] = chunk.totals[real].std(axis=1, ddof=1) * np.sqrt(batches)
     seen = watch[1].radiance() if watch else np.zeros((0, fine.count))
     seen = seen.reshape(len(watched), batches, fine.count)
-    return IndirectLight(concatenate(parts), noise, Watched(watched, fine, origin_m[watched], seen))
+    return IndirectLight(noise, Watched(watched, fine, origin_m[watched], seen))

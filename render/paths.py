@@ -25,7 +25,7 @@ from render.rays import camera_rays, first_opaque, laser_leg, laser_light, segme
 from render.world import Bool, Float, UInt32, World, dr, mi, upload
 
 BLOCK = 16  # pixels that share their paths
-# Of one launch: a path takes 250 bytes and a connection 40, and what Python needs for a launch takes as long as 2^16 paths
+# Of one launch, 40 and 75 MB in its course. Python records a launch for as long as some 2^16 connections take.
 LANES = 1 << 20  # connections
 PATHS = 1 << 18
 # Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32

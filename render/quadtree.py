@@ -88,7 +88,9 @@ class CellTree:
         for band in self._bands():
             column = ((pixels[band] % self.width)[:, None] * grid + cell_column).ravel()
             row = ((pixels[band] // self.width)[:, None] * grid + cell_row).ravel()
-            self._add(np.repeat(np.arange(band.start, band.stop, dtype=np.int32), grid * grid), column, row, np.uint8(0))
+            self._add(
+                np.repeat(np.arange(band.start, band.stop, dtype=np.int32), grid * grid), column, row, np.uint8(0)
+            )
 
     def refine(self, levels: int, least_share: float) -> np.ndarray:
         """Cut cells until none needs it or is `levels` deep; whether a cell of each pixel was, (pixels,) bool.
