@@ -9,9 +9,10 @@ import numpy as np
 
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
 from render.heap import release
-from render.paths import BLOCK, LANES, PATHS, Sums, Turns, add_paths, noise_of_paths
+from render.paths import BLOCK, LANES, PATHS, Turns, add_paths, noise_of_paths
 from render.returns import Samples, concatenate
 from render.settings import BATCHES
+from render.sums import Sums
 from render.world import World
 
 MOST_CELLS = 1 << 21  # of one launch: 64 MB of accumulators
