@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -13,9 +14,13 @@ from render.paths import BLOCK, LANES, PATHS, Turns, add_paths, noise_of_paths
 from render.returns import Samples, concatenate
 from render.settings import BATCHES
 from render.sums import Sums
-from render.world import World
+from render.world import World, dr
 
-MOST_CELLS = 1 << 21  # of one launch: 64 MB of accumulators
+MOST_CELLS = 1 << 21  # of one launch: 32 MB of accumulators
+OVER = 0.3  # of a launch
+# Launches of connections that may wait: each holds memory of its own, but the paths of one alone, four packets of work,
+# leave a thread without any.
+QUEUED = 2
 # Seconds of one path with its tail in units of one connection, on 2 cores. Only the choice of who shares depends on it.
 PATH_COST = 9.0
 
@@ -206,7 +211,9 @@ def collect(
                 watched=None if watch is None else watch[1],
                 watch=None if watch is None else np.where(pixels >= 0, watch[0][pixels], -1),
             )
-            for turns in _turns(chosen, rounds, LANES // BLOCK**2 if shared else PATHS // BLOCK):
+            for number, turns in enumerate(_turns(chosen, rounds, LANES // BLOCK**2 if shared else PATHS // BLOCK)):
+                if number % (QUEUED if shared else 1) == 0:
+                    dr.sync_thread()
                 add_paths(world, pixels, turns, bounces, seed, sums, shared=shared)
             release()  # what the launches took
             totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
@@ -216,9 +223,12 @@ def collect(
 
 
 def _turns(streams: np.ndarray, rounds: np.ndarray, most: int) -> Iterator[Turns]:
-    """All rounds of some blocks in launches of at most `most` turns, of one size: memory of another is not reused."""
+    """All rounds of some blocks in launches of one size: memory of another is not reused.
+
+    A launch has at most `most` turns, or OVER more where that saves one.
+    """
     ends = np.cumsum(rounds)
-    launches = -(-int(ends[-1]) // most)
+    launches = max(1, math.ceil(ends[-1] / most - OVER))
     for turn in np.array_split(np.arange(int(ends[-1])), launches):
         block = np.searchsorted(ends, turn, side="right")
         yield Turns(block, streams[block], turn - (ends - rounds)[block])

@@ -190,8 +190,6 @@ def _trace(
         paths=paths,
     )
     batch = round_index % batches
-    # one launch at a time: of those that wait, each would hold memory of its own
-    dr.sync_thread()
     dr.eval(*heads, *tails, batch)
     return heads, tails, batch
 
