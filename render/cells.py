@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.returns import Samples, packed
+from render.returns import Samples, concatenate, no_samples, packed
 from render.world import Float, UInt32, dr, mi
 
 UInt64 = mi.UInt64
@@ -18,6 +18,7 @@ UInt64 = mi.UInt64
 # cell overflows only beyond 2^21 times that radiance. A single sample above 2^17 times is clipped, and counted.
 QUANTA_PER_BRIGHTEST = 2.0**43
 MOST_QUANTA = 2.0**60
+READ = 1 << 16  # cells read at a time
 
 
 class Cells(NamedTuple):
@@ -93,12 +94,14 @@ class Rows:
         Energy and centroid are exact; a sample is uniform over the widest interval around its centroid in its cell.
         """
         energy, moment = self.energy.numpy(), self.moment.numpy()
-        filled = np.flatnonzero(energy)
-        energy, moment = energy[filled].astype(np.float64), moment[filled].astype(np.float64)
-        row, cell = np.divmod(filled, self.cells.count)
-        return cell_samples(
-            self.cells, pixels[row], origin_m[row], cell, energy * self.quantum, np.clip(moment / energy, 0, 1)
-        )
+        parts = [no_samples()]
+        for first in range(0, len(energy), READ):
+            filled = np.flatnonzero(energy[first : first + READ]) + first
+            units, moments = energy[filled].astype(np.float64), moment[filled].astype(np.float64)
+            row, cell = np.divmod(filled, self.cells.count)
+            share = np.clip(moments / units, 0, 1)
+            parts.append(cell_samples(self.cells, pixels[row], origin_m[row], cell, units * self.quantum, share))
+        return concatenate(parts)
 
     def radiance(self) -> np.ndarray:
         """Radiance of every cell, (rows, cells) float64."""

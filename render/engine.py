@@ -15,11 +15,13 @@ from render.ambient import AmbientLight, ambient_light
 from render.cells import coarsened
 from render.direct import centre_layers, direct_light
 from render.error import ErrorEstimate, estimate, noise_power, power_of, response
+from render.heap import release
 from render.indirect import (
     IndirectLight,
     Schedule,
     allocate,
     combined,
+    combined_samples,
     image_cells,
     indirect_light,
     pilot_noise,
@@ -27,7 +29,7 @@ from render.indirect import (
 )
 from render.paths import BLOCK, block_order
 from render.planning import make_plan, pilot_pixels
-from render.returns import Samples, concatenate, no_samples, select, to_returns
+from render.returns import Growing, Samples, concatenate, no_samples, select, to_returns
 from render.settings import BATCHES, Plan, RenderSettings
 from render.specular import specular_light
 from render.transient import Transient
@@ -48,10 +50,13 @@ Progress = Callable[[str, float], None]
 
 
 class Traced(NamedTuple):
-    """Light of a planned render before it is packed: direct and specular samples, indirect light or None, counts."""
+    """Light of a planned render before it is packed: its samples, what is known of indirect light or None, counts.
 
-    direct: Samples
-    specular: Samples
+    Samples of direct light come first, then those of specular light, up to `ends`, then those of indirect light.
+    """
+
+    samples: Samples
+    ends: tuple[int, int]
     indirect: IndirectLight | None
     origin_m: np.ndarray
     mixed: np.ndarray
@@ -66,9 +71,16 @@ class Traced(NamedTuple):
         return 0 if self.schedule is None else round(self.schedule.cost)
 
     @property
-    def samples(self) -> Samples:
-        parts = [self.direct, self.specular]
-        return concatenate(parts if self.indirect is None else [*parts, self.indirect.samples])
+    def direct(self) -> Samples:
+        return select(self.samples, slice(self.ends[0]))
+
+    @property
+    def specular(self) -> Samples:
+        return select(self.samples, slice(*self.ends))
+
+    @property
+    def indirect_samples(self) -> Samples:
+        return select(self.samples, slice(self.ends[1], None))
 
 
 def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
@@ -147,15 +159,23 @@ def trace(
     # only indirect light is counted from where direct light is
     origin_m, brightest = _mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
+    release()
     rays, indirect, schedule, reasons = direct.rays, None, None, ()
     if plan.bounces > 1 and brightest > 0:
         schedule, reasons = _schedule(world, plan, settings, direct.samples, seed)
-        indirect = _indirect(world, plan, settings, schedule, STAGE_INDIRECT, seed, origin_m, brightest, checked, say)
+    light = Growing()
+    light.add(direct.samples)
+    direct = direct._replace(samples=no_samples())  # they are in the list now
+    ends = len(light), len(light) + len(specular.samples.pixel)
+    light.add(specular.samples)
+    release()
+    if schedule is not None:
+        indirect = _indirect(
+            world, plan, settings, schedule, STAGE_INDIRECT, seed, origin_m, brightest, checked, light, say
+        )
         rays += schedule.paths * (2 * plan.bounces - 1) + schedule.connections
     reasons = (*specular.notes, *reasons)
-    return Traced(
-        direct.samples, specular.samples, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons
-    )
+    return Traced(light.finished(), ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
 
 
 def _indirect(
@@ -168,6 +188,7 @@ def _indirect(
     origin_m: np.ndarray,
     brightest: float,
     checked: np.ndarray | None,
+    light: Growing,
     say: Progress,
 ) -> IndirectLight:
     return indirect_light(
@@ -178,6 +199,7 @@ def _indirect(
         origin_m,
         brightest,
         np.empty(0, np.int64) if checked is None else checked,
+        light.add,
         width_m=settings.indirect_tolerance_m,
         growth=settings.indirect_growth,
         say=lambda share: say("indirect light", 0.1 + 0.8 * share),
@@ -215,15 +237,18 @@ def _traced_on(
     These follow the first paths' noise; the bias of such a stop is of second order in it.
     """
     _, brightest = _mean_path(traced.direct, len(traced.origin_m))
-    added = _indirect(world, plan, settings, more, STAGE_MORE, seed, traced.origin_m, brightest, checked, say)
+    light = Growing()
+    added = _indirect(world, plan, settings, more, STAGE_MORE, seed, traced.origin_m, brightest, checked, light, say)
     before = traced.schedule
     share = np.ones(len(traced.origin_m))
     pixels, real = before.pixels, before.pixels >= 0
     share[pixels[real]] = np.repeat(before.rounds / (before.rounds + more.rounds), BLOCK)[real]
     cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
+    merged = combined_samples(traced.indirect_samples, light.finished(), share, cells, traced.origin_m)
     reason = f"indirect light: the work of {more.cost:.0f} paths a pixel on top, to meet the target"
     return traced._replace(
-        indirect=combined(traced.indirect, added, share, cells, traced.origin_m),
+        samples=concatenate([traced.direct, traced.specular, merged]),
+        indirect=combined(traced.indirect, added, share),
         rays=traced.rays + more.paths * (2 * plan.bounces - 1) + more.connections,
         schedule=before._replace(rounds=before.rounds + more.rounds),
         reasons=(*traced.reasons, reason),

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
-from render.paths import BLOCK, LANES, Sums, Turns, add_paths, noise_of_paths
-from render.returns import Samples, concatenate, no_samples
+from render.heap import release
+from render.paths import BLOCK, LANES, PATHS, Turns, add_paths, noise_of_paths
+from render.returns import Samples, concatenate
 from render.settings import BATCHES
-from render.world import World
+from render.sums import Sums
+from render.world import World, dr
 
-MOST_CELLS = 1 << 22  # of one launch: 64 MB of accumulators
+MOST_CELLS = 1 << 21  # of one launch: 32 MB of accumulators
+OVER = 0.3  # of a launch
+# Launches of connections that may wait: each holds memory of its own, but the paths of one alone, four packets of work,
+# leave a thread without any.
+QUEUED = 2
 # Seconds of one path with its tail in units of one connection, on 2 cores. Only the choice of who shares depends on it.
 PATH_COST = 9.0
 
@@ -130,33 +137,34 @@ class Watched(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Finished rows of some pixels, and each pixel's total radiance by batch, (pixels, batches)."""
+    """Merged samples of some pixels, and each pixel's total radiance by batch, (pixels, batches)."""
 
     pixels: np.ndarray
-    rows: Rows
+    samples: Samples
     totals: np.ndarray
 
 
 class IndirectLight(NamedTuple):
-    """Merged samples; standard error of each pixel's total; batches of the watched pixels."""
+    """Standard error of each pixel's total; batches of the watched pixels. Its samples are handed on as they come."""
 
-    samples: Samples
     noise: np.ndarray
     watched: Watched
 
 
-def combined(
-    one: IndirectLight, other: IndirectLight, share: np.ndarray, cells: Cells, origin_m: np.ndarray
-) -> IndirectLight:
-    """The weighted mean of two independent estimates in the same `cells`; `share` of the first, for every pixel."""
-    parts = [
-        light.samples._replace(radiance=light.samples.radiance * weight[light.samples.pixel])
-        for light, weight in ((one, share), (other, 1 - share))
-    ]
+def combined(one: IndirectLight, other: IndirectLight, share: np.ndarray) -> IndirectLight:
+    """The weighted mean of two independent estimates but for their samples; `share` of the first, for every pixel."""
     weight = share[one.watched.pixels][:, None, None]
     seen = one.watched._replace(radiance=weight * one.watched.radiance + (1 - weight) * other.watched.radiance)
-    noise = np.hypot(share * one.noise, (1 - share) * other.noise)
-    return IndirectLight(coarsened(concatenate(parts), cells, origin_m), noise, seen)
+    return IndirectLight(np.hypot(share * one.noise, (1 - share) * other.noise), seen)
+
+
+def combined_samples(one: Samples, other: Samples, share: np.ndarray, cells: Cells, origin_m: np.ndarray) -> Samples:
+    """The weighted mean of two estimates' samples in the same `cells`; `share` of the first, for every pixel."""
+    parts = [
+        samples._replace(radiance=samples.radiance * weight[samples.pixel])
+        for samples, weight in ((one, share), (other, 1 - share))
+    ]
+    return coarsened(concatenate(parts), cells, origin_m)
 
 
 def image_cells(world: World, width_m: float, growth: float, origin_m: np.ndarray, bounces: int) -> Cells:
@@ -180,7 +188,7 @@ def collect(
     watch: tuple[np.ndarray, Rows] | None = None,
     say: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Chunk]:
-    """Trace a schedule and hand out finished rows, some blocks at a time.
+    """Trace a schedule and hand out merged samples, some blocks at a time.
 
     `origin_m` belongs to flat pixels of the image. `watch` = (row of every flat pixel or -1, rows by batch).
     """
@@ -203,16 +211,25 @@ def collect(
                 watched=None if watch is None else watch[1],
                 watch=None if watch is None else np.where(pixels >= 0, watch[0][pixels], -1),
             )
-            for turns in _turns(chosen, rounds, LANES // BLOCK**2 if shared else LANES // BLOCK):
+            for number, turns in enumerate(_turns(chosen, rounds, LANES // BLOCK**2 if shared else PATHS // BLOCK)):
+                if number % (QUEUED if shared else 1) == 0:
+                    dr.sync_thread()
                 add_paths(world, pixels, turns, bounces, seed, sums, shared=shared)
-            yield Chunk(pixels, rows, sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum)
+            release()  # what the launches took
+            totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
+            samples = rows.samples(pixels, origin_m[pixels])
+            del rows, sums  # before the next ones are there
+            yield Chunk(pixels, samples, totals)
 
 
 def _turns(streams: np.ndarray, rounds: np.ndarray, most: int) -> Iterator[Turns]:
-    """All rounds of some blocks in launches of at most `most` turns."""
+    """All rounds of some blocks in launches of one size: memory of another is not reused.
+
+    A launch has at most `most` turns, or OVER more where that saves one.
+    """
     ends = np.cumsum(rounds)
-    for first in range(0, int(ends[-1]), most):
-        turn = np.arange(first, min(first + most, int(ends[-1])))
+    launches = max(1, math.ceil(ends[-1] / most - OVER))
+    for turn in np.array_split(np.arange(int(ends[-1])), launches):
         block = np.searchsorted(ends, turn, side="right")
         yield Turns(block, streams[block], turn - (ends - rounds)[block])
 
@@ -232,12 +249,13 @@ def indirect_light(
     origin_m: np.ndarray,
     brightest: float,
     watched: np.ndarray,
+    add: Callable[[Samples], None],
     *,
     width_m: float,
     growth: float,
     say: Callable[[float], None] = lambda share: None,
 ) -> IndirectLight:
-    """Light of 2 to `bounces` surfaces in the scheduled pixels, unbiased.
+    """Light of 2 to `bounces` surfaces in the scheduled pixels, unbiased; `add` is given its samples, part by part.
 
     `origin_m`, for every pixel of the image, is the path length from which cells widen: the direct return's.
     `brightest` sets the fixed-point scale. The `watched` pixels, sorted, must be among the scheduled.
@@ -246,12 +264,12 @@ def indirect_light(
     cells = image_cells(world, width_m, growth, origin_m, bounces)
     fine = image_cells(world, width_m / 2, growth / 2, origin_m, bounces)
     watch = watched_rows(watched, image_pixels, fine, batches, brightest) if len(watched) else None
-    parts, noise = [no_samples()], np.zeros(image_pixels)
+    noise = np.zeros(image_pixels)
     for chunk in collect(world, schedule, origin_m, cells, bounces, seed, brightest, watch=watch, say=say):
         real = chunk.pixels >= 0
-        parts.append(chunk.rows.samples(chunk.pixels, origin_m[chunk.pixels]))
+        add(chunk.samples)
         if batches > 1:
             noise[chunk.pixels[real]] = chunk.totals[real].std(axis=1, ddof=1) * np.sqrt(batches)
     seen = watch[1].radiance() if watch else np.zeros((0, fine.count))
     seen = seen.reshape(len(watched), batches, fine.count)
-    return IndirectLight(concatenate(parts), noise, Watched(watched, fine, origin_m[watched], seen))
+    return IndirectLight(noise, Watched(watched, fine, origin_m[watched], seen))

@@ -20,76 +20,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.cells import Rows
 from render.rays import camera_rays, first_opaque, laser_leg, laser_light, segment, shape_index, spawn
+from render.sums import Sums
 from render.world import Bool, Float, UInt32, World, dr, mi, upload
 
 BLOCK = 16  # pixels that share their paths
-LANES = 1 << 20  # connections, or paths, of one launch
+# Of one launch, 40 and 75 MB in its course. Python records a launch for as long as some 2^16 connections take.
+LANES = 1 << 20  # connections
+PATHS = 1 << 18
 # Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32
 GOLDEN = (3242174889, 2447445414)
-
-
-class Sums:
-    """Where connections are added: rows of the pixels' cells, finer rows of watched pixels by batch, totals by batch.
-
-    origin_m   zero of every pixel's cells
-    watch      the watched row of every pixel, -1 for none
-    batches    rounds take turns: round r belongs to batch r modulo this
-    rounds     paths of every pixel: each counts one of them
-    Not a dataclass: Dr.Jit would take its fields for variables of a loop.
-    """
-
-    def __init__(
-        self,
-        rows: Rows,
-        origin_m: np.ndarray,
-        *,
-        rounds: np.ndarray,
-        batches: int,
-        watched: Rows | None = None,
-        watch: np.ndarray | None = None,
-    ) -> None:
-        self.rows, self.watched = rows, watched
-        self.origin_m = upload(Float, origin_m)
-        self.watch = None if watch is None else upload(mi.Int32, watch)
-        self.totals = dr.zeros(mi.UInt64, rows.rows * batches)
-        self.batches = dr.opaque(UInt32, batches)
-        self._scale = upload(Float, 1 / rounds)
-
-    def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
-        """Add samples to the pixels' and the watched rows; returns what was added, for `add_total`."""
-        x = path - dr.gather(Float, self.origin_m, pixel, active)
-        radiance *= dr.gather(Float, self._scale, pixel, active)
-        radiance = dr.select(active & dr.isfinite(radiance), radiance, 0)
-        active = active & (radiance > 0)  # not in place: the caller goes on with its own
-        self.rows.add(pixel, x, radiance, active)
-        if self.watched is not None:
-            watch = dr.gather(mi.Int32, self.watch, pixel, active)
-            row = UInt32(dr.maximum(watch, 0)) * self.batches + batch
-            self.watched.add(row, x, radiance * Float(self.batches), active & (watch >= 0))
-        return radiance
-
-    def add_total(self, pixel: Any, batch: Any, radiance: Any) -> None:
-        dr.scatter_add(
-            self.totals,
-            self.rows.quanta(radiance),
-            pixel * self.batches + batch,
-            radiance > 0,
-            mode=dr.ReduceMode.Direct,
-        )
-
-    def evaluate(self) -> None:
-        """Run what was added so far."""
-        watched = [] if self.watched is None else [self.watched.energy, self.watched.moment]
-        dr.eval(self.rows.energy, self.rows.moment, self.totals, *watched)
 
 
 class _Heads(NamedTuple):
     """x1 of every path of a launch and where it belongs."""
 
     receiver: Any
-    pixel: Any
     si: Any
     transmission: Any
     path: Any
@@ -210,7 +156,7 @@ def _trace(
     si, transmission, path, _ = first_opaque(world, ray, valid)
     hit = valid & si.is_valid()
     shares = hit & (dr.gather(Float, world.shares, shape_index(si), hit) > 0)
-    heads = _Heads(receiver, pixel, si, transmission + dr.zeros(Float, lanes), path, hit, shares)
+    heads = _Heads(receiver, _kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares)
     context = mi.BSDFContext()
     sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), heads.valid)
     alive = heads.valid & (weight[0] > 0)
@@ -229,7 +175,7 @@ def _trace(
     direction = si.to_world(onward.wo)
     values, paths = _beyond(world, si, direction, alive & (onward_weight[0] > 0), pixel, random, bounces - 2)
     tails = _Tails(
-        si=si,
+        si=_kept(si),
         to_laser=to_laser,
         irradiance=dr.select(alive, irradiance, 0),
         laser_path=laser_path,
@@ -246,6 +192,14 @@ def _trace(
     batch = round_index % batches
     dr.eval(*heads, *tails, batch)
     return heads, tails, batch
+
+
+def _kept(si: Any) -> Any:
+    """The interaction with what reflectance and rays need of it alone: most of a launch's memory is interactions."""
+    kept = dr.zeros(mi.SurfaceInteraction3f, dr.width(si.p))
+    for name in ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index"):
+        setattr(kept, name, getattr(si, name))
+    return kept
 
 
 @dr.syntax

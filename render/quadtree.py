@@ -20,6 +20,8 @@ MIXED_GAP_M = 0.05
 # A cell follows its neighbours if its tangent plane is off the mean step to them by no more than this share of its
 # distance, a bent surface apart.
 FOLLOWED = 3e-4
+# Cells of level 0 are traced and compared with their neighbours so many at a time: 40 MB.
+BAND = 1 << 18
 # Refinement ends at this many cells a side of a pixel, however fine the grid it started from.
 MOST_CELLS = 64
 # A wire that runs through the image is followed by at most this many launches.
@@ -81,10 +83,14 @@ class CellTree:
         self.mixed = np.zeros(len(pixels), bool)
         for name, dtype in zip(_NAMES, _TYPES, strict=True):
             setattr(self, name, np.empty(0, dtype))
+        self._reserve(len(pixels) * grid * grid)
         cell_row, cell_column = np.divmod(np.arange(grid * grid, dtype=np.int32), grid)
-        column = ((pixels % self.width)[:, None] * grid + cell_column).ravel()
-        row = ((pixels // self.width)[:, None] * grid + cell_row).ravel()
-        self._add(np.repeat(np.arange(len(pixels), dtype=np.int32), grid * grid), column, row, np.uint8(0))
+        for band in self._bands():
+            column = ((pixels[band] % self.width)[:, None] * grid + cell_column).ravel()
+            row = ((pixels[band] // self.width)[:, None] * grid + cell_row).ravel()
+            self._add(
+                np.repeat(np.arange(band.start, band.stop, dtype=np.int32), grid * grid), column, row, np.uint8(0)
+            )
 
     def refine(self, levels: int, least_share: float) -> np.ndarray:
         """Cut cells until none needs it or is `levels` deep; whether a cell of each pixel was, (pixels,) bool.
@@ -127,32 +133,51 @@ class CellTree:
         """Trace new cells and append them."""
         new = slice(self.used, self.used + len(rank))
         if new.stop > len(self.rank):
-            for name in _NAMES:
-                old = getattr(self, name)
-                grown = np.empty(new.stop + new.stop // 2, old.dtype)
-                grown[: self.used] = old[: self.used]
-                setattr(self, name, grown)
+            self._reserve(new.stop + new.stop // 2)
         self.rank[new], self.column[new], self.row[new], self.level[new], self.child[new] = rank, column, row, level, -1
         for name, values in zip(Footprints._fields, self._trace(new), strict=True):
             getattr(self, name)[new] = values
         self.used = new.stop
         return new
 
+    def _reserve(self, cells: int) -> None:
+        """Make room for so many cells."""
+        for name, dtype in zip(_NAMES, _TYPES, strict=True):
+            old, grown = getattr(self, name), np.empty(cells, dtype)
+            grown[: self.used] = old[: self.used]
+            setattr(self, name, grown)
+
+    def _bands(self) -> list[slice]:
+        """The pixels in runs of about BAND cells, of whole rows where whole rows were asked for."""
+        unit = self.width if self.whole_rows else 1
+        size = max(1, BAND // (self.grid**2 * unit)) * unit
+        return [slice(first, min(first + size, len(self.pixels))) for first in range(0, len(self.pixels), size)]
+
     def _first_reasons(self) -> np.ndarray:
         """Which cells of level 0 to cut, (cells,) bool.
 
-        Raster images of the cells where whole rows were asked for; else one small image for each pixel.
+        Raster images of the cells where whole rows were asked for, each band with a row of pixels more on either side;
+        else one small image for each pixel.
         """
-        images = [self._image(getattr(self, name)) for name in _COMPARED]
-        reasons = (images[-2] & LARGE) != 0
-        joined = self._compare_images(images, np.float32(1 / self.grid), reasons)
-        self._follow_neighbours(joined, images)
-        return self._column(reasons)
+        cells = self.grid**2
+        reasons = np.empty(len(self.pixels) * cells, bool)
+        path_m = self.path_m[: len(reasons)].copy()  # cells are compared as they were before they follow others
+        for band in self._bands():
+            beside = self.width if self.whole_rows else 0
+            wider = slice(max(band.start - beside, 0), min(band.stop + beside, len(self.pixels)))
+            images = [self._image(getattr(self, name), wider) for name in _COMPARED]
+            found = (images[-2] & LARGE) != 0
+            joined = self._compare_images(images, np.float32(1 / self.grid), found)
+            inner = slice((band.start - wider.start) * cells, (band.stop - wider.start) * cells)
+            reasons[band.start * cells : band.stop * cells] = self._column(found)[inner]
+            self._follow_neighbours(joined, images, self._image(path_m, wider), band.start * cells, inner)
+        return reasons
 
-    def _image(self, column: np.ndarray) -> np.ndarray:
-        """A property of the cells of level 0 as raster images (..., rows, columns): of whole rows, or of each pixel."""
+    def _image(self, column: np.ndarray, pixels: slice) -> np.ndarray:
+        """A property of the pixels' cells of level 0 as raster images (..., rows, columns): of whole rows, or of each
+        pixel."""
         grid = self.grid
-        image = column[: len(self.pixels) * grid**2].reshape(-1, grid, grid)
+        image = column[pixels.start * grid**2 : pixels.stop * grid**2].reshape(-1, grid, grid)
         if self.whole_rows:
             image = image.reshape(-1, self.width, grid, grid).transpose(0, 2, 1, 3).reshape(-1, self.width * grid)
         return image
@@ -163,7 +188,9 @@ class CellTree:
             image = image.reshape(-1, self.grid, self.width, self.grid).transpose(0, 2, 1, 3)
         return image.reshape(-1)
 
-    def _follow_neighbours(self, joined: list[np.ndarray], images: list[np.ndarray]) -> None:
+    def _follow_neighbours(
+        self, joined: list[np.ndarray], images: list[np.ndarray], path: np.ndarray, start: int, inner: slice
+    ) -> None:
         """Spread small cells of level 0 between their neighbours on the same surface instead of on the tangent plane.
 
         Along each axis p = p_0 + s x + c x^2 / 2 and r = r_0 + g x, with s, g the mean of the steps to both neighbours
@@ -171,9 +198,11 @@ class CellTree:
         |s| / 2 (c adds c^2 / 720 to the variance), and the mean path p_0 + c / 24 + g s / (12 r_0), summed over the
         axes: second order in the cell's width where the tangent plane is first, and blind to facets of a curved
         surface. At a crease the tangent plane agrees with one of the steps instead of their mean, and is kept.
+
+        The images' cells `inner` are changed, which are the tree's from `start`.
         """
         distance, slope_x, slope_y, _, radiance, flags, _ = images
-        path, pitch = self._image(self.path_m), np.float32(1 / self.grid)
+        pitch = np.float32(1 / self.grid)
         follows = ((flags & (HIT | LARGE)) == HIT) & (radiance > 0)
         per_radiance = np.divide(np.float32(1), radiance, out=np.zeros_like(radiance), where=follows)
         mean, halves, variance = path.copy(), [], np.zeros_like(path)
@@ -191,13 +220,13 @@ class CellTree:
             mean += bend / 24 + gain * slope / 12
             halves.append(np.abs(slope) / 2)
             variance += np.square(slope) / 4 + np.square(bend) / 240
-        chosen = np.flatnonzero(self._column(follows))
+        chosen = np.flatnonzero(self._column(follows)[inner])
         for column, image in (
             (self.path_m, mean),
             (self.half_width_m, np.sqrt(variance)),
             (self.minor_m, np.minimum(*halves)),
         ):
-            column[chosen] = self._column(image)[chosen]
+            column[start + chosen] = self._column(image)[inner][chosen]
 
     def _cut(self, parents: np.ndarray, levels: int) -> np.ndarray:
         """Cut cells in four; the cells (children, and older leaves beside them) that now need cutting, sorted."""

@@ -21,6 +21,30 @@ class Samples(NamedTuple):
 
 
 COLUMN_TYPES = (np.int32, np.float32, np.float32, np.float32, np.uint8)
+SORTED = 1 << 19  # samples sorted at a time
+
+
+class Growing:
+    """Samples that come part by part, in columns that grow in place: joining parts at the end would hold all twice."""
+
+    def __init__(self) -> None:
+        self._columns = list(no_samples())
+
+    def __len__(self) -> int:
+        return len(self._columns[0])
+
+    def add(self, part: Samples) -> None:
+        before = len(self)
+        for column, more in zip(self._columns, part, strict=True):
+            # no view of a column is out, as `refcheck` would have it: only `finished` hands them over
+            column.resize(before + len(more), refcheck=False)
+            column[before:] = more
+
+    def finished(self) -> Samples:
+        """All samples; nothing more can be added."""
+        samples = Samples(*self._columns)
+        del self._columns
+        return samples
 
 
 class Returns(NamedTuple):
@@ -33,8 +57,8 @@ class Returns(NamedTuple):
     bounces: np.ndarray
 
 
-def select(samples: Samples, kept: np.ndarray) -> Samples:
-    """The samples where `kept` is true."""
+def select(samples: Samples, kept: np.ndarray | slice) -> Samples:
+    """The samples where `kept` is true, or those that it numbers; of a slice, views."""
     return Samples(*(column[kept] for column in samples))
 
 
@@ -79,19 +103,25 @@ def merge(samples: Samples, tolerance_m: float) -> Samples:
 
 
 def to_returns(samples: Samples, pixels: int) -> Returns:
-    """Sort merged samples by pixel and path and pack them as ragged float32 lists."""
-    near = np.maximum(samples.path_m - samples.half_width_m, 0)
-    far = samples.path_m + samples.half_width_m
-    order = np.lexsort((samples.bounces, far, near, samples.pixel))
+    """Sort merged samples by pixel and path and pack them as ragged float32 lists, some pixels at a time."""
     counts = np.bincount(samples.pixel, minlength=pixels)
-    near, far = near[order].astype(np.float32), far[order].astype(np.float32)
-    return Returns(
-        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-        path_near_m=near,
-        path_far_m=np.maximum(far, near),
-        radiance=samples.radiance[order].astype(np.float32),
-        bounces=samples.bounces[order].astype(np.uint8),
-    )
+    offsets = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
+    returns = Returns(offsets, *(np.empty(len(samples.pixel), kind) for kind in (*(np.float32,) * 3, np.uint8)))
+    first = 0
+    while first < pixels:
+        end = max(first + 1, int(np.searchsorted(offsets, offsets[first] + SORTED, side="right")) - 1)
+        some = slice(offsets[first], offsets[end])
+        part = samples
+        if end - first < pixels:
+            part = select(samples, np.flatnonzero((samples.pixel >= first) & (samples.pixel < end)))
+        near = np.maximum(part.path_m - part.half_width_m, 0)
+        far = part.path_m + part.half_width_m
+        order = np.lexsort((part.bounces, far, near, part.pixel))
+        near, far = near[order].astype(np.float32), far[order].astype(np.float32)
+        returns.path_near_m[some], returns.path_far_m[some] = near, np.maximum(far, near)
+        returns.radiance[some], returns.bounces[some] = part.radiance[order], part.bounces[order]
+        first = end
+    return returns
 
 
 def no_samples() -> Samples:

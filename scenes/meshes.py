@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from scenes import shapes
+from scenes.arrays import check_faces
 from scenes.errors import InputError
-from scenes.model import Camera, Material, Scene, Surface, Texture, check_faces
+from scenes.model import Camera, Material, Scene, Surface, Texture
 from scenes.textures import load_texture, luminance, srgb_to_linear
 
 EXTENSIONS = (".obj", ".ply", ".stl", ".glb")

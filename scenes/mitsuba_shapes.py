@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from scenes import shapes
+from scenes.arrays import check_faces
 from scenes.errors import InputError
 from scenes.mitsuba_bsdf import Look, Materials
 from scenes.mitsuba_nodes import Document
 from scenes.mitsuba_plugin import Plugin
-from scenes.model import Surface, check_faces
+from scenes.model import Surface
 
 # At 128 segments a disk's area is 4e-4 too small, at 5 subdivisions a sphere's 3e-4: under the 1e-3 that is promised.
 SEGMENTS = 128

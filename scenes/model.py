@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from scenes.arrays import check_faces, frozen_array, rigid_pose
 from scenes.errors import InputError, require
 
 MaterialKind = Literal[
@@ -22,40 +23,6 @@ MaterialKind = Literal[
 LaserMode = Literal["flood", "line", "scan"]
 MATERIAL_KINDS: tuple[str, ...] = MaterialKind.__args__
 LASER_MODES: tuple[str, ...] = LaserMode.__args__
-
-
-def _frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: str) -> np.ndarray:
-    """`value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError.
-
-    A read-only array that owns its memory is kept as it is: copies of big meshes were most of a room's time.
-    """
-    kept = isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable
-    kept = kept and value.dtype == dtype and value.flags.c_contiguous
-    try:
-        array = value if kept else np.array(value, dtype=dtype, order="C")
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what}: not an array of numbers ({error})") from None
-    tail = array.shape[array.ndim - len(shape_tail) :] if array.ndim >= len(shape_tail) else None
-    require(tail == shape_tail, f"{what}: shape {array.shape}, expected (..., {', '.join(map(str, shape_tail))})")
-    array.setflags(write=False)
-    return array
-
-
-def check_faces(faces: np.ndarray, vertices: int, where: str) -> None:
-    """InputError if a face refers to a vertex that is not there."""
-    worst = faces.min() if faces.min() < 0 else faces.max()
-    require(0 <= worst < vertices, f"{where}: a face refers to vertex {worst}, expected 0 to {vertices - 1}")
-
-
-def rigid_pose(value: object, what: str) -> np.ndarray:
-    """`value` as a read-only 4x4 rotation and translation (camera or environment to world); a reflection is refused."""
-    pose = _frozen_array(value, np.float64, (4, 4), what)
-    require(pose.ndim == 2 and bool(np.isfinite(pose).all()), f"{what}: needs 4x4 finite numbers")
-    rotation = pose[:3, :3]
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
-    require(orthonormal, f"{what}: the upper 3x3 block is not a rotation")
-    require(np.allclose(pose[3], (0, 0, 0, 1)), f"{what}: the last row is {pose[3].tolist()}, expected 0 0 0 1")
-    return pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,8 +126,8 @@ class Surface:
 
     def __post_init__(self) -> None:
         where = f"mesh {self.name}"
-        vertices = _frozen_array(self.vertices, np.float64, (3,), f"{where}: vertices")
-        faces = _frozen_array(self.faces, np.int64, (3,), f"{where}: faces")
+        vertices = frozen_array(self.vertices, np.float64, (3,), f"{where}: vertices")
+        faces = frozen_array(self.faces, np.int64, (3,), f"{where}: faces")
         require(vertices.ndim == 2 and faces.ndim == 2, f"{where}: vertices and faces must be tables of three columns")
         require(len(faces) > 0 and len(vertices) > 0, f"{where}: has no faces")
         if not np.isfinite(vertices).all():
@@ -173,7 +140,7 @@ class Surface:
             value = getattr(self, label)
             if value is None:
                 continue
-            array = _frozen_array(value, np.float64, (width,), f"{where}: {label}")
+            array = frozen_array(value, np.float64, (width,), f"{where}: {label}")
             require(len(array) == len(vertices), f"{where}: {len(array)} {label} for {len(vertices)} vertices")
             require(bool(np.isfinite(array).all()), f"{where}: {label} hold NaN or infinite values")
             object.__setattr__(self, label, array)

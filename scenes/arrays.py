@@ -1,0 +1,41 @@
+"""Arrays checked on their way into a scene: numbers, triangles' vertices, poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scenes.errors import InputError, require
+
+
+def frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: str) -> np.ndarray:
+    """`value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError.
+
+    A read-only array that owns its memory is kept as it is: copies of big meshes were most of a room's time.
+    """
+    kept = isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable
+    kept = kept and value.dtype == dtype and value.flags.c_contiguous
+    try:
+        array = value if kept else np.array(value, dtype=dtype, order="C")
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{what}: not an array of numbers ({error})") from None
+    tail = array.shape[array.ndim - len(shape_tail) :] if array.ndim >= len(shape_tail) else None
+    require(tail == shape_tail, f"{what}: shape {array.shape}, expected (..., {', '.join(map(str, shape_tail))})")
+    array.setflags(write=False)
+    return array
+
+
+def check_faces(faces: np.ndarray, vertices: int, where: str) -> None:
+    """InputError if a face refers to a vertex that is not there."""
+    worst = faces.min() if faces.min() < 0 else faces.max()
+    require(0 <= worst < vertices, f"{where}: a face refers to vertex {worst}, expected 0 to {vertices - 1}")
+
+
+def rigid_pose(value: object, what: str) -> np.ndarray:
+    """`value` as a read-only 4x4 rotation and translation (camera or environment to world); a reflection is refused."""
+    pose = frozen_array(value, np.float64, (4, 4), what)
+    require(pose.ndim == 2 and bool(np.isfinite(pose).all()), f"{what}: needs 4x4 finite numbers")
+    rotation = pose[:3, :3]
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
+    require(orthonormal, f"{what}: the upper 3x3 block is not a rotation")
+    require(np.allclose(pose[3], (0, 0, 0, 1)), f"{what}: the last row is {pose[3].tolist()}, expected 0 0 0 1")
+    return pose

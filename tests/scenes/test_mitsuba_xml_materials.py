@@ -1,0 +1,210 @@
+"""scenes.mitsuba_bsdf: the materials of a Mitsuba scene file, against Mitsuba itself and against closed forms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from xml_files import GREY, LUMINANCE, first_hit, image, load, material, meshes, refusal, texel, write
+
+from scenes.mitsuba_xml import load_mitsuba_xml
+from scenes.textures import srgb_to_linear
+
+AIR = 1.000277
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (GREY, LUMINANCE),
+        ('<rgb name="reflectance" value="0.2, 0.4, 0.6"/>', LUMINANCE),
+        ('<rgb name="reflectance" value="0.3"/>', 0.3),
+        ('<rgb name="reflectance" value="#808080"/>', float(srgb_to_linear(128 / 255))),
+        ('<srgb name="reflectance" value="0.5 0.5 0.5"/>', float(srgb_to_linear(0.5))),
+        ('<spectrum name="reflectance" value="0.25"/>', 0.25),
+        ('<spectrum name="reflectance" value="400:0.1, 500:0.2 600:0.6"/>', 0.275),
+        ('<float name="reflectance" value="0.7"/>', 0.7),
+        ("", 0.5),
+    ],
+)
+def test_colours_become_one_number(tmp_path: Path, value: str, expected: float) -> None:
+    assert material(tmp_path, f'<bsdf type="diffuse">{value}</bsdf>').albedo == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "expected"),
+    [
+        (f'<bsdf type="twosided"><bsdf type="diffuse">{GREY}</bsdf></bsdf>', {"kind": "diffuse", "albedo": LUMINANCE}),
+        (
+            f'<bsdf type="roughdiffuse">{GREY}<float name="alpha" value="0.3"/></bsdf>',
+            {"kind": "roughdiffuse", "roughness": 0.3, "albedo": LUMINANCE},
+        ),
+        ('<bsdf type="plastic"/>', {"kind": "plastic", "albedo": 0.5, "ior": 1.49 / AIR, "specular": 1}),
+        (
+            '<bsdf type="roughplastic"><float name="intIOR" value="1.5"/><float name="extIOR" value="1"/>'
+            '<float name="alpha" value="0.2"/><rgb name="diffuseReflectance" value="0.1"/></bsdf>',
+            {"kind": "roughplastic", "ior": 1.5, "roughness": 0.2, "albedo": 0.1},
+        ),
+        ('<bsdf type="conductor"/>', {"kind": "conductor", "eta": 0, "k": 1}),
+        (
+            '<bsdf type="roughconductor"><string name="material" value="Au"/><float name="alpha" value="0"/></bsdf>',
+            {"kind": "conductor", "eta": 0.156, "k": 3.602},
+        ),
+        (
+            '<bsdf type="roughconductor"><rgb name="eta" value="2"/><rgb name="k" value="4"/><float name="extEta" '
+            'value="2"/><float name="alpha_u" value="0.1"/><float name="alpha_v" value="0.3"/></bsdf>',
+            {"kind": "roughconductor", "eta": 1, "k": 2, "roughness": 0.2},
+        ),
+        ('<bsdf type="dielectric"/>', {"kind": "dielectric", "ior": 1.5046 / AIR}),
+        (
+            '<bsdf type="thindielectric"><string name="int_ior" value="diamond"/><string name="ext_ior" value="water"/>'
+            "</bsdf>",
+            {"kind": "thindielectric", "ior": 2.419 / 1.333},
+        ),
+        (
+            '<bsdf type="mask"><float name="opacity" value="0.3"/><bsdf type="dielectric"/></bsdf>',
+            {"kind": "dielectric", "opacity": 0.3},
+        ),
+    ],
+)
+def test_bsdfs(tmp_path: Path, bsdf: str, expected: dict) -> None:
+    made = material(tmp_path, bsdf)
+    assert {key: getattr(made, key) for key in expected} == pytest.approx(expected)
+
+
+def test_conductor_defaults_differ_by_version(tmp_path: Path) -> None:
+    """0.6 takes copper where nothing is said, 3 a perfect mirror; 0.6 also knows air outside."""
+    copper = material(tmp_path, '<bsdf type="conductor"/>', version="0.6.0")
+    assert (copper.eta, copper.k) == pytest.approx((0.238 / AIR, 3.626 / AIR))
+
+
+@pytest.mark.parametrize(
+    ("metal", "reflectance"), [("Au", 0.95), ("Ag", 0.98), ("Cu", 0.93), ("Al", 0.905), ("Cr", 0.55)]
+)
+def test_metals_reflect_as_metals_do(tmp_path: Path, metal: str, reflectance: float) -> None:
+    made = material(tmp_path, f'<bsdf type="conductor"><string name="material" value="{metal}"/></bsdf>')
+    fresnel = ((made.eta - 1) ** 2 + made.k**2) / ((made.eta + 1) ** 2 + made.k**2)
+    assert fresnel == pytest.approx(reflectance, abs=0.025)
+
+
+def test_one_material_object_for_all_its_shapes(tmp_path: Path) -> None:
+    body = f'<bsdf type="diffuse" id="m">{GREY}</bsdf><alias id="m" as="n"/><rgb id="white" name="x" value="0.9"/>'
+    body += '<shape type="sphere"><ref id="m"/></shape><shape type="cube"><ref name="bsdf" id="n"/></shape>'
+    body += "<shape type='cube'/><shape type='disk'/>"
+    body += '<shape type="cube"><bsdf type="diffuse"><ref name="reflectance" id="white"/></bsdf></shape>'
+    found = [surface.material for surface in load(tmp_path, body).surfaces]
+    assert found[0] is found[1] and found[2] is found[3] and found[0].name == "m"
+    assert found[4].albedo == pytest.approx(0.9)
+
+
+def test_textures_are_shared_scaled_and_masked(tmp_path: Path) -> None:
+    rgba = np.zeros((2, 2, 4))
+    rgba[..., :3], rgba[0, 0, 3], rgba[1, 1, 3] = 128, 255, 51
+    image(tmp_path, "leaf.png", rgba)
+    file = (
+        '<string name="filename" value="leaf.png"/><float name="uscale" value="3"/><float name="voffset" value="0.5"/>'
+    )
+    leaf = f'<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{file}</texture></bsdf>'
+    mask = f'<bsdf type="mask"><texture type="bitmap" name="opacity">{file}</texture>{leaf}</bsdf>'
+    scene = load(tmp_path, f'<shape type="rectangle">{mask}</shape><shape type="rectangle">{leaf}</shape>')
+    one, two = scene.surfaces
+    np.testing.assert_allclose(one.material.opacity.image, [[1, 0], [0, 0.2]], atol=1e-6)
+    np.testing.assert_allclose(one.material.albedo.image, srgb_to_linear(128 / 255), rtol=1e-6)
+    assert one.material.albedo is two.material.albedo and scene.notes == ()
+    # The rectangle's own v runs downwards in Mitsuba's images: v -> 1 - (v + 0.5).
+    np.testing.assert_allclose(one.uv, [(0, 0.5), (3, 0.5), (3, -0.5), (0, -0.5)])
+
+
+def test_an_opacity_image_without_alpha_is_linear(tmp_path: Path) -> None:
+    image(tmp_path, "t.png", np.full((2, 2), 128))
+    texture = '<texture type="bitmap" name="opacity"><string name="filename" value="t.png"/></texture>'
+    opacity = material(tmp_path, f'<bsdf type="mask">{texture}<bsdf type="diffuse"/></bsdf>').opacity
+    np.testing.assert_allclose(opacity.image, 128 / 255, rtol=1e-6)
+
+
+def test_to_uv_and_checkerboard_are_mitsubas(tmp_path: Path, mitsuba: object) -> None:
+    texture = (
+        '<texture type="checkerboard" name="reflectance"><rgb name="color0" value="0.1"/>'
+        '<rgb name="color1" value="0.8"/><transform name="to_uv"><rotate z="1" angle="30"/><scale x="2" y="3"/>'
+        '<translate x="0.2"/></transform></texture>'
+    )
+    path = write(tmp_path, f'<shape type="rectangle"><bsdf type="diffuse">{texture}</bsdf></shape>')
+    surface = load_mitsuba_xml(path).surfaces[0]
+    rays = [((x, y, 3), (0, 0, -1)) for x in np.linspace(-0.9, 0.95, 6) for y in np.linspace(-0.95, 0.9, 6)]
+    for ray, hit in zip(rays, mitsuba(path, rays=rays)["hits"], strict=True):
+        assert texel(surface.material.albedo, first_hit(surface, *ray)[3]) == pytest.approx(hit[2][0])
+
+
+def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
+    image(tmp_path, "t.png", np.full((2, 2), 255))
+    texture = '<texture type="bitmap" name="{}"><string name="filename" value="t.png"/>{}</texture>'
+    clamp = '<string name="wrap_mode" value="clamp"/>'
+    bsdfs = [
+        '<bsdf type="diffuse" id="white"><rgb name="reflectance" value="1.5"/></bsdf>',
+        f'<bsdf type="bumpmap" id="bumpy">{texture.format("", clamp)}<bsdf type="diffuse"/></bsdf>',
+        '<bsdf type="roughplastic" id="beck"><boolean name="nonlinear" value="true"/></bsdf>',
+        f'<bsdf type="plastic" id="mean">{texture.format("specular_reflectance", clamp)}</bsdf>',
+        '<bsdf type="twosided" id="two"><bsdf type="diffuse"/><bsdf type="plastic"/></bsdf>',
+        '<bsdf type="diffuse" id="typo"><rgb name="reflectence" value="0.1"/></bsdf>',
+        '<bsdf type="dielectric" id="tint"><rgb name="specular_transmittance" value="0.5"/></bsdf>',
+    ]
+    body = '<path value="x"/>' + "".join(f'<shape type="rectangle">{bsdf}</shape>' for bsdf in bsdfs)
+    scene = load(tmp_path, body)
+    assert scene.surfaces[0].material.albedo == 1
+    expected = ["over 1 is clipped to 1: white", "bumpmap is left out", "as ggx with the same alpha: beck", "nonlinear"]
+    expected += ["its mean is used: mean", "taken as repeat: mean", "back side", "reflectence is not used: typo"]
+    expected += ["specular_transmittance is left out", "<path>"]
+    for words in expected:
+        assert sum(words in note for note in scene.notes) == 1, words
+    assert len(scene.notes) == len(expected) and all("\n" not in note for note in scene.notes)
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "words"),
+    [
+        ('<bsdf type="principled"/>', "'principled'"),
+        ('<bsdf type="blendbsdf"/>', "'blendbsdf'"),
+        ('<bsdf type="roughdielectric"/>', "'roughdielectric'"),
+        ('<bsdf type="twosided"/>', "0 bsdfs"),
+        (16 * '<bsdf type="twosided">' + '<bsdf type="diffuse"/>' + 16 * "</bsdf>", "nested more than"),
+        ('<bsdf type="twosided" id="me"><ref id="me"/></bsdf>', "nested more than"),
+        ('<bsdf type="mask"><bsdf type="mask"><bsdf type="diffuse"/></bsdf></bsdf>', "mask inside a mask"),
+        ('<bsdf type="diffuse"><rgb name="reflectance" value="1 2"/></bsdf>', "2 values, expected 1 or 3"),
+        ('<bsdf type="diffuse"><rgb name="reflectance" value="-1"/></bsdf>', "albedo"),
+        ('<bsdf type="diffuse"><rgb name="reflectance" value="#12"/></bsdf>', "#rrggbb"),
+        ('<bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf>', "plugin or file"),
+        ('<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1 500"/></bsdf>', "expected 2"),
+        ('<bsdf type="diffuse"><texture name="reflectance" type="noise"/></bsdf>', "'noise'"),
+        ('<bsdf type="diffuse"><texture name="reflectance" type="bitmap"/></bsdf>', "filename"),
+        (
+            '<bsdf type="diffuse"><texture name="reflectance" type="bitmap"><string name="filename" value="n.png"/>'
+            "</texture></bsdf>",
+            "texture 'n.png' not found",
+        ),
+        (
+            '<bsdf type="diffuse"><texture name="reflectance" type="bitmap"><string name="filename" value="bad.png"/>'
+            "</texture></bsdf>",
+            "not an image",
+        ),
+        ('<bsdf type="conductor"><string name="material" value="Unobtainium"/></bsdf>', "'Unobtainium'"),
+        ('<bsdf type="conductor"><float name="eta" value="1"/></bsdf>', "both eta and k"),
+        ('<bsdf type="dielectric"><float name="int_ior" value="1"/></bsdf>', "not above 1"),
+        ('<bsdf type="dielectric"><string name="int_ior" value="jelly"/></bsdf>', "'jelly'"),
+        ('<bsdf type="roughplastic"><float name="alpha" value="3"/></bsdf>', "roughness 3"),
+    ],
+)
+def test_bad_materials_are_refused(tmp_path: Path, bsdf: str, words: str) -> None:
+    (tmp_path / "bad.png").write_text("no image")
+    assert words in refusal(tmp_path, f'<shape type="rectangle">{bsdf}</shape>')
+
+
+def test_two_uv_transforms_and_missing_uv_are_refused(tmp_path: Path) -> None:
+    meshes(tmp_path)
+    checks = '<texture type="checkerboard" name="{}">{}</texture>'
+    inner = f'<bsdf type="diffuse">{checks.format("reflectance", "")}</bsdf>'
+    scaled = checks.format("opacity", '<float name="uscale" value="2"/>')
+    masked = f'<shape type="rectangle"><bsdf type="mask">{scaled}{inner}</bsdf></shape>'
+    assert "different to_uv" in refusal(tmp_path, masked)
+    bare = f'<shape type="obj"><string name="filename" value="bare.obj"/>{inner}</shape>'
+    assert "bare.obj: mesh bare: its material has a texture" in refusal(tmp_path, bare)
