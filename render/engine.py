@@ -77,17 +77,23 @@ def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
 
 
 def render(
-    scene: Scene, settings: RenderSettings | None = None, *, seed: int = 0, progress: Progress | None = None
+    scene: Scene,
+    settings: RenderSettings | None = None,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+    world: World | None = None,
 ) -> Transient:
     """Render the time-resolved radiance that the camera's pixels receive from the laser.
 
     The same scene, settings and seed give the same bytes on any number of threads. A scene with nothing in view gives
     a transient without returns. `progress(what, share)` is called between passes. The plan, its reasons, the error
-    estimate and everything needed to repeat the render are in the transient's `meta`.
+    estimate and everything needed to repeat the render are in the transient's `meta`. `world` is the scene ready to
+    trace, where it is there already.
     """
     settings = settings or RenderSettings()
     say = progress or (lambda what, share: None)
-    world = World(scene)
+    world = World(scene) if world is None else world
     camera = scene.camera
     say("plan", 0.0)
     pilot_seed = derived_seed(seed, STAGE_PLAN)

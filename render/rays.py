@@ -14,7 +14,7 @@ def camera_rays(world: World, x: Any, y: Any) -> tuple[Any, Any]:
     local = mi.Vector3f(
         (x - Float(world.width) / 2) / world.focal_px, (y - Float(world.height) / 2) / world.focal_px, 1
     )
-    return mi.Ray3f(mi.Point3f(0), dr.normalize(to_world(world, local))), local
+    return mi.Ray3f(mi.Point3f(world.eye), dr.normalize(to_world(world, local))), local
 
 
 def to_world(world: World, local: Any) -> Any:
@@ -33,7 +33,7 @@ def shape_index(si: Any) -> Any:
 
 
 def spawn(si: Any, direction: Any) -> Any:
-    """A ray that leaves a surface from a little off it: a share of its distance to the camera, which is the origin.
+    """A ray that leaves a surface from a little off it: a share of its distance to the origin, as float32 rounds.
 
     Mitsuba's `spawn_ray` keeps off 90 um more, whatever the scene's size: in one of millimetres that is a gap.
     """
@@ -165,7 +165,7 @@ def in_beam(world: World, point: Any, pixel: Any) -> Any:
     if laser.mode == "flood":
         aim = to_camera(world, mi.Vector3f(point) - world.laser)
         return dr.atan2(dr.norm(mi.Vector2f(aim.x, aim.y)), aim.z) <= world.half_angle
-    local = to_camera(world, mi.Vector3f(point))
+    local = to_camera(world, mi.Vector3f(point) - world.eye)
     row = dr.floor(local.y / local.z * world.focal_px + Float(world.height) / 2)
     column = dr.floor(local.x / local.z * world.focal_px + Float(world.width) / 2)
     same = (local.z > 0) & (row == Float(pixel // world.width))
