@@ -43,6 +43,8 @@ AMBIENT_BOUNCES = 16  # most paths end long before, by chance
 # Paths traced on top aim at the target's square times MARGIN, and are at most MOST_MORE times those traced before.
 MARGIN, MOST_MORE = 0.75, 3.0
 FINER = 2  # direct light is checked, on the pilot's pixels, against this many times the cells a side
+# whose returns merge within this length of path: a quarter of the pulse's width, with their variance kept
+FINER_TOLERANCE_M = 0.01
 
 Progress = Callable[[str, float], None]
 
@@ -271,7 +273,9 @@ def _estimated(
     """The error of a trace, from the checked pixels' batches and from finer direct light there."""
     coarse = response(_of_pixels(traced.direct, checked), checked)
     glints = response(_of_pixels(traced.specular, checked), checked)
-    finer = direct_light(world, checked, FINER * plan.grid, least_share=plan.least_share / FINER)
+    finer = direct_light(
+        world, checked, FINER * plan.grid, FINER_TOLERANCE_M, least_share=plan.least_share / FINER
+    )
     fine = response(finer.samples, checked) + glints
     coarse += glints
     if traced.indirect is None:
