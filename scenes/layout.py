@@ -192,7 +192,7 @@ class Boxes:
         self.extent = np.array([place.extent for place in places]).reshape(-1, 4)
 
     def beside(self, place: Place) -> np.ndarray:
-        """The numbers of those that share heights with a place, and the ground of its bounds: `in_each_other` at most."""
+        """The numbers of those that share heights with a place, and ground by its bounds: at most these are in it."""
         (x0, z0, x1, z1), (u0, w0, u1, w1) = place.extent, self.extent.T
         meets = (x0 < u1) & (u0 < x1) & (z0 < w1) & (w0 < z1)
         return np.flatnonzero(meets & (place.low < self.high) & (self.low < place.high))

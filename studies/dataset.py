@@ -44,6 +44,7 @@ Progress = Callable[[str, float], None]
 STAGE_VIEW = 20
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
+AIM = 0.95  # of the squared error target: a set's views are to meet it together, not each by itself
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
 _WORLDS: dict[tuple[Job, str], World] = {}  # that of the last place
 _ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
@@ -77,6 +78,7 @@ class Job:
             spp=self.spp,
             grid=self.grid,
             error=self.error,
+            aim=AIM,
             ambient_spp=self.ambient_spp,
             direct_tolerance_m=DIRECT_TOLERANCE_M,
             indirect_tolerance_m=INDIRECT_TOLERANCE_M,
@@ -207,7 +209,7 @@ class Folder:
 
     def __init__(self, path: Path, job: Job) -> None:
         self.path, self.job = path, job
-        stored = {"schema": 2, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED]}
+        stored = {"schema": 3, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, AIM]}
         asked = json.dumps(asdict(job) | stored, sort_keys=True, indent=1) + "\n"
         config = path / "set.json"
         if config.is_file():
