@@ -35,12 +35,12 @@ def ambient_light(world: World, spp: int, bounces: int, seed: int) -> AmbientLig
     pixels = camera.height * camera.width
     per_pass = min(spp, max(1, MOST_LANES // pixels))
     total, squares, left = np.zeros(pixels), np.zeros(pixels), spp
-    sampler = mi.load_dict({"type": "independent"})
     while left > 0:
         now = min(per_pass, left)
-        sampler.seed(dr.opaque(UInt32, (seed + left) & 0xFFFFFFFF), pixels * now)
-        light = _of_pixels(world, sampler, pixels, now)
-        light = _traced(world, sampler, light, bounces)
+        lane = dr.arange(UInt32, pixels * now)
+        dr.eval(lane)
+        numbers = [dr.opaque(UInt32, number) for number in ((seed + left) & 0xFFFFFFFF, now, bounces)]
+        light = world.recordings.call(world, "ambient", _of_paths, lane, *numbers)
         of_pixel = np.array(light, np.float64).reshape(pixels, now)
         total, squares, left = total + of_pixel.sum(axis=1), squares + (of_pixel**2).sum(axis=1), left - now
     mean = total / spp
@@ -49,16 +49,18 @@ def ambient_light(world: World, spp: int, bounces: int, seed: int) -> AmbientLig
     return AmbientLight(mean.reshape(camera.height, camera.width).astype(np.float32), error)
 
 
-def _of_pixels(world: World, sampler: Any, pixels: int, paths: int) -> Any:
-    """Camera rays, `paths` in a row through random positions of each pixel."""
-    pixel = dr.arange(UInt32, pixels * paths) // dr.opaque(UInt32, paths)
+def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> Any:
+    """Light of camera rays, `paths` in a row through random positions of each pixel."""
+    pixel = lane // paths
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, dr.width(lane))
     shift = sampler.next_2d()
     x, y = Float(pixel % world.width) + shift.x, Float(pixel // world.width) + shift.y
-    return camera_rays(world, x, y)[0]
+    return _traced(world, sampler, camera_rays(world, x, y)[0], bounces)
 
 
 @dr.syntax
-def _traced(world: World, sampler: Any, ray: Any, bounces: int) -> Any:
+def _traced(world: World, sampler: Any, ray: Any, most: Any) -> Any:
     """Light that comes back along each ray."""
     scene, context = world.traced, mi.BSDFContext()
     lanes = dr.width(ray.d)
@@ -67,7 +69,6 @@ def _traced(world: World, sampler: Any, ray: Any, bounces: int) -> Any:
     density = dr.full(Float, 1, lanes)  # of the ray's direction there; 0: no light could be sampled that way
     density = dr.select(weight > 0, 0, density)
     met, layer = dr.zeros(UInt32, lanes), dr.zeros(UInt32, lanes)
-    most = dr.opaque(UInt32, bounces)
     ray, active = mi.Ray3f(ray), dr.full(Bool, True, lanes)
     while active:
         si = scene.ray_intersect(ray, active)
@@ -138,10 +139,13 @@ def _open(world: World, si: Any, to_light: Any, active: Any) -> Any:
     else:
         layer, searching, end = dr.zeros(UInt32, dr.width(ray.d)), Bool(active), ray.o + ray.d * ray.maxt
         while searching:
-            other = world.traced.ray_intersect(ray, searching)
-            hit = searching & other.is_valid()
-            thin = dr.gather(Float, world.thin_ior, shape_index(other), hit)
-            passing, let = hit & (thin > 0), dr.select(thin > 0, _transmission(thin, ray, other), 0)
+            # most rays are stopped or meet nothing: all about a point is worked out only where it matters
+            first = world.traced.ray_intersect_preliminary(ray, coherent=False, active=searching)
+            hit = searching & first.is_valid()
+            thin = dr.gather(Float, world.thin_ior, shape_index(first), hit)
+            passing = hit & (thin > 0)
+            other = first.compute_surface_interaction(ray, mi.RayFlags.All, hit if world.has_cutouts else passing)
+            let = dr.select(passing, _transmission(thin, ray, other), 0)
             if dr.hint(world.has_cutouts, mode="scalar"):
                 hole = hit & (other.shape.eval_attribute_1(OPACITY, other, hit) < 0.5)
                 passing, let = passing | hole, dr.select(hole, 1, let)

@@ -28,7 +28,7 @@ from render.indirect import (
     uniform,
 )
 from render.paths import BLOCK, block_order
-from render.planning import make_plan, pilot_pixels
+from render.planning import make_plan, pilot_pixels, pilot_response
 from render.returns import Growing, Samples, concatenate, no_samples, select, to_returns
 from render.settings import BATCHES, Plan, RenderSettings
 from render.specular import specular_light
@@ -42,8 +42,7 @@ STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT, STAGE_PILOT, STAGE_MORE = 10, 11, 12,
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
 MOST_SPP, MOST_SPP_BY_DEFAULT = 16384, 1024
 AMBIENT_BOUNCES = 16  # most paths end long before, by chance
-# Paths traced on top aim at the target's square times MARGIN, and are at most MOST_MORE times those traced before.
-MARGIN, MOST_MORE = 0.75, 3.0
+MOST_MORE = 3.0  # paths traced on top are at most this many times those traced before
 FINER = 2  # direct light is checked, on the pilot's pixels, against this many times the cells a side
 
 Progress = Callable[[str, float], None]
@@ -89,17 +88,23 @@ def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
 
 
 def render(
-    scene: Scene, settings: RenderSettings | None = None, *, seed: int = 0, progress: Progress | None = None
+    scene: Scene,
+    settings: RenderSettings | None = None,
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+    world: World | None = None,
 ) -> Transient:
     """Render the time-resolved radiance that the camera's pixels receive from the laser.
 
     The same scene, settings and seed give the same bytes on any number of threads. A scene with nothing in view gives
     a transient without returns. `progress(what, share)` is called between passes. The plan, its reasons, the error
-    estimate and everything needed to repeat the render are in the transient's `meta`.
+    estimate and everything needed to repeat the render are in the transient's `meta`. `world` is the scene ready to
+    trace, where it is there already.
     """
     settings = settings or RenderSettings()
     say = progress or (lambda what, share: None)
-    world = World(scene)
+    world = World(scene) if world is None else world
     camera = scene.camera
     say("plan", 0.0)
     pilot_seed = derived_seed(seed, STAGE_PLAN)
@@ -210,8 +215,8 @@ def _missing(plan: Plan, settings: RenderSettings, traced: Traced, error: ErrorE
     """What to trace on top where a planned render misses its target: pilots see few of the rare bright paths."""
     if settings.spp is not None or traced.schedule is None or traced.indirect is None or plan.target <= 0:
         return None
-    allowed = plan.target**2 * MARGIN - error.direct**2 - error.merging**2
-    if error.total**2 <= MARGIN * plan.target**2 or allowed <= 0 or traced.schedule.batches < BATCHES:
+    allowed = settings.aim * plan.target**2 - error.direct**2 - error.merging**2
+    if error.total**2 <= settings.aim * plan.target**2 or allowed <= 0 or traced.schedule.batches < BATCHES:
         return None
     asked = settings.error is not None or settings.budget is not None
     left = (MOST_SPP if asked else MOST_SPP_BY_DEFAULT) / traced.schedule.cost - 1
@@ -290,8 +295,7 @@ def _estimated(
     """The error of a trace, from the checked pixels' batches and from finer direct light there."""
     coarse = response(_of_pixels(traced.direct, checked), checked)
     glints = response(_of_pixels(traced.specular, checked), checked)
-    finer = direct_light(world, checked, FINER * plan.grid, least_share=plan.least_share / FINER)
-    fine = response(finer.samples, checked) + glints
+    fine = pilot_response(world, checked, FINER * plan.grid, plan.least_share / FINER) + glints
     coarse += glints
     if traced.indirect is None:
         none = np.zeros(len(checked))

@@ -42,21 +42,26 @@ def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
     A sample's pulse and footprint are taken as one Gaussian of variance sigma^2 + h^2 / 3 at bin centres: exact to
     second order, which is all an error estimate needs. `pixels` must be sorted and hold every sample's pixel.
     """
-    row = np.searchsorted(pixels, samples.pixel)
-    centre = samples.path_m / BIN_M
-    sigma = np.sqrt(SIGMA_M**2 + samples.half_width_m**2 / 3) / BIN_M
     counts = np.zeros(len(pixels) * REFERENCE_BINS)
+    row = np.searchsorted(pixels, samples.pixel)
+    # float32: an estimate of errors needs no more, from bins counted from a whole one
+    whole = np.floor(samples.path_m / BIN_M)
+    within = (samples.path_m / BIN_M - whole).astype(np.float32)
+    whole = whole.astype(np.int64)
+    sigma = (np.sqrt(SIGMA_M**2 + samples.half_width_m**2 / 3) / BIN_M).astype(np.float32)
+    height = (samples.radiance / (math.sqrt(2 * math.pi) * sigma)).astype(np.float32)
     reach = np.minimum(np.ceil(5 * sigma), WIDEST_STENCIL).astype(int)
-    # a few footprints are wide, most are not: one stencil width for each power of two
-    size = 1 << np.ceil(np.log2(np.maximum(reach, 1))).astype(int)
+    # a few footprints are wide, most are not: one stencil width for each power of two, after the pulse's own
+    narrowest = math.ceil(5 * SIGMA_M / BIN_M)
+    size = narrowest << np.ceil(np.log2(np.maximum(reach / narrowest, 1))).astype(int)
     for half in np.unique(size):
         chosen = np.flatnonzero(size == half)
+        stencil = np.arange(-half, half + 1)
         for part in np.array_split(chosen, 1 + len(chosen) * (2 * half + 1) // BLOCK_ENTRIES):
-            first = np.floor(centre[part]).astype(np.int64)[:, None] + np.arange(-half, half + 1)
-            z = (first + 0.5 - centre[part, None]) / sigma[part, None]
-            weight = np.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * sigma[part, None]) * samples.radiance[part, None]
-            index = row[part, None] * REFERENCE_BINS + first % REFERENCE_BINS
-            counts += np.bincount(index.ravel(), weights=weight.ravel(), minlength=len(counts))
+            z = (stencil + np.float32(0.5) - within[part, None]) / sigma[part, None]
+            weight = np.exp(np.float32(-0.5) * z * z) * height[part, None]
+            index = (whole[part, None] + stencil) % REFERENCE_BINS + row[part, None] * REFERENCE_BINS
+            np.add.at(counts, index.ravel(), weight.ravel().astype(np.float64))  # of one type: 40 times as fast
     return counts.reshape(len(pixels), REFERENCE_BINS)
 
 

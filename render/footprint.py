@@ -11,8 +11,7 @@ SMALL bounds D: 1/32 means 2.5e-4 of energy, and a shift of 1 % of the standard 
 
 from __future__ import annotations
 
-import copy
-import weakref
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,40 +45,21 @@ class Footprints(NamedTuple):
 def trace(world: World, column: np.ndarray, row: np.ndarray, level: np.ndarray, grid: int, *, clip: bool = False):
     """Footprints of the cells in these columns and rows (N,) of an image of cells 1/(grid 2^level) pixels wide.
 
-    With `clip` a footprint that is not small is cut to the path lengths that its face spans. The tracing is recorded
-    once for each world and replayed: what Python needs to trace a small launch takes longer than its rays.
+    With `clip` a footprint that is not small is cut to the path lengths that its face spans.
     """
     if len(column) == 0:
         return Footprints(*(np.empty(0, np.float32) for _ in range(8)), np.empty(0, np.uint32))
-    recorded = vars(world).setdefault("recorded_footprints", {})
-    if clip not in recorded:
-        # weakly: a world held by its own recording would stay among the scenes that Dr.Jit compiles calls for
-        owner = weakref.ref(world)
-        recorded[clip] = dr.freeze(lambda *arguments: _footprints(owner(), *arguments, clip), warn_after=1000)
     packed = row.astype(np.uint32) | level.astype(np.uint32) << LEVEL_BIT
     if len(column) == 1:  # arrays of one entry are scalars to Dr.Jit: another kernel
         alone = trace(world, np.repeat(column, 2), np.repeat(row, 2), np.repeat(level, 2), grid, clip=clip)
         return Footprints(*(values[:1] for values in alone))
     columns = upload(UInt32, column), upload(UInt32, packed), dr.opaque(UInt32, grid)
-    found = recorded[clip](_arrays(world), *columns)
+    found = world.recordings.call(world, ("footprints", clip), partial(_footprints, clip=clip), *columns)
     dr.eval(found)
     return Footprints(*(values.numpy() for values in found))
 
 
-def _arrays(world: World) -> dict[str, Any]:
-    """Everything of the world that lives in Dr.Jit: a recording has to be told its inputs."""
-    held = {
-        name: value
-        for name, value in vars(world).items()
-        if dr.is_array_v(value) or (isinstance(value, tuple) and value and all(dr.is_array_v(part) for part in value))
-    }
-    return {**held, "traced": world.traced}
-
-
-def _footprints(world: World, arrays: dict[str, Any], column: Any, packed: Any, grid: Any, clip: bool) -> tuple:
-    # a recording refuses Dr.Jit variables from outside: take the world's from the arguments
-    world = copy.copy(world)
-    vars(world).update(arrays)
+def _footprints(world: World, column: Any, packed: Any, grid: Any, *, clip: bool) -> tuple:
     side = grid << (packed >> LEVEL_BIT)
     row = packed & ((1 << LEVEL_BIT) - 1)
     pitch = dr.rcp(Float(side))
@@ -167,14 +147,14 @@ def _face_span(world: World, si: Any, path: Any, active: Any) -> tuple[Any, Any]
     """
     mesh = mi.MeshPtr(si.shape)
     face = mesh.face_indices(si.prim_index, active)
-    gradient = dr.normalize(mi.Vector3f(si.p)) + dr.normalize(si.p - world.laser)
+    gradient = dr.normalize(si.p - world.eye) + dr.normalize(si.p - world.laser)
     near, far = Float(path), Float(path)
     for corner in range(3):
         vertex = mesh.vertex_position(face[corner], active)
         near = dr.minimum(near, path + dr.dot(gradient, vertex - si.p))
-        straight = dr.norm(mi.Vector3f(vertex)) + dr.norm(vertex - world.laser)
+        straight = dr.norm(vertex - world.eye) + dr.norm(vertex - world.laser)
         # glass on the way adds the same delay everywhere, as far as a bound needs to know
-        far = dr.maximum(far, path + straight - dr.norm(mi.Vector3f(si.p)) - dr.norm(si.p - world.laser))
+        far = dr.maximum(far, path + straight - dr.norm(si.p - world.eye) - dr.norm(si.p - world.laser))
     return near, far
 
 

@@ -1,6 +1,6 @@
 """Plane smooth faces of a scene and their images: the geometry of specular light. Plain numpy, float64.
 
-Everything is in the traced world's frame: the scene's axes, the camera at the origin.
+Everything has the scene's axes, and the camera at the origin.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ COATED = ("conductor", "plastic", "dielectric", "thindielectric")
 
 
 class Mirrors(NamedTuple):
-    """Plane smooth faces n . x = c in the traced world (camera at the origin), (n,) or (n, 3) each.
+    """Plane smooth faces n . x = c, the camera at the origin, (n,) or (n, 3) each.
 
     `low` and `high` bound the face; `shape` is its mesh's registered index; `is_metal` and `is_solid` its material.
     """

@@ -44,7 +44,7 @@ class _Heads(NamedTuple):
 
 
 class _Tails(NamedTuple):
-    """x2 and beyond: light of the laser at x2; direction to x3; light from there on per path vertex.
+    """x2 and beyond: light of the laser at x2; direction to x3; light from there on per path vertex, `length` of them.
 
     `own_weight` leads from x2 to the pixel, `own_onward` from x3; `shared` and `onward` say whether the pool may use
     the light at x2, and the light beyond.
@@ -63,6 +63,7 @@ class _Tails(NamedTuple):
     own_onward: Any
     values: Any
     paths: Any
+    length: Any
 
 
 class Turns(NamedTuple):
@@ -93,10 +94,10 @@ def add_paths(
     """Trace paths of the given blocks of flat pixels (-1: none) and add their light to `sums`; `shared` by blocks."""
     heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches)
     if not shared or world.has_own:
-        _add_own(heads, tails, batch, sums, bounces - 2, shared)
+        _add_own(heads, tails, batch, sums, shared)
     if shared:
         head, tail = _pairs(dr.width(batch))
-        _add_pairs(tails, head, tail, _weights(world, heads, tails, head, tail), heads, batch, sums, bounces - 2)
+        _add_pairs(tails, head, tail, _weights(world, heads, tails, head, tail), heads, batch, sums)
     sums.evaluate()
 
 
@@ -173,7 +174,7 @@ def _trace(
     )
     spread_onward = ~mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
     direction = si.to_world(onward.wo)
-    values, paths = _beyond(world, si, direction, alive & (onward_weight[0] > 0), pixel, random, bounces - 2)
+    values, paths, length = _beyond(world, si, direction, alive & (onward_weight[0] > 0), pixel, random, bounces - 2)
     tails = _Tails(
         si=_kept(si),
         to_laser=to_laser,
@@ -188,6 +189,7 @@ def _trace(
         own_onward=own * onward_weight[0],
         values=values,
         paths=paths,
+        length=length,
     )
     batch = round_index % batches
     dr.eval(*heads, *tails, batch)
@@ -205,10 +207,11 @@ def _kept(si: Any) -> Any:
 @dr.syntax
 def _beyond(
     world: World, si: Any, direction: Any, active: Any, pixel: Any, random: Any, vertices: int
-) -> tuple[Any, Any]:
+) -> tuple[Any, Any, Any]:
     """Light of x3, x4, ... that goes to x2 from `direction`, divided by the density of the path after x2.
 
-    Returns radiances and path lengths from x2 to the laser, vertex-major flat arrays of vertices x lanes.
+    Returns radiances and path lengths from x2 to the laser, vertex-major flat arrays of vertices x lanes, and how many
+    vertices each lane's path had.
     """
     lanes = dr.width(pixel)
     values, paths = dr.zeros(Float, lanes * max(vertices, 1)), dr.zeros(Float, lanes * max(vertices, 1))
@@ -242,10 +245,10 @@ def _beyond(
         survive = dr.clip(throughput, 0.05, 0.95)
         active &= (throughput > 0) & (random.next_float32() < survive)
         throughput /= survive
-    return values, paths
+    return values, paths, vertex
 
 
-def _add_own(heads: _Heads, tails: _Tails, batch: Any, sums: Sums, vertices: int, shared: bool) -> None:
+def _add_own(heads: _Heads, tails: _Tails, batch: Any, sums: Sums, shared: bool) -> None:
     """Light that a pixel gets from its own path alone."""
     first, onward = Bool(heads.valid), Bool(heads.valid)
     if shared:
@@ -258,7 +261,7 @@ def _add_own(heads: _Heads, tails: _Tails, batch: Any, sums: Sums, vertices: int
         dr.select(first, tails.own_value, 0),
         dr.select(onward, tails.own_onward, 0),
     )
-    _add(light, tails, sums, vertices)
+    _add(light, tails, sums)
 
 
 def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: int, seed: int) -> np.ndarray:
@@ -339,13 +342,12 @@ def _add_pairs(
     heads: _Heads,
     batch: Any,
     sums: Sums,
-    vertices: int,
 ) -> None:
     """Light that every pixel of a block gets from every tail of the block."""
     leg, first, weight = weights
     base = dr.gather(Float, heads.path, head) + leg
     receiver, turn = dr.gather(UInt32, heads.receiver, head), dr.gather(UInt32, batch, tail)
-    _add(_Light(receiver, turn, tail, base, first, weight), tails, sums, vertices)
+    _add(_Light(receiver, turn, tail, base, first, weight), tails, sums)
 
 
 class _Light(NamedTuple):
@@ -360,11 +362,11 @@ class _Light(NamedTuple):
 
 
 @dr.syntax
-def _add(light: _Light, tails: _Tails, sums: Sums, vertices: int) -> None:
+def _add(light: _Light, tails: _Tails, sums: Sums) -> None:
     receiver, batch, tail, base, first, weight = light
     laser_path = dr.gather(Float, tails.laser_path, tail)
     values, paths = tails.values, tails.paths
-    stride, last = dr.opaque(UInt32, dr.width(tails.leg)), dr.opaque(UInt32, vertices)
+    stride, last = dr.opaque(UInt32, dr.width(tails.leg)), dr.gather(UInt32, tails.length, tail)
     vertex, total = dr.zeros(UInt32, dr.width(tail)), dr.zeros(Float, dr.width(tail))
     going = (first > 0) | (weight > 0)
     # x2's own light is the loop's first turn: additions before a loop would cost a kernel of their own

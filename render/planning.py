@@ -14,8 +14,11 @@ from render.world import World
 from scenes.model import Material
 
 DEFAULT_ERROR = 0.02
-# Squares of the parts must sum to less than 1; the rest is for merged returns and the pilot's own uncertainty.
-DIRECT_SHARE, MONTE_CARLO_SHARE = 0.4, 0.75
+# Squares of the parts must sum to less than 1; the rest is for merged returns and the pilot's own uncertainty, and
+# for what twice as many rays a side still miss. Of the square of the Monte-Carlo part that is a share of the aim.
+DIRECT_SHARE, MONTE_CARLO_OF_AIM = 0.4, 0.75
+# Of what is aimed at, where there is no other part: twice as many rays a side show 80 to 85 % of the error of cells.
+DIRECT_SHOWN = 0.85
 MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
@@ -23,6 +26,7 @@ PILOT_GRID = 4
 # Merging direct returns within 1 mm makes an error of 5e-4 on the reference sensor (measured): a tenth of the target.
 TOLERANCE_M_PER_ERROR = 0.2
 WIDEST_TOLERANCE_M = 0.005
+PILOT_TOLERANCE_M = 0.01  # of path, within which the pilot's returns merge: a quarter of the pulse's sigma
 
 
 def pilot_pixels(world: World, seed: int) -> np.ndarray:
@@ -31,6 +35,16 @@ def pilot_pixels(world: World, seed: int) -> np.ndarray:
     if pixels <= PILOT_PIXELS:
         return np.arange(pixels)
     return np.sort(np.random.default_rng(seed).choice(pixels, PILOT_PIXELS, replace=False))
+
+
+def pilot_response(world: World, pixels: np.ndarray, grid: int, least_share: float | None = None) -> np.ndarray:
+    """`response` of direct light in a few pixels. Kept with the world: the plan and the error estimate ask the same."""
+    share = least_share_of(grid) if least_share is None else least_share
+    key = grid, share, pixels.tobytes()
+    if key not in world.responses:
+        light = direct_light(world, pixels, grid, PILOT_TOLERANCE_M, least_share=share)
+        world.responses[key] = response(light.samples, pixels)
+    return world.responses[key]
 
 
 def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
@@ -44,10 +58,11 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
     direct_alone = settings.bounces == 1 or (settings.bounces is None and world.scene.laser.mode == "scan")
     fine = None
     if settings.grid is None or settings.budget is not None or not direct_alone:
-        fine = response(direct_light(world, pixels, PILOT_GRID).samples, pixels)
+        fine = pilot_response(world, pixels, PILOT_GRID)
     target, why = _target(settings, fine)
     reasons.append(why)
-    grid, why = _grid(world, settings, pixels, fine, target)
+    direct_share = DIRECT_SHOWN * math.sqrt(settings.aim) if direct_alone else DIRECT_SHARE
+    grid, why = _grid(world, settings, pixels, target, direct_share)
     reasons.append(why)
     tolerance_m = settings.direct_tolerance_m
     if tolerance_m is None:
@@ -65,7 +80,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         tuple(reasons),
         least_share=share,
         direct_tolerance_m=tolerance_m,
-        noise=MONTE_CARLO_SHARE * target,
+        noise=math.sqrt(MONTE_CARLO_OF_AIM * settings.aim) * target,
         target=target,
         adaptive=settings.adaptive and mode_is_flood,
     )
@@ -104,21 +119,19 @@ def _target(settings: RenderSettings, fine: np.ndarray | None) -> tuple[float, s
     return DEFAULT_ERROR, f"error target: {DEFAULT_ERROR:g}, the default"
 
 
-def _grid(
-    world: World, settings: RenderSettings, pixels: np.ndarray, pilot: np.ndarray | None, target: float
-) -> tuple[int, str]:
-    """The smallest grid whose direct light is off by at most DIRECT_SHARE of the error target.
+def _grid(world: World, settings: RenderSettings, pixels: np.ndarray, target: float, share: float) -> tuple[int, str]:
+    """The smallest grid whose direct light is off by at most that share of the error target.
 
     Grids double until one differs by no more from the next; between two, errors follow a power of the grid.
     """
     if settings.grid is not None:
         return settings.grid, f"direct light: {settings.grid} x {settings.grid} rays a pixel, forced"
-    allowed = DIRECT_SHARE * target
+    allowed = share * target
     none = np.zeros(len(pixels))
     errors: dict[int, float] = {}
     coarse = None
     for grid in (*GRIDS, 2 * GRIDS[-1]):
-        finer = pilot if grid == PILOT_GRID else response(direct_light(world, pixels, grid).samples, pixels)
+        finer = pilot_response(world, pixels, grid)
         if coarse is not None:
             errors[grid // 2] = estimate(coarse, finer, np.zeros_like(finer), none, none).total
             # what no ray has met yet may be thin

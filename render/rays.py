@@ -14,7 +14,7 @@ def camera_rays(world: World, x: Any, y: Any) -> tuple[Any, Any]:
     local = mi.Vector3f(
         (x - Float(world.width) / 2) / world.focal_px, (y - Float(world.height) / 2) / world.focal_px, 1
     )
-    return mi.Ray3f(mi.Point3f(0), dr.normalize(to_world(world, local))), local
+    return mi.Ray3f(mi.Point3f(world.eye), dr.normalize(to_world(world, local))), local
 
 
 def to_world(world: World, local: Any) -> Any:
@@ -33,7 +33,7 @@ def shape_index(si: Any) -> Any:
 
 
 def spawn(si: Any, direction: Any) -> Any:
-    """A ray that leaves a surface from a little off it: a share of its distance to the camera, which is the origin.
+    """A ray that leaves a surface from a little off it: a share of its distance to the origin, as float32 rounds.
 
     Mitsuba's `spawn_ray` keeps off 90 um more, whatever the scene's size: in one of millimetres that is a gap.
     """
@@ -73,38 +73,46 @@ def _pass_layers(world: World, ray: Any, origin: Any, active: Any, limit: Any, i
     medium = dr.full(Float, 1 if in_air else 0, lanes)  # index of refraction on the way, 0 = not known yet
     layer = dr.zeros(UInt32, lanes)
     ray, start = mi.Ray3f(ray), mi.Point3f(origin)
-    si = dr.zeros(mi.SurfaceInteraction3f, lanes)
-    si.t = dr.full(Float, dr.inf, lanes)
+    found = dr.zeros(mi.PreliminaryIntersection3f, lanes)
+    found.t = dr.full(Float, dr.inf, lanes)
     searching = Bool(active)
     while searching:
         ray.maxt = limit - dr.dot(ray.o - start, ray.d)
-        si = world.traced.ray_intersect(ray, searching)
-        hit = searching & si.is_valid()
-        solid = dr.gather(Float, world.solid_ior, shape_index(si), hit)
-        thin = dr.gather(Float, world.thin_ior, shape_index(si), hit)
-        passing = hit & ((solid > 0) | (thin > 0))
+        # rays from the camera are neighbours of each other: told so, Embree is faster
+        found = world.traced.ray_intersect_preliminary(ray, coherent=in_air, active=searching)
+        hit = searching & found.is_valid()
+        solid = dr.gather(Float, world.solid_ior, shape_index(found), hit)
+        thin = dr.gather(Float, world.thin_ior, shape_index(found), hit)
+        glass = hit & ((solid > 0) | (thin > 0))
+        # all about a point is worked out where light may pass, and in the end where it does not
+        si = found.compute_surface_interaction(ray, mi.RayFlags.All, hit if world.has_cutouts else glass)
         cosine = dr.dot(ray.d, si.n)
         fresnel = mi.fresnel(dr.abs(cosine), dr.maximum(dr.maximum(solid, thin), 1.0001))[0]
         # one interface lets 1 - F through; a thin pane, with all its inner reflections, (1 - F) / (1 + F)
         crossing = dr.select(thin > 0, (1 - fresnel) / (1 + fresnel), 1 - fresnel)
-        transmission = dr.select(passing, transmission * crossing, transmission)
-        interface = passing & (solid > 0)
+        transmission = dr.select(glass, transmission * crossing, transmission)
+        interface = glass & (solid > 0)
         medium = dr.select(interface & (medium == 0), dr.select(cosine > 0, solid, 1), medium)
+        passing = Bool(glass)
+        if dr.hint(world.has_cutouts, mode="scalar"):
+            passing |= hit & ~glass & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
         # measured from the start: every new ray begins a little off the surface
-        reached = dr.select(hit, dr.dot(si.p - start, ray.d), limit)
+        reached = dr.select(passing, dr.dot(si.p - start, ray.d), distance)
         optical += (reached - distance) * dr.maximum(medium, 1)
         shortening += dr.select(medium > 1, (reached - distance) * (1 - dr.rcp(medium)), 0)
         distance = reached
         medium = dr.select(interface, dr.select(medium == 1, solid, 1), medium)
-        if dr.hint(world.has_cutouts, mode="scalar"):
-            passing |= hit & ~passing & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
-        ray = spawn(si, ray.d)
+        ray.o = dr.select(passing, spawn(si, ray.d).o, ray.o)
         layer += 1
         searching = passing & (layer < MAX_LAYERS)
         lost = passing & ~searching
-        si.t = dr.select(lost, dr.inf, si.t)
+        found.t = dr.select(lost, dr.inf, found.t)
         transmission = dr.select(lost, 0, transmission)
-    return si, transmission, optical, distance, shortening
+    si = found.compute_surface_interaction(ray, mi.RayFlags.All, active & found.is_valid())
+    reached = dr.select(si.is_valid(), dr.dot(si.p - start, ray.d), limit)
+    optical += (reached - distance) * dr.maximum(medium, 1)
+    shortening += dr.select(medium > 1, (reached - distance) * (1 - dr.rcp(medium)), 0)
+    return si, transmission, optical, reached, shortening
 
 
 def laser_leg(
@@ -165,7 +173,7 @@ def in_beam(world: World, point: Any, pixel: Any) -> Any:
     if laser.mode == "flood":
         aim = to_camera(world, mi.Vector3f(point) - world.laser)
         return dr.atan2(dr.norm(mi.Vector2f(aim.x, aim.y)), aim.z) <= world.half_angle
-    local = to_camera(world, mi.Vector3f(point))
+    local = to_camera(world, mi.Vector3f(point) - world.eye)
     row = dr.floor(local.y / local.z * world.focal_px + Float(world.height) / 2)
     column = dr.floor(local.x / local.z * world.focal_px + Float(world.width) / 2)
     same = (local.z > 0) & (row == Float(pixel // world.width))

@@ -24,6 +24,7 @@ class RenderSettings:
     ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
     ambient_spp paths per pixel of ambient light
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
+    aim         share of the squared target that is planned for; the rest is for what pilots miss
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
     least_share edges of surfaces and shadows are followed where they could change this share of a cell or more;
                 0 follows all of them
@@ -39,6 +40,7 @@ class RenderSettings:
     ambient: bool | None = None
     ambient_spp: int = 64
     error: float | None = None
+    aim: float = 0.75
     budget: tuple[float, float] | None = None
     least_share: float | None = None
     direct_tolerance_m: float | None = None
@@ -51,6 +53,7 @@ class RenderSettings:
             ("spp", 1, MAX_SAMPLES),
             ("grid", 1, 64),
             ("error", 1e-4, 1.0),
+            ("aim", 0.1, 1.0),
             ("least_share", 0, 1),
             ("ambient_spp", 1, 1 << 16),
         )

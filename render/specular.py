@@ -79,7 +79,7 @@ class _Tables:
         # one row more: an array of a single value would compile other kernels
         columns = np.vstack((np.column_stack((mirrors.normal, mirrors.offset)), np.zeros(4)))
         self.normal = mi.Vector3f(*(upload(Float, column) for column in columns[:, :3].T))
-        self.offset = upload(Float, columns[:, 3])
+        self.offset = upload(Float, columns[:, 3] + columns[:, :3] @ world.eye_m)
         self.shape = upload(UInt32, np.append(mirrors.shape, 0))
         materials = [group[0].material for group in world.groups]
         self.scale = world.table([m.specular if m.kind in ("conductor", "plastic") else 1 for m in materials])
@@ -118,7 +118,7 @@ def _connect(
     along = target - start
     left = dr.norm(along)
     direction = along / left
-    scale = left + dr.norm(mi.Vector3f(start))
+    scale = left + dr.norm(start - world.eye)
     position, lit = mi.Point3f(start), Bool(active)
     weight, delay, shortening = Float(1), Float(0), Float(0)
     for number, plane in enumerate((*sequence, None)):
@@ -178,8 +178,8 @@ def _glints(world: World, tables: _Tables, mirrors: Mirrors, sequence: np.ndarra
     distance = np.linalg.norm(image, axis=1)
     lanes = _lobe(image).reshape(-1, 3)
     planes = [upload(UInt32, np.repeat(plane, LOBE_RAYS)) for plane in sequence.T]
-    target = mi.Point3f(*(upload(Float, axis) for axis in lanes.T))
-    start = dr.zeros(mi.Point3f, len(lanes))
+    target = mi.Point3f(*(upload(Float, axis) for axis in (lanes + world.eye_m).T))
+    start = mi.Point3f(world.eye) + dr.zeros(mi.Vector3f, len(lanes))
     active = dr.full(Bool, True, len(lanes))
     weight, delay, shortening, _ = _connect(world, tables, start, mi.Vector3f(0), target, planes, active, True)
     dr.eval(weight, delay, shortening)
@@ -257,7 +257,7 @@ def _mirrored(world: World, tables: _Tables, mirrors: Mirrors, sequence: np.ndar
     """What the camera sees, directly or by way of up to MAX_ORDER mirrors, lit by the planes of `sequence` (k,)."""
     camera, laser = world.scene.camera, world.scene.laser
     image = image_of(mirrors, sequence[None], laser.position(camera) - camera.origin)[0]
-    target = mi.Point3f(*(dr.opaque(Float, float(v)) for v in image))
+    target = mi.Point3f(*(dr.opaque(Float, float(v)) for v in image + world.eye_m))
     planes = [dr.opaque(UInt32, int(plane)) for plane in sequence]
     pixels, cells = np.arange(camera.height * camera.width), grid * grid
     per_chunk = max(1, LANES // cells)
@@ -293,7 +293,7 @@ def _cells(
     along = target - si.p
     length = dr.norm(along)
     direction = along / length
-    lift = si.n * dr.select(dr.dot(si.n, direction) > 0, 1e-5, -1e-5) * (length + dr.norm(mi.Vector3f(si.p)))
+    lift = si.n * dr.select(dr.dot(si.n, direction) > 0, 1e-5, -1e-5) * (length + dr.norm(si.p - world.eye))
     passed, delay, shortening, last = _connect(world, tables, si.p, lift, target, planes, active, False)
     active &= in_beam(world, last, pixel)
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)[0]

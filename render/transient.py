@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -165,10 +166,11 @@ def _ragged(values: np.ndarray, transient: Transient) -> np.ndarray:
     if values.dtype == np.uint8:
         values = values.astype(np.uint32)
     cells = np.empty(transient.height * transient.width, dtype=object)
-    cells[0] = values[:0]  # OpenEXR needs one array to learn the type from, also where no pixel has a return
-    bounds = transient.offsets
-    for pixel in np.flatnonzero(np.diff(bounds)):
-        cells[pixel] = values[bounds[pixel] : bounds[pixel + 1]]
+    for pixel, (start, end) in enumerate(pairwise(transient.offsets.tolist())):
+        if start < end:
+            cells[pixel] = values[start:end]
+    if cells[0] is None:
+        cells[0] = values[:0]  # OpenEXR needs one array to learn the type from, also where no pixel has a return
     return cells.reshape(transient.height, transient.width)
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import weakref
+from collections.abc import Callable, Hashable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from render.llvm import start_mitsuba
-from scenes.model import Material, Scene, Surface, Texture
+from scenes.model import Camera, Material, Scene, Surface, Texture
 
 mi = start_mitsuba()
 import drjit as dr  # noqa: E402  (other modules take dr and mi from here: only now has an LLVM been chosen)
@@ -23,7 +27,9 @@ PALETTE = 64  # albedos in one row of a plastic mesh: its size is part of the ke
 class World:
     """A scene ready to trace: merged meshes, tables of their materials, the laser's intensity per pixel.
 
-    The traced world has the scene's axes and the camera at its origin, where float32 resolves best.
+    The traced world has the scene's axes. Its origin is the camera, where float32 resolves best; or, of a place that
+    several cameras look at (`of_place`), the middle of the scene: then `seen_from` gives the world of another camera
+    without building anything again. `eye` is the camera in the traced world.
     Surfaces whose materials differ in nothing but a plain albedo share one mesh, with an albedo per face: the number of
     meshes decides which kernels are compiled, so scenes of a set with the same kinds of material share their kernels.
     `groups[i]` are the surfaces of mesh i, `shape_ids[i]` its registered index; `solid_indices` those of solid glass.
@@ -31,18 +37,17 @@ class World:
     Not a dataclass: Dr.Jit would take its fields for variables of every loop that mentions it.
     """
 
-    def __init__(self, scene: Scene, *, cutouts_by_mitsuba: bool = False) -> None:
+    def __init__(self, scene: Scene, *, of_place: bool = False, cutouts_by_mitsuba: bool = False) -> None:
         groups: dict[tuple, list[Surface]] = {}
         for surface in scene.surfaces:
             groups.setdefault(_merge_key(surface), []).append(surface)
         self.groups = tuple(tuple(group) for group in groups.values())
         materials = [group[0].material for group in self.groups]
-        self.scene = scene
         self.has_glass = any(m.is_glass for m in materials)
         self.has_cutouts = any(_has_cutouts(m) for m in materials)
         masks = "mitsuba" if cutouts_by_mitsuba else "ours" if self.has_cutouts else "none"
-        origin = scene.camera.origin
-        meshes = {f"mesh{i}": _mesh(f"mesh{i}", group, origin, masks) for i, group in enumerate(self.groups)}
+        self.origin = np.mean(scene.bounds(), axis=0) if of_place else scene.camera.origin
+        meshes = {f"mesh{i}": _mesh(f"mesh{i}", group, self.origin, masks) for i, group in enumerate(self.groups)}
         environment = _environment(scene)
         lights = {} if environment is None else {"environment": environment}
         # optimize=False: equal objects must not be merged, since shapes are told apart by their registry index
@@ -59,10 +64,23 @@ class World:
         self.albedo = self.table([_specular_albedo(m) for m in materials])
         self.solid_indices = sorted({m.ior for m in materials if m.kind == "dielectric"})
         self.solid_index = dr.opaque(Float, max(self.solid_indices, default=1.0))
-        self.intensity = upload(Float, scene.laser.intensity(scene.camera))
+        self.recordings = Recordings()
+        self._look(scene)
+
+    def seen_from(self, camera: Camera) -> World:
+        """The same surfaces and lights before another camera, its laser with it: nothing is built or recorded again."""
+        other = copy.copy(self)
+        other._look(replace(self.scene, camera=camera))
+        return other
+
+    def _look(self, scene: Scene) -> None:
         # What differs between the views of a set is opaque: a literal would compile every kernel again.
-        camera = scene.camera
-        self.laser = _opaque(scene.laser.position(camera) - origin)
+        self.scene, camera = scene, scene.camera
+        self.responses: dict[tuple, np.ndarray] = {}  # `render.planning.pilot_response`
+        self.intensity = upload(Float, scene.laser.intensity(camera))
+        self.eye_m = camera.origin - self.origin
+        self.eye = _opaque(self.eye_m)
+        self.laser = _opaque(scene.laser.position(camera) - self.origin)
         self.axes = tuple(_opaque(column) for column in camera.rotation.T)
         self.focal_px = dr.opaque(Float, camera.focal_px)
         self.width, self.height = dr.opaque(UInt32, camera.width), dr.opaque(UInt32, camera.height)
@@ -75,9 +93,47 @@ class World:
         table[self.shape_ids] = values
         return upload(Float, table)
 
+    def arrays(self) -> dict[str, Any]:
+        """Everything of the world that lives in Dr.Jit: a recording has to be told its inputs."""
+        held = {
+            name: value
+            for name, value in vars(self).items()
+            if dr.is_array_v(value)
+            or (isinstance(value, tuple) and value and all(dr.is_array_v(part) for part in value))
+        }
+        return {**held, "traced": self.traced}
+
+    def with_arrays(self, arrays: dict[str, Any]) -> World:
+        """A copy with other Dr.Jit arrays: a recording refuses those that are not among its arguments."""
+        other = copy.copy(self)
+        vars(other).update(arrays)
+        return other
+
     @property
     def sees_through(self) -> bool:
         return self.has_glass or self.has_cutouts
+
+
+class Recordings:
+    """Kernels of a world that were traced once and are replayed (`recorded`); `world` is the one that asks."""
+
+    def __init__(self) -> None:
+        self.calls: dict[Any, Callable] = {}
+        self.world: weakref.ref[World] | None = None
+
+    def call(self, world: World, key: Hashable, work: Callable, *arguments: Any) -> Any:
+        """`work(world, *arguments)`, recorded at the first call of `key` for this world's surfaces, then replayed.
+
+        What Python and Dr.Jit need to trace a small launch takes longer than its rays. `arguments` are Dr.Jit arrays.
+        """
+        if key not in self.calls:
+            # weakly: a world held by its own recording would stay among the scenes that Dr.Jit compiles calls for
+            owner = weakref.ref(self)
+            self.calls[key] = dr.freeze(
+                lambda arrays, *given: work(owner().world().with_arrays(arrays), *given), warn_after=1000
+            )
+        self.world = weakref.ref(world)
+        return self.calls[key](world.arrays(), *arguments)
 
 
 def upload(kind: type, values: np.ndarray) -> Any:

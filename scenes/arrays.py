@@ -35,7 +35,8 @@ def rigid_pose(value: object, what: str) -> np.ndarray:
     pose = frozen_array(value, np.float64, (4, 4), what)
     require(pose.ndim == 2 and bool(np.isfinite(pose).all()), f"{what}: needs 4x4 finite numbers")
     rotation = pose[:3, :3]
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
-    require(orthonormal, f"{what}: the upper 3x3 block is not a rotation")
-    require(np.allclose(pose[3], (0, 0, 0, 1)), f"{what}: the last row is {pose[3].tolist()}, expected 0 0 0 1")
+    orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-5 and np.linalg.det(rotation) > 0
+    require(bool(orthonormal), f"{what}: the upper 3x3 block is not a rotation")
+    last_row = np.abs(pose[3] - (0, 0, 0, 1)).max() <= 1e-6
+    require(bool(last_row), f"{what}: the last row is {pose[3].tolist()}, expected 0 0 0 1")
     return pose

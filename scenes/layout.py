@@ -65,14 +65,19 @@ def _turn(points: np.ndarray, turn_deg: float, by: tuple[float, float]) -> np.nd
     return np.stack((c * x + s * z + by[0], -s * x + c * z + by[1]), axis=-1)
 
 
+def _onward(polygon: np.ndarray) -> np.ndarray:
+    """The corner after each corner (`np.roll`, whose generality takes longer than all else here)."""
+    return np.concatenate((polygon[1:], polygon[:1]))
+
+
 def overlap(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two convex polygons (n, 2) share more than a border: no edge of either separates them."""
     if (a.max(axis=0) <= b.min(axis=0)).any() or (b.max(axis=0) <= a.min(axis=0)).any():
         return False
     for polygon in (a, b):
-        edge = np.roll(polygon, -1, axis=0) - polygon
-        normal = np.column_stack((edge[:, 1], -edge[:, 0]))
-        pa, pb = a @ normal.T, b @ normal.T
+        edge = _onward(polygon) - polygon
+        normal = np.stack((edge[:, 1], -edge[:, 0]))
+        pa, pb = a @ normal, b @ normal
         if ((pa.max(axis=0) <= pb.min(axis=0) + 1e-6) | (pb.max(axis=0) <= pa.min(axis=0) + 1e-6)).any():
             return False
     return True
@@ -85,12 +90,13 @@ class Floor:
     outline: np.ndarray
     places: list[Place] = field(default_factory=list)
 
+    @cached_property
     def edges(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.outline, np.roll(self.outline, -1, axis=0)
+        return self.outline, _onward(self.outline)
 
     def holds(self, points: np.ndarray, slack: float = 1e-3) -> bool:
         """Whether all points lie inside the outline (even-odd rule), or within `slack` of it."""
-        (ax, az), (bx, bz) = (corners.T for corners in self.edges())
+        (ax, az), (bx, bz) = (corners.T for corners in self.edges)
         x, z = points[:, :1], points[:, 1:]
         crosses = (az > z) != (bz > z)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -100,7 +106,7 @@ class Floor:
 
     def distance(self, point: np.ndarray) -> float:
         """From a point to the outline."""
-        a, b = self.edges()
+        a, b = self.edges
         along = b - a
         t = np.clip(((point - a) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
         return float(np.linalg.norm(a + t[:, None] * along - point, axis=1).min())
@@ -116,7 +122,7 @@ class Floor:
         self, piece: Piece, rng: Random, tries: int = 12, gap: float = 0.01, margin: float = 0.03
     ) -> Place | None:
         """The piece somewhere along a wall that is long enough, its back to it."""
-        a, b = self.edges()
+        a, b = self.edges
         low, high = piece.low, piece.high
         long = np.linalg.norm(b - a, axis=1)
         wide = float(high[0] - low[0])
@@ -159,7 +165,7 @@ def in_each_other(a: Place, b: Place) -> bool:
 
 def _inside_any(polygon: np.ndarray, points: np.ndarray) -> bool:
     """Whether any of the points lies well inside a convex polygon."""
-    edge = np.roll(polygon, -1, axis=0) - polygon
+    edge = _onward(polygon) - polygon
     offset = points[:, None] - polygon
     away = (edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]) / np.linalg.norm(edge, axis=1)
     return bool(((away > 0.02).all(axis=1) | (away < -0.02).all(axis=1)).any())
@@ -170,7 +176,7 @@ def to_shell(floor: Floor, ceiling: float, origin: np.ndarray, rays: np.ndarray)
     with np.errstate(divide="ignore", invalid="ignore"):
         to_level = np.where(rays[:, 1] < 0, -origin[1] / rays[:, 1], (ceiling - origin[1]) / rays[:, 1])
         nearest = np.where(np.abs(rays[:, 1]) < 1e-9, np.inf, to_level)
-        return np.minimum(nearest, _edge_hits(*floor.edges(), origin[[0, 2]], rays[:, [0, 2]]).min(axis=1))
+        return np.minimum(nearest, _edge_hits(*floor.edges, origin[[0, 2]], rays[:, [0, 2]]).min(axis=1))
 
 
 class Boxes:
@@ -183,6 +189,13 @@ class Boxes:
         # a point p of the plan has (p - centre) . axis in -1 to 1, for both axes
         self.axes = tuple(side / np.maximum((side**2).sum(axis=1, keepdims=True), 1e-12) for side in sides)
         self.low, self.high = (np.array([getattr(place, end) for place in places]) for end in ("low", "high"))
+        self.extent = np.array([place.extent for place in places]).reshape(-1, 4)
+
+    def beside(self, place: Place) -> np.ndarray:
+        """The numbers of those that share heights with a place, and ground by its bounds: at most these are in it."""
+        (x0, z0, x1, z1), (u0, w0, u1, w1) = place.extent, self.extent.T
+        meets = (x0 < u1) & (u0 < x1) & (z0 < w1) & (w0 < z1)
+        return np.flatnonzero(meets & (place.low < self.high) & (self.low < place.high))
 
     def distance(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Distance along unit rays (n, 3) to each box, (n, boxes), inf where it is missed: three slabs a box."""

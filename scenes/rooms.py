@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scenes import clutter, fittings, furniture
-from scenes.layout import Boxes, Floor, Place, in_each_other, set_down, to_shell
+from scenes.layout import Boxes, Floor, Place, in_each_other, overlap, set_down, to_shell
 from scenes.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
 from scenes.model import Camera, Scene, Surface
 from scenes.palette import make_palette, pick
@@ -129,7 +129,7 @@ def _shell(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> list[
     """Floor, walls, ceiling, sometimes a slope of the roof, skirting boards, beams or a picture rail."""
     low, high = floor.outline.min(axis=0) - 0.05, floor.outline.max(axis=0) + 0.05
     middle, half = (low + high) / 2, (high - low) / 2
-    a, b = floor.edges()
+    a, b = floor.edges
     walls, boards = [], []
     for start, end in zip(a, b, strict=True):
         centre, along = (start + end) / 2, (end - start) / 2
@@ -307,7 +307,7 @@ def _candidates(rng: Random, floor: Floor, ceiling: float) -> list[Seen]:
         y, heading = rng.uniform(0.9, 1.75), rng.uniform(0, 2 * np.pi)
         pitch, roll, fov = math.radians(rng.normal(-17, 8)), rng.normal(0, 0.02), rng.uniform(*FOV_DEG)
         point = np.array((x, z))
-        if not floor.holds(point[None], 0.0) or floor.distance(point) < 0.25 or _too_near(floor, point, y):
+        if not floor.holds(point[None], 0.0) or floor.distance(point) < 0.25 or _too_near(floor, boxes, point, y):
             continue
         ahead = np.array((math.cos(pitch) * math.sin(heading), math.sin(pitch), math.cos(pitch) * math.cos(heading)))
         up = (roll * math.cos(heading), 1.0, -roll * math.sin(heading))
@@ -325,10 +325,10 @@ def _candidates(rng: Random, floor: Floor, ceiling: float) -> list[Seen]:
     return found
 
 
-def _too_near(floor: Floor, point: np.ndarray, y: float) -> bool:
+def _too_near(floor: Floor, boxes: Boxes, point: np.ndarray, y: float) -> bool:
     """Whether a head there would be in or right beside something."""
     head = Place(Piece(()), (0.0, 0.0, 0.0), 0.0, point + 0.28 * HEAD, 0.0, y + 0.2)
-    return any(p.high > 0.5 * y and in_each_other(head, p) for p in floor.places)
+    return any(boxes.high[i] > 0.5 * y and overlap(head.plan, floor.places[i].plan) for i in boxes.beside(head))
 
 
 def pieces(scene: Scene) -> set[str]:

@@ -23,16 +23,20 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 from threading import Lock
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from render.settings import RenderSettings
 from scenes.errors import InputError, require
 from scenes.files import whole_file
+from scenes.model import Scene
 from scenes.offsets import OffsetMode, check_offset
 from scenes.sets import scene_set
 from studies.workers import executor
+
+if TYPE_CHECKING:
+    from render.world import World
 
 log = logging.getLogger("scene2spad")
 
@@ -40,7 +44,9 @@ Progress = Callable[[str, float], None]
 STAGE_VIEW = 20
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
+AIM = 0.95  # of the squared error target: a set's views are to meet it together, not each by itself
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
+_WORLDS: dict[tuple[Job, str], World] = {}  # that of the last place
 _ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
 
 
@@ -72,6 +78,7 @@ class Job:
             spp=self.spp,
             grid=self.grid,
             error=self.error,
+            aim=AIM,
             ambient_spp=self.ambient_spp,
             direct_tolerance_m=DIRECT_TOLERANCE_M,
             indirect_tolerance_m=INDIRECT_TOLERANCE_M,
@@ -102,6 +109,7 @@ def render_view(job: Job, view: int, again: int = 0) -> Done:
             told = " ".join(str(error).split()) or type(error).__name__
             name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
             record, exr = {"view": view, "failed": f"{name}{told}"[:500]}, None
+            _WORLDS.clear()  # what was recorded may be half done
     return Done(record, exr, time.perf_counter() - start, where)
 
 
@@ -141,7 +149,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         scene = moved(scene, job.offset_m, job.offset_mode)
     key = (STAGE_VIEW, view, *((again,) if again else ()))
     seed = int(np.random.SeedSequence(job.seed, spawn_key=key).generate_state(1)[0])
-    transient = render(scene, job.settings(), seed=seed)
+    transient = render(scene, job.settings(), seed=seed, world=_world(job, view, scene))
     if job.offset_m and job.offset_mode == "time":
         transient = transient.delayed(job.offset_m)
     require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
@@ -171,6 +179,24 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     return record, exr
 
 
+def _world(job: Job, view: int, scene: Scene) -> World | None:
+    """The world of a place that several cameras look at, built once for all of them; None: the scene's own.
+
+    Its origin is the place's, not a camera's, so a view's bytes are the same whether others were rendered before.
+    """
+    from render.world import World
+
+    chosen = scene_set(job.set)
+    if chosen.views_per_place == 1 or (job.offset_m and job.offset_mode != "time"):
+        return None
+    key = job, chosen.place(view)
+    if key in _WORLDS:
+        return _WORLDS[key].seen_from(scene.camera)
+    _WORLDS.clear()  # before the next is built: calls are compiled for all materials that are there
+    _WORLDS[key] = World(scene, of_place=True)
+    return _WORLDS[key]
+
+
 def file_name(view: int) -> str:
     return f"views/{view:06d}.exr"
 
@@ -183,7 +209,7 @@ class Folder:
 
     def __init__(self, path: Path, job: Job) -> None:
         self.path, self.job = path, job
-        stored = {"schema": 2, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED]}
+        stored = {"schema": 3, "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, AIM]}
         asked = json.dumps(asdict(job) | stored, sort_keys=True, indent=1) + "\n"
         config = path / "set.json"
         if config.is_file():
