@@ -28,7 +28,7 @@ def quietly(what: str, share: float) -> None:
 def folder(tmp_path_factory) -> Path:
     """A folder of runs that holds one."""
     path = tmp_path_factory.mktemp("models")
-    Library(path).train([LEARNED], "smoke", Path("planes"), quietly)
+    Library(path, None).train([LEARNED], "smoke", Path("planes"), quietly)
     return path
 
 
