@@ -28,7 +28,7 @@ from render.indirect import (
     uniform,
 )
 from render.paths import BLOCK, block_order
-from render.planning import make_plan, pilot_pixels, pilot_response
+from render.planning import finer_pilot, make_plan, pilot_pixels
 from render.returns import Growing, Samples, concatenate, no_samples, select, to_returns
 from render.settings import BATCHES, Plan, RenderSettings
 from render.specular import specular_light
@@ -43,7 +43,6 @@ STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT, STAGE_PILOT, STAGE_MORE = 10, 11, 12,
 MOST_SPP, MOST_SPP_BY_DEFAULT = 16384, 1024
 AMBIENT_BOUNCES = 16  # most paths end long before, by chance
 MOST_MORE = 3.0  # paths traced on top are at most this many times those traced before
-FINER = 2  # direct light is checked, on the pilot's pixels, against this many times the cells a side
 
 Progress = Callable[[str, float], None]
 
@@ -295,7 +294,7 @@ def _estimated(
     """The error of a trace, from the checked pixels' batches and from finer direct light there."""
     coarse = response(_of_pixels(traced.direct, checked), checked)
     glints = response(_of_pixels(traced.specular, checked), checked)
-    fine = pilot_response(world, checked, FINER * plan.grid, plan.least_share / FINER) + glints
+    fine = finer_pilot(world, checked, plan.grid, plan.least_share) + glints
     coarse += glints
     if traced.indirect is None:
         none = np.zeros(len(checked))

@@ -15,6 +15,9 @@ from render.world import World
 STEP_M = 0.0025
 CREASE_M = 0.03
 CREASE_COSINE = 0.05
+# An edge of paint or of a glint lies between two neighbours on one surface whose radiances differ by more than this
+# share of the brighter one.
+TONE = 0.1
 
 MIXED_GAP_M = 0.05
 # A cell follows its neighbours if its tangent plane is off the mean step to them by no more than this share of its
@@ -298,6 +301,7 @@ class CellTree:
             pairs = _compare(
                 (flags[before], flags[after]),
                 (facing[before], facing[after]),
+                (radiance[before], radiance[after]),
                 distance[after] - distance[before],
                 (rise[before], rise[after]),
             )
@@ -320,14 +324,16 @@ class CellTree:
             for place in (self.column, self.row)
         )
         flags = self.flags.take(one), self.flags.take(other)
+        radiance = self.radiance.take(one), self.radiance.take(other)
         pairs = _compare(
             flags,
             (self.facing.take(one), self.facing.take(other)),
+            radiance,
             self.distance_m.take(other) - self.distance_m.take(one),
             tuple(self.slope_x_m.take(cell) * way_x + self.slope_y_m.take(cell) * way_y for cell in (one, other)),
         )
         self._find_mixed(pairs, (self.rank.take(one), self.rank.take(other)), flags)
-        brighter = np.maximum(self.radiance.take(one), self.radiance.take(other))
+        brighter = np.maximum(*radiance)
         wider = 2 * np.ldexp(unit, np.maximum(*shift).astype(np.int32))
         return pairs.differ & (brighter * np.square(wider) * pairs.contrast >= self.least)
 
@@ -361,7 +367,7 @@ class _Pairs(NamedTuple):
     joined: np.ndarray
 
 
-def _compare(flags: Two, facing: Two, step: np.ndarray, rise: Two) -> _Pairs:
+def _compare(flags: Two, facing: Two, radiance: Two, step: np.ndarray, rise: Two) -> _Pairs:
     """Compare cells with their neighbours.
 
     `step` is the difference of two hits' distances [m], `rise` what each one's tangent plane predicts for it. Across a
@@ -372,4 +378,7 @@ def _compare(flags: Two, facing: Two, step: np.ndarray, rise: Two) -> _Pairs:
     gap = np.where(both, np.maximum(step - most, least - step), np.float32(0))
     edge = (gap > STEP_M) | (both & (most - least > CREASE_M)) | (((flags[0] ^ flags[1]) & (HIT | LIT)) != 0)
     bend = np.abs(facing[0] - facing[1])
-    return _Pairs(edge | (both & (bend > CREASE_COSINE)), gap, np.where(edge, np.float32(1), bend), both & ~edge)
+    brighter = np.maximum(*radiance)
+    tone = np.divide(np.abs(radiance[0] - radiance[1]), brighter, out=np.zeros_like(brighter), where=brighter > 0)
+    differ = edge | (both & ((bend > CREASE_COSINE) | (tone > TONE)))
+    return _Pairs(differ, gap, np.where(edge, np.float32(1), np.maximum(bend, tone)), both & ~edge)

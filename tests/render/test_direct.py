@@ -8,7 +8,7 @@ import pytest
 
 from render.direct import DirectLight, direct_light
 from render.world import World, dr
-from scenes import Camera, Laser, Material, Scene, Surface, Texture
+from scenes import Camera, Laser, Material, Scene, Surface
 from scenes.shapes import sphere
 
 
@@ -225,11 +225,25 @@ def test_shadow_edge_of_a_displaced_laser():
 
 
 @pytest.mark.parametrize("baseline_m", [(0, 0, 0), (0.1, 0, 0)])
-def test_texture_edges_are_not_silhouettes(baseline_m):
-    checker = Texture(np.kron([[0.0, 1.0], [1.0, 0.0]], np.ones((16, 16))), "checker")
-    board = wall(-2.0, 3.0, Material(albedo=checker), uv=True)
-    light = direct(Scene("board", (board,), camera(24, 24, 30), Laser("flood", baseline_m, 60)))
-    assert light.rays == 4 * 576 and not light.mixed.any()
+def test_edges_of_paint_are_followed_and_are_no_silhouettes(baseline_m):
+    # half of the wall is painted black, and the border lies where no row of cells does
+    view, laser, border_m = camera(24, 24, 30), Laser("flood", baseline_m, 60), 0.0137
+    halves = ((-3, border_m, 0.0), (border_m, 3, 1.0))
+    painted = tuple(
+        quad([(a, -3, -2), (b, -3, -2), (b, 3, -2), (a, 3, -2)], Material(albedo=albedo)) for a, b, albedo in halves
+    )
+    scene = Scene("painted", painted, view, laser)
+    white = Scene("white", (wall(-2.0, 3.0, Material(albedo=1.0)),), view, laser)
+    column = border_m / 2 * view.focal_px + 12
+    followed, left = direct(scene, least_share=0.01), direct(scene, refine=0)
+    whole = moments(white, direct(white)).total[:, int(column)]
+    off, off_before = (
+        np.abs(moments(scene, light).total[:, int(column)] / whole - (1 - column % 1)).max()
+        for light in (followed, left)
+    )
+    assert left.rays == 4 * 576 < followed.rays
+    assert not followed.mixed.any()
+    assert off < 0.02 < 0.1 < off_before
 
 
 MATERIALS = (
