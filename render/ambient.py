@@ -10,47 +10,106 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from render.direct import Layers
 from render.rays import MAX_LAYERS, camera_rays, shape_index, spawn
 from render.world import OPACITY, Bool, Float, UInt32, World, dr, mi
+from scenes.model import Camera
 
 MOST_LANES = 1 << 18  # paths of one launch, where an image is not larger by itself
 CERTAIN = 3  # surfaces that every path may meet; from then on it goes on with the probability of its weight
 MOST_LIKELY = 0.95
+# Pixels share reflected light: a Gaussian of so many pixels, ended at that radius, of points that lie within a share of
+# the distance of the tangent plane, weighted by this power of the cosine between normals.
+SHARED_SIGMA, SHARED_RADIUS, SHARED_PLANE, SHARED_NORMAL = 2.0, 4, 0.02, 16
 
 
 class AmbientLight(NamedTuple):
-    """Radiance of each pixel [W/(m^2 sr nm)], (H, W) float32, and its noise: rms over pixels by the image's mean."""
+    """Radiance of each pixel [W/(m^2 sr nm)], (H, W) float32, and its noise: rms over pixels by the image's mean.
+
+    Where pixels shared their light (`shared`) the noise is what is left of it; how far it is blurred is not in it.
+    """
 
     radiance: np.ndarray
     error: float
 
 
-def ambient_light(world: World, spp: int, bounces: int, seed: int) -> AmbientLight:
+def ambient_light(world: World, spp: int, bounces: int, seed: int, shared_by: Layers | None = None) -> AmbientLight:
     """Steady spectral radiance of environment and area lights at each pixel, after up to `bounces - 1` surfaces.
 
     L(p) = E[sum over vertices of the path's weight and the light emitted there], with multiple importance sampling
-    (balance heuristic) between lights and reflectance at every surface; unbiased. Same seed, same bytes.
+    (balance heuristic) between lights and reflectance at every surface; unbiased. Same seed, same bytes. With the
+    `shared_by` layers of the pixels' centres, neighbours share what is reflected (`shared`): far less noise, biased.
     """
     camera = world.scene.camera
     pixels = camera.height * camera.width
     per_pass = min(spp, max(1, MOST_LANES // pixels))
-    total, squares, left = np.zeros(pixels), np.zeros(pixels), spp
+    emitted = np.zeros(pixels)
+    halves, left = np.zeros((2, pixels)), spp  # of what is reflected: paths of even and of odd number
+    squares = np.zeros((2, pixels))  # of what is emitted where it is seen, and of all
     while left > 0:
         now = min(per_pass, left)
         lane = dr.arange(UInt32, pixels * now)
         dr.eval(lane)
         numbers = [dr.opaque(UInt32, number) for number in ((seed + left) & 0xFFFFFFFF, now, bounces)]
-        light = world.recordings.call(world, "ambient", _of_paths, lane, *numbers)
-        of_pixel = np.array(light, np.float64).reshape(pixels, now)
-        total, squares, left = total + of_pixel.sum(axis=1), squares + (of_pixel**2).sum(axis=1), left - now
-    mean = total / spp
-    variance = np.maximum(squares / spp - mean**2, 0) / max(spp - 1, 1)
-    error = float(np.sqrt(variance.mean()) / mean.mean()) if mean.any() else 0.0
+        seen, light = world.recordings.call(world, "ambient", _of_paths, lane, *numbers)
+        seen, light = (np.array(values, np.float64).reshape(pixels, now) for values in (seen, light))
+        emitted += seen.sum(axis=1)
+        halves[0] += light[:, left % 2 :: 2].sum(axis=1)
+        halves[1] += light[:, 1 - left % 2 :: 2].sum(axis=1)
+        squares += np.square((seen, seen + light)).sum(axis=2)
+        left -= now
+    emitted /= spp
+    mean = emitted + halves.sum(axis=0) / spp
+    of_emitted, noise2 = np.maximum(squares / spp - np.square((emitted, mean)), 0).mean(axis=1) / max(spp - 1, 1)
+    if shared_by is not None:
+        number = np.array([[spp // 2], [spp - spp // 2]])
+        smooth = shared((halves / np.maximum(number, 1)).reshape(2, camera.height, camera.width), shared_by, camera)
+        mean = emitted + (smooth.reshape(2, -1) * number).sum(axis=0) / spp
+        noise2 = of_emitted + np.square(smooth[0] - smooth[1]).mean() / 4
+    error = float(np.sqrt(noise2) / mean.mean()) if mean.any() else 0.0
     return AmbientLight(mean.reshape(camera.height, camera.width).astype(np.float32), error)
 
 
-def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> Any:
-    """Light of camera rays, `paths` in a row through random positions of each pixel."""
+def shared(light: np.ndarray, layers: Layers, camera: Camera) -> np.ndarray:
+    """Reflected light (..., H, W) whose irradiance neighbouring pixels of one surface share: a joint bilateral filter.
+
+    L_i = a_i sum_j w_ij L_j / sum_j w_ij a_j, with the albedos a and w_ij = exp(-|ij|^2 / 2 sigma^2) (n_i . n_j)^k
+    exp(-(n_i . (x_i - x_j) / (share of d_i))^2). Light on surfaces of even irradiance is kept whatever their albedo;
+    edges of shadows and glossy reflections are blurred over some SHARED_SIGMA pixels. Where nothing is hit, or the
+    albedo is 0, light stays what it is.
+    """
+    radius, (height, width) = SHARED_RADIUS, layers.depth_m.shape
+    there = np.isfinite(layers.depth_m) & (layers.albedo > 0)
+    depth = np.where(there, layers.depth_m, 0).astype(np.float32)
+    point = np.moveaxis(camera.rays().astype(np.float32) * depth[..., None], -1, 0)
+    normal = np.moveaxis(layers.normal.astype(np.float32), -1, 0)
+    albedo = np.where(there, layers.albedo, 0).astype(np.float32)
+    fields = (np.where(there, light, 0), point, normal, albedo, there)
+    pads = (((0, 0),) * (field.ndim - 2) + ((radius, radius),) * 2 for field in fields)
+    light_of, point_of, normal_of, albedo_of, there_of = map(np.pad, fields, pads)
+    total, albedos = np.zeros(light.shape), np.zeros((height, width))
+    per_reach = 1 / (SHARED_PLANE * np.where(there, depth, 1))
+    plane = _dot(point, normal)
+    for row, column in np.ndindex(2 * radius + 1, 2 * radius + 1):
+        away2 = (row - radius) ** 2 + (column - radius) ** 2
+        if away2 > radius**2:
+            continue
+        beside = ..., slice(row, row + height), slice(column, column + width)
+        off = (_dot(point_of[beside], normal) - plane) * per_reach
+        alike = np.maximum(_dot(normal_of[beside], normal), 0) ** SHARED_NORMAL
+        weight = np.exp(-away2 / (2 * SHARED_SIGMA**2) - off * off) * alike * there_of[beside]
+        total += weight * light_of[beside]
+        albedos += weight * albedo_of[beside]
+    return np.where(there, total * albedo / np.where(albedos > 0, albedos, 1), light)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of vectors along the first axis."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> tuple[Any, Any]:
+    """Light of camera rays, `paths` in a row through random positions of each pixel: seen where emitted; reflected."""
     pixel = lane // paths
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, dr.width(lane))
@@ -60,11 +119,11 @@ def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> A
 
 
 @dr.syntax
-def _traced(world: World, sampler: Any, ray: Any, most: Any) -> Any:
-    """Light that comes back along each ray."""
+def _traced(world: World, sampler: Any, ray: Any, most: Any) -> tuple[Any, Any]:
+    """Light that comes back along each ray: what the ray itself meets, and what surfaces reflect."""
     scene, context = world.traced, mi.BSDFContext()
     lanes = dr.width(ray.d)
-    light, weight = dr.zeros(Float, lanes), dr.full(Float, 1, lanes)
+    seen, light, weight = dr.zeros(Float, lanes), dr.zeros(Float, lanes), dr.full(Float, 1, lanes)
     before = dr.zeros(mi.Interaction3f, lanes)  # the surface that the ray left, past all that it went straight through
     density = dr.full(Float, 1, lanes)  # of the ray's direction there; 0: no light could be sampled that way
     density = dr.select(weight > 0, 0, density)
@@ -77,7 +136,9 @@ def _traced(world: World, sampler: Any, ray: Any, most: Any) -> Any:
         chosen = active & (density > 0) & (emitter != None)  # noqa: E711 (an array of pointers)
         of_lights = scene.pdf_emitter_direction(before, to_light, chosen)
         share = dr.select(chosen, density / (density + of_lights), 1)
-        light += dr.select(active, weight * share * emitter.eval(si, active)[0], 0)
+        found = dr.select(active, weight * share * emitter.eval(si, active)[0], 0)
+        seen += dr.select(met == 0, found, 0)
+        light += dr.select(met == 0, 0, found)
 
         hit = active & si.is_valid()
         passing, mirrored = _pane(world, si, ray, sampler.next_1d(active), hit)
@@ -107,7 +168,7 @@ def _traced(world: World, sampler: Any, ray: Any, most: Any) -> Any:
         weight /= dr.maximum(likely, 1e-9)
         active &= weight > 0
         ray = spawn(si, direction)
-    return light
+    return seen, light
 
 
 def _pane(world: World, si: Any, ray: Any, sample: Any, hit: Any) -> tuple[Any, Any]:

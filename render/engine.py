@@ -126,7 +126,8 @@ def render(
     ambient = AmbientLight(np.zeros((camera.height, camera.width), np.float32), 0.0)
     if plan.ambient:
         say("ambient light", 0.9)
-        ambient = ambient_light(world, settings.ambient_spp, AMBIENT_BOUNCES, derived_seed(seed, STAGE_AMBIENT))
+        by = layers if settings.ambient_shared else None
+        ambient = ambient_light(world, settings.ambient_spp, AMBIENT_BOUNCES, derived_seed(seed, STAGE_AMBIENT), by)
     say("done", 1.0)
     return Transient(
         camera.height,
@@ -330,7 +331,10 @@ def _mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:
 
 
 def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> dict:
-    return {"ambient_spp": settings.ambient_spp, "ambient_error": round(ambient.error, 6)} if plan.ambient else {}
+    if not plan.ambient:
+        return {}
+    paths = {"ambient_spp": settings.ambient_spp, "ambient_shared": settings.ambient_shared}
+    return paths | {"ambient_error": round(ambient.error, 6)}
 
 
 def _meta(scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: ErrorEstimate, traced: Traced) -> dict:

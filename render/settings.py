@@ -11,6 +11,7 @@ MAX_BOUNCES = 63
 MAX_SAMPLES = 1 << 26
 BATCHES = 16  # independent batches of indirect light, whose spread is the error estimate
 GRIDS = (2, 4, 8, 16)
+SHARED_AMBIENT_SPP = 4  # paths a pixel of ambient light where neighbours share it: as little noise as 100 alone
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class RenderSettings:
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
     ambient_spp paths per pixel of ambient light
+    ambient_shared  whether neighbouring pixels share the ambient light they reflect: far less noise, edges of shadows
+                and reflections in it are blurred by some pixels
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
     aim         share of the squared target that is planned for; the rest is for what pilots miss
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
@@ -39,6 +42,7 @@ class RenderSettings:
     grid: int | None = None
     ambient: bool | None = None
     ambient_spp: int = 64
+    ambient_shared: bool = False
     error: float | None = None
     aim: float = 0.75
     budget: tuple[float, float] | None = None

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from render.settings import SHARED_AMBIENT_SPP
 from studies.experiments import Bench, Report, Study
 from studies.options import Common, Count, File, Mode, Number, Offset, Pixels, Positional, may_stay_open
 
@@ -116,8 +117,8 @@ class Dataset(Common):
     """Target of the relative error (default: 0.01 with 1 bounce, 0.03 with more)."""
     ambient: bool = True
     """Render ambient light."""
-    ambient_spp: int = 8
-    """Paths per pixel of ambient light."""
+    ambient_spp: int = SHARED_AMBIENT_SPP
+    """Paths per pixel of ambient light, which neighbouring pixels share."""
     offset: float = 0.0
     """Move every scene this many metres away."""
     offset_mode: Offset = "time"

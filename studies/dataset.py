@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from render.settings import RenderSettings
+from render.settings import SHARED_AMBIENT_SPP, RenderSettings
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.model import Scene
@@ -65,7 +65,7 @@ class Job:
     offset_m: float = 0.0
     offset_mode: OffsetMode = "time"
     ambient: bool = True
-    ambient_spp: int = 8
+    ambient_spp: int = SHARED_AMBIENT_SPP
 
     def __post_init__(self) -> None:
         scene_set(self.set)
@@ -80,6 +80,7 @@ class Job:
             error=self.error,
             aim=AIM,
             ambient_spp=self.ambient_spp,
+            ambient_shared=True,
             direct_tolerance_m=DIRECT_TOLERANCE_M,
             indirect_tolerance_m=INDIRECT_TOLERANCE_M,
             indirect_growth=INDIRECT_GROWTH,

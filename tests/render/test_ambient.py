@@ -1,9 +1,12 @@
 """Ambient light against Mitsuba's own path integrator, and its stated noise against repetitions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from render.ambient import ambient_light
+from render.ambient import ambient_light, shared
+from render.direct import Layers, centre_layers
 from render.world import World, mi
 from scenes.model import Material, Scene, Surface
 from scenes.shapes import box, sphere
@@ -58,3 +61,37 @@ def test_the_stated_noise_is_that_of_repetitions():
     assert stated == pytest.approx(spread, rel=0.35) and stated > 0
     again = ambient_light(world, 32, 16, 0)
     assert (again.radiance == runs[0].radiance).all() and again.error == runs[0].error
+
+
+def test_neighbours_share_irradiance_whatever_their_albedo_and_not_past_edges():
+    """Light that an even irradiance would give stays; noise falls by the pixels that share; another wall is let be."""
+    view = oracles.camera(32, 24, 60)
+    board = (np.indices((24, 32)).sum(axis=0) % 2).astype(np.float16) * 0.6 + 0.2
+    near = np.arange(32) < 16
+    rays = view.rays()
+    depth = np.where(near, 1.0, 2.0) / (rays @ view.rotation[:, 2])  # two frontal walls, one behind the other
+    layers = Layers(depth, np.broadcast_to(-view.rotation[:, 2], (24, 32, 3)).astype(np.float16), board)
+    albedo = board.astype(np.float32).astype(np.float64)
+    even = albedo * np.where(near, 5.0, 1.0)
+    assert np.allclose(shared(even, layers, view), even, rtol=1e-5)
+    noise = np.random.default_rng(1).normal(size=(64, 24, 32)) * albedo
+    left = (shared(noise, layers, view) / albedo)[:, 8:-8, 6:10].std()
+    assert left < 0.25  # of about 4 pi sigma^2 pixels, of which the brighter half counts more
+    nothing = layers._replace(depth_m=np.full((24, 32), np.nan))
+    assert (shared(even, nothing, view) == even).all()
+
+
+def test_shared_light_keeps_what_is_seen_directly_and_its_mean():
+    """Against the unshared light of the same room: the mean within 4 standard errors, the noise far below it."""
+    room = windowed_room()
+    world = World(replace(room, camera=room.camera.resized(32, 24)))
+    layers = centre_layers(world)
+    alone = [ambient_light(world, 16, 16, seed) for seed in range(6)]
+    together = [ambient_light(world, 16, 16, 100 + seed, layers) for seed in range(6)]
+    means = np.array([[run.radiance.mean() for run in runs] for runs in (alone, together)])
+    spread = np.sqrt(means.var(axis=1, ddof=1).sum() / 6)
+    assert abs(means[0].mean() - means[1].mean()) < 4 * spread + 0.02 * means[0].mean()
+    before, images = (np.array([run.radiance for run in runs]) for runs in (alone, together))
+    assert np.median(images.std(axis=0)) < 0.4 * np.median(before.std(axis=0))  # most pixels do not see the window
+    left = np.sqrt(images.var(axis=0, ddof=1).mean()) / images.mean()
+    assert np.sqrt(np.mean([run.error**2 for run in together])) == pytest.approx(left, rel=0.35)
