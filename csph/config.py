@@ -12,9 +12,9 @@ from scenes.errors import InputError, require
 from spad.sensor import Sensor
 
 Network = Literal["compact", "published", "published-signed"]
-Front = Literal["codes", "counts", "peak"]
+Front = Literal["codes", "counts", "matched", "peak"]
 NETWORKS: tuple[str, ...] = ("compact", "published", "published-signed")
-FRONTS: tuple[str, ...] = ("codes", "counts", "peak")
+FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 
 
@@ -22,7 +22,8 @@ PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 class ModelConfig:
     """What stands between counts and depth.
 
-    front    what the network sees: the back-projection of codes, the counts (no compression), or one-hot argmax
+    front    what the network sees: the back-projection of codes; without compression the counts, or their correlation
+             with the pulse (`spad.matching.normalised_correlation`); or one-hot argmax
     design   the codes, with `front` = "codes"
     layer    switches of `csph.layer.LayerOptions` that differ from the published layer
     network  compact; published; or published with logits of any sign, which cannot die
@@ -51,7 +52,9 @@ class ModelConfig:
 
     @property
     def name(self) -> str:
-        front = {"counts": "no compression", "peak": "peak"}.get(self.front) or self.design.name
+        front = {"counts": "no compression", "matched": "no compression", "peak": "peak"}.get(
+            self.front
+        ) or self.design.name
         return f"{front}, {self.network}"
 
 

@@ -17,6 +17,7 @@ from csph.quantise import encode_int16, quantised
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from spad.histogram import Histogram
+from spad.matching import normalised_correlation
 
 KIND = "network"
 
@@ -40,11 +41,15 @@ class DepthModel(nn.Module):
         return parameters_of(self)
 
     def seen(self, counts: Tensor) -> Tensor:
-        """What the network is given, (B, 1, T, R, C): back-projection, counts, or 1 at the first fullest bin."""
+        """What the network sees, (B, 1, T, R, C): back-projection, counts, these matched, or 1 at the fullest bin."""
         if self.layer is not None:
             return self.layer(counts)
         if self.config.front == "counts":
             return counts.float()
+        if self.config.front == "matched":
+            of_pixels = counts.float().movedim(2, -1)
+            scores = normalised_correlation(of_pixels.reshape(-1, counts.shape[2]), self.config.sensor)
+            return scores.view(of_pixels.shape).movedim(-1, 2).contiguous()
         return torch.zeros(counts.shape, device=counts.device).scatter_(2, counts.argmax(2, keepdim=True), 1.0)
 
     def forward(self, counts: Tensor) -> Tensor:

@@ -172,14 +172,28 @@ def published_log_matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
     return correlate(counts, weights, int(taps.shifts[0]), sensor).argmax(-1).double() + 0.5
 
 
+def correlation(counts: Tensor, sensor: Sensor) -> Tensor:
+    """<n - mean n, h(tau) - mean h> for the pulse h in the centre of each bin, (P, T) -> (P, T)."""
+    taps = pulse_taps(sensor, str(counts.device))
+    mean = (taps.centred.sum() / sensor.bins).to(counts.dtype)
+    scores = correlate(counts, taps.centred.to(counts.dtype).unsqueeze(0), int(taps.shifts[0]), sensor)
+    return scores - counts.sum(-1, keepdim=True) * mean
+
+
+def normalised_correlation(counts: Tensor, sensor: Sensor) -> Tensor:
+    """Zero-normalised cross-correlation (ZNCC) with the pulse in the centre of each bin, in [-1, 1], (P, T) -> (P, T);
+    0 where all bins of a pixel hold the same."""
+    pulse = pulse_taps(sensor, str(counts.device)).centred
+    norm = ((pulse**2).sum() - pulse.sum() ** 2 / sensor.bins).sqrt().to(counts.dtype)
+    spread = (counts - counts.mean(-1, keepdim=True)).norm(dim=-1, keepdim=True)
+    return correlation(counts, sensor) / (spread * norm).clamp(min=1e-6)
+
+
 def correlation_bins(counts: Tensor, sensor: Sensor) -> Tensor:
     """Peak over whole bins of the zero-normalised cross-correlation (ZNCC) with the pulse in a bin's centre, and a
     parabola through its neighbours. `matched_bins` knows the pulse at every place within a bin, this one does not."""
     taps = pulse_taps(sensor, str(counts.device))
-    mean = (taps.centred.sum() / sensor.bins).to(counts.dtype)
-    scores = correlate(counts, taps.centred.to(counts.dtype).unsqueeze(0), int(taps.shifts[0]), sensor)
-    scores = scores - counts.sum(-1, keepdim=True) * mean  # the counts' own norm is the same for every bin
-    best = scores.argmax(-1)
+    best = correlation(counts, sensor).argmax(-1)  # the counts' own norm is the same for every bin
     near, _ = _around(counts, best, taps.shifts, sensor)
     neighbours = taps.fine[[0, len(taps.steps) // 2, -1]]  # a bin before, here, a bin after
     total = counts.sum(-1, keepdim=True).double()

@@ -52,7 +52,10 @@ _ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worke
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that decides the bytes of a set's views, but for their number."""
+    """Everything that decides the bytes of a set's views, but for their number.
+
+    merging     how much of a set's merging of returns is done: 1 as sets are written, 0.1 for references
+    """
 
     set: str
     seed: int = 0
@@ -66,6 +69,7 @@ class Job:
     offset_mode: OffsetMode = "time"
     ambient: bool = True
     ambient_spp: int = SHARED_AMBIENT_SPP
+    merging: float = 1.0
 
     def __post_init__(self) -> None:
         scene_set(self.set)
@@ -81,9 +85,9 @@ class Job:
             aim=AIM,
             ambient_spp=self.ambient_spp,
             ambient_shared=True,
-            direct_tolerance_m=DIRECT_TOLERANCE_M,
-            indirect_tolerance_m=INDIRECT_TOLERANCE_M,
-            indirect_growth=INDIRECT_GROWTH,
+            direct_tolerance_m=self.merging * DIRECT_TOLERANCE_M,
+            indirect_tolerance_m=self.merging * INDIRECT_TOLERANCE_M,
+            indirect_growth=self.merging * INDIRECT_GROWTH,
         )
 
 
@@ -154,7 +158,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     if job.offset_m and job.offset_mode == "time":
         transient = transient.delayed(job.offset_m)
     require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
-    transient = rounded(thinned(transient, THINNED))
+    transient = rounded(thinned(transient, job.merging * THINNED))
     with tempfile.TemporaryDirectory(prefix="scene2spad-") as folder:
         path = Path(folder) / "view.exr"
         write_transient(transient, path)

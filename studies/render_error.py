@@ -44,7 +44,7 @@ log = logging.getLogger("scene2spad")
 
 BOUNCES = 4  # the same for all, so that nothing but accuracy differs
 QUALITIES = ((1, 16), (2, 64), (4, 256), (8, 1024))  # direct rays a pixel side, indirect paths a pixel
-FINE = (16, 4096)
+FINE, FINE_MERGING = (16, 4096), 0.1  # and returns hardly merged, which is most of a set's own error at this quality
 RUNS = 2  # renders of each quality, with other noise
 DRAWS = 3  # of photons, for every render
 LEVELS = ((10.0, 10.0), (10.0, 200.0), (50.0, 50.0))
@@ -109,7 +109,9 @@ def _sensor_of(models: Mapping[str, DepthModel]) -> Sensor:
 def _views(command: Study, name: str, quality: tuple[int, int], again: int, cache: Path, progress: Progress) -> Views:
     """All views at one quality, from the cache or rendered into it one by one."""
     grid, spp = quality
-    job = Job(name, command.seed, command.width, command.height, bounces=BOUNCES, spp=spp, grid=grid)
+    merging = FINE_MERGING if quality == FINE else 1.0
+    size = command.width, command.height
+    job = Job(name, command.seed, *size, bounces=BOUNCES, spp=spp, grid=grid, merging=merging)
     transients = [_view(job, view, again, cache, progress) for view in range(command.views)]
     return Views(tuple(transients), tuple(str(t.meta["scene"]) for t in transients))
 

@@ -245,6 +245,18 @@ def test_peaks_and_codes_of_8_bits():
         DepthModel(replace(MODEL, design=None, front="counts")).depth_of(histogram, int8=True)
 
 
+def test_matched_counts_are_the_zero_normalised_correlation_with_the_pulse():
+    """In [-1, 1]; 1 where a noise-free pulse is; the same for any scale and level of the counts; 0 for a flat pixel."""
+    arrival = torch.tensor([10.5, 40.5], dtype=torch.float64) * SMALL.bin_width_s
+    pulses = binned_pulse(arrival, SMALL).float()
+    counts = torch.cat([3 * pulses, 700 * pulses + 5, torch.full((1, SMALL.bins), 2.0)]).T.reshape(1, 1, -1, 1, 5)
+    seen = DepthModel(replace(MODEL, design=None, front="matched")).seen(counts)
+    assert seen.shape == counts.shape and seen.abs().max() < 1 + 1e-5
+    assert seen[0, 0, :, 0].argmax(0).tolist()[:4] == [10, 40, 10, 40]
+    assert torch.allclose(seen.amax(2)[..., :4], torch.ones(4), atol=1e-4)
+    assert torch.allclose(seen[..., :2], seen[..., 2:4], atol=1e-3) and (seen[..., 4].abs() < 1e-3).all()
+
+
 def test_damaged_and_foreign_checkpoints(tmp_path):
     path = tmp_path / "model.safetensors"
     config = preset("smoke", MODEL, **FEW)
