@@ -52,10 +52,8 @@ class ModelConfig:
 
     @property
     def name(self) -> str:
-        front = {"counts": "no compression", "matched": "no compression", "peak": "peak"}.get(
-            self.front
-        ) or self.design.name
-        return f"{front}, {self.network}"
+        uncoded = {"counts": "no compression", "matched": "no compression", "peak": "peak"}
+        return f"{uncoded[self.front] if self.design is None else self.design.name}, {self.network}"
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,8 @@ def direct_light(
     Every pixel starts as grid x grid cells, one ray and footprint each (`render.footprint`). A cell is cut in four, at
     most `refine` times and down to 1/MOST_CELLS of a pixel, where
     - its footprint is not small, so that first order no longer describes it; or
-    - it and a neighbouring cell lie on different surfaces, or one is in shadow: an edge runs through one of them.
+    - it and a neighbouring cell lie on different surfaces, or one is in shadow, or one is painted darker: an edge runs
+      through one of them.
       An edge that could change less than `least_share` of a first cell's energy, in a pixel of the root mean square of
       all pixels' radiance, is left alone; by default `least_share_of` the grid.
     New cells are compared with their neighbours too, of whatever size and pixel, and those are cut in turn: a wire

@@ -154,9 +154,10 @@ def _grid(world: World, settings: RenderSettings, pixels: np.ndarray, allowed: f
         errors[2 * max(errors)] = off(2 * max(errors))
     coarse = max((grid for grid, error in errors.items() if error > allowed), default=min(errors))
     error, finer = errors[coarse], errors.get(2 * coarse, 0)
-    power = math.log2(error / finer) if 0 < finer < error < math.inf else GRID_POWER
-    grid = max(errors) if error == math.inf else min(math.ceil(coarse * (error / allowed) ** (1 / power)), GRIDS[-1])
-    grid = max(grid, coarse)
+    if error == math.inf:
+        return coarse, f"direct light: {coarse} x {coarse} rays a pixel, none of the pilot's pixels is lit"
+    power = math.log2(error / finer) if 0 < finer < error else GRID_POWER
+    grid = max(min(math.ceil(coarse * (error / allowed) ** (1 / power)), GRIDS[-1]), coarse)
     error *= (coarse / grid) ** power
     why = f"direct light: {grid} x {grid} rays a pixel, error {error:.2g} by twice as many a side"
     return grid, why if error <= allowed else f"{why}: its share of the target needs more; force grid"
