@@ -47,9 +47,7 @@ class DepthModel(nn.Module):
         if self.config.front == "counts":
             return counts.float()
         if self.config.front == "matched":
-            of_pixels = counts.float().movedim(2, -1)
-            scores = normalised_correlation(of_pixels.reshape(-1, counts.shape[2]), self.config.sensor)
-            return scores.view(of_pixels.shape).movedim(-1, 2).contiguous()
+            return normalised_correlation(counts.float().flatten(3).squeeze(1), self.config.sensor).view(counts.shape)
         return torch.zeros(counts.shape, device=counts.device).scatter_(2, counts.argmax(2, keepdim=True), 1.0)
 
     def forward(self, counts: Tensor) -> Tensor:

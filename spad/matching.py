@@ -11,6 +11,7 @@ from spad.sensor import Sensor
 from spad.template import FINE_STEP, FINEST_STEP, Taps, pulse_taps
 
 MAX_DIRECT_TAPS = 128
+TOEPLITZ_ROWS = 64
 
 
 def is_circular(sensor: Sensor) -> bool:
@@ -181,12 +182,29 @@ def correlation(counts: Tensor, sensor: Sensor) -> Tensor:
 
 
 def normalised_correlation(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Zero-normalised cross-correlation (ZNCC) with the pulse in the centre of each bin, in [-1, 1], (P, T) -> (P, T);
-    0 where all bins of a pixel hold the same."""
-    pulse = pulse_taps(sensor, str(counts.device)).centred
+    """Zero-normalised cross-correlation (ZNCC) with the pulse in the centre of each bin, in [-1, 1], (B, T, P) ->
+    (B, T, P); 0 where all bins of a pixel hold the same."""
+    taps = pulse_taps(sensor, str(counts.device))
+    pulse, mean = taps.centred, counts.mean(1, keepdim=True)
     norm = ((pulse**2).sum() - pulse.sum() ** 2 / sensor.bins).sqrt().to(counts.dtype)
-    spread = (counts - counts.mean(-1, keepdim=True)).norm(dim=-1, keepdim=True)
-    return correlation(counts, sensor) / (spread * norm).clamp(min=1e-6)
+    spread = torch.linalg.vector_norm(counts - mean, dim=1, keepdim=True)
+    scores = _correlate_all(counts, pulse.to(counts.dtype), int(taps.shifts[0]), sensor)
+    return scores.sub_(mean * pulse.sum().to(counts.dtype)).div_((spread * norm).clamp(min=1e-6))
+
+
+def _correlate_all(counts: Tensor, weights: Tensor, first: int, sensor: Sensor) -> Tensor:
+    """`correlate` for one set of weights (L,) and bins that come before pixels, (B, T, P): blocks of bins by one small
+    Toeplitz matrix each, in place of two transpositions and a kernel a pixel (a sixth of the time on 72 x 88)."""
+    (batch, bins, pixels), taps = counts.shape, len(weights)
+    before, after, rest = -first, taps - 1 + first, -bins % TOEPLITZ_ROWS
+    edges = [counts.new_zeros(batch, size, pixels) for size in (before, after + rest)]
+    if is_circular(sensor):
+        edges = [counts[:, bins - before :], torch.cat([counts[:, :after], edges[1][:, :rest]], dim=1)]
+    ring = torch.cat([edges[0], counts, edges[1]], dim=1)
+    width = TOEPLITZ_ROWS + taps - 1
+    rows = torch.nn.functional.pad(weights, (0, TOEPLITZ_ROWS)).repeat(TOEPLITZ_ROWS)
+    matrix = rows[: TOEPLITZ_ROWS * width].view(TOEPLITZ_ROWS, width)  # each row begins a place further right
+    return (matrix @ ring.unfold(1, width, TOEPLITZ_ROWS).mT).reshape(batch, -1, pixels)[:, :bins]
 
 
 def correlation_bins(counts: Tensor, sensor: Sensor) -> Tensor:

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from spad.depth import ESTIMATORS, METHODS, by_pixels, cramer_rao_m, depth_errors, estimate_depth, noise_free_bias_m
+from spad.matching import correlation, normalised_correlation
 from spad.sensor import Pulse, Sensor
-from spad.template import binned_pulse
+from spad.template import binned_pulse, pulse_taps
 
 REFERENCE = Sensor()
 WIDTH = REFERENCE.bin_width_s
@@ -105,6 +106,22 @@ def test_log_matched_reaches_the_cramer_rao_bound(signal: float, background: flo
     matched = wrapped_error(estimate_depth(counts, REFERENCE, "matched"), arrival, REFERENCE)
     assert (matched.abs() / bound).median() < 1.40 * 0.6745
     assert matched.median().abs() < 1e-3
+
+
+@pytest.mark.parametrize("sensor", [REFERENCE, GATED, Sensor(name="odd", bins=150), WIDE], ids=lambda s: s.name)
+def test_bins_before_pixels_are_correlated_as_pixels_before_bins_are(sensor: Sensor) -> None:
+    """Blocks of bins, also where they do not fill the period, on two images; deep background does not cost digits."""
+    generator = torch.Generator().manual_seed(11)
+    counts = torch.poisson(torch.tensor([0.4, 3000.0])[:, None, None].expand(2, 5, sensor.bins), generator=generator)
+    pulse = pulse_taps(sensor, "cpu").centred
+    norm = ((pulse**2).sum() - pulse.sum() ** 2 / sensor.bins).sqrt()
+    exact = counts.double().flatten(0, 1)
+    spread = (exact - exact.mean(-1, keepdim=True)).norm(dim=-1, keepdim=True)
+    expected = (correlation(exact, sensor) / (spread * norm)).view(counts.shape).mT
+    found = normalised_correlation(counts.mT.contiguous(), sensor)
+    # float32 rounds relative to the counts' level, which is 55 times their spread in the second image
+    assert (found[0] - expected[0]).abs().max() < 1e-5 and (found[1] - expected[1]).abs().max() < 1e-4
+    assert expected.abs().amax() > 0.05
 
 
 def test_argmax_is_within_the_pulse() -> None:
