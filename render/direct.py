@@ -66,7 +66,7 @@ def direct_light(
     not small at the end are clipped to the face they lie on, and counted if that changes them.
 
     Small cells that are not cut, and whose neighbours lie on the same surface, take their spread of path lengths from
-    them instead of from the tangent plane (`CellTree._follow_neighbours`).
+    them instead of from the tangent plane (`render.edges.first_edges`).
 
     Pixels are treated in groups of whole rows, about LANES rays each. Neither across edges of groups nor, where not all
     pixels are asked for, across edges of pixels are cells compared.
@@ -132,7 +132,7 @@ def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Sampl
     cells = tree.grid**2
     index = ranks[:, None] * cells + np.arange(cells)
     share = 1 / cells
-    if cells > 16 or tolerance_m == 0:
+    if cells > 64 or tolerance_m == 0:
         return merge(_samples(tree, index.ravel(), 1 / tree.grid, tolerance_m), tolerance_m)
     radiance = tree.radiance[index]
     lit = radiance > 0

@@ -93,22 +93,22 @@ def render(
     seed: int = 0,
     progress: Progress | None = None,
     world: World | None = None,
+    plan: Plan | None = None,
 ) -> Transient:
     """Render the time-resolved radiance that the camera's pixels receive from the laser.
 
     The same scene, settings and seed give the same bytes on any number of threads. A scene with nothing in view gives
     a transient without returns. `progress(what, share)` is called between passes. The plan, its reasons, the error
     estimate and everything needed to repeat the render are in the transient's `meta`. `world` is the scene ready to
-    trace, where it is there already.
+    trace, where it is there already, and `plan` what was planned for it, say before another camera in the same room.
     """
     settings = settings or RenderSettings()
     say = progress or (lambda what, share: None)
     world = World(scene) if world is None else world
     camera = scene.camera
     say("plan", 0.0)
-    pilot_seed = derived_seed(seed, STAGE_PLAN)
-    plan = make_plan(world, settings, pilot_seed)
-    checked = pilot_pixels(world, pilot_seed)
+    plan = planned(world, settings, seed) if plan is None else plan
+    checked = pilot_pixels(world, derived_seed(seed, STAGE_PLAN))
     traced = trace(world, plan, settings, seed=seed, checked=checked, progress=say)
     layers = centre_layers(world)
     # where nothing is in view there is nothing to explain
@@ -143,6 +143,11 @@ def render(
     )
 
 
+def planned(world: World, settings: RenderSettings, seed: int = 0) -> Plan:
+    """The plan that `render` makes with these settings and this seed."""
+    return make_plan(world, settings, derived_seed(seed, STAGE_PLAN))
+
+
 def trace(
     world: World,
     plan: Plan,
@@ -164,7 +169,7 @@ def trace(
     # only indirect light is counted from where direct light is
     origin_m, brightest = _mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
-    release()
+    release(len(pixels))
     rays, indirect, schedule, reasons = direct.rays, None, None, ()
     if plan.bounces > 1 and brightest > 0:
         schedule, reasons = _schedule(world, plan, settings, direct.samples, seed)
@@ -173,7 +178,7 @@ def trace(
     direct = direct._replace(samples=no_samples())  # they are in the list now
     ends = len(light), len(light) + len(specular.samples.pixel)
     light.add(specular.samples)
-    release()
+    release(len(pixels))
     if schedule is not None:
         indirect = _indirect(
             world, plan, settings, schedule, STAGE_INDIRECT, seed, origin_m, brightest, checked, light, say

@@ -215,7 +215,7 @@ def collect(
                 if number % (QUEUED if shared else 1) == 0:
                     dr.sync_thread()
                 add_paths(world, pixels, turns, bounces, seed, sums, shared=shared)
-            release()  # what the launches took
+            release(world.scene.camera.height * world.scene.camera.width)  # what the launches took
             totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
             samples = rows.samples(pixels, origin_m[pixels])
             del rows, sums  # before the next ones are there

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from render.direct import direct_light, least_share_of
 from render.error import error_for_budget, estimate, response
 from render.paths import energy_by_bounces
+from render.returns import select
 from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
 from render.world import World
 from scenes.model import Material
@@ -16,11 +18,10 @@ from scenes.model import Material
 DEFAULT_ERROR = 0.02
 # Squares of the parts must sum to less than 1; the rest is for merged returns and the pilot's own uncertainty, and
 # for what twice as many rays a side still miss. Of the square of the Monte-Carlo part that is a share of the aim.
-# Where there is no other part, direct light has all that is aimed at.
 DIRECT_SHARE, MONTE_CARLO_OF_AIM = 0.4, 0.75
 # The pilot's pixels are not compared with those beside them, so that it shows 1.3 to 1.4 times the error of cells at
 # grids of 4 to 8 (measured in rooms); most of that is not planned for.
-PILOT_SHOWS = 1.25
+PILOT_SHOWS = 1.4
 MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
@@ -59,6 +60,34 @@ def finer_pilot(world: World, pixels: np.ndarray, grid: int, least_share: float)
     return pilot_response(world, pixels, FINER * grid, least_share / FINER)
 
 
+def direct_error(world: World, settings: RenderSettings, seed: int) -> float:
+    """nRMSE of a view's direct light at PILOT_GRID, by twice as many rays a side in some of its pixels."""
+    camera, checked = world.scene.camera, pilot_pixels(world, seed)
+    tolerance_m = WIDEST_TOLERANCE_M if settings.direct_tolerance_m is None else settings.direct_tolerance_m
+    light = direct_light(world, np.arange(camera.height * camera.width), PILOT_GRID, tolerance_m)
+    coarse = response(select(light.samples, np.isin(light.samples.pixel, checked)), checked)
+    none = np.zeros(len(checked))
+    fine = pilot_response(world, checked, FINER * PILOT_GRID)
+    return estimate(coarse, fine, np.zeros_like(fine), none, none).total
+
+
+def grid_for_all(errors: Sequence[float], settings: RenderSettings) -> int:
+    """The grid at which many views together, their mean squared error, meet direct light's part of the target.
+
+    `errors` are some views' `direct_error`. One grid for all costs less than each view's own: rays grow with its
+    square, so that the views that need most would take most of them for the least gain.
+    """
+    target = DEFAULT_ERROR if settings.error is None else settings.error
+    off = math.sqrt(np.mean(np.square(errors)))
+    grid = PILOT_GRID * (off / (_direct_share(settings, settings.bounces == 1) * target)) ** (1 / GRID_POWER)
+    return int(np.clip(math.ceil(grid), GRIDS[0], GRIDS[-1]))
+
+
+def _direct_share(settings: RenderSettings, direct_alone: bool) -> float:
+    """Of the target; where there is no other light, direct light has all that is aimed at."""
+    return math.sqrt(settings.aim) if direct_alone else DIRECT_SHARE
+
+
 def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
     """Plan a render: every choice that `settings` leaves open follows from a pilot; every choice gets a reason.
 
@@ -73,8 +102,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         fine = pilot_response(world, pixels, PILOT_GRID)
     target, why = _target(settings, fine)
     reasons.append(why)
-    direct_share = math.sqrt(settings.aim) if direct_alone else DIRECT_SHARE
-    grid, why = _grid(world, settings, pixels, PILOT_SHOWS * direct_share * target)
+    grid, why = _grid(world, settings, pixels, PILOT_SHOWS * _direct_share(settings, direct_alone) * target)
     reasons.append(why)
     tolerance_m = settings.direct_tolerance_m
     if tolerance_m is None:

@@ -112,7 +112,7 @@ class Dataset(Common):
     spp: Count = None
     """Indirect light paths per pixel (default: planned for each view)."""
     grid: Count = None
-    """Direct rays per pixel side (default: planned for each view)."""
+    """Direct rays per pixel side (default: planned, one for all views of an endless set)."""
     error: Number = None
     """Target of the relative error (default: 0.01 with 1 bounce, 0.03 with more)."""
     ambient: bool = True

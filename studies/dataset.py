@@ -1,6 +1,7 @@
 """Render a scene set to a folder: one EXR a view, one index, on one process, several, or a Dask cluster.
 
     set.json      what was asked for; a folder is continued only with the same
+    grid.json     rays a pixel side for all views of an endless set, and the errors of some that say so
     views/*.exr   one transient a view, written beside and renamed, so that a file is whole or not there
     journal.jsonl one line a view as it ends, in whatever order; gone once the index is written
     index.jsonl   one line a view in the order of the views: scene, plan, error, depth statistics, or why it failed
@@ -18,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -27,13 +28,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from render.settings import SHARED_AMBIENT_SPP, RenderSettings
+from render.settings import SHARED_AMBIENT_SPP, Plan, RenderSettings
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.model import Scene
 from scenes.offsets import OffsetMode, check_offset
 from scenes.sets import scene_set
-from studies.workers import executor
+from studies.workers import Run, executor
 
 if TYPE_CHECKING:
     from render.world import World
@@ -45,8 +46,11 @@ STAGE_VIEW = 20
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 AIM = 0.95  # of the squared error target: a set's views are to meet it together, not each by itself
+PLANNED_PLACES = 8  # that tell the grid of an endless set
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
-_WORLDS: dict[tuple[Job, str], World] = {}  # that of the last place
+# of the last place
+_WORLDS: dict[tuple, World] = {}
+_PLANS: dict[tuple[Job, str], Plan] = {}
 _ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
 
 
@@ -114,13 +118,25 @@ def render_view(job: Job, view: int, again: int = 0) -> Done:
             told = " ".join(str(error).split()) or type(error).__name__
             name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
             record, exr = {"view": view, "failed": f"{name}{told}"[:500]}, None
-            _WORLDS.clear()  # what was recorded may be half done
+            _forget()  # what was recorded may be half done
     return Done(record, exr, time.perf_counter() - start, where)
 
 
 def render_views(job: Job, views: Sequence[int]) -> list[Done]:
     """Views that one process renders in a row, since they show one place."""
     return [render_view(job, view) for view in views]
+
+
+def _direct_errors(job: Job, views: Sequence[int]) -> list[float]:
+    from render.planning import direct_error
+    from render.world import World
+
+    found = []
+    for view in views:
+        with _ONE_AT_A_TIME:
+            scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
+            found.append(direct_error(_world(job, view, scene) or World(scene), job.settings(), _seed(job, view)))
+    return found
 
 
 def _lost(view: int, why: str) -> Done:
@@ -152,9 +168,9 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         scene = scene.without_lights()
     if job.offset_m and job.offset_mode != "time":
         scene = moved(scene, job.offset_m, job.offset_mode)
-    key = (STAGE_VIEW, view, *((again,) if again else ()))
-    seed = int(np.random.SeedSequence(job.seed, spawn_key=key).generate_state(1)[0])
-    transient = render(scene, job.settings(), seed=seed, world=_world(job, view, scene))
+    seed = _seed(job, view, again)
+    world = _world(job, view, scene)
+    transient = render(scene, job.settings(), seed=seed, world=world, plan=_plan(job, view, world))
     if job.offset_m and job.offset_mode == "time":
         transient = transient.delayed(job.offset_m)
     require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
@@ -184,6 +200,11 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     return record, exr
 
 
+def _seed(job: Job, view: int, again: int = 0) -> int:
+    key = (STAGE_VIEW, view, *((again,) if again else ()))
+    return int(np.random.SeedSequence(job.seed, spawn_key=key).generate_state(1)[0])
+
+
 def _world(job: Job, view: int, scene: Scene) -> World | None:
     """The world of a place that several cameras look at, built once for all of them; None: the scene's own.
 
@@ -194,12 +215,31 @@ def _world(job: Job, view: int, scene: Scene) -> World | None:
     chosen = scene_set(job.set)
     if chosen.views_per_place == 1 or (job.offset_m and job.offset_mode != "time"):
         return None
+    place = job.set, job.seed, job.ambient, chosen.place(view)
+    if place not in _WORLDS:
+        _forget()  # before the next is built: calls are compiled for all materials that are there
+        _WORLDS[place] = World(scene, of_place=True)
+    return _WORLDS[place].seen_from(scene.camera)
+
+
+def _plan(job: Job, view: int, world: World | None) -> Plan | None:
+    """The plan for the first camera of a place, which holds for the others too; None: the view's own."""
+    from render.engine import planned
+
+    if world is None:
+        return None
+    chosen = scene_set(job.set)
+    first = view - view % chosen.views_per_place
     key = job, chosen.place(view)
-    if key in _WORLDS:
-        return _WORLDS[key].seen_from(scene.camera)
-    _WORLDS.clear()  # before the next is built: calls are compiled for all materials that are there
-    _WORLDS[key] = World(scene, of_place=True)
-    return _WORLDS[key]
+    if key not in _PLANS:
+        camera = chosen.view(first, seed=job.seed, width=job.width, height=job.height).camera
+        _PLANS[key] = planned(world.seen_from(camera), job.settings(), _seed(job, first))
+    return _PLANS[key]
+
+
+def _forget() -> None:
+    _WORLDS.clear()
+    _PLANS.clear()
 
 
 def file_name(view: int) -> str:
@@ -293,6 +333,24 @@ def _runs(job: Job, views: Sequence[int]) -> list[tuple[int, ...]]:
     return [tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place)]
 
 
+def _with_grid(job: Job, folder: Folder, run: Run, say: Progress) -> Job:
+    """The job with one grid for all views, from the errors of the first places' first views, however many are asked."""
+    from render.planning import grid_for_all
+
+    path = folder.path / "grid.json"
+    if not path.is_file():
+        say("plan", 0.0)
+        places = [(place * scene_set(job.set).views_per_place,) for place in range(PLANNED_PLACES)]
+        errors = sorted(run(partial(_direct_errors, job), places, _lost_error))
+        with whole_file(path) as beside:
+            beside.write_text(json.dumps({"grid": grid_for_all(errors, job.settings()), "errors": errors}) + "\n")
+    return replace(job, grid=json.loads(path.read_text())["grid"])
+
+
+def _lost_error(view: int, why: str) -> float:
+    raise InputError(f"view {view} cannot be planned: {why}")
+
+
 def make_set(
     job: Job, count: int, out: Path, *, workers: int = 1, scheduler: str | None = None, progress: Progress | None = None
 ) -> dict:
@@ -310,9 +368,9 @@ def make_set(
     todo = [view for view in range(count) if view not in folder.records]
     say = progress or (lambda what, share: None)
     start = time.perf_counter()
-    runs, work = _runs(job, todo), partial(render_views, job)
     with executor(workers if todo else 1, scheduler if todo else None) as run:
-        for number, done in enumerate(run(work, runs, _lost), 1):
+        job = _with_grid(job, folder, run, say) if todo and size is None and job.grid is None else job
+        for number, done in enumerate(run(partial(render_views, job), _runs(job, todo), _lost), 1):
             folder.add(done)
             if "failed" in done.record:
                 log.warning("view %d failed: %s", done.record["view"], done.record["failed"])

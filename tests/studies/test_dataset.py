@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,26 @@ def test_a_view_does_not_depend_on_what_was_rendered_before_it():
     assert [render_view(job, view).exr for view in (4, 2, 1, 0)] == in_order[::-1]
     dataset._WORLDS.clear()
     assert render_view(job, 1).exr == in_order[1]
+
+
+def test_an_endless_set_has_one_grid_however_many_views_are_asked(tmp_path, monkeypatch):
+    monkeypatch.setattr("studies.dataset.PLANNED_PLACES", 2)
+    job = Job("rooms", width=16, height=16, bounces=1, error=0.05)
+    for count in (1, 5):
+        make_set(job, count, tmp_path / "in steps")
+    make_set(job, 5, tmp_path / "at once")
+    steps, once = (tmp_path / name for name in ("in steps", "at once"))
+    for name in ("grid.json", "index.jsonl", "views/000000.exr", "views/000004.exr"):
+        assert (steps / name).read_bytes() == (once / name).read_bytes()
+    planned = json.loads((once / "grid.json").read_text())
+    assert len(planned["errors"]) == 2 and {r["plan"]["grid"] for r in read_index(once)} == {planned["grid"]}
+    make_set(replace(job, grid=3), 1, tmp_path / "forced")
+    assert not (tmp_path / "forced" / "grid.json").exists()
+
+
+def test_cameras_of_a_place_share_the_plan_of_its_first():
+    job = Job("rooms", width=16, height=16, bounces=1, error=0.02)
+    assert len({render_view(job, view).record["plan"]["grid"] for view in (2, 1, 0)}) == 1
 
 
 def test_two_processes_give_the_same_bytes(whole, tmp_path):

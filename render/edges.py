@@ -1,0 +1,211 @@
+"""What lies between neighbouring cells of pixels, compared all at once; and how cells follow their neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.footprint import HIT, LARGE, LIT
+from render.world import Bool, Float, UInt32, dr, mi, upload
+
+# Two neighbours lie on one surface if their planes explain the step between their distances up to this [m]: a sixth of
+# the reference sensor's bin. A crease lies between them if their planes differ by more than CREASE_M over the step, or
+# if the cosines toward the laser differ by more than CREASE_COSINE.
+STEP_M = 0.0025
+CREASE_M = 0.03
+CREASE_COSINE = 0.05
+# An edge of paint or of a glint lies between two neighbours on one surface whose radiances differ by more than this
+# share of the brighter one.
+TONE = 0.1
+MIXED_GAP_M = 0.05
+# A cell follows its neighbours if its tangent plane is off the mean step to them by no more than this share of its
+# distance, a bent surface apart.
+FOLLOWED = 3e-4
+
+CUT, MIXED = 1, 2
+
+# What Python and Dr.Jit need to trace a launch takes longer than its cells. Neither depends on a world.
+_recorded = partial(dr.freeze, warn_after=1000)
+
+
+class Cells(NamedTuple):
+    """What is compared of cells, (N,) each: see `render.footprint.Footprints`."""
+
+    distance_m: Any
+    slope_x_m: Any
+    slope_y_m: Any
+    facing: Any
+    radiance: Any
+    flags: Any
+
+    def at(self, index: Any, active: Any) -> Cells:
+        """Those of other cells; of nothing where not `active`."""
+        return Cells(*(dr.gather(type(column), column, index, active) for column in self))
+
+
+class Place(NamedTuple):
+    """Where cells lie: level, column and row in cells of that level, and the rank of their pixel, (N,) each."""
+
+    level: Any
+    column: Any
+    row: Any
+    rank: Any
+
+
+class _Between(NamedTuple):
+    """Of a pair of cells: whether an edge lies between them, whether it parts surfaces too far from each other (or one
+    from nothing), the share of the brighter one's radiance that misplacing it can change, and whether both are hits on
+    one surface, bent or not."""
+
+    differ: Any
+    apart: Any
+    contrast: Any
+    joined: Any
+
+
+def first_edges(
+    cells: Cells, spans: Sequence[np.ndarray], grid: int, width: int, least: float
+) -> tuple[np.ndarray, ...]:
+    """Compare all cells of whole pixels, grid x grid each, with their neighbours: CUT and MIXED bits, and spans.
+
+    `width` is the image's where the pixels are its whole rows; 0: neighbours in other pixels are not met. CUT is set
+    where an edge could change radiance times a pixel's area by `least` or more, or where the cell is large.
+
+    `spans` are path centres, half widths and smaller half spans [m]. Small cells are spread between their neighbours on
+    the same surface instead of on the tangent plane. Along each axis p = p_0 + s x + c x^2 / 2 and r = r_0 + g x, with
+    s, g the mean of the steps to both neighbours (the one step where the other neighbour lies across an edge) and c
+    their difference. Then the half span is |s| / 2 (c adds c^2 / 720 to the variance), and the mean path
+    p_0 + c / 24 + g s / (12 r_0), summed over the axes: second order in the cell's width where the tangent plane is
+    first, and blind to facets of a curved surface. At a crease the tangent plane agrees with one of the steps instead
+    of their mean, and is kept.
+    """
+    if len(cells.flags) < 2:  # arrays of one entry are scalars to Dr.Jit: another kernel
+        return np.where(cells.flags & LARGE, np.uint32(CUT), np.uint32(0)), *spans
+    columns = *_uploaded(cells), *(upload(Float, column) for column in spans)
+    lane = dr.arange(UInt32, len(cells.flags))
+    dr.eval(lane)
+    numbers = (dr.opaque(UInt32, value) for value in (grid, width, len(cells.flags) // grid**2))
+    least = dr.opaque(Float, float(least))
+    found = _first_edges(*columns, lane, *numbers, least)
+    dr.eval(found)
+    return tuple(values.numpy() for values in found)
+
+
+def pair_edges(one: tuple[Place, Cells], other: tuple[Place, Cells], grid: int, least: float) -> Any:
+    """Compare pairs of cells of any size, side by side: CUT and MIXED bits of each pair, (P,) uint32."""
+    number = len(one[0].level)
+    if number == 0:
+        return np.empty(0, np.uint32)
+    if number == 1:  # arrays of one entry are scalars to Dr.Jit: another kernel
+        one, other = (tuple(type(part)(*(np.repeat(c, 2) for c in part)) for part in cell) for cell in (one, other))
+    columns = []
+    for place, cells in (one, other):
+        columns += [*(upload(UInt32, column) for column in place), *_uploaded(cells)]
+    numbers = dr.opaque(UInt32, grid), dr.opaque(Float, float(least))
+    found = _pair_edges(*columns, *numbers)
+    dr.eval(found)
+    return found.numpy()[:number]
+
+
+def _uploaded(cells: Cells) -> tuple[Any, ...]:
+    return *(upload(Float, column) for column in cells[:-1]), upload(UInt32, cells.flags)
+
+
+@_recorded
+def _first_edges(*columns: Any) -> tuple[Any, ...]:
+    cells, (path, half, minor, lane, grid, width, pixels, least) = Cells(*columns[:6]), columns[6:]
+    per_pixel = grid * grid
+    rank = lane // per_pixel
+    row = (lane - rank * per_pixel) // grid
+    column = lane - rank * per_pixel - row * grid
+    whole = width > 0
+    pixel_x = rank % dr.maximum(width, 1)
+    # after and before along x, then y: whether the neighbour is of the same pixel, whether of another, and which it is
+    sides = (
+        (column + 1 < grid, whole & (pixel_x + 1 < width), lane + 1, lane + per_pixel + 1 - grid),
+        (column > 0, whole & (pixel_x > 0), lane - 1, lane - per_pixel - 1 + grid),
+        (row + 1 < grid, whole & (rank + width < pixels), lane + grid, lane + per_pixel * width + grid - per_pixel),
+        (row > 0, whole & (rank >= width), lane - grid, lane - per_pixel * width - grid + per_pixel),
+    )
+    pitch = dr.rcp(Float(grid))
+    follows = ((cells.flags & (HIT | LARGE)) == HIT) & (cells.radiance > 0)
+    per_radiance = dr.select(follows, dr.rcp(cells.radiance), 0)
+    cut, mixed = (cells.flags & LARGE) != 0, Bool(False)
+    mean, variance, halves = Float(path), Float(0), []  # a copy: += would change the path
+    for axis in range(2):
+        number, rise, rises, bend, run, bends = (Float(0) for _ in range(6))
+        gain = Float(0)
+        slope = cells[1 + axis] * pitch
+        for (inside, across, near, far), way in zip(sides[2 * axis : 2 * axis + 2], (1, -1), strict=True):
+            there = inside | across
+            index = dr.select(inside, near, far)
+            other = cells.at(index, there)
+            step = way * (other.distance_m - cells.distance_m)
+            between = _between(cells, other, step, slope, other[1 + axis] * pitch)
+            brighter = dr.maximum(cells.radiance, other.radiance) * pitch * pitch
+            cut |= there & between.differ & (brighter * between.contrast >= least)
+            mixed |= inside & between.differ & between.apart
+            joined = there & between.joined
+            number += dr.select(joined, 1, 0)
+            rise += dr.select(joined, step, 0)
+            rises += dr.select(joined, way * step, 0)
+            step = dr.select(joined, way * (dr.gather(Float, path, index, there) - path), 0)
+            run, bends = run + step, bends + way * step
+            gain += dr.select(joined, way * (other.radiance - cells.radiance), 0)
+        share, two = dr.rcp(dr.maximum(number, 1)), dr.select(number == 2, Float(1), Float(0))
+        off = dr.abs(slope - rise * share)
+        follows &= (number > 0) & (off <= dr.maximum(dr.abs(rises) * two / 4, FOLLOWED * cells.distance_m))
+        run, bend = run * share, bends * two
+        gain = dr.clip(gain * share * per_radiance, -2, 2)
+        mean += bend / 24 + gain * run / 12
+        halves.append(dr.abs(run) / 2)
+        variance += dr.square(run) / 4 + dr.square(bend) / 240
+    bits = dr.select(cut, CUT, UInt32(0)) | dr.select(mixed, MIXED, UInt32(0))
+    return (
+        bits,
+        dr.select(follows, mean, path),
+        dr.select(follows, dr.sqrt(variance), half),
+        dr.select(follows, dr.minimum(*halves), minor),
+    )
+
+
+@_recorded
+def _pair_edges(*columns: Any) -> Any:
+    (begin, first), (end, second) = ((Place(*columns[i : i + 4]), Cells(*columns[i + 4 : i + 10])) for i in (0, 10))
+    grid, least = columns[20:]
+    # half a cell's width, in the unit of the finer cell of the pair's half width; columns and rows at that unit
+    finer = dr.maximum(begin.level, end.level)
+    unit = 0.5 / Float(grid << finer)
+    way_x, way_y = (
+        Float(mi.Int32(((2 * to + 1) << (finer - end.level)) - ((2 * of + 1) << (finer - begin.level)))) * unit
+        for of, to in ((begin.column, end.column), (begin.row, end.row))
+    )
+    rises = (cell.slope_x_m * way_x + cell.slope_y_m * way_y for cell in (first, second))
+    between = _between(first, second, second.distance_m - first.distance_m, *rises)
+    wider = 2 * unit * Float(UInt32(1) << (finer - dr.minimum(begin.level, end.level)))
+    energy = dr.maximum(first.radiance, second.radiance) * dr.square(wider)
+    cut = between.differ & (energy * between.contrast >= least)
+    mixed = between.differ & between.apart & (begin.rank == end.rank)
+    return dr.select(cut, CUT, UInt32(0)) | dr.select(mixed, MIXED, UInt32(0))
+
+
+def _between(one: Cells, other: Cells, step: Any, rise: Any, other_rise: Any) -> _Between:
+    """Compare cells with their neighbours.
+
+    `step` is the difference of two hits' distances [m], the rises what each one's tangent plane predicts for it. Across
+    a crease, or along a surface that bends one way, it lies between the two predictions; across a gap it does not.
+    """
+    least, most = dr.minimum(rise, other_rise), dr.maximum(rise, other_rise)
+    both = (one.flags & other.flags & HIT) != 0
+    unlike = one.flags ^ other.flags
+    gap = dr.select(both, dr.maximum(step - most, least - step), 0)
+    edge = (gap > STEP_M) | (both & (most - least > CREASE_M)) | ((unlike & (HIT | LIT)) != 0)
+    bend = dr.abs(one.facing - other.facing)
+    brighter = dr.maximum(one.radiance, other.radiance)
+    tone = dr.select(brighter > 0, dr.abs(one.radiance - other.radiance) / brighter, 0)
+    differ = edge | (both & ((bend > CREASE_COSINE) | (tone > TONE)))
+    apart = (gap > MIXED_GAP_M) | ((unlike & HIT) != 0)
+    return _Between(differ, apart, dr.select(edge, Float(1), dr.maximum(bend, tone)), both & ~edge)

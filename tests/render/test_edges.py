@@ -1,0 +1,150 @@
+"""Edges between cells, against one pair at a time in plain Python; and cells that follow their neighbours."""
+
+import math
+
+import numpy as np
+import pytest
+
+from render.edges import (
+    CREASE_COSINE,
+    CREASE_M,
+    CUT,
+    FOLLOWED,
+    MIXED,
+    MIXED_GAP_M,
+    STEP_M,
+    TONE,
+    Cells,
+    Place,
+    first_edges,
+    pair_edges,
+)
+from render.footprint import HIT, LARGE, LIT
+
+HEIGHT, WIDTH, GRID, LEAST = 8, 9, 3, 0.02
+COUNT = HEIGHT * WIDTH * GRID**2
+
+
+def cells_of(seed: int, count: int = COUNT) -> Cells:
+    """Cells on a few surfaces, half a metre apart or nearly level, some of them nothing or in shadow."""
+    draw = np.random.default_rng(seed)
+    flags = draw.choice([0, HIT, HIT | LIT, HIT | LIT, HIT | LIT, HIT | LIT | LARGE], count)
+    hit = (flags & HIT) != 0
+    return Cells(
+        np.where(hit, draw.choice([2.0] * 7 + [2.0005, 2.001, 2.04, 2.5], count), 0).astype(np.float32),
+        np.where(hit, draw.choice([0.0] * 5 + [0.001, 0.02, 0.2], count), 0).astype(np.float32),
+        np.where(hit, draw.choice([0.0] * 5 + [-0.001, 0.01], count), 0).astype(np.float32),
+        np.where(hit, draw.choice([0.8, 0.82, 0.9], count), 0).astype(np.float32),
+        np.where((flags & LIT) != 0, draw.choice([0.2, 0.21, 0.5], count), 0).astype(np.float32),
+        flags.astype(np.uint32),
+    )
+
+
+def between(cells: Cells, a: int, b: int, way: tuple[float, float]) -> tuple[bool, bool, float, bool]:
+    """differ, apart, contrast, joined: a sentence of `render.edges` a line."""
+    hits = [bool(cells.flags[i] & HIT) for i in (a, b)]
+    lits = [bool(cells.flags[i] & LIT) for i in (a, b)]
+    step = float(cells.distance_m[b]) - float(cells.distance_m[a])
+    rises = [float(cells.slope_x_m[i]) * way[0] + float(cells.slope_y_m[i]) * way[1] for i in (a, b)]
+    gap = max(step - max(rises), min(rises) - step) if all(hits) else 0.0
+    edge = gap > STEP_M or (all(hits) and abs(rises[0] - rises[1]) > CREASE_M) or hits[0] != hits[1]
+    edge = edge or lits[0] != lits[1]
+    bend = abs(float(cells.facing[a]) - float(cells.facing[b]))
+    bright = max(float(cells.radiance[a]), float(cells.radiance[b]))
+    tone = abs(float(cells.radiance[a]) - float(cells.radiance[b])) / bright if bright else 0.0
+    differ = edge or (all(hits) and (bend > CREASE_COSINE or tone > TONE))
+    return differ, gap > MIXED_GAP_M or hits[0] != hits[1], 1.0 if edge else max(bend, tone), all(hits) and not edge
+
+
+def index_of(x: int, y: int) -> int:
+    """Cell in column x and row y of the image: pixel by pixel, in each row by row."""
+    pixel = y // GRID * WIDTH + x // GRID
+    return pixel * GRID**2 + y % GRID * GRID + x % GRID
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["image", "single-pixels"])
+@pytest.mark.parametrize("seed", range(3))
+def test_first_cells_are_compared_with_their_neighbours(seed: int, whole: bool) -> None:
+    cells = cells_of(seed)
+    draw = np.random.default_rng(100 + seed)
+    spans = [draw.uniform(low, high, COUNT).astype(np.float32) for low, high in ((4, 5), (0, 0.1), (0, 0.05))]
+    bits, path, half, minor = first_edges(cells, spans, GRID, WIDTH if whole else 0, LEAST)
+    cut, mixed = (cells.flags & LARGE) != 0, np.zeros(COUNT, bool)
+    followed = 0
+    for y, x in np.ndindex(HEIGHT * GRID, WIDTH * GRID):
+        here, means, halves, variances, follows = index_of(x, y), [], [], [], True
+        for axis, (dx, dy) in enumerate(((1, 0), (0, 1))):
+            steps, paths, gains = [], [], []
+            for sign in (1, -1):
+                u, v = x + sign * dx, y + sign * dy
+                same = 0 <= u < WIDTH * GRID and 0 <= v < HEIGHT * GRID
+                other = index_of(u, v) if same else -1
+                within = same and other // GRID**2 == here // GRID**2
+                if not same or not (whole or within):
+                    continue
+                pair = (here, other) if sign > 0 else (other, here)
+                differ, apart, contrast, joined = between(cells, *pair, (dx / GRID, dy / GRID))
+                energy = max(cells.radiance[here], cells.radiance[other]) / GRID**2
+                cut[here] |= differ and energy * contrast >= LEAST
+                mixed[here] |= within and differ and apart
+                if joined:
+                    steps.append(float(cells.distance_m[pair[1]]) - float(cells.distance_m[pair[0]]))
+                    paths.append(float(spans[0][pair[1]]) - float(spans[0][pair[0]]))
+                    gains.append(float(cells.radiance[pair[1]]) - float(cells.radiance[pair[0]]))
+            if not steps:
+                follows = False
+                continue
+            two = len(steps) == 2
+            off = abs(float(cells[1 + axis][here]) / GRID - np.mean(steps))
+            bend = abs(steps[0] - steps[1]) / 4 if two else 0.0
+            follows &= off <= max(bend, FOLLOWED * float(cells.distance_m[here]))
+            slope, curve = np.mean(paths), paths[0] - paths[1] if two else 0.0
+            gain = np.clip(np.mean(gains) / max(float(cells.radiance[here]), 1e-9), -2, 2)
+            means.append(curve / 24 + gain * slope / 12)
+            halves.append(abs(slope) / 2)
+            variances.append(slope**2 / 4 + curve**2 / 240)
+        follows &= cells.flags[here] & (HIT | LARGE) == HIT and cells.radiance[here] > 0
+        expected = [span[here] for span in spans]
+        if follows:
+            followed += 1
+            expected = [spans[0][here] + sum(means), math.sqrt(sum(variances)), min(halves)]
+        assert np.allclose([path[here], half[here], minor[here]], expected, rtol=1e-5, atol=1e-6)
+    assert np.array_equal((bits & CUT) != 0, cut) and np.array_equal((bits & MIXED) != 0, mixed)
+    assert followed > 0 and 10 < cut.sum() < COUNT and mixed.any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 300])
+def test_pairs_of_cells_of_any_size_are_compared(count: int) -> None:
+    """A cell at each level beside a cell of the same or another size, to its right."""
+    one, other = cells_of(7, count), cells_of(8, count)
+    draw = np.random.default_rng(9)
+    levels = draw.integers(0, 4, (2, count))
+    column = draw.integers(0, 50, count) << (levels[0] + 3)
+    right = ((column + 1) << levels[1]) >> levels[0]  # begins where the first one ends
+    row = draw.integers(0, 50, count) << (levels[0] + 3)
+    ranks = draw.integers(0, 2, (2, count))
+    places = [
+        Place(levels[0], column, row, ranks[0]),
+        Place(levels[1], right, (row << levels[1]) >> levels[0], ranks[1]),
+    ]
+    bits = pair_edges((places[0], one), (places[1], other), GRID, LEAST)
+    both = Cells(*(np.concatenate(column) for column in zip(one, other, strict=True)))
+    for i in range(count):
+        widths = 1 / (GRID * 2.0 ** levels[:, i])
+        centres = [((p.column[i] + 0.5) * w, (p.row[i] + 0.5) * w) for p, w in zip(places, widths, strict=True)]
+        way = tuple(float(end - begin) for begin, end in zip(*centres, strict=True))
+        differ, apart, contrast, _ = between(both, i, count + i, way)
+        energy = max(one.radiance[i], other.radiance[i]) * widths.max() ** 2
+        assert bool(bits[i] & CUT) == (differ and energy * contrast >= LEAST)
+        assert bool(bits[i] & MIXED) == (differ and apart and ranks[0, i] == ranks[1, i])
+    assert count < 300 or 30 < np.count_nonzero(bits & CUT) < 270
+
+
+def test_nothing_to_compare() -> None:
+    none = Cells(*(np.empty(0, np.float32),) * 5, np.empty(0, np.uint32))
+    nowhere = Place(*(np.empty(0, np.int32),) * 4)
+    assert pair_edges((nowhere, none), (nowhere, none), 2, 0.1).size == 0
+    alone = cells_of(1, 1)
+    assert first_edges(alone, [np.ones(1, np.float32)] * 3, 1, 1, 0.1)[0].tolist() == [
+        CUT * bool(alone.flags[0] & LARGE)
+    ]
