@@ -57,7 +57,7 @@ class RenderSettings:
             ("spp", 1, MAX_SAMPLES),
             ("grid", 1, 64),
             ("error", 1e-4, 1.0),
-            ("aim", 0.1, 1.0),
+            ("aim", 0.1, 2.0),
             ("least_share", 0, 1),
             ("ambient_spp", 1, 1 << 16),
         )
