@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from csph.allocation import keep_freed_memory
 from csph.metrics import (
     PHOTON_LEVELS,
     TOLERANCES_MM,
@@ -130,6 +131,7 @@ def evaluate(
     empty set or no method, an image smaller than a tile, and what the methods raise.
     """
     require(bool(views.transients) and bool(methods), "evaluation: no view or no method")
+    keep_freed_memory()
     say, result = progress or (lambda what, share: None), Evaluation(depths={name: [] for name in methods})
     total = len(views.transients) * len(levels)
     for view, (transient, scene) in enumerate(zip(views.transients, views.scenes, strict=True)):
