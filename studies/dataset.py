@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import tempfile
 import time
@@ -130,14 +131,21 @@ def render_views(job: Job, views: Sequence[int]) -> list[Done]:
 
 
 def _direct_errors(job: Job, views: Sequence[int]) -> list[float]:
+    """`render.planning.direct_error` of some views; NaN of one that cannot be rendered, which its record will say."""
     from render.planning import direct_error
     from render.world import World
 
     found = []
     for view in views:
         with _ONE_AT_A_TIME:
-            scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
-            found.append(direct_error(_world(job, view, scene) or World(scene), job.settings(), _seed(job, view)))
+            try:
+                scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
+                world = _world(job, view, scene) or World(scene)
+                found.append(direct_error(world, job.settings(), _seed(job, view)))
+            except Exception:  # as in `render_view`
+                log.debug("view %d cannot be planned", view, exc_info=True)
+                found.append(math.nan)
+                _forget()
     return found
 
 
@@ -346,14 +354,15 @@ def _with_grid(job: Job, folder: Folder, run: Run, say: Progress) -> Job:
     if not path.is_file():
         say("plan", 0.0)
         places = [(place * scene_set(job.set).views_per_place,) for place in range(PLANNED_PLACES)]
-        errors = sorted(run(partial(_direct_errors, job), places, _lost_error))
+        found = run(partial(_direct_errors, job), places, lambda view, why: math.nan)
+        errors = sorted(error for error in found if math.isfinite(error))
+        grid = grid_for_all(errors, job.settings()) if errors else None  # None: each place by itself
         with whole_file(path) as beside:
-            beside.write_text(json.dumps({"grid": grid_for_all(errors, job.settings()), "errors": errors}) + "\n")
-    return replace(job, grid=json.loads(path.read_text())["grid"])
-
-
-def _lost_error(view: int, why: str) -> float:
-    raise InputError(f"view {view} cannot be planned: {why}")
+            beside.write_text(json.dumps({"grid": grid, "errors": errors}) + "\n")
+    try:
+        return replace(job, grid=json.loads(path.read_text())["grid"])
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: is damaged; delete it, and it is made again") from None
 
 
 def make_set(

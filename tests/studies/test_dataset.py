@@ -148,6 +148,25 @@ def test_an_endless_set_has_one_grid_however_many_views_are_asked(tmp_path, monk
     assert len(planned["errors"]) == 2 and {r["plan"]["grid"] for r in read_index(once)} == {planned["grid"]}
     make_set(replace(job, grid=3), 1, tmp_path / "forced")
     assert not (tmp_path / "forced" / "grid.json").exists()
+    (once / "grid.json").write_text("{")
+    with pytest.raises(InputError, match=r"grid\.json: is damaged"):
+        make_set(job, 6, once)
+
+
+def test_places_that_cannot_be_planned_are_left_out_of_the_plan(tmp_path, monkeypatch):
+    monkeypatch.setattr("studies.dataset.PLANNED_PLACES", 2)
+    job, errors = Job("rooms", width=8, height=8, bounces=1), iter((ValueError("odd"), 0.02))
+
+    def direct_error(*_):
+        error = next(errors)
+        if isinstance(error, Exception):
+            raise error
+        return error
+
+    monkeypatch.setattr("render.planning.direct_error", direct_error)
+    result = make_set(job, 1, tmp_path)
+    planned = json.loads((tmp_path / "grid.json").read_text())
+    assert result["scenes"] == 1 and planned["errors"] == [0.02] and planned["grid"] > 4
 
 
 def test_cameras_of_a_place_share_the_plan_of_its_first():
