@@ -21,7 +21,7 @@ DEFAULT_ERROR = 0.02
 DIRECT_SHARE, MONTE_CARLO_OF_AIM = 0.4, 0.75
 # The pilot's pixels are not compared with those beside them, so that it shows 1.3 to 1.4 times the error of cells at
 # grids of 4 to 8 (measured in rooms); most of that is not planned for.
-PILOT_SHOWS = 1.4
+PILOT_SHOWS = 1.25
 MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
