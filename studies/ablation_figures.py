@@ -10,10 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
 from csph.evaluation import Row
-from studies.figures import DEPTH_COLOURS, plt, save
+from studies.figures import DEPTH_COLOURS, plain_log, plt, save
 from studies.trained import Trained
 
 LIMIT_MM = 50.0  # of the axis where errors are as small as the paper's; wider where half of a model's images are not
+LOGARITHMIC = 3.0  # where models' medians lie so far apart a linear axis shows the worst alone
 WIDTH = 0.36  # of a model's cloud of points
 
 
@@ -80,9 +81,14 @@ def _scatter(panel: Axes, clouds: Sequence[Sequence[Row]]) -> None:
     flat = np.concatenate(errors)
     norm = LogNorm(min(ratios.min(), 0.01), max(ratios.max(), 1.0))
     panel.scatter(place, flat, c=ratios, norm=norm, cmap="plasma", s=10, zorder=3, alpha=0.8, linewidths=0)
-    top = max(LIMIT_MM, 1.3 * max(float(np.quantile(values, 0.75)) for values in errors))
+    bottom, top = 0.0, max(LIMIT_MM, 1.3 * max(float(np.quantile(values, 0.75)) for values in errors))
+    medians = [float(np.median(values)) for values in errors]
+    if max(medians) > LOGARITHMIC * min(medians) > 0:
+        bottom, top = flat.min() / 1.3, 1.3 * flat.max()
+        plain_log(panel)
     hidden = int((flat > top).sum())
-    panel.set_ylim(0, top)
+    panel.set_ylim(bottom, top)
     panel.set_ylabel("mean absolute depth error [mm]")
-    panel.set_title(f"every test image; {hidden} of {flat.size} lie above the axis and are counted", fontsize=9)
+    above = f"; {hidden} of {flat.size} lie above the axis and are counted" if hidden else ""
+    panel.set_title(f"every test image{above}", fontsize=9)
     panel.grid(alpha=0.3, axis="y")

@@ -264,10 +264,8 @@ class Folder:
 
     def __init__(self, path: Path, job: Job) -> None:
         self.path, self.job = path, job
-        stored = {
-            "schema": 3,
-            "tolerances": [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, AIM, INDIRECT_AIM],
-        }
+        tolerances = [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, job.settings().aim]
+        stored = {"schema": 4, "tolerances": tolerances}
         asked = json.dumps(asdict(job) | stored, sort_keys=True, indent=1) + "\n"
         config = path / "set.json"
         if config.is_file():
