@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from csph.evaluation import Evaluation, Row, as_dicts
+from csph.metrics import PHOTON_LEVELS
 from render.engine import Progress
 from scenes.files import whole_file, write_csv
 from studies import ablation_figures as figures
@@ -43,7 +44,8 @@ def run(command: Study, progress: Progress) -> dict:
     levels = sorted({level for sheet in sheets for level in sheet.shown}) if smoke else LEVELS
     shown = [view for view in SHOWN_VIEWS if view < len(test.views.scenes)]
     rows = evaluated(store, [*subjects.values()], test, levels, maps=shown, **options)
-    pair_options = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, levels)
+    # published numbers are means of all test levels
+    pair_options = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, PHOTON_LEVELS)
     numbers: dict[str, Any] = {
         **models.described(),
         "conclusions": [decided(claim, rows, models.found) for claim in CLAIMS[command.name]],
