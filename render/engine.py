@@ -29,7 +29,7 @@ from render.indirect import (
 )
 from render.paths import BLOCK, block_order
 from render.planning import finer_pilot, make_plan, pilot_pixels
-from render.returns import Growing, Samples, concatenate, no_samples, select, to_returns
+from render.returns import Growing, Samples, concatenate, no_samples, of_pixels, select, to_returns
 from render.settings import BATCHES, Plan, RenderSettings
 from render.specular import specular_light
 from render.transient import Transient
@@ -298,13 +298,12 @@ def _estimated(
     world: World, plan: Plan, settings: RenderSettings, traced: Traced, checked: np.ndarray
 ) -> ErrorEstimate:
     """The error of a trace, from the checked pixels' batches and from finer direct light there."""
-    coarse = response(_of_pixels(traced.direct, checked), checked)
-    glints = response(_of_pixels(traced.specular, checked), checked)
+    coarse = response(of_pixels(traced.direct, checked), checked)
+    glints = response(of_pixels(traced.specular, checked), checked)
     fine = finer_pilot(world, checked, plan.grid, plan.least_share) + glints
     coarse += glints
     if traced.indirect is None:
-        none = np.zeros(len(checked))
-        return estimate(coarse, fine, np.zeros_like(fine), none, none)
+        return estimate(coarse, fine)
     seen = traced.indirect.watched
     place, origin_m = np.arange(len(checked)), traced.origin_m[checked]
     cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
@@ -322,10 +321,6 @@ def _estimated(
     of_checked = variance[checked].mean()
     typical = variance.mean() / of_checked if of_checked > 0 else 1.0
     return estimate(coarse, fine, indirect, noise * typical, merging)
-
-
-def _of_pixels(samples: Samples, pixels: np.ndarray) -> Samples:
-    return select(samples, np.isin(samples.pixel, pixels))
 
 
 def _mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:

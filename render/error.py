@@ -70,12 +70,18 @@ def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
 
 
 def estimate(
-    coarse: np.ndarray, fine: np.ndarray, indirect: np.ndarray, noise: np.ndarray, merging: np.ndarray
+    coarse: np.ndarray,
+    fine: np.ndarray,
+    indirect: np.ndarray | float = 0.0,
+    noise: np.ndarray | float = 0.0,
+    merging: np.ndarray | float = 0.0,
 ) -> ErrorEstimate:
     """Error of direct light by `coarse` against `fine` cells beside the indirect light's `noise` and `merging` error.
 
-    coarse, fine, indirect are (pixels, bins) responses; noise and merging squared errors of the pixels.
+    coarse, fine, indirect are (pixels, bins) responses; noise and merging squared errors of the pixels. Without
+    these three there is direct light alone.
     """
+    noise, merging = (np.broadcast_to(part, len(coarse)) for part in (noise, merging))
     direct = ((coarse - fine) ** 2).sum(axis=1)
     power = ((fine + indirect) ** 2).sum(axis=1)
     whole = power.sum()

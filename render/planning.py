@@ -10,7 +10,7 @@ import numpy as np
 from render.direct import direct_light, least_share_of
 from render.error import error_for_budget, estimate, response
 from render.paths import energy_by_bounces
-from render.returns import select
+from render.returns import of_pixels
 from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
 from render.world import World
 from scenes.model import Material
@@ -65,10 +65,8 @@ def direct_error(world: World, settings: RenderSettings, seed: int) -> float:
     camera, checked = world.scene.camera, pilot_pixels(world, seed)
     tolerance_m = WIDEST_TOLERANCE_M if settings.direct_tolerance_m is None else settings.direct_tolerance_m
     light = direct_light(world, np.arange(camera.height * camera.width), PILOT_GRID, tolerance_m)
-    coarse = response(select(light.samples, np.isin(light.samples.pixel, checked)), checked)
-    none = np.zeros(len(checked))
-    fine = pilot_response(world, checked, FINER * PILOT_GRID)
-    return estimate(coarse, fine, np.zeros_like(fine), none, none).total
+    coarse = response(of_pixels(light.samples, checked), checked)
+    return estimate(coarse, pilot_response(world, checked, FINER * PILOT_GRID)).total
 
 
 def grid_for_all(errors: Sequence[float], settings: RenderSettings) -> int:
@@ -168,12 +166,11 @@ def _grid(world: World, settings: RenderSettings, pixels: np.ndarray, allowed: f
     """
     if settings.grid is not None:
         return settings.grid, f"direct light: {settings.grid} x {settings.grid} rays a pixel, forced"
-    none = np.zeros(len(pixels))
 
     def off(grid: int) -> float:
         coarse, finer = (pilot_response(world, pixels, number) for number in (grid, 2 * grid))
         # what no ray has met yet may be thin
-        return estimate(coarse, finer, np.zeros_like(finer), none, none).total if finer.any() else math.inf
+        return estimate(coarse, finer).total if finer.any() else math.inf
 
     errors = {PILOT_GRID: off(PILOT_GRID)}
     while errors[min(errors)] <= allowed and min(errors) > GRIDS[0]:

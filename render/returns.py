@@ -62,6 +62,11 @@ def select(samples: Samples, kept: np.ndarray | slice) -> Samples:
     return Samples(*(column[kept] for column in samples))
 
 
+def of_pixels(samples: Samples, pixels: np.ndarray) -> Samples:
+    """Those of some pixels."""
+    return select(samples, np.isin(samples.pixel, pixels))
+
+
 def packed(*columns: np.ndarray) -> Samples:
     """Samples of columns of any type, as `COLUMN_TYPES`."""
     return Samples(*(column.astype(kind, copy=False) for column, kind in zip(columns, COLUMN_TYPES, strict=True)))

@@ -1,12 +1,5 @@
 """Render a scene set to a folder: one EXR a view, one index, on one process, several, or a Dask cluster.
 
-    set.json      what was asked for; a folder is continued only with the same
-    grid.json     rays a pixel side for all views of an endless set, and the errors of some that say so
-    views/*.exr   one transient a view, written beside and renamed, so that a file is whole or not there
-    journal.jsonl one line a view as it ends, in whatever order; gone once the index is written
-    index.jsonl   one line a view in the order of the views: scene, plan, error, depth statistics, or why it failed
-    timings.jsonl seconds and places, kept out of the index so that two runs are the same byte for byte
-
 Every view is a function of the set, the seed and its number: who renders it, when, and after what, changes no byte.
 """
 
@@ -25,7 +18,7 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,6 +28,7 @@ from scenes.files import whole_file
 from scenes.model import Scene
 from scenes.offsets import OffsetMode, check_offset
 from scenes.sets import scene_set
+from studies.set_folder import Done, Folder, file_name, read_index
 from studies.workers import Run, executor
 
 if TYPE_CHECKING:
@@ -47,7 +41,7 @@ STAGE_VIEW = 20
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 # Of the squared error target: a set's views are to meet it together, not each by itself. With indirect light plans do
-# better than they promise, since the noise that they count on is that of pixels without mixed returns (measured).
+# better than they promise: they take too little power for mixed pixels, and round paths up (measured).
 AIM, INDIRECT_AIM = 0.95, 1.5
 PLANNED_PLACES = 8  # that tell the grid of an endless set
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
@@ -97,14 +91,10 @@ class Job:
             indirect_growth=self.merging * INDIRECT_GROWTH,
         )
 
-
-class Done(NamedTuple):
-    """A finished view: its record for the index, the bytes of its EXR (None: it failed), seconds, and by whom."""
-
-    record: dict
-    exr: bytes | None
-    seconds: float
-    where: str
+    def made(self) -> dict:
+        """All that decides the bytes of its views, this version's choices included."""
+        tolerances = [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, self.settings().aim]
+        return asdict(self) | {"schema": 4, "tolerances": tolerances}
 
 
 def render_view(job: Job, view: int, again: int = 0) -> Done:
@@ -252,89 +242,6 @@ def _forget() -> None:
     _PLANS.clear()
 
 
-def file_name(view: int) -> str:
-    return f"views/{view:06d}.exr"
-
-
-# --- The folder ------------------------------------------------------------------------------------------------------
-
-
-class Folder:
-    """A set's folder: what is there already, and where finished views go."""
-
-    def __init__(self, path: Path, job: Job) -> None:
-        self.path, self.job = path, job
-        tolerances = [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, job.settings().aim]
-        stored = {"schema": 4, "tolerances": tolerances}
-        asked = json.dumps(asdict(job) | stored, sort_keys=True, indent=1) + "\n"
-        config = path / "set.json"
-        if config.is_file():
-            if config.read_text() != asked:
-                raise InputError(
-                    f"{path}: holds a set that was made with other options or another version; choose another --out"
-                )
-        else:
-            require(
-                not path.exists() or not any(path.iterdir()),
-                f"{path}: is not empty and holds no set; choose another --out",
-            )
-            (path / "views").mkdir(parents=True, exist_ok=True)
-            with whole_file(config) as beside:
-                beside.write_text(asked)
-        (path / "views").mkdir(exist_ok=True)
-        for left in (*path.glob(".*.part*"), *(path / "views").glob(".*.part*")):
-            left.unlink()  # of a run that was killed while it wrote
-        self.records = {r["view"]: r for r in self._known() if self._stands(r)}
-
-    def _known(self) -> Iterator[dict]:
-        for name in ("index.jsonl", "journal.jsonl"):
-            path = self.path / name
-            for line in path.read_text().splitlines() if path.is_file() else ():
-                try:
-                    record = json.loads(line)
-                except ValueError:
-                    continue  # a line that was cut when the process was killed
-                if isinstance(record, dict) and isinstance(record.get("view"), int):
-                    yield record
-
-    def _stands(self, record: dict) -> bool:
-        """Whether the view of a record is there in full; failed ones are tried again."""
-        path = self.path / str(record.get("file", ""))
-        return "failed" not in record and path.is_file() and path.stat().st_size == record.get("bytes")
-
-    def add(self, done: Done) -> None:
-        """The file first, then the line that vouches for it."""
-        view = done.record["view"]
-        if done.exr is not None:
-            with whole_file(self.path / file_name(view)) as beside:
-                beside.write_bytes(done.exr)
-        self.records[view] = done.record
-        self._append("journal.jsonl", done.record)
-        self._append("timings.jsonl", {"view": view, "seconds": round(done.seconds, 4), "where": done.where})
-
-    def _append(self, name: str, value: dict) -> None:
-        path = self.path / name
-        with path.open("ab+") as file:
-            if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
-                file.write(b"\n")  # after a line that was cut
-            file.write(json.dumps(value, sort_keys=True).encode() + b"\n")
-
-    def close(self) -> None:
-        """The index in the order of the views, then no journal."""
-        with whole_file(self.path / "index.jsonl") as beside:
-            lines = (json.dumps(self.records[view], sort_keys=True) + "\n" for view in sorted(self.records))
-            beside.write_text("".join(lines))
-        (self.path / "journal.jsonl").unlink(missing_ok=True)
-
-
-def read_index(folder: Path) -> list[dict]:
-    """The finished views of a set's folder in order, failed ones left out; InputError if there is no index."""
-    path = Path(folder) / "index.jsonl"
-    require(path.is_file(), f"{path}: no index; run `scene2spad dataset` to its end first")
-    records = [json.loads(line) for line in path.read_text().splitlines()]
-    return [record for record in records if "failed" not in record]
-
-
 # --- Running ---------------------------------------------------------------------------------------------------------
 
 
@@ -376,7 +283,7 @@ def make_set(
         count >= 1 and (size is None or count <= size), f"set {job.set}: count {count} is outside 1 to {size or 'any'}"
     )
     require(1 <= workers <= 256, f"workers {workers} is outside 1 to 256")
-    folder = Folder(out, job)
+    folder = Folder(out, job.made())
     todo = [view for view in range(count) if view not in folder.records]
     say = progress or (lambda what, share: None)
     start = time.perf_counter()

@@ -18,7 +18,8 @@ from render.transient import read_transient
 from scenes import InputError
 from studies import dataset
 from studies.cli import main
-from studies.dataset import Folder, Job, make_set, pack_set, read_index, render_view
+from studies.dataset import Job, make_set, pack_set, render_view
+from studies.set_folder import Folder, read_index
 
 # hard cases 0 to 7: walls at 0.05 to 500 m, quick to build and to render
 JOB = Job("hard-cases", width=12, height=9, bounces=1, grid=2)
@@ -71,7 +72,7 @@ def test_a_set_has_its_files_and_an_index_in_order(whole):
 def test_a_run_stopped_anywhere_and_resumed_gives_the_same_bytes(whole, tmp_path):
     """Stopped after some views, with a cut line in the journal, a stray half file and a missing one."""
     out = tmp_path / "set"
-    folder = Folder(out, CLI_JOB)
+    folder = Folder(out, CLI_JOB.made())
     for view in (5, 0, 3):
         folder.add(render_view(CLI_JOB, view))
     with (out / "journal.jsonl").open("a") as file:

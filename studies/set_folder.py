@@ -1,0 +1,107 @@
+"""The folder of a rendered scene set: what it holds, what may be added, and its index.
+
+set.json      what was asked for; a folder is continued only with the same
+grid.json     rays a pixel side for all views of an endless set, and the errors of some that say so
+views/*.exr   one transient a view, written beside and renamed, so that a file is whole or not there
+journal.jsonl one line a view as it ends, in whatever order; gone once the index is written
+index.jsonl   one line a view in the order of the views: scene, plan, error, depth statistics, or why it failed
+timings.jsonl seconds and places, kept out of the index so that two runs are the same byte for byte
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from scenes.errors import InputError, require
+from scenes.files import whole_file
+
+
+class Done(NamedTuple):
+    """A finished view: its record for the index, the bytes of its EXR (None: it failed), seconds, and by whom."""
+
+    record: dict
+    exr: bytes | None
+    seconds: float
+    where: str
+
+
+def file_name(view: int) -> str:
+    return f"views/{view:06d}.exr"
+
+
+class Folder:
+    """A set's folder: what is there already, and where finished views go. `made` is all that decides their bytes."""
+
+    def __init__(self, path: Path, made: dict) -> None:
+        self.path = path
+        asked = json.dumps(made, sort_keys=True, indent=1) + "\n"
+        config = path / "set.json"
+        if config.is_file():
+            if config.read_text() != asked:
+                raise InputError(
+                    f"{path}: holds a set that was made with other options or another version; choose another --out"
+                )
+        else:
+            require(
+                not path.exists() or not any(path.iterdir()),
+                f"{path}: is not empty and holds no set; choose another --out",
+            )
+            (path / "views").mkdir(parents=True, exist_ok=True)
+            with whole_file(config) as beside:
+                beside.write_text(asked)
+        (path / "views").mkdir(exist_ok=True)
+        for left in (*path.glob(".*.part*"), *(path / "views").glob(".*.part*")):
+            left.unlink()  # of a run that was killed while it wrote
+        self.records = {r["view"]: r for r in self._known() if self._stands(r)}
+
+    def _known(self) -> Iterator[dict]:
+        for name in ("index.jsonl", "journal.jsonl"):
+            path = self.path / name
+            for line in path.read_text().splitlines() if path.is_file() else ():
+                try:
+                    record = json.loads(line)
+                except ValueError:
+                    continue  # a line that was cut when the process was killed
+                if isinstance(record, dict) and isinstance(record.get("view"), int):
+                    yield record
+
+    def _stands(self, record: dict) -> bool:
+        """Whether the view of a record is there in full; failed ones are tried again."""
+        path = self.path / str(record.get("file", ""))
+        return "failed" not in record and path.is_file() and path.stat().st_size == record.get("bytes")
+
+    def add(self, done: Done) -> None:
+        """The file first, then the line that vouches for it."""
+        view = done.record["view"]
+        if done.exr is not None:
+            with whole_file(self.path / file_name(view)) as beside:
+                beside.write_bytes(done.exr)
+        self.records[view] = done.record
+        self._append("journal.jsonl", done.record)
+        self._append("timings.jsonl", {"view": view, "seconds": round(done.seconds, 4), "where": done.where})
+
+    def _append(self, name: str, value: dict) -> None:
+        path = self.path / name
+        with path.open("ab+") as file:
+            if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
+                file.write(b"\n")  # after a line that was cut
+            file.write(json.dumps(value, sort_keys=True).encode() + b"\n")
+
+    def close(self) -> None:
+        """The index in the order of the views, then no journal."""
+        with whole_file(self.path / "index.jsonl") as beside:
+            lines = (json.dumps(self.records[view], sort_keys=True) + "\n" for view in sorted(self.records))
+            beside.write_text("".join(lines))
+        (self.path / "journal.jsonl").unlink(missing_ok=True)
+
+
+def read_index(folder: Path) -> list[dict]:
+    """The finished views of a set's folder in order, failed ones left out; InputError if there is no index."""
+    path = Path(folder) / "index.jsonl"
+    require(path.is_file(), f"{path}: no index; run `scene2spad dataset` to its end first")
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    return [record for record in records if "failed" not in record]
