@@ -94,22 +94,26 @@ class Floor:
     def edges(self) -> tuple[np.ndarray, np.ndarray]:
         return self.outline, _onward(self.outline)
 
-    def holds(self, points: np.ndarray, slack: float = 1e-3) -> bool:
-        """Whether all points lie inside the outline (even-odd rule), or within `slack` of it."""
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """Whether each point (n, 2) lies inside the outline (even-odd rule)."""
         (ax, az), (bx, bz) = (corners.T for corners in self.edges)
         x, z = points[:, :1], points[:, 1:]
         crosses = (az > z) != (bz > z)
         with np.errstate(divide="ignore", invalid="ignore"):
             at = ax + (z - az) / (bz - az) * (bx - ax)
-        inside = (crosses & (x < at)).sum(axis=1) % 2 == 1
-        return all(self.distance(point) <= slack for point in points[~inside])
+        return (crosses & (x < at)).sum(axis=1) % 2 == 1
 
-    def distance(self, point: np.ndarray) -> float:
-        """From a point to the outline."""
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """From each point (n, 2) to the outline."""
         a, b = self.edges
-        along = b - a
-        t = np.clip(((point - a) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
-        return float(np.linalg.norm(a + t[:, None] * along - point, axis=1).min())
+        along, to = b - a, points[:, None] - a
+        t = np.clip((to * along).sum(axis=2) / (along**2).sum(axis=1), 0, 1)
+        return np.linalg.norm(t[..., None] * along - to, axis=2).min(axis=1)
+
+    def holds(self, points: np.ndarray, slack: float = 1e-3) -> bool:
+        """Whether all points lie inside the outline, or within `slack` of it."""
+        out = ~self.inside(points)
+        return not out.any() or bool((self.distances(points[out]) <= slack).all())
 
     def fits(self, place: Place) -> bool:
         """Inside, and clear of everything that stands at the same height."""
@@ -191,11 +195,19 @@ class Boxes:
         self.low, self.high = (np.array([getattr(place, end) for place in places]) for end in ("low", "high"))
         self.extent = np.array([place.extent for place in places]).reshape(-1, 4)
 
-    def beside(self, place: Place) -> np.ndarray:
-        """The numbers of those that share heights with a place, and ground by its bounds: at most these are in it."""
-        (x0, z0, x1, z1), (u0, w0, u1, w1) = place.extent, self.extent.T
-        meets = (x0 < u1) & (u0 < x1) & (z0 < w1) & (w0 < z1)
-        return np.flatnonzero(meets & (place.low < self.high) & (self.low < place.high))
+    def meet_head(self, points: np.ndarray, half: float, y: np.ndarray, over: float) -> np.ndarray:
+        """Whether anything that reaches half the height y is in the square column around each point (n, 2).
+
+        The column's sides are 2 `half` and along the axes; it goes from the floor to `over` above y.
+        """
+        (px, pz), (u0, w0, u1, w1) = points.T[..., None], self.extent.T
+        meets = (px - half < u1) & (px + half > u0) & (pz - half < w1) & (pz + half > w0)
+        meets &= (self.low < y[:, None] + over) & (self.high > 0.5 * y[:, None])
+        for axis in self.axes:
+            # the square's half width along this side of a box, in units of half the box
+            reach = half * np.abs(axis).sum(axis=1)
+            meets &= np.abs(((points[:, None] - self.centre) * axis).sum(axis=2)) < 1 + reach
+        return meets.any(axis=1)
 
     def distance(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Distance along unit rays (n, 3) to each box, (n, boxes), inf where it is missed: three slabs a box."""

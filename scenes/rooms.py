@@ -29,7 +29,7 @@ CANDIDATES, ATTEMPTS = 120, 8  # views of a room, rooms
 LEAST_BUSY = 0.3  # of a view, by upright boxes: what stands before the walls
 VIEWS_PER_ROOM = 4
 APART_M, APART_DEG = 0.5, 30.0  # any two cameras of a room, at least
-HEAD = np.array(((-1, -1), (1, -1), (1, 1), (-1, 1)))
+HEAD_M = 0.28  # half the side of the square that a head takes
 FLAT = ("window", "door", "picture", "clock", "radiator", "rug")  # an image should show more than these
 
 
@@ -301,34 +301,43 @@ def _candidates(rng: Random, floor: Floor, ceiling: float) -> list[Seen]:
     boxes = Boxes(floor.places)
     has_body = [bool(p.piece.surfaces) and not p.piece.surfaces[0].name.startswith(FLAT) for p in floor.places]
     standing = np.flatnonzero(has_body)
-    found = []
-    for _ in range(CANDIDATES):
-        x, z = rng.uniform(low + 0.3, high - 0.3)
-        y, heading = rng.uniform(0.9, 1.75), rng.uniform(0, 2 * np.pi)
-        pitch, roll, fov = math.radians(rng.normal(-17, 8)), rng.normal(0, 0.02), rng.uniform(*FOV_DEG)
-        point = np.array((x, z))
-        if not floor.holds(point[None], 0.0) or floor.distance(point) < 0.25 or _too_near(floor, boxes, point, y):
-            continue
-        ahead = np.array((math.cos(pitch) * math.sin(heading), math.sin(pitch), math.cos(pitch) * math.cos(heading)))
-        up = (roll * math.cos(heading), 1.0, -roll * math.sin(heading))
-        origin = np.array((x, y, z))
-        camera = Camera.look_at(origin, origin + ahead, fov_deg=fov, width=16, height=12, up=up)
+    heads = np.array([_head(rng, low + 0.3, high - 0.3) for _ in range(CANDIDATES)])
+    points, y = heads[:, :2], heads[:, 2]
+    roomy = floor.inside(points) & (floor.distances(points) >= 0.25)
+    heads = heads[roomy & ~boxes.meet_head(points, HEAD_M, y, 0.2)]
+    cameras, distances, busy = [], [], []
+    for head in heads:
+        camera = _camera(*head)
         rays = camera.rays().reshape(-1, 3)
-        to_walls, to_boxes = to_shell(floor, ceiling, origin, rays), boxes.distance(origin, rays)
+        to_walls = to_shell(floor, ceiling, camera.origin, rays)
+        if to_walls.min() < NEAREST_M:
+            continue
+        to_boxes = boxes.distance(camera.origin, rays)
         distance = np.minimum(to_walls, to_boxes.min(axis=1, initial=np.inf))
-        if distance.min() < NEAREST_M or np.quantile(distance, 0.99) > FARTHEST_M:
-            continue
-        busy = float((to_boxes[:, standing].min(axis=1, initial=np.inf) < to_walls - 0.1).mean())
-        if busy < LEAST_BUSY:
-            continue
-        found.append(Seen(camera, np.quantile(distance, (0.05, 0.5, 0.95)), max(0.0, 0.6 - busy)))
-    return found
+        if distance.min() >= NEAREST_M:
+            cameras.append(camera)
+            distances.append(distance)
+            busy.append((to_boxes[:, standing].min(axis=1, initial=np.inf) < to_walls - 0.1).mean())
+    if not cameras:
+        return []
+    *quantiles, farthest = np.quantile(distances, (0.05, 0.5, 0.95, 0.99), axis=1)
+    good = (farthest <= FARTHEST_M) & (np.array(busy) >= LEAST_BUSY)
+    bare = np.maximum(0.0, 0.6 - np.array(busy))
+    return [Seen(cameras[i], np.array(quantiles)[:, i], float(bare[i])) for i in np.flatnonzero(good)]
 
 
-def _too_near(floor: Floor, boxes: Boxes, point: np.ndarray, y: float) -> bool:
-    """Whether a head there would be in or right beside something."""
-    head = Place(Piece(()), (0.0, 0.0, 0.0), 0.0, point + 0.28 * HEAD, 0.0, y + 0.2)
-    return any(boxes.high[i] > 0.5 * y and overlap(head.plan, floor.places[i].plan) for i in boxes.beside(head))
+def _head(rng: Random, low: np.ndarray, high: np.ndarray) -> tuple[float, ...]:
+    """Where a person might look from and how: x, z, y, heading, pitch, roll [rad] and field of view [deg]."""
+    x, z = rng.uniform(low, high)
+    y, heading = rng.uniform(0.9, 1.75), rng.uniform(0, 2 * np.pi)
+    return x, z, y, heading, math.radians(rng.normal(-17, 8)), rng.normal(0, 0.02), rng.uniform(*FOV_DEG)
+
+
+def _camera(x: float, z: float, y: float, heading: float, pitch: float, roll: float, fov: float) -> Camera:
+    ahead = np.array((math.cos(pitch) * math.sin(heading), math.sin(pitch), math.cos(pitch) * math.cos(heading)))
+    up = (roll * math.cos(heading), 1.0, -roll * math.sin(heading))
+    origin = np.array((x, y, z))
+    return Camera.look_at(origin, origin + ahead, fov_deg=fov, width=16, height=12, up=up)
 
 
 def pieces(scene: Scene) -> set[str]:
