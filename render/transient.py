@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -166,9 +165,11 @@ def _ragged(values: np.ndarray, transient: Transient) -> np.ndarray:
     if values.dtype == np.uint8:
         values = values.astype(np.uint32)
     cells = np.empty(transient.height * transient.width, dtype=object)
-    for pixel, (start, end) in enumerate(pairwise(transient.offsets.tolist())):
-        if start < end:
-            cells[pixel] = values[start:end]
+    counts = np.diff(transient.offsets)
+    for count in np.unique(counts[counts > 0]):
+        pixels = np.flatnonzero(counts == count)
+        rows = values[transient.offsets[pixels, None] + np.arange(count)]
+        cells[pixels] = np.fromiter(rows, dtype=object, count=len(pixels))
     if cells[0] is None:
         cells[0] = values[:0]  # OpenEXR needs one array to learn the type from, also where no pixel has a return
     return cells.reshape(transient.height, transient.width)

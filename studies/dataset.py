@@ -45,6 +45,7 @@ DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 AIM, INDIRECT_AIM = 0.95, 1.5
 PLANNED_PLACES = 8  # that tell the grid of an endless set
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
+MEMORY = Path("/dev/shm")  # where Linux keeps files in memory: a view is written and read back there
 # of the last place
 _WORLDS: dict[tuple, World] = {}
 _PLANS: dict[tuple[Job, str], Plan] = {}
@@ -175,7 +176,9 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         transient = transient.delayed(job.offset_m)
     require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
     transient = rounded(thinned(transient, job.merging * THINNED))
-    with tempfile.TemporaryDirectory(prefix="scene2spad-") as folder:
+    with tempfile.TemporaryDirectory(
+        prefix="scene2spad-", dir=MEMORY if os.access(MEMORY, os.W_OK) else None
+    ) as folder:
         path = Path(folder) / "view.exr"
         write_transient(transient, path)
         exr = path.read_bytes()
