@@ -41,10 +41,6 @@ class Cells(NamedTuple):
     radiance: Any
     flags: Any
 
-    def at(self, index: Any, active: Any) -> Cells:
-        """Those of other cells; of nothing where not `active`."""
-        return Cells(*(dr.gather(type(column), column, index, active) for column in self))
-
 
 class Place(NamedTuple):
     """Where cells lie: level, column and row in cells of that level, and the rank of their pixel, (N,) each."""
@@ -74,7 +70,7 @@ def first_edges(
     `width` is the image's where the pixels are its whole rows; 0: neighbours in other pixels are not met. CUT is set
     where an edge could change radiance times a pixel's area by `least` or more, or where the cell is large.
 
-    `spans` are path centres, half widths and smaller half spans [m]. Small cells are spread between their neighbours on
+    `spans` are path centres, half widths and smaller half spans [m], all columns `aligned`. Small cells are spread between their neighbours on
     the same surface instead of on the tangent plane. Along each axis p = p_0 + s x + c x^2 / 2 and r = r_0 + g x, with
     s, g the mean of the steps to both neighbours (the one step where the other neighbour lies across an edge) and c
     their difference. Then the half span is |s| / 2 (c adds c^2 / 720 to the variance), and the mean path
@@ -84,7 +80,7 @@ def first_edges(
     """
     if len(cells.flags) < 2:  # arrays of one entry are scalars to Dr.Jit: another kernel
         return np.where(cells.flags & LARGE, np.uint32(CUT), np.uint32(0)), *spans
-    columns = *_uploaded(cells), *(upload(Float, column) for column in spans)
+    columns = *_seen(cells), *(Float(column) for column in spans)
     lane = dr.arange(UInt32, len(cells.flags))
     dr.eval(lane)
     numbers = (dr.opaque(UInt32, value) for value in (grid, width, len(cells.flags) // grid**2))
@@ -94,24 +90,30 @@ def first_edges(
     return tuple(values.numpy() for values in found)
 
 
-def pair_edges(one: tuple[Place, Cells], other: tuple[Place, Cells], grid: int, least: float) -> Any:
-    """Compare pairs of cells of any size, side by side: CUT and MIXED bits of each pair, (P,) uint32."""
-    number = len(one[0].level)
+def pair_edges(places: Place, cells: Cells, one: np.ndarray, other: np.ndarray, grid: int, least: float) -> np.ndarray:
+    """Compare pairs of cells of any size, side by side: CUT and MIXED bits of each pair, (P,) uint32.
+
+    `one` and `other` number the pairs' cells in `places` (int32) and `cells`, whose columns are `aligned`.
+    """
+    number = len(one)
     if number == 0:
         return np.empty(0, np.uint32)
     if number == 1:  # arrays of one entry are scalars to Dr.Jit: another kernel
-        one, other = (tuple(type(part)(*(np.repeat(c, 2) for c in part)) for part in cell) for cell in (one, other))
-    columns = []
-    for place, cells in (one, other):
-        columns += [*(upload(UInt32, column) for column in place), *_uploaded(cells)]
-    numbers = dr.opaque(UInt32, grid), dr.opaque(Float, float(least))
-    found = _pair_edges(*columns, *numbers)
+        one, other = np.repeat(one, 2), np.repeat(other, 2)
+    columns = (
+        *(UInt32(column.view(np.uint32)) for column in places),
+        *_seen(cells),
+        upload(UInt32, one),
+        upload(UInt32, other),
+    )
+    found = _pair_edges(*columns, dr.opaque(UInt32, grid), dr.opaque(Float, float(least)))
     dr.eval(found)
     return found.numpy()[:number]
 
 
-def _uploaded(cells: Cells) -> tuple[Any, ...]:
-    return *(upload(Float, column) for column in cells[:-1]), upload(UInt32, cells.flags)
+def _seen(cells: Cells) -> tuple[Any, ...]:
+    """The same memory, as Dr.Jit sees it."""
+    return *(Float(column) for column in cells[:-1]), UInt32(cells.flags)
 
 
 @_recorded
@@ -142,7 +144,7 @@ def _first_edges(*columns: Any) -> tuple[Any, ...]:
         for (inside, across, near, far), way in zip(sides[2 * axis : 2 * axis + 2], (1, -1), strict=True):
             there = inside | across
             index = dr.select(inside, near, far)
-            other = cells.at(index, there)
+            other = _at(cells, index, there)
             step = way * (other.distance_m - cells.distance_m)
             between = _between(cells, other, step, slope, other[1 + axis] * pitch)
             brighter = dr.maximum(cells.radiance, other.radiance) * pitch * pitch
@@ -174,8 +176,8 @@ def _first_edges(*columns: Any) -> tuple[Any, ...]:
 
 @_recorded
 def _pair_edges(*columns: Any) -> Any:
-    (begin, first), (end, second) = ((Place(*columns[i : i + 4]), Cells(*columns[i + 4 : i + 10])) for i in (0, 10))
-    grid, least = columns[20:]
+    places, cells, (one, other, grid, least) = Place(*columns[:4]), Cells(*columns[4:10]), columns[10:]
+    (begin, first), (end, second) = ((_at(places, index), _at(cells, index)) for index in (one, other))
     # half a cell's width, in the unit of the finer cell of the pair's half width; columns and rows at that unit
     finer = dr.maximum(begin.level, end.level)
     unit = 0.5 / Float(grid << finer)
@@ -190,6 +192,11 @@ def _pair_edges(*columns: Any) -> Any:
     cut = between.differ & (energy * between.contrast >= least)
     mixed = between.differ & between.apart & (begin.rank == end.rank)
     return dr.select(cut, CUT, UInt32(0)) | dr.select(mixed, MIXED, UInt32(0))
+
+
+def _at(columns: Any, index: Any, active: bool | Any = True) -> Any:
+    """Those of other cells; of nothing where not `active`."""
+    return type(columns)(*(dr.gather(type(column), column, index, active) for column in columns))
 
 
 def _between(one: Cells, other: Cells, step: Any, rise: Any, other_rise: Any) -> _Between:

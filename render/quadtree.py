@@ -6,7 +6,7 @@ import numpy as np
 
 from render.edges import CUT, MIXED, Cells, Place, first_edges, pair_edges
 from render.footprint import CLIPPED, LARGE, Footprints, trace
-from render.world import World
+from render.world import World, aligned
 
 # Refinement ends at this many cells a side of a pixel, however fine the grid it started from.
 MOST_CELLS = 64
@@ -17,7 +17,7 @@ MOST_LAUNCHES = 256
 LAST_SHARE = 1 / 32
 
 _NAMES = ("rank", "column", "row", "level", "child", *Footprints._fields)
-_TYPES = (np.int32, np.int32, np.int32, np.uint8, np.int32, *(np.float32,) * 8, np.uint32)
+_TYPES = (*(np.int32,) * 5, *(np.float32,) * 8, np.uint32)
 # a cut cell's children: (0, 0), (1, 0), (0, 1), (1, 1) in (column, row)
 _CHILD_COLUMN, _CHILD_ROW = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
 # per side of a cut cell: the way to the neighbour, the children on that side, and the neighbour's children facing them
@@ -75,7 +75,7 @@ class CellTree:
         pixel_row, pixel_column = np.divmod(pixels.astype(np.int32), self.width)
         column = (pixel_column[:, None] * grid + cell_column).ravel()
         row = (pixel_row[:, None] * grid + cell_row).ravel()
-        self._add(np.repeat(np.arange(len(pixels), dtype=np.int32), grid * grid), column, row, np.uint8(0))
+        self._add(np.repeat(np.arange(len(pixels), dtype=np.int32), grid * grid), column, row, 0)
 
     def refine(self, levels: int, least_share: float) -> np.ndarray:
         """Cut cells until none needs it or is `levels` deep; whether a cell of each pixel was, (pixels,) bool.
@@ -109,14 +109,14 @@ class CellTree:
 
     def pitch(self, index: np.ndarray | slice) -> np.ndarray:
         """Width of cells in pixels, float32."""
-        return np.ldexp(np.float32(1 / self.grid), -self.level[index].astype(np.int32))
+        return np.ldexp(np.float32(1 / self.grid), -self.level[index])
 
     def _trace(self, index: np.ndarray | slice, *, clip: bool = False) -> Footprints:
         column, row, level = self.column[index], self.row[index], self.level[index]
         self.rays += len(column)
         return trace(self.world, column, row, level, self.grid, clip=clip)
 
-    def _add(self, rank: np.ndarray, column: np.ndarray, row: np.ndarray, level: np.ndarray | np.uint8) -> slice:
+    def _add(self, rank: np.ndarray, column: np.ndarray, row: np.ndarray, level: np.ndarray | int) -> slice:
         """Trace new cells and append them."""
         new = slice(self.used, self.used + len(rank))
         if new.stop > len(self.rank):
@@ -130,7 +130,7 @@ class CellTree:
     def _reserve(self, cells: int) -> None:
         """Make room for so many cells."""
         for name, dtype in zip(_NAMES, _TYPES, strict=True):
-            old, grown = getattr(self, name), np.empty(cells, dtype)
+            old, grown = getattr(self, name), aligned(cells, dtype)
             grown[: self.used] = old[: self.used]
             setattr(self, name, grown)
 
@@ -154,7 +154,7 @@ class CellTree:
             np.repeat(self.rank[parents], 4),
             (2 * self.column[parents, None] + _CHILD_COLUMN).ravel(),
             (2 * self.row[parents, None] + _CHILD_ROW).ravel(),
-            np.repeat(self.level[parents] + np.uint8(1), 4),
+            np.repeat(self.level[parents] + 1, 4),
         )
         cut = np.zeros(self.used, bool)
         cut[new] = (self.flags[new] & LARGE) != 0
@@ -172,7 +172,7 @@ class CellTree:
 
         Two cells cut in this pass, side by side, are met once.
         """
-        level, column, row = self.level[parents].astype(np.int32), self.column[parents], self.row[parents]
+        level, column, row = self.level[parents], self.column[parents], self.row[parents]
         one, other = [], []
         for way_x, way_y, near_side, far_side in _SIDES:
             beside = self._find(level, column + way_x, row + way_y)
@@ -202,13 +202,7 @@ class CellTree:
 
     def _worth_cutting(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Which pairs of cells an edge runs between that is worth cutting; marks the `mixed` pixels among them."""
-        pair = [
-            (
-                Place(*(getattr(self, name).take(cells) for name in Place._fields)),
-                Cells(*(getattr(self, name).take(cells) for name in Cells._fields)),
-            )
-            for cells in (one, other)
-        ]
-        bits = pair_edges(*pair, self.grid, self.least)
+        places, cells = (kind(*(getattr(self, name) for name in kind._fields)) for kind in (Place, Cells))
+        bits = pair_edges(places, cells, one, other, self.grid, self.least)
         self.mixed[self.rank[one[np.flatnonzero(bits & MIXED)]]] = True
         return np.flatnonzero(bits & CUT)

@@ -136,18 +136,26 @@ class Recordings:
         return self.calls[key](world.arrays(), *arguments)
 
 
-def upload(kind: type, values: np.ndarray) -> Any:
-    """Values as a flat Dr.Jit array of `kind` (Float, UInt32, Bool) in memory aligned to 64 bytes.
+_NUMPY = {Float: np.float32, UInt32: np.uint32, Bool: np.bool_, mi.Int32: np.int32}
 
-    Dr.Jit uses a numpy array's own memory, and compiles one kernel for aligned and another for unaligned input.
+
+def upload(kind: type, values: np.ndarray) -> Any:
+    """Values as a flat Dr.Jit array of `kind` (Float, UInt32, Bool), copied to aligned memory."""
+    memory = aligned(np.size(values), _NUMPY[kind])
+    memory[:] = np.ravel(values)
+    return kind(memory)
+
+
+def aligned(size: int, dtype: type) -> np.ndarray:
+    """An empty flat array in memory aligned to 64 bytes.
+
+    On the CPU Dr.Jit uses a numpy array's own memory, and compiles one kernel for aligned and another for unaligned
+    input.
     """
-    dtype = np.dtype({Float: np.float32, UInt32: np.uint32, Bool: np.bool_, mi.Int32: np.int32}[kind])
-    size = np.size(values)
-    memory = np.empty(size * dtype.itemsize + ALIGNMENT, np.uint8)
+    count = size * np.dtype(dtype).itemsize
+    memory = np.empty(count + ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % ALIGNMENT
-    aligned = memory[start : start + size * dtype.itemsize].view(dtype)
-    aligned[:] = np.ravel(values)
-    return kind(aligned)
+    return memory[start : start + count].view(dtype)
 
 
 def _opaque(vector: np.ndarray) -> Any:

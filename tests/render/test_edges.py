@@ -127,8 +127,10 @@ def test_pairs_of_cells_of_any_size_are_compared(count: int) -> None:
         Place(levels[0], column, row, ranks[0]),
         Place(levels[1], right, (row << levels[1]) >> levels[0], ranks[1]),
     ]
-    bits = pair_edges((places[0], one), (places[1], other), GRID, LEAST)
     both = Cells(*(np.concatenate(column) for column in zip(one, other, strict=True)))
+    where = Place(*(np.concatenate(column).astype(np.int32) for column in zip(*places, strict=True)))
+    first = np.arange(count)
+    bits = pair_edges(where, both, first, count + first, GRID, LEAST)
     for i in range(count):
         widths = 1 / (GRID * 2.0 ** levels[:, i])
         centres = [((p.column[i] + 0.5) * w, (p.row[i] + 0.5) * w) for p, w in zip(places, widths, strict=True)]
@@ -143,7 +145,7 @@ def test_pairs_of_cells_of_any_size_are_compared(count: int) -> None:
 def test_nothing_to_compare() -> None:
     none = Cells(*(np.empty(0, np.float32),) * 5, np.empty(0, np.uint32))
     nowhere = Place(*(np.empty(0, np.int32),) * 4)
-    assert pair_edges((nowhere, none), (nowhere, none), 2, 0.1).size == 0
+    assert pair_edges(nowhere, none, np.arange(0), np.arange(0), 2, 0.1).size == 0
     alone = cells_of(1, 1)
     assert first_edges(alone, [np.ones(1, np.float32)] * 3, 1, 1, 0.1)[0].tolist() == [
         CUT * bool(alone.flags[0] & LARGE)
