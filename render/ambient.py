@@ -12,15 +12,15 @@ import numpy as np
 
 from render.direct import Layers
 from render.rays import MAX_LAYERS, camera_rays, shape_index, spawn
-from render.world import OPACITY, Bool, Float, UInt32, World, dr, mi
+from render.world import OPACITY, Bool, Float, UInt32, World, dr, mi, recorded, upload
 from scenes.model import Camera
 
 MOST_LANES = 1 << 18  # paths of one launch, where an image is not larger by itself
 CERTAIN = 3  # surfaces that every path may meet; from then on it goes on with the probability of its weight
 MOST_LIKELY = 0.95
 # Pixels share reflected light: a Gaussian of so many pixels, ended at that radius, of points that lie within a share of
-# the distance of the tangent plane, weighted by this power of the cosine between normals.
-SHARED_SIGMA, SHARED_RADIUS, SHARED_PLANE, SHARED_NORMAL = 2.0, 4, 0.02, 16
+# the distance of the tangent plane, weighted by the cosine between normals to this power of 2.
+SHARED_SIGMA, SHARED_RADIUS, SHARED_PLANE, SHARED_NORMAL_DOUBLED = 2.0, 4, 0.02, 4
 
 
 class AmbientLight(NamedTuple):
@@ -73,39 +73,64 @@ def ambient_light(world: World, spp: int, bounces: int, seed: int, shared_by: La
 def shared(light: np.ndarray, layers: Layers, camera: Camera) -> np.ndarray:
     """Reflected light (..., H, W) whose irradiance neighbouring pixels of one surface share: a joint bilateral filter.
 
-    L_i = a_i sum_j w_ij L_j / sum_j w_ij a_j, with the albedos a and w_ij = exp(-|ij|^2 / 2 sigma^2) (n_i . n_j)^k
+    L_i = a_i sum_j w_ij L_j / sum_j w_ij a_j, with the albedos a and w_ij = exp(-|ij|^2 / 2 sigma^2) (n_i . n_j)^16
     exp(-(n_i . (x_i - x_j) / (share of d_i))^2). Light on surfaces of even irradiance is kept whatever their albedo;
     edges of shadows and glossy reflections are blurred over some SHARED_SIGMA pixels. Where nothing is hit, or the
     albedo is 0, light stays what it is.
     """
-    radius, (height, width) = SHARED_RADIUS, layers.depth_m.shape
     there = np.isfinite(layers.depth_m) & (layers.albedo > 0)
-    depth = np.where(there, layers.depth_m, 0).astype(np.float32)
-    point = np.moveaxis(camera.rays().astype(np.float32) * depth[..., None], -1, 0)
-    normal = np.moveaxis(layers.normal.astype(np.float32), -1, 0)
-    albedo = np.where(there, layers.albedo, 0).astype(np.float32)
-    fields = (np.where(there, light, 0), point, normal, albedo, there)
-    pads = (((0, 0),) * (field.ndim - 2) + ((radius, radius),) * 2 for field in fields)
-    light_of, point_of, normal_of, albedo_of, there_of = map(np.pad, fields, pads)
-    total, albedos = np.zeros(light.shape), np.zeros((height, width))
-    per_reach = 1 / (SHARED_PLANE * np.where(there, depth, 1))
-    plane = _dot(point, normal)
-    for row, column in np.ndindex(2 * radius + 1, 2 * radius + 1):
-        away2 = (row - radius) ** 2 + (column - radius) ** 2
-        if away2 > radius**2:
-            continue
-        beside = ..., slice(row, row + height), slice(column, column + width)
-        off = (_dot(point_of[beside], normal) - plane) * per_reach
-        alike = np.maximum(_dot(normal_of[beside], normal), 0) ** SHARED_NORMAL
-        weight = np.exp(-away2 / (2 * SHARED_SIGMA**2) - off * off) * alike * there_of[beside]
-        total += weight * light_of[beside]
-        albedos += weight * albedo_of[beside]
-    return np.where(there, total * albedo / np.where(albedos > 0, albedos, 1), light)
+    depth = np.where(there, layers.depth_m, 0)
+    albedo = np.where(there, layers.albedo, 0)
+    point = np.moveaxis(camera.rays() * depth[..., None], -1, 0)
+    normal = np.moveaxis(layers.normal, -1, 0)
+    columns = [upload(Float, column) for column in (albedo, depth, *point, *normal)]
+    lights = [upload(Float, part) for part in light.reshape(-1, there.size)]
+    pixel = dr.arange(UInt32, there.size)
+    dr.eval(pixel)
+    found = _shared(pixel, columns, lights, *(dr.opaque(UInt32, side) for side in (camera.width, camera.height)))
+    dr.eval(found)
+    return np.stack([part.numpy() for part in found]).reshape(light.shape).astype(np.float64)
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of vectors along the first axis."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+@recorded
+def _shared(pixel: Any, columns: list, lights: list, width: Any, height: Any) -> list:
+    """`shared` of each pixel; what has an albedo is hit."""
+    albedo = columns[0]
+    albedos, *totals = _sums(pixel, columns, lights, width, height)
+    share = albedo / dr.select(albedos > 0, albedos, 1)
+    return [dr.select(albedo > 0, total * share, own) for total, own in zip(totals, lights, strict=True)]
+
+
+@dr.syntax
+def _sums(pixel: Any, columns: list, lights: list, width: Any, height: Any) -> list:
+    """Weighted sums over each pixel's neighbours of the albedo and of all lights."""
+    side, tap = 2 * SHARED_RADIUS + 1, dr.zeros(UInt32, dr.width(pixel))
+    sums = [dr.zeros(Float, dr.width(pixel)) for _ in range(1 + len(lights))]
+    while tap < side * side:
+        right, down = mi.Int32(tap % side) - SHARED_RADIUS, mi.Int32(tap // side) - SHARED_RADIUS
+        sums = _with_neighbour(sums, pixel, columns, lights, (right, down), (mi.Int32(width), mi.Int32(height)))
+        tap += 1
+    return sums
+
+
+def _with_neighbour(sums: list, pixel: Any, columns: list, lights: list, way: tuple, size: tuple) -> list:
+    """The sums with what the pixel that way adds."""
+    albedo, depth, point, normal = columns[0], columns[1], mi.Vector3f(*columns[2:5]), mi.Vector3f(*columns[5:])
+    (right, down), (width, height) = way, size
+    column, row = mi.Int32(pixel) % width + right, mi.Int32(pixel) // width + down
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    away2 = right * right + down * down
+    inside &= away2 <= SHARED_RADIUS**2
+    other = UInt32(row * width + column)
+    its_albedo, _, *its = (dr.gather(Float, values, other, inside) for values in columns)
+    off = dr.dot(mi.Vector3f(*its[:3]) - point, normal) / (SHARED_PLANE * dr.select(albedo > 0, depth, 1))
+    alike = dr.maximum(dr.dot(mi.Vector3f(*its[3:]), normal), 0)
+    for _ in range(SHARED_NORMAL_DOUBLED):
+        alike *= alike
+    weight = dr.exp(-Float(away2) / (2 * SHARED_SIGMA**2) - off * off) * alike
+    weight = dr.select(inside & (its_albedo > 0), weight, 0)
+    its_lights = (dr.gather(Float, values, other, inside) for values in lights)
+    return [total + weight * more for total, more in zip(sums, (its_albedo, *its_lights), strict=True)]
 
 
 def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> tuple[Any, Any]:

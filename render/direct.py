@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -174,18 +174,19 @@ def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, share: 
 
 def centre_layers(world: World) -> Layers:
     """Depth, normal and albedo at every pixel centre, (H, W)."""
-    camera = world.scene.camera
-    pixel = dr.arange(UInt32, camera.height * camera.width)
+    shape = (world.scene.camera.height, world.scene.camera.width)
+    pixel = dr.arange(UInt32, shape[0] * shape[1])
+    dr.eval(pixel)
+    found = world.recordings.call(world, "centre layers", _centres, pixel)
+    dr.eval(found)
+    depth, x, y, z, reflectance = (values.numpy().reshape(shape) for values in found)
+    normal = np.stack((x, y, z), axis=-1)
+    return Layers(depth.copy(), normal.astype(np.float16), reflectance.astype(np.float16))
+
+
+def _centres(world: World, pixel: Any) -> tuple[Any, ...]:
     ray, _ = camera_rays(world, Float(pixel % world.width) + 0.5, Float(pixel // world.width) + 0.5)
     si, _, _, distance = first_opaque(world, ray, Bool(True))
     hit = si.is_valid()
-    normal = si.n * dr.select(hit, dr.select(dr.dot(si.n, ray.d) > 0, -1, 1), 0)
-    depth = dr.select(hit, distance, dr.nan)
-    reflectance = albedo(world, si, hit)
-    dr.eval(depth, normal, reflectance)
-    shape = (camera.height, camera.width)
-    return Layers(
-        np.array(depth, dtype=np.float32).reshape(shape),
-        np.array(normal, dtype=np.float32).T.reshape(*shape, 3).astype(np.float16),
-        np.array(reflectance, dtype=np.float32).reshape(shape).astype(np.float16),
-    )
+    normal = si.n * dr.select(hit, dr.select(dr.dot(si.n, ray.d) > 0, Float(-1), Float(1)), 0)
+    return dr.select(hit, distance, dr.nan), *normal, albedo(world, si, hit)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from render.footprint import HIT, LARGE, LIT
-from render.world import Bool, Float, UInt32, dr, mi, upload
+from render.world import Bool, Float, UInt32, dr, mi, recorded, upload
 
 # Two neighbours lie on one surface if their planes explain the step between their distances up to this [m]: a sixth of
 # the reference sensor's bin. A crease lies between them if their planes differ by more than CREASE_M over the step, or
@@ -26,9 +25,6 @@ MIXED_GAP_M = 0.05
 FOLLOWED = 3e-4
 
 CUT, MIXED = 1, 2
-
-# What Python and Dr.Jit need to trace a launch takes longer than its cells. Neither depends on a world.
-_recorded = partial(dr.freeze, warn_after=1000)
 
 
 class Cells(NamedTuple):
@@ -70,13 +66,13 @@ def first_edges(
     `width` is the image's where the pixels are its whole rows; 0: neighbours in other pixels are not met. CUT is set
     where an edge could change radiance times a pixel's area by `least` or more, or where the cell is large.
 
-    `spans` are path centres, half widths and smaller half spans [m], all columns `aligned`. Small cells are spread between their neighbours on
-    the same surface instead of on the tangent plane. Along each axis p = p_0 + s x + c x^2 / 2 and r = r_0 + g x, with
-    s, g the mean of the steps to both neighbours (the one step where the other neighbour lies across an edge) and c
-    their difference. Then the half span is |s| / 2 (c adds c^2 / 720 to the variance), and the mean path
-    p_0 + c / 24 + g s / (12 r_0), summed over the axes: second order in the cell's width where the tangent plane is
-    first, and blind to facets of a curved surface. At a crease the tangent plane agrees with one of the steps instead
-    of their mean, and is kept.
+    `spans` are path centres, half widths and smaller half spans [m]; all columns are `aligned`. Small cells are spread
+    between their neighbours on the same surface instead of on the tangent plane. Along each axis
+    p = p_0 + s x + c x^2 / 2 and r = r_0 + g x, with s, g the mean of the steps to both neighbours (the one step where
+    the other neighbour lies across an edge) and c their difference. Then the half span is |s| / 2 (c adds c^2 / 720 to
+    the variance), and the mean path p_0 + c / 24 + g s / (12 r_0), summed over the axes: second order in the cell's
+    width where the tangent plane is first, and blind to facets of a curved surface. At a crease the tangent plane
+    agrees with one of the steps instead of their mean, and is kept.
     """
     if len(cells.flags) < 2:  # arrays of one entry are scalars to Dr.Jit: another kernel
         return np.where(cells.flags & LARGE, np.uint32(CUT), np.uint32(0)), *spans
@@ -116,7 +112,7 @@ def _seen(cells: Cells) -> tuple[Any, ...]:
     return *(Float(column) for column in cells[:-1]), UInt32(cells.flags)
 
 
-@_recorded
+@recorded
 def _first_edges(*columns: Any) -> tuple[Any, ...]:
     cells, (path, half, minor, lane, grid, width, pixels, least) = Cells(*columns[:6]), columns[6:]
     per_pixel = grid * grid
@@ -174,7 +170,7 @@ def _first_edges(*columns: Any) -> tuple[Any, ...]:
     )
 
 
-@_recorded
+@recorded
 def _pair_edges(*columns: Any) -> Any:
     places, cells, (one, other, grid, least) = Place(*columns[:4]), Cells(*columns[4:10]), columns[10:]
     (begin, first), (end, second) = ((_at(places, index), _at(cells, index)) for index in (one, other))

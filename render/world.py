@@ -7,6 +7,7 @@ import math
 import weakref
 from collections.abc import Callable, Hashable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,10 @@ class World:
         return self.has_glass or self.has_cutouts
 
 
+# What does not depend on a world is recorded once for all; see `Recordings`.
+recorded = partial(dr.freeze, warn_after=1000)
+
+
 class Recordings:
     """Kernels of a world that were traced once and are replayed (`recorded`); `world` is the one that asks."""
 
@@ -129,9 +134,7 @@ class Recordings:
         if key not in self.calls:
             # weakly: a world held by its own recording would stay among the scenes that Dr.Jit compiles calls for
             owner = weakref.ref(self)
-            self.calls[key] = dr.freeze(
-                lambda arrays, *given: work(owner().world().with_arrays(arrays), *given), warn_after=1000
-            )
+            self.calls[key] = recorded(lambda arrays, *given: work(owner().world().with_arrays(arrays), *given))
         self.world = weakref.ref(world)
         return self.calls[key](world.arrays(), *arguments)
 
