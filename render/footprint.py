@@ -50,13 +50,22 @@ def trace(world: World, column: np.ndarray, row: np.ndarray, level: np.ndarray, 
     if len(column) == 0:
         return Footprints(*(np.empty(0, np.float32) for _ in range(8)), np.empty(0, np.uint32))
     packed = row.astype(np.uint32) | level.astype(np.uint32) << LEVEL_BIT
-    if len(column) == 1:  # arrays of one entry are scalars to Dr.Jit: another kernel
-        alone = trace(world, np.repeat(column, 2), np.repeat(row, 2), np.repeat(level, 2), grid, clip=clip)
-        return Footprints(*(values[:1] for values in alone))
-    columns = upload(UInt32, column), upload(UInt32, packed), dr.opaque(UInt32, grid)
-    found = world.recordings.call(world, ("footprints", clip), partial(_footprints, clip=clip), *columns)
+    count, lanes = len(column), _lanes(len(column))
+    columns = [upload(UInt32, np.pad(values, (0, lanes - count), mode="edge")) for values in (column, packed)]
+    work = partial(_footprints, clip=clip)
+    found = world.recordings.call(world, ("footprints", clip), work, *columns, dr.opaque(UInt32, grid))
     dr.eval(found)
-    return Footprints(*(values.numpy() for values in found))
+    return Footprints(*(values.numpy()[:count] for values in found))
+
+
+def _lanes(count: int) -> int:
+    """The next number that neither 2 nor 3 divides, from 5 on.
+
+    Dr.Jit records anew where two inputs have one size that had not before. Coordinates of meshes and their textures
+    come in twos and threes; and arrays of one entry are scalars to it.
+    """
+    lanes = max(count, 5)
+    return next(more for more in range(lanes, lanes + 4) if more % 2 and more % 3)
 
 
 def _footprints(world: World, column: Any, packed: Any, grid: Any, *, clip: bool) -> tuple:

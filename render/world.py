@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
 ALIGNMENT = 64  # bytes
 OPACITY = "opacity"
 FACE_ALBEDO = "face_albedo"
-PALETTE = 64  # albedos in one row of a plastic mesh: its size is part of the kernel
+RAMP_FROM, RAMP = 0.25, 0.5  # u of albedo 0 in `_ramp`, and how much more albedo 1 has
 
 
 class World:
@@ -35,10 +35,19 @@ class World:
     meshes decides which kernels are compiled, so scenes of a set with the same kinds of material share their kernels.
     `groups[i]` are the surfaces of mesh i, `shape_ids[i]` its registered index; `solid_indices` those of solid glass.
     Tables per registered shape: index of refraction of solid and thin glass (0: none), albedo of conductors (-1: none).
+    `plastics` are its plain coated materials, which the next world of a set may be given: their tables take longer than
+    all its other parts.
     Not a dataclass: Dr.Jit would take its fields for variables of every loop that mentions it.
     """
 
-    def __init__(self, scene: Scene, *, of_place: bool = False, cutouts_by_mitsuba: bool = False) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        of_place: bool = False,
+        cutouts_by_mitsuba: bool = False,
+        plastics: Mapping[tuple, Any] | None = None,
+    ) -> None:
         groups: dict[tuple, list[Surface]] = {}
         for surface in scene.surfaces:
             groups.setdefault(_merge_key(surface), []).append(surface)
@@ -48,7 +57,11 @@ class World:
         self.has_cutouts = any(_has_cutouts(m) for m in materials)
         masks = "mitsuba" if cutouts_by_mitsuba else "ours" if self.has_cutouts else "none"
         self.origin = np.mean(scene.bounds(), axis=0) if of_place else scene.camera.origin
-        meshes = {f"mesh{i}": _mesh(f"mesh{i}", group, self.origin, masks) for i, group in enumerate(self.groups)}
+        self.plastics: dict[tuple, Any] = {}
+        meshes = {}
+        for i, group in enumerate(self.groups):
+            bsdf = self._reflectance(group[0].material, masks, plastics or {})
+            meshes[f"mesh{i}"] = _mesh(f"mesh{i}", group, self.origin, bsdf, masks)
         environment = _environment(scene)
         lights = {} if environment is None else {"environment": environment}
         # optimize=False: equal objects must not be merged, since shapes are told apart by their registry index
@@ -87,6 +100,17 @@ class World:
         self.width, self.height = dr.opaque(UInt32, camera.width), dr.opaque(UInt32, camera.height)
         # the corner pixels' rays lie on the rim of the smallest cone
         self.half_angle = dr.opaque(Float, math.acos(scene.laser.cos_half_angle(camera)) * (1 + 1e-5))
+
+    def _reflectance(self, material: Material, masks: str, known: Mapping[tuple, Any]) -> Any:
+        """Mitsuba's BSDF of a material, taken from those known if it is a plain plastic that is among them."""
+        bsdf = _bsdf(material, _albedo(material))
+        if masks == "mitsuba" and _has_cutouts(material):
+            bsdf = {"type": "mask", "opacity": _texture(material.opacity), "nested": bsdf}
+        if not _is_on_ramp(material):
+            return mi.load_dict(bsdf)
+        key = material.kind, *(getattr(material, name) for name in _PARAMETERS[material.kind])
+        self.plastics[key] = self.plastics.get(key) or known.get(key) or mi.load_dict(bsdf)
+        return self.plastics[key]
 
     def table(self, values: list[float]) -> Any:
         """One value a mesh as an array over registered shapes, to be read at `shape_index`."""
@@ -200,18 +224,14 @@ def _specular_albedo(material: Material) -> float:
     return material.specular * ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
 
 
-def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, masks: str) -> Any:
-    """One mesh of surfaces that share a material; cut-outs by `masks`: none, ours (an attribute), or Mitsuba's BSDF."""
+def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: Any, masks: str) -> Any:
+    """One mesh of surfaces that share a material; cut-outs by `masks`: none, ours (an attribute), or the BSDF's own."""
     material, emission = surfaces[0].material, surfaces[0].emission
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces])
     vertices = np.concatenate([s.vertices for s in surfaces]) - origin
     faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts[:-1], strict=True)])
     props = mi.Properties()
-    albedo, palette = _albedo(surfaces)
-    bsdf = _bsdf(material, albedo)
-    if masks == "mitsuba" and _has_cutouts(material):
-        bsdf = {"type": "mask", "opacity": _texture(material.opacity), "nested": bsdf}
-    props["bsdf"] = mi.load_dict(bsdf)
+    props["bsdf"] = bsdf
     if emission > 0:
         props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": emission}})
     smooth = surfaces[0].normals is not None
@@ -219,16 +239,17 @@ def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, masks: s
     params = mi.traverse(mesh)
     params["vertex_positions"] = upload(Float, vertices)
     params["faces"] = upload(UInt32, faces)
-    if palette is None:
-        uv = np.concatenate([np.zeros((len(s.vertices), 2)) if s.uv is None else s.uv for s in surfaces])
+    if _is_on_ramp(material):
+        albedo = np.repeat([s.material.albedo for s in surfaces], np.diff(starts))
+        uv = np.column_stack((RAMP_FROM + RAMP * albedo, np.full(len(albedo), 0.5)))
     else:
-        uv = np.repeat(palette, np.diff(starts), axis=0)
+        uv = np.concatenate([np.zeros((len(s.vertices), 2)) if s.uv is None else s.uv for s in surfaces])
     # Mitsuba's v runs down the image, ours up
     params["vertex_texcoords"] = upload(Float, np.column_stack((uv[:, 0], 1 - uv[:, 1])))
     if smooth:
         params["vertex_normals"] = upload(Float, np.concatenate([s.normals for s in surfaces]))
     params.update()
-    if albedo is not None and albedo["type"] == "mesh_attribute":
+    if _is_on_faces(material):
         values = np.repeat([s.material.albedo for s in surfaces], [len(s.faces) for s in surfaces])
         mesh.add_attribute(FACE_ALBEDO, 1, values.astype(np.float32))
     if masks == "ours":
@@ -236,26 +257,32 @@ def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, masks: s
     return mesh
 
 
-def _albedo(surfaces: tuple[Surface, ...]) -> tuple[dict[str, Any] | None, np.ndarray | None]:
-    """Mitsuba's texture for the albedo of one mesh, and texture coordinates (surfaces, 2) where they pick it.
+def _is_on_faces(material: Material) -> bool:
+    """Whether the albedo is an attribute of the mesh's faces."""
+    return material.kind in ("diffuse", "roughdiffuse") and not isinstance(material.albedo, Texture)
 
-    A plain albedo is an attribute of the faces, but Mitsuba's plastics need a texture with a mean: theirs is a palette.
+
+def _is_on_ramp(material: Material) -> bool:
+    """Whether the albedo is a texture coordinate on a ramp.
+
+    Mitsuba's plastics need a texture with a mean, which an attribute has not. With textured opacity the coordinates are
+    taken; such a surface has a mesh of its own.
     """
-    material = surfaces[0].material
+    plain = not isinstance(material.albedo, Texture) and not isinstance(material.opacity, Texture)
+    return material.kind in ("plastic", "roughplastic") and plain
+
+
+def _albedo(material: Material) -> dict[str, Any] | None:
+    """Mitsuba's texture for the albedo of a mesh."""
     if material.kind not in ("diffuse", "roughdiffuse", "plastic", "roughplastic"):
-        return None, None
-    if isinstance(material.albedo, Texture):
-        return _texture(material.albedo), None
-    if material.kind in ("diffuse", "roughdiffuse"):
-        return {"type": "mesh_attribute", "name": FACE_ALBEDO}, None
-    if isinstance(material.opacity, Texture):  # its coordinates are taken: such a surface has a mesh of its own
-        return _texture(material.albedo), None
-    values = np.array([s.material.albedo for s in surfaces])
-    texels = np.full(-(-len(values) // PALETTE) * PALETTE, values.mean(), dtype=np.float32)
-    texels[: len(values)] = values
-    u = (np.arange(len(values)) + 0.5) / len(texels)
-    palette = {"type": "bitmap", "bitmap": mi.Bitmap(texels[None, :, None]), "raw": True, "filter_type": "nearest"}
-    return palette, np.column_stack((u, np.full(len(u), 0.5)))
+        return None
+    if _is_on_faces(material):
+        return {"type": "mesh_attribute", "name": FACE_ALBEDO}
+    if _is_on_ramp(material):
+        # two texels, whose centres are at a quarter and at three quarters
+        ramp = mi.Bitmap(np.array([[[0], [1]]], np.float32))
+        return {"type": "bitmap", "bitmap": ramp, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+    return _texture(material.albedo)
 
 
 def _texture(value: float | Texture) -> dict[str, Any]:

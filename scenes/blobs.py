@@ -25,20 +25,21 @@ def blend(points: np.ndarray, radii: np.ndarray, cells: int = CELLS) -> shapes.S
     step = float((high - low).max()) / cells
     counts = np.ceil((high - low) / step).astype(int) + 1
     axes = [low[i] + step * np.arange(counts[i]) for i in range(3)]
-    field = np.zeros(counts)
-    for centre, radius in zip(points, radii, strict=True):
-        # one ball's field is a product of three one-dimensional ones, and next to nothing beyond REACH radii
-        first = np.maximum(np.floor((centre - REACH * radius - low) / step), 0).astype(int)
-        last = np.ceil((centre + REACH * radius - low) / step).astype(int) + 1
-        x, y, z = (np.exp(-4 * ((axes[i][first[i] : last[i]] - centre[i]) / radius) ** 2) for i in range(3))
-        window = tuple(slice(first[i], first[i] + n) for i, n in enumerate((len(x), len(y), len(z))))
-        field[window] += np.exp(4.0) * x[:, None, None] * y[None, :, None] * z[None, None, :]
+    # one ball's field is a product of three one-dimensional ones, and next to nothing beyond REACH radii
+    x, y, z = (_falls(axes[i] - points[:, i, None], radii[:, None], step) for i in range(3))
+    across = (y[:, :, None] * z[:, None, :]).reshape(len(points), -1)
+    field = (np.exp(4.0) * x.T @ across).reshape(counts)
     vertices, faces, _, _ = marching_cubes(field, LEVEL, spacing=(step, step, step), gradient_direction="ascent")
     vertices = vertices.astype(np.float64) + low
     middle = vertices.mean(axis=0)
     u = np.arctan2(vertices[:, 2] - middle[2], vertices[:, 0] - middle[0]) / (2 * np.pi) + 0.5
     v = (vertices[:, 1] - vertices[:, 1].min()) / max(np.ptp(vertices[:, 1]), 1e-9)
     return vertices, faces.astype(np.int64), np.column_stack((u, v))
+
+
+def _falls(away: np.ndarray, radius: np.ndarray, step: float) -> np.ndarray:
+    """One-dimensional field at distances from a ball's centre; 0 from a grid step beyond its reach on."""
+    return np.where(np.abs(away) < REACH * radius + step, np.exp(-4 * (away / radius) ** 2), 0.0)
 
 
 def standing(shape: shapes.Shape, height: float) -> shapes.Shape:

@@ -51,6 +51,12 @@ def _number(value: object, what: str) -> float:
     return float(value)
 
 
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of two vectors; numpy's takes longer to see that they are."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+
+
 def _fraction(value: float | Texture, what: str) -> float | Texture:
     """`value`, a number or a texture, if it lies in [0, 1], as a reflectance or an opacity does."""
     if not isinstance(value, Texture):
@@ -183,13 +189,13 @@ class Camera:
         """A camera at `origin` whose axis meets `target`, with `up` (world) upwards in the image."""
         origin, target, up = (np.asarray(tuple(v), float) for v in (origin, target, up))
         forward = target - origin
-        right = np.cross(forward, up)
+        right = _cross(forward, up)
         far_enough = np.linalg.norm(forward) > 1e-9 and np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward)
         require(bool(far_enough), f"camera at {origin.tolist()} cannot look at {target.tolist()} with up {up.tolist()}")
         forward = forward / np.linalg.norm(forward)
         right = right / np.linalg.norm(right)
         pose = np.eye(4)
-        pose[:3] = np.column_stack((right, np.cross(forward, right), forward, origin))
+        pose[:3] = np.column_stack((right, _cross(forward, right), forward, origin))
         return cls(pose, fov_deg, width, height)
 
     @property
@@ -219,11 +225,9 @@ class Camera:
     def rays(self, x: np.ndarray | None = None, y: np.ndarray | None = None) -> np.ndarray:
         """Unit directions in the world, float64, through raster positions x, y (default: all pixel centres)."""
         if x is None or y is None:
-            x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
-        local = np.stack(
-            ((x - self.width / 2) / self.focal_px, (y - self.height / 2) / self.focal_px, np.ones_like(x, float)),
-            axis=-1,
-        )
+            x, y = np.arange(self.width) + 0.5, np.arange(self.height)[:, None] + 0.5
+        local = np.ones((*np.broadcast_shapes(np.shape(x), np.shape(y)), 3))
+        local[..., 0], local[..., 1] = (x - self.width / 2) / self.focal_px, (y - self.height / 2) / self.focal_px
         local /= np.linalg.norm(local, axis=-1, keepdims=True)
         return local @ self.rotation.T
 

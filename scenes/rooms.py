@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scenes import clutter, fittings, furniture
-from scenes.layout import Boxes, Floor, Place, in_each_other, overlap, set_down, to_shell
+from scenes.layout import Boxes, Floor, Place, in_each_other, set_down, to_shell
 from scenes.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
 from scenes.model import Camera, Scene, Surface
 from scenes.palette import make_palette, pick

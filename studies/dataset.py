@@ -220,8 +220,9 @@ def _world(job: Job, view: int, scene: Scene) -> World | None:
         return None
     place = job.set, job.seed, job.ambient, chosen.place(view)
     if place not in _WORLDS:
+        plastics = {key: made for world in _WORLDS.values() for key, made in world.plastics.items()}
         _forget()  # before the next is built: calls are compiled for all materials that are there
-        _WORLDS[place] = World(scene, of_place=True)
+        _WORLDS[place] = World(scene, of_place=True, plastics=plastics)
     return _WORLDS[place].seen_from(scene.camera)
 
 
