@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from csph.allocation import keep_freed_memory
 from csph.metrics import (
     PHOTON_LEVELS,
     TOLERANCES_MM,
@@ -25,6 +24,7 @@ from csph.metrics import (
     paired_difference,
 )
 from csph.views import Views
+from render.heap import keep_freed_memory
 from scenes.errors import require
 from spad.detect import sense
 from spad.histogram import TRUTH, Histogram

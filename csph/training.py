@@ -28,7 +28,6 @@ import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
 
-from csph.allocation import keep_freed_memory
 from csph.backbone import soft_argmax
 from csph.config import TrainConfig
 from csph.data import SetData
@@ -36,6 +35,7 @@ from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
 from csph.snapshots import CodeEnergy
 from csph.views import Views, packed_sha256, packed_views
+from render.heap import keep_freed_memory
 from scenes.errors import require
 from scenes.files import whole_file, write_csv
 from spad.fly import Batch

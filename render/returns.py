@@ -89,22 +89,26 @@ def merge(samples: Samples, tolerance_m: float) -> Samples:
         samples = select(samples, lit)
     if len(samples.pixel) == 0 or tolerance_m == 0:
         return samples
-    cell = samples.path_m.astype(np.float64) / tolerance_m
-    cell = np.clip(np.floor(cell) + (1 << 27), 0, (1 << 28) - 1).astype(np.int64)
-    key = (samples.pixel.astype(np.int64) << 1 | (samples.bounces > 1)) << 28 | cell
+    cell = np.floor(samples.path_m.astype(np.float64) / tolerance_m)
+    number = np.clip(cell + (1 << 27), 0, (1 << 28) - 1).astype(np.int64)
+    key = (samples.pixel.astype(np.int64) << 1 | (samples.bounces > 1)) << 28 | number
     order = np.argsort(key, kind="stable")
     key = key[order]
     first = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
-    energy = samples.radiance[order].astype(np.float64)
-    path = samples.path_m[order].astype(np.float64)
-    half_width = samples.half_width_m[order].astype(np.float64)
-    total = np.add.reduceat(energy, first)
-    centroid = np.add.reduceat(energy * path, first) / total
-    length = np.diff(np.append(first, len(key)))
-    spread = (path - np.repeat(centroid, length)) ** 2 + half_width**2 / 3
-    variance = np.add.reduceat(energy * spread, first) / total
-    bounces = np.minimum.reduceat(samples.bounces[order], first)
-    return packed(samples.pixel[order[first]], centroid, np.sqrt(3 * variance), total, bounces)
+    base = cell * tolerance_m
+    # moments about the cell's beginning: float64 holds them to 1e-16 of a cell
+    offset, moments = samples.path_m - base, np.empty((3, len(key)))
+    moments[0] = samples.radiance
+    np.multiply(moments[0], offset, out=moments[1])
+    np.multiply(moments[0], offset**2 + np.square(samples.half_width_m, dtype=np.float64) / 3, out=moments[2])
+    total, mean, square = np.add.reduceat(moments.take(order, axis=1), first, axis=1)
+    mean /= total
+    variance = np.maximum(square / total - mean**2, 0)
+    heads = order[first]
+    bounces = samples.bounces[heads]
+    if samples.bounces.max() > 1:
+        bounces = np.minimum.reduceat(samples.bounces[order], first)
+    return packed(samples.pixel[heads], base[heads] + mean, np.sqrt(3 * variance), total, bounces)
 
 
 def to_returns(samples: Samples, pixels: int) -> Returns:

@@ -25,9 +25,9 @@ SPLITS = ("train", "val", "test")
 FOV_DEG = (52.0, 66.0)
 NEAREST_M, FARTHEST_M = 0.6, 6.9
 MEDIAN_M = (1.9, 3.9)  # of one view, by upright boxes; drawn evenly
-CANDIDATES, ATTEMPTS = 120, 8  # views of a room, rooms
+CANDIDATES, DRAWS, ATTEMPTS = 120, 4, 8  # views of a room at a time, as often as it takes, rooms
 LEAST_BUSY = 0.3  # of a view, by upright boxes: what stands before the walls
-VIEWS_PER_ROOM = 4
+VIEWS_PER_ROOM = 6  # raw frames of NYUv2 show a place some eighty times
 APART_M, APART_DEG = 0.5, 30.0  # any two cameras of a room, at least
 HEAD_M = 0.28  # half the side of the square that a head takes
 FLAT = ("window", "door", "picture", "clock", "radiator", "rug")  # an image should show more than these
@@ -273,14 +273,18 @@ class Seen(NamedTuple):
 
 def _cameras(rng: Random, floor: Floor, ceiling: float) -> tuple[Camera, ...] | None:
     """Hand-held views, far enough from each other, with the wanted median distances and enough to see."""
-    seen = _candidates(rng, floor, ceiling)
+    wanted = rng.uniform(*MEDIAN_M, VIEWS_PER_ROOM)
     chosen: list[Camera] = []
-    for wanted in rng.uniform(*MEDIAN_M, VIEWS_PER_ROOM):
-        free = [other for other in seen if all(_apart(other.camera, camera) for camera in chosen)]
-        if not free:
-            return None
-        chosen.append(min(free, key=lambda one: _score(one, wanted)).camera)
-    return tuple(chosen)
+    for _ in range(DRAWS):
+        seen = _candidates(rng, floor, ceiling)
+        while len(chosen) < VIEWS_PER_ROOM:
+            free = [other for other in seen if all(_apart(other.camera, camera) for camera in chosen)]
+            if not free:
+                break
+            chosen.append(min(free, key=lambda one: _score(one, wanted[len(chosen)])).camera)
+        else:
+            return tuple(chosen)
+    return None
 
 
 def _apart(a: Camera, b: Camera) -> bool:

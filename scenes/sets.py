@@ -9,7 +9,7 @@ from scenes.errors import InputError, require
 from scenes.model import Scene
 
 SETS: dict[str, str] = {
-    "rooms/train": "procedural furnished rooms, each seen by four cameras, without end (short: rooms)",
+    "rooms/train": "procedural furnished rooms, each seen by six cameras, without end (short: rooms)",
     "rooms/val": "rooms that are not in rooms/train",
     "rooms/test": "rooms that are in neither",
     "tabletop": "eight still lifes with fine structure, 1.1 to 2.9 m",

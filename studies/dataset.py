@@ -43,7 +43,7 @@ DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 # Of the squared error target: a set's views are to meet it together, not each by itself. With indirect light plans do
 # better than they promise: they take too little power for mixed pixels, and round paths up (measured).
 AIM, INDIRECT_AIM = 0.95, 1.5
-PLANNED_PLACES = 8  # that tell the grid of an endless set
+PLANNED_PLACES, OF_A_PLACE = 8, 3  # views that tell how many rays an endless set takes
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
 MEMORY = Path("/dev/shm")  # where Linux keeps files in memory: a view is written and read back there
 # of the last place
@@ -72,6 +72,7 @@ class Job:
     ambient: bool = True
     ambient_spp: int = SHARED_AMBIENT_SPP
     merging: float = 1.0
+    least_share: float | None = None
 
     def __post_init__(self) -> None:
         scene_set(self.set)
@@ -83,6 +84,7 @@ class Job:
             bounces=self.bounces,
             spp=self.spp,
             grid=self.grid,
+            least_share=self.least_share,
             error=self.error,
             aim=AIM if self.bounces == 1 else INDIRECT_AIM,
             ambient_spp=self.ambient_spp,
@@ -95,7 +97,7 @@ class Job:
     def made(self) -> dict:
         """All that decides the bytes of its views, this version's choices included."""
         tolerances = [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, self.settings().aim]
-        return asdict(self) | {"schema": 4, "tolerances": tolerances}
+        return asdict(self) | {"schema": 5, "tolerances": tolerances}
 
 
 def render_view(job: Job, view: int, again: int = 0) -> Done:
@@ -192,7 +194,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         "file": file_name(view),
         "bytes": len(exr),
         "seed": seed,
-        "plan": {key: plan[key] for key in ("bounces", "spp", "grid", "ambient")},
+        "plan": {key: plan[key] for key in ("bounces", "spp", "grid", "least_share", "ambient")},
         "error": transient.meta["relative_error"]["total"],
         "depth_m": dict(zip(("min", "q01", "median", "q99", "max"), np.round(quantiles, 4).tolist(), strict=True)),
         "empty": round(1 - depth.size / transient.depth_m.size, 6),
@@ -256,20 +258,24 @@ def _runs(job: Job, views: Sequence[int]) -> list[tuple[int, ...]]:
 
 
 def _with_grid(job: Job, folder: Folder, run: Run, say: Progress) -> Job:
-    """The job with one grid for all views, from the errors of the first places' first views, however many are asked."""
-    from render.planning import grid_for_all
+    """The job with as many rays for all views, by the errors of some of the first places', however many are asked."""
+    from render.planning import rays_for_all
 
     path = folder.path / "grid.json"
     if not path.is_file():
         say("plan", 0.0)
-        places = [(place * scene_set(job.set).views_per_place,) for place in range(PLANNED_PLACES)]
+        each = scene_set(job.set).views_per_place
+        some = range(0, each, -(-each // OF_A_PLACE))
+        places = [tuple(place * each + view for view in some) for place in range(PLANNED_PLACES)]
         found = run(partial(_direct_errors, job), places, lambda view, why: math.nan)
         errors = sorted(error for error in found if math.isfinite(error))
-        grid = grid_for_all(errors, job.settings()) if errors else None  # None: each place by itself
+        # None: each place by itself
+        grid, least_share = rays_for_all(errors, job.settings()) if errors else (None, None)
         with whole_file(path) as beside:
-            beside.write_text(json.dumps({"grid": grid, "errors": errors}) + "\n")
+            beside.write_text(json.dumps({"grid": grid, "least_share": least_share, "errors": errors}) + "\n")
     try:
-        return replace(job, grid=json.loads(path.read_text())["grid"])
+        planned = json.loads(path.read_text())
+        return replace(job, grid=planned["grid"], least_share=planned["least_share"])
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{path}: is damaged; delete it, and it is made again") from None
 

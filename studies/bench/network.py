@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from csph.allocation import keep_freed_memory
 from csph.backbone import DeepBoosting, parameters_of
 from csph.config import NETWORKS, ModelConfig, preset
 from csph.design import Design
@@ -25,6 +24,7 @@ from csph.loss import kl_divergence
 from csph.model import DepthModel
 from csph.views import packed_views, split_views
 from render.engine import Progress
+from render.heap import keep_freed_memory
 from scenes.errors import require
 from scenes.files import write_csv
 from spad.fly import Patch, sense_patches

@@ -318,7 +318,7 @@ def test_histograms_that_do_not_fit():
 def test_freed_memory_is_kept():
     script = (
         "import resource, numpy as np\n"
-        "from csph.allocation import keep_freed_memory\n"
+        "from render.heap import keep_freed_memory\n"
         "def faults():\n"
         "    start = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
         "    for _ in range(20):\n"

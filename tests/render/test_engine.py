@@ -8,7 +8,7 @@ import pytest
 from render import engine
 from render.engine import render
 from render.error import BIN_M, SIGMA_M, response
-from render.planning import grid_for_all, make_plan
+from render.planning import make_plan, rays_for_all
 from render.returns import Samples
 from render.settings import RenderSettings
 from render.world import World
@@ -41,13 +41,16 @@ def test_same_seed_same_bytes_with_one_and_two_threads():
     assert render(room(), RenderSettings(bounces=4, spp=64, grid=4), seed=6).sha256() not in hashes
 
 
-def test_many_views_get_the_grid_that_their_mean_squared_error_asks_for():
-    """Errors fall with at least the power 1.3 of the grid; direct light alone has all that is aimed at."""
+def test_many_views_get_the_rays_that_their_mean_squared_error_asks_for():
+    """Errors fall with at least the power 1.3 of the grid, 0.7 of the edges; direct light alone has all that is aimed
+    at."""
     alone = RenderSettings(bounces=1, error=0.01, aim=1.0)
-    assert grid_for_all([0.00999] * 2, alone) == 4 and grid_for_all([0.0, 0.00999 * 2**0.5], alone) == 4
-    assert grid_for_all([0.0101], alone) == 5 and grid_for_all([0.00999 * 2**1.3], alone) == 8
-    assert grid_for_all([0.0], alone) == 2 and grid_for_all([1.0], alone) == 16
-    assert grid_for_all([0.01], RenderSettings(error=0.01, aim=1.0)) > grid_for_all([0.01], alone)
+    assert rays_for_all([0.01], alone) == rays_for_all([0.0, 0.01 * 2**0.5], alone) == (4, 0.5)
+    assert rays_for_all([0.0101 * 2**1.3], alone)[0] == 8
+    assert rays_for_all([0.0], alone)[0] == 2 and rays_for_all([1.0], alone)[0] == 16
+    grid, share = rays_for_all([0.012], alone)
+    assert grid == 4 and 0.012 * (share / 0.5) ** 0.7 == pytest.approx(0.01)
+    assert rays_for_all([0.01], RenderSettings(error=0.01, aim=1.0))[0] > 4
 
 
 def test_plan_gives_a_reason_for_every_choice_and_can_be_forced():

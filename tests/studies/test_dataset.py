@@ -146,7 +146,7 @@ def test_an_endless_set_has_one_grid_however_many_views_are_asked(tmp_path, monk
     for name in ("grid.json", "index.jsonl", "views/000000.exr", "views/000004.exr"):
         assert (steps / name).read_bytes() == (once / name).read_bytes()
     planned = json.loads((once / "grid.json").read_text())
-    assert len(planned["errors"]) == 2 and {r["plan"]["grid"] for r in read_index(once)} == {planned["grid"]}
+    assert len(planned["errors"]) == 6 and {r["plan"]["grid"] for r in read_index(once)} == {planned["grid"]}
     make_set(replace(job, grid=3), 1, tmp_path / "forced")
     assert not (tmp_path / "forced" / "grid.json").exists()
     (once / "grid.json").write_text("{")
@@ -156,6 +156,7 @@ def test_an_endless_set_has_one_grid_however_many_views_are_asked(tmp_path, monk
 
 def test_places_that_cannot_be_planned_are_left_out_of_the_plan(tmp_path, monkeypatch):
     monkeypatch.setattr("studies.dataset.PLANNED_PLACES", 2)
+    monkeypatch.setattr("studies.dataset.OF_A_PLACE", 1)
     job, errors = Job("rooms", width=8, height=8, bounces=1), iter((ValueError("odd"), 0.02))
 
     def direct_error(*_):
