@@ -81,7 +81,7 @@ def rays_for_all(errors: Sequence[float], settings: RenderSettings) -> tuple[int
     off = math.sqrt(np.mean(np.square(errors)))
     ideal = PILOT_GRID * (off / (_direct_share(settings, settings.bounces == 1) * target)) ** (1 / GRID_POWER)
     ideal = min(max(ideal, GRIDS[0]), GRIDS[-1])
-    grid = math.floor(ideal)
+    grid = math.floor(ideal + 1e-6)
     return grid, least_share_of(grid) * (grid / ideal) ** (GRID_POWER / SHARE_POWER)
 
 

@@ -42,7 +42,7 @@ STAGE_VIEW = 20
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 # Of the squared error target: a set's views are to meet it together, not each by itself. With indirect light plans do
 # better than they promise: they take too little power for mixed pixels, and round paths up (measured).
-AIM, INDIRECT_AIM = 0.95, 1.5
+AIM, INDIRECT_AIM = 0.95, 1.4
 PLANNED_PLACES, OF_A_PLACE = 8, 3  # views that tell how many rays an endless set takes
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
 MEMORY = Path("/dev/shm")  # where Linux keeps files in memory: a view is written and read back there
