@@ -9,6 +9,7 @@ S.5.2; a convolution and a transposed convolution with stride = kernel there, ma
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -143,9 +144,14 @@ class CompressiveLayer(nn.Module):
         """The weights as they are now, constraint and pulse applied; separable ones stay so."""
         return CodingTensor(self.name, self._temporal_part(), self.spatial, computed=self.computed)
 
+    def _forms(self, counts: int) -> bool:
+        return self.spatial is None or blocks.forms(self.codes, self.block, counts)
+
     def encode(self, counts: Tensor) -> Tensor:
         """Codes of a histogram. Raises InputError for counts of another shape or type, or that blocks do not tile."""
         with torch.autocast(counts.device.type, enabled=False):
+            if not self._forms(counts.numel()):
+                return blocks.encode_separable(counts, self._temporal_part(), self.spatial)
             return blocks.encode_blocks(counts, self.weights())
 
     def encode_timestamps(self, timestamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
@@ -158,16 +164,23 @@ class CompressiveLayer(nn.Module):
         good = codes.ndim == 5 and codes.shape[1] == self.codes
         require(good, f"codes of shape {tuple(codes.shape)}: expected (batch, {self.codes}, time, rows, columns)")
         with torch.autocast(codes.device.type, enabled=False):
-            weights = self.weights()
-            return self._projected(codes.to(weights.dtype), weights)
+            return self._projected(codes.to(self.temporal.dtype))
 
     def forward(self, counts: Tensor) -> Tensor:
-        """`decode(encode(counts))`, the input of the depth network; the constraint is applied once for both."""
+        """`decode(encode(counts))`, the input of the depth network."""
         with torch.autocast(counts.device.type, enabled=False):
-            weights = self.weights()
-            return self._projected(blocks.encode_blocks(counts, weights), weights)
+            return self._projected(self.encode(counts))
 
-    def _projected(self, codes: Tensor, weights: Tensor) -> Tensor:
+    def _projected(self, codes: Tensor) -> Tensor:
+        centre = not (self.options.keep_mean and self.codes <= KEEP_MEAN_UP_TO)
+        over = (2,) if self.options.per_pixel_norm else ()
+        if self.background is None and not self._forms(codes.numel() * math.prod(self.block) // self.codes):
+            unit = blocks.zero_normalised(codes, 1, centre=centre, over=over)
+            temporal = self._temporal_part()
+            if self.options.pulse_in_decoder:
+                temporal = self._blurred(temporal)
+            return blocks.correlate_separable(unit, temporal, self.spatial, centre=centre)
+        weights = self.weights()
         direction = None if self.background is None else self._direction(weights, codes.shape[2])
         if self.options.pulse_in_decoder:
             weights = self._blurred(weights)
@@ -176,8 +189,6 @@ class CompressiveLayer(nn.Module):
             codes = codes - (codes * along).sum(1, keepdim=True) * along
             flat = weights.flatten(1)
             weights = (flat - direction.unsqueeze(-1) * (direction @ flat).unsqueeze(1)).view(-1, *weights.shape)
-        centre = not (self.options.keep_mean and self.codes <= KEEP_MEAN_UP_TO)
-        over = (2,) if self.options.per_pixel_norm else ()
         unit = blocks.zero_normalised(codes, 1, centre=centre, over=over)
         axis = 0 if direction is None else 1
         return blocks.back_project(unit, blocks.zero_normalised(weights, axis, centre=centre))

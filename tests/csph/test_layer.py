@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from csph.blocks import EPSILON, back_project, encode_blocks, zero_normalised
+from csph.blocks import EPSILON, FORMED, back_project, encode_blocks, zero_normalised
 from csph.codes import truncated_fourier
 from csph.coding import CodingTensor
 from csph.design import Design
@@ -80,6 +80,13 @@ def convolved(counts: torch.Tensor, weights: torch.Tensor) -> tuple[torch.Tensor
     return codes, torch.nn.functional.conv_transpose3d(zn(codes, 1), zn(kernel, 0), stride=stride)
 
 
+@pytest.fixture(params=[FORMED, 0], ids=["formed", "in two steps"])
+def both_routes(request, monkeypatch):
+    """Separable tensors formed, as for this little counts, and not."""
+    monkeypatch.setattr("csph.blocks.FORMED", request.param)
+
+
+@pytest.mark.usefixtures("both_routes")
 @pytest.mark.parametrize("name", DESIGNS)
 def test_layer_equals_strided_convolutions_with_gradients(name):
     layer, counts = CompressiveLayer.of(DESIGNS[name]).double(), counts_from(1)
@@ -162,6 +169,7 @@ def test_a_lone_return_reaches_one_at_its_bin_for_orthonormal_codes():
         assert projected[t] == pytest.approx(1, abs=2e-5)
 
 
+@pytest.mark.usefixtures("both_routes")
 @pytest.mark.parametrize("name", DESIGNS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16, torch.int32, torch.uint16])
 def test_outputs_are_finite_in_the_hard_cases(name, dtype):
@@ -183,6 +191,7 @@ def test_outputs_are_finite_in_the_hard_cases(name, dtype):
     assert layer(million).isfinite().all()
 
 
+@pytest.mark.usefixtures("both_routes")
 def test_half_precision_counts_are_summed_in_float32():
     layer = CompressiveLayer.of(Design("learned", (32, 2, 2), 8))
     counts = counts_from(5, mean=20)
@@ -194,6 +203,7 @@ def test_half_precision_counts_are_summed_in_float32():
         assert torch.equal(layer(counts.to(dtype)), exact)
 
 
+@pytest.mark.usefixtures("both_routes")
 @pytest.mark.parametrize("options", [{}, {"per_pixel_norm": True}, {"pulse_in_codes": True, "pulse_in_decoder": True}])
 @pytest.mark.parametrize("design", [Design("learned", (4, 2, 2), 4), Design("learned", (4, 2, 2), 5, full=True)])
 def test_gradients_by_finite_differences(design, options):
@@ -228,6 +238,7 @@ def test_gradients_of_the_products_by_counts_codes_and_table():
 # -- switches ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("both_routes")
 def test_two_codes_keep_a_sign_alone_unless_their_mean_stays():
     counts = torch.zeros(1, 1, 32, 1, 1)
     counts[0, 0, 9] = 100
@@ -243,6 +254,7 @@ def test_two_codes_keep_a_sign_alone_unless_their_mean_stays():
     assert torch.equal(five(counts), same(counts))
 
 
+@pytest.mark.usefixtures("both_routes")
 def test_norm_of_a_pixel_tells_which_time_block_holds_the_return():
     counts = torch.ones(1, 1, 32, 1, 1)
     counts[0, 0, 21] += 500
@@ -257,6 +269,7 @@ def test_norm_of_a_pixel_tells_which_time_block_holds_the_return():
     assert torch.allclose(*(CompressiveLayer.of(single, per_pixel_norm=flag)(counts) for flag in (False, True)))
 
 
+@pytest.mark.usefixtures("both_routes")
 def test_pulse_aware_weights_are_codes_of_the_returning_pulse():
     sensor = Sensor(name="small", bins=32)
     design = Design("learned", (32, 2, 2), 8)
@@ -352,6 +365,7 @@ def test_wrong_codes_timestamps_and_parts_end_in_one_line():
             CompressiveLayer(make_coding(DESIGNS["learned 16x2x2 K8"]), background=background)
 
 
+@pytest.mark.usefixtures("both_routes")
 def test_an_empty_batch_and_views_are_served():
     layer = CompressiveLayer.of(DESIGNS["learned 16x2x2 K8"])
     assert layer(torch.zeros(0, 1, *SIZE)).shape == (0, 1, *SIZE)
