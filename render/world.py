@@ -22,7 +22,9 @@ Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
 ALIGNMENT = 64  # bytes
 OPACITY = "opacity"
 FACE_ALBEDO = "face_albedo"
-RAMP_FROM, RAMP = 0.25, 0.5  # u of albedo 0 in `_ramp`, and how much more albedo 1 has
+# u of albedo 0 on a plastic's ramp, and how much more albedo 1 has; the ramp's mean, 1/2 whatever the albedo, only says
+# how often paths follow the coat
+RAMP_FROM, RAMP = 0.25, 0.5
 
 
 class World:
@@ -102,11 +104,11 @@ class World:
         self.half_angle = dr.opaque(Float, math.acos(scene.laser.cos_half_angle(camera)) * (1 + 1e-5))
 
     def _reflectance(self, material: Material, masks: str, known: Mapping[tuple, Any]) -> Any:
-        """Mitsuba's BSDF of a material, taken from those known if it is a plain plastic that is among them."""
+        """Mitsuba's BSDF of a material, taken from those known if it is a plain, whole plastic that is among them."""
         bsdf = _bsdf(material, _albedo(material))
         if masks == "mitsuba" and _has_cutouts(material):
             bsdf = {"type": "mask", "opacity": _texture(material.opacity), "nested": bsdf}
-        if not _is_on_ramp(material):
+        if _has_cutouts(material) or not _is_on_ramp(material):
             return mi.load_dict(bsdf)
         key = material.kind, *(getattr(material, name) for name in _PARAMETERS[material.kind])
         self.plastics[key] = self.plastics.get(key) or known.get(key) or mi.load_dict(bsdf)

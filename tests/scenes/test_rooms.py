@@ -8,7 +8,7 @@ import pytest
 
 from scenes import InputError, Scene, Texture
 from scenes.catalog import load_scene
-from scenes.layout import Boxes, set_down
+from scenes.layout import Boxes, overlap, set_down
 from scenes.model import Material
 from scenes.parts import Piece, box, joined, panel
 from scenes.patterns import on_one_sheet
@@ -73,6 +73,22 @@ def test_boxes_are_hit_where_rays_enter_them():
     assert distance == pytest.approx([edge, np.inf, np.inf, edge / 0.9 * np.hypot(0.1, 1)])
     inside = boxes.distance(np.array((0, 1.0, 5.0)), rays)[:, 0]
     assert inside[:3] == pytest.approx([np.sqrt(2), np.sqrt(2), 1])
+
+
+def test_heads_meet_the_boxes_that_their_squares_overlap():
+    """All heads and boxes at once against one pair of convex polygons at a time."""
+    draw = np.random.default_rng(1)
+    piece = Piece((joined("box", Material(), box((-0.3, 0, -0.6), (0.3, 1, 0.6))),))
+    places = [
+        set_down(piece, *draw.uniform(-3, 3, 2), y=draw.uniform(0, 2), turn_deg=draw.uniform(0, 360)) for _ in range(9)
+    ]
+    points, y = draw.uniform(-3, 3, (300, 2)), draw.uniform(0.9, 1.75, 300)
+    square = 0.28 * np.array(((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    met = [
+        any(p.high > 0.5 * h and p.low < h + 0.2 and overlap(at + square, p.plan) for p in places)
+        for at, h in zip(points, y, strict=True)
+    ]
+    assert Boxes(places).meet_head(points, 0.28, y, 0.2).tolist() == met and 60 < sum(met) < 240
 
 
 @pytest.mark.parametrize("index", VIEWS)
