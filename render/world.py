@@ -116,7 +116,7 @@ class World:
 
     def table(self, values: list[float]) -> Any:
         """One value a mesh as an array over registered shapes, to be read at `shape_index`."""
-        table = np.zeros(self.shape_ids.max() + 2)  # never of size one: its kernels would differ
+        table = np.zeros(6 * (self.shape_ids.max() // 6 + 1))  # of no launch's size (`render.footprint`), nor one
         table[self.shape_ids] = values
         return upload(Float, table)
 

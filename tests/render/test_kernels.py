@@ -1,9 +1,12 @@
 """Compiling a kernel takes longer than rendering a small view: from the third view of a set on nothing is compiled."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from render.engine import render
+from render.footprint import trace
 from render.settings import RenderSettings
 from render.specular import specular_light
 from render.world import World, dr
@@ -64,3 +67,25 @@ def test_albedos_objects_and_triangles_compile_nothing(kinds):
 def test_specular_light_compiles_nothing_from_the_third_view_on():
     views = [compiled(lambda s=s: specular_light(World(room(s, ("plastic",), mirrors=2)), 2)) for s in range(4)]
     assert views[2:] == [0, 0], views
+
+
+def test_launches_of_any_size_are_recorded_once():
+    """Dr.Jit records anew where a launch is as long as one of the scene's arrays and an earlier one was not."""
+    world = World(room(14, ("plastic", "diffuse", "roughplastic"), balls=5))
+    sizes = {len(values) for surface in world.scene.surfaces for values in (surface.faces, surface.vertices.ravel())}
+    for size in sorted({*range(1, 70), *sizes, *(2 * len(s.vertices) for s in world.scene.surfaces)}):
+        column = np.arange(size) % 24
+        trace(world, column, np.zeros(size, int), np.zeros(size, int), 1)
+    assert world.recordings.calls["footprints", False].n_recordings == 1
+
+
+def test_the_next_world_takes_plastics_and_renders_the_same():
+    """Their tables are those of equal parameters, whatever the albedo; cut-outs have tables of their own."""
+    first, second = (room(seed, ("plastic", "diffuse", "roughplastic"), balls=4) for seed in (15, 16))
+    plastics = World(first).plastics
+    handed = World(second, plastics=plastics)
+    assert len(plastics) == 2 and all(handed.plastics[key] is made for key, made in plastics.items())
+    settings = RenderSettings(bounces=3, spp=16, grid=2)
+    assert render(second, settings, world=handed).sha256() == render(second, settings).sha256()
+    pane = replace(first.surfaces[-1], material=Material("plastic", opacity=0.3))
+    assert not World(replace(first, surfaces=(first.surfaces[0], pane)), cutouts_by_mitsuba=True).plastics
