@@ -226,9 +226,12 @@ def _indirect(
 def _bounces(energy: np.ndarray, allowed: float) -> tuple[int, float]:
     """Fewest bounces that leave out at most the share `allowed` of the energy, and the share left out.
 
-    What lies beyond the pilot's last bounce follows the geometric series of its last two.
+    What lies beyond the pilot's last bounce follows the geometric series of its later half: of two alone, a rare
+    bright path in the last one would make any number too few.
     """
-    ratio = min(energy[-1] / energy[-2], 0.99) if energy[-2] > 0 else 0.0
+    half = len(energy) // 2
+    before = energy[half:-1].sum()
+    ratio = min(energy[half + 1 :].sum() / before, 0.99) if before > 0 else 0.0
     beyond = energy[-1] * ratio ** np.arange(1, MAX_BOUNCES - len(energy) + 2)
     tail = energy[-1] * ratio / (1 - ratio) - beyond.sum()
     full = np.concatenate((energy, beyond))
