@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from scenes.errors import require
 
 EPSILON = 1e-5  # of zero-normalisation, as published
-FORMED = 4
+FORMED = 4  # entries for each count, at most, of a separable coding tensor that is formed
 NO_NORM = 1e-13  # of the sum of squares: a variance below it is what rounding in float64 leaves of none
 COUNT_TYPES = (
     *(torch.float64, torch.float32, torch.float16, torch.bfloat16),

@@ -9,6 +9,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -45,7 +46,8 @@ DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 AIM, INDIRECT_AIM = 0.95, 1.4
 PLANNED_PLACES, OF_A_PLACE = 8, 3  # views that tell how many rays an endless set takes
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
-MEMORY = Path("/dev/shm")  # where Linux keeps files in memory: a view is written and read back there
+# where Linux keeps files in memory: a view is written and read back there, if so many bytes are free
+MEMORY, LARGEST_VIEW = Path("/dev/shm"), 1 << 28
 # of the last place
 _WORLDS: dict[tuple, World] = {}
 _PLANS: dict[tuple[Job, str], Plan] = {}
@@ -57,6 +59,7 @@ class Job:
     """Everything that decides the bytes of a set's views, but for their number.
 
     merging     how much of a set's merging of returns is done: 1 as sets are written, 0.1 for references
+    least_share as of `RenderSettings`; what `grid.json` says, where a set plans its rays
     """
 
     set: str
@@ -178,9 +181,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         transient = transient.delayed(job.offset_m)
     require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
     transient = rounded(thinned(transient, job.merging * THINNED))
-    with tempfile.TemporaryDirectory(
-        prefix="scene2spad-", dir=MEMORY if os.access(MEMORY, os.W_OK) else None
-    ) as folder:
+    with tempfile.TemporaryDirectory(prefix="scene2spad-", dir=_memory()) as folder:
         path = Path(folder) / "view.exr"
         write_transient(transient, path)
         exr = path.read_bytes()
@@ -203,6 +204,13 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         "triangles": scene.triangles,
     }
     return record, exr
+
+
+def _memory() -> Path | None:
+    """Where files are kept in memory; None where there is no such place, or little room: a container may have 64 MB."""
+    if os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > LARGEST_VIEW:
+        return MEMORY
+    return None
 
 
 def _seed(job: Job, view: int, again: int = 0) -> int:

@@ -1,7 +1,7 @@
 """The folder of a rendered scene set: what it holds, what may be added, and its index.
 
 set.json      what was asked for; a folder is continued only with the same
-grid.json     rays a pixel side for all views of an endless set, and the errors of some that say so
+grid.json     how many rays all views of an endless set take, and the errors of some that say so
 views/*.exr   one transient a view, written beside and renamed, so that a file is whole or not there
 journal.jsonl one line a view as it ends, in whatever order; gone once the index is written
 index.jsonl   one line a view in the order of the views: scene, plan, error, depth statistics, or why it failed

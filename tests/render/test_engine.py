@@ -8,7 +8,7 @@ import pytest
 from render import engine
 from render.engine import render
 from render.error import BIN_M, SIGMA_M, response
-from render.planning import make_plan, rays_for_all
+from render.planning import _bounces, make_plan, rays_for_all
 from render.returns import Samples
 from render.settings import RenderSettings
 from render.world import World
@@ -39,6 +39,15 @@ def test_same_seed_same_bytes_with_one_and_two_threads():
         dr.set_thread_count(threads)
     assert len(hashes) == 1
     assert render(room(), RenderSettings(bounces=4, spp=64, grid=4), seed=6).sha256() not in hashes
+
+
+def test_bounces_follow_a_geometric_series_and_not_one_bright_path():
+    """Half of the energy goes on at each bounce: 2^-n is left out after n. A last bounce twice as bright adds few."""
+    energy = np.array([0.0, *0.5 ** np.arange(1, 9)])
+    bounces, left_out = _bounces(energy, 0.011)
+    assert bounces == 7 and left_out == pytest.approx(0.5**7, rel=1e-9)
+    energy[-1] *= 2
+    assert _bounces(energy, 0.011)[0] in (7, 8, 9)
 
 
 def test_many_views_get_the_rays_that_their_mean_squared_error_asks_for():

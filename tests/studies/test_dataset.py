@@ -172,6 +172,15 @@ def test_places_that_cannot_be_planned_are_left_out_of_the_plan(tmp_path, monkey
     assert planned["grid"] == 4 and planned["least_share"] < 0.5
 
 
+def test_a_view_is_the_same_without_files_in_memory(tmp_path, monkeypatch):
+    """No such place, or one with little room."""
+    exr = render_view(JOB, 0).exr
+    for place in (tmp_path / "nowhere", tmp_path):
+        monkeypatch.setattr("studies.dataset.MEMORY", place)
+        monkeypatch.setattr("studies.dataset.LARGEST_VIEW", 1 << 60)
+        assert dataset._memory() is None and render_view(JOB, 0).exr == exr
+
+
 def test_cameras_of_a_place_share_the_plan_of_its_first():
     job = Job("rooms", width=16, height=16, bounces=1, error=0.02)
     assert len({render_view(job, view).record["plan"]["grid"] for view in (2, 1, 0)}) == 1
