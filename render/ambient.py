@@ -6,6 +6,7 @@ it by chance alone. Here a straight line passes thin panes and the holes of cut-
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,58 +17,87 @@ from render.world import OPACITY, Bool, Float, UInt32, World, dr, mi, recorded, 
 from scenes.model import Camera
 
 MOST_LANES = 1 << 18  # paths of one launch, where an image is not larger by itself
-CERTAIN = 3  # surfaces that every path may meet; from then on it goes on with the probability of its weight
-MOST_LIKELY = 0.95
+# Surfaces that every path may meet; from then on it goes on by chance where its weight has fallen below LEAST_WEIGHT
+# (in rooms a tenth to a quarter of the noise's square, at 1.4 times the cost, of going on with the weight itself).
+CERTAIN, LEAST_WEIGHT, MOST_LIKELY = 3, 1 / 6, 0.95
+FIRST_SPP, LEAST_MORE, MOST_MORE = 64, 1.25, 8  # paths a pixel whose noise tells how many times as many are needed
 # Pixels share reflected light: a Gaussian of so many pixels, ended at that radius, of points that lie within a share of
 # the distance of the tangent plane, weighted by the cosine between normals to this power of 2.
 SHARED_SIGMA, SHARED_RADIUS, SHARED_PLANE, SHARED_NORMAL_DOUBLED = 2.0, 4, 0.02, 4
 
 
 class AmbientLight(NamedTuple):
-    """Radiance of each pixel [W/(m^2 sr nm)], (H, W) float32, and its noise: rms over pixels by the image's mean.
+    """Radiance of each pixel [W/(m^2 sr nm)], (H, W) float32, its noise (rms over pixels by the image's mean), paths.
 
     Where pixels shared their light (`shared`) the noise is what is left of it; how far it is blurred is not in it.
     """
 
     radiance: np.ndarray
     error: float
+    spp: int
 
 
-def ambient_light(world: World, spp: int, bounces: int, seed: int, shared_by: Layers | None = None) -> AmbientLight:
+def ambient_light(
+    world: World, spp: int, bounces: int, seed: int, shared_by: Layers | None = None, *, noise: float = 0.0
+) -> AmbientLight:
     """Steady spectral radiance of environment and area lights at each pixel, after up to `bounces - 1` surfaces.
 
     L(p) = E[sum over vertices of the path's weight and the light emitted there], with multiple importance sampling
     (balance heuristic) between lights and reflectance at every surface; unbiased. Same seed, same bytes. With the
     `shared_by` layers of the pixels' centres, neighbours share what is reflected (`shared`): far less noise, biased.
+    `spp` paths a pixel; where a `noise` is enough, as many as take the `AmbientLight.error` there, `spp` at most.
     """
-    camera = world.scene.camera
-    pixels = camera.height * camera.width
-    per_pass = min(spp, max(1, MOST_LANES // pixels))
-    emitted = np.zeros(pixels)
-    halves, left = np.zeros((2, pixels)), spp  # of what is reflected: paths of even and of odd number
-    squares = np.zeros((2, pixels))  # of what is emitted where it is seen, and of all
-    while left > 0:
-        now = min(per_pass, left)
-        lane = dr.arange(UInt32, pixels * now)
-        dr.eval(lane)
-        numbers = [dr.opaque(UInt32, number) for number in ((seed + left) & 0xFFFFFFFF, now, bounces)]
-        seen, light = world.recordings.call(world, "ambient", _of_paths, lane, *numbers)
-        seen, light = (np.array(values, np.float64).reshape(pixels, now) for values in (seen, light))
-        emitted += seen.sum(axis=1)
-        halves[0] += light[:, left % 2 :: 2].sum(axis=1)
-        halves[1] += light[:, 1 - left % 2 :: 2].sum(axis=1)
-        squares += np.square((seen, seen + light)).sum(axis=2)
-        left -= now
-    emitted /= spp
-    mean = emitted + halves.sum(axis=0) / spp
-    of_emitted, noise2 = np.maximum(squares / spp - np.square((emitted, mean)), 0).mean(axis=1) / max(spp - 1, 1)
-    if shared_by is not None:
-        number = np.array([[spp // 2], [spp - spp // 2]])
-        smooth = shared((halves / np.maximum(number, 1)).reshape(2, camera.height, camera.width), shared_by, camera)
-        mean = emitted + (smooth.reshape(2, -1) * number).sum(axis=0) / spp
-        noise2 = of_emitted + np.square(smooth[0] - smooth[1]).mean() / 4
-    error = float(np.sqrt(noise2) / mean.mean()) if mean.any() else 0.0
-    return AmbientLight(mean.reshape(camera.height, camera.width).astype(np.float32), error)
+    sums, wanted = _Sums(world), spp if noise == 0 else min(spp, FIRST_SPP)
+    while True:
+        sums.trace(wanted, bounces, seed)
+        light = sums.light(shared_by)
+        if light.error <= noise or wanted == spp:
+            return light
+        # the first paths underrate what is rare: by steps
+        more = min(max((light.error / noise) ** 2, LEAST_MORE), MOST_MORE)
+        wanted = min(spp, math.ceil(more * wanted))
+
+
+class _Sums:
+    """Light of the paths traced so far, `spp` of each pixel, and what its noise is told by."""
+
+    def __init__(self, world: World) -> None:
+        self.world, self.camera, self.spp = world, world.scene.camera, 0
+        pixels = self.camera.height * self.camera.width
+        self.emitted = np.zeros(pixels)
+        self.halves = np.zeros((2, pixels))  # of what is reflected: paths of even and of odd number
+        self.squares = np.zeros((2, pixels))  # of what is emitted where it is seen, and of all
+
+    def trace(self, spp: int, bounces: int, seed: int) -> None:
+        """Go on until there are `spp` paths of each pixel."""
+        pixels = self.emitted.size
+        per_pass = max(1, MOST_LANES // pixels)
+        while self.spp < spp:
+            now = min(per_pass, spp - self.spp)
+            lane = dr.arange(UInt32, pixels * now)
+            dr.eval(lane)
+            numbers = [dr.opaque(UInt32, number) for number in ((seed + self.spp) & 0xFFFFFFFF, now, bounces)]
+            seen, light = self.world.recordings.call(self.world, "ambient", _of_paths, lane, *numbers)
+            seen, light = (np.array(values, np.float64).reshape(pixels, now) for values in (seen, light))
+            self.emitted += seen.sum(axis=1)
+            for half in (0, 1):
+                self.halves[half] += light[:, (half + self.spp) % 2 :: 2].sum(axis=1)
+            self.squares += np.square((seen, seen + light)).sum(axis=2)
+            self.spp += now
+
+    def light(self, shared_by: Layers | None) -> AmbientLight:
+        spp, shape = self.spp, (self.camera.height, self.camera.width)
+        emitted = self.emitted / spp
+        mean = emitted + self.halves.sum(axis=0) / spp
+        variance = np.maximum(self.squares / spp - np.square((emitted, mean)), 0)
+        of_emitted, noise2 = variance.mean(axis=1) / max(spp - 1, 1)
+        if shared_by is not None:
+            number = np.array([[spp - spp // 2], [spp // 2]])
+            smooth = shared((self.halves / np.maximum(number, 1)).reshape(2, *shape), shared_by, self.camera)
+            mean = emitted + (smooth.reshape(2, -1) * number).sum(axis=0) / spp
+            noise2 = of_emitted + np.square(smooth[0] - smooth[1]).mean() / 4
+        error = float(np.sqrt(noise2) / mean.mean()) if mean.any() else 0.0
+        return AmbientLight(mean.reshape(shape).astype(np.float32), error, spp)
 
 
 def shared(light: np.ndarray, layers: Layers, camera: Camera) -> np.ndarray:
@@ -188,7 +218,7 @@ def _traced(world: World, sampler: Any, ray: Any, most: Any) -> tuple[Any, Any]:
         before.p = dr.select(passing, before.p, si.p)
         met += dr.select(passing, UInt32(0), UInt32(1))
         layer += dr.select(passing, UInt32(1), UInt32(0))
-        likely = dr.select((met >= CERTAIN) & ~passing, dr.minimum(weight, MOST_LIKELY), 1)
+        likely = dr.select((met >= CERTAIN) & ~passing, dr.minimum(weight / LEAST_WEIGHT, MOST_LIKELY), 1)
         active = hit & going_on & (layer < MAX_LAYERS) & (sampler.next_1d(active) < likely)
         weight /= dr.maximum(likely, 1e-9)
         active &= weight > 0

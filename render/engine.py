@@ -30,7 +30,7 @@ from render.indirect import (
 from render.paths import BLOCK, block_order
 from render.planning import finer_pilot, make_plan, pilot_pixels
 from render.returns import Growing, Samples, concatenate, no_samples, of_pixels, select, to_returns
-from render.settings import BATCHES, Plan, RenderSettings
+from render.settings import BATCHES, MOST_AMBIENT_SPP, Plan, RenderSettings
 from render.specular import specular_light
 from render.transient import Transient
 from render.world import World
@@ -123,11 +123,15 @@ def render(
         log.info("%s", line)
     noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
 
-    ambient = AmbientLight(np.zeros((camera.height, camera.width), np.float32), 0.0)
+    ambient = AmbientLight(np.zeros((camera.height, camera.width), np.float32), 0.0, 0)
     if plan.ambient:
         say("ambient light", 0.9)
-        by = layers if settings.ambient_shared else None
-        ambient = ambient_light(world, settings.ambient_spp, AMBIENT_BOUNCES, derived_seed(seed, STAGE_AMBIENT), by)
+        by, spp = layers if settings.ambient_shared else None, settings.ambient_spp or MOST_AMBIENT_SPP
+        its_seed = derived_seed(seed, STAGE_AMBIENT)
+        ambient = ambient_light(world, spp, AMBIENT_BOUNCES, its_seed, by, noise=plan.ambient_noise)
+        told = f"ambient light: {ambient.spp} paths a pixel, noise {ambient.error:.2g} of its mean"
+        plan = replace(plan, reasons=(*plan.reasons, told))
+        log.info("%s", told)
     say("done", 1.0)
     return Transient(
         camera.height,
@@ -333,7 +337,7 @@ def _mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:
 def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> dict:
     if not plan.ambient:
         return {}
-    paths = {"ambient_spp": settings.ambient_spp, "ambient_shared": settings.ambient_shared}
+    paths = {"ambient_spp": ambient.spp, "ambient_shared": settings.ambient_shared}
     return paths | {"ambient_error": round(ambient.error, 6)}
 
 

@@ -17,6 +17,7 @@ from scenes.constants import (
 
 BIN_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PERIOD_S / REFERENCE_BINS
 SIGMA_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PULSE_SIGMA_S
+PULSE_POWER = BIN_M / (2 * math.sqrt(math.pi) * SIGMA_M)  # sum over bins of the square of one return of energy 1
 WIDEST_STENCIL = 256
 BLOCK_ENTRIES = 1 << 16
 
@@ -126,7 +127,7 @@ def power_of(direct: Samples) -> tuple[float, float]:
     lit = energy > 0
     variance = np.maximum(second[lit] / energy[lit] - (first[lit] / energy[lit]) ** 2, 0)
     power = energy[lit] ** 2 * BIN_M / (2 * math.sqrt(math.pi) * np.sqrt(SIGMA_M**2 + variance))
-    return float(power.sum()), BIN_M / (2 * math.sqrt(math.pi) * SIGMA_M)
+    return float(power.sum()), PULSE_POWER
 
 
 def error_for_budget(reference: np.ndarray, signal: float, background: float) -> float:
@@ -139,3 +140,12 @@ def error_for_budget(reference: np.ndarray, signal: float, background: float) ->
         return 1.0
     scale = signal * len(reference) / total
     return float(np.clip(0.1 * math.sqrt(len(reference) * (signal + background) / power) / scale, 1e-4, 1.0))
+
+
+def error_of_background(background: float, signal: float) -> float:
+    """nRMSE that a background of that many photons a pixel would make, were it an error of the signal's photons.
+
+    b / N in each of N bins, beside s photons of one return with the pulse alone:
+    (b / s) sqrt(1 / N) / sqrt(PULSE_POWER).
+    """
+    return background / signal / math.sqrt(REFERENCE_BINS * PULSE_POWER)

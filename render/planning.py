@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from render.direct import direct_light, least_share_of
-from render.error import error_for_budget, estimate, response
+from render.error import error_for_budget, error_of_background, estimate, response
 from render.paths import energy_by_bounces
 from render.returns import of_pixels
 from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
@@ -22,6 +22,9 @@ DIRECT_SHARE, MONTE_CARLO_OF_AIM = 0.4, 0.75
 # The pilot's pixels are not compared with those beside them, so that it shows 1.3 to 1.4 times the error of cells at
 # grids of 4 to 8 (measured in rooms); most of that is not planned for.
 PILOT_SHOWS = 1.25
+# What noise of ambient light adds to the error at the photons in question, in shares of the target; a constant rate is
+# no echo, and what it does to depth grows with its square. At least, and at most, that noise:
+AMBIENT_SHARE, LEAST_AMBIENT_NOISE, MOST_AMBIENT_NOISE = 0.7, 0.02, 0.5
 MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
@@ -112,7 +115,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
     share = least_share_of(grid) if settings.least_share is None else settings.least_share
     bounces, spp, whys = _indirect(world, settings, pixels, fine, target, seed)
     reasons += whys
-    ambient, why = _ambient(world, settings)
+    ambient, ambient_noise, why = _ambient(world, settings, target)
     reasons.append(why)
     return Plan(
         bounces,
@@ -125,18 +128,29 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         noise=math.sqrt(MONTE_CARLO_OF_AIM * settings.aim) * target,
         target=target,
         adaptive=settings.adaptive and mode_is_flood,
+        ambient_noise=ambient_noise,
     )
 
 
-def _ambient(world: World, settings: RenderSettings) -> tuple[bool, str]:
-    """Whether steady light is rendered: only if there is any, and a photon budget has room for it."""
+def _ambient(world: World, settings: RenderSettings, target: float) -> tuple[bool, float, str]:
+    """Whether steady light is rendered: only if there is any, and a photon budget has room for it; and its noise.
+
+    Noise that would make an error of AMBIENT_SHARE of the target beside the signal of the budget's photons, or where
+    there is no budget beside as many signal photons as background.
+    """
     if not world.scene.has_ambient:
-        return False, "ambient light: none in the scene; a sensor's background will be uniform"
-    if settings.ambient is not None:
-        return settings.ambient, f"ambient light: {'rendered' if settings.ambient else 'left out'}, as asked"
-    if settings.budget is not None and settings.budget[1] == 0:
-        return False, "ambient light: left out, the photon budget has no background"
-    return True, "ambient light: rendered, the scene has environment or area lights"
+        return False, 0.0, "ambient light: none in the scene; a sensor's background will be uniform"
+    if settings.ambient is False:
+        return False, 0.0, "ambient light: left out, as asked"
+    signal, background = settings.budget or (1.0, 1.0)
+    if settings.ambient is None and background == 0:
+        return False, 0.0, "ambient light: left out, the photon budget has no background"
+    why = "as asked" if settings.ambient else "the scene has environment or area lights"
+    if settings.ambient_spp is not None:
+        return True, 0.0, f"ambient light: rendered, {why}, with {settings.ambient_spp} paths a pixel, forced"
+    noise = AMBIENT_SHARE * target / error_of_background(background or 1.0, signal)
+    noise = float(np.clip(noise, LEAST_AMBIENT_NOISE, MOST_AMBIENT_NOISE))
+    return True, noise, f"ambient light: rendered, {why}, until its noise is {noise:.2g} of its mean"
 
 
 def _limits(world: World) -> list[str]:

@@ -11,6 +11,7 @@ MAX_BOUNCES = 63
 MAX_SAMPLES = 1 << 26
 BATCHES = 16  # independent batches of indirect light, whose spread is the error estimate
 GRIDS = (2, 4, 8, 16)
+MOST_AMBIENT_SPP = 1 << 12
 SHARED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours share it: as little noise as 45 alone
 
 
@@ -23,7 +24,7 @@ class RenderSettings:
     adaptive    whether it is spent so, or evenly and without sharing
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
-    ambient_spp paths per pixel of ambient light
+    ambient_spp paths per pixel of ambient light; open: as many as its noise asks for
     ambient_shared  whether neighbouring pixels share the ambient light they reflect: far less noise, edges of shadows
                 and reflections in it are blurred by some pixels
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
@@ -41,7 +42,7 @@ class RenderSettings:
     adaptive: bool = True
     grid: int | None = None
     ambient: bool | None = None
-    ambient_spp: int = 64
+    ambient_spp: int | None = None
     ambient_shared: bool = False
     error: float | None = None
     aim: float = 0.75
@@ -89,6 +90,7 @@ class Plan:
     spp         work on indirect light in paths per pixel; None: whatever `noise` takes
     noise       target of the Monte-Carlo part of the error where spp is open
     target      that of the whole error
+    ambient_noise  where the paths of ambient light are open: the noise at which they end
     """
 
     bounces: int
@@ -101,6 +103,7 @@ class Plan:
     noise: float = 0.0
     target: float = 0.0
     adaptive: bool = True
+    ambient_noise: float = 0.0
 
     def to_dict(self) -> dict:
         return asdict(self)

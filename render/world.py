@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import weakref
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -64,7 +64,8 @@ class World:
         for i, group in enumerate(self.groups):
             bsdf = self._reflectance(group[0].material, masks, plastics or {})
             meshes[f"mesh{i}"] = _mesh(f"mesh{i}", group, self.origin, bsdf, masks)
-        environment = _environment(scene)
+        # lights are chosen by their power, half the time the environment: walls may stop any of its light, or none
+        environment = _environment(scene, sum(map(_power, self.groups)) or 1.0)
         lights = {} if environment is None else {"environment": environment}
         # optimize=False: equal objects must not be merged, since shapes are told apart by their registry index
         # robust: without it a ray through the shared edge of two triangles can miss both (OptiX is so by itself)
@@ -235,7 +236,8 @@ def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: An
     props = mi.Properties()
     props["bsdf"] = bsdf
     if emission > 0:
-        props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": emission}})
+        radiance = {"type": "rgb", "value": emission}
+        props["emitter"] = mi.load_dict({"type": "area", "radiance": radiance, "sampling_weight": _power(surfaces)})
     smooth = surfaces[0].normals is not None
     mesh = mi.Mesh(name, len(vertices), len(faces), props, has_vertex_normals=smooth, has_vertex_texcoords=True)
     params = mi.traverse(mesh)
@@ -324,11 +326,22 @@ def _bsdf(material: Material, albedo: dict[str, Any] | None) -> dict[str, Any]:
     return {"type": "twosided", "nested": inner}
 
 
-def _environment(scene: Scene) -> dict[str, Any] | None:
-    ambient = scene.ambient
+def _power(surfaces: Sequence[Surface]) -> float:
+    """Of what emits: radiance times area."""
+    power = 0.0
+    for surface in surfaces:
+        if surface.emission > 0:
+            a, b, c = (surface.vertices[surface.faces[:, corner]] for corner in range(3))
+            power += surface.emission * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    return power
+
+
+def _environment(scene: Scene, weight: float) -> dict[str, Any] | None:
+    ambient, sampled = scene.ambient, {"sampling_weight": weight}
     if ambient.environment is not None:
         image = np.repeat(ambient.environment.image[..., None], 3, axis=-1)
-        return {"type": "envmap", "bitmap": mi.Bitmap(image), "to_world": mi.ScalarTransform4f(ambient.pose)}
+        pose = mi.ScalarTransform4f(ambient.pose)
+        return {"type": "envmap", "bitmap": mi.Bitmap(image), "to_world": pose, **sampled}
     if ambient.radiance > 0:
-        return {"type": "constant", "radiance": {"type": "rgb", "value": ambient.radiance}}
+        return {"type": "constant", "radiance": {"type": "rgb", "value": ambient.radiance}, **sampled}
     return None

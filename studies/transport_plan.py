@@ -76,6 +76,6 @@ PLANS = {
     "smoke": Plan(
         (Places("tabletop", 2, sun=True),), (24, 20), _full(2, 4, 16, 16), _SMOKE_PLANNED, codes=SMOKE_CODES, draws=2
     ),
-    "laptop": Plan((Places("tabletop", 8, sun=True), Places("rooms/test", 4)), (88, 72), _full(8, 16, 512, 256)),
-    "paper": Plan((Places("tabletop", 8, sun=True), Places("rooms/test", 16)), (176, 144), _full(16, 16, 1024, 1024)),
+    "laptop": Plan((Places("tabletop", 8, sun=True), Places("rooms/test", 4)), (88, 72), _full(8, 16, 512, 1024)),
+    "paper": Plan((Places("tabletop", 8, sun=True), Places("rooms/test", 16)), (176, 144), _full(16, 16, 1024, 4096)),
 }

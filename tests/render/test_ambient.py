@@ -63,6 +63,30 @@ def test_the_stated_noise_is_that_of_repetitions():
     assert (again.radiance == runs[0].radiance).all() and again.error == runs[0].error
 
 
+def test_paths_are_traced_until_the_noise_asked_for_and_no_further():
+    """As good as that many at once; where the noise is out of reach, all that are allowed."""
+    world = World(windowed_room())
+    light = ambient_light(world, 4096, 16, 3, noise=0.05)
+    assert 0.025 < light.error <= 0.05 and 64 < light.spp < 4096
+    at_once = ambient_light(world, light.spp, 16, 3)
+    apart = np.sqrt(np.square(light.radiance - at_once.radiance).mean()) / at_once.radiance.mean()
+    assert at_once.error == pytest.approx(light.error, rel=0.3) and apart == pytest.approx(
+        2**0.5 * light.error, rel=0.4
+    )
+    assert ambient_light(world, 100, 16, 3, noise=1e-6).spp == 100
+
+
+def test_a_light_of_no_power_costs_no_noise():
+    """Lights are chosen by their power: a speck that shines as brightly as the window is hardly ever tried."""
+    room = windowed_room()
+    speck = replace(room.surfaces[2], vertices=room.surfaces[2].vertices * 1e-3 + (0, -1.4, 0))
+    noise = [
+        np.mean([ambient_light(World(one), 64, 16, seed).error ** 2 for seed in range(4)])
+        for one in (room, replace(room, surfaces=(*room.surfaces, speck)))
+    ]
+    assert noise[1] == pytest.approx(noise[0], rel=0.4)
+
+
 def test_neighbours_share_irradiance_whatever_their_albedo_and_not_past_edges():
     """Light that an even irradiance would give stays; noise falls by the pixels that share; another wall is let be."""
     view = oracles.camera(32, 24, 60)

@@ -92,6 +92,24 @@ def test_ambient_light_is_rendered_only_where_a_budget_has_room_for_it():
         assert transient.meta["plan"]["ambient"] == wanted == bool(transient.ambient.any()), settings
 
 
+def test_the_plan_asks_of_ambient_light_what_its_photons_are_worth():
+    """Noise that would make a fixed share of the target; the more background, the less of it, within limits."""
+    dark = room()
+    lit = World(replace(dark, surfaces=(replace(dark.surfaces[0], emission=0.3), dark.surfaces[1])))
+
+    def noise(**asked: object) -> float:
+        return make_plan(lit, RenderSettings(bounces=1, **asked), 1).ambient_noise
+
+    flat = np.full(1024, 1 / 1024)
+    single = Samples(np.array([0]), np.array([6.0]), np.array([0.0]), np.array([1.0]), np.array([1]))
+    pulse = response(single, np.array([0]))[0]
+    one = np.sqrt(np.square(flat).sum() / np.square(pulse).sum())  # what noise 1 of as many photons would be
+    assert noise(error=0.02) * one == pytest.approx(0.7 * 0.02, rel=0.01)
+    assert noise(error=0.01) == pytest.approx(noise(error=0.02) / 2)
+    assert noise(error=0.5) == 0.5 and noise(error=1e-3) == 0.02
+    assert noise(ambient_spp=8) == 0 == noise(ambient=False)
+
+
 def test_a_glint_is_no_error_of_the_direct_light():
     """A window's own return is exact, and brighter than all the rest: it must not count as a difference."""
     transient = render(hard_case("window"), RenderSettings(bounces=1, grid=4))
