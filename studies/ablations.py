@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from studies.cli import finite
 from studies.depth_offset_plan import SHOWN_VIEWS, SMOKE, TEST_SET
 from studies.depth_offset_tables import summary_rows
 from studies.experiments import Study
-from studies.obtained import obtain
+from studies.obtained import obtain, other_seeds
 from studies.store import Store
 from studies.testsets import TestSet, depth_map, evaluated, rendered
 from studies.trained import Trained, Wanted, ship_all
@@ -41,14 +42,17 @@ def run(command: Study, progress: Progress) -> dict:
     shape = {"count": SMOKE.views, "size": SMOKE.size} if smoke else {}
     test = rendered(TEST_SET, folder / "sets", progress=progress, **shape)
     subjects = {one: model.subject for one, model in models.found.items()}
+    claims = CLAIMS[command.name]
+    again = other_seeds(dict.fromkeys(one for claim in claims for one in (claim.first, claim.second)), command)
     levels = sorted({level for sheet in sheets for level in sheet.shown}) if smoke else LEVELS
     shown = [view for view in SHOWN_VIEWS if view < len(test.views.scenes)]
     rows = evaluated(store, [*subjects.values()], test, levels, maps=shown, **options)
+    repeated = evaluated(store, [model.subject for model in again.values()], test, levels, **options)
     # published numbers are means of all test levels
     pair_options = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, PHOTON_LEVELS)
     numbers: dict[str, Any] = {
         **models.described(),
-        "conclusions": [decided(claim, rows, models.found) for claim in CLAIMS[command.name]],
+        "conclusions": [decided(claim, [*rows, *repeated], {**models.found, **again}) for claim in claims],
         "published": published.compared(store, subjects, *pair_options, (0.0,), **options),
         "summary": summary_rows(rows, models.found, {"set": TEST_SET}),
     }
@@ -71,18 +75,25 @@ def decided(claim: Claim, rows: Sequence[Row], models: Mapping[Wanted, Trained])
 
     The paired difference of MAE over scenes and levels decides, by its 95 % interval: `better` holds where it lies
     below 0 and does not where it lies above; `comparable` holds where it lies within ALIKE_WITHIN of the second's MAE,
-    and does not where it lies outside.
+    and does not where it lies outside. Where models were trained by several seeds it is of their means, and the means
+    of every seed of one and every seed of the other have to say the same.
     """
     told = {"claim": claim.text, "says": f"{claim.first.name} {claim.relation} {claim.second.name}"}
-    missing = [one.name for one in (claim.first, claim.second) if one not in models]
+    seeds = [[one.name for one in models if replace(one, seed=of.seed) == of] for of in (claim.first, claim.second)]
+    missing = [one.name for one, names in zip((claim.first, claim.second), seeds, strict=True) if not names]
     if missing:
         return {**told, "levels": claim.levels, "verdict": "not decided", "why": f"absent: {', '.join(missing)}"}
     evaluation = Evaluation(list(rows))
-    names = [[claim.first.name], [claim.second.name]]
-    first, second = (evaluation.interval(name, levels=claim.levels) for name in names)
-    apart = evaluation.difference(*names, claim.levels)
-    numbers = {"first_mm": first.mean, "second_mm": second.mean, "difference_mm": list(apart)}
-    return {**told, "levels": claim.levels, **numbers, "verdict": verdict(claim.relation, apart, second.mean)}
+    first, second = (evaluation.interval(names, levels=claim.levels).mean for names in seeds)
+    apart = evaluation.difference(*seeds, claim.levels)
+    each = [[evaluation.interval([name], levels=claim.levels).mean for name in names] for names in seeds]
+    numbers = {"first_mm": first, "second_mm": second, "difference_mm": list(apart)}
+    numbers |= {"first_seeds_mm": each[0], "second_seeds_mm": each[1]}
+    found = verdict(claim.relation, apart, second)
+    pairs = [(a - b, a - b, a - b) for a in each[0] for b in each[1]]
+    if any(verdict(claim.relation, pair, second) != found for pair in pairs):
+        found = "not decided"
+    return {**told, "levels": claim.levels, **numbers, "verdict": found}
 
 
 def verdict(relation: str, apart: Sequence[float], second_mm: float) -> str:
@@ -122,8 +133,11 @@ def _told(numbers: dict[str, Any]) -> dict[str, list[str]]:
     """What the terminal shows: conclusions, MAE of every model, and the published numbers beside ours."""
     conclusions = []
     for one in numbers["conclusions"]:
-        why = one.get("why") or "{:.1f} and {:.1f} mm, difference {:.1f} to {:.1f}".format(
-            one["first_mm"], one["second_mm"], *one["difference_mm"][1:]
+        why = one.get("why") or "{:.1f} and {:.1f} mm, difference {:.1f} to {:.1f}, {} and {} seeds".format(
+            one["first_mm"],
+            one["second_mm"],
+            *one["difference_mm"][1:],
+            *(len(one[f"{which}_seeds_mm"]) for which in ("first", "second")),
         )
         conclusions.append(f"{one['claim']}: {one['verdict']} ({why})")
     table = [

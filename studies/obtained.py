@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from studies.testsets import rooms
 from studies.trained import Library, Trained, Wanted
 from studies.training import PLANES
 
+OTHER_SEEDS = (1, 2)
 log = logging.getLogger("scene2spad")
 
 
@@ -37,10 +39,9 @@ def obtain(wanted: Sequence[Wanted], command: Study, progress: Progress) -> Obta
     Absent ones are named, with the command that makes each. Raises InputError where none is found, and for a model of
     another configuration under a wanted name.
     """
-    folder, retrain = command.out / command.preset, command.retrain or command.preset == "smoke"
-    library = Library(command.models or folder / "models", None if retrain else WEIGHTS)
+    folder, library = command.out / command.preset, _library(command)
     training = command.set or (Path(PLANES) if command.preset == "smoke" else None)
-    if retrain:
+    if library.shipped is None:
         training = training or rooms(folder / "sets", progress)
         library.train(wanted, command.preset, training, progress)
     found = library.gather(wanted)
@@ -55,6 +56,16 @@ def obtain(wanted: Sequence[Wanted], command: Study, progress: Progress) -> Obta
         log.warning("absent: %s; made by: %s", one.name, one.spelled(command.preset, training, library.folder))
     _say_if_unlike(found.values())
     return Obtained(found, absent)
+
+
+def other_seeds(wanted: Iterable[Wanted], command: Study) -> dict[Wanted, Trained]:
+    """Trainings of the same models by OTHER_SEEDS, where there are any: none is missed, and none is trained for it."""
+    return _library(command).gather([replace(one, seed=seed) for one in wanted for seed in OTHER_SEEDS])
+
+
+def _library(command: Study) -> Library:
+    retrain = command.retrain or command.preset == "smoke"
+    return Library(command.models or command.out / command.preset / "models", None if retrain else WEIGHTS)
 
 
 def _say_if_unlike(found: Iterable[Trained]) -> None:

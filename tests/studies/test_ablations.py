@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -61,7 +62,7 @@ def test_intervals_decide(relation, interval, expected):
 
 
 def test_a_conclusion_is_decided_scene_by_scene_and_says_what_is_absent():
-    claim = plans.Claim("c", Wanted(seed=1), plans.BETTER, Wanted(seed=2))
+    claim = plans.Claim("c", Wanted(), plans.BETTER, Wanted(block=(256, 2, 2)))
 
     def row(one: Wanted, scene: int, mae: float) -> Row:
         return Row(one.name, str(scene), scene, 10.0, 10.0, "all", mae, mae, 0, 0, 0.5, 1.0, 0.0, 4, 0, 0)
@@ -73,6 +74,13 @@ def test_a_conclusion_is_decided_scene_by_scene_and_says_what_is_absent():
     assert found["verdict"] == "holds" and found["difference_mm"][0] == pytest.approx(-4.5)
     found = decided(claim, rows, {claim.first: None})
     assert found["verdict"] == "not decided" and claim.second.name in found["why"]
+
+    # other seeds count: one that is better on average leaves open what the means' interval would decide
+    again = replace(claim.second, seed=1)
+    for mae, expected in ((9, "holds"), (4, "not decided"), (-20, "not decided")):
+        more = [*rows, *(row(again, i, 100.0 * i + mae) for i in range(8))]
+        found = decided(claim, more, dict.fromkeys((claim.first, claim.second, again)))
+        assert found["verdict"] == expected and len(found["second_seeds_mm"]) == 2
 
 
 @pytest.mark.slow
