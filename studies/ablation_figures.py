@@ -15,6 +15,7 @@ from studies.trained import Trained
 
 LIMIT_MM = 50.0  # of the axis where errors are as small as the paper's; wider where half of a model's images are not
 LOGARITHMIC = 3.0  # where models' medians lie so far apart a linear axis shows the worst alone
+GENERATED = "**"  # marks parameters of codes that are computed
 WIDTH = 0.36  # of a model's cloud of points
 
 
@@ -22,7 +23,7 @@ def label_of(trained: Trained) -> str:
     """Design, block and parameters, as in the paper: Fourier codes by the quarter wave that generates them."""
     design = trained.config.model.design
     kind = design.name.rsplit(" ", 2)[0]
-    mark = "**" if design.computed is not None else ""
+    mark = GENERATED if design.computed is not None else ""
     return f"{kind}\n{design.block_name}, K = {design.codes}\n({design.storage:,} params{mark})"
 
 
@@ -59,7 +60,8 @@ def draw(
         bar = below.colorbar(shown, ax=row[-1], fraction=0.06, pad=0.03)
         bar.set_label("depth [m]", fontsize=7)
         bar.ax.tick_params(labelsize=7)
-    figure.suptitle(f"{title}\nwhite circle: mean, line: median; ** numbers that generate Fourier codes", fontsize=10)
+    marked = f"; {GENERATED} numbers that generate Fourier codes" if any(GENERATED in label for label in labels) else ""
+    figure.suptitle(f"{title}\nwhite circle: mean, line: median{marked}", fontsize=10)
     return save(figure, path)
 
 
