@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -132,10 +133,16 @@ def classical(name: str) -> Callable[[Tensor, Sensor], Tensor]:
     require(code != "" and number.isdigit(), f"baseline {name!r}: expected {', '.join(METHODS)}, or CODE-K")
 
     def compressive(counts: Tensor, sensor: Sensor) -> Tensor:
-        coding = CodingTensor(name, temporal_code(code, int(number), sensor.bins, sensor))
+        coding = _coding(code, int(number), sensor)
         return decode_depth(encode(counts, coding), coding, sensor)
 
     return compressive
+
+
+@lru_cache(maxsize=16)
+def _coding(code: str, number: int, sensor: Sensor) -> CodingTensor:
+    """One object for all images: the decoder keeps what it works out for a coding tensor."""
+    return CodingTensor(f"{code}-{number}", temporal_code(code, number, sensor.bins, sensor))
 
 
 def common_tile(models: Sequence[DepthModel]) -> tuple[int, int]:
