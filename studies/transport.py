@@ -71,7 +71,7 @@ def run(command: Study, progress: Progress) -> dict:
     rows = _measured(places, contenders, store, command.seed, progress)
     ranked = ranking(rows, contenders)
     checked = [one for one in contenders if one.name in CHECKED]
-    planned = planned_rows(places, checked, plan.draws, store, command.seed, progress)
+    planned = planned_rows(places, checked, (plan.draws, plan.most_draws), store, command.seed, progress)
     numbers: dict[str, Any] = {
         **models.described(),
         "steps": STEPS,

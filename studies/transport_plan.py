@@ -54,6 +54,7 @@ class Plan:
     full       a render with everything in it, no choice of which is left to the planner
     planned    one whose choices are the planner's
     draws      of photons, on which planned and full renders are compared
+    most_draws where those leave it open
     """
 
     places: tuple[Places, ...]
@@ -61,7 +62,8 @@ class Plan:
     full: RenderSettings
     planned: RenderSettings = field(default_factory=RenderSettings)
     codes: tuple[str, ...] = CODES
-    draws: int = 8
+    draws: int = 16
+    most_draws: int = 64
 
 
 def _full(bounces: int, grid: int, spp: int, ambient_spp: int) -> RenderSettings:
@@ -74,7 +76,13 @@ _SMOKE_PLANNED = RenderSettings(error=0.1)
 # nothing else lights the still lifes
 PLANS = {
     "smoke": Plan(
-        (Places("tabletop", 2, sun=True),), (24, 20), _full(2, 4, 16, 16), _SMOKE_PLANNED, codes=SMOKE_CODES, draws=2
+        (Places("tabletop", 2, sun=True),),
+        (24, 20),
+        _full(2, 4, 16, 16),
+        _SMOKE_PLANNED,
+        codes=SMOKE_CODES,
+        draws=2,
+        most_draws=2,
     ),
     "laptop": Plan((Places("tabletop", 8, sun=True), Places("rooms/test", 4)), (88, 72), _full(8, 16, 512, 1024)),
     "paper": Plan((Places("tabletop", 8, sun=True), Places("rooms/test", 16)), (176, 144), _full(16, 16, 1024, 4096)),

@@ -144,8 +144,26 @@ def test_a_plan_is_judged_by_its_interval(full, planned, expected):
     assert transport_planned.within(share, wide) == expected
 
 
+def test_photons_are_drawn_until_a_scene_is_decided(monkeypatch):
+    """A difference of 1 % with a scatter of 4 % a draw is open after 8 draws and under 2 % after 512; one of 0 is not
+    drawn again."""
+    rng = np.random.default_rng(3)
+
+    def errors(place, checked, store, level, keys):
+        off = rng.normal(0.01, 0.04, len(keys)) if place.name == "noisy" else np.zeros(len(keys))
+        return [[[100.0, 100.0 * (1 + each)]] for each in off]
+
+    monkeypatch.setattr(transport_planned, "_both", errors)
+    places = [transport_planned.Place(name, "set", "flood", None, None) for name in ("noisy", "clear")]
+    one = transport_planned.Contender(None, "likelihood", 1)
+    monkeypatch.setattr(transport_planned.Contender, "name", "log-matched")
+    rows = transport_planned.planned_rows(places, [one], (8, 512), None, 0, lambda what, share: None)
+    assert [row["draws"] for row in rows] == [512, 8]
+    assert {row["verdict"] for row in rows} == {"holds"} and rows[0]["difference"] == pytest.approx(0.01, abs=0.004)
+
+
 def test_one_bad_design_fails_a_scene():
-    row = {"scene": "s", "laser": "flood", "uncertain": 0.001}
+    row = {"scene": "s", "laser": "flood", "uncertain": 0.001, "draws": 16}
     rows = [
         {**row, "design": "a", "difference": 0.001, "verdict": "holds"},
         {**row, "design": "b", "difference": -0.03, "verdict": "does not hold"},
