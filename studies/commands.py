@@ -71,6 +71,8 @@ class Render(Common):
     """Mean SIGNAL and BACKGROUND photons: render no finer than their shot noise can show, instead of --error."""
     ambient: Literal["auto", "on", "off"] = "auto"
     """Steady ambient light; auto renders it if the scene has any and the budget has background."""
+    ambient_spp: Count = None
+    """Ambient light paths per pixel (default: until their noise is what --error or --budget asks for)."""
     offset: float = 0.0
     """Move the scene this many metres away."""
     offset_mode: Offset = "time"

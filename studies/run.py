@@ -167,6 +167,7 @@ def run_render(command: commands.Render, progress: Progress) -> dict:
         spp=command.spp,
         grid=command.grid,
         ambient={"auto": None, "on": True, "off": False}[command.ambient],
+        ambient_spp=command.ambient_spp,
         error=command.error,
         budget=command.budget,
     )
