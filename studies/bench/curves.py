@@ -8,6 +8,7 @@ from itertools import pairwise
 
 MONTE_CARLO = -0.5  # log-log slope of error against seconds
 FLATTENED = -0.25  # a slope above this is no Monte-Carlo convergence any more, but a bias
+FARTHEST = 100  # times the longest time measured
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Reached:
     interpolated  between two measured points, log-log
     cheapest      the cheapest measured point is better already: an upper bound
     extrapolated  beyond the best measured point, see `seconds_at`
-    flattened     not reached: the curve had flattened before; seconds is inf
+    flattened     not reached: the curve had flattened before, or is too far from it; seconds is inf
     """
 
     seconds: float
@@ -61,7 +62,8 @@ def seconds_at(points: list[Point], error: float, *, kindly: bool = False) -> Re
     """Seconds that a method needs for an error. `points` in the order of their quality.
 
     Beyond the best point error ~ seconds^-1/2 goes on, or the curve's own last slope where that is flatter; `kindly`,
-    where that is steeper (stratified samples converge faster than plain ones), but no steeper than -1.
+    where that is steeper (stratified samples converge faster than plain ones), but no steeper than -1. Not farther than
+    FARTHEST times the longest time measured: what fireflies make of a slope says nothing.
     """
     curve = front(points)
     if not curve:
@@ -77,7 +79,10 @@ def seconds_at(points: list[Point], error: float, *, kindly: bool = False) -> Re
     own = slopes(curve[-2:]) or [MONTE_CARLO]
     slope = max(min(own[0], MONTE_CARLO), -1.0) if kindly else max(own[0], MONTE_CARLO)
     best = curve[-1]
-    return Reached(best.seconds * (best.error / error) ** (-1 / slope), "extrapolated")
+    times = -math.log(best.error / error) / slope  # in logarithms: next to no slope would overflow
+    if times > math.log(FARTHEST * max(point.seconds for point in points) / best.seconds):
+        return Reached(math.inf, "flattened")
+    return Reached(best.seconds * math.exp(times), "extrapolated")
 
 
 @dataclass(frozen=True)

@@ -192,6 +192,9 @@ def test_ratio_at_equal_error_of_two_monte_carlo_curves():
     assert found.ratio == pytest.approx(9, rel=1e-9) and not found.at_least and found.extrapolated == ""
     beyond = ratio_at(ours, theirs, 0.005)
     assert beyond.ratio == pytest.approx(9, rel=1e-9) and beyond.extrapolated == "both"
+    # next to no slope, as after a firefly: carried on it would take longer than any time
+    stuck = [Point(0.1, 0.45), Point(1.0, 0.4499999)]
+    assert ratio_at(stuck, theirs, 0.02).ratio == 0 and math.isinf(seconds_at(stuck, 1e-3).seconds)
     cheap = ratio_at(ours, theirs, 0.2)  # both are better already
     assert cheap.ratio == pytest.approx(0.5 / 0.01) and not cheap.at_least
     bound = ratio_at(law(0.001, [0.01, 0.1]), theirs, 0.02)
