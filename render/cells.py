@@ -103,9 +103,10 @@ class Rows:
             parts.append(cell_samples(self.cells, pixels[row], origin_m[row], cell, units * self.quantum, share))
         return concatenate(parts)
 
-    def radiance(self) -> np.ndarray:
-        """Radiance of every cell, (rows, cells) float64."""
-        return self.energy.numpy().reshape(self.rows, self.cells.count) * self.quantum
+    def sums(self) -> tuple[np.ndarray, np.ndarray]:
+        """Radiance of every cell, and its moment in the cell's width, (rows, cells) float64."""
+        shape = self.rows, self.cells.count
+        return self.energy.numpy().reshape(shape) * self.quantum, self.moment.numpy().reshape(shape) * self.quantum
 
 
 def cell_samples(

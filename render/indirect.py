@@ -119,7 +119,8 @@ def allocate(
 
 
 class Watched(NamedTuple):
-    """Light of a few flat `pixels` by independent batches: (pixels, batches, cells) radiance, in cells half as wide.
+    """Light of a few flat `pixels` by independent batches, in cells half as wide: radiance, and its moment about the
+    cell's beginning in the cell's width, (pixels, batches, cells) each.
 
     Every batch estimates the whole indirect light.
     """
@@ -128,12 +129,15 @@ class Watched(NamedTuple):
     cells: Cells
     origin_m: np.ndarray
     radiance: np.ndarray
+    moment: np.ndarray
 
     def samples(self, turns: slice = slice(None)) -> Samples:
         """The mean of some batches as samples, their pixel an index into `pixels`."""
-        mean = self.radiance[:, turns].mean(axis=1)
+        mean, moment = (values[:, turns].mean(axis=1) for values in (self.radiance, self.moment))
         row, cell = np.nonzero(mean)
-        return cell_samples(self.cells, row, self.origin_m[row], cell, mean[row, cell], np.full(len(row), 0.5))
+        radiance = mean[row, cell]
+        share = np.clip(moment[row, cell] / radiance, 0, 1)
+        return cell_samples(self.cells, row, self.origin_m[row], cell, radiance, share)
 
 
 class Chunk(NamedTuple):
@@ -154,7 +158,8 @@ class IndirectLight(NamedTuple):
 def combined(one: IndirectLight, other: IndirectLight, share: np.ndarray) -> IndirectLight:
     """The weighted mean of two independent estimates but for their samples; `share` of the first, for every pixel."""
     weight = share[one.watched.pixels][:, None, None]
-    seen = one.watched._replace(radiance=weight * one.watched.radiance + (1 - weight) * other.watched.radiance)
+    both = [weight * a + (1 - weight) * b for a, b in zip(one.watched[-2:], other.watched[-2:], strict=True)]
+    seen = one.watched._replace(radiance=both[0], moment=both[1])
     return IndirectLight(np.hypot(share * one.noise, (1 - share) * other.noise), seen)
 
 
@@ -270,6 +275,6 @@ def indirect_light(
         add(chunk.samples)
         if batches > 1:
             noise[chunk.pixels[real]] = chunk.totals[real].std(axis=1, ddof=1) * np.sqrt(batches)
-    seen = watch[1].radiance() if watch else np.zeros((0, fine.count))
-    seen = seen.reshape(len(watched), batches, fine.count)
-    return IndirectLight(noise, Watched(watched, fine, origin_m[watched], seen))
+    seen = watch[1].sums() if watch else (np.zeros(0),) * 2
+    seen = (values.reshape(len(watched), batches, fine.count) for values in seen)
+    return IndirectLight(noise, Watched(watched, fine, origin_m[watched], *seen))

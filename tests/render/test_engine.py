@@ -1,5 +1,6 @@
 """The whole render: determinism, the plan and its reasons, the error estimate, hard and empty cases."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -171,6 +172,19 @@ def test_different_seeds_agree_within_the_estimated_error():
     z = (first.total_radiance() - second.total_radiance()) / error
     # Student's t with about 30 degrees of freedom: variance 30/28; 432 pixels give its mean to 7 %
     assert 0.7 < (z**2).mean() < 1.5 and np.abs(z).max() < 6
+
+
+def test_wide_returns_beside_each_other_respond_as_one():
+    """What is even over a metre is so in any number of returns, 1/1 to 1/16 of it wide, and in every bin within."""
+    whole = Samples(*(np.array([value]) for value in (0, 6.0, 0.5, 1.0, 2)))
+    one = response(whole, np.array([0]))[0]
+    inside = np.arange(math.ceil(5.7 / BIN_M), math.floor(6.3 / BIN_M))
+    assert np.allclose(one[inside], BIN_M, rtol=0.01) and one.sum() == pytest.approx(1, rel=1e-4)
+    for parts in (4, 16):
+        centres = 5.5 + (np.arange(parts) + 0.5) / parts
+        columns = np.zeros(parts, int), centres, np.full(parts, 0.5 / parts), np.full(parts, 1 / parts)
+        many = response(Samples(*columns, np.full(parts, 2)), np.array([0]))[0]
+        assert np.sqrt(np.square(many - one).sum() / np.square(one).sum()) < 0.01
 
 
 def test_nothing_in_view_is_an_empty_transient():
