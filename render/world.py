@@ -229,15 +229,16 @@ def _specular_albedo(material: Material) -> float:
 
 def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: Any, masks: str) -> Any:
     """One mesh of surfaces that share a material; cut-outs by `masks`: none, ours (an attribute), or the BSDF's own."""
-    material, emission = surfaces[0].material, surfaces[0].emission
+    material = surfaces[0].material
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces])
     vertices = np.concatenate([s.vertices for s in surfaces]) - origin
     faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts[:-1], strict=True)])
     props = mi.Properties()
     props["bsdf"] = bsdf
-    if emission > 0:
-        radiance = {"type": "rgb", "value": emission}
-        props["emitter"] = mi.load_dict({"type": "area", "radiance": radiance, "sampling_weight": _power(surfaces)})
+    power = _power(surfaces)
+    if power > 0:  # not of degenerate faces alone
+        radiance = {"type": "rgb", "value": surfaces[0].emission}
+        props["emitter"] = mi.load_dict({"type": "area", "radiance": radiance, "sampling_weight": power})
     smooth = surfaces[0].normals is not None
     mesh = mi.Mesh(name, len(vertices), len(faces), props, has_vertex_normals=smooth, has_vertex_texcoords=True)
     params = mi.traverse(mesh)

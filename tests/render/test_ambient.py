@@ -8,7 +8,7 @@ import pytest
 from render.ambient import ambient_light, shared
 from render.direct import Layers, centre_layers
 from render.world import World, mi
-from scenes.model import Material, Scene, Surface
+from scenes.model import Ambient, Material, Scene, Surface
 from scenes.shapes import box, sphere
 from studies.bench import oracles
 
@@ -85,6 +85,16 @@ def test_a_light_of_no_power_costs_no_noise():
         for one in (room, replace(room, surfaces=(*room.surfaces, speck)))
     ]
     assert noise[1] == pytest.approx(noise[0], rel=0.4)
+
+
+def test_a_light_without_area_is_none():
+    """Degenerate faces that emit: dark by themselves, and nothing beside a light from outside."""
+    walls = windowed_room().surfaces[0]
+    flat = Surface(np.full((3, 3), -1.0), [[0, 1, 2]], Material(albedo=0.5), emission=1.0)
+    dark = Scene("degenerate light", (replace(walls, material=Material(albedo=0.4)), flat), oracles.camera(8, 6, 70))
+    assert not ambient_light(World(dark), 4, 4, 1).radiance.any()
+    lit = replace(dark, surfaces=(flat,), ambient=Ambient(radiance=0.1))
+    assert np.allclose(ambient_light(World(lit), 4, 4, 1).radiance, 0.1)
 
 
 def test_neighbours_share_irradiance_whatever_their_albedo_and_not_past_edges():
