@@ -170,7 +170,9 @@ def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> t
     sampler.seed(seed, dr.width(lane))
     shift = sampler.next_2d()
     x, y = Float(pixel % world.width) + shift.x, Float(pixel // world.width) + shift.y
-    return _traced(world, sampler, camera_rays(world, x, y)[0], bounces)
+    found = _traced(world, sampler, camera_rays(world, x, y)[0], bounces)
+    # a path across a face without a normal says nothing, as in `render.sums`
+    return tuple(dr.select(dr.isfinite(light), light, 0) for light in found)
 
 
 @dr.syntax
