@@ -24,7 +24,7 @@ DIRECT_SHARE, MONTE_CARLO_OF_AIM = 0.4, 0.75
 PILOT_SHOWS = 1.25
 # What noise of ambient light adds to the error at the photons in question, in shares of the target; a constant rate is
 # no echo, and what it does to depth grows with its square. At least, and at most, that noise:
-AMBIENT_SHARE, LEAST_AMBIENT_NOISE, MOST_AMBIENT_NOISE = 0.7, 0.02, 0.5
+AMBIENT_SHARE, LEAST_AMBIENT_NOISE, MOST_AMBIENT_NOISE = 0.5, 0.02, 0.5
 MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8

@@ -105,7 +105,7 @@ def test_the_plan_asks_of_ambient_light_what_its_photons_are_worth():
     single = Samples(np.array([0]), np.array([6.0]), np.array([0.0]), np.array([1.0]), np.array([1]))
     pulse = response(single, np.array([0]))[0]
     one = np.sqrt(np.square(flat).sum() / np.square(pulse).sum())  # what noise 1 of as many photons would be
-    assert noise(error=0.02) * one == pytest.approx(0.7 * 0.02, rel=0.01)
+    assert noise(error=0.02) * one == pytest.approx(0.5 * 0.02, rel=0.01)
     assert noise(error=0.01) == pytest.approx(noise(error=0.02) / 2)
     assert noise(error=0.5) == 0.5 and noise(error=1e-3) == 0.02
     assert noise(ambient_spp=8) == 0 == noise(ambient=False)
