@@ -54,6 +54,12 @@ def _cell_number(x: Any, width_m: float, growth: float) -> Any:
     return np.log1p(growth * x / width_m) / growth if growth > 0 else x / width_m
 
 
+def add_quanta(target: Any, amount: Any, index: Any, active: Any) -> None:
+    """Add an amount, in quanta and rounded to whole ones, to a fixed-point sum."""
+    whole = UInt64(dr.minimum(amount, MOST_QUANTA) + 0.5)
+    dr.scatter_add(target, whole, index, active, mode=dr.ReduceMode.Direct)
+
+
 class Rows:
     """Accumulators of several rows (a pixel, or a pixel and batch, each): energy, and its moment within the cell.
 
@@ -67,26 +73,34 @@ class Rows:
         self._edges = Float(cells.edges_m)
         self._growth, self._width = dr.opaque(Float, cells.growth), dr.opaque(Float, cells.width_m)
         self._behind, self._count = dr.opaque(UInt32, cells.behind), dr.opaque(UInt32, cells.count)
-        self._per_quantum = dr.opaque(Float, 1 / quantum)
+        self.per_quantum = dr.opaque(Float, 1 / quantum)
 
-    def add(self, row: Any, x_m: Any, radiance: Any, active: Any) -> None:
-        """Add samples of radiance at x = path - origin to their rows' cells."""
+    def _cell(self, x_m: Any) -> Any:
         ratio = dr.abs(x_m) / self._width
         number = dr.log(1 + self._growth * ratio) / self._growth if self.cells.growth > 0 else ratio
         signed = dr.floor(dr.mulsign(number, x_m)) + Float(self._behind)
-        cell = UInt32(dr.clip(signed, 0, Float(self._count) - 1))
+        return UInt32(dr.clip(signed, 0, Float(self._count) - 1))
+
+    def add(self, row: Any, x_m: Any, radiance: Any, active: Any) -> None:
+        """Add samples of radiance at x = path - origin to their rows' cells."""
+        cell = self._cell(x_m)
         low, high = (
             dr.gather(Float, self._edges, cell, active),
             dr.gather(Float, self._edges, cell + 1, active),
         )
         share = dr.clip((x_m - low) / (high - low), 0, 1)
         index = row * self._count + cell
-        dr.scatter_add(self.energy, self.quanta(radiance), index, active, mode=dr.ReduceMode.Direct)
-        dr.scatter_add(self.moment, self.quanta(radiance * share), index, active, mode=dr.ReduceMode.Direct)
+        add_quanta(self.energy, radiance * self.per_quantum, index, active)
+        add_quanta(self.moment, radiance * share * self.per_quantum, index, active)
 
-    def quanta(self, radiance: Any) -> Any:
-        """Radiance in units of the fixed-point sums, rounded."""
-        return UInt64(dr.minimum(radiance * self._per_quantum, MOST_QUANTA) + 0.5)
+    def add_between(self, row: Any, low_m: Any, high_m: Any, radiance: Any, active: Any) -> None:
+        """Add radiance that is even between two values of x, no farther apart than cells are wide there, or little."""
+        edge = dr.gather(Float, self._edges, self._cell(low_m) + 1, active)
+        below = dr.select(
+            high_m > edge, dr.clip((edge - low_m) / (high_m - low_m), 0, 1), 1
+        )  # the last cell ends early
+        self.add(row, 0.5 * (low_m + dr.minimum(high_m, edge)), radiance * below, active)
+        self.add(row, 0.5 * (edge + high_m), radiance * (1 - below), active & (below < 1))
 
     def samples(self, pixels: np.ndarray, origin_m: np.ndarray) -> Samples:
         """Merged samples, one for every cell that holds energy, of rows that belong to `pixels`.

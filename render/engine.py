@@ -4,86 +4,37 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
-from collections.abc import Callable
+import math
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
 from render.ambient import AmbientLight, ambient_light
 from render.cells import coarsened
-from render.direct import centre_layers, direct_light
-from render.error import ErrorEstimate, estimate, noise_power, power_of, response
-from render.heap import release
+from render.direct import centre_layers
+from render.error import ErrorEstimate, estimate, noise_of_responses, noise_power, response
 from render.indirect import (
-    IndirectLight,
     Schedule,
-    allocate,
-    combined,
-    combined_samples,
+    Watched,
     image_cells,
-    indirect_light,
-    pilot_noise,
-    uniform,
 )
-from render.paths import BLOCK, block_order
 from render.planning import finer_pilot, make_plan, pilot_pixels
-from render.returns import Growing, Samples, concatenate, no_samples, of_pixels, select, to_returns
-from render.settings import BATCHES, MOST_AMBIENT_SPP, Plan, RenderSettings
-from render.specular import specular_light
+from render.returns import concatenate, no_samples, of_pixels, to_returns
+from render.settings import BATCHES, FILTERED_BATCHES, MOST_AMBIENT_SPP, Plan, RenderSettings
+from render.tracing import Progress, Traced, derived_seed, filtered, most_spp, trace, traced_on
 from render.transient import Transient
 from render.world import World
 from scenes.model import Scene
 
 log = logging.getLogger(__name__)
 
-STAGE_PLAN, STAGE_INDIRECT, STAGE_AMBIENT, STAGE_PILOT, STAGE_MORE = 10, 11, 12, 13, 14
-# Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
-MOST_SPP, MOST_SPP_BY_DEFAULT = 16384, 1024
+STAGE_PLAN, STAGE_AMBIENT, STAGE_MORE = 10, 12, 14
 AMBIENT_BOUNCES = 16  # most paths end long before, by chance
-MOST_MORE = 3.0  # paths traced on top are at most this many times those traced before
-
-Progress = Callable[[str, float], None]
-
-
-class Traced(NamedTuple):
-    """Light of a planned render before it is packed: its samples, what is known of indirect light or None, counts.
-
-    Samples of direct light come first, then those of specular light, up to `ends`, then those of indirect light.
-    """
-
-    samples: Samples
-    ends: tuple[int, int]
-    indirect: IndirectLight | None
-    origin_m: np.ndarray
-    mixed: np.ndarray
-    clipped: int
-    rays: int
-    schedule: Schedule | None
-    reasons: tuple[str, ...]
-
-    @property
-    def spp(self) -> int:
-        """Work on indirect light in paths a pixel."""
-        return 0 if self.schedule is None else round(self.schedule.cost)
-
-    @property
-    def direct(self) -> Samples:
-        return select(self.samples, slice(self.ends[0]))
-
-    @property
-    def specular(self) -> Samples:
-        return select(self.samples, slice(*self.ends))
-
-    @property
-    def indirect_samples(self) -> Samples:
-        return select(self.samples, slice(self.ends[1], None))
-
-
-def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
-    """A 32-bit seed for one pass of one stage of one scene: independent streams from one number."""
-    return int(np.random.SeedSequence(seed, spawn_key=(stage, scene, number)).generate_state(1)[0])
+# paths traced on top are at most this many times those traced before; filtered light has no pilot
+MOST_MORE, MOST_MORE_FILTERED = 3.0, 15.0
+CLEAR = 3  # standard deviations above which a bias is believed
+MOST_FILTERED_PASSES, LEAST_ALLOWED = 3, 0.25
 
 
 def render(
@@ -114,11 +65,14 @@ def render(
     # where nothing is in view there is nothing to explain
     plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, *traced.reasons))
     error = _estimated(world, plan, settings, traced, checked)
-    more = _missing(plan, settings, traced, error)
-    if more is not None:
-        traced = _traced_on(world, plan, settings, traced, more, seed, checked, say)
+    for number in range(MOST_FILTERED_PASSES if plan.filter else 1):
+        more = _missing(world, plan, settings, traced, error)
+        if more is None:
+            break
+        traced = traced_on(world, plan, settings, traced, more, derived_seed(seed, STAGE_MORE, 0, number), checked, say)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
         error = _estimated(world, plan, settings, traced, checked)
+    plan = replace(plan, reasons=(*plan.reasons, *_said_of_bias(plan, error)))
     for line in (*scene.notes, *plan.reasons) if len(traced.samples.pixel) else ():
         log.info("%s", line)
     noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
@@ -152,150 +106,41 @@ def planned(world: World, settings: RenderSettings, seed: int = 0) -> Plan:
     return make_plan(world, settings, derived_seed(seed, STAGE_PLAN))
 
 
-def trace(
-    world: World,
-    plan: Plan,
-    settings: RenderSettings,
-    *,
-    seed: int = 0,
-    checked: np.ndarray | None = None,
-    progress: Progress | None = None,
-) -> Traced:
-    """Trace what the plan says: the light alone, without layers, ambient light or an error estimate.
-
-    `checked` are sorted flat pixels whose indirect light is kept by batches, for the error estimate.
-    """
-    say = progress or (lambda what, share: None)
-    camera = world.scene.camera
-    pixels = np.arange(camera.height * camera.width)
-    say("direct light", 0.05)
-    direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, least_share=plan.least_share)
-    # only indirect light is counted from where direct light is
-    origin_m, brightest = _mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
-    specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
-    release(len(pixels))
-    rays, indirect, schedule, reasons = direct.rays, None, None, ()
-    if plan.bounces > 1 and brightest > 0:
-        schedule, reasons = _schedule(world, plan, settings, direct.samples, seed)
-    light = Growing()
-    light.add(direct.samples)
-    direct = direct._replace(samples=no_samples())  # they are in the list now
-    ends = len(light), len(light) + len(specular.samples.pixel)
-    light.add(specular.samples)
-    release(len(pixels))
-    if schedule is not None:
-        indirect = _indirect(
-            world, plan, settings, schedule, STAGE_INDIRECT, seed, origin_m, brightest, checked, light, say
-        )
-        rays += schedule.paths * (2 * plan.bounces - 1) + schedule.connections
-    reasons = (*specular.notes, *reasons)
-    return Traced(light.finished(), ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
-
-
-def _indirect(
-    world: World,
-    plan: Plan,
-    settings: RenderSettings,
-    schedule: Schedule,
-    stage: int,
-    seed: int,
-    origin_m: np.ndarray,
-    brightest: float,
-    checked: np.ndarray | None,
-    light: Growing,
-    say: Progress,
-) -> IndirectLight:
-    return indirect_light(
-        world,
-        schedule,
-        plan.bounces,
-        derived_seed(seed, stage),
-        origin_m,
-        brightest,
-        np.empty(0, np.int64) if checked is None else checked,
-        light.add,
-        width_m=settings.indirect_tolerance_m,
-        growth=settings.indirect_growth,
-        say=lambda share: say("indirect light", 0.1 + 0.8 * share),
-    )
-
-
-def _missing(plan: Plan, settings: RenderSettings, traced: Traced, error: ErrorEstimate) -> Schedule | None:
+def _missing(
+    world: World, plan: Plan, settings: RenderSettings, traced: Traced, error: ErrorEstimate
+) -> Schedule | None:
     """What to trace on top where a planned render misses its target: pilots see few of the rare bright paths."""
     if settings.spp is not None or traced.schedule is None or traced.indirect is None or plan.target <= 0:
         return None
-    allowed = settings.aim * plan.target**2 - error.direct**2 - error.merging**2
-    if error.total**2 <= settings.aim * plan.target**2 or allowed <= 0 or traced.schedule.batches < BATCHES:
+    batches = traced.schedule.batches
+    allowed = settings.aim * plan.target**2 - error.direct**2 - error.merging**2 - error.bias**2
+    if plan.filter and error.bias < plan.target:
+        # what merging and the filter seem to cost after few paths falls with more
+        allowed = max(allowed, LEAST_ALLOWED * settings.aim * plan.target**2)
+    enough = error.total**2 <= settings.aim * plan.target**2
+    if enough or allowed <= 0 or batches < (FILTERED_BATCHES if plan.filter else BATCHES):
         return None
-    asked = settings.error is not None or settings.budget is not None
-    left = (MOST_SPP if asked else MOST_SPP_BY_DEFAULT) / traced.schedule.cost - 1
-    factor = min(error.monte_carlo**2 / allowed - 1, MOST_MORE, left)
+    left = most_spp(settings)[0] / traced.schedule.cost - 1
+    factor = min(error.monte_carlo**2 / allowed - 1, MOST_MORE_FILTERED if plan.filter else MOST_MORE, left)
     if factor <= 0:
         return None
-    rounds = np.ceil(traced.schedule.rounds * factor / BATCHES).astype(np.int64) * BATCHES
+    rounds = np.ceil(traced.schedule.rounds * factor / batches).astype(np.int64) * batches
+    if plan.filter:
+        before, blocks = int(traced.schedule.rounds[0]), traced.schedule.pixels
+        return filtered(world, plan, settings, blocks, traced.origin_m, int(rounds[0]), before)
     return traced.schedule._replace(rounds=rounds)
 
 
-def _traced_on(
-    world: World,
-    plan: Plan,
-    settings: RenderSettings,
-    traced: Traced,
-    more: Schedule,
-    seed: int,
-    checked: np.ndarray,
-    say: Progress,
-) -> Traced:
-    """A trace with further paths, weighted by their numbers.
-
-    These follow the first paths' noise; the bias of such a stop is of second order in it.
-    """
-    _, brightest = _mean_path(traced.direct, len(traced.origin_m))
-    light = Growing()
-    added = _indirect(world, plan, settings, more, STAGE_MORE, seed, traced.origin_m, brightest, checked, light, say)
-    before = traced.schedule
-    share = np.ones(len(traced.origin_m))
-    pixels, real = before.pixels, before.pixels >= 0
-    share[pixels[real]] = np.repeat(before.rounds / (before.rounds + more.rounds), BLOCK)[real]
-    cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
-    merged = combined_samples(traced.indirect_samples, light.finished(), share, cells, traced.origin_m)
-    reason = f"indirect light: the work of {more.cost:.0f} paths a pixel on top, to meet the target"
-    return traced._replace(
-        samples=concatenate([traced.direct, traced.specular, merged]),
-        indirect=combined(traced.indirect, added, share),
-        rays=traced.rays + more.paths * (2 * plan.bounces - 1) + more.connections,
-        schedule=before._replace(rounds=before.rounds + more.rounds),
-        reasons=(*traced.reasons, reason),
-    )
-
-
-def _schedule(
-    world: World, plan: Plan, settings: RenderSettings, direct: Samples, seed: int
-) -> tuple[Schedule, tuple[str, ...]]:
-    """How many paths each pixel traces, and why: from the noise of a pilot of a few paths, which is not used again."""
-    camera = world.scene.camera
-    blocks = block_order(np.arange(camera.height * camera.width), camera.width)
-    if plan.spp is not None and (not plan.adaptive or plan.spp < BATCHES):
-        rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
-        return uniform(blocks, rounds, shared=False), ()
-    own, shared = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT))
-    if not plan.adaptive:
-        own, shared = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
-    if plan.spp is not None:
-        return allocate(blocks, own, shared, cost=plan.spp), ()
-    power, per_sample = power_of(direct)
-    allowed = plan.noise**2 * power / per_sample
-    schedule = allocate(blocks, own, shared, squared_error=allowed)
-    asked = settings.error is not None or settings.budget is not None
-    limit = MOST_SPP if asked else MOST_SPP_BY_DEFAULT
-    wanted, reasons = schedule.cost, []
-    if wanted > limit:
-        schedule = allocate(blocks, own, shared, cost=limit)
-        remedy = "force more with spp" if asked else "ask for more with an error target"
-        reasons.append(f"indirect light: the work of {wanted:.0f} paths a pixel would meet the target; {remedy}")
-    spread = f"{schedule.rounds.min()} to {schedule.rounds.max()} paths a pixel, {schedule.shared.mean():.0%} shared"
-    reasons.append(f"indirect light: {spread}; the work of {schedule.cost:.0f} paths a pixel")
-    return schedule, tuple(reasons)
+def _said_of_bias(plan: Plan, error: ErrorEstimate) -> tuple[str, ...]:
+    """What to know of a filter's bias, measured against the same paths without it."""
+    if not plan.filter or plan.bounces == 1:
+        return ()
+    if error.bias == 0:
+        return ("filter: biased, by less than the noise of as many paths shows",)
+    told = f"filter: biased by {error.bias:.2g}, measured against the same paths without it"
+    if error.bias > plan.target:
+        told += f", more than the target of {plan.target:.2g}: render without a filter"
+    return (told,)
 
 
 def _estimated(
@@ -318,20 +163,34 @@ def _estimated(
         merged = coarsened(kept, cells, origin_m)
         changes.append(response(concatenate([merged, kept._replace(radiance=-kept.radiance)]), place))
     merging = (changes[0] * changes[1]).sum(axis=1)
-    indirect = response(seen.samples(), place)
-    noise = noise_power(seen.radiance, seen.cells.width_of_m)
+    bias = 0.0
+    if traced.indirect.plain is None:
+        indirect = response(seen.samples(), place)
+        noise = noise_power(seen.radiance, seen.cells.width_of_m)
+    else:
+        batches = [response(seen.samples(slice(b, b + 1)), place) for b in range(seen.radiance.shape[1])]
+        indirect, noise = np.mean(batches, axis=0), noise_of_responses(batches)
+        bias = _filter_bias(batches, traced.indirect.plain, place)
     # few pixels hold the rare bright paths: the noise of all pixels' totals says how typical the checked ones are
     variance = traced.indirect.noise**2
     of_checked = variance[checked].mean()
     typical = variance.mean() / of_checked if of_checked > 0 else 1.0
-    return estimate(coarse, fine, indirect, noise * typical, merging)
+    return estimate(coarse, fine, indirect, noise * typical, merging, bias)
 
 
-def _mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:
-    """Radiance-weighted mean path of each pixel [m], 0 where there is none; and the brightest pixel's radiance."""
-    total = np.bincount(samples.pixel, weights=samples.radiance, minlength=pixels)
-    moment = np.bincount(samples.pixel, weights=samples.radiance * samples.path_m, minlength=pixels)
-    return np.divide(moment, total, out=np.zeros(pixels), where=total > 0), float(total.max(initial=0))
+def _filter_bias(filtered: list[np.ndarray], plain: Watched, place: np.ndarray) -> np.ndarray | float:
+    """Squared difference that the filter makes, per pixel, from two independent halves of the batches.
+
+    What noise adds to it has mean 0; 0 where the sum is not CLEAR standard deviations above that.
+    """
+    if len(filtered) < 2:
+        return 0.0
+    changes = [
+        np.mean(filtered[half], axis=0) - response(plain.samples(half), place)
+        for half in (slice(0, None, 2), slice(1, None, 2))
+    ]
+    squared = (changes[0] * changes[1]).sum(axis=1)
+    return squared if squared.sum() > CLEAR * math.sqrt((squared**2).sum()) else 0.0
 
 
 def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> dict:

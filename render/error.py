@@ -25,12 +25,13 @@ BLOCK_ENTRIES = 1 << 16
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """Relative errors: overall (nRMSE) and its parts; median and 95th percentile over pixels."""
+    """Relative errors: overall (nRMSE) and its parts, `bias` the filter's; median and 95th percentile of pixels."""
 
     total: float
     direct: float
     merging: float
     monte_carlo: float
+    bias: float
     pixel_median: float
     pixel_p95: float
 
@@ -92,20 +93,21 @@ def estimate(
     indirect: np.ndarray | float = 0.0,
     noise: np.ndarray | float = 0.0,
     merging: np.ndarray | float = 0.0,
+    bias: np.ndarray | float = 0.0,
 ) -> ErrorEstimate:
-    """Error of direct light by `coarse` against `fine` cells beside the indirect light's `noise` and `merging` error.
+    """Error of direct light by `coarse` against `fine` cells beside the indirect light's `noise`, `merging` and `bias`.
 
-    coarse, fine, indirect are (pixels, bins) responses; noise and merging squared errors of the pixels. Without
-    these three there is direct light alone.
+    coarse, fine, indirect are (pixels, bins) responses; noise, merging and bias squared errors of the pixels. Without
+    these four there is direct light alone.
     """
-    noise, merging = (np.broadcast_to(part, len(coarse)) for part in (noise, merging))
+    noise, merging, bias = (np.broadcast_to(part, len(coarse)) for part in (noise, merging, bias))
     direct = ((coarse - fine) ** 2).sum(axis=1)
     power = ((fine + indirect) ** 2).sum(axis=1)
     whole = power.sum()
     if whole <= 0:
-        return ErrorEstimate(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    parts = [max(part.sum() / whole, 0.0) for part in (direct, merging, noise)]
-    per_pixel = np.sqrt(np.maximum(direct + merging + noise, 0)[power > 0] / power[power > 0])
+        return ErrorEstimate(*(0.0,) * 7)
+    parts = [max(part.sum() / whole, 0.0) for part in (direct, merging, noise, bias)]
+    per_pixel = np.sqrt(np.maximum(direct + merging + noise + bias, 0)[power > 0] / power[power > 0])
     return ErrorEstimate(
         math.sqrt(sum(parts)),
         *(math.sqrt(part) for part in parts),
@@ -128,6 +130,16 @@ def noise_power(batches: np.ndarray, width_m: np.ndarray) -> np.ndarray:
     variance = batches.var(axis=1, ddof=1) / count
     sigma = np.sqrt(SIGMA_M**2 + width_m**2 / 12)
     return variance @ (BIN_M / (2 * math.sqrt(math.pi) * sigma))
+
+
+def noise_of_responses(responses: list[np.ndarray]) -> np.ndarray:
+    """Expected squared error of the mean of independent batches, per pixel, from each one's response.
+
+    Takes what cells have in common into account, as `noise_power` does not: filtered light spreads over some.
+    """
+    if len(responses) < 2:
+        return np.zeros(len(responses[0]))
+    return np.var(responses, axis=0, ddof=1).sum(axis=1) / len(responses)
 
 
 def power_of(direct: Samples) -> tuple[float, float]:

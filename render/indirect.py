@@ -10,10 +10,12 @@ import numpy as np
 
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
 from render.heap import release
-from render.paths import BLOCK, LANES, PATHS, Turns, add_paths, noise_of_paths
+from render.paths import LANES, PATHS, add_paths, noise_of_paths
+from render.regions import Octaves, Regions
 from render.returns import Samples, concatenate
-from render.settings import BATCHES
+from render.settings import BATCHES, FILTERED_BATCHES
 from render.sums import Sums
+from render.turns import BLOCK, Turns, turns_of
 from render.world import World, dr
 
 MOST_CELLS = 1 << 21  # of one launch: 32 MB of accumulators
@@ -28,16 +30,19 @@ PATH_COST = 9.0
 class Schedule(NamedTuple):
     """Who traces how many paths: blocks of flat pixels (-1: none), and per block its rounds and whether it shares.
 
-    A round is one path in every pixel of a block. `batches` of rounds are kept apart for the error estimate.
+    A round is one path in every pixel of a block. `batches` of rounds are kept apart for the error estimate. With
+    `spans` no block shares, and late light is filtered over regions of these octaves.
     """
 
     pixels: np.ndarray
     rounds: np.ndarray
     shared: np.ndarray
+    spans: Octaves | None = None
 
     @property
     def batches(self) -> int:
-        return int(min(BATCHES, self.rounds.min(initial=BATCHES)))
+        most = BATCHES if self.spans is None else FILTERED_BATCHES
+        return int(min(most, self.rounds.min(initial=most)))
 
     @property
     def paths(self) -> int:
@@ -73,8 +78,8 @@ def pilot_noise(world: World, blocks: np.ndarray, bounces: int, seed: int) -> tu
     per_launch = max(1, LANES // BLOCK**2 // rounds)
     for first in range(0, count, per_launch):
         size = min(per_launch, count - first)
-        block = np.repeat(np.arange(size), rounds)
-        turns = Turns(block, block + first, np.tile(np.arange(rounds), size))
+        block = np.arange(size)
+        turns = turns_of(block, block + first, np.full(size, rounds))
         chosen = blocks[first * BLOCK : (first + size) * BLOCK]
         for total, part in zip((own, shared), noise_of_paths(world, chosen, turns, bounces, seed), strict=True):
             total[first : first + size] = part.sum(axis=1).reshape(size, rounds).mean(axis=1)
@@ -149,18 +154,28 @@ class Chunk(NamedTuple):
 
 
 class IndirectLight(NamedTuple):
-    """Standard error of each pixel's total; batches of the watched pixels. Its samples are handed on as they come."""
+    """Standard error of each pixel's total; batches of the watched pixels, and what they would be without a filter.
+
+    Its samples are handed on as they come.
+    """
 
     noise: np.ndarray
     watched: Watched
+    plain: Watched | None = None
 
 
 def combined(one: IndirectLight, other: IndirectLight, share: np.ndarray) -> IndirectLight:
     """The weighted mean of two independent estimates but for their samples; `share` of the first, for every pixel."""
     weight = share[one.watched.pixels][:, None, None]
-    both = [weight * a + (1 - weight) * b for a, b in zip(one.watched[-2:], other.watched[-2:], strict=True)]
-    seen = one.watched._replace(radiance=both[0], moment=both[1])
-    return IndirectLight(np.hypot(share * one.noise, (1 - share) * other.noise), seen)
+
+    def mean(first: Watched | None, second: Watched | None) -> Watched | None:
+        if first is None or second is None:
+            return None
+        both = (weight * a + (1 - weight) * b for a, b in zip(first[-2:], second[-2:], strict=True))
+        return Watched(*first[:-2], *both)
+
+    noise = np.hypot(share * one.noise, (1 - share) * other.noise)
+    return IndirectLight(noise, mean(one.watched, other.watched), mean(one.plain, other.plain))
 
 
 def combined_samples(one: Samples, other: Samples, share: np.ndarray, cells: Cells, origin_m: np.ndarray) -> Samples:
@@ -190,12 +205,12 @@ def collect(
     seed: int,
     brightest: float,
     *,
-    watch: tuple[np.ndarray, Rows] | None = None,
+    watch: Watch | None = None,
     say: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Chunk]:
     """Trace a schedule and hand out merged samples, some blocks at a time.
 
-    `origin_m` belongs to flat pixels of the image. `watch` = (row of every flat pixel or -1, rows by batch).
+    `origin_m` belongs to flat pixels of the image.
     """
     per_chunk = max(1, MOST_CELLS // (cells.count * BLOCK))
     done = 0
@@ -213,13 +228,20 @@ def collect(
                 origin_m[pixels],
                 rounds=np.repeat(rounds, BLOCK),
                 batches=schedule.batches,
-                watched=None if watch is None else watch[1],
-                watch=None if watch is None else np.where(pixels >= 0, watch[0][pixels], -1),
+                watched=None if watch is None else watch.rows,
+                plain=None if watch is None else watch.plain,
+                watch=None if watch is None else np.where(pixels >= 0, watch.row_of[pixels], -1),
             )
-            for number, turns in enumerate(_turns(chosen, rounds, LANES // BLOCK**2 if shared else PATHS // BLOCK)):
+            regions = None
+            if schedule.spans is not None:
+                regions = Regions(world, pixels, schedule.spans, schedule.batches, rows.quantum, seed)
+            most = LANES // BLOCK**2 if shared else PATHS // BLOCK
+            for number, turns in enumerate(_launches(chosen, rounds, schedule.batches, most)):
                 if number % (QUEUED if shared else 1) == 0:
                     dr.sync_thread()
-                add_paths(world, pixels, turns, bounces, seed, sums, shared=shared)
+                add_paths(world, pixels, turns, bounces, seed, sums, shared=shared, regions=regions)
+            if regions is not None:
+                regions.read(sums)
             release(world.scene.camera.height * world.scene.camera.width)  # what the launches took
             totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
             samples = rows.samples(pixels, origin_m[pixels])
@@ -227,23 +249,33 @@ def collect(
             yield Chunk(pixels, samples, totals)
 
 
-def _turns(streams: np.ndarray, rounds: np.ndarray, most: int) -> Iterator[Turns]:
+def _launches(streams: np.ndarray, rounds: np.ndarray, batches: int, most: int) -> Iterator[Turns]:
     """All rounds of some blocks in launches of one size: memory of another is not reused.
 
     A launch has at most `most` turns, or OVER more where that saves one.
     """
-    ends = np.cumsum(rounds)
-    launches = max(1, math.ceil(ends[-1] / most - OVER))
-    for turn in np.array_split(np.arange(int(ends[-1])), launches):
-        block = np.searchsorted(ends, turn, side="right")
-        yield Turns(block, streams[block], turn - (ends - rounds)[block])
+    count = int(rounds.sum())
+    for turns in np.array_split(np.arange(count), max(1, math.ceil(count / most - OVER))):
+        yield turns_of(np.arange(len(rounds)), streams, rounds, batches, turns)
 
 
-def watched_rows(pixels: np.ndarray, image_pixels: int, cells: Cells, batches: int, brightest: float) -> tuple:
-    """`watch` of `collect` for a sorted few of the image's pixels."""
-    row = np.full(image_pixels, -1)
-    row[pixels] = np.arange(len(pixels))
-    return row, Rows(len(pixels) * batches, cells, quantum_for(brightest))
+class Watch(NamedTuple):
+    """The watched row of every flat pixel of the image, or -1; rows by batch, and such without a filter."""
+
+    row_of: np.ndarray
+    rows: Rows
+    plain: Rows | None
+
+
+def _watch(pixels: np.ndarray, image_pixels: int, cells: Cells, schedule: Schedule, brightest: float) -> Watch | None:
+    """What it takes to watch a sorted few of the image's pixels."""
+    if len(pixels) == 0:
+        return None
+    row_of = np.full(image_pixels, -1)
+    row_of[pixels] = np.arange(len(pixels))
+    kinds = 1 if schedule.spans is None else 2
+    rows = [Rows(len(pixels) * schedule.batches, cells, quantum_for(brightest)) for _ in range(kinds)]
+    return Watch(row_of, rows[0], rows[1] if kinds == 2 else None)
 
 
 def indirect_light(
@@ -260,7 +292,9 @@ def indirect_light(
     growth: float,
     say: Callable[[float], None] = lambda share: None,
 ) -> IndirectLight:
-    """Light of 2 to `bounces` surfaces in the scheduled pixels, unbiased; `add` is given its samples, part by part.
+    """Light of 2 to `bounces` surfaces in the scheduled pixels; `add` is given its samples, part by part.
+
+    Unbiased, unless the schedule asks for a filter.
 
     `origin_m`, for every pixel of the image, is the path length from which cells widen: the direct return's.
     `brightest` sets the fixed-point scale. The `watched` pixels, sorted, must be among the scheduled.
@@ -268,13 +302,18 @@ def indirect_light(
     image_pixels, batches = len(origin_m), schedule.batches
     cells = image_cells(world, width_m, growth, origin_m, bounces)
     fine = image_cells(world, width_m / 2, growth / 2, origin_m, bounces)
-    watch = watched_rows(watched, image_pixels, fine, batches, brightest) if len(watched) else None
+    watch = _watch(watched, image_pixels, fine, schedule, brightest)
     noise = np.zeros(image_pixels)
     for chunk in collect(world, schedule, origin_m, cells, bounces, seed, brightest, watch=watch, say=say):
         real = chunk.pixels >= 0
         add(chunk.samples)
         if batches > 1:
             noise[chunk.pixels[real]] = chunk.totals[real].std(axis=1, ddof=1) * np.sqrt(batches)
-    seen = watch[1].sums() if watch else (np.zeros(0),) * 2
-    seen = (values.reshape(len(watched), batches, fine.count) for values in seen)
-    return IndirectLight(noise, Watched(watched, fine, origin_m[watched], *seen))
+
+    def seen(rows: Rows | None) -> Watched:
+        sums = (np.zeros(0),) * 2 if rows is None else rows.sums()
+        shape = len(watched), batches, fine.count
+        return Watched(watched, fine, origin_m[watched], *(values.reshape(shape) for values in sums))
+
+    rows, plain = (None, None) if watch is None else watch[1:]
+    return IndirectLight(noise, seen(rows), None if plain is None else seen(plain))

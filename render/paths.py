@@ -21,10 +21,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.rays import camera_rays, first_opaque, laser_leg, laser_light, segment, shape_index, spawn
+from render.regions import Late, Point, Regions, point_of
 from render.sums import Sums
+from render.turns import BLOCK, Turns, block_order, turns_of
 from render.world import Bool, Float, UInt32, World, dr, mi, upload
 
-BLOCK = 16  # pixels that share their paths
 # Of one launch, 40 and 75 MB in its course. Python records a launch for as long as some 2^16 connections take.
 LANES = 1 << 20  # connections
 PATHS = 1 << 18
@@ -33,7 +34,7 @@ GOLDEN = (3242174889, 2447445414)
 
 
 class _Heads(NamedTuple):
-    """x1 of every path of a launch and where it belongs."""
+    """x1 of every path of a launch and where it belongs; its `point` reflects nothing where the path left by a lobe."""
 
     receiver: Any
     si: Any
@@ -41,10 +42,13 @@ class _Heads(NamedTuple):
     path: Any
     valid: Any
     shares: Any
+    point: Point
 
 
 class _Tails(NamedTuple):
     """x2 and beyond: light of the laser at x2; direction to x3; light from there on per path vertex, `length` of them.
+
+    `direction` leads from x1 to x2.
 
     `own_weight` leads from x2 to the pixel, `own_onward` from x3; `shared` and `onward` say whether the pool may use
     the light at x2, and the light beyond.
@@ -64,35 +68,28 @@ class _Tails(NamedTuple):
     values: Any
     paths: Any
     length: Any
-
-
-class Turns(NamedTuple):
-    """One launch: turn n traces a path in each pixel of its block `block[n]`, number `stream[n]` of the image.
-
-    `round` numbers the turns of a block. With the seed, stream and round decide the random numbers.
-    """
-
-    block: np.ndarray
-    stream: np.ndarray
-    round: np.ndarray
-
-
-def block_order(pixels: np.ndarray, width: int) -> np.ndarray:
-    """Flat pixel indices along a Z-order curve, so that runs of 16 are square neighbourhoods; padded with -1."""
-    row, column = np.divmod(pixels.astype(np.uint64), np.uint64(width))
-    code = np.zeros(len(pixels), np.uint64)
-    for bit in range(15):
-        one, shift = np.uint64(1), np.uint64(bit)
-        code |= ((column >> shift) & one) << np.uint64(2 * bit) | ((row >> shift) & one) << np.uint64(2 * bit + 1)
-    ordered = pixels[np.argsort(code, kind="stable")]
-    return np.concatenate((ordered, np.full(-len(ordered) % BLOCK, -1, ordered.dtype)))
+    direction: Any
 
 
 def add_paths(
-    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int, sums: Sums, *, shared: bool
+    world: World,
+    pixels: np.ndarray,
+    turns: Turns,
+    bounces: int,
+    seed: int,
+    sums: Sums,
+    *,
+    shared: bool,
+    regions: Regions | None = None,
 ) -> None:
-    """Trace paths of the given blocks of flat pixels (-1: none) and add their light to `sums`; `shared` by blocks."""
-    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches)
+    """Trace paths of the given blocks of flat pixels (-1: none) and add their light to `sums`; `shared` by blocks.
+
+    With `regions` late light goes there instead, to be read from them when all paths are traced.
+    """
+    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches, shared=shared)
+    if regions is not None:
+        regions.count_paths(heads.point)
+        sums = Late(regions, sums, heads.point, tails.direction)
     if not shared or world.has_own:
         _add_own(heads, tails, batch, sums, shared)
     if shared:
@@ -108,7 +105,7 @@ def noise_of_paths(
 
     Histograms of paths that fall into different bins have this variance.
     """
-    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, dr.opaque(UInt32, 1))
+    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, dr.opaque(UInt32, 1), shared=True)
     lanes = dr.width(batch)
     values = tails.values.numpy().reshape(-1, lanes)[: bounces - 2].astype(np.float64)
     beyond = (values**2).sum(axis=0)
@@ -134,18 +131,25 @@ def _pairs(lanes: int) -> tuple[Any, Any]:
 
 
 def _trace(
-    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int, batches: Any
+    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int, batches: Any, *, shared: bool
 ) -> tuple[_Heads, _Tails, Any]:
     lanes = len(turns.block) * BLOCK
     lane = dr.arange(UInt32, lanes)
     turn, member = lane // BLOCK, lane % BLOCK
-    block, stream, round_index = (dr.gather(UInt32, upload(UInt32, column), turn) for column in turns)
+    block, stream, round_index, stride = (dr.gather(UInt32, upload(UInt32, column), turn) for column in turns)
     receiver = block * BLOCK + member
     pixels = upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF)
     keys = [dr.opaque(UInt32, int(key)) for key in np.random.SeedSequence(seed).generate_state(2)]
-    # one random shift a block and round; the members share a low-discrepancy set of first directions
-    shift = mi.sample_tea_32(stream, round_index ^ keys[0])
-    spread = [Float((s + member * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
+    if shared:
+        # one random shift a block and round; the members share a low-discrepancy set of first directions
+        shift = mi.sample_tea_32(stream, round_index ^ keys[0])
+        spread = [Float((s + member * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
+    else:
+        # one randomised (0, 2)-sequence a block and batch (Sobol 1967): the rounds of each member are an aligned run of
+        # it, and as even as those of all
+        shift = mi.sample_tea_32(stream, (round_index % batches) ^ keys[0])
+        number = member * stride + round_index // batches
+        spread = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
     # a hash of block, member and round numbers the streams, whichever launch they run in
     lane_key = mi.sample_tea_32(stream * BLOCK + member, round_index ^ keys[1])
     random = mi.PCG32(initstate=mi.UInt64(lane_key[0]), initseq=mi.UInt64(lane_key[1]))
@@ -157,12 +161,14 @@ def _trace(
     si, transmission, path, _ = first_opaque(world, ray, valid)
     hit = valid & si.is_valid()
     shares = hit & (dr.gather(Float, world.shares, shape_index(si), hit) > 0)
-    heads = _Heads(receiver, _kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares)
     context = mi.BSDFContext()
-    sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), heads.valid)
-    alive = heads.valid & (weight[0] > 0)
-    point = mi.Point3f(si.p)
-    si, passed, leg, _ = first_opaque(world, spawn(si, si.to_world(sample.wo)), alive, point)
+    sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), hit)
+    diffuse = hit & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+    point = point_of(si, ray, path, dr.select(diffuse, transmission * weight[0], 0))
+    heads = _Heads(receiver, _kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares, point)
+    alive = hit & (weight[0] > 0)
+    start, towards = mi.Point3f(si.p), si.to_world(sample.wo)
+    si, passed, leg, _ = first_opaque(world, spawn(si, towards), alive, start)
     alive &= si.is_valid()
     own = dr.select(alive, transmission * weight[0] * passed, 0)
     to_laser, irradiance, laser_path = laser_light(world, si, pixel, alive, seen_by_camera=None)
@@ -190,6 +196,7 @@ def _trace(
         values=values,
         paths=paths,
         length=length,
+        direction=towards,
     )
     batch = round_index % batches
     dr.eval(*heads, *tails, batch)
@@ -267,9 +274,9 @@ def _add_own(heads: _Heads, tails: _Tails, batch: Any, sums: Sums, shared: bool)
 def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: int, seed: int) -> np.ndarray:
     """Mean radiance, summed over the pixels, of light that met exactly 0, 1, ..., `bounces` surfaces (0 below 2)."""
     blocks = block_order(pixels, world.scene.camera.width)
-    block = np.tile(np.arange(len(blocks) // BLOCK), rounds)
-    turns = Turns(block, block, np.repeat(np.arange(rounds), len(blocks) // BLOCK))
-    _, tails, batch = _trace(world, blocks, turns, bounces, seed, dr.opaque(UInt32, 1))
+    block = np.arange(len(blocks) // BLOCK)
+    turns = turns_of(block, block, np.full(len(block), rounds))
+    _, tails, batch = _trace(world, blocks, turns, bounces, seed, dr.opaque(UInt32, 1), shared=False)
     beyond = tails.own_onward.numpy() * tails.values.numpy().reshape(-1, dr.width(batch))
     energy = np.zeros(bounces + 1)
     energy[2] = tails.own_value.numpy().sum(dtype=np.float64)

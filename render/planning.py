@@ -13,6 +13,7 @@ from render.paths import energy_by_bounces
 from render.returns import of_pixels
 from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
 from render.world import World
+from scenes.errors import InputError
 from scenes.model import Material
 
 DEFAULT_ERROR = 0.02
@@ -101,6 +102,11 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
     pixels = pilot_pixels(world, seed)
     reasons = list(_limits(world))
     mode_is_flood = world.scene.laser.mode == "flood"
+    if settings.filter and not mode_is_flood:
+        mode = world.scene.laser.mode
+        raise InputError(
+            f"render: a filter shares light of a flood laser among pixels, this one is {mode}: leave it out"
+        )
     direct_alone = settings.bounces == 1 or (settings.bounces is None and world.scene.laser.mode == "scan")
     fine = None
     if settings.grid is None or settings.budget is not None or not direct_alone:
@@ -128,6 +134,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         noise=math.sqrt(MONTE_CARLO_OF_AIM * settings.aim) * target,
         target=target,
         adaptive=settings.adaptive and mode_is_flood,
+        filter=settings.filter,
         ambient_noise=ambient_noise,
     )
 

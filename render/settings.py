@@ -10,6 +10,7 @@ from scenes.errors import InputError
 MAX_BOUNCES = 63
 MAX_SAMPLES = 1 << 26
 BATCHES = 16  # independent batches of indirect light, whose spread is the error estimate
+FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
 MOST_AMBIENT_SPP = 1 << 12
 SHARED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours share it: as little noise as 45 alone
@@ -22,6 +23,7 @@ class RenderSettings:
     bounces     surfaces that light may meet, 1 = direct light only
     spp         work on indirect light, in paths per pixel; spent where the noise is, and partly on sharing paths
     adaptive    whether it is spent so, or evenly and without sharing
+    filter      whether late indirect light is averaged over regions of surfaces instead: far less noise, and a bias
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
     ambient_spp paths per pixel of ambient light; open: as many as its noise asks for
@@ -40,6 +42,7 @@ class RenderSettings:
     bounces: int | None = None
     spp: int | None = None
     adaptive: bool = True
+    filter: bool = False
     grid: int | None = None
     ambient: bool | None = None
     ambient_spp: int | None = None
@@ -103,6 +106,7 @@ class Plan:
     noise: float = 0.0
     target: float = 0.0
     adaptive: bool = True
+    filter: bool = False
     ambient_noise: float = 0.0
 
     def to_dict(self) -> dict:

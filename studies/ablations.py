@@ -16,7 +16,7 @@ import numpy as np
 
 from csph.evaluation import Evaluation, Row, as_dicts
 from csph.metrics import PHOTON_LEVELS
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.files import whole_file, write_csv
 from studies import ablation_figures as figures
 from studies import published

@@ -24,8 +24,9 @@ from torch import Tensor
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.metrics import LOW_SBR
 from csph.metrics import PHOTON_LEVELS as LEVELS
-from render.engine import Progress, render
+from render.engine import render
 from render.settings import RenderSettings
+from render.tracing import Progress
 from render.transient import Transient
 from scenes import Laser
 from scenes.catalog import load_scene

@@ -63,6 +63,9 @@ class Render(Common):
     """Surfaces light may meet, 1 = direct only (default: planned from a pilot)."""
     spp: Count = None
     """Indirect light paths per pixel (default: planned from a pilot)."""
+    filter: bool = False
+    """Average late indirect light over small regions of surfaces: far less noise for the same paths, and a bias, which
+    is measured and stated."""
     grid: Count = None
     """Direct rays per pixel side (default: planned from a pilot)."""
     error: Number = None

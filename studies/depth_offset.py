@@ -19,7 +19,7 @@ from typing import Any
 from csph.evaluation import Row, as_dicts
 from csph.model import DepthModel, weights_sha256
 from csph.views import read_views, split_views
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv
 from studies import depth_offset_figures as figures

@@ -19,7 +19,7 @@ from csph.memory import (
     memory_compression,
     separable_factor,
 )
-from render.engine import Progress
+from render.tracing import Progress
 from studies.experiments import Study
 from studies.figures import save
 

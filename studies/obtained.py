@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from csph.shipped import WEIGHTS
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import InputError
 from studies.experiments import Study
 from studies.testsets import rooms

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from render.engine import Progress, render
+from render.engine import render
+from render.tracing import Progress
 from scenes.catalog import load_scene
 from scenes.errors import require
 from scenes.files import whole_file

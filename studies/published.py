@@ -21,7 +21,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from csph.metrics import PHOTON_LEVELS, image_errors
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import InputError
 from scenes.relief import (
     MIDDLEBURY_BASELINE_M,

@@ -19,8 +19,9 @@ import torch
 
 from csph.backbone import soft_argmax
 from csph.model import DepthModel, load_model
-from render.engine import Progress, render
+from render.engine import render
 from render.settings import RenderSettings
+from render.tracing import Progress
 from render.transient import Transient, read_transient, write_transient
 from scenes import Laser, Scene
 from scenes.catalog import load_scene

@@ -28,7 +28,7 @@ import numpy as np
 from csph.evaluation import Method, evaluate
 from csph.model import DepthModel, load_model
 from csph.views import Views
-from render.engine import Progress
+from render.tracing import Progress
 from render.transient import Transient, read_transient
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv

@@ -23,7 +23,7 @@ from typing import Any
 
 from PIL import Image
 
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from studies import report_html as html

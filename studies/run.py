@@ -17,8 +17,9 @@ import torch
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.model import DepthModel, load_model
-from render.engine import Progress, render
+from render.engine import render
 from render.settings import RenderSettings
+from render.tracing import Progress
 from render.transient import Transient, write_transient
 from scenes import Camera, InputError, Laser, Scene
 from scenes.catalog import SCENES, WIDTH, load_scene
@@ -165,6 +166,7 @@ def run_render(command: commands.Render, progress: Progress) -> dict:
     settings = RenderSettings(
         bounces=command.bounces,
         spp=command.spp,
+        filter=command.filter,
         grid=command.grid,
         ambient={"auto": None, "on": True, "off": False}[command.ambient],
         ambient_spp=command.ambient_spp,

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from render.engine import Progress, render
+from render.engine import render
 from render.settings import RenderSettings
+from render.tracing import Progress
 from render.transient import Transient
 from scenes.model import Scene
 from studies.dataset import quiet

@@ -13,7 +13,7 @@ from matplotlib.figure import SubFigure
 from torch import Tensor
 
 from csph import CodingTensor, Design, make_coding
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import InputError, require
 from studies.experiments import Study
 from studies.figures import save

@@ -12,7 +12,7 @@ import numpy as np
 from csph.evaluation import Method, Row, as_dicts, evaluate
 from csph.metrics import PHOTON_LEVELS
 from csph.views import Views, read_views
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import require
 from scenes.offsets import OffsetMode
 from scenes.sets import scene_set

@@ -18,7 +18,7 @@ from csph.config import ModelConfig, TrainConfig
 from csph.design import Design
 from csph.model import DepthModel, load_model, weights_sha256
 from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, ship, shipped_file
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import require
 from spad.histogram import Histogram
 from studies.commands import Train

@@ -21,7 +21,7 @@ from csph.evaluation import LEVEL_GROUPS, Evaluation, Method, as_dicts, evaluate
 from csph.metrics import PHOTON_LEVELS
 from csph.model import DepthModel, load_model
 from csph.views import Views, read_views, split_views
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import write_csv
 from spad.depth import METHODS, estimate_depth

@@ -22,8 +22,9 @@ import numpy as np
 
 from csph.evaluation import as_dicts
 from csph.views import Views
-from render.engine import Progress, render
+from render.engine import render
 from render.settings import RenderSettings
+from render.tracing import Progress
 from render.transient import Transient, read_transient, write_transient
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv

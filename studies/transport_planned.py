@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from csph.metrics import image_errors
-from render.engine import Progress
+from render.tracing import Progress
 from render.transient import Transient
 from spad.flux import expected_counts, rates_for
 from spad.histogram import Histogram

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from studies.commands import Ultraphase

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import require
 from scenes.files import whole_file
 from studies.ultraphase_chain import int8_temporal, timestamps_of

@@ -23,7 +23,7 @@ from torch.nn.functional import conv3d, conv_transpose3d
 from csph import CompressiveLayer, Design
 from csph.blocks import EPSILON
 from csph.photons import encode_photons, photon_table
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import require
 from scenes.files import whole_file
 from spad.histogram import counts_from_timestamps

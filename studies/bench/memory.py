@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from render.engine import Progress
+from render.tracing import Progress
 from scenes.errors import InputError
 from studies.bench import ours, peers, settings
 from studies.bench.settings import BIN_M, BINS, BOUNCES, METHODS

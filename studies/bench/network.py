@@ -23,8 +23,8 @@ from csph.evaluation import evaluate
 from csph.loss import kl_divergence
 from csph.model import DepthModel
 from csph.views import packed_views, split_views
-from render.engine import Progress
 from render.heap import keep_freed_memory
+from render.tracing import Progress
 from scenes.errors import require
 from scenes.files import write_csv
 from spad.fly import Patch, sense_patches

@@ -71,9 +71,14 @@ def qualities(method: Method, transport: str, size: int, quick: bool) -> tuple[i
     return (4, 16, 64, 256) if size <= 64 or (size <= 128 and not quick) else (4, 16, 64)
 
 
-def grid_beside(spp: int) -> int:
-    """Direct rays a pixel side that go with indirect `spp`, so that direct light's error stays below the indirect."""
-    return 4 if spp <= 64 else 6 if spp <= 256 else 8
+def grid_beside(spp: int, filtered: bool = False) -> int:
+    """Direct rays a pixel side that go with indirect `spp`, so that direct light's error stays below the indirect.
+
+    Filtered light has the noise of many times as many paths.
+    """
+    if filtered:
+        spp *= 4
+    return 3 if spp < 64 and filtered else 4 if spp <= 64 else 6 if spp <= 256 else 8
 
 
 def reference_passes(transport: str, size: int) -> tuple[int, int]:

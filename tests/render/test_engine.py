@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from render import engine
+from render import engine, tracing
 from render.engine import render
 from render.error import BIN_M, SIGMA_M, response
 from render.planning import _bounces, make_plan, rays_for_all
@@ -124,14 +124,14 @@ def test_a_missed_target_is_made_good():
     fine = as_response(render(scene, RenderSettings(spp=8192, grid=16, bounces=4), seed=99), pixels)
     world, settings = World(scene), RenderSettings(bounces=4, error=0.02)
     plan = replace(make_plan(world, settings, 1), noise=0.1)  # a pilot that promises five times too much
-    first = engine.trace(world, plan, settings, seed=1, checked=pixels)
+    first = tracing.trace(world, plan, settings, seed=1, checked=pixels)
     error = engine._estimated(world, plan, settings, first, pixels)
-    more = engine._missing(plan, settings, first, error)
+    more = engine._missing(world, plan, settings, first, error)
     assert error.total > 0.02 and more is not None
-    both = engine._traced_on(world, plan, settings, first, more, 1, pixels, lambda what, share: None)
+    both = tracing.traced_on(world, plan, settings, first, more, 1, pixels, lambda what, share: None)
     assert both.spp > first.spp
 
-    def true(traced: engine.Traced) -> float:
+    def true(traced: tracing.Traced) -> float:
         return np.linalg.norm(response(traced.samples, pixels) - fine) / np.linalg.norm(fine)
 
     assert true(both) < true(first)

@@ -1,0 +1,340 @@
+"""Late indirect light shared by the paths that meet one small region of a surface: a filter, fast and biased.
+
+Light that arrives an excess path x after the direct light, path = 2 |x1 - camera| + x, met a second surface at least
+x / 2 away from the first, x1. Seen from there, points of the first surface much closer together than that are one. So
+light is averaged over regions of a width that is a share of x, in octaves of x; what comes before the first octave
+stays with its own pixel. This is path-space filtering (Keller, Dahm, Binder 2014; Binder, Fricke, Keller 2018), with
+regions that widen with delay as irradiance samples are spaced by the distance of what they see (Ward, Rubinstein, Clear
+1988).
+
+A region is a cube of the world and a class of normals. It keeps what comes to its points over the path from the laser
+to x1, without the way to the camera ("unwarped") and divided by the reflectance ("demodulated"), and the mean direction
+in which that path grows along the surface: light from one side reaches points farther away later, to first order.
+Every path of a diffuse lobe goes into one region of one octave, and pixels read the regions of some points of theirs:
+energy is kept. The bias is what differs within a region, shadows above all.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.cells import add_quanta
+from render.rays import camera_rays, first_opaque
+from render.sums import Sums
+from render.world import Float, UInt32, World, dr, mi, upload
+
+UInt64, Int32 = mi.UInt64, mi.Int32
+# Width of a region in its octave's excess path, and of the widest in the mean distance, at PATHS paths a pixel. They
+# shrink with paths^-SHRINKING, so that the bias goes where the noise does.
+KAPPA, WIDEST, PATHS, SHRINKING = 0.4, 0.3, 16, 0.25
+READERS = 4  # points of a pixel that read
+MOST_OCTAVES = 16
+FINENESS = 0.6  # of cells, in those of the pixels that read them: between two pixels none is lumped together
+GROWTH = 0.03  # of a region's cells along the path
+KEY_BITS, NORMAL_BITS = 15, 2  # of a cube's number along an axis (they wrap around), and of a class of normals
+
+
+class Octaves(NamedTuple):
+    """Per octave: where its excess path begins, the width of its regions and of the first of their cells [m]; how many
+    cells a region has."""
+
+    from_m: np.ndarray
+    size_m: np.ndarray
+    width_m: np.ndarray
+    cells: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return len(self.from_m)
+
+
+class Point(NamedTuple):
+    """Points on surfaces: position, normal toward the camera, optical path to the camera, and diffuse reflectance."""
+
+    p: Any
+    n: Any
+    path: Any
+    reflectance: Any
+
+
+def octaves(
+    paths: float, footprint_m: float, distance_m: float, longest_m: float, width_m: float, growth: float
+) -> Octaves:
+    """Octaves for so many paths a pixel, from regions of a pixel's footprint to the widest; the last one is open."""
+    shrunk = (PATHS / paths) ** SHRINKING
+    count = 1 + max(0, round(math.log2(shrunk * WIDEST * distance_m / footprint_m)))
+    count = min(count, MOST_OCTAVES)
+    size = footprint_m * 2.0 ** np.arange(count)
+    start = size / (shrunk * KAPPA)
+    width = FINENESS * (width_m + growth * start)
+    # an octave's excess paths, what the camera's way differs by across a region, and that along it to its middle
+    length = np.append(np.diff(start), longest_m) + 2 * math.sqrt(3) * size
+    cells = np.ceil(np.log1p(GROWTH * length / width) / GROWTH).astype(np.int64) + 1
+    return Octaves(start, size, width, cells)
+
+
+def point_of(si: Any, ray: Any, path_m: Any, reflectance: Any) -> Point:
+    """The point that a camera's ray met."""
+    normal = mi.Vector3f(dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n))
+    return Point(mi.Point3f(si.p), normal, Float(path_m), Float(reflectance))
+
+
+class Regions:
+    """The regions that some pixels of the image see, and the light in them, by batches.
+
+    `pixels` are flat (-1: none); what is read is added to `Sums` by their places in that list.
+    Not a dataclass: Dr.Jit would take its fields for variables of a loop.
+    """
+
+    def __init__(
+        self, world: World, pixels: np.ndarray, spans: Octaves, batches: int, quantum: float, seed: int
+    ) -> None:
+        self.spans, self.batches = spans, batches
+        numbers = np.random.SeedSequence(seed).generate_state(4)
+        self._shift = mi.Vector3f(*(dr.opaque(Float, float(number) * 2.0**-32) for number in numbers[:3]))
+        self._quantum, self._per_quantum = dr.opaque(Float, quantum), dr.opaque(Float, 1 / quantum)
+        self._from, self._size = dr.opaque(Float, float(spans.from_m[0])), upload(Float, spans.size_m)
+        self._width, self._last = upload(Float, spans.width_m), dr.opaque(Int32, spans.count - 1)
+        self.place, self.points = _points(world, pixels, dr.opaque(UInt32, int(numbers[3])))
+        reader, octave = _each(dr.width(self.place), spans.count)
+        point = _gathered(self.points, reader)
+        key = self._key(point, octave)
+        dr.eval(key, point.path)
+        found, row = np.unique(key.numpy(), return_inverse=True)
+        self._row_of = upload(UInt32, row)
+        nearest = np.full(len(found), np.inf, np.float32)  # of the paths' type: ten times as fast
+        np.minimum.at(nearest, row, point.path.numpy())
+        # the length of the search is part of its kernel: one for all views of a size
+        self._searched = 1 << (len(pixels) * READERS * MOST_OCTAVES).bit_length()
+        self._keys = UInt64(np.pad(found, (0, self._searched - len(found)), constant_values=2**64 - 1))
+        self._lay_out(found, nearest)
+
+    def _lay_out(self, found: np.ndarray, nearest_m: np.ndarray) -> None:
+        """Cells for the regions with these keys, whose points are at least so far from the camera."""
+        octave = (found >> np.uint64(3 * (KEY_BITS + NORMAL_BITS))).astype(np.int64)
+        cells = self.spans.cells[octave]
+        reach = 0.5 * math.sqrt(3) * self.spans.size_m[octave]
+        self._base = upload(Float, np.append(nearest_m + self.spans.from_m[octave] - 3 * reach, 0))
+        self._first, self._cells = (upload(UInt32, np.append(part, 0)) for part in (np.cumsum(cells) - cells, cells))
+        size = max(int(cells.sum()), 1)
+        self.energy = dr.zeros(UInt64, size * self.batches)
+        self.growing = [dr.zeros(UInt64, size * self.batches) for _ in range(3)]
+        self.paths, self.filled = dr.zeros(UInt32, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
+
+    def _key(self, point: Point, octave: Any) -> Any:
+        """Octave, class of normals and cube of a point in one number."""
+        size, key = dr.gather(Float, self._size, octave), UInt64(octave)
+        for part in point.n:
+            key = (key << NORMAL_BITS) | UInt64(UInt32(Int32(dr.round(part)) + 1))
+        for part, shift in zip(point.p, self._shift, strict=True):
+            number = UInt32(Int32(dr.floor(part / size + shift))) & ((1 << KEY_BITS) - 1)
+            key = (key << KEY_BITS) | UInt64(number)
+        return key
+
+    def _from_middle(self, point: Point, octave: Any) -> Any:
+        """The way along the surface to a point from the middle of its cube."""
+        size = dr.gather(Float, self._size, octave)
+        parts = [part / size + shift for part, shift in zip(point.p, self._shift, strict=True)]
+        off = mi.Vector3f(*(part - dr.floor(part) - 0.5 for part in parts)) * size
+        return off - point.n * dr.dot(point.n, off)
+
+    def _row(self, key: Any, active: Any) -> tuple[Any, Any]:
+        """Number of a region, and whether there is one."""
+        found = dr.binary_search(0, self._searched - 1, lambda i: dr.gather(UInt64, self._keys, i, active) < key)
+        return found, active & (dr.gather(UInt64, self._keys, found, active) == key)
+
+    def count_paths(self, points: Point) -> None:
+        """One more path for the regions of each point that reflects."""
+        number, octave = _each(dr.width(points.path), self.spans.count)
+        point = _gathered(points, number)
+        row, known = self._row(self._key(point, octave), point.reflectance > 0)
+        dr.scatter_add(self.paths, UInt32(1), row, known, mode=dr.ReduceMode.Direct)
+
+    def add(self, point: Point, towards: Any, batch: Any, path_m: Any, radiance: Any, active: Any) -> Any:
+        """Add light that comes to points from x2, which lies `towards`, after `path_m` from the laser.
+
+        `radiance` is what the pixel sees of it. Returns where it came too early for any region, and is still to add.
+        Late light in a region that no pixel reads is dropped.
+        """
+        number = Int32(dr.floor(dr.log2(dr.maximum(path_m - point.path, 0) / self._from)))
+        late = active & (number >= 0) & (point.reflectance > 0)
+        octave = UInt32(dr.clip(number, 0, self._last))
+        row, lit = self._row(self._key(point, octave), late & (radiance > 0) & dr.isfinite(radiance))
+        # the path grows away from x2
+        path_m = path_m + dr.dot(towards, self._from_middle(point, octave))
+        x = dr.maximum(path_m - dr.gather(Float, self._base, row, lit), 0) / dr.gather(Float, self._width, octave)
+        cell = dr.minimum(UInt32(dr.log(1 + GROWTH * x) / GROWTH), dr.gather(UInt32, self._cells, row, lit) - 1)
+        value = radiance / point.reflectance * self._per_quantum
+        index = (dr.gather(UInt32, self._first, row, lit) + cell) * self.batches + batch
+        add_quanta(self.energy, value, index, lit)
+        dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, lit)
+        for target, part in zip(self.growing, -towards, strict=True):
+            add_quanta(target, value * dr.clip(0.5 + 0.5 * part, 0, 1), index, lit)
+        return active & ~late
+
+    def evaluate(self) -> None:
+        """Run what was added so far."""
+        dr.eval(self.energy, self.growing, self.paths, self.filled)
+
+    def read(self, sums: Sums) -> None:
+        """Add every region's light to the pixels that have points there."""
+        if dr.width(self.place) == 0:
+            return
+        place, octave, row, weight, point = self._readings()
+        weight = weight * self._quantum / (READERS * Float(dr.gather(UInt32, self.paths, row)))
+        base = dr.gather(Float, self._base, row) + point.path
+        reading = _Reading(place, octave, row, weight, base, self._from_middle(point, octave))
+        dr.eval(reading)
+        for batch, total in enumerate(self._read(sums, reading, None)):
+            sums.add_total(place, dr.opaque(UInt32, batch), total)
+        if sums.watched is not None:
+            watched = dr.compress(dr.gather(Int32, sums.watch, place) >= 0)
+            number, batch = _each(dr.width(watched), self.batches)
+            if dr.width(number):
+                self._read(sums, _gathered(reading, dr.gather(UInt32, watched, number)), batch)
+        sums.evaluate()
+
+    def _readings(self) -> tuple[Any, Any, Any, Any, Point]:
+        """Which place reads which region, once, with its points' summed reflectance and their mean.
+
+        Points of one place lie next to each other.
+        """
+        readers = dr.opaque(UInt32, dr.width(self.place))
+        reader, octave = _each(dr.width(self.place), self.spans.count)
+        row, place = self._row_of, dr.gather(UInt32, self.place, reader)
+        first, sums = dr.gather(UInt32, self.paths, row) > 0, [Float(0)] * 8
+        for step in range(1 - READERS, READERS):
+            other = Int32(reader) + step
+            near = (other >= 0) & (other < Int32(readers))
+            other = UInt32(dr.select(near, other, 0))
+            near &= dr.gather(UInt32, self.place, other, near) == place
+            near &= dr.gather(UInt32, row, octave * readers + other, near) == row
+            if step < 0:
+                first &= ~near
+            point = _gathered(self.points, other)
+            share = dr.select(near, point.reflectance, 0)
+            sums = [a + share * b for a, b in zip(sums, (1, *point.p, *point.n, point.path), strict=True)]
+        columns = [place, octave, row, *sums]
+        chosen = dr.compress(first)
+        dr.eval(chosen, columns)
+        place, octave, row, weight, x, y, z, right, up, back, path = (dr.gather(type(c), c, chosen) for c in columns)
+        normal = dr.normalize(mi.Vector3f(right, up, back))
+        return place, octave, row, weight, Point(mi.Point3f(x, y, z) / weight, normal, path / weight, weight)
+
+    def _cell(self, index: Any) -> tuple[Any, Any]:
+        """A cell's energy, and the sum over it of the directions in which its light's path grows."""
+        energy = Float(dr.gather(UInt64, self.energy, index))
+        return energy, mi.Vector3f(*(2 * Float(dr.gather(UInt64, part, index)) - energy for part in self.growing))
+
+    @dr.syntax
+    def _read(self, sums: Sums, reading: Any, batch: Any) -> Any:
+        """Read cell by cell; returns each batch's total. Of one `batch` a lane for the watched rows, or of all."""
+        place, row, weight, off = reading.place, reading.row, reading.weight, reading.off
+        width = dr.gather(Float, self._width, reading.octave)
+        index, cells = dr.gather(UInt32, self._first, row), dr.gather(UInt32, self.filled, row)
+        cell = dr.zeros(UInt32, dr.width(place))
+        totals = [dr.zeros(Float, dr.width(place)) for _ in range(self.batches)]
+        while cell < cells:
+            low, high = reading.base + _edge(cell) * width, reading.base + _edge(cell + 1) * width
+            if dr.hint(batch is None, mode="scalar"):
+                found = [self._cell(index * self.batches + b) for b in range(self.batches)]
+                energy, growing = _sum(found)
+                totals = _plus(totals, found, weight)
+            else:
+                energy, growing = self._cell(index * self.batches + batch)
+            lit = energy > 0
+            later = dr.select(lit, dr.dot(growing, off) / energy, 0)
+            if dr.hint(batch is None, mode="scalar"):
+                sums.spread(place, low + later, high + later, energy * weight, lit)
+            else:
+                sums.spread_watched(place, batch, low + later, high + later, energy * weight, lit)
+            cell += 1
+            index += 1
+        return totals
+
+
+class _Reading(NamedTuple):
+    """A place that reads a region: factor of its quanta, path at which the region's cells begin, and how far along the
+    surface the place's points are from the middle."""
+
+    place: Any
+    octave: Any
+    row: Any
+    weight: Any
+    base: Any
+    off: Any
+
+
+class Late:
+    """The `Sums` of one launch of paths, of which late light goes to regions.
+
+    `plain` is told of all light, filtered or not. Not a dataclass: Dr.Jit would take its fields for a loop's variables.
+    """
+
+    def __init__(self, regions: Regions, sums: Sums, points: Point, towards: Any) -> None:
+        self.regions, self.sums, self.points, self.towards = regions, sums, points, towards
+
+    def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
+        """Add light of every lane's own path; returns what its pixel got at once."""
+        self.sums.add_plain(pixel, batch, path, radiance, active)
+        one_way = path - self.points.path
+        early = self.regions.add(self.points, self.towards, batch, one_way, radiance, active)
+        return self.sums.add(pixel, batch, path, radiance, early)
+
+    def add_total(self, pixel: Any, batch: Any, radiance: Any) -> None:
+        """Total of what `add` returned."""
+        self.sums.add_total(pixel, batch, radiance)
+
+    def evaluate(self) -> None:
+        """Run what was added so far."""
+        self.regions.evaluate()
+        self.sums.evaluate()
+
+
+def _plus(totals: list, cells: list, weight: Any) -> list:
+    return [total + energy * weight for total, (energy, _) in zip(totals, cells, strict=True)]
+
+
+def _sum(cells: list) -> tuple[Any, Any]:
+    energy, growing = cells[0]
+    for more, also in cells[1:]:
+        energy, growing = energy + more, growing + also
+    return energy, growing
+
+
+def _edge(cell: Any) -> Any:
+    """Where a cell begins, in widths of the first."""
+    return (dr.exp(GROWTH * Float(cell)) - 1) / GROWTH
+
+
+def _each(count: int, times: int) -> tuple[Any, Any]:
+    """All pairs of 0 .. `count` and 0 .. `times`, the first running faster. Opaque: counts differ from run to run."""
+    lane, number = dr.arange(UInt32, count * times), dr.opaque(UInt32, max(count, 1))
+    return lane % number, lane // number
+
+
+def _gathered(columns: NamedTuple, index: Any) -> Any:
+    return type(columns)(*(dr.gather(type(column), column, index) for column in columns))
+
+
+def _points(world: World, pixels: np.ndarray, key: Any) -> tuple[Any, Point]:
+    """READERS points of every pixel, spread evenly, where they reflect diffusely, and their places in `pixels`."""
+    lane = dr.arange(UInt32, len(pixels) * READERS)
+    place, number = lane // READERS, lane % READERS
+    pixel = dr.gather(UInt32, upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF), place)
+    valid = pixel != 0xFFFFFFFF
+    pixel = dr.select(valid, pixel, 0)
+    first, second = mi.sample_tea_32(pixel, key)
+    x, y = mi.radical_inverse_2(number, first), mi.sobol_2(number, second)
+    ray, _ = camera_rays(world, Float(pixel % world.width) + x, Float(pixel // world.width) + y)
+    si, transmission, path, _ = first_opaque(world, ray, valid)
+    context = mi.BSDFContext()
+    context.type_mask = mi.BSDFFlags.DiffuseReflection
+    _, weight = si.bsdf().sample(context, si, Float(0.5), mi.Point2f(y, x), valid & si.is_valid())
+    point = point_of(si, ray, path, weight[0] * transmission)
+    lit = dr.compress(valid & si.is_valid() & (point.reflectance > 0))
+    dr.eval(lit, place, point)
+    return dr.gather(UInt32, place, lit), _gathered(point, lit)

@@ -1,0 +1,44 @@
+"""Blocks of pixels that lie together, and the turns in which they trace paths. Plain numpy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+BLOCK = 16  # pixels that share their paths
+
+
+class Turns(NamedTuple):
+    """One launch: turn n traces a path in each pixel of its block `block[n]`, number `stream[n]` of the image.
+
+    `round` numbers the turns of a block. With the seed, stream and round decide the random numbers. `stride` is a power
+    of two, at least the rounds that a block has in a batch.
+    """
+
+    block: np.ndarray
+    stream: np.ndarray
+    round: np.ndarray
+    stride: np.ndarray
+
+
+def turns_of(
+    blocks: np.ndarray, streams: np.ndarray, rounds: np.ndarray, batches: int = 1, turns: np.ndarray | None = None
+) -> Turns:
+    """The turns of some blocks, `rounds` each, block by block; or those that `turns` numbers among them."""
+    ends = np.cumsum(rounds)
+    turns = np.arange(int(ends[-1])) if turns is None else turns
+    place = np.searchsorted(ends, turns, side="right")
+    stride = 1 << np.ceil(np.log2(np.maximum(rounds / batches, 1))).astype(np.int64)
+    return Turns(blocks[place], streams[place], turns - (ends - rounds)[place], stride[place])
+
+
+def block_order(pixels: np.ndarray, width: int) -> np.ndarray:
+    """Flat pixel indices along a Z-order curve, so that runs of 16 are square neighbourhoods; padded with -1."""
+    row, column = np.divmod(pixels.astype(np.uint64), np.uint64(width))
+    code = np.zeros(len(pixels), np.uint64)
+    for bit in range(15):
+        one, shift = np.uint64(1), np.uint64(bit)
+        code |= ((column >> shift) & one) << np.uint64(2 * bit) | ((row >> shift) & one) << np.uint64(2 * bit + 1)
+    ordered = pixels[np.argsort(code, kind="stable")]
+    return np.concatenate((ordered, np.full(-len(ordered) % BLOCK, -1, ordered.dtype)))

@@ -1,0 +1,224 @@
+"""Filtered indirect light: energy is kept, noise falls, the bias is stated, small and goes with more paths."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from render.cells import Rows, make_cells
+from render.engine import render
+from render.error import response
+from render.planning import make_plan
+from render.regions import octaves
+from render.returns import Samples, select
+from render.settings import RenderSettings
+from render.tracing import trace
+from render.world import Bool, Float, UInt32, World, dr, upload
+from scenes import Camera, InputError, Laser, Material, Scene, Surface, hard_cases
+from scenes.hard_cases import hard_case
+from scenes.shapes import box, sphere
+from studies.bench import oracles, settings
+from studies.bench.binning import binned
+from studies.bench.hard_case import moments_of
+from studies.bench.oracles_optics import integrating_sphere
+
+
+def room(width: int = 24, kind: str = "diffuse", **laser) -> Scene:
+    vertices, faces, uv = box((4, 3, 5))
+    walls = Surface(vertices + [0, 0, -1.5], faces[:, ::-1], Material(albedo=0.7), uv=uv)
+    vertices, faces, _ = sphere(0.4, 4)
+    ball = Surface(vertices + [0.5, -0.1, -2.2], faces, Material(kind, albedo=0.3))
+    return Scene("room", (walls, ball), oracles.camera(width, width, 60), Laser(**{"cone_deg": 360, **laser}))
+
+
+def indirect(transient) -> np.ndarray:
+    """Radiance of indirect light in every pixel."""
+    return moments_of(transient, transient.bounces > 1).total.ravel()
+
+
+def samples_of(transient, least_bounces: int = 1) -> Samples:
+    """A transient's returns as samples, those of so many bounces or more."""
+    near, far = transient.path_near_m.astype(float), transient.path_far_m.astype(float)
+    columns = (transient.return_pixel, (near + far) / 2, (far - near) / 2, transient.radiance, transient.bounces)
+    return select(Samples(*columns), transient.bounces >= least_bounces)
+
+
+def test_octaves_cover_every_path_and_narrow_with_more_paths():
+    for paths in (1, 16, 4096):
+        spans = octaves(paths, 0.05, 3.0, 40.0, 0.03, 0.05)
+        assert np.allclose(np.diff(np.log2(spans.size_m)), 1) and spans.size_m[0] == 0.05
+        assert spans.size_m[-1] < 3.0 and np.allclose(spans.size_m / spans.from_m, spans.size_m[0] / spans.from_m[0])
+    few, many = (octaves(paths, 0.05, 3.0, 40.0, 0.03, 0.05) for paths in (16, 256))
+    assert few.size_m[0] / few.from_m[0] == pytest.approx(2 * many.size_m[0] / many.from_m[0])
+    assert many.count < few.count
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.05])
+def test_light_between_two_paths_keeps_its_energy_and_place(growth):
+    """Also beyond the last cell, where an interval reaches past the end of all cells."""
+    rng, cells = np.random.default_rng(1), make_cells(0.03, growth, -0.5, 5.0)
+    rows = Rows(1, cells, 2.0**-40)
+    low = rng.uniform(-0.6, 5.5, 5000)
+    high = low + rng.uniform(0, 0.03, len(low))
+    radiance = rng.uniform(0, 1, len(low))
+    columns = (upload(Float, part) for part in (low, high, radiance))
+    rows.add_between(UInt32(0), *columns, Bool(True))
+    dr.eval(rows.energy, rows.moment)
+    energy, moment = (values[0] for values in rows.sums())
+    assert energy.sum() == pytest.approx(radiance.sum(), rel=1e-6)
+    inside = (low > -0.4) & (high < 4.9)
+    rows = Rows(1, cells, 2.0**-40)
+    columns = (upload(Float, part[inside]) for part in (low, high, radiance))
+    rows.add_between(UInt32(0), *columns, Bool(True))
+    energy, moment = (values[0] for values in rows.sums())
+    mean = (energy * cells.edges_m[:-1] + moment * cells.width_of_m).sum() / energy.sum()
+    assert mean == pytest.approx(np.average((low + high)[inside] / 2, weights=radiance[inside]), abs=1e-6)
+
+
+@pytest.mark.parametrize("albedo", [0.5, 0.99])
+def test_integrating_sphere_is_exact_but_for_noise(albedo):
+    """Everywhere the same light: averaging over regions changes nothing but the noise.
+
+    The path's mean and spread are right as well: what comes from one side is moved along the surface to first order.
+    """
+    scene, bounces = hard_case(f"sphere-{albedo:g}"), 4
+    radius_m, offset_m = hard_cases.SPHERE_RADIUS_M, hard_cases.SPHERE_OFFSET_M
+    expected = integrating_sphere(scene, radius_m=radius_m, offset_m=offset_m, albedo=albedo, bounces=bounces)
+    ratios, lags, spreads = [], [], []
+    for seed in range(8):
+        transient = render(scene, RenderSettings(bounces=bounces, spp=16, grid=2, filter=True), seed=seed)
+        got = moments_of(transient, transient.bounces > 1)
+        ratios.append(got.total.mean() / expected.radiance - 1)
+        weight = got.total / got.total.sum()
+        lags.append((weight * (got.mean_m - expected.mean_path_m)).sum())
+        variance = got.deviation_m**2 + (got.mean_m - expected.mean_path_m) ** 2
+        spreads.append(np.sqrt((weight * variance).sum() / (weight * expected.variance_m2).sum()) - 1)
+    for values, allowed in ((ratios, 1e-3), (lags, 2e-3 * radius_m), (spreads, 5e-3)):
+        assert abs(np.mean(values)) < allowed + 4 * np.std(values, ddof=1) / math.sqrt(len(values)), values
+
+
+@pytest.mark.parametrize("kind", ["diffuse", "plastic", "roughconductor"])
+def test_energy_is_kept(kind):
+    """Every path goes into one region of one octave, and regions are read by all that is in them.
+
+    Coated and rough surfaces: their diffuse lobe is filtered, the rest stays with its pixel.
+    """
+    scene = room(kind=kind)
+    world = World(scene)
+    wanted = indirect(render(scene, RenderSettings(bounces=4, spp=1024, grid=2), seed=99, world=world))
+    settings = RenderSettings(bounces=4, spp=16, grid=2, filter=True)
+    totals = [indirect(render(scene, settings, seed=seed, world=world)).sum() for seed in range(8)]
+    standard = np.std(totals, ddof=1) / math.sqrt(len(totals)) / wanted.sum()
+    assert abs(np.mean(totals) / wanted.sum() - 1) < 0.005 + 4 * standard
+
+
+def test_noise_falls_and_the_bias_goes_with_more_paths():
+    """At 16 paths the filter's error is a third of the same paths' own; at 256 its mean is nearer to the truth.
+
+    Direct light is not touched.
+    """
+    scene = room()
+    world, pixels = World(scene), np.arange(24 * 24)
+    fine = render(scene, RenderSettings(bounces=4, spp=8192, grid=4), seed=99, world=world)
+
+    def late(spp: int, filtered: bool, seed: int) -> np.ndarray:
+        given = RenderSettings(bounces=4, spp=spp, grid=4, filter=filtered, adaptive=filtered)
+        transient = render(scene, given, seed=seed, world=world)
+        direct = transient.bounces == 1
+        assert np.array_equal(transient.radiance[direct], fine.radiance[fine.bounces == 1])
+        return response(samples_of(transient, 2), pixels)
+
+    truth = response(samples_of(fine, 2), pixels)
+    size = np.linalg.norm(truth)
+    own, few = (np.linalg.norm(late(16, filtered, 1) - truth) / size for filtered in (False, True))
+    assert few < own / 3
+    biases = [np.linalg.norm(np.mean([late(n, True, s) for s in range(8)], axis=0) - truth) / size for n in (16, 256)]
+    assert biases[1] < biases[0]
+
+
+def test_same_seed_same_bytes_with_one_and_two_threads():
+    threads, hashes = dr.thread_count(), set()
+    given = RenderSettings(bounces=4, spp=16, grid=2, filter=True)
+    try:
+        for count in (1, 2, 2):
+            dr.set_thread_count(count)
+            hashes.add(render(room(), given, seed=5).sha256())
+    finally:
+        dr.set_thread_count(threads)
+    assert len(hashes) == 1
+    assert render(room(), given, seed=6).sha256() not in hashes
+
+
+def test_the_stated_error_is_the_true_one():
+    """Of the mean over seeds, within the issue's factor of 1.3; a filtered result says that it is biased."""
+    scene = room(32)
+    world, pixels = World(scene), np.arange(32 * 32)
+    given = RenderSettings(bounces=4, spp=64, grid=4, filter=True)
+    fine = render(scene, RenderSettings(bounces=4, spp=8192, grid=16), seed=99, world=world)
+
+    truth, stated, true = response(samples_of(fine), pixels), [], []
+    for seed in range(8):
+        transient = render(scene, given, seed=seed, world=world)
+        stated.append(transient.meta["relative_error"]["total"])
+        true.append(np.linalg.norm(response(samples_of(transient), pixels) - truth) / np.linalg.norm(truth))
+        assert transient.meta["plan"]["filter"] and "biased" in transient.meta["plan"]["reasons"][-1]
+    ratio = math.sqrt(np.mean(np.square(stated)) / np.mean(np.square(true)))
+    assert 1 / 1.3 < ratio < 1.3, (stated, true)
+
+
+def test_a_target_is_met_by_more_paths():
+    transient = render(room(), RenderSettings(bounces=4, error=0.06, filter=True), seed=3)
+    assert transient.meta["relative_error"]["total"] < 0.06
+    assert any("on top" in reason for reason in transient.meta["plan"]["reasons"])
+
+
+def test_one_pixel_nothing_in_view_and_glass():
+    tiny = render(room(1), RenderSettings(bounces=3, spp=64, filter=True), seed=1)
+    assert np.isfinite(tiny.radiance).all() and (tiny.bounces > 1).any()
+    away = replace(room(), camera=Camera.look_at((0, 0, 20), (0, 0, 40), fov_deg=30, width=4, height=4))
+    assert render(away, RenderSettings(bounces=3, spp=16, filter=True), seed=1).returns == 0
+    for name in ("window", "leaf", "mirror"):
+        found = render(hard_case(name), RenderSettings(bounces=3, spp=16, filter=True), seed=1)
+        assert np.isfinite(found.radiance).all() and (found.radiance >= 0).all()
+
+
+@pytest.mark.parametrize("mode", ["scan", "line"])
+def test_other_lasers_are_refused_in_one_line(mode):
+    with pytest.raises(InputError, match=f"flood laser.*{mode}"):
+        render(replace(room(), laser=Laser(mode)), RenderSettings(bounces=3, spp=16, filter=True))
+
+
+@pytest.mark.slow
+def test_bias_and_depth_under_a_flash():
+    """Mean of 32 filtered runs of the flash scene: off by at most 0.5 % after the pulse, depth by 1 mm (median)."""
+    import torch
+
+    from spad.depth import estimate_depth
+    from spad.sensor import Sensor
+    from studies.bench.errors import pulsed
+    from studies.bench.settings import BIN_M, BINS
+
+    size, sensor = 64, Sensor()
+    world = World(settings.bench_scene("flash", size))
+
+    def half_means(spp: int, runs: int, first_seed: int, filtered: bool) -> list[np.ndarray]:
+        """Means of two independent halves of the runs, after the pulse."""
+        given = RenderSettings(bounces=5, spp=spp, grid=8, filter=filtered)
+        plan = make_plan(world, given, 0)
+        means = [np.zeros((size * size, BINS), np.float32) for _ in range(2)]
+        for number in range(runs):
+            samples = trace(world, plan, given, seed=first_seed + number).samples
+            means[number % 2] += pulsed(binned(samples, size * size, BINS, BIN_M)) / (runs / 2)
+        return means
+
+    (one, other), (first, second) = half_means(1024, 16, 100, False), half_means(64, 32, 0, True)
+    squared = ((first - one) * (second - other)).sum() / (one * other).sum()
+    assert squared < 0.005**2, math.sqrt(squared)
+    photons = 1000 / (one + other).sum(axis=1).mean()
+    depths = [
+        estimate_depth(torch.from_numpy(photons * (a + b)).reshape(size, size, BINS), sensor, "log-matched").numpy()
+        for a, b in ((one, other), (first, second))
+    ]
+    shift_m = np.abs(depths[1] - depths[0])
+    assert np.median(shift_m) < 0.001 and np.quantile(shift_m, 0.95) < 0.005
