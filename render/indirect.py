@@ -242,7 +242,8 @@ def collect(
                 add_paths(world, pixels, turns, bounces, seed, sums, shared=shared, regions=regions)
             if regions is not None:
                 regions.read(sums)
-            release(world.scene.camera.height * world.scene.camera.width)  # what the launches took
+            if regions is None:  # whose memory the next ones take
+                release(world.scene.camera.height * world.scene.camera.width)  # what the launches took
             totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
             samples = rows.samples(pixels, origin_m[pixels])
             del rows, sums  # before the next ones are there

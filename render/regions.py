@@ -1,7 +1,7 @@
 """Late indirect light shared by the paths that meet one small region of a surface: a filter, fast and biased.
 
-Light that arrives an excess path x after the direct light, path = 2 |x1 - camera| + x, met a second surface at least
-x / 2 away from the first, x1. Seen from there, points of the first surface much closer together than that are one. So
+Light that arrives an excess path x after the direct light from x1, the first surface, met a second one at least x / 2
+away from there. Seen from there, points of the first surface much closer together than that are one. So
 light is averaged over regions of a width that is a share of x, in octaves of x; what comes before the first octave
 stays with its own pixel. This is path-space filtering (Keller, Dahm, Binder 2014; Binder, Fricke, Keller 2018), with
 regions that widen with delay as irradiance samples are spaced by the distance of what they see (Ward, Rubinstein, Clear
@@ -95,9 +95,10 @@ class Regions:
         self.spans, self.batches = spans, batches
         numbers = np.random.SeedSequence(seed).generate_state(4)
         self._shift = mi.Vector3f(*(dr.opaque(Float, float(number) * 2.0**-32) for number in numbers[:3]))
+        self._eye, self._laser = world.eye, world.laser
         self._quantum, self._per_quantum = dr.opaque(Float, quantum), dr.opaque(Float, 1 / quantum)
         self._from, self._size = dr.opaque(Float, float(spans.from_m[0])), upload(Float, spans.size_m)
-        self._width, self._last = upload(Float, spans.width_m), dr.opaque(Int32, spans.count - 1)
+        self._width, self._last = upload(Float, spans.width_m), dr.opaque(UInt32, spans.count - 1)
         self.place, self.points = _points(world, pixels, dr.opaque(UInt32, int(numbers[3])))
         reader, octave = _each(dr.width(self.place), spans.count)
         point = _gathered(self.points, reader)
@@ -109,7 +110,7 @@ class Regions:
         np.minimum.at(nearest, row, point.path.numpy())
         # the length of the search is part of its kernel: one for all views of a size
         self._searched = 1 << (len(pixels) * READERS * MOST_OCTAVES).bit_length()
-        self._keys = UInt64(np.pad(found, (0, self._searched - len(found)), constant_values=2**64 - 1))
+        self._keys = upload(UInt64, np.pad(found, (0, self._searched - len(found)), constant_values=2**64 - 1))
         self._lay_out(found, nearest)
 
     def _lay_out(self, found: np.ndarray, nearest_m: np.ndarray) -> None:
@@ -159,9 +160,10 @@ class Regions:
         `radiance` is what the pixel sees of it. Returns where it came too early for any region, and is still to add.
         Late light in a region that no pixel reads is dropped.
         """
-        number = Int32(dr.floor(dr.log2(dr.maximum(path_m - point.path, 0) / self._from)))
+        direct_m = point.path + dr.norm(point.p - self._laser) - dr.norm(point.p - self._eye)
+        number = Int32(dr.floor(dr.log2(dr.maximum(path_m - direct_m, 0) / self._from)))
         late = active & (number >= 0) & (point.reflectance > 0)
-        octave = UInt32(dr.clip(number, 0, self._last))
+        octave = UInt32(dr.clip(number, 0, Int32(self._last)))
         row, lit = self._row(self._key(point, octave), late & (radiance > 0) & dr.isfinite(radiance))
         # the path grows away from x2
         path_m = path_m + dr.dot(towards, self._from_middle(point, octave))
@@ -170,7 +172,7 @@ class Regions:
         value = radiance / point.reflectance * self._per_quantum
         index = (dr.gather(UInt32, self._first, row, lit) + cell) * self.batches + batch
         add_quanta(self.energy, value, index, lit)
-        dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, lit)
+        dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, lit, mode=dr.ReduceMode.Direct)
         for target, part in zip(self.growing, -towards, strict=True):
             add_quanta(target, value * dr.clip(0.5 + 0.5 * part, 0, 1), index, lit)
         return active & ~late
@@ -187,7 +189,7 @@ class Regions:
         weight = weight * self._quantum / (READERS * Float(dr.gather(UInt32, self.paths, row)))
         base = dr.gather(Float, self._base, row) + point.path
         reading = _Reading(place, octave, row, weight, base, self._from_middle(point, octave))
-        dr.eval(reading)
+        dr.eval(*reading)
         for batch, total in enumerate(self._read(sums, reading, None)):
             sums.add_total(place, dr.opaque(UInt32, batch), total)
         if sums.watched is not None:
@@ -335,6 +337,7 @@ def _points(world: World, pixels: np.ndarray, key: Any) -> tuple[Any, Point]:
     context.type_mask = mi.BSDFFlags.DiffuseReflection
     _, weight = si.bsdf().sample(context, si, Float(0.5), mi.Point2f(y, x), valid & si.is_valid())
     point = point_of(si, ray, path, weight[0] * transmission)
-    lit = dr.compress(valid & si.is_valid() & (point.reflectance > 0))
-    dr.eval(lit, place, point)
-    return dr.gather(UInt32, place, lit), _gathered(point, lit)
+    lit = valid & si.is_valid() & (point.reflectance > 0)
+    dr.eval(lit, place, *point)
+    chosen = dr.compress(lit)
+    return dr.gather(UInt32, place, chosen), _gathered(point, chosen)

@@ -166,11 +166,11 @@ class Recordings:
         return self.calls[key](world.arrays(), *arguments)
 
 
-_NUMPY = {Float: np.float32, UInt32: np.uint32, Bool: np.bool_, mi.Int32: np.int32}
+_NUMPY = {Float: np.float32, UInt32: np.uint32, mi.UInt64: np.uint64, Bool: np.bool_, mi.Int32: np.int32}
 
 
 def upload(kind: type, values: np.ndarray) -> Any:
-    """Values as a flat Dr.Jit array of `kind` (Float, UInt32, Bool), copied to aligned memory."""
+    """Values as a flat Dr.Jit array of `kind` (one of _NUMPY), copied to aligned memory."""
     memory = aligned(np.size(values), _NUMPY[kind])
     memory[:] = np.ravel(values)
     return kind(memory)

@@ -116,6 +116,8 @@ class Dataset(Common):
     """Surfaces light may meet, 1 = direct only (default: planned for each view)."""
     spp: Count = None
     """Indirect light paths per pixel (default: planned for each view)."""
+    filter: bool = False
+    """Average late indirect light over small regions of surfaces, as `render` does: faster, and biased."""
     grid: Count = None
     """Direct rays per pixel side (default: planned, one for all views of an endless set)."""
     error: Number = None

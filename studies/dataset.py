@@ -76,6 +76,7 @@ class Job:
     ambient_spp: int = SHARED_AMBIENT_SPP
     merging: float = 1.0
     least_share: float | None = None
+    filter: bool = False
 
     def __post_init__(self) -> None:
         scene_set(self.set)
@@ -86,6 +87,7 @@ class Job:
         return RenderSettings(
             bounces=self.bounces,
             spp=self.spp,
+            filter=self.filter,
             grid=self.grid,
             least_share=self.least_share,
             error=self.error,
@@ -100,7 +102,7 @@ class Job:
     def made(self) -> dict:
         """All that decides the bytes of its views, this version's choices included."""
         tolerances = [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, self.settings().aim]
-        return asdict(self) | {"schema": 5, "tolerances": tolerances}
+        return asdict(self) | {"schema": 6, "tolerances": tolerances}
 
 
 def render_view(job: Job, view: int, again: int = 0) -> Done:

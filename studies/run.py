@@ -148,7 +148,7 @@ def run_dataset(command: commands.Dataset, progress: Progress) -> dict:
     error = command.error or (0.01 if command.bounces == 1 else 0.03)
     job = Job(
         of.name, command.seed, command.width, command.height, command.bounces, command.spp, command.grid, error,
-        command.offset, command.offset_mode, command.ambient, command.ambient_spp,
+        command.offset, command.offset_mode, command.ambient, command.ambient_spp, filter=command.filter,
     )  # fmt: skip
     if command.pack is not None:
         _output(command.pack, ".h5", "pack")

@@ -66,8 +66,12 @@ def qualities(method: Method, transport: str, size: int, quick: bool) -> tuple[i
         return (16, 64) if size <= 64 else (16,)
     if method is MULTIJITTER and transport == "direct":
         return (16, 64, 256, 1024) if size <= 64 else (16, 64, 256)
+    if method is MULTIJITTER and size <= 64 and not quick:
+        return (16, 64, 256, 1024)
     if method is MULTIJITTER:
-        return (16, 64, 256) if size <= 64 or (size <= 128 and not quick) else (16, 64)
+        return (16, 64, 256) if size <= 64 or not quick else (16, 64)
+    if method is FILTERED:
+        return (2, 4, 16, 64, 256) if size <= 64 or (size <= 128 and not quick) else (1, 4, 16, 64)
     return (4, 16, 64, 256) if size <= 64 or (size <= 128 and not quick) else (4, 16, 64)
 
 
@@ -77,8 +81,8 @@ def grid_beside(spp: int, filtered: bool = False) -> int:
     Filtered light has the noise of many times as many paths.
     """
     if filtered:
-        spp *= 4
-    return 3 if spp < 64 and filtered else 4 if spp <= 64 else 6 if spp <= 256 else 8
+        return 3 if spp <= 16 else 6 if spp <= 64 else 8
+    return 4 if spp <= 64 else 6 if spp <= 256 else 8
 
 
 def reference_passes(transport: str, size: int) -> tuple[int, int]:

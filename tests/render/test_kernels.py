@@ -44,10 +44,12 @@ def room(seed: int, kinds: tuple[str, ...], *, balls: int = 2, detail: int = 2, 
     return Scene("room", tuple(surfaces), camera, Laser())
 
 
+@pytest.mark.parametrize("filtered", [False, True])
 @pytest.mark.parametrize("kinds", [("diffuse",), ("plastic", "diffuse", "roughplastic")])
-def test_no_kernel_is_compiled_from_the_third_view_on(kinds):
+def test_no_kernel_is_compiled_from_the_third_view_on(kinds, filtered):
     """Same size and materials: another pose."""
-    views = [compiled(lambda seed=seed: render(room(seed, kinds), SETTINGS, seed=seed)) for seed in range(4)]
+    settings = replace(SETTINGS, filter=filtered)
+    views = [compiled(lambda seed=seed: render(room(seed, kinds), settings, seed=seed)) for seed in range(4)]
     assert views[2:] == [0, 0], views
 
 
