@@ -34,7 +34,7 @@ GOLDEN = (3242174889, 2447445414)
 
 
 class _Heads(NamedTuple):
-    """x1 of every path of a launch and where it belongs; its `point` reflects nothing where the path left by a lobe."""
+    """x1 of every path of a launch and where it belongs; as a `point` of `render.regions`, if that is asked for."""
 
     receiver: Any
     si: Any
@@ -42,13 +42,13 @@ class _Heads(NamedTuple):
     path: Any
     valid: Any
     shares: Any
-    point: Point
+    point: Point | None
 
 
 class _Tails(NamedTuple):
     """x2 and beyond: light of the laser at x2; direction to x3; light from there on per path vertex, `length` of them.
 
-    `direction` leads from x1 to x2.
+    `direction` leads from x1 to x2, by a `diffuse` lobe or not.
 
     `own_weight` leads from x2 to the pixel, `own_onward` from x3; `shared` and `onward` say whether the pool may use
     the light at x2, and the light beyond.
@@ -69,6 +69,7 @@ class _Tails(NamedTuple):
     paths: Any
     length: Any
     direction: Any
+    diffuse: Any
 
 
 def add_paths(
@@ -86,10 +87,11 @@ def add_paths(
 
     With `regions` late light goes there instead, to be read from them when all paths are traced.
     """
-    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches, shared=shared)
+    points = regions is not None
+    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches, shared=shared, points=points)
     if regions is not None:
         regions.count_paths(heads.point)
-        sums = Late(regions, sums, heads.point, tails.direction)
+        sums = Late(regions, sums, heads.point, tails.direction, tails.diffuse)
     if not shared or world.has_own:
         _add_own(heads, tails, batch, sums, shared)
     if shared:
@@ -131,7 +133,15 @@ def _pairs(lanes: int) -> tuple[Any, Any]:
 
 
 def _trace(
-    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int, batches: Any, *, shared: bool
+    world: World,
+    pixels: np.ndarray,
+    turns: Turns,
+    bounces: int,
+    seed: int,
+    batches: Any,
+    *,
+    shared: bool,
+    points: bool = False,
 ) -> tuple[_Heads, _Tails, Any]:
     lanes = len(turns.block) * BLOCK
     lane = dr.arange(UInt32, lanes)
@@ -163,11 +173,11 @@ def _trace(
     shares = hit & (dr.gather(Float, world.shares, shape_index(si), hit) > 0)
     context = mi.BSDFContext()
     sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), hit)
-    diffuse = hit & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
-    point = point_of(si, ray, path, dr.select(diffuse, transmission * weight[0], 0))
+    point = point_of(si, ray, path, transmission, hit) if points else None
     heads = _Heads(receiver, _kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares, point)
     alive = hit & (weight[0] > 0)
     start, towards = mi.Point3f(si.p), si.to_world(sample.wo)
+    diffuse = alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
     si, passed, leg, _ = first_opaque(world, spawn(si, towards), alive, start)
     alive &= si.is_valid()
     own = dr.select(alive, transmission * weight[0] * passed, 0)
@@ -196,7 +206,8 @@ def _trace(
         values=values,
         paths=paths,
         length=length,
-        direction=towards,
+        direction=towards if points else None,
+        diffuse=diffuse if points else None,
     )
     batch = round_index % batches
     dr.eval(*heads, *tails, batch)

@@ -10,7 +10,7 @@ regions that widen with delay as irradiance samples are spaced by the distance o
 A region is a cube of the world and a class of normals. It keeps what comes to its points over the path from the laser
 to x1, without the way to the camera ("unwarped") and divided by the reflectance ("demodulated"), and the mean direction
 in which that path grows along the surface: light from one side reaches points farther away later, to first order.
-Every path of a diffuse lobe goes into one region of one octave, and pixels read the regions of some points of theirs:
+Light of diffuse lobes goes into one region of one octave each, and pixels read the regions of some points of theirs:
 energy is kept. The bias is what differs within a region, shadows above all.
 """
 
@@ -76,10 +76,18 @@ def octaves(
     return Octaves(start, size, width, cells)
 
 
-def point_of(si: Any, ray: Any, path_m: Any, reflectance: Any) -> Point:
-    """The point that a camera's ray met."""
+def point_of(si: Any, ray: Any, path_m: Any, transmission: Any, hit: Any) -> Point:
+    """The point that a camera's ray met.
+
+    What it reflects diffusely depends on where the light comes from, on coated surfaces; that of one direction stands
+    for all: regions are divided by it and multiplied with it again.
+    """
     normal = mi.Vector3f(dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n))
-    return Point(mi.Point3f(si.p), normal, Float(path_m), Float(reflectance))
+    context = mi.BSDFContext()
+    context.type_mask = mi.BSDFFlags.DiffuseReflection
+    _, weight = si.bsdf().sample(context, si, Float(0.5), mi.Point2f(0.25, 0.5), hit)
+    reflectance = dr.select(hit & (weight[0] > 0), weight[0] * transmission, 0)
+    return Point(mi.Point3f(si.p), normal, Float(path_m), reflectance)
 
 
 class Regions:
@@ -154,15 +162,15 @@ class Regions:
         row, known = self._row(self._key(point, octave), point.reflectance > 0)
         dr.scatter_add(self.paths, UInt32(1), row, known, mode=dr.ReduceMode.Direct)
 
-    def add(self, point: Point, towards: Any, batch: Any, path_m: Any, radiance: Any, active: Any) -> Any:
+    def add(self, point: Point, towards: Any, diffuse: Any, batch: Any, path_m: Any, radiance: Any, active: Any) -> Any:
         """Add light that comes to points from x2, which lies `towards`, after `path_m` from the laser.
 
-        `radiance` is what the pixel sees of it. Returns where it came too early for any region, and is still to add.
-        Late light in a region that no pixel reads is dropped.
+        `radiance` is what the pixel sees of it. Returns where it is still to add: where it came too early for any
+        region, or left by no `diffuse` lobe. Late light in a region that no pixel reads is dropped.
         """
         direct_m = point.path + dr.norm(point.p - self._laser) - dr.norm(point.p - self._eye)
         number = Int32(dr.floor(dr.log2(dr.maximum(path_m - direct_m, 0) / self._from)))
-        late = active & (number >= 0) & (point.reflectance > 0)
+        late = active & diffuse & (number >= 0) & (point.reflectance > 0)
         octave = UInt32(dr.clip(number, 0, Int32(self._last)))
         row, lit = self._row(self._key(point, octave), late & (radiance > 0) & dr.isfinite(radiance))
         # the path grows away from x2
@@ -276,15 +284,15 @@ class Late:
     `plain` is told of all light, filtered or not. Not a dataclass: Dr.Jit would take its fields for a loop's variables.
     """
 
-    def __init__(self, regions: Regions, sums: Sums, points: Point, towards: Any) -> None:
-        self.regions, self.sums, self.points, self.towards = regions, sums, points, towards
+    def __init__(self, regions: Regions, sums: Sums, points: Point, towards: Any, diffuse: Any) -> None:
+        self.regions, self.sums, self.points, self.towards, self.diffuse = regions, sums, points, towards, diffuse
 
     def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
         """Add light of every lane's own path; returns what its pixel got at once."""
         self.sums.add_plain(pixel, batch, path, radiance, active)
         one_way = path - self.points.path
-        early = self.regions.add(self.points, self.towards, batch, one_way, radiance, active)
-        return self.sums.add(pixel, batch, path, radiance, early)
+        own = self.regions.add(self.points, self.towards, self.diffuse, batch, one_way, radiance, active)
+        return self.sums.add(pixel, batch, path, radiance, own)
 
     def add_total(self, pixel: Any, batch: Any, radiance: Any) -> None:
         """Total of what `add` returned."""
@@ -333,11 +341,9 @@ def _points(world: World, pixels: np.ndarray, key: Any) -> tuple[Any, Point]:
     x, y = mi.radical_inverse_2(number, first), mi.sobol_2(number, second)
     ray, _ = camera_rays(world, Float(pixel % world.width) + x, Float(pixel // world.width) + y)
     si, transmission, path, _ = first_opaque(world, ray, valid)
-    context = mi.BSDFContext()
-    context.type_mask = mi.BSDFFlags.DiffuseReflection
-    _, weight = si.bsdf().sample(context, si, Float(0.5), mi.Point2f(y, x), valid & si.is_valid())
-    point = point_of(si, ray, path, weight[0] * transmission)
-    lit = valid & si.is_valid() & (point.reflectance > 0)
+    hit = valid & si.is_valid()
+    point = point_of(si, ray, path, transmission, hit)
+    lit = hit & (point.reflectance > 0)
     dr.eval(lit, place, *point)
     chosen = dr.compress(lit)
     return dr.gather(UInt32, place, chosen), _gathered(point, chosen)

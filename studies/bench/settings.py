@@ -81,7 +81,7 @@ def grid_beside(spp: int, filtered: bool = False) -> int:
     Filtered light has the noise of many times as many paths.
     """
     if filtered:
-        return 3 if spp <= 16 else 6 if spp <= 64 else 8
+        return 3 if spp < 16 else 4 if spp < 64 else 6 if spp < 256 else 8
     return 4 if spp <= 64 else 6 if spp <= 256 else 8
 
 

@@ -126,9 +126,10 @@ def test_nothing_in_view_is_a_failure_of_that_view_alone(tmp_path):
     assert done.exr is None and "nothing in view" in done.record["failed"]
 
 
-def test_a_view_does_not_depend_on_what_was_rendered_before_it():
+@pytest.mark.parametrize("filtered", [False, True])
+def test_a_view_does_not_depend_on_what_was_rendered_before_it(filtered):
     """The cameras of a room share one traced world: in any order, and alone, they give the same bytes."""
-    job = Job("rooms", width=16, height=16, error=0.2)
+    job = Job("rooms", width=16, height=16, error=0.2, filter=filtered)
     in_order = [render_view(job, view).exr for view in (0, 1, 2, 4)]
     assert all(in_order)
     assert [render_view(job, view).exr for view in (4, 2, 1, 0)] == in_order[::-1]
