@@ -281,7 +281,9 @@ def test_bench_of_ours_alone(capfd, tmp_path, few_qualities):
     assert status == 0, err
     assert {"rows", "ratios", "figure", "csv"} <= result.keys() and result["ratios"] == []
     names = {row["method"] for row in result["rows"]}
-    assert {"ours direct", "ours unbiased"} <= names and all(row["seconds"] > 0 for row in result["rows"])
+    assert {"ours direct", "ours unbiased", "ours filtered"} <= names and all(
+        row["seconds"] > 0 for row in result["rows"]
+    )
     for key in ("figure", "figure_pulse"):
         assert (tmp_path / "out" / result[key].rsplit("/", 1)[1]).read_bytes()[:4] == b"\x89PNG"
     with Path(result["csv"]).open(newline="") as file:
@@ -289,6 +291,14 @@ def test_bench_of_ours_alone(capfd, tmp_path, few_qualities):
     stored = json.loads((tmp_path / "out" / "bench-render.json").read_text(), parse_constant=lambda word: 1 / 0)
     assert stored["rows"] == result["rows"] and stored["machine"]["versions"]["drjit"]
     assert all("no independent check" in check["reference"] for check in result["checks"])
+
+
+def test_memory_is_measured_in_processes_of_its_own(capfd, tmp_path):
+    argv = ("--memory", "--scenes", "groove", "--sizes", "16", "--peer", "none")
+    status, result, err = bench(capfd, tmp_path, *argv)
+    assert status == 0, err
+    peaks = result["peak_mb_above_imports"]
+    assert peaks.keys() == {"ours unbiased", "ours filtered"} and all(0 < peak < 2000 for peak in peaks.values())
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mitransient") is None, reason="mitransient is not installed")
