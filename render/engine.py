@@ -72,7 +72,7 @@ def render(
         traced = traced_on(world, plan, settings, traced, more, derived_seed(seed, STAGE_MORE, 0, number), checked, say)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
         error = _estimated(world, plan, settings, traced, checked)
-    plan = replace(plan, reasons=(*plan.reasons, *_said_of_bias(plan, error)))
+    plan = replace(plan, reasons=(*plan.reasons, *_said_of_bias(plan, traced, error)))
     for line in (*scene.notes, *plan.reasons) if len(traced.samples.pixel) else ():
         log.info("%s", line)
     noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
@@ -131,10 +131,12 @@ def _missing(
     return traced.schedule._replace(rounds=rounds)
 
 
-def _said_of_bias(plan: Plan, error: ErrorEstimate) -> tuple[str, ...]:
+def _said_of_bias(plan: Plan, traced: Traced, error: ErrorEstimate) -> tuple[str, ...]:
     """What to know of a filter's bias, measured against the same paths without it."""
-    if not plan.filter or plan.bounces == 1:
+    if not plan.filter or traced.schedule is None:
         return ()
+    if traced.schedule.batches < FILTERED_BATCHES:
+        return ("filter: biased, and one path a pixel does not tell by how much",)
     if error.bias == 0:
         return ("filter: biased, by less than the noise of as many paths shows",)
     told = f"filter: biased by {error.bias:.2g}, measured against the same paths without it"

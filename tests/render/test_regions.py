@@ -174,6 +174,8 @@ def test_a_target_is_met_by_more_paths():
 
 
 def test_one_pixel_nothing_in_view_and_glass():
+    assert "does not tell" in render(room(2), RenderSettings(spp=1, filter=True)).meta["plan"]["reasons"][-1]
+    assert "filter" not in render(room(2), RenderSettings(bounces=1, filter=True)).meta["plan"]["reasons"][-1]
     tiny = render(room(1), RenderSettings(bounces=3, spp=64, filter=True), seed=1)
     assert np.isfinite(tiny.radiance).all() and (tiny.bounces > 1).any()
     away = replace(room(), camera=Camera.look_at((0, 0, 20), (0, 0, 40), fov_deg=30, width=4, height=4))
