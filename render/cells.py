@@ -96,9 +96,9 @@ class Rows:
     def add_between(self, row: Any, low_m: Any, high_m: Any, radiance: Any, active: Any) -> None:
         """Add radiance that is even between two values of x, no farther apart than cells are wide there, or little."""
         edge = dr.gather(Float, self._edges, self._cell(low_m) + 1, active)
-        below = dr.select(
-            high_m > edge, dr.clip((edge - low_m) / (high_m - low_m), 0, 1), 1
-        )  # the last cell ends early
+        # beyond the last cell its end lies below both
+        share = dr.clip((edge - low_m) / (high_m - low_m), 0, 1)
+        below = dr.select(high_m > edge, share, 1)
         self.add(row, 0.5 * (low_m + dr.minimum(high_m, edge)), radiance * below, active)
         self.add(row, 0.5 * (edge + high_m), radiance * (1 - below), active & (below < 1))
 

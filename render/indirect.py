@@ -11,7 +11,7 @@ import numpy as np
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
 from render.heap import release
 from render.paths import LANES, PATHS, add_paths, noise_of_paths
-from render.regions import Octaves, Regions
+from render.regions import READERS, Octaves, Regions
 from render.returns import Samples, concatenate
 from render.settings import BATCHES, FILTERED_BATCHES
 from render.sums import Sums
@@ -53,6 +53,11 @@ class Schedule(NamedTuple):
     def connections(self) -> int:
         """Rays between pixels and their neighbours' paths."""
         return int(self.rounds[self.shared].sum()) * BLOCK**2
+
+    def rays(self, bounces: int) -> int:
+        """Rays of all paths, connections and points that read regions; glass and cut-outs on the way not counted."""
+        points = 0 if self.spans is None else READERS * int((self.pixels >= 0).sum())
+        return self.paths * (2 * bounces - 1) + self.connections + points
 
     @property
     def cost(self) -> float:

@@ -87,9 +87,8 @@ def add_paths(
 
     With `regions` late light goes there instead, to be read from them when all paths are traced.
     """
-    points = regions is not None
-    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches, shared=shared, points=points)
-    if regions is not None:
+    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches, shared=shared, points=bool(regions))
+    if regions:
         regions.count_paths(heads.point)
         sums = Late(regions, sums, heads.point, tails.direction, tails.diffuse)
     if not shared or world.has_own:

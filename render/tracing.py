@@ -115,7 +115,7 @@ def trace(
     if schedule is not None:
         its_seed = derived_seed(seed, STAGE_INDIRECT)
         indirect = _indirect(world, plan, settings, schedule, its_seed, origin_m, brightest, checked, light, say)
-        rays += schedule.paths * (2 * plan.bounces - 1) + schedule.connections
+        rays += schedule.rays(plan.bounces)
     reasons = (*specular.notes, *reasons)
     return Traced(light.finished(), ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
 
@@ -174,7 +174,7 @@ def traced_on(
     return traced._replace(
         samples=concatenate([traced.direct, traced.specular, merged]),
         indirect=combined(traced.indirect, added, share),
-        rays=traced.rays + more.paths * (2 * plan.bounces - 1) + more.connections,
+        rays=traced.rays + more.rays(plan.bounces),
         schedule=before._replace(rounds=before.rounds + more.rounds),
         reasons=(*traced.reasons, reason),
     )

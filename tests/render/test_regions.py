@@ -10,7 +10,7 @@ from render.cells import Rows, make_cells
 from render.engine import render
 from render.error import response
 from render.planning import make_plan
-from render.regions import octaves
+from render.regions import READERS, octaves
 from render.returns import Samples, select
 from render.settings import RenderSettings
 from render.tracing import trace
@@ -165,6 +165,14 @@ def test_the_stated_error_is_the_true_one():
         assert transient.meta["plan"]["filter"] and "biased" in transient.meta["plan"]["reasons"][-1]
     ratio = math.sqrt(np.mean(np.square(stated)) / np.mean(np.square(true)))
     assert 1 / 1.3 < ratio < 1.3, (stated, true)
+
+
+def test_rays_count_the_points_that_read():
+    filtered, plain = (
+        render(room(8), RenderSettings(bounces=3, spp=4, grid=2, filter=f, adaptive=False)).meta["rays"]
+        for f in (True, False)
+    )
+    assert filtered == plain + READERS * 8 * 8
 
 
 def test_a_target_is_met_by_more_paths():
