@@ -244,7 +244,7 @@ def collect(
             for number, turns in enumerate(_launches(chosen, rounds, schedule.batches, most)):
                 if number % (QUEUED if shared else 1) == 0:
                     dr.sync_thread()
-                add_paths(world, pixels, turns, bounces, seed, sums, shared=shared, regions=regions)
+                add_paths(world, pixels, turns, bounces, seed, sums, schedule.batches, shared=shared, regions=regions)
             if regions is not None:
                 regions.read(sums)
             if regions is None:  # whose memory the next ones take

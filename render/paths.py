@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.rays import camera_rays, first_opaque, laser_leg, laser_light, segment, shape_index, spawn
+from render.lit import Lit, by_chance, densities, density_of, joined, kept, lit_points
+from render.rays import camera_rays, first_opaque, laser_light, segment, shape_index, spawn
 from render.regions import Late, Point, Regions, point_of
 from render.sums import Sums
 from render.turns import BLOCK, Turns, block_order, turns_of
@@ -42,6 +43,7 @@ class _Heads(NamedTuple):
     path: Any
     valid: Any
     shares: Any
+    diffuse: Any
     point: Point | None
 
 
@@ -58,6 +60,7 @@ class _Tails(NamedTuple):
     to_laser: Any
     irradiance: Any
     laser_path: Any
+    density: Any
     onward_direction: Any
     shared: Any
     onward: Any
@@ -65,6 +68,8 @@ class _Tails(NamedTuple):
     own_transmission: Any
     own_value: Any
     own_onward: Any
+    joined_value: Any
+    joined_path: Any
     values: Any
     paths: Any
     length: Any
@@ -79,6 +84,7 @@ def add_paths(
     bounces: int,
     seed: int,
     sums: Sums,
+    batches: int,
     *,
     shared: bool,
     regions: Regions | None = None,
@@ -87,12 +93,11 @@ def add_paths(
 
     With `regions` late light goes there instead, to be read from them when all paths are traced.
     """
-    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, sums.batches, shared=shared, points=bool(regions))
+    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, batches, shared=shared, points=bool(regions))
     if regions:
         regions.count_paths(heads.point)
         sums = Late(regions, sums, heads.point, tails.direction, tails.diffuse)
-    if not shared or world.has_own:
-        _add_own(heads, tails, batch, sums, shared)
+    _add_own(heads, tails, batch, sums, shared)
     if shared:
         head, tail = _pairs(dr.width(batch))
         _add_pairs(tails, head, tail, _weights(world, heads, tails, head, tail), heads, batch, sums)
@@ -106,16 +111,17 @@ def noise_of_paths(
 
     Histograms of paths that fall into different bins have this variance.
     """
-    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, dr.opaque(UInt32, 1), shared=True)
+    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, 1, shared=True)
     lanes = dr.width(batch)
-    values = tails.values.numpy().reshape(-1, lanes)[: bounces - 2].astype(np.float64)
+    values = tails.values.numpy().reshape(-1, lanes)[: 2 * (bounces - 2)].astype(np.float64)
     beyond = (values**2).sum(axis=0)
-    own = tails.own_value.numpy().astype(np.float64) ** 2 + tails.own_onward.numpy().astype(np.float64) ** 2 * beyond
+    first = tails.joined_value.numpy().astype(np.float64) ** 2
+    own = first + tails.own_value.numpy().astype(np.float64) ** 2 + tails.own_onward.numpy().astype(np.float64) ** 2 * beyond
     head, tail = _pairs(lanes)
-    _, first, weight = _weights(world, heads, tails, head, tail)
-    power = first.numpy().astype(np.float64) ** 2
+    _, value, weight = _weights(world, heads, tails, head, tail)
+    power = value.numpy().astype(np.float64) ** 2
     power += weight.numpy().astype(np.float64) ** 2 * np.repeat(beyond, BLOCK)
-    shared = np.nan_to_num(power.reshape(-1, BLOCK, BLOCK)).sum(axis=1)
+    shared = np.nan_to_num(power.reshape(-1, BLOCK, BLOCK)).sum(axis=1) + first.reshape(-1, BLOCK)
     if world.has_own:
         alone, onward = ~tails.shared.numpy().astype(bool), ~tails.onward.numpy().astype(bool)
         mirrored = np.where(alone, tails.own_value.numpy(), 0).astype(np.float64) ** 2
@@ -137,7 +143,7 @@ def _trace(
     turns: Turns,
     bounces: int,
     seed: int,
-    batches: Any,
+    batches: int,
     *,
     shared: bool,
     points: bool = False,
@@ -148,7 +154,12 @@ def _trace(
     block, stream, round_index, stride = (dr.gather(UInt32, upload(UInt32, column), turn) for column in turns)
     receiver = block * BLOCK + member
     pixels = upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF)
-    keys = [dr.opaque(UInt32, int(key)) for key in np.random.SeedSequence(seed).generate_state(2)]
+    numbers = np.random.SeedSequence(seed).generate_state(4)
+    keys = [dr.opaque(UInt32, int(key)) for key in numbers[:2]]
+    first = np.random.SeedSequence(numbers[2:], spawn_key=(int(turns.stream[0]), int(turns.round[0])))
+    lit = lit_points(world, lanes, batches, tuple(dr.opaque(UInt32, int(key)) for key in first.generate_state(2)))
+    batches = dr.opaque(UInt32, batches)
+    batch = round_index % batches
     if shared:
         # one random shift a block and round; the members share a low-discrepancy set of first directions
         shift = mi.sample_tea_32(stream, round_index ^ keys[0])
@@ -156,7 +167,7 @@ def _trace(
     else:
         # one randomised (0, 2)-sequence a block and batch (Sobol 1967): the rounds of each member are an aligned run of
         # it, and as even as those of all
-        shift = mi.sample_tea_32(stream, (round_index % batches) ^ keys[0])
+        shift = mi.sample_tea_32(stream, batch ^ keys[0])
         number = member * stride + round_index // batches
         spread = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
     # a hash of block, member and round numbers the streams, whichever launch they run in
@@ -173,15 +184,21 @@ def _trace(
     context = mi.BSDFContext()
     sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), hit)
     point = point_of(si, ray, path, transmission, hit) if points else None
-    heads = _Heads(receiver, _kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares, point)
     alive = hit & (weight[0] > 0)
-    start, towards = mi.Point3f(si.p), si.to_world(sample.wo)
     diffuse = alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+    heads = _Heads(receiver, kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares, diffuse, point)
+    # a head that shares has as many lobes as its block
+    copies = dr.select(shares, BLOCK, 1) if shared else 1
+    number = random.next_uint32() if shared else member * stride + round_index // batches + stream * 2654435769
+    joined_value, joined_path = joined(world, si, lit, batch, number, hit, copies)
+    before, start, towards = heads.si, mi.Point3f(si.p), si.to_world(sample.wo)
     si, passed, leg, _ = first_opaque(world, spawn(si, towards), alive, start)
     alive &= si.is_valid()
     own = dr.select(alive, transmission * weight[0] * passed, 0)
     to_laser, irradiance, laser_path = laser_light(world, si, pixel, alive, seen_by_camera=None)
+    density = density_of(world, si, to_laser)
     value = si.bsdf().eval(context, si, si.to_local(to_laser), alive)[0] * irradiance
+    value *= by_chance(world, before, sample, weight[0], si, density, copies, alive)
     shares = shares & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
     spread_lobe = ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     onward, onward_weight = si.bsdf().sample(
@@ -189,80 +206,99 @@ def _trace(
     )
     spread_onward = ~mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
     direction = si.to_world(onward.wo)
-    values, paths, length = _beyond(world, si, direction, alive & (onward_weight[0] > 0), pixel, random, bounces - 2)
+    scale = dr.select(onward_weight[0] > 0, onward_weight[0], 1)
+    way = _Way(kept(si), onward, onward_weight[0] / scale, 1 / scale, onward_weight[0])
+    values, paths, length = _beyond(world, lit, batch, way, alive, pixel, random, bounces - 2)
     tails = _Tails(
-        si=_kept(si),
+        si=kept(si),
         to_laser=to_laser,
         irradiance=dr.select(alive, irradiance, 0),
         laser_path=laser_path,
+        density=density,
         onward_direction=direction,
         shared=alive & shares & spread_lobe,
         onward=alive & shares & spread_lobe & spread_onward & (onward_weight[0] > 0),
         leg=leg,
         own_transmission=dr.select(alive, passed, 0),
         own_value=dr.select(alive & dr.isfinite(value), own * value, 0),
-        own_onward=own * onward_weight[0],
+        own_onward=own * scale,
+        joined_value=joined_value * transmission,
+        joined_path=joined_path,
         values=values,
         paths=paths,
         length=length,
         direction=towards if points else None,
         diffuse=diffuse if points else None,
     )
-    batch = round_index % batches
     dr.eval(*heads, *tails, batch)
     return heads, tails, batch
 
 
-def _kept(si: Any) -> Any:
-    """The interaction with what reflectance and rays need of it alone: most of a launch's memory is interactions."""
-    kept = dr.zeros(mi.SurfaceInteraction3f, dr.width(si.p))
-    for name in ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index"):
-        setattr(kept, name, getattr(si, name))
-    return kept
+class _Way(NamedTuple):
+    """Where paths stand and how they go on: a sample of direction and its weight; light that arrives so from there is
+    to be multiplied by `throughput`, light that arrives otherwise, reflectance included, by `arrived`."""
+
+    si: Any
+    sample: Any
+    throughput: Any
+    arrived: Any
+    weight: Any
 
 
 @dr.syntax
 def _beyond(
-    world: World, si: Any, direction: Any, active: Any, pixel: Any, random: Any, vertices: int
+    world: World, lit: Lit, batch: Any, way: _Way, active: Any, pixel: Any, random: Any, vertices: int
 ) -> tuple[Any, Any, Any]:
-    """Light of x3, x4, ... that goes to x2 from `direction`, divided by the density of the path after x2.
+    """Light of x3, x4, ... that goes to x2 along the way, divided by the density of the path after x2.
 
-    Returns radiances and path lengths from x2 to the laser, vertex-major flat arrays of vertices x lanes, and how many
-    vertices each lane's path had.
+    Returns radiances and path lengths from x2 to the laser, flat arrays of 2 vertices x lanes: of each vertex, joined
+    and by chance. And how many of these each lane has.
     """
     lanes = dr.width(pixel)
-    values, paths = dr.zeros(Float, lanes * max(vertices, 1)), dr.zeros(Float, lanes * max(vertices, 1))
+    slots = lanes * 2 * max(vertices, 1)
+    values, paths = dr.zeros(Float, slots), dr.zeros(Float, slots)
     lane, stride = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes)
-    last = dr.opaque(UInt32, vertices)
-    vertex, throughput, path = dr.zeros(UInt32, lanes), dr.full(Float, 1, lanes), dr.zeros(Float, lanes)
-    si, direction = mi.SurfaceInteraction3f(si), mi.Vector3f(direction)
-    active = Bool(active) & (vertex < last)
+    last = dr.opaque(UInt32, 2 * vertices)
+    slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
+    si, sample, throughput, arrived, weight = way
+    sample, weight = mi.BSDFSample3f(sample), Float(weight)
+    throughput, arrived = Float(throughput), Float(arrived)
+    active = Bool(active) & (slot < last)
     while active:
-        ray, point = spawn(si, direction), mi.Point3f(si.p)
-        si, passed, optical, _ = first_opaque(world, ray, active, point)
-        throughput *= passed
+        light, leg = joined(world, si, lit, batch, random.next_uint32(), active, 1)
+        dr.scatter(paths, path + leg, slot * stride + lane, active)
+        dr.scatter(values, arrived * light, slot * stride + lane, active)
+        slot += 1
+        going = active & (weight > 0)
+        direction = si.to_world(sample.wo)
+        ray, before = spawn(si, direction), kept(si)
+        si, passed, optical, _ = first_opaque(world, ray, going, before.p)
         path += optical
-        active &= si.is_valid()
-        value, leg = laser_leg(world, si, pixel, active, seen_by_camera=None)
-        slot = vertex * stride + lane
-        dr.scatter(paths, path + leg, slot, active)
-        dr.scatter(values, throughput * value, slot, active)
-        vertex += 1
-        active &= vertex < last
-        sample, weight = si.bsdf().sample(
+        active = going & si.is_valid()
+        to_laser, irradiance, leg = laser_light(world, si, pixel, active, seen_by_camera=None)
+        value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)[0] * irradiance
+        density = density_of(world, si, to_laser)
+        value *= by_chance(world, before, sample, weight, si, density, 1, active)
+        dr.scatter(paths, path + leg, slot * stride + lane, active)
+        dr.scatter(values, dr.select(dr.isfinite(value), throughput * passed * value, 0), slot * stride + lane, active)
+        slot += 1
+        active &= slot < last
+        arrived = throughput * passed
+        sample, onward = si.bsdf().sample(
             mi.BSDFContext(),
             si,
             random.next_float32(),
             mi.Point2f(random.next_float32(), random.next_float32()),
             active,
         )
-        direction = si.to_world(sample.wo)
-        throughput *= weight[0]
+        weight = onward[0]
+        throughput = arrived * weight
         # Russian roulette: paths that carry little end early, the others carry their energy on
-        survive = dr.clip(throughput, 0.05, 0.95)
-        active &= (throughput > 0) & (random.next_float32() < survive)
+        survive = dr.clip(dr.select(weight > 0, throughput, arrived), 0.05, 0.95)
+        active &= (arrived > 0) & (random.next_float32() < survive)
         throughput /= survive
-    return values, paths, vertex
+        arrived /= survive
+    return values, paths, slot
 
 
 def _add_own(heads: _Heads, tails: _Tails, batch: Any, sums: Sums, shared: bool) -> None:
@@ -277,6 +313,8 @@ def _add_own(heads: _Heads, tails: _Tails, batch: Any, sums: Sums, shared: bool)
         heads.path + tails.leg,
         dr.select(first, tails.own_value, 0),
         dr.select(onward, tails.own_onward, 0),
+        tails.joined_value,
+        heads.path + tails.joined_path,
     )
     _add(light, tails, sums)
 
@@ -286,11 +324,12 @@ def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: in
     blocks = block_order(pixels, world.scene.camera.width)
     block = np.arange(len(blocks) // BLOCK)
     turns = turns_of(block, block, np.full(len(block), rounds))
-    _, tails, batch = _trace(world, blocks, turns, bounces, seed, dr.opaque(UInt32, 1), shared=False)
+    _, tails, batch = _trace(world, blocks, turns, bounces, seed, 1, shared=False)
     beyond = tails.own_onward.numpy() * tails.values.numpy().reshape(-1, dr.width(batch))
     energy = np.zeros(bounces + 1)
     energy[2] = tails.own_value.numpy().sum(dtype=np.float64)
-    energy[3:] = beyond[: bounces - 2].sum(axis=1, dtype=np.float64)
+    energy[2] += tails.joined_value.numpy().sum(dtype=np.float64)
+    energy[3:] = beyond[: 2 * (bounces - 2)].sum(axis=1, dtype=np.float64).reshape(-1, 2).sum(axis=1)
     return energy / rounds
 
 
@@ -328,10 +367,15 @@ def _connect(world: World, heads: _Heads, tails: _Tails, head: Any, tail: Any) -
     value3, density3 = si2.bsdf().eval_pdf(context, si2, onward, going)
     area = dr.abs(dr.dot(si2.n, direction)) / distance2
     reach = dr.gather(Float, heads.transmission, head, active) * value1[0] * area * passed
+    lit_density = dr.gather(Float, tails.density, tail, active)
+    lobes, both = densities(
+        dr.dot(si1.sh_frame.n, direction), distance2, dr.dot(si2.n, direction), lit_density, BLOCK
+    )
+    kept_share = dr.select(dr.gather(Bool, heads.diffuse, head, active) & (both > 0), lobes / both, 1)
     density = dr.select(active, density1 * area, 0)
     connections = _Connections(
         leg,
-        dr.select(active, reach * value2 * irradiance, 0),
+        dr.select(active, reach * value2 * irradiance * kept_share, 0),
         dr.select(going, reach * value3[0], 0),
         density,
         dr.select(going, density * density3, 0),
@@ -376,25 +420,38 @@ class _Light(NamedTuple):
     base: Any
     first: Any
     weight: Any
+    joined: Any = None
+    joined_path: Any = None
 
 
 @dr.syntax
 def _add(light: _Light, tails: _Tails, sums: Sums) -> None:
-    receiver, batch, tail, base, first, weight = light
+    receiver, batch, tail, base, first, weight, also, also_path = light
     laser_path = dr.gather(Float, tails.laser_path, tail)
     values, paths = tails.values, tails.paths
     stride, last = dr.opaque(UInt32, dr.width(tails.leg)), dr.gather(UInt32, tails.length, tail)
-    vertex, total = dr.zeros(UInt32, dr.width(tail)), dr.zeros(Float, dr.width(tail))
+    turn, total = dr.zeros(UInt32, dr.width(tail)), dr.zeros(Float, dr.width(tail))
     going = (first > 0) | (weight > 0)
+    if dr.hint(also is not None, mode="scalar"):
+        going |= also > 0
     # x2's own light is the loop's first turn: additions before a loop would cost a kernel of their own
     while going:
-        beyond = going & (vertex > 0)
-        slot = (vertex - 1) * stride + tail
+        beyond = going & (turn > 0)
+        slot = (turn - 1) * stride + tail
+        if dr.hint(also is not None, mode="scalar"):
+            beyond &= turn > 1
+            slot -= stride
         radiance = dr.select(beyond, weight * dr.gather(Float, values, slot, beyond), first)
         path = base + dr.select(beyond, dr.gather(Float, paths, slot, beyond), laser_path)
+        if dr.hint(also is not None, mode="scalar"):
+            radiance = dr.select(turn == 1, also, radiance)
+            path = dr.select(turn == 1, also_path, path)
         total += sums.add(receiver, batch, path, radiance, going)
-        going &= (vertex < last) & (weight > 0)
-        vertex += 1
+        if dr.hint(also is not None, mode="scalar"):
+            going &= (turn == 0) | ((turn < last + 1) & (weight > 0))
+        else:
+            going &= (turn < last) & (weight > 0)
+        turn += 1
     sums.add_total(receiver, batch, total)
 
 

@@ -77,6 +77,7 @@ class World:
         self.thin_ior = self.table([m.ior if m.kind == "thindielectric" else 0 for m in materials])
         # coated surfaces trace paths of their own, and share none (`render.paths`)
         self.has_own = any(m.kind in ("conductor", "plastic", "roughplastic") for m in materials)
+        self.has_rough_coats = any(m.kind == "roughplastic" for m in materials)
         self.shares = self.table([m.kind not in ("plastic", "roughplastic") for m in materials])
         self.albedo = self.table([_specular_albedo(m) for m in materials])
         self.solid_indices = sorted({m.ior for m in materials if m.kind == "dielectric"})

@@ -1,0 +1,136 @@
+"""Points that the laser lights, to which paths of indirect light are joined.
+
+A path that goes on by chance seldom meets what the laser lights most: what is near it, or the few places in its cone.
+So every vertex is also joined to a point that was found from the laser's side (bidirectional path tracing with one
+vertex of the laser's: Lafortune, Willems 1993; Veach 1997, chapter 10). Both ways sample the same light. Going on by
+chance keeps the share
+
+    w = B q / (B q + p d^2 / cos),
+
+where q = cos / pi is the density, per solid angle, of a diffuse lobe (taken for every diffuse reflectance, coated or
+not, so that w does not depend on how the path came), p the density of lit points per area, d the distance and cos the
+cosine at the far end: the balance heuristic (Veach, eq. 9.8). Joining has the rest, of diffuse lobes alone: mirror-like
+ones go on by chance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from render.rays import first_opaque, laser_light, segment, to_world
+from render.world import Bool, Float, UInt32, World, dr, mi
+
+MOST_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
+LEAST_COSINE = 1e-9
+
+
+class Lit(NamedTuple):
+    """Points of a launch, `each` for every batch: direction and optical path to the laser, irradiance, and density.
+
+    `density` is that of one point per area [1/m^2].
+    """
+
+    si: Any
+    to_laser: Any
+    path: Any
+    irradiance: Any
+    density: Any
+    each: Any
+
+
+def lit_points(world: World, lanes: int, batches: int, key: tuple[Any, Any]) -> Lit:
+    """Points where uniform directions of the laser's cone meet a surface, for a launch of so many paths."""
+    wanted = min(MOST_POINTS, max(int(lanes * POINTS_PER_PATH), 1))
+    parts = 1 << (batches - 1).bit_length()
+    each = max(1, (1 << (wanted - 1).bit_length()) // parts)
+    count = each * parts
+    opaque = dr.opaque(UInt32, each)
+    index = dr.arange(UInt32, count)
+    # each batch has a randomised (0, 2)-sequence of its own
+    shift = mi.sample_tea_32(index // opaque + key[0], dr.zeros(UInt32, count) + key[1])
+    number = index % opaque
+    u, v = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
+    height = u * _cap(world)
+    ring = dr.sqrt(dr.maximum(height * (2 - height), 0))
+    sine, cosine = dr.sincos(2 * math.pi * v)
+    towards = to_world(world, mi.Vector3f(ring * cosine, ring * sine, 1 - height))
+    ray = mi.Ray3f(mi.Point3f(world.laser) + dr.zeros(mi.Point3f, count), towards)
+    si, _, _, _ = first_opaque(world, ray, dr.full(Bool, True, count))
+    found = si.is_valid()
+    to_laser, irradiance, path = laser_light(world, si, dr.zeros(UInt32, count), found, seen_by_camera=None)
+    lit = Lit(kept(si), to_laser, path, irradiance, density_of(world, si, to_laser), opaque)
+    dr.eval(*lit)
+    return lit
+
+
+def kept(si: Any) -> Any:
+    """The interaction with what reflectance and rays need of it alone: most of a launch's memory is interactions."""
+    few = dr.zeros(mi.SurfaceInteraction3f, dr.width(si.p))
+    for name in ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index"):
+        setattr(few, name, getattr(si, name))
+    return few
+
+
+def density_of(world: World, si: Any, to_laser: Any) -> Any:
+    """Density per area [1/m^2] of a lit point at an interaction, if the laser lights it."""
+    distance2 = dr.squared_norm(world.laser - si.p)
+    return dr.abs(dr.dot(si.n, to_laser)) / (distance2 * 2 * math.pi * _cap(world))
+
+
+def _cap(world: World) -> Any:
+    """Solid angle of the laser's cone over 2 pi: 1 - cos, without cancellation."""
+    return 2 * dr.square(dr.sin(0.5 * world.half_angle))
+
+
+def densities(cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> tuple[Any, Any]:
+    """Per solid angle: density of `copies` diffuse lobes at that cosine, and of these and a lit point together."""
+    lobes = copies / math.pi * dr.abs(cosine)
+    return lobes, lobes + density * distance2 / dr.maximum(dr.abs(far_cosine), LEAST_COSINE)
+
+
+def by_chance(
+    world: World, si: Any, sample: Any, weight: Any, end: Any, density: Any, copies: Any, active: Any
+) -> Any:
+    """Share of the light of a lit point `end` that a path keeps which went there from `si` by a sample of its lobes."""
+    if world.has_rough_coats:
+        value = si.bsdf().eval(_diffuse(), si, sample.wo, active)[0] / (weight * sample.pdf)
+        diffuse = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, dr.clip(value, 0, 1))
+    else:
+        diffuse = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection), Float(1), 0)
+    offset = end.p - si.p
+    distance2 = dr.squared_norm(offset)
+    far_cosine = dr.dot(end.n, offset) * dr.rsqrt(distance2)
+    lobes, both = densities(sample.wo.z, distance2, far_cosine, density, copies)
+    return 1 - diffuse * dr.select(both > 0, 1 - lobes / both, 0)
+
+
+def _diffuse() -> Any:
+    context = mi.BSDFContext()
+    context.type_mask = mi.BSDFFlags.DiffuseReflection
+    return context
+
+
+def joined(world: World, si: Any, lit: Lit, batch: Any, number: Any, active: Any, copies: Any) -> tuple[Any, Any]:
+    """Light that a surface reflects diffusely from one lit point, towards `si.wi`, and the path from it to the laser.
+
+    `number` chooses among the batch's points. The light is divided by the density of `copies` lobes and the point.
+    """
+    point = batch * lit.each + number % lit.each
+    end = dr.gather(mi.SurfaceInteraction3f, lit.si, point, active)
+    irradiance = dr.gather(Float, lit.irradiance, point, active)
+    offset = end.p - si.p
+    distance2 = dr.squared_norm(offset)
+    direction = offset * dr.rsqrt(distance2)
+    local = si.to_local(direction)
+    value = si.bsdf().eval(_diffuse(), si, local, active & (irradiance > 0) & (distance2 > 0))[0]
+    active = active & (value > 0) & (irradiance > 0)
+    end.wi = end.to_local(-direction)
+    to_laser = mi.Vector3f(*(dr.gather(Float, part, point, active) for part in lit.to_laser))
+    value *= end.bsdf().eval(mi.BSDFContext(), end, end.to_local(to_laser), active)[0] * irradiance
+    active &= value > 0
+    passed, leg = segment(world, si, end.p, active)
+    density = dr.gather(Float, lit.density, point, active)
+    _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies)
+    light = dr.select(active, value * passed / both, 0)
+    return dr.select(dr.isfinite(light), light, 0), leg + dr.gather(Float, lit.path, point, active)
