@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.lit import Lit, by_chance, densities, density_of, joined, kept, lit_points
+from render.lit import Lit, _diffuse, by_chance, densities, density_of, joined, kept, lit_points
 from render.rays import camera_rays, first_opaque, laser_light, segment, shape_index, spawn
 from render.regions import Late, Point, Regions, point_of
 from render.sums import Sums
@@ -207,7 +207,10 @@ def _trace(
     spread_onward = ~mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
     direction = si.to_world(onward.wo)
     scale = dr.select(onward_weight[0] > 0, onward_weight[0], 1)
-    way = _Way(kept(si), onward, onward_weight[0] / scale, 1 / scale, onward_weight[0])
+    may = Bool(True)
+    if shared and world.has_rough_coats:
+        may = dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
+    way = _Way(kept(si), onward, onward_weight[0] / scale, 1 / scale, onward_weight[0], may & alive)
     values, paths, length = _beyond(world, lit, batch, way, alive, pixel, random, bounces - 2)
     tails = _Tails(
         si=kept(si),
@@ -243,6 +246,7 @@ class _Way(NamedTuple):
     throughput: Any
     arrived: Any
     weight: Any
+    may: Any
 
 
 @dr.syntax
@@ -260,12 +264,12 @@ def _beyond(
     lane, stride = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes)
     last = dr.opaque(UInt32, 2 * vertices)
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
-    si, sample, throughput, arrived, weight = way
+    si, sample, throughput, arrived, weight, may = way
     sample, weight = mi.BSDFSample3f(sample), Float(weight)
-    throughput, arrived = Float(throughput), Float(arrived)
+    throughput, arrived, may = Float(throughput), Float(arrived), Bool(may)
     active = Bool(active) & (slot < last)
     while active:
-        light, leg = joined(world, si, lit, batch, random.next_uint32(), active, 1)
+        light, leg = joined(world, si, lit, batch, random.next_uint32(), active & may, 1)
         dr.scatter(paths, path + leg, slot * stride + lane, active)
         dr.scatter(values, arrived * light, slot * stride + lane, active)
         slot += 1
@@ -278,7 +282,8 @@ def _beyond(
         to_laser, irradiance, leg = laser_light(world, si, pixel, active, seen_by_camera=None)
         value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)[0] * irradiance
         density = density_of(world, si, to_laser)
-        value *= by_chance(world, before, sample, weight, si, density, 1, active)
+        value *= dr.select(may, by_chance(world, before, sample, weight, si, density, 1, active), 1)
+        may = Bool(True) | active
         dr.scatter(paths, path + leg, slot * stride + lane, active)
         dr.scatter(values, dr.select(dr.isfinite(value), throughput * passed * value, 0), slot * stride + lane, active)
         slot += 1
@@ -371,7 +376,12 @@ def _connect(world: World, heads: _Heads, tails: _Tails, head: Any, tail: Any) -
     lobes, both = densities(
         dr.dot(si1.sh_frame.n, direction), distance2, dr.dot(si2.n, direction), lit_density, BLOCK
     )
-    kept_share = dr.select(dr.gather(Bool, heads.diffuse, head, active) & (both > 0), lobes / both, 1)
+    if world.has_rough_coats:
+        diffuse = si1.bsdf().eval(_diffuse(), si1, si1.to_local(direction), active)[0] / value1[0]
+        diffuse = dr.select(value1[0] > 0, dr.clip(diffuse, 0, 1), 0)
+    else:
+        diffuse = dr.select(dr.gather(Bool, heads.diffuse, head, active), Float(1), 0)
+    kept_share = 1 - diffuse * dr.select(both > 0, 1 - lobes / both, 0)
     density = dr.select(active, density1 * area, 0)
     connections = _Connections(
         leg,
