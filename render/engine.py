@@ -22,7 +22,7 @@ from render.indirect import (
 from render.planning import finer_pilot, make_plan, pilot_pixels
 from render.returns import concatenate, no_samples, of_pixels, to_returns
 from render.settings import BATCHES, FILTERED_BATCHES, MOST_AMBIENT_SPP, Plan, RenderSettings
-from render.tracing import Progress, Traced, derived_seed, filtered, most_spp, trace, traced_on
+from render.tracing import Progress, Traced, derived_seed, most_spp, spans_of, trace, traced_on
 from render.transient import Transient
 from render.world import World
 from scenes.model import Scene
@@ -125,10 +125,11 @@ def _missing(
     if factor <= 0:
         return None
     rounds = np.ceil(traced.schedule.rounds * factor / batches).astype(np.int64) * batches
+    more = traced.schedule._replace(rounds=rounds)
     if plan.filter:
-        before, blocks = int(traced.schedule.rounds[0]), traced.schedule.pixels
-        return filtered(world, plan, settings, blocks, traced.origin_m, int(rounds[0]), before)
-    return traced.schedule._replace(rounds=rounds)
+        spans = spans_of(world, plan, settings, traced.origin_m, traced.schedule.cost + more.cost)
+        return more._replace(spans=spans)
+    return more
 
 
 def _said_of_bias(plan: Plan, traced: Traced, error: ErrorEstimate) -> tuple[str, ...]:

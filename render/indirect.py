@@ -10,10 +10,10 @@ import numpy as np
 
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
 from render.heap import release
-from render.paths import LANES, PATHS, add_paths, noise_of_paths
 from render.regions import READERS, Octaves, Regions
 from render.returns import Samples, concatenate
 from render.settings import BATCHES, FILTERED_BATCHES
+from render.sharing import LANES, PATHS, add_paths, noise_of_filtered_paths, noise_of_paths
 from render.sums import Sums
 from render.turns import BLOCK, Turns, turns_of
 from render.world import World, dr
@@ -72,45 +72,57 @@ def uniform(blocks: np.ndarray, rounds: int, *, shared: bool) -> Schedule:
     return Schedule(blocks, np.full(count, rounds), np.full(count, shared))
 
 
-def pilot_noise(world: World, blocks: np.ndarray, bounces: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def pilot_noise(
+    world: World, blocks: np.ndarray, bounces: int, seed: int, from_m: float | None = None
+) -> tuple[np.ndarray, ...]:
     """Squared contributions of one round summed over the pixels of every block, without and with sharing.
 
-    From a round or a few, smoothed along the Z-order curve: single bright paths must not rule.
+    With `from_m`, from which on light is filtered, there is one way alone. From a round or a few, smoothed along the
+    Z-order curve: single bright paths must not rule.
     """
     count = len(blocks) // BLOCK
     rounds = int(np.clip(256 // max(count, 1), 1, 16))
-    own, shared = np.zeros(count), np.zeros(count)
     per_launch = max(1, LANES // BLOCK**2 // rounds)
+    parts = []
     for first in range(0, count, per_launch):
         size = min(per_launch, count - first)
         block = np.arange(size)
         turns = turns_of(block, block + first, np.full(size, rounds))
         chosen = blocks[first * BLOCK : (first + size) * BLOCK]
-        for total, part in zip((own, shared), noise_of_paths(world, chosen, turns, bounces, seed), strict=True):
-            total[first : first + size] = part.sum(axis=1).reshape(size, rounds).mean(axis=1)
+        if from_m is None:
+            found = noise_of_paths(world, chosen, turns, bounces, seed)
+        else:
+            found = (noise_of_filtered_paths(world, chosen, turns, bounces, seed, from_m),)
+        parts.append([part.reshape(size, rounds).mean(axis=1) for part in found])
     kernel = np.array((1, 2, 3, 2, 1)) / 9
-    smooth = [np.convolve(np.pad(total, 2, mode="edge"), kernel, mode="valid") for total in (own, shared)]
-    return smooth[0], smooth[1]
+    totals = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return tuple(np.convolve(np.pad(total, 2, mode="edge"), kernel, mode="valid") for total in totals)
 
 
 def allocate(
-    blocks: np.ndarray, own: np.ndarray, shared: np.ndarray, *, cost: float = np.inf, squared_error: float = 0.0
+    blocks: np.ndarray,
+    own: np.ndarray,
+    shared: np.ndarray | None = None,
+    *,
+    cost: float = np.inf,
+    squared_error: float = 0.0,
+    batches: int = BATCHES,
 ) -> Schedule:
     """Spend work where it lowers the summed squared error most, until the error is met or `cost` paths a pixel spent.
 
     R rounds with noise N and work c add N / R to the error and R c to the work, in one block and one way (own paths or
-    shared ones); N / R + L R c is least at R = sqrt(N / (L c)), at least BATCHES (Neyman 1934). L comes by bisection.
+    shared ones); N / R + L R c is least at R = sqrt(N / (L c)), at least `batches` (Neyman 1934). L comes by bisection.
     A block's noise is at least 2 % of the mean, since a short pilot sees no rare path.
     """
-    each = np.array((1.0, 1 + BLOCK / PATH_COST))[:, None]
-    noise = np.stack((own, shared))
+    noise = np.stack((own,) if shared is None else (own, shared))
+    each = np.array((1.0, 1 + BLOCK / PATH_COST))[: len(noise), None]
     least = noise.min(axis=0).mean()
     noise = np.maximum(noise, 0.02 * least) if least > 0 else np.ones_like(noise)
-    most = max(BATCHES, 256 * cost) if np.isfinite(cost) else np.inf
+    most = max(batches, 256 * cost) if np.isfinite(cost) else np.inf
 
     def spent(price: float) -> tuple[np.ndarray, np.ndarray]:
-        rounds = np.clip(np.sqrt(noise / (price * each)), BATCHES, most)
-        rounds = np.ceil(rounds / BATCHES) * BATCHES
+        rounds = np.clip(np.sqrt(noise / (price * each)), batches, most)
+        rounds = np.ceil(rounds / batches) * batches
         best = np.argmin(noise / rounds + price * rounds * each, axis=0)
         return best, np.take_along_axis(rounds, best[None], 0)[0]
 

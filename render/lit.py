@@ -16,6 +16,7 @@ ones go on by chance.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from render.rays import first_opaque, laser_light, segment, to_world
@@ -23,6 +24,22 @@ from render.world import Bool, Float, UInt32, World, dr, mi
 
 MOST_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
 LEAST_COSINE = 1e-9
+# Lit points that x1 is joined to, of a path alone and of one that is shared: as many as lowered the noise of a second
+# most. Under a lamp, whose paths seldom meet what is close to it, later vertices are joined to one, too. A flash lights
+# what its pixels see, which paths meet often: there joining hardly pays.
+WIDE_JOINS, NARROW_JOINS = (4, 8), (1, 0)
+
+
+def joins_of(world: World, *, shared: bool) -> int:
+    """Lit points that every x1 is joined to; none where the laser is no flood, and lights another place every time."""
+    if world.scene.laser.mode != "flood":
+        return 0
+    return (WIDE_JOINS if is_wide(world) else NARROW_JOINS)[shared]
+
+
+def is_wide(world: World) -> bool:
+    """Whether the laser lights half the sphere or more."""
+    return world.scene.laser.cos_half_angle(world.scene.camera) <= 0
 
 
 class Lit(NamedTuple):
@@ -84,25 +101,34 @@ def _cap(world: World) -> Any:
 
 
 def densities(cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> tuple[Any, Any]:
-    """Per solid angle: density of `copies` diffuse lobes at that cosine, and of these and a lit point together."""
+    """Per solid angle: density of `copies` diffuse lobes at that cosine, and of these and lit points together."""
     lobes = copies / math.pi * dr.abs(cosine)
     return lobes, lobes + density * distance2 / dr.maximum(dr.abs(far_cosine), LEAST_COSINE)
 
 
-def by_chance(
-    world: World, si: Any, sample: Any, weight: Any, end: Any, density: Any, copies: Any, active: Any
-) -> Any:
-    """Share of the light of a lit point `end` that a path keeps which went there from `si` by a sample of its lobes."""
-    if world.has_rough_coats:
-        value = si.bsdf().eval(_diffuse(), si, sample.wo, active)[0] / (weight * sample.pdf)
-        diffuse = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, dr.clip(value, 0, 1))
-    else:
-        diffuse = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection), Float(1), 0)
-    offset = end.p - si.p
-    distance2 = dr.squared_norm(offset)
-    far_cosine = dr.dot(end.n, offset) * dr.rsqrt(distance2)
-    lobes, both = densities(sample.wo.z, distance2, far_cosine, density, copies)
+def share_by_chance(diffuse: Any, cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> Any:
+    """Share of a lit point's light that paths keep which go there by chance, from a surface that reflects the share
+    `diffuse` of it diffusely."""
+    lobes, both = densities(cosine, distance2, far_cosine, density, copies)
     return 1 - diffuse * dr.select(both > 0, 1 - lobes / both, 0)
+
+
+def diffuse_share(world: World, si: Any, direction: Any, value: Any, active: Any) -> Any:
+    """Share of a surface's reflectance `value`, cosine included, that is diffuse; of what is not mirror-like."""
+    if not world.has_mixed_lobes:
+        return 1
+    diffuse = si.bsdf().eval(_diffuse(), si, si.to_local(direction), active)[0]
+    return dr.select(value > 0, dr.clip(diffuse / value, 0, 1), 0)
+
+
+def by_chance(world: World, si: Any, sample: Any, weight: Any, end: Any, density: Any, copies: Any, active: Any) -> Any:
+    """`share_by_chance` of a lit point `end` that was met in the direction of a sample, with its weight, of `si`."""
+    direction = si.to_world(sample.wo)
+    diffuse = diffuse_share(world, si, direction, weight * sample.pdf, active)
+    diffuse = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, diffuse)
+    offset = end.p - si.p
+    far_cosine = dr.dot(end.n, direction)
+    return share_by_chance(diffuse, sample.wo.z, dr.squared_norm(offset), far_cosine, density, copies)
 
 
 def _diffuse() -> Any:
@@ -111,10 +137,21 @@ def _diffuse() -> Any:
     return context
 
 
-def joined(world: World, si: Any, lit: Lit, batch: Any, number: Any, active: Any, copies: Any) -> tuple[Any, Any]:
-    """Light that a surface reflects diffusely from one lit point, towards `si.wi`, and the path from it to the laser.
+def joined(
+    world: World,
+    si: Any,
+    lit: Lit,
+    batch: Any,
+    number: Any,
+    active: Any,
+    copies: Callable[[Any], Any] = lambda path: 1,
+    joins: int = 1,
+) -> tuple[Any, Any, Any]:
+    """Light that a surface reflects diffusely from one lit point, towards `si.wi`; the path from the laser;
+    the direction of the point.
 
-    `number` chooses among the batch's points. The light is divided by the density of `copies` lobes and the point.
+    `number` chooses among the batch's points. The light is divided by the density of all `joins` such points together
+    with as many lobes as `copies` says of the path.
     """
     point = batch * lit.each + number % lit.each
     end = dr.gather(mi.SurfaceInteraction3f, lit.si, point, active)
@@ -123,14 +160,16 @@ def joined(world: World, si: Any, lit: Lit, batch: Any, number: Any, active: Any
     distance2 = dr.squared_norm(offset)
     direction = offset * dr.rsqrt(distance2)
     local = si.to_local(direction)
-    value = si.bsdf().eval(_diffuse(), si, local, active & (irradiance > 0) & (distance2 > 0))[0]
-    active = active & (value > 0) & (irradiance > 0)
+    active = active & (irradiance > 0) & (distance2 > 0)
+    value = si.bsdf().eval(_diffuse(), si, local, active)[0]
+    active &= value > 0
     end.wi = end.to_local(-direction)
     to_laser = mi.Vector3f(*(dr.gather(Float, part, point, active) for part in lit.to_laser))
     value *= end.bsdf().eval(mi.BSDFContext(), end, end.to_local(to_laser), active)[0] * irradiance
     active &= value > 0
     passed, leg = segment(world, si, end.p, active)
-    density = dr.gather(Float, lit.density, point, active)
-    _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies)
+    path = leg + dr.gather(Float, lit.path, point, active)
+    density = dr.gather(Float, lit.density, point, active) * joins
+    _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))
     light = dr.select(active, value * passed / both, 0)
-    return dr.select(dr.isfinite(light), light, 0), leg + dr.gather(Float, lit.path, point, active)
+    return dr.select(dr.isfinite(light), light, 0), path, direction

@@ -1,17 +1,8 @@
-"""Paths of indirect light: camera paths whose tails are shared by the pixels around them, each connected to the laser.
+"""Paths of indirect light: from the camera over surfaces, every vertex of them connected to the laser.
 
-A camera path meets x1, the first surface of its pixel, then x2, x3, ... and is connected to the laser at each of them.
-What follows x1 is its tail. Pixels near each other form a block of T, and every pixel of the block uses the tails of
-all: it sees T samples for the price of one path and T rays that test whether its x1 sees x2 (path reuse: Bekaert,
-Sbert, Halton 2002, "Accelerating path tracing by re-using paths"). Weighted by the balance heuristic (Veach 1997,
-eq. 9.8) the estimate stays unbiased: with F_i the integrand of pixel i over x2 and p_k the density, per area at x2,
-with which pixel k samples x2 (0 where x2 is hidden from it),
-
-    L_i = sum_j F_i(x2_j) / sum_k p_k(x2_j),
-
-where tail j goes on in a direction that was sampled as seen from x1_j, so that beyond x2 the densities have the factor
-p(w3 | x1_k, x2). Paths that leave x1 (or x2) by a mirror-like lobe, or whose x1 or x2 lies on plastic, are disjoint
-from all others and stay their own.
+A camera path meets x1, the first surface of its pixel, then x2, x3, ... What the laser does at each of them is added to
+the pixel, and so is what one point lit by the laser does there (`render.lit`). What follows x1 is the path's tail: the
+pixels around it may use it, too (`render.sharing`).
 """
 
 from __future__ import annotations
@@ -20,22 +11,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.lit import Lit, _diffuse, by_chance, densities, density_of, joined, kept, lit_points
-from render.rays import camera_rays, first_opaque, laser_light, segment, shape_index, spawn
-from render.regions import Late, Point, Regions, point_of
-from render.sums import Sums
+from render.lit import Lit, by_chance, density_of, is_wide, joined, joins_of, kept, lit_points
+from render.rays import camera_rays, first_opaque, laser_light, shape_index, spawn
+from render.regions import Point, late_from, point_of
 from render.turns import BLOCK, Turns, block_order, turns_of
 from render.world import Bool, Float, UInt32, World, dr, mi, upload
 
-# Of one launch, 40 and 75 MB in its course. Python records a launch for as long as some 2^16 connections take.
-LANES = 1 << 20  # connections
-PATHS = 1 << 18
-# Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32
+# Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32; and of the plain
 GOLDEN = (3242174889, 2447445414)
+PLAIN_GOLDEN = 2654435769
 
 
-class _Heads(NamedTuple):
-    """x1 of every path of a launch and where it belongs; as a `point` of `render.regions`, if that is asked for."""
+class Heads(NamedTuple):
+    """x1 of every path of a launch and where it belongs; as a `point` of `render.regions`, if that is asked for.
+
+    `late_m` is the path from the laser to x1 [m] up to which light comes by the tails of the whole block, where the
+    head `shares`, and not by the path alone: infinite where blocks share all, 0 where they share nothing.
+    """
 
     receiver: Any
     si: Any
@@ -43,101 +35,66 @@ class _Heads(NamedTuple):
     path: Any
     valid: Any
     shares: Any
-    diffuse: Any
+    late_m: Any
     point: Point | None
 
+    @property
+    def early_m(self) -> Any:
+        """`late_m` of those that share, 0 for others."""
+        return dr.select(self.shares, self.late_m, 0)
 
-class _Tails(NamedTuple):
-    """x2 and beyond: light of the laser at x2; direction to x3; light from there on per path vertex, `length` of them.
 
-    `direction` leads from x1 to x2, by a `diffuse` lobe or not.
+class Joined(NamedTuple):
+    """What x1 reflects of a lit point: radiance, path to the laser, and direction to the point."""
 
-    `own_weight` leads from x2 to the pixel, `own_onward` from x3; `shared` and `onward` say whether the pool may use
-    the light at x2, and the light beyond.
+    value: Any
+    path: Any
+    direction: Any
+
+
+class Tails(NamedTuple):
+    """x2 and beyond.
+
+    direction, diffuse  from x1 to x2, by a diffuse lobe or not
+    irradiance, to_laser, laser_path, density  the laser's light at x2, and `render.lit.density_of` there
+    onward_direction    from x2 to x3
+    shared, onward      whether the block may use the laser's light at x2, and what lies beyond
+    own_value           what the pixel itself gets of the laser's light at x2
+    own_onward          factor of what lies beyond: `values` with their `paths` from x2 to the laser, `length` of them
+    soonest_m           the shortest of these paths and `laser_path` that carries light
     """
 
     si: Any
-    to_laser: Any
+    direction: Any
+    diffuse: Any
+    leg: Any
     irradiance: Any
+    to_laser: Any
     laser_path: Any
     density: Any
     onward_direction: Any
     shared: Any
     onward: Any
-    leg: Any
     own_transmission: Any
     own_value: Any
     own_onward: Any
-    joined_value: Any
-    joined_path: Any
     values: Any
     paths: Any
     length: Any
-    direction: Any
-    diffuse: Any
+    soonest_m: Any
 
 
-def add_paths(
-    world: World,
-    pixels: np.ndarray,
-    turns: Turns,
-    bounces: int,
-    seed: int,
-    sums: Sums,
-    batches: int,
-    *,
-    shared: bool,
-    regions: Regions | None = None,
-) -> None:
-    """Trace paths of the given blocks of flat pixels (-1: none) and add their light to `sums`; `shared` by blocks.
+class Traced(NamedTuple):
+    """Paths of a launch, and the batch that each belongs to."""
 
-    With `regions` late light goes there instead, to be read from them when all paths are traced.
-    """
-    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, batches, shared=shared, points=bool(regions))
-    if regions:
-        regions.count_paths(heads.point)
-        sums = Late(regions, sums, heads.point, tails.direction, tails.diffuse)
-    _add_own(heads, tails, batch, sums, shared)
-    if shared:
-        head, tail = _pairs(dr.width(batch))
-        _add_pairs(tails, head, tail, _weights(world, heads, tails, head, tail), heads, batch, sums)
-    sums.evaluate()
+    heads: Heads
+    joined: tuple[Joined, ...]
+    tails: Tails
+    lit: Lit
+    batch: Any
 
 
-def noise_of_paths(
-    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of the squared contributions of one path to each pixel, own and shared; (turns, BLOCK) each.
-
-    Histograms of paths that fall into different bins have this variance.
-    """
-    heads, tails, batch = _trace(world, pixels, turns, bounces, seed, 1, shared=True)
-    lanes = dr.width(batch)
-    values = tails.values.numpy().reshape(-1, lanes)[: 2 * (bounces - 2)].astype(np.float64)
-    beyond = (values**2).sum(axis=0)
-    first = tails.joined_value.numpy().astype(np.float64) ** 2
-    own = first + tails.own_value.numpy().astype(np.float64) ** 2 + tails.own_onward.numpy().astype(np.float64) ** 2 * beyond
-    head, tail = _pairs(lanes)
-    _, value, weight = _weights(world, heads, tails, head, tail)
-    power = value.numpy().astype(np.float64) ** 2
-    power += weight.numpy().astype(np.float64) ** 2 * np.repeat(beyond, BLOCK)
-    shared = np.nan_to_num(power.reshape(-1, BLOCK, BLOCK)).sum(axis=1) + first.reshape(-1, BLOCK)
-    if world.has_own:
-        alone, onward = ~tails.shared.numpy().astype(bool), ~tails.onward.numpy().astype(bool)
-        mirrored = np.where(alone, tails.own_value.numpy(), 0).astype(np.float64) ** 2
-        mirrored += np.where(onward, tails.own_onward.numpy(), 0).astype(np.float64) ** 2 * beyond
-        shared += mirrored.reshape(-1, BLOCK)
-    return np.nan_to_num(own).reshape(-1, BLOCK), shared
-
-
-def _pairs(lanes: int) -> tuple[Any, Any]:
-    """Head and tail of every pair: neighbours in a block are neighbours in the launch, which keeps rays coherent."""
-    pair = dr.arange(UInt32, lanes * BLOCK)
-    tail = pair // BLOCK
-    return tail // BLOCK * BLOCK + pair % BLOCK, tail
-
-
-def _trace(
+def trace_paths(
     world: World,
     pixels: np.ndarray,
     turns: Turns,
@@ -146,33 +103,40 @@ def _trace(
     batches: int,
     *,
     shared: bool,
-    points: bool = False,
-) -> tuple[_Heads, _Tails, Any]:
+    from_m: Any = None,
+) -> Traced:
+    """Trace a path for every member of every turn.
+
+    Blocks share their tails if they are `shared`, or for light less than `from_m` behind direct light.
+    """
     lanes = len(turns.block) * BLOCK
     lane = dr.arange(UInt32, lanes)
     turn, member = lane // BLOCK, lane % BLOCK
     block, stream, round_index, stride = (dr.gather(UInt32, upload(UInt32, column), turn) for column in turns)
-    receiver = block * BLOCK + member
     pixels = upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF)
     numbers = np.random.SeedSequence(seed).generate_state(4)
-    keys = [dr.opaque(UInt32, int(key)) for key in numbers[:2]]
-    first = np.random.SeedSequence(numbers[2:], spawn_key=(int(turns.stream[0]), int(turns.round[0])))
-    lit = lit_points(world, lanes, batches, tuple(dr.opaque(UInt32, int(key)) for key in first.generate_state(2)))
+    keys = [dr.opaque(UInt32, int(number)) for number in numbers[:2]]
+    joins = joins_of(world, shared=shared)
+    lit = _lit(world, turns, lanes, batches, joins, numbers[2:])
     batches = dr.opaque(UInt32, batches)
     batch = round_index % batches
+    # a hash of block, member and round numbers the streams, whichever launch they run in
+    lane_key = mi.sample_tea_32(stream * BLOCK + member, round_index ^ keys[1])
+    random = mi.PCG32(initstate=mi.UInt64(lane_key[0]), initseq=mi.UInt64(lane_key[1]))
     if shared:
-        # one random shift a block and round; the members share a low-discrepancy set of first directions
+        # one random shift a block and round; the members share a low-discrepancy set of first directions, and their
+        # lit points: rays to these are neighbours
         shift = mi.sample_tea_32(stream, round_index ^ keys[0])
         spread = [Float((s + member * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
+        first = mi.sample_tea_32(stream, round_index ^ keys[1])[0]
     else:
         # one randomised (0, 2)-sequence a block and batch (Sobol 1967): the rounds of each member are an aligned run of
         # it, and as even as those of all
         shift = mi.sample_tea_32(stream, batch ^ keys[0])
         number = member * stride + round_index // batches
         spread = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
-    # a hash of block, member and round numbers the streams, whichever launch they run in
-    lane_key = mi.sample_tea_32(stream * BLOCK + member, round_index ^ keys[1])
-    random = mi.PCG32(initstate=mi.UInt64(lane_key[0]), initseq=mi.UInt64(lane_key[1]))
+        first = (number + stream * PLAIN_GOLDEN) * joins
+    receiver = block * BLOCK + member
     pixel = dr.gather(UInt32, pixels, receiver)
     valid = pixel != 0xFFFFFFFF
     pixel = dr.select(valid, pixel, 0)
@@ -181,147 +145,185 @@ def _trace(
     si, transmission, path, _ = first_opaque(world, ray, valid)
     hit = valid & si.is_valid()
     shares = hit & (dr.gather(Float, world.shares, shape_index(si), hit) > 0)
+    late_m, point = dr.full(Float, dr.inf if shared else 0, lanes), None
+    if from_m is not None:
+        point = point_of(si, ray, path, transmission, hit)
+        late_m = late_from(world, point, from_m)
+    sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*spread), hit)
+    heads = Heads(receiver, kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares, late_m, point)
+    near = _joined(world, heads, lit, batch, first, joins)
+    tails = _tails(
+        world, heads, sample, weight[0], pixel, lit, joins, batch, random, bounces, used=shared or from_m is not None
+    )
+    traced = Traced(heads, near, tails, lit, batch)
+    dr.eval(*heads, *(part for light in near for part in light), *tails, batch)
+    return traced
+
+
+def _lit(world: World, turns: Turns, lanes: int, batches: int, joins: int, numbers: np.ndarray) -> Lit | None:
+    """Lit points of this launch alone."""
+    if joins == 0:
+        return None
+    seeds = np.random.SeedSequence(numbers.tolist(), spawn_key=(int(turns.stream[0]), int(turns.round[0])))
+    return lit_points(world, lanes, batches, tuple(dr.opaque(UInt32, int(key)) for key in seeds.generate_state(2)))
+
+
+def _joined(world: World, heads: Heads, lit: Lit | None, batch: Any, first: Any, joins: int) -> tuple[Joined, ...]:
+    """x1 joined to lit points, each of which has a share of their light. No loop: one would be a kernel of its own."""
+    found = []
+    for join in range(joins):
+        light, path, direction = joined(
+            world, heads.si, lit, batch, first + join, heads.valid, lambda path: copies_of(heads, path), joins
+        )
+        found.append(Joined(light * heads.transmission, path, direction))
+    return tuple(found)
+
+
+def copies_of(heads: Heads, path: Any) -> Any:
+    """How many lobes look for light that has come so far from the laser to x1: those of the whole block, or one."""
+    return dr.select(path < heads.early_m, Float(BLOCK), Float(1))
+
+
+def _tails(
+    world: World,
+    heads: Heads,
+    sample: Any,
+    weight: Any,
+    pixel: Any,
+    lit: Lit | None,
+    joins: int,
+    batch: Any,
+    random: Any,
+    bounces: int,
+    *,
+    used: bool,
+) -> Tails:
+    """Tails in sampled directions. If neighbours may use them (`used`), x2 on a rough coat is not joined to lit points:
+    what it reflects diffusely depends on where it is seen from, and joined light is handed on as one number."""
     context = mi.BSDFContext()
-    sample, weight = si.bsdf().sample(context, si, random.next_float32(), mi.Point2f(*spread), hit)
-    point = point_of(si, ray, path, transmission, hit) if points else None
-    alive = hit & (weight[0] > 0)
-    diffuse = alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
-    heads = _Heads(receiver, kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares, diffuse, point)
-    # a head that shares has as many lobes as its block
-    copies = dr.select(shares, BLOCK, 1) if shared else 1
-    number = random.next_uint32() if shared else member * stride + round_index // batches + stream * 2654435769
-    joined_value, joined_path = joined(world, si, lit, batch, number, hit, copies)
-    before, start, towards = heads.si, mi.Point3f(si.p), si.to_world(sample.wo)
-    si, passed, leg, _ = first_opaque(world, spawn(si, towards), alive, start)
+    x1, alive = heads.si, heads.valid & (weight > 0)
+    direction = x1.to_world(sample.wo)
+    si, passed, leg, _ = first_opaque(world, spawn(x1, direction), alive, x1.p)
     alive &= si.is_valid()
-    own = dr.select(alive, transmission * weight[0] * passed, 0)
+    own = dr.select(alive, heads.transmission * weight * passed, 0)
     to_laser, irradiance, laser_path = laser_light(world, si, pixel, alive, seen_by_camera=None)
-    density = density_of(world, si, to_laser)
+    density = density_of(world, si, to_laser) * joins
     value = si.bsdf().eval(context, si, si.to_local(to_laser), alive)[0] * irradiance
-    value *= by_chance(world, before, sample, weight[0], si, density, copies, alive)
-    shares = shares & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
-    spread_lobe = ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    if lit is not None:
+        value *= by_chance(world, x1, sample, weight, si, density, copies_of(heads, leg + laser_path), alive)
+    value = dr.select(alive & dr.isfinite(value), own * value, 0)
     onward, onward_weight = si.bsdf().sample(
         context, si, random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32()), alive
     )
-    spread_onward = ~mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta)
-    direction = si.to_world(onward.wo)
-    scale = dr.select(onward_weight[0] > 0, onward_weight[0], 1)
-    may = Bool(True)
-    if shared and world.has_rough_coats:
-        may = dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
-    way = _Way(kept(si), onward, onward_weight[0] / scale, 1 / scale, onward_weight[0], may & alive)
-    values, paths, length = _beyond(world, lit, batch, way, alive, pixel, random, bounces - 2)
-    tails = _Tails(
-        si=kept(si),
-        to_laser=to_laser,
-        irradiance=dr.select(alive, irradiance, 0),
-        laser_path=laser_path,
-        density=density,
-        onward_direction=direction,
-        shared=alive & shares & spread_lobe,
-        onward=alive & shares & spread_lobe & spread_onward & (onward_weight[0] > 0),
-        leg=leg,
-        own_transmission=dr.select(alive, passed, 0),
-        own_value=dr.select(alive & dr.isfinite(value), own * value, 0),
-        own_onward=own * scale,
-        joined_value=joined_value * transmission,
-        joined_path=joined_path,
-        values=values,
-        paths=paths,
-        length=length,
-        direction=towards if points else None,
-        diffuse=diffuse if points else None,
+    onward_weight = onward_weight[0]
+    joinable = Bool(alive)
+    if used and world.has_rough_coats:
+        joinable &= dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
+    scale = dr.select(onward_weight > 0, onward_weight, 1)
+    way = _Way(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, joinable)
+    soonest = dr.select(value > 0, laser_path, dr.inf)
+    light = _beyond(world, lit, batch, way, alive, pixel, random, soonest, bounces - 2)
+    shared = alive & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
+    shared &= heads.shares & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    return Tails(
+        kept(si),
+        direction,
+        alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection),
+        leg,
+        dr.select(alive, irradiance, 0),
+        to_laser,
+        laser_path,
+        density,
+        si.to_world(onward.wo),
+        shared,
+        shared & ~mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta) & (onward_weight > 0),
+        dr.select(alive, passed, 0),
+        value,
+        own * scale,
+        *light,
     )
-    dr.eval(*heads, *tails, batch)
-    return heads, tails, batch
 
 
 class _Way(NamedTuple):
-    """Where paths stand and how they go on: a sample of direction and its weight; light that arrives so from there is
-    to be multiplied by `throughput`, light that arrives otherwise, reflectance included, by `arrived`."""
+    """Where paths stand and how they go on: a sample of the surface's lobes and its weight. `through` is the factor of
+    light that comes from there, `here` that of light reflected on the spot, reflectance counted in that light, and
+    `joinable` says whether there is such."""
 
     si: Any
     sample: Any
-    throughput: Any
-    arrived: Any
     weight: Any
-    may: Any
+    through: Any
+    here: Any
+    joinable: Any
 
 
 @dr.syntax
 def _beyond(
-    world: World, lit: Lit, batch: Any, way: _Way, active: Any, pixel: Any, random: Any, vertices: int
-) -> tuple[Any, Any, Any]:
+    world: World,
+    lit: Lit | None,
+    batch: Any,
+    way: _Way,
+    active: Any,
+    pixel: Any,
+    random: Any,
+    soonest: Any,
+    vertices: int,
+) -> tuple[Any, Any, Any, Any]:
     """Light of x3, x4, ... that goes to x2 along the way, divided by the density of the path after x2.
 
-    Returns radiances and path lengths from x2 to the laser, flat arrays of 2 vertices x lanes: of each vertex, joined
-    and by chance. And how many of these each lane has.
+    Returns radiances and path lengths from x2 to the laser, flat arrays of 2 vertices x lanes: of every vertex, by way
+    of a lit point that the last one was joined to, and of the vertex itself. Then how many of these each lane has, and
+    the shortest path.
     """
     lanes = dr.width(pixel)
     slots = lanes * 2 * max(vertices, 1)
     values, paths = dr.zeros(Float, slots), dr.zeros(Float, slots)
-    lane, stride = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes)
-    last = dr.opaque(UInt32, 2 * vertices)
+    lane, stride, last = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes), dr.opaque(UInt32, 2 * vertices)
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
-    si, sample, throughput, arrived, weight, may = way
-    sample, weight = mi.BSDFSample3f(sample), Float(weight)
-    throughput, arrived, may = Float(throughput), Float(arrived), Bool(may)
-    active = Bool(active) & (slot < last)
+    si, sample = mi.SurfaceInteraction3f(way.si), mi.BSDFSample3f(way.sample)
+    weight, through, here, joinable = Float(way.weight), Float(way.through), Float(way.here), Bool(way.joinable)
+    active, joining = Bool(active) & (slot < last), lit is not None and is_wide(world)
     while active:
-        light, leg = joined(world, si, lit, batch, random.next_uint32(), active & may, 1)
-        dr.scatter(paths, path + leg, slot * stride + lane, active)
-        dr.scatter(values, arrived * light, slot * stride + lane, active)
+        if dr.hint(joining, mode="scalar"):
+            light, leg, _ = joined(world, si, lit, batch, random.next_uint32(), active & joinable)
+            light *= here
+            dr.scatter(paths, path + leg, slot * stride + lane, active)
+            dr.scatter(values, light, slot * stride + lane, active)
+            soonest = dr.select(light > 0, dr.minimum(soonest, path + leg), soonest)
         slot += 1
-        going = active & (weight > 0)
-        direction = si.to_world(sample.wo)
-        ray, before = spawn(si, direction), kept(si)
-        si, passed, optical, _ = first_opaque(world, ray, going, before.p)
+        active &= weight > 0
+        before, towards = kept(si), spawn(si, si.to_world(sample.wo))
+        si, passed, optical, _ = first_opaque(world, towards, active, before.p)
         path += optical
-        active = going & si.is_valid()
+        active &= si.is_valid()
         to_laser, irradiance, leg = laser_light(world, si, pixel, active, seen_by_camera=None)
-        value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)[0] * irradiance
-        density = density_of(world, si, to_laser)
-        value *= dr.select(may, by_chance(world, before, sample, weight, si, density, 1, active), 1)
-        may = Bool(True) | active
+        light = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)[0] * irradiance
+        if dr.hint(joining, mode="scalar"):
+            density = density_of(world, si, to_laser)
+            light *= dr.select(joinable, by_chance(world, before, sample, weight, si, density, 1, active), 1)
+        here = through * passed
+        light = dr.select(dr.isfinite(light), here * light, 0)
         dr.scatter(paths, path + leg, slot * stride + lane, active)
-        dr.scatter(values, dr.select(dr.isfinite(value), throughput * passed * value, 0), slot * stride + lane, active)
+        dr.scatter(values, light, slot * stride + lane, active)
+        soonest = dr.select(active & (light > 0), dr.minimum(soonest, path + leg), soonest)
         slot += 1
         active &= slot < last
-        arrived = throughput * passed
-        sample, onward = si.bsdf().sample(
+        sample, again = si.bsdf().sample(
             mi.BSDFContext(),
             si,
             random.next_float32(),
             mi.Point2f(random.next_float32(), random.next_float32()),
             active,
         )
-        weight = onward[0]
-        throughput = arrived * weight
+        weight = again[0]
+        through = here * weight
         # Russian roulette: paths that carry little end early, the others carry their energy on
-        survive = dr.clip(dr.select(weight > 0, throughput, arrived), 0.05, 0.95)
-        active &= (arrived > 0) & (random.next_float32() < survive)
-        throughput /= survive
-        arrived /= survive
-    return values, paths, slot
-
-
-def _add_own(heads: _Heads, tails: _Tails, batch: Any, sums: Sums, shared: bool) -> None:
-    """Light that a pixel gets from its own path alone."""
-    first, onward = Bool(heads.valid), Bool(heads.valid)
-    if shared:
-        first, onward = first & ~tails.shared, onward & ~tails.onward
-    light = _Light(
-        heads.receiver,
-        batch,
-        dr.arange(UInt32, dr.width(batch)),
-        heads.path + tails.leg,
-        dr.select(first, tails.own_value, 0),
-        dr.select(onward, tails.own_onward, 0),
-        tails.joined_value,
-        heads.path + tails.joined_path,
-    )
-    _add(light, tails, sums)
+        survive = dr.clip(dr.select(weight > 0, through, here), 0.05, 0.95)
+        active &= (here > 0) & (random.next_float32() < survive)
+        through /= survive
+        here /= survive
+        joinable = Bool(active)
+    return values, paths, slot, soonest
 
 
 def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: int, seed: int) -> np.ndarray:
@@ -329,141 +331,11 @@ def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: in
     blocks = block_order(pixels, world.scene.camera.width)
     block = np.arange(len(blocks) // BLOCK)
     turns = turns_of(block, block, np.full(len(block), rounds))
-    _, tails, batch = _trace(world, blocks, turns, bounces, seed, 1, shared=False)
-    beyond = tails.own_onward.numpy() * tails.values.numpy().reshape(-1, dr.width(batch))
+    traced = trace_paths(world, blocks, turns, bounces, seed, 1, shared=False)
+    tails, vertices = traced.tails, bounces - 2
+    beyond = tails.own_onward.numpy() * tails.values.numpy().reshape(-1, dr.width(traced.batch))
     energy = np.zeros(bounces + 1)
-    energy[2] = tails.own_value.numpy().sum(dtype=np.float64)
-    energy[2] += tails.joined_value.numpy().sum(dtype=np.float64)
-    energy[3:] = beyond[: 2 * (bounces - 2)].sum(axis=1, dtype=np.float64).reshape(-1, 2).sum(axis=1)
+    energy[2] = sum(part.numpy().sum(dtype=np.float64) for part in (tails.own_value, *(n.value for n in traced.joined)))
+    by_slot = beyond.sum(axis=1, dtype=np.float64)
+    energy[3:] = (by_slot[0::2] + by_slot[1::2])[:vertices]
     return energy / rounds
-
-
-class _Connections(NamedTuple):
-    """Of every pair: leg x1 to x2 [m], pixel radiance from x2's laser light and from beyond, and their densities."""
-
-    leg: Any
-    value: Any
-    onward: Any
-    density: Any
-    onward_density: Any
-
-
-def _connect(world: World, heads: _Heads, tails: _Tails, head: Any, tail: Any) -> _Connections:
-    shared = dr.gather(Bool, tails.shared, tail) & dr.gather(Bool, heads.shares, head)
-    si1 = dr.gather(mi.SurfaceInteraction3f, heads.si, head, shared)
-    si2 = dr.gather(mi.SurfaceInteraction3f, tails.si, tail, shared)
-    offset = si2.p - si1.p
-    distance2 = dr.squared_norm(offset)
-    direction = offset * dr.rsqrt(distance2)
-    passed, leg = segment(world, si1, si2.p, shared)
-    # a tail is seen from where it came, whatever rounding says
-    own = head == tail
-    passed = dr.select(own, dr.gather(Float, tails.own_transmission, tail, shared), passed)
-    leg = dr.select(own, dr.gather(Float, tails.leg, tail, shared), leg)
-    active = shared & (passed > 0) & (distance2 > 0)
-    context = mi.BSDFContext()
-    value1, density1 = si1.bsdf().eval_pdf(context, si1, si1.to_local(direction), active)
-    si2.wi = si2.to_local(-direction)
-    to_laser = si2.to_local(_gather_vector(tails.to_laser, tail, active))
-    value2 = si2.bsdf().eval(context, si2, to_laser, active)[0]
-    irradiance = dr.gather(Float, tails.irradiance, tail, active)
-    going = active & dr.gather(Bool, tails.onward, tail, active)
-    onward = si2.to_local(_gather_vector(tails.onward_direction, tail, going))
-    value3, density3 = si2.bsdf().eval_pdf(context, si2, onward, going)
-    area = dr.abs(dr.dot(si2.n, direction)) / distance2
-    reach = dr.gather(Float, heads.transmission, head, active) * value1[0] * area * passed
-    lit_density = dr.gather(Float, tails.density, tail, active)
-    lobes, both = densities(
-        dr.dot(si1.sh_frame.n, direction), distance2, dr.dot(si2.n, direction), lit_density, BLOCK
-    )
-    if world.has_rough_coats:
-        diffuse = si1.bsdf().eval(_diffuse(), si1, si1.to_local(direction), active)[0] / value1[0]
-        diffuse = dr.select(value1[0] > 0, dr.clip(diffuse, 0, 1), 0)
-    else:
-        diffuse = dr.select(dr.gather(Bool, heads.diffuse, head, active), Float(1), 0)
-    kept_share = 1 - diffuse * dr.select(both > 0, 1 - lobes / both, 0)
-    density = dr.select(active, density1 * area, 0)
-    connections = _Connections(
-        leg,
-        dr.select(active, reach * value2 * irradiance * kept_share, 0),
-        dr.select(going, reach * value3[0], 0),
-        density,
-        dr.select(going, density * density3, 0),
-    )
-    dr.eval(*connections)
-    return connections
-
-
-def _weights(world: World, heads: _Heads, tails: _Tails, head: Any, tail: Any) -> tuple[Any, Any, Any]:
-    """Of every pair: leg from x1 to x2 [m], radiance of x2's laser light, factor of what lies beyond x2."""
-    made = _connect(world, heads, tails, head, tail)
-    density, onward_density = dr.block_sum(made.density, BLOCK), dr.block_sum(made.onward_density, BLOCK)
-    dr.eval(density, onward_density)
-    density, onward_density = dr.gather(Float, density, tail), dr.gather(Float, onward_density, tail)
-    first = dr.select(density > 0, made.value / density, 0)
-    weight = dr.select(onward_density > 0, made.onward / onward_density, 0)
-    return made.leg, first, weight
-
-
-def _add_pairs(
-    tails: _Tails,
-    head: Any,
-    tail: Any,
-    weights: tuple[Any, Any, Any],
-    heads: _Heads,
-    batch: Any,
-    sums: Sums,
-) -> None:
-    """Light that every pixel of a block gets from every tail of the block."""
-    leg, first, weight = weights
-    base = dr.gather(Float, heads.path, head) + leg
-    receiver, turn = dr.gather(UInt32, heads.receiver, head), dr.gather(UInt32, batch, tail)
-    _add(_Light(receiver, turn, tail, base, first, weight), tails, sums)
-
-
-class _Light(NamedTuple):
-    """What lanes add to their pixels: path to x2, radiance of x2's laser light, factor of light beyond."""
-
-    receiver: Any
-    batch: Any
-    tail: Any
-    base: Any
-    first: Any
-    weight: Any
-    joined: Any = None
-    joined_path: Any = None
-
-
-@dr.syntax
-def _add(light: _Light, tails: _Tails, sums: Sums) -> None:
-    receiver, batch, tail, base, first, weight, also, also_path = light
-    laser_path = dr.gather(Float, tails.laser_path, tail)
-    values, paths = tails.values, tails.paths
-    stride, last = dr.opaque(UInt32, dr.width(tails.leg)), dr.gather(UInt32, tails.length, tail)
-    turn, total = dr.zeros(UInt32, dr.width(tail)), dr.zeros(Float, dr.width(tail))
-    going = (first > 0) | (weight > 0)
-    if dr.hint(also is not None, mode="scalar"):
-        going |= also > 0
-    # x2's own light is the loop's first turn: additions before a loop would cost a kernel of their own
-    while going:
-        beyond = going & (turn > 0)
-        slot = (turn - 1) * stride + tail
-        if dr.hint(also is not None, mode="scalar"):
-            beyond &= turn > 1
-            slot -= stride
-        radiance = dr.select(beyond, weight * dr.gather(Float, values, slot, beyond), first)
-        path = base + dr.select(beyond, dr.gather(Float, paths, slot, beyond), laser_path)
-        if dr.hint(also is not None, mode="scalar"):
-            radiance = dr.select(turn == 1, also, radiance)
-            path = dr.select(turn == 1, also_path, path)
-        total += sums.add(receiver, batch, path, radiance, going)
-        if dr.hint(also is not None, mode="scalar"):
-            going &= (turn == 0) | ((turn < last + 1) & (weight > 0))
-        else:
-            going &= (turn < last) & (weight > 0)
-        turn += 1
-    sums.add_total(receiver, batch, total)
-
-
-def _gather_vector(source: Any, index: Any, active: Any) -> Any:
-    return mi.Vector3f(*(dr.gather(Float, component, index, active) for component in source))

@@ -29,9 +29,10 @@ from render.world import Float, UInt32, World, dr, mi, upload
 UInt64, Int32 = mi.UInt64, mi.Int32
 # Width of a region in its octave's excess path, and of the widest in the mean distance, at PATHS paths a pixel. They
 # shrink with paths^-SHRINKING, so that the bias goes where the noise does.
-KAPPA, WIDEST, PATHS, SHRINKING = 0.4, 0.3, 16, 0.25
+KAPPA, WIDEST, PATHS, SHRINKING = 0.2, 0.15, 16, 0.3
 READERS = 4  # points of a pixel that read
 MOST_OCTAVES = 16
+FULL = 1 << 24  # weight of all paths of a pixel: divided by their number, it stays a whole one
 FINENESS = 0.6  # of cells, in those of the pixels that read them: between two pixels none is lumped together
 GROWTH = 0.03  # of a region's cells along the path
 KEY_BITS, NORMAL_BITS = 15, 2  # of a cube's number along an axis (they wrap around), and of a class of normals
@@ -90,6 +91,11 @@ def point_of(si: Any, ray: Any, path_m: Any, transmission: Any, hit: Any) -> Poi
     return Point(mi.Point3f(si.p), normal, Float(path_m), reflectance)
 
 
+def late_from(world: World, point: Point, from_m: Any) -> Any:
+    """The path from the laser to points [m] from which on light there is late: so much behind direct light."""
+    return point.path + dr.norm(point.p - world.laser) - dr.norm(point.p - world.eye) + from_m
+
+
 class Regions:
     """The regions that some pixels of the image see, and the light in them, by batches.
 
@@ -103,9 +109,8 @@ class Regions:
         self.spans, self.batches = spans, batches
         numbers = np.random.SeedSequence(seed).generate_state(4)
         self._shift = mi.Vector3f(*(dr.opaque(Float, float(number) * 2.0**-32) for number in numbers[:3]))
-        self._eye, self._laser = world.eye, world.laser
         self._quantum, self._per_quantum = dr.opaque(Float, quantum), dr.opaque(Float, 1 / quantum)
-        self._from, self._size = dr.opaque(Float, float(spans.from_m[0])), upload(Float, spans.size_m)
+        self.from_m, self._size = dr.opaque(Float, float(spans.from_m[0])), upload(Float, spans.size_m)
         self._width, self._last = upload(Float, spans.width_m), dr.opaque(UInt32, spans.count - 1)
         self.place, self.points = _points(world, pixels, dr.opaque(UInt32, int(numbers[3])))
         reader, octave = _each(dr.width(self.place), spans.count)
@@ -119,6 +124,7 @@ class Regions:
         # the length of the search is part of its kernel: one for all views of a size
         self._searched = 1 << (len(pixels) * READERS * MOST_OCTAVES).bit_length()
         self._keys = upload(UInt64, np.pad(found, (0, self._searched - len(found)), constant_values=2**64 - 1))
+        self._nowhere = len(found)
         self._lay_out(found, nearest)
 
     def _lay_out(self, found: np.ndarray, nearest_m: np.ndarray) -> None:
@@ -131,7 +137,7 @@ class Regions:
         size = max(int(cells.sum()), 1)
         self.energy = dr.zeros(UInt64, size * self.batches)
         self.growing = [dr.zeros(UInt64, size * self.batches) for _ in range(3)]
-        self.paths, self.filled = dr.zeros(UInt32, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
+        self.paths, self.filled = dr.zeros(UInt64, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
 
     def _key(self, point: Point, octave: Any) -> Any:
         """Octave, class of normals and cube of a point in one number."""
@@ -155,29 +161,50 @@ class Regions:
         found = dr.binary_search(0, self._searched - 1, lambda i: dr.gather(UInt64, self._keys, i, active) < key)
         return found, active & (dr.gather(UInt64, self._keys, found, active) == key)
 
-    def count_paths(self, points: Point) -> None:
-        """One more path for the regions of each point that reflects."""
+    def count_paths(self, points: Point, weight: Any) -> Any:
+        """One more path for the regions of each point that reflects; returns their numbers, octaves x points.
+
+        A pixel's paths count FULL together, however many they are: a region's light is the mean over its pixels.
+        """
         number, octave = _each(dr.width(points.path), self.spans.count)
         point = _gathered(points, number)
         row, known = self._row(self._key(point, octave), point.reflectance > 0)
-        dr.scatter_add(self.paths, UInt32(1), row, known, mode=dr.ReduceMode.Direct)
+        row = dr.select(known, row, dr.opaque(UInt32, self._nowhere))
+        dr.scatter_add(self.paths, UInt64(dr.gather(UInt32, weight, number)), row, known, mode=dr.ReduceMode.Direct)
+        return row
 
-    def add(self, point: Point, towards: Any, diffuse: Any, batch: Any, path_m: Any, radiance: Any, active: Any) -> Any:
+    def add(
+        self,
+        point: Point,
+        rows: Any,
+        late_m: Any,
+        towards: Any,
+        diffuse: Any,
+        batch: Any,
+        path_m: Any,
+        radiance: Any,
+        weight: Any,
+        active: Any,
+    ) -> Any:
         """Add light that comes to points from x2, which lies `towards`, after `path_m` from the laser.
 
-        `radiance` is what the pixel sees of it. Returns where it is still to add: where it came too early for any
+        It is late from `late_m` on. `radiance` is what the pixel sees of it by one path, which counts with `weight`
+        quanta of FULL (see `count_paths`). Returns where it is still to add: where it came too early for any
         region, or left by no `diffuse` lobe. Late light in a region that no pixel reads is dropped.
         """
-        direct_m = point.path + dr.norm(point.p - self._laser) - dr.norm(point.p - self._eye)
-        number = Int32(dr.floor(dr.log2(dr.maximum(path_m - direct_m, 0) / self._from)))
-        late = active & diffuse & (number >= 0) & (point.reflectance > 0)
+        excess_m = path_m - late_m + self.from_m
+        late = active & diffuse & (path_m >= late_m) & (point.reflectance > 0)
+        number = Int32(dr.floor(dr.log2(dr.maximum(excess_m, self.from_m) / self.from_m)))
         octave = UInt32(dr.clip(number, 0, Int32(self._last)))
-        row, lit = self._row(self._key(point, octave), late & (radiance > 0) & dr.isfinite(radiance))
+        lane = dr.arange(UInt32, dr.width(point.path))
+        lit = late & (radiance > 0) & dr.isfinite(radiance)
+        row = dr.gather(UInt32, rows, octave * dr.opaque(UInt32, dr.width(point.path)) + lane, lit)
+        lit &= row != dr.opaque(UInt32, self._nowhere)
         # the path grows away from x2
         path_m = path_m + dr.dot(towards, self._from_middle(point, octave))
         x = dr.maximum(path_m - dr.gather(Float, self._base, row, lit), 0) / dr.gather(Float, self._width, octave)
         cell = dr.minimum(UInt32(dr.log(1 + GROWTH * x) / GROWTH), dr.gather(UInt32, self._cells, row, lit) - 1)
-        value = radiance / point.reflectance * self._per_quantum
+        value = radiance / point.reflectance * self._per_quantum * (Float(weight) / FULL)
         index = (dr.gather(UInt32, self._first, row, lit) + cell) * self.batches + batch
         add_quanta(self.energy, value, index, lit)
         dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, lit, mode=dr.ReduceMode.Direct)
@@ -194,7 +221,7 @@ class Regions:
         if dr.width(self.place) == 0:
             return
         place, octave, row, weight, point = self._readings()
-        weight = weight * self._quantum / (READERS * Float(dr.gather(UInt32, self.paths, row)))
+        weight = weight * self._quantum / (READERS / FULL * Float(dr.gather(UInt64, self.paths, row)))
         base = dr.gather(Float, self._base, row) + point.path
         reading = _Reading(place, octave, row, weight, base, self._from_middle(point, octave))
         dr.eval(*reading)
@@ -215,7 +242,7 @@ class Regions:
         readers = dr.opaque(UInt32, dr.width(self.place))
         reader, octave = _each(dr.width(self.place), self.spans.count)
         row, place = self._row_of, dr.gather(UInt32, self.place, reader)
-        first, sums = dr.gather(UInt32, self.paths, row) > 0, [Float(0)] * 8
+        first, sums = dr.gather(UInt64, self.paths, row) > 0, [Float(0)] * 8
         for step in range(1 - READERS, READERS):
             other = Int32(reader) + step
             near = (other >= 0) & (other < Int32(readers))
@@ -276,32 +303,6 @@ class _Reading(NamedTuple):
     weight: Any
     base: Any
     off: Any
-
-
-class Late:
-    """The `Sums` of one launch of paths, of which late light goes to regions.
-
-    `plain` is told of all light, filtered or not. Not a dataclass: Dr.Jit would take its fields for a loop's variables.
-    """
-
-    def __init__(self, regions: Regions, sums: Sums, points: Point, towards: Any, diffuse: Any) -> None:
-        self.regions, self.sums, self.points, self.towards, self.diffuse = regions, sums, points, towards, diffuse
-
-    def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
-        """Add light of every lane's own path; returns what its pixel got at once."""
-        self.sums.add_plain(pixel, batch, path, radiance, active)
-        one_way = path - self.points.path
-        own = self.regions.add(self.points, self.towards, self.diffuse, batch, one_way, radiance, active)
-        return self.sums.add(pixel, batch, path, radiance, own)
-
-    def add_total(self, pixel: Any, batch: Any, radiance: Any) -> None:
-        """Total of what `add` returned."""
-        self.sums.add_total(pixel, batch, radiance)
-
-    def evaluate(self) -> None:
-        """Run what was added so far."""
-        self.regions.evaluate()
-        self.sums.evaluate()
 
 
 def _plus(totals: list, cells: list, weight: Any) -> list:

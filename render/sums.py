@@ -39,7 +39,7 @@ class Sums:
         self.watch = None if watch is None else upload(mi.Int32, watch)
         self.totals = dr.zeros(mi.UInt64, rows.rows * batches)
         self.batches = dr.opaque(UInt32, batches)
-        self._scale = upload(Float, 1 / rounds)
+        self.scale = upload(Float, 1 / rounds)
 
     def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
         """Add samples to the pixels' and the watched rows; returns what was added, for `add_total`."""
@@ -78,7 +78,7 @@ class Sums:
     def _given(self, pixel: Any, path: Any, radiance: Any, active: Any) -> tuple[Any, Any, Any]:
         """Place from the pixel's origin, share of the pixel's mean, and where there is any."""
         x = path - dr.gather(Float, self.origin_m, pixel, active)
-        radiance = radiance * dr.gather(Float, self._scale, pixel, active)
+        radiance = radiance * dr.gather(Float, self.scale, pixel, active)
         radiance = dr.select(active & dr.isfinite(radiance), radiance, 0)
         return x, radiance, active & (radiance > 0)
 

@@ -21,7 +21,7 @@ from render.indirect import (
     pilot_noise,
     uniform,
 )
-from render.regions import octaves
+from render.regions import Octaves, octaves
 from render.returns import Growing, Samples, concatenate, no_samples, select
 from render.settings import BATCHES, FILTERED_BATCHES, Plan, RenderSettings
 from render.specular import specular_light
@@ -188,11 +188,17 @@ def _schedule(
     blocks = block_order(np.arange(camera.height * camera.width), camera.width)
     if plan.filter:
         spp = FIRST_FILTERED_SPP if plan.spp is None else plan.spp
-        schedule = filtered(world, plan, settings, blocks, origin_m, spp, 0)
-        spans = schedule.spans
+        spans = spans_of(world, plan, settings, origin_m, spp)
+        rounds = spp if spp < FILTERED_BATCHES else -(-spp // FILTERED_BATCHES) * FILTERED_BATCHES
+        schedule = uniform(blocks, rounds, shared=False)
+        if plan.adaptive and spp >= FIRST_FILTERED_SPP:
+            from_m = float(spans.from_m[0])
+            noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT), from_m)
+            schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES)
+        least, most = schedule.rounds.min(), schedule.rounds.max()
         told = f"indirect light: filtered, later than {spans.from_m[0]:.2g} m behind direct light, over regions of "
-        told += f"surfaces {spans.size_m[0]:.2g} to {spans.size_m[-1]:.2g} m wide; {schedule.rounds[0]} paths a pixel"
-        return schedule, (told,)
+        told += f"surfaces {spans.size_m[0]:.2g} to {spans.size_m[-1]:.2g} m wide; {least} to {most} paths a pixel"
+        return schedule._replace(spans=spans), (told,)
     if plan.spp is not None and (not plan.adaptive or plan.spp < BATCHES):
         rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
         return uniform(blocks, rounds, shared=False), ()
@@ -215,17 +221,13 @@ def _schedule(
     return schedule, tuple(reasons)
 
 
-def filtered(
-    world: World, plan: Plan, settings: RenderSettings, blocks: np.ndarray, origin_m: np.ndarray, spp: int, before: int
-) -> Schedule:
-    """The schedule of filtered light: the same for all pixels, in regions for all paths, those `before` included."""
-    rounds = spp if spp < FILTERED_BATCHES else -(-spp // FILTERED_BATCHES) * FILTERED_BATCHES
+def spans_of(world: World, plan: Plan, settings: RenderSettings, origin_m: np.ndarray, spp: float) -> Octaves:
+    """Octaves of filtered light for so many paths a pixel in all."""
     distance_m = float(origin_m[origin_m > 0].mean()) / 2
     width_m, growth = settings.indirect_tolerance_m, settings.indirect_growth
     longest_m = float(image_cells(world, width_m, growth, origin_m, plan.bounces).edges_m[-1])
     footprint_m = distance_m / world.scene.camera.focal_px
-    spans = octaves(before + rounds, footprint_m, distance_m, longest_m, width_m, growth)
-    return uniform(blocks, rounds, shared=False)._replace(spans=spans)
+    return octaves(spp, footprint_m, distance_m, longest_m, width_m, growth)
 
 
 def mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:

@@ -1,0 +1,141 @@
+"""Paths joined to points that the laser lights: the same light as by chance alone, with less noise where it is wide."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from render import lit, paths, sharing
+from render.paths import trace_paths
+from render.rays import laser_light
+from render.turns import BLOCK, block_order, turns_of
+from render.world import Float, UInt32, World, dr
+from scenes import Laser, Material, Scene, Surface
+from scenes.shapes import box, sphere
+from studies.bench import oracles
+
+LAMP = Laser("flood", cone_deg=360)
+KINDS = ("diffuse", "plastic", "roughplastic", "roughconductor", "dielectric")
+
+
+def room(kind: str = "diffuse", laser: Laser = LAMP, width: int = 12) -> Scene:
+    vertices, faces, uv = box((4, 3, 5))
+    walls = Surface(vertices + [0, 0, -1.5], faces[:, ::-1], Material(albedo=0.6), uv=uv)
+    vertices, faces, _ = sphere(0.4, 3)
+    options = {"ior": 1.5} if kind == "dielectric" else {"roughness": 0.2} if kind.startswith("rough") else {}
+    ball = Surface(vertices + [0.4, -0.2, -1.6], faces, Material(kind, albedo=0.4, **options))
+    return Scene("room", (walls, ball), oracles.camera(width, width, 60), laser)
+
+
+def points(world: World, lanes: int = 1 << 18, batches: int = 1) -> lit.Lit:
+    return lit.lit_points(world, lanes, batches, (dr.opaque(UInt32, 1), dr.opaque(UInt32, 2)))
+
+
+def totals(scene: Scene, seed: int, *, shared: bool, rounds: int = 64) -> np.ndarray:
+    """Radiance of indirect light in a view's blocks by every round: (rounds, blocks)."""
+    world, pixels = World(scene), scene.camera.height * scene.camera.width
+    blocks = block_order(np.arange(pixels), scene.camera.width)
+    count = len(blocks) // BLOCK
+    turns = turns_of(np.arange(count), np.arange(count), np.full(count, rounds))
+    traced = trace_paths(world, blocks, turns, 4, seed, 1, shared=shared)
+
+    class Sum:
+        lanes = None
+
+        def add(self, pixel, batch, path, radiance, active):
+            return dr.select(active & dr.isfinite(radiance), radiance, 0)
+
+        def add_total(self, pixel, batch, total):
+            self.lanes = total.numpy().astype(np.float64)
+
+    own = Sum()
+    sharing._add(sharing._own_lanes(traced), traced, own, own=True)
+    found = own.lanes.reshape(count, rounds, BLOCK).sum(axis=2)
+    if shared:
+        pairs = Sum()
+        lanes = sharing._pair_lanes(world, traced, sharing._all_pairs(dr.width(traced.batch)))
+        sharing._add(lanes, traced, pairs, own=False)
+        found = found + pairs.lanes.reshape(count, rounds, BLOCK**2).sum(axis=2)
+    return found.T
+
+
+@pytest.mark.parametrize("cone_deg", [360, 40])
+def test_lit_points_cover_what_the_laser_lights(cone_deg):
+    """The mean of 1 / density is the area lit: all of a closed room, or the patch that a cone cuts from a wall."""
+    vertices, faces, _ = box((4, 3, 5))
+    walls = Surface(vertices + [0, 0, -1.5], faces[:, ::-1], Material(albedo=0.6))
+    found = points(World(Scene("box", (walls,), oracles.camera(8, 8, 20), Laser("flood", cone_deg=cone_deg))))
+    assert (found.irradiance.numpy() > 0).mean() > 0.999
+    inverse = 1 / found.density.numpy().astype(np.float64)
+    area = 2 * (4 * 3 + 4 * 5 + 3 * 5) if cone_deg == 360 else np.pi * (4 * np.tan(np.radians(20))) ** 2
+    assert inverse.mean() == pytest.approx(area, abs=4 * inverse.std() / np.sqrt(len(inverse)))
+
+
+def test_lit_points_carry_the_lasers_light():
+    """Irradiance and path are those of `laser_light`; batches have points of their own, spread as evenly."""
+    world = World(room())
+    found = points(world, 1 << 12, batches=4)
+    _, irradiance, path = laser_light(
+        world,
+        found.si,
+        dr.zeros(UInt32, dr.width(found.path)),
+        dr.full(type(found.path > 0), True),
+        seen_by_camera=None,
+    )
+    assert np.array_equal(irradiance.numpy(), found.irradiance.numpy()) and np.array_equal(
+        path.numpy(), found.path.numpy()
+    )
+    each = int(found.each.numpy()[0])
+    directions = np.array([part.numpy() for part in found.to_laser]).T.reshape(4, each, 3)
+    assert np.abs(directions.mean(axis=1)).max() < 4 / each**0.75  # of independent points 1/sqrt(3 each)
+    assert not np.array_equal(directions[0], directions[1])
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_joined_paths_carry_the_same_light_with_less_noise(kind, shared, monkeypatch):
+    """Against paths by chance alone, over all blocks; a lamp close to a wall is what chance misses."""
+    scene = room(kind)
+    joined = totals(scene, 1, shared=shared)
+    monkeypatch.setattr(paths, "joins_of", lambda world, shared: 0)
+    plain = totals(scene, 2, shared=shared, rounds=128)
+    means, errors = zip(*((t.sum(1).mean(), t.sum(1).std() / np.sqrt(len(t))) for t in (joined, plain)), strict=True)
+    assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
+    assert joined.var(axis=0).sum() < plain.var(axis=0).sum() / 1.5
+
+
+@pytest.mark.parametrize("cone_deg", [30, 120, 360])
+def test_any_cone_and_a_displaced_laser(cone_deg, monkeypatch):
+    scene = room("roughplastic", Laser("flood", cone_deg=cone_deg, baseline_m=(0.3, 0.1, 0)))
+    monkeypatch.setattr(lit, "NARROW_JOINS", (2, 2))
+    joined = totals(scene, 1, shared=True)
+    monkeypatch.setattr(paths, "joins_of", lambda world, shared: 0)
+    plain = totals(scene, 2, shared=True, rounds=128)
+    means, errors = zip(*((t.sum(1).mean(), t.sum(1).std() / np.sqrt(len(t))) for t in (joined, plain)), strict=True)
+    assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
+
+
+@pytest.mark.parametrize("mode", ["scan", "line"])
+def test_a_laser_that_moves_has_no_lit_points(mode):
+    world = World(room(laser=Laser(mode)))
+    assert lit.joins_of(world, shared=True) == lit.joins_of(world, shared=False) == 0
+    wide, narrow = World(room()), World(replace(room(), laser=Laser("flood", cone_deg=60)))
+    assert lit.joins_of(wide, shared=False) > lit.joins_of(narrow, shared=False)
+
+
+def test_shares_are_whole_and_stay_finite():
+    """What joining has and what chance keeps add up to 1, also where points touch or are seen edge-on."""
+    for cosine, distance2, far, density in (
+        (0.5, 2.0, 0.3, 0.1),
+        (0, 1, 1, 1),
+        (1, 0, 1, 1),
+        (1, 1, 0, 1),
+        (1, 1, 1, 0),
+    ):
+        values = (Float(float(value)) for value in (cosine, distance2, far, density))
+        lobes, both = lit.densities(*values, 4)
+        kept = lit.share_by_chance(1, Float(float(cosine)), Float(float(distance2)), Float(float(far)),
+                                   Float(float(density)), 4)  # fmt: skip
+        assert 0 <= kept[0] <= 1 and np.isfinite(kept[0])
+        if both[0] > 0:
+            assert kept[0] == pytest.approx(lobes[0] / both[0], abs=1e-6)
