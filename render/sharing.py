@@ -89,15 +89,16 @@ def noise_of_filtered_paths(
 ) -> np.ndarray:
     """The same of filtered light: what is later than `from_m` behind direct light is read from regions, whose area, and
     with it the number of paths in them, grows with the square of its excess path."""
-    traced = trace_paths(world, pixels, turns, bounces, seed, 1, shared=False, from_m=dr.opaque(Float, from_m))
+    start = dr.opaque(Float, from_m)
+    traced = trace_paths(world, pixels, turns, bounces, seed, 1, shared=False, from_m=start)
     heads = traced.heads
     late_m = heads.path + heads.late_m
-    own = _Squares(late_m, from_m)
+    own = _Squares(late_m, start)
     _add(_own_lanes(traced), traced, own, own=True)
     noise = own.by_block(BLOCK)
     pairs = _pairs(traced, shared=False, filtered=True)
     if pairs is not None:
-        early = _Squares(dr.gather(Float, late_m, pairs.head), from_m)
+        early = _Squares(dr.gather(Float, late_m, pairs.head), start)
         _add(_pair_lanes(world, traced, pairs), traced, early, own=False)
         block = dr.gather(UInt32, pairs.tail, dr.arange(UInt32, dr.width(pairs.tail) // BLOCK) * BLOCK) // BLOCK
         np.add.at(noise, block.numpy(), early.by_block(BLOCK))
@@ -110,7 +111,7 @@ class _Squares:
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
-    def __init__(self, late_m: Any = None, from_m: float = 0.0) -> None:
+    def __init__(self, late_m: Any = None, from_m: Any = None) -> None:
         self._late_m, self._from_m, self._lanes = late_m, from_m, None
 
     def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
@@ -213,13 +214,14 @@ def _connect(world: World, traced: Traced, pairs: _Pairs) -> _Connections:
             lit_density,
             BLOCK,
         )
-    density = dr.select(active, density1 * area, 0)
+    # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
+    density = dr.select(active & (value1[0] > 0), density1 * area, 0)
     connections = _Connections(
         leg,
         dr.select(active, reach * value2 * irradiance, 0),
         dr.select(going, reach * value3[0], 0),
         density,
-        dr.select(going, density * density3, 0),
+        dr.select(going & (value3[0] > 0), density * density3, 0),
     )
     dr.eval(*connections)
     return connections

@@ -104,6 +104,22 @@ def test_joined_paths_carry_the_same_light_with_less_noise(kind, shared, monkeyp
     assert joined.var(axis=0).sum() < plain.var(axis=0).sum() / 1.5
 
 
+@pytest.mark.parametrize("kind", [*KINDS, "panel"])
+def test_shared_paths_carry_the_light_of_own_ones(kind):
+    """The same, by the same joined paths: also before a panel whose two sides the heads of one block may see.
+
+    Mitsuba's coated lobes state a density for directions where they reflect nothing: it must not count.
+    """
+    scene = room("diffuse" if kind == "panel" else kind)
+    if kind == "panel":
+        corners = np.array([(-1, -0.6, -1.5), (1, -0.6, -1.5), (1, -0.6, -3), (-1, -0.6, -3)])
+        coated = Material("roughplastic", albedo=0.5, roughness=0.3)
+        scene = replace(scene, surfaces=(scene.surfaces[0], Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), coated)))
+    own, shared = (totals(scene, 1, shared=shared, rounds=512).sum(axis=1) for shared in (False, True))
+    error = np.hypot(own.std(), shared.std()) / np.sqrt(512)
+    assert abs(own.mean() - shared.mean()) < 4 * error and error < 0.004 * own.mean()
+
+
 @pytest.mark.parametrize("cone_deg", [30, 120, 360])
 def test_any_cone_and_a_displaced_laser(cone_deg, monkeypatch):
     scene = room("roughplastic", Laser("flood", cone_deg=cone_deg, baseline_m=(0.3, 0.1, 0)))
