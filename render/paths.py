@@ -107,7 +107,7 @@ def trace_paths(
 ) -> Traced:
     """Trace a path for every member of every turn.
 
-    Blocks share their tails if they are `shared`, or for light less than `from_m` behind direct light.
+    Blocks share their tails if they are `shared`; for light less than `from_m` behind direct light if `shares_early`.
     """
     lanes = len(turns.block) * BLOCK
     lane = dr.arange(UInt32, lanes)
@@ -149,15 +149,20 @@ def trace_paths(
     if from_m is not None:
         point = point_of(si, ray, path, transmission, hit)
         late_m = late_from(world, point, from_m)
+        shares &= shares_early(world)
     sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*spread), hit)
     heads = Heads(receiver, kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares, late_m, point)
     near = _joined(world, heads, lit, batch, first, joins)
-    tails = _tails(
-        world, heads, sample, weight[0], pixel, lit, joins, batch, random, bounces, used=shared or from_m is not None
-    )
+    used = shared or (from_m is not None and shares_early(world))
+    tails = _tails(world, heads, sample, weight[0], pixel, lit, joins, batch, random, bounces, used=used)
     traced = Traced(heads, near, tails, lit, batch)
     dr.eval(*heads, *(part for light in near for part in light), *tails, batch)
     return traced
+
+
+def shares_early(world: World) -> bool:
+    """Whether blocks share what comes too early to be filtered: under a lamp that is little of the light."""
+    return not is_wide(world)
 
 
 def _lit(world: World, turns: Turns, lanes: int, batches: int, joins: int, numbers: np.ndarray) -> Lit | None:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.lit import diffuse_share, share_by_chance
-from render.paths import Traced, trace_paths
+from render.paths import Traced, shares_early, trace_paths
 from render.rays import segment
 from render.regions import FULL, Regions
 from render.sums import Sums
@@ -47,7 +47,7 @@ def add_paths(
     """Trace paths of the given blocks of flat pixels (-1: none) and add their light to `sums`; `shared` by blocks.
 
     With `regions` late light goes there instead, to be read from them when all paths are traced, and early light alone
-    is shared.
+    is shared, where it matters (`shares_early`).
     """
     from_m = None if regions is None else regions.from_m
     traced = trace_paths(world, pixels, turns, bounces, seed, batches, shared=shared, from_m=from_m)
@@ -57,7 +57,7 @@ def add_paths(
     _add(_own_lanes(traced), traced, sums, regions, rows, own=True)
     if regions is not None:
         regions.evaluate()
-    pairs = _pairs(traced, shared=shared, filtered=regions is not None)
+    pairs = _pairs(traced, shared=shared, early=regions is not None and shares_early(world))
     if pairs is not None:
         _add(_pair_lanes(world, traced, pairs), traced, sums, own=False)
     sums.evaluate()
@@ -96,7 +96,7 @@ def noise_of_filtered_paths(
     own = _Squares(late_m, start)
     _add(_own_lanes(traced), traced, own, own=True)
     noise = own.by_block(BLOCK)
-    pairs = _pairs(traced, shared=False, filtered=True)
+    pairs = _pairs(traced, shared=False, early=shares_early(world))
     if pairs is not None:
         early = _Squares(dr.gather(Float, late_m, pairs.head), start)
         _add(_pair_lanes(world, traced, pairs), traced, early, own=False)
@@ -146,11 +146,11 @@ def _all_pairs(lanes: int) -> _Pairs:
     return _Pairs(tail // BLOCK * BLOCK + pair % BLOCK, tail, tail)
 
 
-def _pairs(traced: Traced, *, shared: bool, filtered: bool) -> _Pairs | None:
+def _pairs(traced: Traced, *, shared: bool, early: bool) -> _Pairs | None:
     """The pairs that may have light for each other."""
     if shared:
         return _all_pairs(dr.width(traced.batch))
-    if not filtered:
+    if not early:
         return None
     chosen = dr.compress(_early(traced))
     if dr.width(chosen) == 0:

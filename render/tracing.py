@@ -21,6 +21,7 @@ from render.indirect import (
     pilot_noise,
     uniform,
 )
+from render.lit import is_wide
 from render.regions import Octaves, octaves
 from render.returns import Growing, Samples, concatenate, no_samples, select
 from render.settings import BATCHES, FILTERED_BATCHES, Plan, RenderSettings
@@ -191,7 +192,8 @@ def _schedule(
         spans = spans_of(world, plan, settings, origin_m, spp)
         rounds = spp if spp < FILTERED_BATCHES else -(-spp // FILTERED_BATCHES) * FILTERED_BATCHES
         schedule = uniform(blocks, rounds, shared=False)
-        if plan.adaptive and spp >= FIRST_FILTERED_SPP:
+        # under a lamp the noise that the filter leaves is even, and a pilot costs more than it saves
+        if plan.adaptive and spp >= FIRST_FILTERED_SPP and not is_wide(world):
             from_m = float(spans.from_m[0])
             noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT), from_m)
             schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES)
