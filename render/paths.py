@@ -85,12 +85,12 @@ class Tails(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """Paths of a launch, and the batch that each belongs to."""
+    """Paths of a launch, the lit points that they were joined to, and the batch that each path belongs to."""
 
     heads: Heads
     joined: tuple[Joined, ...]
     tails: Tails
-    lit: Lit
+    lit: Lit | None
     batch: Any
 
 
@@ -226,7 +226,7 @@ def _tails(
         joinable &= dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
     scale = dr.select(onward_weight > 0, onward_weight, 1)
     way = _Way(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, joinable)
-    soonest = dr.select(value > 0, laser_path, dr.inf)
+    soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
     light = _beyond(world, lit, batch, way, alive, pixel, random, soonest, bounces - 2)
     shared = alive & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
     shared &= heads.shares & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
@@ -276,18 +276,18 @@ def _beyond(
 ) -> tuple[Any, Any, Any, Any]:
     """Light of x3, x4, ... that goes to x2 along the way, divided by the density of the path after x2.
 
-    Returns radiances and path lengths from x2 to the laser, flat arrays of 2 vertices x lanes: of every vertex, by way
-    of a lit point that the last one was joined to, and of the vertex itself. Then how many of these each lane has, and
-    the shortest path.
+    Returns radiances and path lengths from x2 to the laser, flat arrays of slots x lanes. A vertex has a slot of its
+    own, and one before it if the last one was joined to a lit point. Then how many slots each lane has filled, and the
+    shortest path.
     """
-    lanes = dr.width(pixel)
-    slots = lanes * 2 * max(vertices, 1)
-    values, paths = dr.zeros(Float, slots), dr.zeros(Float, slots)
-    lane, stride, last = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes), dr.opaque(UInt32, 2 * vertices)
+    lanes, joining = dr.width(pixel), lit is not None and is_wide(world)
+    slots = (2 if joining else 1) * vertices
+    values, paths = (dr.zeros(Float, lanes * max(slots, 1)) for _ in range(2))
+    lane, stride, last = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes), dr.opaque(UInt32, slots)
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
     si, sample = mi.SurfaceInteraction3f(way.si), mi.BSDFSample3f(way.sample)
     weight, through, here, joinable = Float(way.weight), Float(way.through), Float(way.here), Bool(way.joinable)
-    active, joining = Bool(active) & (slot < last), lit is not None and is_wide(world)
+    active = Bool(active) & (slot < last)
     while active:
         if dr.hint(joining, mode="scalar"):
             light, leg, _ = joined(world, si, lit, batch, random.next_uint32(), active & joinable)
@@ -295,7 +295,7 @@ def _beyond(
             dr.scatter(paths, path + leg, slot * stride + lane, active)
             dr.scatter(values, light, slot * stride + lane, active)
             soonest = dr.select(light > 0, dr.minimum(soonest, path + leg), soonest)
-        slot += 1
+            slot += 1
         active &= weight > 0
         before, towards = kept(si), spawn(si, si.to_world(sample.wo))
         si, passed, optical, _ = first_opaque(world, towards, active, before.p)
@@ -342,5 +342,5 @@ def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: in
     energy = np.zeros(bounces + 1)
     energy[2] = sum(part.numpy().sum(dtype=np.float64) for part in (tails.own_value, *(n.value for n in traced.joined)))
     by_slot = beyond.sum(axis=1, dtype=np.float64)
-    energy[3:] = (by_slot[0::2] + by_slot[1::2])[:vertices]
+    energy[3:] = by_slot.reshape(max(vertices, 1), -1).sum(axis=1)[:vertices]
     return energy / rounds

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from render.world import World, dr, mi
 from scenes.errors import InputError
 from scenes.files import silenced
-from scenes.model import Ambient, Scene
+from scenes.model import Scene
 
 INSTALL = "pip install 'scene2spad[bench]'"
 NEAR_CLIP_M, FAR_CLIP_M = 1e-5, 1e4
@@ -26,15 +25,18 @@ def available() -> bool:
 
 
 class Peer:
-    """One scene as mitransient holds it, for one sampler and one number of bounces; built once, not timed."""
+    """One scene as mitransient holds it, for one sampler and one number of bounces; built once, not timed.
 
-    def __init__(self, scene: Scene, sampler: str, bounces: int, bins: int, bin_m: float) -> None:
+    It takes the meshes and reflectances of our `world`, which must hold no other lights (`settings.comparable`): Dr.Jit
+    compiles calls for every such object there is, so a second set of them would slow both codes down.
+    """
+
+    def __init__(self, world: World, sampler: str, bounces: int, bins: int, bin_m: float) -> None:
         with silenced():
             import mitransient  # noqa: F401  (registers its plugins with Mitsuba)
+        scene = world.scene
         if not scene.laser.is_colocated or scene.laser.mode != "flood":
             raise InputError("mitransient has no line, scanning or displaced laser of ours to compare with")
-        dark = tuple(replace(surface, emission=0.0) for surface in scene.surfaces)
-        world = World(replace(scene, surfaces=dark, ambient=Ambient()))
         camera = scene.camera
         turned = np.eye(4)
         # our traced world has the camera at its origin; Mitsuba's camera has x to the left and y up

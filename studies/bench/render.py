@@ -118,7 +118,7 @@ def _measure(case: Case, transport: str, command: Bench, with_peer: bool, say: P
         if method.code == "ours":
             runners.append(our_runner(world, method, transport))
         else:
-            runners.append(peer_runner(peers.Peer(case.scene, method.sampler, bounces, BINS, BIN_M), method))
+            runners.append(peer_runner(peers.Peer(world, method.sampler, bounces, BINS, BIN_M), method))
     grades = [settings.qualities(m, transport, case.size, command.quick) for m in methods]
     rows: dict[str, list[Row]] = {m.name: [] for m in methods}
     levels = max(map(len, grades))
@@ -154,7 +154,7 @@ def _reference(
     }
     pixels = case.size**2
     if with_peer:
-        peer = peers.Peer(case.scene, "multijitter", bounces, BINS, BIN_M)
+        peer = peers.Peer(world, "multijitter", bounces, BINS, BIN_M)
         maker = f"mitransient multijitter, 2 x {passes * spp} spp"
 
         def make(seed: int) -> np.ndarray:
