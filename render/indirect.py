@@ -13,7 +13,7 @@ from render.heap import release
 from render.regions import READERS, Octaves, Regions
 from render.returns import Samples, concatenate
 from render.settings import BATCHES, FILTERED_BATCHES
-from render.sharing import LANES, PATHS, add_paths, noise_of_filtered_paths, noise_of_paths
+from render.sharing import FILTERED_PATHS, LANES, PATHS, add_paths, noise_of_filtered_paths, noise_of_paths
 from render.sums import Sums
 from render.turns import BLOCK, Turns, turns_of
 from render.world import World, dr
@@ -252,18 +252,20 @@ def collect(
             regions = None
             if schedule.spans is not None:
                 regions = Regions(world, pixels, schedule.spans, schedule.batches, rows.quantum, seed)
-            most = LANES // BLOCK**2 if shared else PATHS // BLOCK
-            for number, turns in enumerate(_launches(chosen, rounds, schedule.batches, most)):
-                if number % (QUEUED if shared else 1) == 0:
+            most = LANES // BLOCK**2 if shared else (PATHS if regions is None else FILTERED_PATHS) // BLOCK
+            launches = 0
+            for turns in _launches(chosen, rounds, schedule.batches, most):
+                if launches % (QUEUED if shared else 1) == 0:
                     dr.sync_thread()
+                launches += 1
                 add_paths(world, pixels, turns, bounces, seed, sums, schedule.batches, shared=shared, regions=regions)
             if regions is not None:
                 regions.read(sums)
-            if regions is None:  # whose memory the next ones take
+            if regions is None or launches > 1:  # the next regions take the memory of the last
                 release(world.scene.camera.height * world.scene.camera.width)  # what the launches took
             totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
             samples = rows.samples(pixels, origin_m[pixels])
-            del rows, sums  # before the next ones are there
+            del rows, sums, regions  # before the next ones are there
             yield Chunk(pixels, samples, totals)
 
 
