@@ -31,32 +31,38 @@ def points(world: World, lanes: int = 1 << 18, batches: int = 1) -> lit.Lit:
     return lit.lit_points(world, lanes, batches, (dr.opaque(UInt32, 1), dr.opaque(UInt32, 2)))
 
 
-def totals(scene: Scene, seed: int, *, shared: bool, rounds: int = 64) -> np.ndarray:
-    """Radiance of indirect light in a view's blocks by every round: (rounds, blocks)."""
+class Sum:
+    """In place of `Sums`: what every lane adds."""
+
+    lanes = None
+
+    def add(self, pixel, batch, path, radiance, active):
+        return dr.select(active & dr.isfinite(radiance), radiance, 0)
+
+    def add_total(self, pixel, batch, total):
+        self.lanes = total.numpy().astype(np.float64)
+
+
+def totals(scene: Scene, seed: int, *, shared: bool, rounds: int = 64, from_m: float | None = None) -> np.ndarray:
+    """Radiance of indirect light in a view's blocks by every round: (rounds, blocks).
+
+    Blocks share all of it, none, or what comes less than `from_m` behind direct light.
+    """
     world, pixels = World(scene), scene.camera.height * scene.camera.width
     blocks = block_order(np.arange(pixels), scene.camera.width)
     count = len(blocks) // BLOCK
     turns = turns_of(np.arange(count), np.arange(count), np.full(count, rounds))
-    traced = trace_paths(world, blocks, turns, 4, seed, 1, shared=shared)
-
-    class Sum:
-        lanes = None
-
-        def add(self, pixel, batch, path, radiance, active):
-            return dr.select(active & dr.isfinite(radiance), radiance, 0)
-
-        def add_total(self, pixel, batch, total):
-            self.lanes = total.numpy().astype(np.float64)
-
+    start = None if from_m is None else dr.opaque(Float, from_m)
+    traced = trace_paths(world, blocks, turns, 4, seed, 1, shared=shared, from_m=start)
     own = Sum()
     sharing._add(sharing._own_lanes(traced), traced, own, own=True)
-    found = own.lanes.reshape(count, rounds, BLOCK).sum(axis=2)
-    if shared:
-        pairs = Sum()
-        lanes = sharing._pair_lanes(world, traced, sharing._all_pairs(dr.width(traced.batch)))
-        sharing._add(lanes, traced, pairs, own=False)
-        found = found + pairs.lanes.reshape(count, rounds, BLOCK**2).sum(axis=2)
-    return found.T
+    found = own.lanes.reshape(-1, BLOCK).sum(axis=1)
+    pairs = sharing._pairs(traced, shared=shared, early=from_m is not None)
+    if pairs is not None:
+        of_pairs = Sum()
+        sharing._add(sharing._pair_lanes(world, traced, pairs), traced, of_pairs, own=False)
+        np.add.at(found, pairs.head.numpy() // BLOCK, of_pairs.lanes)
+    return found.reshape(count, rounds).T
 
 
 @pytest.mark.parametrize("cone_deg", [360, 40])
@@ -118,6 +124,16 @@ def test_shared_paths_carry_the_light_of_own_ones(kind):
     own, shared = (totals(scene, 1, shared=shared, rounds=512).sum(axis=1) for shared in (False, True))
     error = np.hypot(own.std(), shared.std()) / np.sqrt(512)
     assert abs(own.mean() - shared.mean()) < 4 * error and error < 0.004 * own.mean()
+
+
+@pytest.mark.parametrize("from_m", [0.05, 0.5, 100.0])
+@pytest.mark.parametrize("kind", ["diffuse", "plastic", "roughplastic"])
+def test_early_light_may_be_shared_alone(kind, from_m):
+    """Under a flash, what comes soon after direct light by the block's paths, the rest by the pixel's own."""
+    scene = room(kind, Laser("flood"))
+    own, split = (totals(scene, 1, shared=False, rounds=512, from_m=start).sum(axis=1) for start in (None, from_m))
+    error = np.hypot(own.std(), split.std()) / np.sqrt(512)
+    assert abs(own.mean() - split.mean()) < 4 * error and error < 0.01 * own.mean()
 
 
 @pytest.mark.parametrize("cone_deg", [30, 120, 360])
