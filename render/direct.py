@@ -14,7 +14,7 @@ from render.returns import Samples, concatenate, merge, packed
 from render.world import Bool, Float, UInt32, World, dr
 
 LANES = 1 << 21
-REFINE = 4
+REFINE = 6
 # A footprint whose smaller half span is below this is as good as uniform: a thirtieth of the reference sensor's bin.
 NARROW_M = 1e-3
 

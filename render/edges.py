@@ -23,8 +23,9 @@ MIXED_GAP_M = 0.05
 # A cell follows its neighbours if its tangent plane is off the mean step to them by no more than this share of its
 # distance, a bent surface apart.
 FOLLOWED = 3e-4
+GLINT_WIDTH = 2.0  # of a highlight, in units of the roughness
 
-CUT, MIXED = 1, 2
+CUT, MIXED, GLINT = 1, 2, 4
 
 
 class Cells(NamedTuple):
@@ -36,6 +37,9 @@ class Cells(NamedTuple):
     facing: Any
     radiance: Any
     flags: Any
+    tilt_x: Any = None
+    tilt_y: Any = None
+    peak: Any = None
 
 
 class Place(NamedTuple):
@@ -49,22 +53,24 @@ class Place(NamedTuple):
 
 class _Between(NamedTuple):
     """Of a pair of cells: whether an edge lies between them, whether it parts surfaces too far from each other (or one
-    from nothing), the share of the brighter one's radiance that misplacing it can change, and whether both are hits on
-    one surface, bent or not."""
+    from nothing), the share of the brighter one's radiance that misplacing it can change, whether both are hits on
+    one surface, bent or not, and the mean radiance that a highlight between them may add to a cell."""
 
     differ: Any
     apart: Any
     contrast: Any
     joined: Any
+    glint: Any
 
 
 def first_edges(
     cells: Cells, spans: Sequence[np.ndarray], grid: int, width: int, least: float
 ) -> tuple[np.ndarray, ...]:
-    """Compare all cells of whole pixels, grid x grid each, with their neighbours: CUT and MIXED bits, and spans.
+    """Compare all cells of whole pixels, grid x grid each, with their neighbours: CUT, MIXED, GLINT bits, and spans.
 
     `width` is the image's where the pixels are its whole rows; 0: neighbours in other pixels are not met. CUT is set
-    where an edge could change radiance times a pixel's area by `least` or more, or where the cell is large.
+    where an edge could change radiance times a pixel's area by `least` or more, or where the cell is large; GLINT
+    where a highlight between two cells could.
 
     `spans` are path centres, half widths and smaller half spans [m]; all columns are `aligned`. Small cells are spread
     between their neighbours on the same surface instead of on the tangent plane. Along each axis
@@ -76,18 +82,18 @@ def first_edges(
     """
     if len(cells.flags) < 2:  # arrays of one entry are scalars to Dr.Jit: another kernel
         return np.where(cells.flags & LARGE, np.uint32(CUT), np.uint32(0)), *spans
-    columns = *_seen(cells), *(Float(column) for column in spans)
+    columns = tuple(Float(column) for column in spans)
     lane = dr.arange(UInt32, len(cells.flags))
     dr.eval(lane)
     numbers = (dr.opaque(UInt32, value) for value in (grid, width, len(cells.flags) // grid**2))
     least = dr.opaque(Float, float(least))
-    found = _first_edges(*columns, lane, *numbers, least)
+    found = _first_edges(_seen(cells), *columns, lane, *numbers, least)
     dr.eval(found)
     return tuple(values.numpy() for values in found)
 
 
 def pair_edges(places: Place, cells: Cells, one: np.ndarray, other: np.ndarray, grid: int, least: float) -> np.ndarray:
-    """Compare pairs of cells of any size, side by side: CUT and MIXED bits of each pair, (P,) uint32.
+    """Compare pairs of cells of any size, side by side: CUT, MIXED and GLINT bits of each pair, (P,) uint32.
 
     `one` and `other` number the pairs' cells in `places` (int32) and `cells`, whose columns are `aligned`.
     """
@@ -96,25 +102,29 @@ def pair_edges(places: Place, cells: Cells, one: np.ndarray, other: np.ndarray, 
         return np.empty(0, np.uint32)
     if number == 1:  # arrays of one entry are scalars to Dr.Jit: another kernel
         one, other = np.repeat(one, 2), np.repeat(other, 2)
-    columns = (
-        *(UInt32(column.view(np.uint32)) for column in places),
-        *_seen(cells),
+    where = tuple(UInt32(column.view(np.uint32)) for column in places)
+    found = _pair_edges(
+        where,
+        _seen(cells),
         upload(UInt32, one),
         upload(UInt32, other),
+        dr.opaque(UInt32, grid),
+        dr.opaque(Float, float(least)),
     )
-    found = _pair_edges(*columns, dr.opaque(UInt32, grid), dr.opaque(Float, float(least)))
     dr.eval(found)
     return found.numpy()[:number]
 
 
 def _seen(cells: Cells) -> tuple[Any, ...]:
     """The same memory, as Dr.Jit sees it."""
-    return *(Float(column) for column in cells[:-1]), UInt32(cells.flags)
+    return tuple((UInt32 if column.dtype == np.uint32 else Float)(column) for column in cells if column is not None)
 
 
 @recorded
-def _first_edges(*columns: Any) -> tuple[Any, ...]:
-    cells, (path, half, minor, lane, grid, width, pixels, least) = Cells(*columns[:6]), columns[6:]
+def _first_edges(
+    cells: Any, path: Any, half: Any, minor: Any, lane: Any, grid: Any, width: Any, pixels: Any, least: Any
+) -> tuple[Any, ...]:
+    cells = Cells(*cells)
     per_pixel = grid * grid
     rank = lane // per_pixel
     row = (lane - rank * per_pixel) // grid
@@ -131,7 +141,7 @@ def _first_edges(*columns: Any) -> tuple[Any, ...]:
     pitch = dr.rcp(Float(grid))
     follows = ((cells.flags & (HIT | LARGE)) == HIT) & (cells.radiance > 0)
     per_radiance = dr.select(follows, dr.rcp(cells.radiance), 0)
-    cut, mixed = (cells.flags & LARGE) != 0, Bool(False)
+    cut, mixed, glint = (cells.flags & LARGE) != 0, Bool(False), Bool(False)
     mean, variance, halves = Float(path), Float(0), []  # a copy: += would change the path
     for axis in range(2):
         number, rise, rises, bend, run, bends = (Float(0) for _ in range(6))
@@ -143,8 +153,9 @@ def _first_edges(*columns: Any) -> tuple[Any, ...]:
             other = _at(cells, index, there)
             step = way * (other.distance_m - cells.distance_m)
             between = _between(cells, other, step, slope, other[1 + axis] * pitch)
-            brighter = dr.maximum(cells.radiance, other.radiance) * pitch * pitch
-            cut |= there & between.differ & (brighter * between.contrast >= least)
+            brighter = dr.maximum(cells.radiance, other.radiance)
+            cut |= there & between.differ & (brighter * between.contrast * pitch * pitch >= least)
+            glint |= there & (between.glint > 0) & (between.glint * pitch * pitch >= least)
             mixed |= inside & between.differ & between.apart
             joined = there & between.joined
             number += dr.select(joined, 1, 0)
@@ -161,9 +172,8 @@ def _first_edges(*columns: Any) -> tuple[Any, ...]:
         mean += bend / 24 + gain * run / 12
         halves.append(dr.abs(run) / 2)
         variance += dr.square(run) / 4 + dr.square(bend) / 240
-    bits = dr.select(cut, CUT, UInt32(0)) | dr.select(mixed, MIXED, UInt32(0))
     return (
-        bits,
+        _bits(cut, mixed, glint),
         dr.select(follows, mean, path),
         dr.select(follows, dr.sqrt(variance), half),
         dr.select(follows, dr.minimum(*halves), minor),
@@ -171,8 +181,8 @@ def _first_edges(*columns: Any) -> tuple[Any, ...]:
 
 
 @recorded
-def _pair_edges(*columns: Any) -> Any:
-    places, cells, (one, other, grid, least) = Place(*columns[:4]), Cells(*columns[4:10]), columns[10:]
+def _pair_edges(places: Any, cells: Any, one: Any, other: Any, grid: Any, least: Any) -> Any:
+    places, cells = Place(*places), Cells(*cells)
     (begin, first), (end, second) = ((_at(places, index), _at(cells, index)) for index in (one, other))
     # half a cell's width, in the unit of the finer cell of the pair's half width; columns and rows at that unit
     finer = dr.maximum(begin.level, end.level)
@@ -184,15 +194,22 @@ def _pair_edges(*columns: Any) -> Any:
     rises = (cell.slope_x_m * way_x + cell.slope_y_m * way_y for cell in (first, second))
     between = _between(first, second, second.distance_m - first.distance_m, *rises)
     wider = 2 * unit * Float(UInt32(1) << (finer - dr.minimum(begin.level, end.level)))
-    energy = dr.maximum(first.radiance, second.radiance) * dr.square(wider)
-    cut = between.differ & (energy * between.contrast >= least)
+    brighter = dr.maximum(first.radiance, second.radiance)
+    cut = between.differ & (brighter * between.contrast * dr.square(wider) >= least)
+    glint = (between.glint > 0) & (between.glint * dr.square(wider) >= least)
     mixed = between.differ & between.apart & (begin.rank == end.rank)
-    return dr.select(cut, CUT, UInt32(0)) | dr.select(mixed, MIXED, UInt32(0))
+    return _bits(cut, mixed, glint)
+
+
+def _bits(cut: Any, mixed: Any, glint: Any) -> Any:
+    bits = ((cut, CUT), (mixed, MIXED), (glint, GLINT))
+    return sum((dr.select(condition, bit, UInt32(0)) for condition, bit in bits), UInt32(0))
 
 
 def _at(columns: Any, index: Any, active: bool | Any = True) -> Any:
     """Those of other cells; of nothing where not `active`."""
-    return type(columns)(*(dr.gather(type(column), column, index, active) for column in columns))
+    gathered = (dr.gather(type(column), column, index, active) for column in columns if column is not None)
+    return type(columns)(*gathered)
 
 
 def _between(one: Cells, other: Cells, step: Any, rise: Any, other_rise: Any) -> _Between:
@@ -211,4 +228,23 @@ def _between(one: Cells, other: Cells, step: Any, rise: Any, other_rise: Any) ->
     tone = dr.select(brighter > 0, dr.abs(one.radiance - other.radiance) / brighter, 0)
     differ = edge | (both & ((bend > CREASE_COSINE) | (tone > TONE)))
     apart = (gap > MIXED_GAP_M) | ((unlike & HIT) != 0)
-    return _Between(differ, apart, dr.select(edge, Float(1), dr.maximum(bend, tone)), both & ~edge)
+    joined = both & ~edge
+    glint = Float(0) if one.peak is None else dr.select(joined, _highlight(one, other) - brighter, 0)
+    return _Between(differ, apart, dr.select(edge, Float(1), dr.maximum(bend, tone)), joined, glint)
+
+
+def _highlight(one: Cells, other: Cells) -> Any:
+    """Mean radiance of a cell that holds the highlight between two neighbours on a surface that bends.
+
+    Between them the tilt off its middle, in units of the roughness, runs from one's to the other's, and in the
+    neighbouring rows as far to the side as half the step. GGX falls as 1 / (1 + t^2)^2 with the tilt t; a highlight
+    narrower than the step fills a part of the cell.
+    """
+    step_x, step_y = other.tilt_x - one.tilt_x, other.tilt_y - one.tilt_y
+    step2 = dr.square(step_x) + dr.square(step_y)
+    part = dr.clip(-(one.tilt_x * step_x + one.tilt_y * step_y) / dr.maximum(step2, 1e-12), 0, 1)
+    off = dr.norm(mi.Vector2f(one.tilt_x + part * step_x, one.tilt_y + part * step_y))
+    step = dr.sqrt(step2)
+    off = dr.maximum(off - step / 2, 0)
+    share = dr.minimum(GLINT_WIDTH / dr.maximum(step, GLINT_WIDTH), 1)
+    return dr.minimum(one.peak, other.peak) / dr.square(1 + dr.square(off)) * share

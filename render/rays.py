@@ -117,15 +117,15 @@ def _pass_layers(world: World, ray: Any, origin: Any, active: Any, limit: Any, i
 
 def laser_leg(
     world: World, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
-) -> tuple[Any, Any]:
-    """What the laser does at a surface: radiance scattered towards `si.wi` [1/(m^2 sr)] and the laser leg's path [m].
+) -> tuple[Any, Any, Any, Any]:
+    """What the laser does at a surface: radiance scattered towards `si.wi` [1/(m^2 sr)], and the laser leg's path [m].
 
-    L = f(wi, wo) cos I(w) T / d^2.
+    L = f(wi, wo) cos I(w) T / d^2. Between them the direction to the laser and the irradiance I(w) T / d^2 across it.
     """
     direction, irradiance, path = laser_light(world, si, pixel, active, seen_by_camera=seen_by_camera)
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)
     radiance = value[0] * irradiance
-    return dr.select(active & dr.isfinite(radiance), radiance, 0), path
+    return dr.select(active & dr.isfinite(radiance), radiance, 0), direction, irradiance, path
 
 
 def laser_light(

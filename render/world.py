@@ -21,6 +21,7 @@ import drjit as dr  # noqa: E402  (other modules take dr and mi from here: only 
 Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
 ALIGNMENT = 64  # bytes
 OPACITY = "opacity"
+GLINT = 1.0  # 1/sr, three times white paint
 FACE_ALBEDO = "face_albedo"
 # u of albedo 0 on a plastic's ramp, and how much more albedo 1 has; the ramp's mean, 1/2 whatever the albedo, only says
 # how often paths follow the coat
@@ -36,7 +37,8 @@ class World:
     Surfaces whose materials differ in nothing but a plain albedo share one mesh, with an albedo per face: the number of
     meshes decides which kernels are compiled, so scenes of a set with the same kinds of material share their kernels.
     `groups[i]` are the surfaces of mesh i, `shape_ids[i]` its registered index; `solid_indices` those of solid glass.
-    Tables per registered shape: index of refraction of solid and thin glass (0: none), albedo of conductors (-1: none).
+    Tables per registered shape: index of refraction of solid and thin glass (0: none), albedo of conductors (-1: none),
+    `peak` of the highlight (0: none that matters).
     `plastics` are its plain coated materials, which the next world of a set may be given: their tables take longer than
     all its other parts.
     Not a dataclass: Dr.Jit would take its fields for variables of every loop that mentions it.
@@ -81,6 +83,11 @@ class World:
         self.shares = self.table([m.kind != "plastic" for m in materials])
         self.rough_coats = self.table([m.kind == "roughplastic" for m in materials])
         self.albedo = self.table([_specular_albedo(m) for m in materials])
+        # highlights that outshine paint and may be narrower than what a ray stands for (`render.edges`)
+        peaks = [_peak(m) for m in materials]
+        self.has_glints = any(peaks)
+        self.peak = self.table(peaks)
+        self.roughness = self.table([m.roughness for m in materials])
         self.solid_indices = sorted({m.ior for m in materials if m.kind == "dielectric"})
         self.solid_index = dr.opaque(Float, max(self.solid_indices, default=1.0))
         self.recordings = Recordings()
@@ -227,6 +234,19 @@ def _specular_albedo(material: Material) -> float:
         return -1.0
     eta, k = material.eta, material.k
     return material.specular * ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
+
+
+def _peak(material: Material) -> float:
+    """f cos of a rough lobe at the middle of its highlight seen along the light, F_0 / (4 pi alpha^2) [1/sr] (GGX with
+    all cosines 1); 0 below GLINT."""
+    if material.kind == "roughconductor":
+        mirrored = _specular_albedo(material)
+    elif material.kind == "roughplastic":
+        mirrored = material.specular * ((material.ior - 1) / (material.ior + 1)) ** 2
+    else:
+        return 0.0
+    peak = mirrored / (4 * math.pi * material.roughness**2)
+    return peak if peak > GLINT else 0.0
 
 
 def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: Any, masks: str) -> Any:

@@ -19,6 +19,7 @@ ALBEDO = 0.5
 WALL_M = 3.0
 GROOVE_ALBEDO, GROOVE_M, GROOVE_SIZE_M = 0.6, 3.0, 1.0
 BALL_M, BALL_RADIUS_M = 3.0, 0.5
+GLINT_M, GLINT_RADIUS_M, GLINT_ROUGHNESS, GLINT_ETA, GLINT_K = 2.0, 0.05, 0.02, 2.9, 3.1
 WIRE_M, WIRE_RADIUS_M, WIRE_X_M = 2.0, 1e-3, 0.011
 FURNACE_EMISSION = 0.3
 SPHERE_RADIUS_M, SPHERE_OFFSET_M = 1.0, 0.3
@@ -73,6 +74,15 @@ def ball() -> Scene:
     vertices, faces, _ = shapes.sphere(BALL_RADIUS_M, 7)
     surface = Surface(vertices + (0, 0, -BALL_M), faces, Material(albedo=0.7), name="ball")
     return Scene("ball", (surface,), camera(48, 36, 30.0))
+
+
+def glint() -> Scene:
+    """A polished steel ball before nothing: its highlight is a fortieth of a pixel wide and most of its light."""
+    vertices, faces, _ = shapes.sphere(GLINT_RADIUS_M, 6)
+    steel = Material("roughconductor", roughness=GLINT_ROUGHNESS, eta=GLINT_ETA, k=GLINT_K)
+    normals = vertices / GLINT_RADIUS_M
+    surface = Surface(vertices + (0, 0, -GLINT_M), faces, steel, normals=normals, name="ball")
+    return Scene("glint", (surface,), camera(16, 12))
 
 
 def wire() -> Scene:
@@ -263,6 +273,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "grazing-89.9": lambda: grazing(89.9),
     "horizon": horizon,
     "silhouette": ball,
+    "glint": glint,
     "wire": wire,
     "groove-60": lambda: groove(60),
     "groove-90": lambda: groove(90),

@@ -18,7 +18,9 @@ __all__ = [
     "camera",
     "groove_interreflection",
     "groove_scene",
+    "metal",
     "moments",
+    "paint",
     "plane_moments",
     "quad",
     "sphere_moments",
@@ -110,11 +112,14 @@ def sphere_moments(
     *,
     distance_m: float,
     radius_m: float,
-    albedo: float,
+    reflected: Callable[[np.ndarray], np.ndarray],
     per_side: int = 48,
     pixels: np.ndarray | None = None,
 ) -> Moments:
-    """Moments of a Lambertian sphere centred at (0, 0, -distance); midpoint rule, since the limb is not smooth."""
+    """Moments of a sphere centred at (0, 0, -distance); midpoint rule, since the limb is not smooth.
+
+    `reflected(cosine)` is f cos of light that goes back where it came from, at this cosine to the normal.
+    """
     directions, weight = midpoint_samples(scene.camera, per_side, pixels)
     along = -directions[..., 2] * distance_m
     discriminant = radius_m**2 - distance_m**2 + along**2
@@ -123,7 +128,26 @@ def sphere_moments(
     normal = (directions * distance[..., None] + [0, 0, distance_m]) / radius_m
     cosine = np.where(hit, -(directions * normal).sum(-1), 0)
     intensity = scene.laser.intensity(scene.camera)[0, 0]  # a flood's is the same everywhere
-    return moments(albedo / np.pi * intensity * cosine / distance**2, 2 * distance, weight)
+    return moments(reflected(cosine) * intensity / distance**2, 2 * distance, weight)
+
+
+def paint(cosine: np.ndarray, *, albedo: float) -> np.ndarray:
+    """f cos of a Lambertian surface."""
+    return albedo / np.pi * cosine
+
+
+def metal(cosine: np.ndarray, *, roughness: float, eta: float, k: float) -> np.ndarray:
+    """f cos of a rough conductor whose light goes back where it came from: F_0 D G_1^2 / (4 cos).
+
+    GGX (Walter et al. 2007, eqs. 33 and 34), Fresnel's reflectance at normal incidence on its facets; the two ways are
+    masked independently.
+    """
+    cosine = np.maximum(cosine, 1e-9)
+    tangent2 = 1 / cosine**2 - 1
+    facets = 1 / (np.pi * roughness**2 * cosine**4 * (1 + tangent2 / roughness**2) ** 2)
+    masked = 2 / (1 + np.sqrt(1 + roughness**2 * tangent2))
+    mirrored = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
+    return mirrored * facets * masked**2 / (4 * cosine)
 
 
 def sphere_coverage(view: Camera, *, distance_m: float, radius_m: float, per_side: int = 48) -> np.ndarray:
@@ -163,13 +187,14 @@ def upright_wire(
 
 class Shadowed(NamedTuple):
     """Moments with the post and its shadow; radiance of the wall without post; the brightest ray's radiance; shares of
-    each pixel that the post covers and that lie in its shadow."""
+    each pixel that the post covers and that lie in its shadow; columns that edges of either run through."""
 
     seen: Moments
     bare: np.ndarray
     brightest: np.ndarray
     post: np.ndarray
     shadow: np.ndarray
+    columns: np.ndarray
 
 
 def shadowed_wall(
@@ -206,7 +231,12 @@ def shadowed_wall(
     radiance = np.where(post, on_post, np.where(dark, 0, on_wall))
     seen = moments(radiance, np.where(post, post_path, wall_path), weight)
     shares = ((covered * weight).sum(-1) for covered in (post, dark & ~post))
-    return Shadowed(seen, (on_wall * weight).sum(-1), np.maximum(radiance, on_wall).max(-1), *shares)
+    camera_x = [x / post_m for x in post_x_m]  # the edges in camera rays' x / z
+    camera_x += [(laser[0] + (x - laser[0]) * wall_m / post_m) / wall_m for x in post_x_m]
+    columns = np.floor(np.array(camera_x) * scene.camera.focal_px + scene.camera.width / 2)
+    return Shadowed(
+        seen, (on_wall * weight).sum(-1), np.maximum(radiance, on_wall).max(-1), *shares, columns.astype(int)
+    )
 
 
 class Leaf(NamedTuple):

@@ -1,5 +1,7 @@
 """The renderer against closed forms, float64 quadratures of the same geometry and Mitsuba's steady render."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -63,7 +65,9 @@ def test_sphere_of_subdivision_seven():
     surface = Surface(vertices + [0, 0, -3], faces, Material(albedo=0.7))
     scene = Scene("sphere", (surface,), oracles.camera(48, 36, 30))
     transient = render(scene, RenderSettings(bounces=1, grid=16, direct_tolerance_m=1e-4))
-    total, mean, _ = oracles.sphere_moments(scene, distance_m=3.0, radius_m=0.5, albedo=0.7, per_side=64)
+    total, mean, _ = oracles.sphere_moments(
+        scene, distance_m=3.0, radius_m=0.5, reflected=partial(oracles.paint, albedo=0.7), per_side=64
+    )
     got = transient.total_radiance()
     assert abs(got.sum() / total.sum() - 1) < 1e-4
     both = (total > 0) & (got > 0) & ~transient.mixed
