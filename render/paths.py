@@ -331,8 +331,13 @@ def _beyond(
     return values, paths, slot, soonest
 
 
-def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: int, seed: int) -> np.ndarray:
-    """Mean radiance, summed over the pixels, of light that met exactly 0, 1, ..., `bounces` surfaces (0 below 2)."""
+def energy_by_bounces(
+    world: World, pixels: np.ndarray, rounds: int, bounces: int, seed: int
+) -> tuple[np.ndarray, float]:
+    """Mean radiance, summed over the pixels, of light that met exactly 0, 1, ..., `bounces` surfaces (0 below 2).
+
+    And its noise: squared contributions of a path in every pixel, summed over the pixels.
+    """
     blocks = block_order(pixels, world.scene.camera.width)
     block = np.arange(len(blocks) // BLOCK)
     turns = turns_of(block, block, np.full(len(block), rounds))
@@ -340,7 +345,9 @@ def energy_by_bounces(world: World, pixels: np.ndarray, rounds: int, bounces: in
     tails, vertices = traced.tails, bounces - 2
     beyond = tails.own_onward.numpy() * tails.values.numpy().reshape(-1, dr.width(traced.batch))
     energy = np.zeros(bounces + 1)
-    energy[2] = sum(part.numpy().sum(dtype=np.float64) for part in (tails.own_value, *(n.value for n in traced.joined)))
+    near = [part.numpy() for part in (tails.own_value, *(n.value for n in traced.joined))]
+    energy[2] = sum(part.sum(dtype=np.float64) for part in near)
+    noise = sum(float(np.square(part, dtype=np.float64).sum()) for part in (*near, beyond))
     by_slot = beyond.sum(axis=1, dtype=np.float64)
     energy[3:] = by_slot.reshape(max(vertices, 1), -1).sum(axis=1)[:vertices]
-    return energy / rounds
+    return energy / rounds, noise / rounds

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from render.direct import direct_light, least_share_of
-from render.error import error_for_budget, error_of_background, estimate, response
+from render.error import PULSE_POWER, error_for_budget, error_of_background, estimate, response
 from render.paths import energy_by_bounces
 from render.returns import of_pixels
 from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
@@ -17,9 +17,11 @@ from scenes.errors import InputError
 from scenes.model import Material
 
 DEFAULT_ERROR = 0.02
-# Squares of the parts must sum to less than 1; the rest is for merged returns and the pilot's own uncertainty, and
-# for what twice as many rays a side still miss. Of the square of the Monte-Carlo part that is a share of the aim.
-DIRECT_SHARE, MONTE_CARLO_OF_AIM = 0.4, 0.75
+# What direct light may be off, in shares of the target, where there is other light; and what is planned for of the
+# square that is aimed at: the rest is for merged returns and what twice as many rays a side still miss.
+DIRECT_SHARE, PLANNED = 0.4, 0.96
+# Time of a cell in that of a path: where many paths are to come, finer cells leave them more of the error.
+CELL_COST = 0.25
 # The pilot's pixels are not compared with those beside them, so that it shows 1.3 to 1.4 times the error of cells at
 # grids of 4 to 8 (measured in rooms); most of that is not planned for.
 PILOT_SHOWS = 1.25
@@ -113,14 +115,14 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         fine = pilot_response(world, pixels, PILOT_GRID)
     target, why = _target(settings, fine)
     reasons.append(why)
-    grid, why = _grid(world, settings, pixels, PILOT_SHOWS * _direct_share(settings, direct_alone) * target)
-    reasons.append(why)
+    bounces, spp, paths, whys = _indirect(world, settings, pixels, fine, target, seed)
+    share = _direct_share(settings, direct_alone)
+    grid, off, why = _grid(world, settings, pixels, share * target, paths, PLANNED * settings.aim * target**2)
+    reasons += [why, *whys]
     tolerance_m = settings.direct_tolerance_m
     if tolerance_m is None:
         tolerance_m = float(np.clip(TOLERANCE_M_PER_ERROR * target, 1e-4, WIDEST_TOLERANCE_M))
     share = least_share_of(grid) if settings.least_share is None else settings.least_share
-    bounces, spp, whys = _indirect(world, settings, pixels, fine, target, seed)
-    reasons += whys
     ambient, ambient_noise, why = _ambient(world, settings, target)
     reasons.append(why)
     return Plan(
@@ -131,7 +133,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
         tuple(reasons),
         least_share=share,
         direct_tolerance_m=tolerance_m,
-        noise=math.sqrt(MONTE_CARLO_OF_AIM * settings.aim) * target,
+        noise=math.sqrt(max(PLANNED * settings.aim * target**2 - off**2, 0.0)),
         target=target,
         adaptive=settings.adaptive and mode_is_flood,
         filter=settings.filter,
@@ -182,20 +184,25 @@ def _target(settings: RenderSettings, fine: np.ndarray | None) -> tuple[float, s
     return DEFAULT_ERROR, f"error target: {DEFAULT_ERROR:g}, the default"
 
 
-def _grid(world: World, settings: RenderSettings, pixels: np.ndarray, allowed: float) -> tuple[int, str]:
-    """The smallest grid whose direct light in the pilot's pixels is off by at most `allowed`.
+def _grid(
+    world: World, settings: RenderSettings, pixels: np.ndarray, allowed: float, paths: float, squared: float
+) -> tuple[int, float, str]:
+    """The grid whose direct light is off by at most `allowed`, how much it is off, and why.
+
+    The smallest such; or a finer one, if that saves more than it costs where the square of the error of all light may
+    be `squared`, for which indirect light alone takes `paths` a pixel.
 
     Grids double, or halve, until one differs by no more from the next and one by more; between two, errors follow a
     power of the grid. Up to EXTRAPOLATED times the last one measured they fall at least as GRID_POWER says: another
     pilot would cost more than it saves.
     """
     if settings.grid is not None:
-        return settings.grid, f"direct light: {settings.grid} x {settings.grid} rays a pixel, forced"
+        return settings.grid, allowed, f"direct light: {settings.grid} x {settings.grid} rays a pixel, forced"
 
     def off(grid: int) -> float:
         coarse, finer = (pilot_response(world, pixels, number) for number in (grid, 2 * grid))
         # what no ray has met yet may be thin
-        return estimate(coarse, finer).total if finer.any() else math.inf
+        return estimate(coarse, finer).total / PILOT_SHOWS if finer.any() else math.inf
 
     errors = {PILOT_GRID: off(PILOT_GRID)}
     while errors[min(errors)] <= allowed and min(errors) > GRIDS[0]:
@@ -205,28 +212,32 @@ def _grid(world: World, settings: RenderSettings, pixels: np.ndarray, allowed: f
     coarse = max((grid for grid, error in errors.items() if error > allowed), default=min(errors))
     error, finer = errors[coarse], errors.get(2 * coarse, 0)
     if error == math.inf:
-        return coarse, f"direct light: {coarse} x {coarse} rays a pixel, none of the pilot's pixels is lit"
+        return coarse, allowed, f"direct light: {coarse} x {coarse} rays a pixel, none of the pilot's pixels is lit"
     power = math.log2(error / finer) if 0 < finer < error else GRID_POWER
     grid = max(min(math.ceil(coarse * (error / allowed) ** (1 / power)), GRIDS[-1]), coarse)
-    error *= (coarse / grid) ** power
-    why = f"direct light: {grid} x {grid} rays a pixel, error {error:.2g} by twice as many a side"
-    return grid, why if error <= allowed else f"{why}: its share of the target needs more; force grid"
+    offs = {g: error * (coarse / g) ** (power if g <= 2 * coarse else GRID_POWER) for g in range(grid, GRIDS[-1] + 1)}
+    grid = min(offs, key=lambda g: CELL_COST * g**2 + paths / max(1 - offs[g] ** 2 / squared, 0.1))
+    why = f"direct light: {grid} x {grid} rays a pixel, error {offs[grid]:.2g} by twice as many a side"
+    if offs[grid] > allowed:
+        return grid, allowed, f"{why}: its share of the target needs more; force grid"
+    return grid, offs[grid], why
 
 
 def _indirect(
     world: World, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray | None, target: float, seed: int
-) -> tuple[int, int | None, list[str]]:
+) -> tuple[int, int | None, float, list[str]]:
+    """Bounces; paths a pixel, if they are forced; about how many meet the target if every pixel has its own; why."""
     mode = world.scene.laser.mode
     if settings.bounces == 1:
-        return 1, 0, ["indirect light: none, forced by 1 bounce"]
+        return 1, 0, 0.0, ["indirect light: none, forced by 1 bounce"]
     if settings.bounces is None and mode == "scan":
         why = "indirect light: left out, also of the error, under a scanning laser unless bounces ask for it"
-        return 1, 0, [why]
+        return 1, 0, 0.0, [why]
     most = PILOT_BOUNCES if settings.bounces is None else settings.bounces
-    energy = energy_by_bounces(world, pixels, BATCHES, most, seed)
+    energy, noise = energy_by_bounces(world, pixels, BATCHES, most, seed)
     energy[1] = fine.sum()
     if energy.sum() <= 0:
-        return settings.bounces or 1, settings.spp or BATCHES, ["indirect light: nothing is lit"]
+        return settings.bounces or 1, settings.spp or BATCHES, 0.0, ["indirect light: nothing is lit"]
     whys = []
     bounces = settings.bounces
     if bounces is None:
@@ -238,10 +249,13 @@ def _indirect(
     else:
         whys.append(f"bounces: {bounces}, forced")
     if bounces == 1:
-        return 1, 0, [*whys, "indirect light: none, what it adds is less than may be left out"]
+        return 1, 0, 0.0, [*whys, "indirect light: none, what it adds is less than may be left out"]
     if settings.spp is not None:
         whys.append(f"indirect light: the work of {settings.spp} paths a pixel, forced")
-    return bounces, settings.spp, whys
+        return bounces, settings.spp, 0.0, whys
+    power = float((fine**2).sum())
+    paths = noise * PULSE_POWER / (PLANNED * settings.aim * target**2 * power) if power > 0 else 0.0
+    return bounces, None, 0.0 if settings.filter else paths, whys
 
 
 def _bounces(energy: np.ndarray, allowed: float) -> tuple[int, float]:
