@@ -8,15 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from render.caustics import Thrown, thrown_light
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
 from render.heap import release
 from render.regions import READERS, Octaves, Regions
-from render.returns import Samples, concatenate
+from render.returns import Samples, concatenate, no_samples, packed
 from render.settings import BATCHES, FILTERED_BATCHES
 from render.sharing import FILTERED_PATHS, LANES, PATHS, add_paths, noise_of_filtered_paths, noise_of_paths
 from render.sums import Sums
 from render.turns import BLOCK, Turns, turns_of
-from render.world import World, dr
+from render.world import Bool, Float, UInt32, World, dr, upload
 
 MOST_CELLS = 1 << 21  # of one launch: 32 MB of accumulators
 OVER = 0.3  # of a launch
@@ -298,6 +299,44 @@ def _watch(pixels: np.ndarray, image_pixels: int, cells: Cells, schedule: Schedu
     return Watch(row_of, rows[0], rows[1] if kinds == 2 else None)
 
 
+def _caustics(
+    world: World,
+    schedule: Schedule,
+    bounces: int,
+    seed: int,
+    origin_m: np.ndarray,
+    cells: Cells,
+    watch: Watch | None,
+    add: Callable[[Samples], None],
+) -> np.ndarray:
+    """Give out light that polished surfaces throw; every pixel's total of it by batch, (pixels, batches)."""
+    batches = schedule.batches
+    totals, merged = np.zeros((len(origin_m), batches)), no_samples()
+    for light in thrown_light(world, schedule.cost, batches, bounces, seed):
+        np.add.at(totals, (light.pixel, light.batch), light.radiance)
+        if watch is not None:
+            _watch_thrown(watch, light, origin_m, batches)
+        few = np.full(len(light.pixel), 2, np.uint8)
+        found = packed(light.pixel, light.path_m, np.zeros(len(few)), light.radiance, few)
+        merged = coarsened(concatenate([merged, found]), cells, origin_m)
+    add(merged)
+    return totals
+
+
+def _watch_thrown(watch: Watch, light: Thrown, origin_m: np.ndarray, batches: int) -> None:
+    """Add what is thrown on watched pixels to their rows."""
+    seen = np.flatnonzero(watch.row_of[light.pixel] >= 0)
+    if len(seen) == 0:
+        return
+    pixel = light.pixel[seen]
+    row = upload(UInt32, watch.row_of[pixel] * batches + light.batch[seen])
+    x = upload(Float, light.path_m[seen] - origin_m[pixel])
+    radiance = upload(Float, light.radiance[seen] * batches)
+    for rows in (watch.rows, watch.plain):
+        if rows is not None:
+            rows.add(row, x, radiance, Bool(True))
+
+
 def indirect_light(
     world: World,
     schedule: Schedule,
@@ -323,12 +362,14 @@ def indirect_light(
     cells = image_cells(world, width_m, growth, origin_m, bounces)
     fine = image_cells(world, width_m / 2, growth / 2, origin_m, bounces)
     watch = _watch(watched, image_pixels, fine, schedule, brightest)
-    noise = np.zeros(image_pixels)
+    thrown = _caustics(world, schedule, bounces, seed, origin_m, cells, watch, add)
+    noise = thrown.std(axis=1, ddof=1) * np.sqrt(batches) if batches > 1 else np.zeros(image_pixels)
     for chunk in collect(world, schedule, origin_m, cells, bounces, seed, brightest, watch=watch, say=say):
         real = chunk.pixels >= 0
         add(chunk.samples)
         if batches > 1:
-            noise[chunk.pixels[real]] = chunk.totals[real].std(axis=1, ddof=1) * np.sqrt(batches)
+            totals = chunk.totals[real] + thrown[chunk.pixels[real]]
+            noise[chunk.pixels[real]] = totals.std(axis=1, ddof=1) * np.sqrt(batches)
 
     def seen(rows: Rows | None) -> Watched:
         sums = (np.zeros(0),) * 2 if rows is None else rows.sums()

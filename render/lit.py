@@ -19,6 +19,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from render.glossy import left_to_paths
 from render.rays import first_opaque, laser_light, segment, to_world
 from render.world import Bool, Float, UInt32, World, dr, mi
 
@@ -171,5 +172,5 @@ def joined(
     path = leg + dr.gather(Float, lit.path, point, active)
     density = dr.gather(Float, lit.density, point, active) * joins
     _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))
-    light = dr.select(active, value * passed / both, 0)
+    light = dr.select(active, value * passed / both * left_to_paths(world, si.p, direction, end, active), 0)
     return dr.select(dr.isfinite(light), light, 0), path, direction

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from render.glossy import left_to_paths
 from render.lit import Lit, by_chance, density_of, is_wide, joined, joins_of, kept, lit_points
 from render.rays import camera_rays, first_opaque, laser_light, shape_index, spawn
 from render.regions import Point, late_from, point_of
@@ -216,6 +217,9 @@ def _tails(
     value = si.bsdf().eval(context, si, si.to_local(to_laser), alive)[0] * irradiance
     if lit is not None:
         value *= by_chance(world, x1, sample, weight, si, density, copies_of(heads, leg + laser_path), alive)
+    # what is reflected by a mirror in the first place cannot be read backwards
+    readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    value *= left_to_paths(world, x1.p, direction, si, readable)
     value = dr.select(alive & dr.isfinite(value), own * value, 0)
     onward, onward_weight = si.bsdf().sample(
         context, si, random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32()), alive
@@ -225,7 +229,7 @@ def _tails(
     if used and world.has_rough_coats:
         joinable &= dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
     scale = dr.select(onward_weight > 0, onward_weight, 1)
-    way = _Way(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, joinable)
+    way = _Way(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, joinable, readable)
     soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
     light = _beyond(world, lit, batch, way, alive, pixel, random, soonest, bounces - 2)
     shared = alive & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
@@ -252,7 +256,7 @@ def _tails(
 class _Way(NamedTuple):
     """Where paths stand and how they go on: a sample of the surface's lobes and its weight. `through` is the factor of
     light that comes from there, `here` that of light reflected on the spot, reflectance counted in that light, and
-    `joinable` says whether there is such."""
+    `joinable` says whether there is such; `readable` whether other paths bring a part of it (`render.glossy`)."""
 
     si: Any
     sample: Any
@@ -260,6 +264,7 @@ class _Way(NamedTuple):
     through: Any
     here: Any
     joinable: Any
+    readable: Any
 
 
 @dr.syntax
@@ -306,6 +311,7 @@ def _beyond(
         if dr.hint(joining, mode="scalar"):
             density = density_of(world, si, to_laser)
             light *= dr.select(joinable, by_chance(world, before, sample, weight, si, density, 1, active), 1)
+        light *= left_to_paths(world, before.p, towards.d, si, active & way.readable)
         here = through * passed
         light = dr.select(dr.isfinite(light), here * light, 0)
         dr.scatter(paths, path + leg, slot * stride + lane, active)

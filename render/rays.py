@@ -173,11 +173,24 @@ def in_beam(world: World, point: Any, pixel: Any) -> Any:
     if laser.mode == "flood":
         aim = to_camera(world, mi.Vector3f(point) - world.laser)
         return dr.atan2(dr.norm(mi.Vector2f(aim.x, aim.y)), aim.z) <= world.half_angle
+    seen_in, same = pixel_of(world, point, columns=laser.mode == "scan")
+    return same & (seen_in == pixel if laser.mode == "scan" else seen_in // world.width == pixel // world.width)
+
+
+def pixel_of(world: World, point: Any, *, columns: bool = True) -> tuple[Any, Any]:
+    """The flat pixel in whose pyramid a point lies, and whether there is one; not in which of its row's `columns` if
+    these do not matter."""
+    column, row, seen = raster_of(world, point)
+    column, row = dr.floor(column) if columns else Float(0), dr.floor(row)
+    inside = seen & (row >= 0) & (row < Float(world.height)) & (column >= 0) & (column < Float(world.width))
+    return UInt32(dr.select(inside, row, 0)) * world.width + UInt32(dr.select(inside, column, 0)), inside
+
+
+def raster_of(world: World, point: Any) -> tuple[Any, Any, Any]:
+    """Where a point lies in the image's plane, in pixels from its corner, and whether it lies before the camera."""
     local = to_camera(world, mi.Vector3f(point) - world.eye)
-    row = dr.floor(local.y / local.z * world.focal_px + Float(world.height) / 2)
-    column = dr.floor(local.x / local.z * world.focal_px + Float(world.width) / 2)
-    same = (local.z > 0) & (row == Float(pixel // world.width))
-    return same & (column == Float(pixel % world.width)) if laser.mode == "scan" else same
+    x, y = (local[axis] / local.z * world.focal_px for axis in range(2))
+    return x + Float(world.width) / 2, y + Float(world.height) / 2, local.z > 0
 
 
 def segment(world: World, si: Any, point: Any, active: Any) -> tuple[Any, Any]:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from render.glossy import left_to_paths
 from render.lit import diffuse_share, share_by_chance
 from render.paths import Traced, shares_early, trace_paths
 from render.rays import segment
@@ -215,6 +216,7 @@ def _connect(world: World, traced: Traced, pairs: _Pairs) -> _Connections:
             lit_density,
             BLOCK,
         )
+    value2 *= left_to_paths(world, si1.p, direction, si2, active)
     # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
     density = dr.select(active & (value1[0] > 0), density1 * area, 0)
     connections = _Connections(

@@ -103,6 +103,7 @@ class World:
         # What differs between the views of a set is opaque: a literal would compile every kernel again.
         self.scene, camera = scene, scene.camera
         self.responses: dict[tuple, np.ndarray] = {}  # `render.planning.pilot_response`
+        self.glossy: Any = None  # `render.glossy.glossy_of`
         self.intensity = upload(Float, scene.laser.intensity(camera))
         self.eye_m = camera.origin - self.origin
         self.eye = _opaque(self.eye_m)

@@ -24,6 +24,7 @@ WIRE_M, WIRE_RADIUS_M, WIRE_X_M = 2.0, 1e-3, 0.011
 FURNACE_EMISSION = 0.3
 SPHERE_RADIUS_M, SPHERE_OFFSET_M = 1.0, 0.3
 MIRROR_M, MIRROR_REFLECTANCE, MIRROR_TILT_DEG = 2.0, 0.8, 3.0
+CAUSTIC_WALL_M, CAUSTIC_PANEL_M, CAUSTIC_DEPTHS_M, CAUSTIC_ROUGHNESS = 4.0, 1.0, (1.2, 3.5), 0.003
 CUBE_M, CUBE_SIZE_M = 2.0, 0.05
 CUBE_APEX_M = (0.03, -0.05, -CUBE_M)
 PANE_M, GLASS_IOR, SLAB_M, SLAB_THICKNESS_M = 1.0, 1.5, 1.0, 0.3
@@ -140,6 +141,17 @@ def mirror() -> Scene:
     material = Material("conductor", eta=0.0, k=1.0, specular=MIRROR_REFLECTANCE, name="mirror")
     square = wall(MIRROR_M, ALBEDO, tilt_deg=MIRROR_TILT_DEG, half_size_m=1.0)
     return Scene("mirror", (replace(square, material=material),), camera(15, 11, 20.0))
+
+
+def caustic() -> Scene:
+    """A wall, and beside it a polished panel, at a right angle to it, that mirrors the flash onto it."""
+    near, far = CAUSTIC_DEPTHS_M
+    corners = [(CAUSTIC_PANEL_M, y, -z) for y, z in ((-2, near), (-2, far), (2, far), (2, near))]
+    panel = Material(
+        "roughconductor", roughness=CAUSTIC_ROUGHNESS, eta=0.0, k=1.0, specular=MIRROR_REFLECTANCE, name="panel"
+    )
+    back = wall(CAUSTIC_WALL_M, ALBEDO, half_size_m=3)
+    return Scene("caustic", (back, quad(corners, panel, "panel")), camera(24, 16, 60.0))
 
 
 def corner_cube() -> Scene:
@@ -286,6 +298,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "sphere-0.5": lambda: integrating_sphere(0.5),
     "sphere-0.99": lambda: integrating_sphere(0.99),
     "mirror": mirror,
+    "caustic": caustic,
     "corner-cube": corner_cube,
     "window": window,
     "slab": slab,

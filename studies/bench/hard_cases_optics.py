@@ -18,15 +18,18 @@ from studies.bench.hard_case import (
     centre_path_m,
     clipped,
     farthest_m,
+    independent,
     moments_of,
     nrmse,
+    over_renders,
     relative,
     worst,
 )
-from studies.bench.oracles_optics import fresnel, mirror_return, pane_transmission, slab_moments
+from studies.bench.oracles_optics import caustic_moments, fresnel, mirror_return, pane_transmission, slab_moments
 
 SMOOTH = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
 EDGES = RenderSettings(bounces=1, grid=16, least_share=0, direct_tolerance_m=1e-4)
+CAUSTIC = RenderSettings(bounces=2, grid=4, spp=256, indirect_tolerance_m=1e-2, indirect_growth=0)
 # A specular return is one number per pixel, in float32 from a handful of operations.
 SPECULAR_ENERGY, SPECULAR_PATH_M = 1e-4, 1e-5
 
@@ -52,6 +55,36 @@ def _mirror(seed: int) -> Outcome:
     every = np.ones(transient.returns, bool)
     errors = _specular(scene, transient, every, toward, scenes.MIRROR_REFLECTANCE, 2 * distance)
     return Outcome(errors, clipped(transient))
+
+
+def _caustic(seed: int) -> Outcome:
+    scene = hard_case("caustic")
+    expected = caustic_moments(
+        scene,
+        wall_m=scenes.CAUSTIC_WALL_M,
+        panel_m=scenes.CAUSTIC_PANEL_M,
+        depths_m=scenes.CAUSTIC_DEPTHS_M,
+        reflectance=scenes.MIRROR_REFLECTANCE,
+        albedo=scenes.ALBEDO,
+    )
+    bright = np.isfinite(expected.total)
+    # clear of the caustic's ends by two pixels, since the metal blurs it a little
+    inner = bright.copy()
+    for axis in (0, 1):
+        for step in (-2, -1, 1, 2):
+            inner &= np.roll(bright, step, axis)
+    inner[[0, 1, -2, -1], :] = inner[:, [0, 1, -2, -1]] = False
+    renders = independent(scene, CAUSTIC, seed)
+    got = [moments_of(transient, transient.bounces > 1) for transient in renders]
+    whole = expected.total[inner].sum()
+    mean = np.mean([one.total for one in got], axis=0)
+    errors = {
+        # GGX's tails end at no pixel
+        "energy": over_renders([float(one.total[inner].sum() / whole - 1) for one in got], 0.005),
+        "energy, nRMSE of pixels": Measured(nrmse(mean[inner], expected.total[inner]), 0.03),
+        "path [m]": over_renders([float((one.mean_m - expected.mean_m)[inner].mean()) for one in got], 2e-3),
+    }
+    return Outcome(errors, clipped(*renders))
 
 
 def _corner_cube(seed: int) -> Outcome:
@@ -140,6 +173,7 @@ def _leaf(seed: int) -> Outcome:
 
 CASES = (
     Case("mirror", "R I / (D^2 Omega), D = 2d, in the pixel that sees the laser in the mirror", _mirror),
+    Case("caustic", "I R cos / D^2 from the laser's mirror image in polished metal, on a wall", _caustic),
     Case("corner-cube", "R^3 I / (D^2 Omega), D = 2d to the apex", _corner_cube),
     Case("window", "own return 2F/(1+F) at normal incidence; the wall behind times T(angle)^2", _window),
     Case("thick-slab", "every ray refracted: (1-F)^4, delay 2t(n-1), spreading over d - t + t/n", _slab),

@@ -43,6 +43,28 @@ def mirror_return(
     return (row, column), float(reflectance * intensity / (one_way_m**2 * solid_angle))
 
 
+def caustic_moments(
+    scene: Scene, *, wall_m: float, panel_m: float, depths_m: tuple[float, float], reflectance: float, albedo: float
+) -> Moments:
+    """What a polished panel at x = panel, upright and along the axis, throws from a laser at the camera on the wall.
+
+    The laser's mirror image at (2 panel, 0, 0) lights the wall with I R cos / D^2, D the unfolded distance:
+    L = albedo/pi R I cos / D^2 at path D + |x|. NaN where the panel does not mirror all of a pixel.
+    """
+    directions, weight = pixel_samples(scene.camera, 4)
+    point = directions * (wall_m / -directions[..., 2])[..., None]
+    way = point - (2 * panel_m, 0, 0)
+    distance = np.linalg.norm(way, axis=-1)
+    depth = wall_m * panel_m / (2 * panel_m - point[..., 0])
+    # in the panel, where the laser shines on it
+    lit = (depth > depths_m[0]) & (depth < depths_m[1])
+    mirrored = np.stack((np.full_like(depth, panel_m), point[..., 1] * depth / wall_m, -depth), axis=-1)
+    lit &= -mirrored[..., 2] > np.linalg.norm(mirrored, axis=-1) * scene.laser.cos_half_angle(scene.camera)
+    intensity = scene.laser.intensity(scene.camera)[..., None]
+    radiance = np.where(lit, albedo / np.pi * reflectance * intensity * (wall_m / distance) / distance**2, np.nan)
+    return moments(radiance, distance + np.linalg.norm(point, axis=-1), weight)
+
+
 def slab_moments(
     scene: Scene, *, wall_m: float, thickness_m: float, ior: float, albedo: float, per_side: int = 4
 ) -> Moments:

@@ -1,0 +1,151 @@
+"""Light by way of polished surfaces: paths begun on them and others together, against others alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import render.caustics
+import render.glossy
+from render.caustics import thrown_light
+from render.glossy import ELSEWHERE, glossy_of
+from render.settings import Plan, RenderSettings
+from render.tracing import Traced, trace
+from render.world import World
+from scenes import Camera, Laser, Material, Scene, Surface
+from scenes.hard_cases import hard_case
+from scenes.shapes import sphere
+
+WIDTH, HEIGHT, BATCHES = 16, 12, 16
+METAL = Material("roughconductor", roughness=0.1, eta=2.9, k=3.1)
+GLOSS = Material("roughplastic", albedo=0.5, roughness=0.05, ior=1.5)
+LASERS = {"flash": Laser("flood"), "lamp": Laser("flood", cone_deg=360), "spot": Laser("flood", cone_deg=20)}
+
+
+def quad(corners: list, material: Material) -> Surface:
+    return Surface(np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]), material)
+
+
+def room(polished: Material, laser: Laser, *, smooth: bool = False) -> Scene:
+    """A corner with a coarse ball, whose shading normals are far from its faces' if it is `smooth`, and a panel."""
+    wall = Material(albedo=0.7)
+    vertices, faces, _ = sphere(0.5, 2)
+    normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True) if smooth else None
+    surfaces = (
+        quad([(-3, -1, 0), (3, -1, 0), (3, -1, -4), (-3, -1, -4)], wall),
+        quad([(-3, -1, -4), (3, -1, -4), (3, 3, -4), (-3, 3, -4)], wall),
+        quad([(-1.5, -1, 1), (-1.5, -1, -4), (-1.5, 3, -4), (-1.5, 3, 1)], wall),
+        Surface(vertices + (0.1, -0.3, -2.5), faces, polished, normals=normals),
+        quad([(0.9, -1, -3.5), (1.5, -1, -2.2), (1.5, 0.6, -2.2), (0.9, 0.6, -3.5)], polished),
+    )
+    view = Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=50, width=WIDTH, height=HEIGHT)
+    return Scene("polished", surfaces, view, laser)
+
+
+def light(scene: Scene, spp: int, seed: int, *, bounces: int = 3, filtered: bool = False) -> Traced:
+    forced = {"bounces": bounces, "spp": spp, "grid": 2, "filter": filtered, "least_share": 1.0}
+    settings = RenderSettings(**forced, direct_tolerance_m=1e-3)
+    plan = Plan(**forced, direct_tolerance_m=1e-3, ambient=False, reasons=())
+    return trace(World(scene), plan, settings, seed=seed, checked=np.arange(0, WIDTH * HEIGHT, 3))
+
+
+def totals(traced: Traced) -> np.ndarray:
+    samples = traced.indirect_samples
+    return np.bincount(samples.pixel, weights=samples.radiance, minlength=len(traced.origin_m))
+
+
+@pytest.fixture
+def by_chance(monkeypatch):
+    """Turns the paths that begin on polished surfaces off."""
+
+    def off() -> None:
+        for module in (render.glossy, render.caustics):
+            monkeypatch.setattr(module, "glossy_of", lambda world: None)
+
+    return off
+
+
+@pytest.mark.parametrize("smooth", [False, True], ids=["facets", "smooth"])
+@pytest.mark.parametrize("laser", LASERS)
+@pytest.mark.parametrize("material", [METAL, GLOSS], ids=["metal", "gloss"])
+def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, by_chance):
+    scene = room(material, LASERS[laser], smooth=smooth)
+    assert glossy_of(World(scene)) is not None
+    seeds = range(4)
+    both = np.array([totals(light(scene, 512, seed)) for seed in seeds])
+    by_chance()
+    alone = np.array([totals(light(scene, 2048, 100 + seed)) for seed in seeds])
+    noise = np.hypot(*(runs.sum(axis=1).std(ddof=1) / len(seeds) ** 0.5 for runs in (both, alone)))
+    off = both.sum(axis=1).mean() - alone.sum(axis=1).mean()
+    assert abs(off) < 5 * noise
+    assert noise < 0.06 * alone.sum() / len(seeds)
+
+
+def test_a_caustic_is_even_where_paths_by_chance_find_sparks(by_chance):
+    scene = hard_case("caustic")
+
+    def scatter() -> float:
+        """Of the pixels' totals from seed to seed, where the panel throws light by the closed form."""
+        runs = [totals(light(scene, 64, seed, bounces=2)) for seed in range(6)]
+        return float(np.sqrt(np.var(runs, axis=0, ddof=1).sum()) / np.mean(runs, axis=0).sum())
+
+    even = scatter()
+    by_chance()
+    assert even < 0.1 * scatter()
+
+
+def test_stated_noise_is_that_of_other_seeds():
+    scene = room(replace(METAL, roughness=0.02), LASERS["flash"])
+    runs = [light(scene, 64, seed) for seed in range(12)]
+    true = np.var([totals(run) for run in runs], axis=0, ddof=1).sum()
+    stated = np.mean([(run.indirect.noise**2).sum() for run in runs])
+    assert 0.6 < stated / true < 1.6
+
+
+@pytest.mark.parametrize("filtered", [False, True], ids=["unbiased", "filtered"])
+def test_watched_pixels_have_the_same_light(filtered):
+    scene = room(replace(METAL, roughness=0.02), LASERS["flash"])
+    traced = light(scene, 64, 3, filtered=filtered)
+    watched = traced.indirect.watched
+    share = watched.radiance.mean(axis=1).sum() / totals(traced)[watched.pixels].sum()
+    assert share == pytest.approx(1, rel=1e-5 if not filtered else 1e-3)
+
+
+def test_same_seed_same_light():
+    scene = room(GLOSS, LASERS["flash"])
+    one, other = (light(scene, 32, 5).samples for _ in range(2))
+    assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_paths_begin_where_something_shines_and_a_few_elsewhere():
+    world = World(room(METAL, LASERS["flash"]))
+    glossy = glossy_of(world)
+    assert set(glossy.shares) == {0.0, ELSEWHERE, 1.0}
+    found = list(thrown_light(world, 64, BATCHES, 3, 1))
+    assert all(part.radiance.min() > 0 and part.pixel.max() < WIDTH * HEIGHT for part in found)
+    assert np.bincount(np.concatenate([part.batch for part in found])).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("scene", "why"),
+    [
+        (room(METAL, Laser("flood", (0.1, 0, 0), 60)), "laser and camera apart"),
+        (room(METAL, Laser("scan")), "scanning"),
+        (room(Material("roughconductor", roughness=0.4, eta=2.9, k=3.1), LASERS["flash"]), "dull"),
+        (room(Material("thindielectric"), LASERS["flash"]), "glass"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_nothing_begins_elsewhere(scene, why):
+    world = World(scene)
+    assert glossy_of(world) is None and not list(thrown_light(world, 4, 1, 3, 0)), why
+
+
+def test_polished_things_behind_the_camera_alone():
+    """Lit by a lamp, seen by no pixel: none of the wider image shows them either."""
+    scene = room(METAL, LASERS["lamp"])
+    behind = quad([(-1, -1, 2), (1, -1, 2), (1, 1, 2), (-1, 1, 2)], METAL)
+    scene = replace(scene, surfaces=(*scene.surfaces[:3], behind))
+    assert glossy_of(World(scene)) is None
