@@ -1,25 +1,27 @@
-"""Paths that begin on polished surfaces, read backwards: light that these send to what the camera sees elsewhere.
+"""Paths that begin at the laser, on polished surfaces: light that these throw on what the camera sees.
 
-A path x1, x2, ..., xk from the camera, x1 polished, is one of pixel i, in the image or beside it. From its other end it
-is a path of the pixel j that shows xk: C, xk, ..., x1, L, as camera and laser coincide. With W the weight of the path
-up to xk (reflectance over density) and f cos I / d^2 what a laser at the camera does at xk, pixel j has from it
+A path L, x1, x2, ..., xk, x1 polished, is light of the pixel that shows xk. Paths are spread evenly, n a pixel, over an
+image that the laser would take (`render.glossy`). With W the weight of the path up to xk (reflectance over density) and
+f the reflectance there, one of them adds to the pixel
 
-    X = c W f cos I / d^2 (cos a_i / cos a_j)^3 prod_m [cos_s / cos_g](in) [cos_g / cos_s](out),
+    X = c W f cos I / (n d^2) (cos a_1 / cos a_k)^3 prod_m [cos_s / cos_g](in) [cos_g / cos_s](out),
 
-where a are angles to the optical axis, as a pixel of the image plane sees (cos a)^3 of solid angle. Shading normals s
-instead of true ones g make reflection unsymmetrical (Veach 1997, section 5.3): the product runs over x1 (in from the
-camera) to xk (out to it). c is the share that other paths leave to these (`render.glossy`).
+where d is the way from xk to the camera, cos the cosine of that way, I the laser's intensity, and a are angles to the
+optical axis, as a pixel of the image plane sees (cos a)^3 of solid angle. Shading normals s instead of true ones g make
+reflection unsymmetrical (Veach 1997, section 5.3): the product runs over x1 (in from the laser) to xk (out to the
+camera). c is the share that other paths leave to these (`render.glossy`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.glossy import RATIO, begun_on_highlight, glossy_of, is_glossy, rays_from
+from render.glossy import RATIO, begun_on_highlight, glossy_of, is_glossy, laser_rays
 from render.rays import first_opaque, in_beam, pixel_of, segment, spawn, to_camera
 from render.world import Bool, Float, UInt32, World, dr, mi, upload
 
@@ -46,8 +48,10 @@ def thrown_light(world: World, paths: float, batches: int, bounces: int, seed: i
         return
     rounds = np.ceil(RATIO * paths * glossy.shares).astype(np.int64)
     ends = np.cumsum(rounds)
+    parts = np.linspace(0, ends[-1], math.ceil(ends[-1] / PATHS) + 1).astype(np.int64)
     keys = [dr.opaque(UInt32, int(number)) for number in np.random.SeedSequence(seed).generate_state(2)]
-    for lane in np.array_split(np.arange(ends[-1]), math.ceil(ends[-1] / PATHS)):
+    for begin, end in pairwise(parts):
+        lane = np.arange(begin, end)
         pixel = np.searchsorted(ends, lane, side="right")
         number = lane - (ends - rounds)[pixel]
         batch = (number + pixel) % batches
@@ -71,19 +75,7 @@ def _thrown(
     place, stride, last = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes), dr.opaque(UInt32, bounces - 1)
     key = mi.sample_tea_32(lane ^ keys[0], keys[1])
     random = mi.PCG32(initstate=mi.UInt64(key[0]), initseq=mi.UInt64(key[1]))
-    jitter = mi.Point2f(random.next_float32(), random.next_float32())
-    glossy, intensity = glossy_of(world), dr.gather(Float, world.intensity, UInt32(0))
-    ray, aim = rays_from(world, pixel, jitter.x, jitter.y, glossy.left, glossy.up, glossy.width)
-    si, _, path, _ = first_opaque(world, ray, dr.full(Bool, True, lanes))
-    active = is_glossy(world, si, si.is_valid()) & in_beam(world, si.p, pixel)
-    # one randomised (0, 2)-sequence a pixel and batch
-    shift = mi.sample_tea_32(pixel ^ keys[1], batch ^ keys[0])
-    first = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
-    sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*first), active)
-    # |aim| = 1 / cos a
-    value = weight[0] * dr.rcp(dr.norm(aim)) ** 3
-    value *= _ratio(si, si.wi) / _ratio(si, sample.wo)
-    active &= value > 0
+    si, path, sample, value, active = _begun(world, pixel, number, batch, keys, random)
     begun, start = Bool(True), mi.SurfaceInteraction3f(si)
     slot = dr.zeros(UInt32, lanes)
     while active:
@@ -95,12 +87,12 @@ def _thrown(
             value *= begun_on_highlight(world, pixel, si.p, -towards.d, start, active)
             begun = Bool(False)
         target, seen = pixel_of(world, si.p)
-        # the camera has to see it; the laser need not shine on it, as long as it does on x1
+        # the camera has to see it; the laser need not shine on it
         passed, back = segment(world, si, world.eye, active & seen)
         local = to_camera(world, si.p - world.eye)
         out = si.to_local((world.eye - si.p) / back)
         light = si.bsdf().eval(mi.BSDFContext(), si, out, active)[0] * value
-        light *= intensity * passed / dr.square(back)
+        light *= passed / dr.square(back)
         light *= _ratio(si, si.wi) / _ratio(si, out) * (back / local.z) ** 3
         light = dr.select(active & seen & dr.isfinite(light), dr.maximum(light, 0), 0)
         dr.scatter(targets, target, slot * stride + place, active)
@@ -121,6 +113,22 @@ def _thrown(
         value *= through / survive * _ratio(si, si.wi) / _ratio(si, sample.wo)
         active &= dr.isfinite(value)
     return targets, paths, values
+
+
+def _begun(world: World, pixel: Any, number: Any, batch: Any, keys: list[Any], random: Any) -> tuple[Any, ...]:
+    """x1, the path to it, a sample of where light goes from there, its value, and whether there is any."""
+    glossy, intensity = glossy_of(world), dr.gather(Float, world.intensity, UInt32(0))
+    jitter = mi.Point2f(random.next_float32(), random.next_float32())
+    ray, aim = laser_rays(world, pixel, jitter.x, jitter.y, glossy.left, glossy.up, glossy.width)
+    si, _, path, _ = first_opaque(world, ray, dr.full(Bool, True, dr.width(pixel)))
+    active = is_glossy(world, si, si.is_valid()) & in_beam(world, si.p, pixel)
+    # one randomised (0, 2)-sequence a pixel and batch
+    shift = mi.sample_tea_32(pixel ^ keys[1], batch ^ keys[0])
+    first = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
+    sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*first), active)
+    # |aim| = 1 / cos a
+    value = intensity * weight[0] * dr.rcp(dr.norm(aim)) ** 3 * _ratio(si, si.wi) / _ratio(si, sample.wo)
+    return si, path, sample, value, active & (value > 0)
 
 
 def _ratio(si: Any, local: Any) -> Any:

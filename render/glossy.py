@@ -1,13 +1,12 @@
-"""Polished surfaces that a camera with a laser sees: which paths of indirect light are better begun on them.
+"""Polished surfaces that the laser shines on: which paths of indirect light are better begun on them.
 
 Polished metal throws a flash's light as caustics on what is around it. A path from a wall meets such metal by chance
-where that sends the light back to the laser, once in ten thousand times, and is as bright then. Where camera and laser
-coincide every path may be read from both ends: begun on the metal, in a direction that its lobe sends light to, it
-finds the wall, which the camera sees, too (`render.caustics`).
+where that sends the light of the laser on its way, once in ten thousand times, and is as bright then. A path from the
+laser that begins on the metal, in a direction that its lobe sends light to, finds the wall (`render.caustics`).
 
 Both ways sample paths C ... y x L whose last point x before the laser is such metal. The one that begins on x keeps
 
-    c = r / (1 + r),   r = RATIO pi D / (4 cos) (|y - C| / |x - C|)^2,
+    c = r / (1 + r),   r = RATIO pi D / (4 cos) (|y - C| / |x - L|)^2,
 
 the other 1 - c: the balance heuristic (Veach 1997, eq. 9.8) for the two densities of the pair x, y, a GGX lobe's D / 4
 beside a diffuse one's cos / pi. Whatever c is, the sum of both is right, as long as both take it from the same points.
@@ -23,16 +22,17 @@ import numpy as np
 from render.rays import camera_rays, first_opaque, raster_of, shape_index
 from render.world import Bool, Float, UInt32, World, dr, upload
 
-RATIO = 2.0  # paths that begin in a polished pixel, for every path of others (1 to 2 do best)
+RATIO = 2.0  # paths that begin in a polished pixel of the laser's image, for every path of others (1 to 2 do best)
 # Where SEEN_BY x SEEN_BY rays a pixel meet no polished surface there may be a sliver: the share that begins there.
 SEEN_BY, ELSEWHERE = 2, 1 / 8
-WIDEST_DEG = 60.0  # off the optical axis, how far such surfaces are looked for that the laser lights beside the image
+WIDEST_DEG = 60.0  # off the optical axis, how far such surfaces are looked for
 LEAST_COSINE = 1e-2
 
 
 class Glossy(NamedTuple):
-    """How many paths begin in each pixel, 1 where it shows polished surfaces, for numpy and Dr.Jit; of an image that is
-    `width` x `height`, and so much to the `left` of the real one and `up`, as far as the laser shines."""
+    """An image as an eye in the laser's place has it that looks as the camera does: how many paths begin in each pixel,
+    1 where it shows polished surfaces, for numpy and Dr.Jit. It is `width` x `height`, and begins so much to the `left`
+    of the camera's and `up` that it holds what the laser lights."""
 
     shares: np.ndarray
     shown: Any
@@ -43,12 +43,11 @@ class Glossy(NamedTuple):
 
 
 def glossy_of(world: World) -> Glossy | None:
-    """Where a view shows polished surfaces, looked for once; None if nowhere, or if laser and camera see other things.
+    """Where a flood laser lights polished surfaces, looked for once; None if nowhere.
 
-    Glass and cut-outs would change what a path is worth that is read backwards.
+    Glass and cut-outs on the way would need to be crossed from the other side, too.
     """
-    laser = world.scene.laser
-    if not world.has_glints or world.sees_through or laser.mode != "flood" or not laser.is_colocated:
+    if not world.has_glints or world.sees_through or world.scene.laser.mode != "flood":
         return None
     if world.glossy is None:
         world.glossy = _look_for(world)
@@ -76,17 +75,17 @@ def _shows(world: World, pixel: Any, left: Any, up: Any, width: Any, height: Any
     shown = Bool(False)
     for place in range(SEEN_BY**2):
         x, y = ((part + 0.5) / SEEN_BY for part in (place % SEEN_BY, place // SEEN_BY))
-        ray, _ = rays_from(world, pixel, x, y, left, up, width)
+        ray, _ = laser_rays(world, pixel, x, y, left, up, width)
         si, _, _, _ = first_opaque(world, ray, Bool(True))
         hit = si.is_valid()
         shown |= hit & is_glossy(world, si, hit)
     return shown
 
 
-def rays_from(world: World, pixel: Any, x: Any, y: Any, left: Any, up: Any, width: Any) -> tuple[Any, Any]:
-    """`camera_rays` through places in pixels of the wider image."""
+def laser_rays(world: World, pixel: Any, x: Any, y: Any, left: Any, up: Any, width: Any) -> tuple[Any, Any]:
+    """`camera_rays` from the laser through places in pixels of its image."""
     column, row = Float(pixel % width) - Float(left), Float(pixel // width) - Float(up)
-    return camera_rays(world, column + x, row + y)
+    return camera_rays(world, column + x, row + y, world.laser)
 
 
 def is_glossy(world: World, si: Any, active: Any) -> Any:
@@ -102,7 +101,7 @@ def left_to_paths(world: World, point: Any, direction: Any, end: Any, active: An
     glossy = glossy_of(world)
     if glossy is None:
         return 1
-    x, y, seen = raster_of(world, end.p)
+    x, y, seen = raster_of(world, world.laser, end.p)
     column, row = dr.floor(x) + Float(glossy.left), dr.floor(y) + Float(glossy.up)
     seen &= (column >= 0) & (column < Float(glossy.width)) & (row >= 0) & (row < Float(glossy.height))
     seen &= is_glossy(world, end, active)
@@ -119,12 +118,12 @@ def begun_on_highlight(world: World, pixel: Any, point: Any, direction: Any, end
 
 
 def _odds(world: World, point: Any, direction: Any, end: Any, active: Any) -> Any:
-    to_camera, way, normal = world.eye - end.p, -dr.normalize(direction), end.sh_frame.n
-    view = dr.normalize(to_camera)
+    to_laser, way, normal = world.laser - end.p, -dr.normalize(direction), end.sh_frame.n
+    light = dr.normalize(to_laser)
     cosine = dr.dot(normal, way)
     rough2 = dr.square(dr.gather(Float, world.roughness, shape_index(end), active))
-    between = dr.square(dr.dot(normal, dr.normalize(view + way)))
+    between = dr.square(dr.dot(normal, dr.normalize(light + way)))
     facets = rough2 / (math.pi * dr.square(between * (rough2 - 1) + 1))
     odds = RATIO * math.pi / 4 * facets / dr.maximum(dr.abs(cosine), LEAST_COSINE)
-    odds *= dr.squared_norm(point - world.eye) / dr.squared_norm(to_camera)
-    return dr.select(dr.isfinite(odds) & (cosine * dr.dot(normal, view) > 0), odds, 0)
+    odds *= dr.squared_norm(point - world.eye) / dr.squared_norm(to_laser)
+    return dr.select(dr.isfinite(odds) & (cosine * dr.dot(normal, light) > 0), odds, 0)

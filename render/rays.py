@@ -9,12 +9,13 @@ from render.world import OPACITY, Bool, Float, UInt32, World, dr, mi
 MAX_LAYERS = 64  # of glass and cut-outs that one ray passes
 
 
-def camera_rays(world: World, x: Any, y: Any) -> tuple[Any, Any]:
-    """Rays from the camera's centre through raster positions, and their camera-frame directions with z = 1."""
+def camera_rays(world: World, x: Any, y: Any, eye: Any = None) -> tuple[Any, Any]:
+    """Rays from the camera's centre through raster positions, and their camera-frame directions with z = 1; from
+    another `eye` that looks as the camera does, if there is one."""
     local = mi.Vector3f(
         (x - Float(world.width) / 2) / world.focal_px, (y - Float(world.height) / 2) / world.focal_px, 1
     )
-    return mi.Ray3f(mi.Point3f(world.eye), dr.normalize(to_world(world, local))), local
+    return mi.Ray3f(mi.Point3f(world.eye if eye is None else eye), dr.normalize(to_world(world, local))), local
 
 
 def to_world(world: World, local: Any) -> Any:
@@ -180,15 +181,16 @@ def in_beam(world: World, point: Any, pixel: Any) -> Any:
 def pixel_of(world: World, point: Any, *, columns: bool = True) -> tuple[Any, Any]:
     """The flat pixel in whose pyramid a point lies, and whether there is one; not in which of its row's `columns` if
     these do not matter."""
-    column, row, seen = raster_of(world, point)
+    column, row, seen = raster_of(world, world.eye, point)
     column, row = dr.floor(column) if columns else Float(0), dr.floor(row)
     inside = seen & (row >= 0) & (row < Float(world.height)) & (column >= 0) & (column < Float(world.width))
     return UInt32(dr.select(inside, row, 0)) * world.width + UInt32(dr.select(inside, column, 0)), inside
 
 
-def raster_of(world: World, point: Any) -> tuple[Any, Any, Any]:
-    """Where a point lies in the image's plane, in pixels from its corner, and whether it lies before the camera."""
-    local = to_camera(world, mi.Vector3f(point) - world.eye)
+def raster_of(world: World, eye: Any, point: Any) -> tuple[Any, Any, Any]:
+    """Where an eye that looks as the camera does sees a point: in pixels from the image's corner; and whether it lies
+    before it."""
+    local = to_camera(world, mi.Vector3f(point) - eye)
     x, y = (local[axis] / local.z * world.focal_px for axis in range(2))
     return x + Float(world.width) / 2, y + Float(world.height) / 2, local.z > 0
 

@@ -26,14 +26,16 @@ def compiled(work) -> int:
     return sum(not kernel["cache_hit"] or kernel["cache_disk"] for kernel in history)
 
 
-def room(seed: int, kinds: tuple[str, ...], *, balls: int = 2, detail: int = 2, mirrors: int = 0) -> Scene:
+def room(
+    seed: int, kinds: tuple[str, ...], *, balls: int = 2, detail: int = 2, mirrors: int = 0, roughness: float = 0.1
+) -> Scene:
     """A box with balls of random albedo and place, seen from a random place."""
     rng = np.random.default_rng(seed)
     vertices, faces, uv = box((4, 3, 5))
     surfaces = [Surface(vertices - (0, 0, 1.5), faces[:, ::-1], Material(albedo=rng.uniform(0.2, 0.9)), uv=uv)]
     for i in range(balls):
         vertices, faces, uv = sphere(rng.uniform(0.1, 0.3), detail + i % 2)
-        material = Material(kinds[i % len(kinds)], albedo=rng.uniform(0.1, 0.9))
+        material = Material(kinds[i % len(kinds)], albedo=rng.uniform(0.1, 0.9), roughness=roughness)
         surfaces.append(Surface(vertices + rng.uniform((-1, -1, -3), (1, 1, -2)), faces, material, uv=uv))
     for _ in range(mirrors):
         vertices, faces, uv = rectangle()
@@ -64,6 +66,15 @@ def test_albedos_objects_and_triangles_compile_nothing(kinds):
     ]
     views = [compiled(lambda scene=scene: render(scene, SETTINGS)) for scene in scenes]
     assert views[2:] == [0, 0], views
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_polished_metal_compiles_nothing_from_the_third_view_on(filtered):
+    """Highlights and caustics, whose launches are as long as what the view shows of the metal."""
+    settings, kinds = replace(SETTINGS, filter=filtered), ("roughconductor", "diffuse")
+    scenes = [room(seed, kinds, balls=3, roughness=0.03) for seed in range(5)]
+    views = [compiled(lambda scene=scene: render(scene, settings)) for scene in scenes]
+    assert views[2:] == [0, 0, 0], views
 
 
 def test_specular_light_compiles_nothing_from_the_third_view_on():
