@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.returns import Samples, concatenate, no_samples, packed
+from render.returns import Samples, no_samples, packed
 from render.world import Float, UInt32, dr, mi
 
 UInt64 = mi.UInt64
@@ -108,14 +108,17 @@ class Rows:
         Energy and centroid are exact; a sample is uniform over the widest interval around its centroid in its cell.
         """
         energy, moment = self.energy.numpy(), self.moment.numpy()
-        parts = [no_samples()]
+        found, done = no_samples(np.count_nonzero(energy)), 0
         for first in range(0, len(energy), READ):
             filled = np.flatnonzero(energy[first : first + READ]) + first
             units, moments = energy[filled].astype(np.float64), moment[filled].astype(np.float64)
             row, cell = np.divmod(filled, self.cells.count)
             share = np.clip(moments / units, 0, 1)
-            parts.append(cell_samples(self.cells, pixels[row], origin_m[row], cell, units * self.quantum, share))
-        return concatenate(parts)
+            part = cell_samples(self.cells, pixels[row], origin_m[row], cell, units * self.quantum, share)
+            for column, values in zip(found, part, strict=True):
+                column[done : done + len(filled)] = values
+            done += len(filled)
+        return found
 
     def sums(self) -> tuple[np.ndarray, np.ndarray]:
         """Radiance of every cell, and its moment in the cell's width, (rows, cells) float64."""

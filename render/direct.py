@@ -13,7 +13,7 @@ from render.rays import camera_rays, first_opaque
 from render.returns import Samples, concatenate, merge, packed
 from render.world import Bool, Float, UInt32, World, dr
 
-LANES = 1 << 21
+LANES, LEAST_ROWS = 1 << 19, 16
 REFINE = 6
 # A footprint whose smaller half span is below this is as good as uniform: a thirtieth of the reference sensor's bin.
 NARROW_M = 1e-3
@@ -68,12 +68,12 @@ def direct_light(
     Small cells that are not cut, and whose neighbours lie on the same surface, take their spread of path lengths from
     them instead of from the tangent plane (`render.edges.first_edges`).
 
-    Pixels are treated in groups of whole rows, about LANES rays each. Neither across edges of groups nor, where not all
-    pixels are asked for, across edges of pixels are cells compared.
+    Pixels are treated in groups of whole rows, at least LEAST_ROWS and about LANES rays each. Neither across edges of
+    groups nor, where not all pixels are asked for, across edges of pixels are cells compared.
     """
     least_share = least_share_of(grid) if least_share is None else least_share
     width = world.scene.camera.width
-    per_chunk = max(1, LANES // (grid * grid * width)) * width
+    per_chunk = max(LEAST_ROWS, LANES // (grid * grid * width)) * width
     parts = [
         _chunk(world, pixels[i : i + per_chunk], grid, tolerance_m, refine, least_share)
         for i in range(0, max(len(pixels), 1), per_chunk)

@@ -234,9 +234,8 @@ def collect(
     done = 0
     for shared in (False, True):
         numbers = np.flatnonzero(schedule.shared == shared)
-        for first in range(0, len(numbers), per_chunk):
+        for chosen in np.array_split(numbers, math.ceil(len(numbers) / per_chunk)) if len(numbers) else ():
             say(done / len(schedule.rounds))
-            chosen = numbers[first : first + per_chunk]
             done += len(chosen)
             pixels = schedule.pixels.reshape(-1, BLOCK)[chosen].ravel()
             rounds = schedule.rounds[chosen]
@@ -260,10 +259,10 @@ def collect(
                     dr.sync_thread()
                 launches += 1
                 add_paths(world, pixels, turns, bounces, seed, sums, schedule.batches, shared=shared, regions=regions)
-            if regions is not None:
-                regions.read(sums)
             if regions is None or launches > 1:  # the next regions take the memory of the last
                 release(world.scene.camera.height * world.scene.camera.width)  # what the launches took
+            if regions is not None:
+                regions.read(sums)
             totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
             samples = rows.samples(pixels, origin_m[pixels])
             del rows, sums, regions  # before the next ones are there

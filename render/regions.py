@@ -136,7 +136,7 @@ class Regions:
         self._first, self._cells = (upload(UInt32, np.append(part, 0)) for part in (np.cumsum(cells) - cells, cells))
         size = max(int(cells.sum()), 1)
         self.energy = dr.zeros(UInt64, size * self.batches)
-        self.growing = [dr.zeros(UInt64, size * self.batches) for _ in range(3)]
+        self.growing = [dr.zeros(UInt64, size) for _ in range(3)]
         self.paths, self.filled = dr.zeros(UInt64, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
 
     def _key(self, point: Point, octave: Any) -> Any:
@@ -205,8 +205,8 @@ class Regions:
         x = dr.maximum(path_m - dr.gather(Float, self._base, row, lit), 0) / dr.gather(Float, self._width, octave)
         cell = dr.minimum(UInt32(dr.log(1 + GROWTH * x) / GROWTH), dr.gather(UInt32, self._cells, row, lit) - 1)
         value = radiance / point.reflectance * self._per_quantum * (Float(weight) / FULL)
-        index = (dr.gather(UInt32, self._first, row, lit) + cell) * self.batches + batch
-        add_quanta(self.energy, value, index, lit)
+        index = dr.gather(UInt32, self._first, row, lit) + cell
+        add_quanta(self.energy, value, index * self.batches + batch, lit)
         dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, lit, mode=dr.ReduceMode.Direct)
         for target, part in zip(self.growing, -towards, strict=True):
             add_quanta(target, value * dr.clip(0.5 + 0.5 * part, 0, 1), index, lit)
@@ -261,10 +261,15 @@ class Regions:
         normal = dr.normalize(mi.Vector3f(right, up, back))
         return place, octave, row, weight, Point(mi.Point3f(x, y, z) / weight, normal, path / weight, weight)
 
-    def _cell(self, index: Any) -> tuple[Any, Any]:
-        """A cell's energy, and the sum over it of the directions in which its light's path grows."""
-        energy = Float(dr.gather(UInt64, self.energy, index))
-        return energy, mi.Vector3f(*(2 * Float(dr.gather(UInt64, part, index)) - energy for part in self.growing))
+    def _energies(self, index: Any) -> list:
+        """Every batch's energy in a cell."""
+        return [Float(dr.gather(UInt64, self.energy, index * self.batches + b)) for b in range(self.batches)]
+
+    def _growing(self, index: Any, energies: list) -> Any:
+        """Mean direction in which the path of a cell's light grows; of all batches, whose energies these are."""
+        energy = sum(energies[1:], energies[0])
+        parts = (2 * Float(dr.gather(UInt64, part, index)) - energy for part in self.growing)
+        return dr.select(energy > 0, mi.Vector3f(*parts) / energy, 0)
 
     @dr.syntax
     def _read(self, sums: Sums, reading: Any, batch: Any) -> Any:
@@ -276,18 +281,15 @@ class Regions:
         totals = [dr.zeros(Float, dr.width(place)) for _ in range(self.batches)]
         while cell < cells:
             low, high = reading.base + _edge(cell) * width, reading.base + _edge(cell + 1) * width
+            energies = self._energies(index)
+            later = dr.dot(self._growing(index, energies), off)
             if dr.hint(batch is None, mode="scalar"):
-                found = [self._cell(index * self.batches + b) for b in range(self.batches)]
-                energy, growing = _sum(found)
-                totals = _plus(totals, found, weight)
+                totals = _plus(totals, energies, weight)
+                energy = sum(energies[1:], energies[0]) * weight
+                sums.spread(place, low + later, high + later, energy, energy > 0)
             else:
-                energy, growing = self._cell(index * self.batches + batch)
-            lit = energy > 0
-            later = dr.select(lit, dr.dot(growing, off) / energy, 0)
-            if dr.hint(batch is None, mode="scalar"):
-                sums.spread(place, low + later, high + later, energy * weight, lit)
-            else:
-                sums.spread_watched(place, batch, low + later, high + later, energy * weight, lit)
+                energy = Float(dr.gather(UInt64, self.energy, index * self.batches + batch)) * weight
+                sums.spread_watched(place, batch, low + later, high + later, energy, energy > 0)
             cell += 1
             index += 1
         return totals
@@ -305,15 +307,8 @@ class _Reading(NamedTuple):
     off: Any
 
 
-def _plus(totals: list, cells: list, weight: Any) -> list:
-    return [total + energy * weight for total, (energy, _) in zip(totals, cells, strict=True)]
-
-
-def _sum(cells: list) -> tuple[Any, Any]:
-    energy, growing = cells[0]
-    for more, also in cells[1:]:
-        energy, growing = energy + more, growing + also
-    return energy, growing
+def _plus(totals: list, energies: list, weight: Any) -> list:
+    return [total + energy * weight for total, energy in zip(totals, energies, strict=True)]
 
 
 def _edge(cell: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -25,26 +26,28 @@ SORTED = 1 << 19  # samples sorted at a time
 
 
 class Growing:
-    """Samples that come part by part, in columns that grow in place: joining parts at the end would hold all twice."""
+    """Samples that come part by part. They are joined one column at a time: no more than one is ever held twice."""
 
     def __init__(self) -> None:
-        self._columns = list(no_samples())
+        self._columns: list[list[np.ndarray]] = [[column] for column in no_samples()]
+        self._count = 0
 
     def __len__(self) -> int:
-        return len(self._columns[0])
+        return self._count
 
     def add(self, part: Samples) -> None:
-        before = len(self)
-        for column, more in zip(self._columns, part, strict=True):
-            # no view of a column is out, as `refcheck` would have it: only `finished` hands them over
-            column.resize(before + len(more), refcheck=False)
-            column[before:] = more
+        for parts, column in zip(self._columns, packed(*part), strict=True):
+            parts.append(column)
+        self._count += len(part.pixel)
 
-    def finished(self) -> Samples:
-        """All samples; nothing more can be added."""
-        samples = Samples(*self._columns)
-        del self._columns
-        return samples
+    def finished(self, release: Callable[[], None] = lambda: None) -> Samples:
+        """All samples; nothing more can be added. `release` is called before each column is joined: the parts of the
+        last one are free then."""
+        joined = []
+        while self._columns:
+            release()
+            joined.append(np.concatenate(self._columns.pop(0)))
+        return Samples(*joined)
 
 
 class Returns(NamedTuple):
@@ -133,6 +136,6 @@ def to_returns(samples: Samples, pixels: int) -> Returns:
     return returns
 
 
-def no_samples() -> Samples:
-    """An empty list of samples."""
-    return Samples(*(np.empty(0, kind) for kind in COLUMN_TYPES))
+def no_samples(room: int = 0) -> Samples:
+    """An empty list of samples, or room for so many."""
+    return Samples(*(np.empty(room, kind) for kind in COLUMN_TYPES))

@@ -31,7 +31,7 @@ from render.world import Bool, Float, UInt32, World, dr, mi
 # Of one launch, 40 and 75 MB in its course. Python records a launch for as long as some 2^16 connections take.
 LANES = 1 << 20  # connections
 PATHS = 1 << 18
-FILTERED_PATHS = 1 << 17  # which may have connections, too
+FILTERED_PATHS = 1 << 16  # which may have connections, too
 
 
 def add_paths(

@@ -112,13 +112,13 @@ def trace(
     direct = direct._replace(samples=no_samples())  # they are in the list now
     ends = len(light), len(light) + len(specular.samples.pixel)
     light.add(specular.samples)
-    release(len(pixels))
     if schedule is not None:
         its_seed = derived_seed(seed, STAGE_INDIRECT)
         indirect = _indirect(world, plan, settings, schedule, its_seed, origin_m, brightest, checked, light, say)
         rays += schedule.rays(plan.bounces)
     reasons = (*specular.notes, *reasons)
-    return Traced(light.finished(), ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
+    samples = light.finished(lambda: release(len(pixels)))
+    return Traced(samples, ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
 
 
 def _indirect(
