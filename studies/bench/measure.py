@@ -19,7 +19,6 @@ from studies.bench.errors import Judge, Reference
 from studies.bench.peers import Peer
 from studies.bench.settings import BIN_M, BINS, BOUNCES, Method
 
-WARM_UP_BELOW_S = 0.5  # after a faster first call one more is thrown away: memory is mapped only then
 DETERMINISTIC = "grid"
 
 
@@ -72,14 +71,20 @@ class Runner:
 
 
 def our_runner(world: World, method: Method, transport: str) -> Runner:
-    """Trace and bin."""
-    camera = world.scene.camera
+    """Trace and bin.
+
+    The last histogram is dropped right before the next is made, in its place. Tracing gives freed memory back to the
+    system, and the peer does not: to map a histogram's pages anew can take as long as tracing.
+    """
+    camera, kept = world.scene.camera, []
 
     def run(quality: int, seed: int) -> np.ndarray:
         samples = ours.trace(world, method, BOUNCES[transport], quality, seed)
-        return binned(samples, camera.width * camera.height, BINS, BIN_M)
+        kept.clear()
+        kept.append(binned(samples, camera.width * camera.height, BINS, BIN_M))
+        return kept[0]
 
-    return Runner(method, run)
+    return Runner(method, run, kept.clear)
 
 
 def peer_runner(peer: Peer, method: Method) -> Runner:
@@ -96,17 +101,18 @@ def peer_runner(peer: Peer, method: Method) -> Runner:
 def measure_level(
     level: list[tuple[Runner, int]], reference: Reference, repeats: int, seeds: int, first_seed: int = 1
 ) -> Iterator[tuple[Runner, int, dict]]:
-    """Time and judge each (runner, quality): `repeats` warm runs of different seeds, `seeds` of them judged."""
+    """Time and judge each (runner, quality): `repeats` warm runs of different seeds, `seeds` of them judged.
+
+    The same method runs once untimed before every timed run, so that none pays for the memory that another left.
+    """
     cold = [_first_call(runner, quality) for runner, quality in level]
     judges = [Judge(reference) for _ in level]
     seconds: list[list[float]] = [[] for _ in level]
     order = list(range(len(level)))
-    for i in order:
-        if cold[i] < WARM_UP_BELOW_S:
-            level[i][0].run(level[i][1], 0)
     for number in range(max(repeats, seeds)):
         for i in order:
             runner, quality = level[i]
+            runner.run(quality, 0)
             start = time.perf_counter()
             histogram = runner.run(quality, first_seed + number)
             seconds[i].append(time.perf_counter() - start)
