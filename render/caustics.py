@@ -46,7 +46,7 @@ def thrown_light(world: World, paths: float, batches: int, bounces: int, seed: i
     glossy = glossy_of(world)
     if glossy is None:
         return
-    rounds = np.ceil(RATIO * paths * glossy.shares).astype(np.int64)
+    rounds = np.ceil(RATIO * paths * np.array(glossy.shares, np.float64)).astype(np.int64)
     ends = np.cumsum(rounds)
     parts = np.linspace(0, ends[-1], math.ceil(ends[-1] / PATHS) + 1).astype(np.int64)
     keys = [dr.opaque(UInt32, int(number)) for number in np.random.SeedSequence(seed).generate_state(2)]

@@ -31,11 +31,10 @@ LEAST_COSINE = 1e-2
 
 class Glossy(NamedTuple):
     """An image as an eye in the laser's place has it that looks as the camera does: how many paths begin in each pixel,
-    1 where it shows polished surfaces, for numpy and Dr.Jit. It is `width` x `height`, and begins so much to the `left`
-    of the camera's and `up` that it holds what the laser lights."""
+    1 where it shows polished surfaces. It is `width` x `height`, and begins so much to the `left` of the camera's and
+    `up` that it holds what the laser lights. Arrays of Dr.Jit."""
 
-    shares: np.ndarray
-    shown: Any
+    shares: Any
     left: Any
     up: Any
     width: Any
@@ -51,10 +50,11 @@ def glossy_of(world: World) -> Glossy | None:
         return None
     if world.glossy is None:
         world.glossy = _look_for(world)
-    return world.glossy if world.glossy.shares.any() else None
+    return Glossy(*world.glossy) if world.glossy else None
 
 
-def _look_for(world: World) -> Glossy:
+def _look_for(world: World) -> tuple[Any, ...]:
+    """The parts of `Glossy`, none if nowhere: a plain tuple, which recordings take for an input."""
     camera, laser = world.scene.camera, world.scene.laser
     angle = min(math.acos(laser.cos_half_angle(camera)), math.radians(WIDEST_DEG))
     reach = camera.focal_px * math.tan(angle)
@@ -65,10 +65,11 @@ def _look_for(world: World) -> Glossy:
     numbers = [dr.opaque(UInt32, number) for number in (left, up, width, height)]
     polished = world.recordings.call(world, "glossy", _shows, pixel, *numbers).numpy().reshape(height, width)
     shares = polished.astype(np.float64)
-    if polished.any():
-        own = shares[up : up + camera.height, left : left + camera.width]
-        own[own == 0] = ELSEWHERE
-    return Glossy(shares.ravel(), upload(Float, shares), *numbers)
+    if not polished.any():
+        return ()
+    own = shares[up : up + camera.height, left : left + camera.width]
+    own[own == 0] = ELSEWHERE
+    return upload(Float, shares), *numbers
 
 
 def _shows(world: World, pixel: Any, left: Any, up: Any, width: Any, height: Any) -> Any:
@@ -106,14 +107,14 @@ def left_to_paths(world: World, point: Any, direction: Any, end: Any, active: An
     seen &= (column >= 0) & (column < Float(glossy.width)) & (row >= 0) & (row < Float(glossy.height))
     seen &= is_glossy(world, end, active)
     pixel = UInt32(dr.select(seen, row, 0)) * glossy.width + UInt32(dr.select(seen, column, 0))
-    odds = dr.gather(Float, glossy.shown, pixel, seen) * _odds(world, point, direction, end, seen)
+    odds = dr.gather(Float, glossy.shares, pixel, seen) * _odds(world, point, direction, end, seen)
     return dr.select(seen, 1 / (1 + odds), 1)
 
 
 def begun_on_highlight(world: World, pixel: Any, point: Any, direction: Any, end: Any, active: Any) -> Any:
     """c: what the path that begins in this pixel, on `end`, and goes to `point` has of that light; `direction` is the
     way back."""
-    odds = dr.gather(Float, glossy_of(world).shown, pixel, active) * _odds(world, point, direction, end, active)
+    odds = dr.gather(Float, glossy_of(world).shares, pixel, active) * _odds(world, point, direction, end, active)
     return dr.select(active, odds / (1 + odds), 0)
 
 

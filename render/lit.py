@@ -46,7 +46,7 @@ def is_wide(world: World) -> bool:
 class Lit(NamedTuple):
     """Points of a launch, `each` for every batch: direction and optical path to the laser, irradiance, and density.
 
-    `density` is that of one point per area [1/m^2].
+    `density` is that of one point per area [1/m^2]. At the end are a few that belong to no batch.
     """
 
     si: Any
@@ -64,30 +64,48 @@ def lit_points(world: World, lanes: int, batches: int, key: tuple[Any, Any]) -> 
     each = max(1, (1 << (wanted - 1).bit_length()) // parts)
     count = each * parts
     opaque = dr.opaque(UInt32, each)
-    index = dr.arange(UInt32, count)
+    index = dr.arange(UInt32, count + 3)  # of no other input's length (`render.paths`)
+    dr.eval(index)
+    parts, *columns = world.recordings.call(world, "lit points", _lit_points, index, opaque, *key)
+    return Lit(of_parts(parts), *columns, opaque)
+
+
+def _lit_points(world: World, index: Any, each: Any, *key: Any) -> tuple[Any, ...]:
+    """The parts of `Lit`, in plain tuples."""
     # each batch has a randomised (0, 2)-sequence of its own
-    shift = mi.sample_tea_32(index // opaque + key[0], dr.zeros(UInt32, count) + key[1])
-    number = index % opaque
+    shift = mi.sample_tea_32(index // each + key[0], index * 0 + key[1])
+    number = index % each
     u, v = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
     height = u * _cap(world)
     ring = dr.sqrt(dr.maximum(height * (2 - height), 0))
     sine, cosine = dr.sincos(2 * math.pi * v)
     towards = to_world(world, mi.Vector3f(ring * cosine, ring * sine, 1 - height))
-    ray = mi.Ray3f(mi.Point3f(world.laser) + dr.zeros(mi.Point3f, count), towards)
-    si, _, _, _ = first_opaque(world, ray, dr.full(Bool, True, count))
+    ray = mi.Ray3f(mi.Point3f(world.laser) + 0 * towards, towards)
+    si, _, _, _ = first_opaque(world, ray, Bool(True))
     found = si.is_valid()
-    to_laser, irradiance, path = laser_light(world, si, dr.zeros(UInt32, count), found, seen_by_camera=None)
-    lit = Lit(kept(si), to_laser, path, irradiance, density_of(world, si, to_laser), opaque)
-    dr.eval(*lit)
-    return lit
+    to_laser, irradiance, path = laser_light(world, si, 0 * index, found, seen_by_camera=None)
+    return parts_of(si), to_laser, path, irradiance, density_of(world, si, to_laser)
+
+
+_KEPT = ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index")
+
+
+def parts_of(si: Any) -> tuple[Any, ...]:
+    """What reflectance and rays need of an interaction."""
+    return tuple(getattr(si, name) for name in _KEPT)
+
+
+def of_parts(parts: tuple[Any, ...]) -> Any:
+    """The interaction with these parts alone."""
+    few = dr.zeros(mi.SurfaceInteraction3f, dr.width(parts[0]))
+    for name, part in zip(_KEPT, parts, strict=True):
+        setattr(few, name, part)
+    return few
 
 
 def kept(si: Any) -> Any:
-    """The interaction with what reflectance and rays need of it alone: most of a launch's memory is interactions."""
-    few = dr.zeros(mi.SurfaceInteraction3f, dr.width(si.p))
-    for name in ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index"):
-        setattr(few, name, getattr(si, name))
-    return few
+    """The interaction with what is needed of it alone: most of a launch's memory is interactions."""
+    return of_parts(parts_of(si))
 
 
 def density_of(world: World, si: Any, to_laser: Any) -> Any:

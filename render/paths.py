@@ -7,12 +7,14 @@ pixels around it may use it, too (`render.sharing`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.glossy import left_to_paths
-from render.lit import Lit, by_chance, density_of, is_wide, joined, joins_of, kept, lit_points
+from render.glossy import glossy_of, left_to_paths
+from render.lit import Lit, by_chance, density_of, is_wide, joined, joins_of, kept, lit_points, of_parts, parts_of
 from render.rays import camera_rays, first_opaque, laser_light, shape_index, spawn
 from render.regions import Point, late_from, point_of
 from render.turns import BLOCK, Turns, block_order, turns_of
@@ -110,17 +112,72 @@ def trace_paths(
 
     Blocks share their tails if they are `shared`; for light less than `from_m` behind direct light if `shares_early`.
     """
-    lanes = len(turns.block) * BLOCK
+    lanes, vertices = len(turns.block) * BLOCK, bounces - 2
     lane = dr.arange(UInt32, lanes)
-    turn, member = lane // BLOCK, lane % BLOCK
-    block, stream, round_index, stride = (dr.gather(UInt32, upload(UInt32, column), turn) for column in turns)
-    pixels = upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF)
-    numbers = np.random.SeedSequence(seed).generate_state(4)
-    keys = [dr.opaque(UInt32, int(number)) for number in numbers[:2]]
+    dr.eval(lane)
+    seeds = np.random.SeedSequence(seed).generate_state(4)
     joins = joins_of(world, shared=shared)
-    lit = _lit(world, turns, lanes, batches, joins, numbers[2:])
-    batches = dr.opaque(UInt32, batches)
-    batch = round_index % batches
+    lit = _lit(world, turns, lanes, batches, joins, seeds[2:])
+    slots = _slots(world, lit, vertices)
+    values, paths = (dr.zeros(Float, lanes * max(slots, 1)) for _ in range(2))
+    dr.make_opaque(values, paths)  # of another length at every call
+    given = _Given(
+        lane,
+        upload(UInt32, np.append(np.stack(turns, axis=1), (0, 0))),
+        upload(UInt32, np.append(pixels.astype(np.int64) & 0xFFFFFFFF, 0)),
+        tuple(dr.opaque(UInt32, int(number)) for number in seeds[:2]),
+        dr.opaque(UInt32, batches),
+        dr.opaque(UInt32, lanes),
+        dr.opaque(UInt32, slots),
+        values,
+        paths,
+        None if lit is None else (parts_of(lit.si), *lit[1:]),
+        from_m,
+    )
+    glossy_of(world)  # looked for before anything is recorded
+    work = partial(_paths, shared=shared, joins=joins)
+    heads, near, tails, batch = world.recordings.call(world, ("paths", shared, joins), work, *given)
+    late_m = dr.full(Float, dr.inf if shared else 0, lanes) if from_m is None else heads[-2]
+    point = None if from_m is None else Point(*heads[-1])
+    return Traced(
+        Heads(heads[0], of_parts(heads[1]), *heads[2:-2], late_m, point),
+        tuple(Joined(*light) for light in near),
+        Tails(of_parts(tails[0]), *tails[1:]),
+        lit,
+        batch,
+    )
+
+
+class _Given(NamedTuple):
+    """What paths are traced from, as arrays: of every lane its number; `Turns`, those of a turn together; flat pixels;
+    keys of the random numbers; how many batches, lanes and slots of `_beyond` there are, and memory for these; parts of
+    `Lit`; and from where on light is filtered [m], or None.
+
+    Dr.Jit records anew where two inputs have one size that had not before: there are 16 n lanes, 4 n + 2 numbers of
+    turns, 16 n + 1 pixels and 2^n + 3 lit points.
+    """
+
+    lane: Any
+    turns: Any
+    pixels: Any
+    keys: tuple
+    batches: Any
+    lanes: Any
+    slots: Any
+    values: Any
+    paths: Any
+    lit: tuple | None
+    from_m: Any
+
+
+def _paths(world: World, *given: Any, shared: bool, joins: int) -> tuple[tuple, tuple, tuple, Any]:
+    """The parts of `Traced`, in plain tuples, which recordings look into."""
+    given = _Given(*given)
+    lane, keys, from_m = given.lane, given.keys, given.from_m
+    lit = None if given.lit is None else Lit(of_parts(given.lit[0]), *given.lit[1:])
+    turn, member = lane // BLOCK, lane % BLOCK
+    block, stream, round_index, stride = (dr.gather(UInt32, given.turns, 4 * turn + part) for part in range(4))
+    batch = round_index % given.batches
     # a hash of block, member and round numbers the streams, whichever launch they run in
     lane_key = mi.sample_tea_32(stream * BLOCK + member, round_index ^ keys[1])
     random = mi.PCG32(initstate=mi.UInt64(lane_key[0]), initseq=mi.UInt64(lane_key[1]))
@@ -134,11 +191,11 @@ def trace_paths(
         # one randomised (0, 2)-sequence a block and batch (Sobol 1967): the rounds of each member are an aligned run of
         # it, and as even as those of all
         shift = mi.sample_tea_32(stream, batch ^ keys[0])
-        number = member * stride + round_index // batches
+        number = member * stride + round_index // given.batches
         spread = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
         first = (number + stream * PLAIN_GOLDEN) * joins
     receiver = block * BLOCK + member
-    pixel = dr.gather(UInt32, pixels, receiver)
+    pixel = dr.gather(UInt32, given.pixels, receiver)
     valid = pixel != 0xFFFFFFFF
     pixel = dr.select(valid, pixel, 0)
     jitter = mi.Point2f(random.next_float32(), random.next_float32())
@@ -146,19 +203,31 @@ def trace_paths(
     si, transmission, path, _ = first_opaque(world, ray, valid)
     hit = valid & si.is_valid()
     shares = hit & (dr.gather(Float, world.shares, shape_index(si), hit) > 0)
-    late_m, point = dr.full(Float, dr.inf if shared else 0, lanes), None
+    late_m, point = Float(dr.inf if shared else 0), None
     if from_m is not None:
         point = point_of(si, ray, path, transmission, hit)
         late_m = late_from(world, point, from_m)
         shares &= shares_early(world)
     sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*spread), hit)
-    heads = Heads(receiver, kept(si), transmission + dr.zeros(Float, lanes), path, hit, shares, late_m, point)
+    heads = Heads(receiver, kept(si), transmission, path, hit, shares, late_m, point)
     near = _joined(world, heads, lit, batch, first, joins)
     used = shared or (from_m is not None and shares_early(world))
-    tails = _tails(world, heads, sample, weight[0], pixel, lit, joins, batch, random, bounces, used=used)
-    traced = Traced(heads, near, tails, lit, batch)
-    dr.eval(*heads, *(part for light in near for part in light), *tails, batch)
-    return traced
+    beyond = partial(_beyond, world, lit, batch, given)
+    tails = _tails(world, heads, sample, weight[0], pixel, lit, joins, random, beyond, used=used)
+    heads = receiver, parts_of(si), *map(_of_any_length, heads[2:-1]), None if point is None else tuple(point)
+    tails = parts_of(tails.si), *map(_of_any_length, tails[1:])
+    return heads, tuple(tuple(light) for light in near), tails, batch
+
+
+def _of_any_length(values: Any) -> Any:
+    """A constant as one entry: a recording would return it in the length of the launch that was recorded."""
+    constant = dr.is_array_v(values) and values.state == dr.VarState.Literal
+    return type(values)(values[0]) if constant else values
+
+
+def _slots(world: World, lit: Lit | None, vertices: int) -> int:
+    """How many lights a lane of `_beyond` may find."""
+    return (2 if lit is not None and is_wide(world) else 1) * vertices
 
 
 def shares_early(world: World) -> bool:
@@ -198,9 +267,8 @@ def _tails(
     pixel: Any,
     lit: Lit | None,
     joins: int,
-    batch: Any,
     random: Any,
-    bounces: int,
+    beyond: Callable[..., tuple[Any, ...]],
     *,
     used: bool,
 ) -> Tails:
@@ -213,7 +281,7 @@ def _tails(
     alive &= si.is_valid()
     own = dr.select(alive, heads.transmission * weight * passed, 0)
     to_laser, irradiance, laser_path = laser_light(world, si, pixel, alive, seen_by_camera=None)
-    density = density_of(world, si, to_laser) * joins
+    density = None if lit is None else density_of(world, si, to_laser) * joins
     value = si.bsdf().eval(context, si, si.to_local(to_laser), alive)[0] * irradiance
     if lit is not None:
         value *= by_chance(world, x1, sample, weight, si, density, copies_of(heads, leg + laser_path), alive)
@@ -231,7 +299,7 @@ def _tails(
     scale = dr.select(onward_weight > 0, onward_weight, 1)
     way = _Way(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, joinable, readable)
     soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
-    light = _beyond(world, lit, batch, way, alive, pixel, random, soonest, bounces - 2)
+    light = beyond(way, alive, pixel, random, soonest)
     shared = alive & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
     shared &= heads.shares & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     return Tails(
@@ -272,12 +340,12 @@ def _beyond(
     world: World,
     lit: Lit | None,
     batch: Any,
+    given: _Given,
     way: _Way,
     active: Any,
     pixel: Any,
     random: Any,
     soonest: Any,
-    vertices: int,
 ) -> tuple[Any, Any, Any, Any]:
     """Light of x3, x4, ... that goes to x2 along the way, divided by the density of the path after x2.
 
@@ -286,9 +354,7 @@ def _beyond(
     shortest path.
     """
     lanes, joining = dr.width(pixel), lit is not None and is_wide(world)
-    slots = (2 if joining else 1) * vertices
-    values, paths = (dr.zeros(Float, lanes * max(slots, 1)) for _ in range(2))
-    lane, stride, last = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes), dr.opaque(UInt32, slots)
+    lane, stride, last, values, paths = given.lane, given.lanes, given.slots, given.values, given.paths
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
     si, sample = mi.SurfaceInteraction3f(way.si), mi.BSDFSample3f(way.sample)
     weight, through, here, joinable = Float(way.weight), Float(way.through), Float(way.here), Bool(way.joinable)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.glossy import left_to_paths
-from render.lit import diffuse_share, share_by_chance
+from render.lit import diffuse_share, of_parts, parts_of, share_by_chance
 from render.paths import Traced, shares_early, trace_paths
 from render.rays import segment
 from render.regions import FULL, Regions
@@ -134,18 +134,25 @@ class _Squares:
 
 
 class _Pairs(NamedTuple):
-    """Head and tail of every pair, those of one tail together, and which group of BLOCK that is."""
+    """Head and tail of every pair, those of one tail together, and which group of BLOCK that is; its number, and which
+    tails were `chosen` (None: all)."""
 
     head: Any
     tail: Any
     group: Any
+    number: Any
+    chosen: Any = None
+
+
+def _pairs_of(number: Any, chosen: Any = None) -> _Pairs:
+    """Neighbours in a block are neighbours in the launch, which keeps rays coherent."""
+    group = number // BLOCK
+    tail = group if chosen is None else dr.gather(UInt32, chosen, group)
+    return _Pairs(tail // BLOCK * BLOCK + number % BLOCK, tail, group, number, chosen)
 
 
 def _all_pairs(lanes: int) -> _Pairs:
-    """Neighbours in a block are neighbours in the launch, which keeps rays coherent."""
-    pair = dr.arange(UInt32, lanes * BLOCK)
-    tail = pair // BLOCK
-    return _Pairs(tail // BLOCK * BLOCK + pair % BLOCK, tail, tail)
+    return _pairs_of(dr.arange(UInt32, lanes * BLOCK))
 
 
 def _pairs(traced: Traced, *, shared: bool, early: bool) -> _Pairs | None:
@@ -157,9 +164,7 @@ def _pairs(traced: Traced, *, shared: bool, early: bool) -> _Pairs | None:
     chosen = dr.compress(_early(traced))
     if dr.width(chosen) == 0:
         return None
-    pair = dr.arange(UInt32, dr.width(chosen) * BLOCK)
-    tail = dr.gather(UInt32, chosen, pair // BLOCK)
-    return _Pairs(tail // BLOCK * BLOCK + pair % BLOCK, tail, pair // BLOCK)
+    return _pairs_of(dr.arange(UInt32, dr.width(chosen) * BLOCK), chosen)
 
 
 def _early(traced: Traced) -> Any:
@@ -169,6 +174,24 @@ def _early(traced: Traced) -> Any:
     left = dr.gather(Float, heads.early_m, pairs.head) - dr.gather(Float, tails.soonest_m, pairs.tail)
     near = UInt32((left > 0) & (dr.squared_norm(x2 - x1) < dr.square(left)))
     return tails.shared & (dr.block_reduce(dr.ReduceOp.Max, near, BLOCK) > 0)
+
+
+class _Ends(NamedTuple):
+    """What pairs need of heads and tails, as arrays and plain tuples, which recordings look into: see `Heads` and
+    `Tails`."""
+
+    si1: tuple
+    transmission: Any
+    shares: Any
+    si2: tuple
+    shared: Any
+    own_transmission: Any
+    leg: Any
+    to_laser: Any
+    irradiance: Any
+    onward: Any
+    onward_direction: Any
+    density: Any
 
 
 class _Connections(NamedTuple):
@@ -181,39 +204,38 @@ class _Connections(NamedTuple):
     onward_density: Any
 
 
-def _connect(world: World, traced: Traced, pairs: _Pairs) -> _Connections:
-    heads, tails, head, tail = traced.heads, traced.tails, pairs.head, pairs.tail
-    shared = dr.gather(Bool, tails.shared, tail) & dr.gather(Bool, heads.shares, head)
-    si1 = dr.gather(mi.SurfaceInteraction3f, heads.si, head, shared)
-    si2 = dr.gather(mi.SurfaceInteraction3f, tails.si, tail, shared)
+def _connect(world: World, ends: _Ends, pairs: _Pairs) -> _Connections:
+    head, tail = pairs.head, pairs.tail
+    shared = dr.gather(Bool, ends.shared, tail) & dr.gather(Bool, ends.shares, head)
+    si1 = dr.gather(mi.SurfaceInteraction3f, of_parts(ends.si1), head, shared)
+    si2 = dr.gather(mi.SurfaceInteraction3f, of_parts(ends.si2), tail, shared)
     offset = si2.p - si1.p
     distance2 = dr.squared_norm(offset)
     direction = offset * dr.rsqrt(distance2)
     passed, leg = segment(world, si1, si2.p, shared)
     # a tail is seen from where it came, whatever rounding says
     own = head == tail
-    passed = dr.select(own, dr.gather(Float, tails.own_transmission, tail, shared), passed)
-    leg = dr.select(own, dr.gather(Float, tails.leg, tail, shared), leg)
+    passed = dr.select(own, dr.gather(Float, ends.own_transmission, tail, shared), passed)
+    leg = dr.select(own, dr.gather(Float, ends.leg, tail, shared), leg)
     active = shared & (passed > 0) & (distance2 > 0)
     context = mi.BSDFContext()
     value1, density1 = si1.bsdf().eval_pdf(context, si1, si1.to_local(direction), active)
     si2.wi = si2.to_local(-direction)
-    to_laser = si2.to_local(_gather_vector(tails.to_laser, tail, active))
+    to_laser = si2.to_local(_gather_vector(ends.to_laser, tail, active))
     value2 = si2.bsdf().eval(context, si2, to_laser, active)[0]
-    irradiance = dr.gather(Float, tails.irradiance, tail, active)
-    going = active & dr.gather(Bool, tails.onward, tail, active)
-    onward = si2.to_local(_gather_vector(tails.onward_direction, tail, going))
+    irradiance = dr.gather(Float, ends.irradiance, tail, active)
+    going = active & dr.gather(Bool, ends.onward, tail, active)
+    onward = si2.to_local(_gather_vector(ends.onward_direction, tail, going))
     value3, density3 = si2.bsdf().eval_pdf(context, si2, onward, going)
     area = dr.abs(dr.dot(si2.n, direction)) / distance2
-    reach = dr.gather(Float, heads.transmission, head, active) * value1[0] * area * passed
-    if traced.lit is not None:
-        lit_density = dr.gather(Float, tails.density, tail, active)
+    reach = dr.gather(Float, ends.transmission, head, active) * value1[0] * area * passed
+    if ends.density is not None:
         value2 *= share_by_chance(
             diffuse_share(world, si1, direction, value1[0], active),
             dr.dot(si1.sh_frame.n, direction),
             distance2,
             dr.dot(si2.n, direction),
-            lit_density,
+            dr.gather(Float, ends.density, tail, active),
             BLOCK,
         )
     value2 *= left_to_paths(world, si1.p, direction, si2, active)
@@ -239,12 +261,27 @@ class _Weights(NamedTuple):
 
 
 def _weights(world: World, traced: Traced, pairs: _Pairs) -> _Weights:
-    made = _connect(world, traced, pairs)
+    heads, tails = traced.heads, traced.tails
+    ends = _Ends(
+        parts_of(heads.si),
+        heads.transmission,
+        heads.shares,
+        parts_of(tails.si),
+        *(getattr(tails, name) for name in _Ends._fields[4:]),
+    )
+    dr.eval(pairs.number)
+    return _Weights(*world.recordings.call(world, "pairs", _weigh, pairs.number, pairs.chosen, *ends))
+
+
+def _weigh(world: World, number: Any, chosen: Any, *ends: Any) -> tuple[Any, Any, Any]:
+    """The parts of `_Weights`."""
+    pairs = _pairs_of(number, chosen)
+    made = _connect(world, _Ends(*ends), pairs)
     sums = dr.block_sum(made.density, BLOCK), dr.block_sum(made.onward_density, BLOCK)
     dr.eval(sums)
     density, onward_density = (dr.gather(Float, total, pairs.group) for total in sums)
     first = dr.select(density > 0, made.value / density, 0)
-    return _Weights(made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0))
+    return made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0)
 
 
 def _pair_lanes(world: World, traced: Traced, pairs: _Pairs) -> _Lanes:
