@@ -10,7 +10,7 @@ import numpy as np
 
 from render.caustics import Thrown, thrown_light
 from render.cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
-from render.heap import SMALL_IMAGE, release
+from render.heap import release
 from render.regions import READERS, Octaves, Regions
 from render.returns import Samples, concatenate, no_samples, packed
 from render.settings import BATCHES, FILTERED_BATCHES
@@ -19,11 +19,8 @@ from render.sums import Sums
 from render.turns import BLOCK, Turns, turns_of
 from render.world import Bool, Float, UInt32, World, dr, upload
 
-MOST_CELLS = 1 << 21  # of one launch: 32 MB of accumulators
+MOST_CELLS = 1 << 20  # of one launch: 16 MB of accumulators
 OVER = 0.3  # of a launch
-# Launches of connections that may wait: each holds memory of its own, but the paths of one alone, four packets of work,
-# leave a thread without any.
-QUEUED = 2
 # Seconds of one path with its tail in units of one connection, on 2 cores. Only the choice of who shares depends on it.
 PATH_COST = 9.0
 
@@ -231,8 +228,6 @@ def collect(
     `origin_m` belongs to flat pixels of the image.
     """
     per_chunk = max(1, MOST_CELLS // (cells.count * BLOCK))
-    # larger launches, an eighth faster, where an image takes little memory else
-    filtered = FILTERED_PATHS * (2 if len(origin_m) <= SMALL_IMAGE else 1)
     done = 0
     for shared in (False, True):
         numbers = np.flatnonzero(schedule.shared == shared)
@@ -254,11 +249,10 @@ def collect(
             regions = None
             if schedule.spans is not None:
                 regions = Regions(world, pixels, schedule.spans, schedule.batches, rows.quantum, seed)
-            most = LANES // BLOCK**2 if shared else (PATHS if regions is None else filtered) // BLOCK
+            most = LANES // BLOCK**2 if shared else (PATHS if regions is None else FILTERED_PATHS) // BLOCK
             launches = 0
             for turns in _launches(chosen, rounds, schedule.batches, most):
-                if launches % (QUEUED if shared else 1) == 0:
-                    dr.sync_thread()
+                dr.sync_thread()  # launches that wait hold memory of their own
                 launches += 1
                 add_paths(world, pixels, turns, bounces, seed, sums, schedule.batches, shared=shared, regions=regions)
             if regions is None or launches > 1:  # the next regions take the memory of the last

@@ -28,7 +28,7 @@ from render.sums import Sums
 from render.turns import BLOCK, Turns
 from render.world import Bool, Float, UInt32, World, dr, mi
 
-# Of one launch, 40 and 75 MB in its course. Python records a launch for as long as some 2^16 connections take.
+# Of one launch, 40 and 75 MB in its course.
 LANES = 1 << 20  # connections
 PATHS = 1 << 18
 FILTERED_PATHS = 1 << 16  # which may have connections, too
@@ -195,7 +195,8 @@ class _Ends(NamedTuple):
 
 
 class _Connections(NamedTuple):
-    """Of every pair: leg x1 to x2 [m], pixel radiance from x2's laser light and from beyond, and their densities."""
+    """Of every pair: leg x1 to x2 [m], pixel radiance from x2's laser light and from beyond, times the densities; the
+    sums of these over each group."""
 
     leg: Any
     value: Any
@@ -204,8 +205,10 @@ class _Connections(NamedTuple):
     onward_density: Any
 
 
-def _connect(world: World, ends: _Ends, pairs: _Pairs) -> _Connections:
-    head, tail = pairs.head, pairs.tail
+def _connect(world: World, number: Any, chosen: Any, *ends: Any) -> tuple[Any, ...]:
+    """The parts of `_Connections`."""
+    head, tail, _ = _pairs_of(number, chosen)[:3]
+    ends = _Ends(*ends)
     shared = dr.gather(Bool, ends.shared, tail) & dr.gather(Bool, ends.shares, head)
     si1 = dr.gather(mi.SurfaceInteraction3f, of_parts(ends.si1), head, shared)
     si2 = dr.gather(mi.SurfaceInteraction3f, of_parts(ends.si2), tail, shared)
@@ -241,15 +244,11 @@ def _connect(world: World, ends: _Ends, pairs: _Pairs) -> _Connections:
     value2 *= left_to_paths(world, si1.p, direction, si2, active)
     # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
     density = dr.select(active & (value1[0] > 0), density1 * area, 0)
-    connections = _Connections(
-        leg,
-        dr.select(active, reach * value2 * irradiance, 0),
-        dr.select(going, reach * value3[0], 0),
-        density,
-        dr.select(going & (value3[0] > 0), density * density3, 0),
-    )
-    dr.eval(*connections)
-    return connections
+    onward_density = dr.select(going & (value3[0] > 0), density * density3, 0)
+    value = dr.select(active, reach * value2 * irradiance, 0)
+    onward = dr.select(going, reach * value3[0], 0)
+    dr.eval(leg, value, onward, density, onward_density)
+    return leg, value, onward, dr.block_sum(density, BLOCK), dr.block_sum(onward_density, BLOCK)
 
 
 class _Weights(NamedTuple):
@@ -270,18 +269,10 @@ def _weights(world: World, traced: Traced, pairs: _Pairs) -> _Weights:
         *(getattr(tails, name) for name in _Ends._fields[4:]),
     )
     dr.eval(pairs.number)
-    return _Weights(*world.recordings.call(world, "pairs", _weigh, pairs.number, pairs.chosen, *ends))
-
-
-def _weigh(world: World, number: Any, chosen: Any, *ends: Any) -> tuple[Any, Any, Any]:
-    """The parts of `_Weights`."""
-    pairs = _pairs_of(number, chosen)
-    made = _connect(world, _Ends(*ends), pairs)
-    sums = dr.block_sum(made.density, BLOCK), dr.block_sum(made.onward_density, BLOCK)
-    dr.eval(sums)
-    density, onward_density = (dr.gather(Float, total, pairs.group) for total in sums)
+    made = _Connections(*world.recordings.call(world, "pairs", _connect, pairs.number, pairs.chosen, *ends))
+    density, onward_density = (dr.gather(Float, total, pairs.group) for total in made[3:])
     first = dr.select(density > 0, made.value / density, 0)
-    return made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0)
+    return _Weights(made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0))
 
 
 def _pair_lanes(world: World, traced: Traced, pairs: _Pairs) -> _Lanes:
