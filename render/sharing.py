@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.glossy import left_to_paths
+from render.heads import shares_early
 from render.lit import diffuse_share, of_parts, parts_of, share_by_chance
-from render.paths import Traced, shares_early, trace_paths
+from render.paths import Traced, trace_paths
 from render.rays import segment
 from render.regions import FULL, Regions
 from render.sums import Sums

@@ -7,8 +7,10 @@ import pytest
 
 from render.engine import render
 from render.footprint import trace
+from render.paths import trace_paths
 from render.settings import RenderSettings
 from render.specular import specular_light
+from render.turns import BLOCK, block_order, turns_of
 from render.world import World, dr
 from scenes import Camera, Laser, Material, Scene, Surface
 from scenes.shapes import box, rectangle, sphere
@@ -90,6 +92,24 @@ def test_launches_of_any_size_are_recorded_once():
         column = np.arange(size) % 24
         trace(world, column, np.zeros(size, int), np.zeros(size, int), 1)
     assert world.recordings.calls["footprints", False].n_recordings == 1
+
+
+@pytest.mark.parametrize("laser", [Laser(), Laser(cone_deg=360)], ids=["flash", "lamp"])
+def test_launches_of_paths_are_recorded_once_and_replayed_as_they_would_be_traced(laser):
+    """Dr.Jit records anew where a launch is as long as a mesh or a table of the scene; none of these is."""
+    scene = replace(room(21, ("plastic", "diffuse", "roughplastic"), balls=3), laser=laser)
+    world, pixels = World(scene), block_order(np.arange(24 * 18), 24)
+    for blocks, rounds in [(1, 3), (2, 8), (2, 16), (5, 5), (16, 1), (27, 4)]:
+        block = np.arange(blocks)
+        turns = turns_of(block, block, np.full(blocks, rounds), 2)
+        ours, new = (
+            trace_paths(w, pixels[: blocks * BLOCK], turns, 4, 3, 2, shared=False) for w in (world, World(scene))
+        )
+        for name in ("own_value", "own_onward", "values", "paths", "soonest_m"):
+            assert np.array_equal(getattr(ours.tails, name).numpy(), getattr(new.tails, name).numpy()), name
+        assert np.count_nonzero(ours.tails.values.numpy()) > 0
+    recorded = {key: call.n_recordings for key, call in world.recordings.calls.items()}
+    assert len(recorded) == 2 and set(recorded.values()) == {1}, recorded
 
 
 def test_the_next_world_takes_plastics_and_renders_the_same():
