@@ -10,7 +10,7 @@ import numpy as np
 from render.footprint import albedo
 from render.quadtree import MOST_CELLS, CellTree
 from render.rays import camera_rays, first_opaque
-from render.returns import Samples, concatenate, merge, packed
+from render.returns import Samples, concatenate, merge, no_samples, packed
 from render.world import Bool, Float, UInt32, World, dr
 
 LANES, LEAST_ROWS = 1 << 19, 16
@@ -93,9 +93,9 @@ def _chunk(
     clipped = tree.clip()
     # pixels that were left alone are a table of equal cells; what was cut is a list
     plain = _merge_plain(tree, np.flatnonzero(~touched), tolerance_m)
-    cells = np.flatnonzero(np.repeat(touched, grid * grid))
-    cells = np.concatenate((cells, np.arange(len(pixels) * grid * grid, tree.used)))
-    cells = cells[tree.child[cells] < 0]
+    leaves = tree.child[: tree.used] < 0
+    leaves[: len(pixels) * grid * grid] &= np.repeat(touched, grid * grid)
+    cells = np.flatnonzero(leaves)
     cut = merge(_samples(tree, cells, tree.pitch(cells), tolerance_m), tolerance_m)
     return DirectLight(concatenate([plain, cut]), tree.mixed, clipped, tree.rays)
 
@@ -107,21 +107,22 @@ def _samples(tree: CellTree, cells: np.ndarray, pitch: np.ndarray | float, toler
     of bins. Where b is above the tolerance two returns do it better, without another ray: its halves along the smaller
     span, at p +- b/2 with half width sqrt(a^2 + b^2 / 4).
     """
-    rank = tree.rank[cells]
-    path, half_width = tree.path_m[cells], tree.half_width_m[cells]
-    radiance = tree.radiance[cells] * np.square(pitch, dtype=np.float32)
+    count = len(cells)
     wide = np.flatnonzero(tree.minor_m[cells] > max(tolerance_m, NARROW_M))
-    if len(wide):
-        minor = tree.minor_m[cells[wide]]
-        radiance[wide] /= 2
-        half_width[wide] = np.sqrt(half_width[wide] ** 2 - 0.75 * minor**2)
-        other_half = path[wide] + minor / 2
-        path[wide] -= minor / 2
-        rank = np.concatenate((rank, rank[wide]))
-        path = np.concatenate((path, other_half))
-        half_width = np.concatenate((half_width, half_width[wide]))
-        radiance = np.concatenate((radiance, radiance[wide]))
-    return packed(tree.pixels[rank], path, half_width, radiance, np.ones(len(path), np.uint8))
+    found = no_samples(count + len(wide))
+    pixel, path, half_width, radiance, _ = found
+    pixel[:count] = tree.pixels[tree.rank[cells]]
+    for column, values in ((path, tree.path_m), (half_width, tree.half_width_m), (radiance, tree.radiance)):
+        np.take(values, cells, out=column[:count], mode="clip")  # other modes copy once more
+    radiance[:count] *= np.square(pitch, dtype=np.float32)
+    found.bounces[:] = 1
+    minor = tree.minor_m[cells[wide]]
+    pixel[count:] = pixel[wide]
+    radiance[wide] = radiance[count:] = radiance[wide] / 2
+    half_width[wide] = half_width[count:] = np.sqrt(half_width[wide] ** 2 - 0.75 * minor**2)
+    path[count:] = path[wide] + minor / 2
+    path[wide] -= minor / 2
+    return found
 
 
 def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Samples:

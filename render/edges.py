@@ -26,6 +26,7 @@ FOLLOWED = 3e-4
 GLINT_WIDTH = 2.0  # of a highlight, in units of the roughness
 
 CUT, MIXED, GLINT = 1, 2, 4
+ACROSS, PAIRS = 8, 12  # pairs of a cut cell's children: with what lies beyond its sides, and with siblings
 
 
 class Cells(NamedTuple):
@@ -49,6 +50,17 @@ class Place(NamedTuple):
     column: Any
     row: Any
     rank: Any
+
+
+class Tree(NamedTuple):
+    """How cells, `grid` a pixel side, are found in an image `width` wide: `rank_of` each pixel from the `first` one on
+    (-1: none), and the first `child` of each cell (-1: a leaf); both int32."""
+
+    grid: int
+    width: int
+    first: int
+    rank_of: np.ndarray
+    child: np.ndarray
 
 
 class _Between(NamedTuple):
@@ -92,27 +104,30 @@ def first_edges(
     return tuple(values.numpy() for values in found)
 
 
-def pair_edges(places: Place, cells: Cells, one: np.ndarray, other: np.ndarray, grid: int, least: float) -> np.ndarray:
-    """Compare pairs of cells of any size, side by side: CUT, MIXED and GLINT bits of each pair, (P,) uint32.
+def child_edges(
+    tree: Tree, places: Place, cells: Cells, parents: np.ndarray, start: int, least: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compare the children of cells that were just cut, numbered from `start`, with each other and with what lies
+    beyond the cut cells' sides: a child of a cell of the same size, or a leaf.
 
-    `one` and `other` number the pairs' cells in `places` (int32) and `cells`, whose columns are `aligned`.
+    Returns the pairs (one, other) and their CUT, MIXED and GLINT bits, all (12 parents,) uint32. Where nothing lies
+    beside, and where both of two neighbours were cut and the other one meets the pair, bits are 0.
     """
-    number = len(one)
-    if number == 0:
-        return np.empty(0, np.uint32)
-    if number == 1:  # arrays of one entry are scalars to Dr.Jit: another kernel
-        one, other = np.repeat(one, 2), np.repeat(other, 2)
-    where = tuple(UInt32(column.view(np.uint32)) for column in places)
-    found = _pair_edges(
-        where,
+    number = max(len(parents), 2)  # arrays of one entry are scalars to Dr.Jit: another kernel
+    lane = dr.arange(UInt32, PAIRS * number)
+    dr.eval(lane)
+    counts = (dr.opaque(UInt32, value) for value in (tree.grid, tree.width, tree.first, len(tree.rank_of), start))
+    found = _child_edges(
+        tuple(mi.Int32(column) for column in (tree.rank_of, tree.child)),
+        tuple(UInt32(column.view(np.uint32)) for column in places),
         _seen(cells),
-        upload(UInt32, one),
-        upload(UInt32, other),
-        dr.opaque(UInt32, grid),
+        upload(UInt32, parents, number),
+        lane,
+        *counts,
         dr.opaque(Float, float(least)),
     )
     dr.eval(found)
-    return found.numpy()[:number]
+    return tuple(values.numpy() for values in found)
 
 
 def _seen(cells: Cells) -> tuple[Any, ...]:
@@ -181,8 +196,92 @@ def _first_edges(
 
 
 @recorded
-def _pair_edges(places: Any, cells: Any, one: Any, other: Any, grid: Any, least: Any) -> Any:
+def _child_edges(
+    tree: Any,
+    places: Any,
+    cells: Any,
+    parent: Any,
+    lane: Any,
+    grid: Any,
+    width: Any,
+    first: Any,
+    pixels: Any,
+    start: Any,
+    least: Any,
+) -> tuple[Any, Any, Any]:
+    rank_of, child = tree
     places, cells = Place(*places), Cells(*cells)
+    number = lane // PAIRS
+    pair = lane - number * PAIRS
+    of = dr.gather(UInt32, parent, number)
+    mine = UInt32(dr.gather(mi.Int32, child, of))
+    # two pairs on each side, left, right, above and below, and four of siblings; children lie (0, 0), (1, 0), (0, 1),
+    # (1, 1) in columns and rows
+    across, side, second = pair < ACROSS, pair >> 1, pair & 1
+    beyond, upright = side & 1, side < 2  # whether the way leads to higher columns or rows; along the columns
+    among = pair - ACROSS
+    near = dr.select(upright, beyond + 2 * second, 2 * beyond + second)
+    near = dr.select(across, near, dr.select(among < 2, 2 * among, among - 2))
+    far = dr.select(upright, 1 - beyond + 2 * second, 2 * (1 - beyond) + second)
+    far = dr.select(across, far, dr.select(among < 2, 2 * among + 1, among))
+    way = 2 * mi.Int32(beyond) - 1
+    level = dr.gather(UInt32, places.level, of)
+    column, row = (mi.Int32(dr.gather(UInt32, numbers, of)) for numbers in (places.column, places.row))
+    column, row = column + dr.select(upright, way, 0), row + dr.select(upright, 0, way)
+    beside = _cell_at(rank_of, child, level, column, row, across, grid, width, first, pixels)
+    met = across & (beside >= 0)
+    its_child = dr.gather(mi.Int32, child, beside, met)
+    cut = met & (its_child >= 0)
+    # two cells cut in this pass, side by side, are met once
+    met &= (beyond == 1) | ~cut | (its_child < mi.Int32(start))
+    even = cut & (dr.gather(UInt32, places.level, beside, met) == level)
+    one, other = mine + near, dr.select(even, its_child + mi.Int32(far), beside)
+    other = dr.select(across, UInt32(other), mine + far)
+    compare = met | ~across
+    one, other = dr.select(compare, one, 0), dr.select(compare, other, 0)
+    return one, other, dr.select(compare, compared(places, cells, one, other, grid, least), 0)
+
+
+@dr.syntax
+def _cell_at(
+    rank_of: Any,
+    child: Any,
+    level: Any,
+    column: Any,
+    row: Any,
+    active: Any,
+    grid: Any,
+    width: Any,
+    first: Any,
+    pixels: Any,
+) -> Any:
+    """The deepest cell, no deeper than `level`, that holds the cell (column, row) of that level; -1 where none."""
+    depth = mi.Int32(level)
+    column_0, row_0 = column >> depth, row >> depth
+    active = active & (column_0 >= 0) & (row_0 >= 0)  # a copy: &= would change the caller's
+    x, y = UInt32(column_0), UInt32(row_0)
+    pixel_x, pixel_y = x // grid, y // grid
+    place = pixel_y * width + pixel_x - first  # wraps to a large number where it would be negative
+    active &= (pixel_x < width) & (place < pixels)
+    rank = dr.gather(mi.Int32, rank_of, place, active)
+    active &= rank >= 0
+    found = mi.Int32((UInt32(rank) * grid + y - pixel_y * grid) * grid + x - pixel_x * grid)
+    found = dr.select(active, found, -1)
+    depth = dr.select(active, depth, 0)
+    while depth > 0:
+        depth -= 1
+        below = dr.gather(mi.Int32, child, found)
+        down = below + 2 * ((row >> depth) & 1) + ((column >> depth) & 1)
+        found = dr.select(below >= 0, down, found)
+        depth = dr.select(below >= 0, depth, 0)
+    return found
+
+
+def compared(places: Place, cells: Cells, one: Any, other: Any, grid: Any, least: Any) -> Any:
+    """CUT, MIXED and GLINT bits of pairs of cells of any size, side by side, as `first_edges` sets them of a cell.
+
+    `one` and `other` number the pairs' cells in `places` and `cells`.
+    """
     (begin, first), (end, second) = ((_at(places, index), _at(cells, index)) for index in (one, other))
     # half a cell's width, in the unit of the finer cell of the pair's half width; columns and rows at that unit
     finer = dr.maximum(begin.level, end.level)

@@ -59,7 +59,7 @@ def trace(world: World, column: np.ndarray, row: np.ndarray, level: np.ndarray, 
         return Footprints(*(nothing,) * 8, np.empty(0, np.uint32), *(nothing,) * (3 if world.has_glints else 0))
     packed = row.astype(np.uint32) | level.astype(np.uint32) << LEVEL_BIT
     count, lanes = len(column), _lanes(len(column))
-    columns = [upload(UInt32, np.pad(values, (0, lanes - count), mode="edge")) for values in (column, packed)]
+    columns = [upload(UInt32, values, lanes) for values in (column, packed)]
     work = partial(_footprints, clip=clip)
     found = world.recordings.call(world, ("footprints", clip), work, *columns, dr.opaque(UInt32, grid))
     dr.eval(found)

@@ -1,6 +1,6 @@
 """What glibc's malloc does with freed memory: gives it back between the stages of a render, or keeps it for the next.
 
-No Mitsuba import: training keeps its memory by the same call.
+No Mitsuba import: training keeps its memory by the same call as the renderer (`render.world`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ def keep_freed_memory() -> None:
     """Have malloc keep freed arrays for the next step, image or view instead of giving them back to the system.
 
     Returned pages come back zeroed, one page fault per 4 KiB: a fifth of a training step on a CPU, 0.4 of an estimate
-    of 72 x 88 pixels, 0.04 of a view of a set. For the whole process and for good; nothing happens with another C
-    library.
+    of 72 x 88 pixels or of the direct light of 64 x 64. For the whole process and for good; nothing happens with
+    another C library. `release` still gives all of it back.
     """
     mallopt = _glibc("mallopt")
     mallopt(_M_MMAP_THRESHOLD, _LARGEST_MMAP_THRESHOLD)

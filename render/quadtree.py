@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from render.edges import CUT, GLINT, MIXED, Cells, Place, first_edges, pair_edges
+from render.edges import CUT, GLINT, MIXED, Cells, Place, Tree, child_edges, first_edges
 from render.footprint import CLIPPED, LARGE, Footprints, trace
 from render.world import World, aligned
 
@@ -23,17 +23,6 @@ _TYPES |= dict.fromkeys(Footprints._fields, np.float32) | {"flags": np.uint32}
 _GLINTS = tuple(Footprints._field_defaults)  # kept of worlds that have some
 # a cut cell's children: (0, 0), (1, 0), (0, 1), (1, 1) in (column, row)
 _CHILD_COLUMN, _CHILD_ROW = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
-# per side of a cut cell: the way to the neighbour, the children on that side, and the neighbour's children facing them
-_SIDES = (
-    (-1, 0, (0, 2), (1, 3)),
-    (1, 0, (1, 3), (0, 2)),
-    (0, -1, (0, 1), (2, 3)),
-    (0, 1, (2, 3), (0, 1)),
-)
-# pairs of siblings, side by side
-_SIBLINGS = np.array([0, 2, 0, 1]), np.array([1, 3, 2, 3])
-
-Two = tuple[np.ndarray, np.ndarray]
 
 
 class CellTree:
@@ -68,7 +57,8 @@ class CellTree:
         self.width = world.scene.camera.width
         self.first = int(pixels[0]) if len(pixels) else 0
         span = int(pixels[-1]) - self.first + 1 if len(pixels) else 0
-        self.rank_of = np.full(span, -1, np.int32)
+        self.rank_of = aligned(span, np.int32)
+        self.rank_of[:] = -1
         self.rank_of[pixels - self.first] = np.arange(len(pixels))
         self.whole_rows = self.first % self.width == 0 and span == len(pixels) and span % self.width == 0
         self.used = self.rays = 0
@@ -76,7 +66,7 @@ class CellTree:
         self.mixed = np.zeros(len(pixels), bool)
         for name, dtype in _TYPES.items():
             setattr(self, name, None if name in _GLINTS and not world.has_glints else np.empty(0, dtype))
-        self._reserve(len(pixels) * grid * grid)
+        self._reserve(len(pixels) * grid * grid * 3 // 2)
         cell_row, cell_column = np.divmod(np.arange(grid * grid, dtype=np.int32), grid)
         pixel_row, pixel_column = np.divmod(pixels.astype(np.int32), self.width)
         column = (pixel_column[:, None] * grid + cell_column).ravel()
@@ -107,7 +97,7 @@ class CellTree:
 
     def clip(self) -> int:
         """Clip the leaves that are still not small to their faces; the number that this changes."""
-        large = np.flatnonzero((self.flags[: self.used] & LARGE) != 0)
+        large = _having(self.flags[: self.used], LARGE)
         large = large[self.child[large] < 0]
         found = self._trace(large, clip=True)
         self.path_m[large], self.half_width_m[large] = found.path_m, found.half_width_m
@@ -153,8 +143,8 @@ class CellTree:
         bits, *found = first_edges(cells, spans, self.grid, of_image, self.least)
         for span, new in zip(spans, found, strict=True):
             span[:] = new
-        self.mixed[self.rank[np.flatnonzero(bits & MIXED)]] = True
-        return np.flatnonzero(bits & (CUT | GLINT))
+        self.mixed[self.rank[_having(bits, MIXED)]] = True
+        return _having(bits, CUT | GLINT)
 
     def _cut(self, parents: np.ndarray, levels: int) -> np.ndarray:
         """Cut cells in four; the cells (children, and older leaves beside them) that now need cutting, sorted."""
@@ -169,53 +159,18 @@ class CellTree:
         )
         most = np.zeros(self.used, np.int32)  # level down to which a cell is to be cut
         most[new] = np.where(self.flags[new] & LARGE, levels, 0)
-        one, other = self._pairs_across(parents, child, start)
-        siblings = ((child[:, None] + places).ravel() for places in _SIBLINGS)
-        one, other = (np.concatenate(cells) for cells in zip((one, other), siblings, strict=True))
-        bits = self._compare(one, other)
+        places, cells = (kind(*(getattr(self, name) for name in kind._fields)) for kind in (Place, Cells))
+        tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
+        one, other, bits = child_edges(tree, places, cells, parents, start, self.least)
+        self.mixed[self.rank[one[_having(bits, MIXED)]]] = True
         for bit, deepest in ((CUT, levels), (GLINT, levels + GLINT_LEVELS)):
-            worth = np.flatnonzero(bits & bit)
+            worth = _having(bits, bit)
             most[one[worth]] = deepest
             most[other[worth]] = deepest
-        cut = np.flatnonzero(most)
+        cut = np.flatnonzero(most > 0)
         return cut[(self.child[cut] < 0) & (self.level[cut] < most[cut])]
 
-    def _pairs_across(self, parents: np.ndarray, child: np.ndarray, start: int) -> Two:
-        """Children of cut cells with what lies beyond the cut cell's sides: a child of a cell of its size, or a leaf.
 
-        Two cells cut in this pass, side by side, are met once.
-        """
-        level, column, row = self.level[parents], self.column[parents], self.row[parents]
-        one, other = [], []
-        for way_x, way_y, near_side, far_side in _SIDES:
-            beside = self._find(level, column + way_x, row + way_y)
-            its_child = np.where(beside >= 0, self.child[beside], -1)
-            met = beside >= 0 if way_x + way_y > 0 else (beside >= 0) & (its_child < start)
-            beside, mine, its_child = beside[met], child[met], its_child[met]
-            even = (its_child >= 0) & (self.level[beside] == level[met])
-            for a, b in zip(near_side, far_side, strict=True):
-                one.append(mine + a)
-                other.append(np.where(even, its_child + b, beside))
-        return np.concatenate(one), np.concatenate(other)
-
-    def _find(self, level: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """The deepest cell, no deeper than `level`, that holds the cell (column, row) of that level; -1 where none."""
-        column_0, row_0 = column >> level, row >> level
-        pixel_x, pixel_y = column_0 // self.grid, row_0 // self.grid
-        place = pixel_y * self.width + pixel_x - self.first
-        inside = (pixel_x >= 0) & (pixel_x < self.width) & (place >= 0) & (place < len(self.rank_of))
-        rank = np.where(inside, self.rank_of[np.where(inside, place, 0)], -1)
-        found = (rank * self.grid + row_0 % self.grid) * self.grid + column_0 % self.grid
-        found = np.where(rank >= 0, found, -1)
-        for deeper in range(int(level.max(initial=0)) - 1, -1, -1):
-            child = self.child[found]
-            down = (child >= 0) & (deeper < level) & (found >= 0)
-            found = np.where(down, child + 2 * (row >> deeper & 1) + (column >> deeper & 1), found)
-        return found
-
-    def _compare(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """What lies between pairs of cells, as `pair_edges` says; marks the `mixed` pixels among them."""
-        places, cells = (kind(*(getattr(self, name) for name in kind._fields)) for kind in (Place, Cells))
-        bits = pair_edges(places, cells, one, other, self.grid, self.least)
-        self.mixed[self.rank[one[np.flatnonzero(bits & MIXED)]]] = True
-        return bits
+def _having(bits: np.ndarray, wanted: int) -> np.ndarray:
+    """Where one of the bits is set. By way of booleans, of which numpy skips those that are false fast."""
+    return np.flatnonzero((bits & wanted) != 0)

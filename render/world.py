@@ -12,11 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from render.heap import keep_freed_memory
 from render.llvm import start_mitsuba
 from scenes.model import Camera, Material, Scene, Surface, Texture
 
 mi = start_mitsuba()
 import drjit as dr  # noqa: E402  (other modules take dr and mi from here: only now has an LLVM been chosen)
+
+keep_freed_memory()
 
 Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
 ALIGNMENT = 64  # bytes
@@ -179,10 +182,13 @@ class Recordings:
 _NUMPY = {Float: np.float32, UInt32: np.uint32, mi.UInt64: np.uint64, Bool: np.bool_, mi.Int32: np.int32}
 
 
-def upload(kind: type, values: np.ndarray) -> Any:
-    """Values as a flat Dr.Jit array of `kind` (one of _NUMPY), copied to aligned memory."""
-    memory = aligned(np.size(values), _NUMPY[kind])
-    memory[:] = np.ravel(values)
+def upload(kind: type, values: np.ndarray, size: int | None = None) -> Any:
+    """Values as a flat Dr.Jit array of `kind` (one of _NUMPY), copied to aligned memory; the last one is repeated up
+    to `size`."""
+    count = np.size(values)
+    memory = aligned(size or count, _NUMPY[kind])
+    memory[:count] = np.ravel(values)
+    memory[count:] = memory[count - 1 : count]
     return kind(memory)
 
 

@@ -69,10 +69,8 @@ def _on_processes(workers: int, work: Work, runs: Sequence[Numbers], lost: Lost)
 def _start_worker(threads: int) -> None:
     """In a new process: as many threads as its share of the cores; it ends when the one that started it does."""
     Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    from render.heap import keep_freed_memory
     from render.llvm import start_mitsuba
 
-    keep_freed_memory()
     start_mitsuba()
     import drjit
 

@@ -18,10 +18,13 @@ from render.edges import (
     TONE,
     Cells,
     Place,
+    Tree,
+    child_edges,
+    compared,
     first_edges,
-    pair_edges,
 )
 from render.footprint import HIT, LARGE, LIT
+from render.world import Float, UInt32
 
 HEIGHT, WIDTH, GRID, LEAST = 8, 9, 3, 0.02
 COUNT = HEIGHT * WIDTH * GRID**2
@@ -146,9 +149,10 @@ def test_pairs_of_cells_of_any_size_are_compared(count: int, glossy: bool) -> No
         Place(levels[1], right, (row << levels[1]) >> levels[0], ranks[1]),
     ]
     both = Cells(*(None if a is None else np.concatenate((a, b)) for a, b in zip(one, other, strict=True)))
-    where = Place(*(np.concatenate(column).astype(np.int32) for column in zip(*places, strict=True)))
-    first = np.arange(count)
-    bits = pair_edges(where, both, first, count + first, GRID, LEAST)
+    where = Place(*(UInt32(np.concatenate(column).astype(np.uint32)) for column in zip(*places, strict=True)))
+    seen = Cells(*(a if a is None else UInt32(a) if a.dtype == np.uint32 else Float(a) for a in both))
+    first = np.arange(count, dtype=np.uint32)
+    bits = compared(where, seen, UInt32(first), UInt32(count + first), UInt32(GRID), Float(LEAST)).numpy()
     for i in range(count):
         widths = 1 / (GRID * 2.0 ** levels[:, i])
         centres = [((p.column[i] + 0.5) * w, (p.row[i] + 0.5) * w) for p, w in zip(places, widths, strict=True)]
@@ -161,10 +165,46 @@ def test_pairs_of_cells_of_any_size_are_compared(count: int, glossy: bool) -> No
     assert count < 300 or 30 < np.count_nonzero(bits & CUT) < 270
 
 
+@pytest.mark.parametrize("cut_before", [0, 1, 2])
+def test_children_are_compared_with_all_that_lies_beside_them(cut_before: int) -> None:
+    """In an image of 4 x 3 pixels, two of them not asked for, whose cells were cut at random in passes before."""
+    draw, (grid, width, first) = np.random.default_rng(cut_before), (2, 4, 1)
+    pixels = np.delete(np.arange(first, 12), [3, 6])
+    rank_of = np.full(12 - first, -1, np.int32)
+    rank_of[pixels - first] = np.arange(len(pixels))
+    cells = [
+        (0, grid * (pixel % width) + i % grid, grid * (pixel // width) + i // grid, rank)
+        for rank, pixel in enumerate(pixels)
+        for i in range(grid**2)
+    ]
+    child = np.full(1000, -1, np.int32)
+    for _ in range(cut_before + 1):
+        start = len(cells)
+        parents = np.sort(draw.choice(np.flatnonzero(child[:start] < 0), start // 3, replace=False))
+        child[parents] = start + 4 * np.arange(len(parents))
+        for level, column, row, rank in [cells[parent] for parent in parents]:
+            cells += [(level + 1, 2 * column + i % 2, 2 * row + i // 2, rank) for i in range(4)]
+    where = {place[:3]: number for number, place in enumerate(cells)}
+    expected = set()
+    for number in range(start, len(cells)):
+        level, column, row, _ = cells[number]
+        for way_x, way_y in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            above = ((up, (column + way_x) >> level - up, (row + way_y) >> level - up) for up in range(level, -1, -1))
+            beside = next((where[place] for place in above if place in where), None)
+            if beside is not None:
+                expected.add(frozenset((number, beside)))
+    # all differ from one another
+    count, ones = len(cells), np.ones(len(cells), np.float32)
+    seen = Cells(np.arange(count, dtype=np.float32), 0 * ones, 0 * ones, ones, ones, np.full(count, HIT, np.uint32))
+    places = Place(*np.array(cells, np.int32).T.copy())
+    one, other, bits = child_edges(Tree(grid, width, first, rank_of, child[:count]), places, seen, parents, start, 0)
+    met = [frozenset(map(int, pair)) for pair in np.stack((one, other), axis=1)[bits & CUT != 0]]
+    assert set(met) == expected and len(met) == len(expected)
+    within = {pair for pair in expected if len({cells[number][3] for number in pair}) == 1}
+    assert set(np.array(met)[bits[bits & CUT != 0] & MIXED != 0]) == within
+
+
 def test_nothing_to_compare() -> None:
-    none = Cells(*(np.empty(0, np.float32),) * 5, np.empty(0, np.uint32))
-    nowhere = Place(*(np.empty(0, np.int32),) * 4)
-    assert pair_edges(nowhere, none, np.arange(0), np.arange(0), 2, 0.1).size == 0
     alone = cells_of(1, 1)
     assert first_edges(alone, [np.ones(1, np.float32)] * 3, 1, 1, 0.1)[0].tolist() == [
         CUT * bool(alone.flags[0] & LARGE)
