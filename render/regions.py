@@ -7,11 +7,11 @@ stays with its own pixel. This is path-space filtering (Keller, Dahm, Binder 201
 regions that widen with delay as irradiance samples are spaced by the distance of what they see (Ward, Rubinstein, Clear
 1988).
 
-A region is a cube of the world and a class of normals. It keeps what comes to its points over the path from the laser
-to x1, without the way to the camera ("unwarped") and divided by the reflectance ("demodulated"), and the mean direction
-in which that path grows along the surface: light from one side reaches points farther away later, to first order.
-Light of diffuse lobes goes into one region of one octave each, and pixels read the regions of some points of theirs:
-energy is kept. The bias is what differs within a region, shadows above all.
+A region is a cube of the world, in one of GRIDS grids, and a class of normals. It keeps what comes to its points over
+the path from the laser to x1, without the way to the camera ("unwarped") and divided by the reflectance
+("demodulated"), and the mean direction in which that path grows along the surface: light from one side reaches points
+farther away later, to first order. Light of diffuse lobes goes into one region of one octave in each grid, and pixels
+read the regions of some points of theirs: energy is kept. The bias is what differs within a region, shadows above all.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ UInt64, Int32 = mi.UInt64, mi.Int32
 # Width of a region in its octave's excess path, and of the widest in the mean distance, at PATHS paths a pixel. They
 # shrink with paths^-SHRINKING, so that the bias goes where the noise does.
 KAPPA, WIDEST, PATHS, SHRINKING = 0.2, 0.15, 16, 0.3
-READERS = 4  # points of a pixel that read
+READERS = 8  # points of a pixel that read
+# Every region is one of a grid, and there are so many grids, shifted against one another: their mean is smooth where
+# one grid has steps, and has less noise. Two were best for their time (measured).
+GRIDS = 2
 MOST_OCTAVES = 16
 FULL = 1 << 24  # weight of all paths of a pixel: divided by their number, it stays a whole one
 FINENESS = 0.6  # of cells, in those of the pixels that read them: between two pixels none is lumped together
@@ -108,28 +111,29 @@ class Regions:
     ) -> None:
         self.spans, self.batches = spans, batches
         numbers = np.random.SeedSequence(seed).generate_state(4)
-        self._shift = mi.Vector3f(*(dr.opaque(Float, float(number) * 2.0**-32) for number in numbers[:3]))
+        shift = numbers[:3] * 2.0**-32 + np.arange(GRIDS)[:, None] / GRIDS
+        self._shift = mi.Vector3f(*(upload(Float, np.tile(part, spans.count)) for part in shift.T))
         self._quantum, self._per_quantum = dr.opaque(Float, quantum), dr.opaque(Float, 1 / quantum)
-        self.from_m, self._size = dr.opaque(Float, float(spans.from_m[0])), upload(Float, spans.size_m)
-        self._width, self._last = upload(Float, spans.width_m), dr.opaque(UInt32, spans.count - 1)
+        self.from_m, self._size = dr.opaque(Float, float(spans.from_m[0])), _by_level(spans.size_m)
+        self._width, self._last = _by_level(spans.width_m), dr.opaque(UInt32, spans.count - 1)
         self.place, self.points = _points(world, pixels, dr.opaque(UInt32, int(numbers[3])))
-        reader, octave = _each(dr.width(self.place), spans.count)
+        reader, level = _each(dr.width(self.place), spans.count * GRIDS)
         point = _gathered(self.points, reader)
-        key = self._key(point, octave)
+        key = self._key(point, level)
         dr.eval(key, point.path)
-        found, row = np.unique(key.numpy(), return_inverse=True)
+        found, row = _numbered(key.numpy())
         self._row_of = upload(UInt32, row)
         nearest = np.full(len(found), np.inf, np.float32)  # of the paths' type: ten times as fast
         np.minimum.at(nearest, row, point.path.numpy())
-        # the length of the search is part of its kernel: one for all views of a size
-        self._searched = 1 << (len(pixels) * READERS * MOST_OCTAVES).bit_length()
-        self._keys = upload(UInt64, np.pad(found, (0, self._searched - len(found)), constant_values=2**64 - 1))
+        # the length of the search is part of its kernel: one for all views of a size, but where there are very many
+        self._searched = 1 << max(len(pixels) * MOST_OCTAVES * GRIDS, len(found)).bit_length()
+        self._keys = upload(UInt64, np.append(found, np.uint64(2**64 - 1)), self._searched)
         self._nowhere = len(found)
         self._lay_out(found, nearest)
 
     def _lay_out(self, found: np.ndarray, nearest_m: np.ndarray) -> None:
         """Cells for the regions with these keys, whose points are at least so far from the camera."""
-        octave = (found >> np.uint64(3 * (KEY_BITS + NORMAL_BITS))).astype(np.int64)
+        octave = (found >> np.uint64(3 * (KEY_BITS + NORMAL_BITS))).astype(np.int64) // GRIDS
         cells = self.spans.cells[octave]
         reach = 0.5 * math.sqrt(3) * self.spans.size_m[octave]
         self._base = upload(Float, np.append(nearest_m + self.spans.from_m[octave] - 3 * reach, 0))
@@ -139,20 +143,20 @@ class Regions:
         self.growing = [dr.zeros(UInt64, size) for _ in range(3)]
         self.paths, self.filled = dr.zeros(UInt64, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
 
-    def _key(self, point: Point, octave: Any) -> Any:
-        """Octave, class of normals and cube of a point in one number."""
-        size, key = dr.gather(Float, self._size, octave), UInt64(octave)
+    def _key(self, point: Point, level: Any) -> Any:
+        """Level, class of normals and cube of a point in one number. A level is a grid of an octave."""
+        size, key = dr.gather(Float, self._size, level), UInt64(level)
         for part in point.n:
             key = (key << NORMAL_BITS) | UInt64(UInt32(Int32(dr.round(part)) + 1))
         for part, shift in zip(point.p, self._shift, strict=True):
-            number = UInt32(Int32(dr.floor(part / size + shift))) & ((1 << KEY_BITS) - 1)
+            number = UInt32(Int32(dr.floor(part / size + dr.gather(Float, shift, level)))) & ((1 << KEY_BITS) - 1)
             key = (key << KEY_BITS) | UInt64(number)
         return key
 
-    def _from_middle(self, point: Point, octave: Any) -> Any:
+    def _from_middle(self, point: Point, level: Any) -> Any:
         """The way along the surface to a point from the middle of its cube."""
-        size = dr.gather(Float, self._size, octave)
-        parts = [part / size + shift for part, shift in zip(point.p, self._shift, strict=True)]
+        size = dr.gather(Float, self._size, level)
+        parts = [part / size + dr.gather(Float, shift, level) for part, shift in zip(point.p, self._shift, strict=True)]
         off = mi.Vector3f(*(part - dr.floor(part) - 0.5 for part in parts)) * size
         return off - point.n * dr.dot(point.n, off)
 
@@ -162,13 +166,13 @@ class Regions:
         return found, active & (dr.gather(UInt64, self._keys, found, active) == key)
 
     def count_paths(self, points: Point, weight: Any) -> Any:
-        """One more path for the regions of each point that reflects; returns their numbers, octaves x points.
+        """One more path for the regions of each point that reflects; returns their numbers, levels x points.
 
         A pixel's paths count FULL together, however many they are: a region's light is the mean over its pixels.
         """
-        number, octave = _each(dr.width(points.path), self.spans.count)
+        number, level = _each(dr.width(points.path), self.spans.count * GRIDS)
         point = _gathered(points, number)
-        row, known = self._row(self._key(point, octave), point.reflectance > 0)
+        row, known = self._row(self._key(point, level), point.reflectance > 0)
         row = dr.select(known, row, dr.opaque(UInt32, self._nowhere))
         dr.scatter_add(self.paths, UInt64(dr.gather(UInt32, weight, number)), row, known, mode=dr.ReduceMode.Direct)
         return row
@@ -189,27 +193,31 @@ class Regions:
         """Add light that comes to points from x2, which lies `towards`, after `path_m` from the laser.
 
         It is late from `late_m` on. `radiance` is what the pixel sees of it by one path, which counts with `weight`
-        quanta of FULL (see `count_paths`). Returns where it is still to add: where it came too early for any
-        region, or left by no `diffuse` lobe. Late light in a region that no pixel reads is dropped.
+        quanta of FULL (see `count_paths`) in a region of each grid. Returns where it is still to add: where it came too
+        early for any region, or left by no `diffuse` lobe. Late light in a region that no pixel reads is dropped.
         """
         excess_m = path_m - late_m + self.from_m
         late = active & diffuse & (path_m >= late_m) & (point.reflectance > 0)
         number = Int32(dr.floor(dr.log2(dr.maximum(excess_m, self.from_m) / self.from_m)))
         octave = UInt32(dr.clip(number, 0, Int32(self._last)))
-        lane = dr.arange(UInt32, dr.width(point.path))
         lit = late & (radiance > 0) & dr.isfinite(radiance)
-        row = dr.gather(UInt32, rows, octave * dr.opaque(UInt32, dr.width(point.path)) + lane, lit)
-        lit &= row != dr.opaque(UInt32, self._nowhere)
-        # the path grows away from x2
-        path_m = path_m + dr.dot(towards, self._from_middle(point, octave))
-        x = dr.maximum(path_m - dr.gather(Float, self._base, row, lit), 0) / dr.gather(Float, self._width, octave)
-        cell = dr.minimum(UInt32(dr.log(1 + GROWTH * x) / GROWTH), dr.gather(UInt32, self._cells, row, lit) - 1)
         value = radiance / point.reflectance * self._per_quantum * (Float(weight) / FULL)
-        index = dr.gather(UInt32, self._first, row, lit) + cell
-        add_quanta(self.energy, value, index * self.batches + batch, lit)
-        dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, lit, mode=dr.ReduceMode.Direct)
-        for target, part in zip(self.growing, -towards, strict=True):
-            add_quanta(target, value * dr.clip(0.5 + 0.5 * part, 0, 1), index, lit)
+        lanes = dr.width(point.path)
+        lane = dr.arange(UInt32, lanes)
+        for grid in range(GRIDS):
+            level = octave * GRIDS + grid
+            row = dr.gather(UInt32, rows, level * dr.opaque(UInt32, lanes) + lane, lit)
+            known = lit & (row != dr.opaque(UInt32, self._nowhere))
+            # the path grows away from x2
+            grown_m = path_m + dr.dot(towards, self._from_middle(point, level))
+            x = dr.maximum(grown_m - dr.gather(Float, self._base, row, known), 0) / dr.gather(Float, self._width, level)
+            last = dr.gather(UInt32, self._cells, row, known) - 1
+            cell = dr.minimum(UInt32(dr.log(1 + GROWTH * x) / GROWTH), last)
+            index = dr.gather(UInt32, self._first, row, known) + cell
+            add_quanta(self.energy, value, index * self.batches + batch, known)
+            dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, known, mode=dr.ReduceMode.Direct)
+            for target, part in zip(self.growing, -towards, strict=True):
+                add_quanta(target, value * dr.clip(0.5 + 0.5 * part, 0, 1), index, known)
         return active & ~late
 
     def evaluate(self) -> None:
@@ -220,10 +228,10 @@ class Regions:
         """Add every region's light to the pixels that have points there."""
         if dr.width(self.place) == 0:
             return
-        place, octave, row, weight, point = self._readings()
-        weight = weight * self._quantum / (READERS / FULL * Float(dr.gather(UInt64, self.paths, row)))
+        place, level, row, weight, point = self._readings()
+        weight = weight * self._quantum / (READERS * GRIDS / FULL * Float(dr.gather(UInt64, self.paths, row)))
         base = dr.gather(Float, self._base, row) + point.path
-        reading = _Reading(place, octave, row, weight, base, self._from_middle(point, octave))
+        reading = _Reading(place, level, row, weight, base, self._from_middle(point, level))
         dr.eval(*reading)
         for batch, total in enumerate(self._read(sums, reading, None)):
             sums.add_total(place, dr.opaque(UInt32, batch), total)
@@ -239,27 +247,30 @@ class Regions:
 
         Points of one place lie next to each other.
         """
-        readers = dr.opaque(UInt32, dr.width(self.place))
-        reader, octave = _each(dr.width(self.place), self.spans.count)
-        row, place = self._row_of, dr.gather(UInt32, self.place, reader)
-        first, sums = dr.gather(UInt64, self.paths, row) > 0, [Float(0)] * 8
-        for step in range(1 - READERS, READERS):
-            other = Int32(reader) + step
-            near = (other >= 0) & (other < Int32(readers))
-            other = UInt32(dr.select(near, other, 0))
-            near &= dr.gather(UInt32, self.place, other, near) == place
-            near &= dr.gather(UInt32, row, octave * readers + other, near) == row
-            if step < 0:
-                first &= ~near
-            point = _gathered(self.points, other)
-            share = dr.select(near, point.reflectance, 0)
-            sums = [a + share * b for a, b in zip(sums, (1, *point.p, *point.n, point.path), strict=True)]
-        columns = [place, octave, row, *sums]
+        reader, level = _each(dr.width(self.place), self.spans.count * GRIDS)
+        place, row = dr.gather(UInt32, self.place, reader), self._row_of
+        first = dr.gather(UInt64, self.paths, row) > 0
+        for step in range(1, READERS):
+            first &= ~self._reads(Int32(reader) - step, level, place, row)
         chosen = dr.compress(first)
-        dr.eval(chosen, columns)
-        place, octave, row, weight, x, y, z, right, up, back, path = (dr.gather(type(c), c, chosen) for c in columns)
+        reader, level, place, row = (dr.gather(UInt32, column, chosen) for column in (reader, level, place, row))
+        sums = [Float(0)] * 8
+        for step in range(READERS):
+            reads = self._reads(Int32(reader) + step, level, place, row)
+            point = _gathered(self.points, dr.select(reads, reader + step, 0))
+            share = dr.select(reads, point.reflectance, 0)
+            sums = [a + share * b for a, b in zip(sums, (1, *point.p, *point.n, point.path), strict=True)]
+        weight, x, y, z, right, up, back, path = sums
         normal = dr.normalize(mi.Vector3f(right, up, back))
-        return place, octave, row, weight, Point(mi.Point3f(x, y, z) / weight, normal, path / weight, weight)
+        return place, level, row, weight, Point(mi.Point3f(x, y, z) / weight, normal, path / weight, weight)
+
+    def _reads(self, reader: Any, level: Any, place: Any, row: Any) -> Any:
+        """Whether there is such a point of this place, and it reads this region."""
+        readers = dr.opaque(UInt32, dr.width(self.place))
+        there = (reader >= 0) & (reader < Int32(readers))
+        number = UInt32(dr.select(there, reader, 0))
+        there &= dr.gather(UInt32, self.place, number, there) == place
+        return there & (dr.gather(UInt32, self._row_of, level * readers + number, there) == row)
 
     def _energies(self, index: Any) -> list:
         """Every batch's energy in a cell."""
@@ -275,7 +286,7 @@ class Regions:
     def _read(self, sums: Sums, reading: Any, batch: Any) -> Any:
         """Read cell by cell; returns each batch's total. Of one `batch` a lane for the watched rows, or of all."""
         place, row, weight, off = reading.place, reading.row, reading.weight, reading.off
-        width = dr.gather(Float, self._width, reading.octave)
+        width = dr.gather(Float, self._width, reading.level)
         index, cells = dr.gather(UInt32, self._first, row), dr.gather(UInt32, self.filled, row)
         cell = dr.zeros(UInt32, dr.width(place))
         totals = [dr.zeros(Float, dr.width(place)) for _ in range(self.batches)]
@@ -300,11 +311,23 @@ class _Reading(NamedTuple):
     surface the place's points are from the middle."""
 
     place: Any
-    octave: Any
+    level: Any
     row: Any
     weight: Any
     base: Any
     off: Any
+
+
+def _numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct keys, sorted, and the number of each one's. Neighbours mostly have the same: runs of them are sorted."""
+    begins = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
+    found, number = np.unique(keys[begins], return_inverse=True)
+    return found, np.repeat(number, np.diff(np.append(begins, len(keys))))
+
+
+def _by_level(of_octaves: np.ndarray) -> Any:
+    """Values of octaves for their levels: one a grid."""
+    return upload(Float, np.repeat(of_octaves, GRIDS))
 
 
 def _plus(totals: list, energies: list, weight: Any) -> list:

@@ -14,7 +14,7 @@ MERGED_M = 0.0  # nothing is merged: a histogram follows at once
 
 def trace(world: World, method: Method, bounces: int, quality: int, seed: int) -> Samples:
     """Merged samples of all pixels, nothing planned or estimated: every setting is forced."""
-    grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality, method.filter), quality)
+    grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality), quality)
     forced = {"bounces": bounces, "spp": spp, "grid": grid, "filter": method.filter}
     exact = {"least_share": least_share_of(grid), "direct_tolerance_m": MERGED_M}
     settings = RenderSettings(**forced, **exact)

@@ -75,14 +75,9 @@ def qualities(method: Method, transport: str, size: int, quick: bool) -> tuple[i
     return (4, 16, 64, 256) if size <= 64 or (size <= 128 and not quick) else (4, 16, 64)
 
 
-def grid_beside(spp: int, filtered: bool = False) -> int:
-    """Direct rays a pixel side that go with indirect `spp`, so that direct light's error stays below the indirect.
-
-    Filtered light has the noise of many times as many paths.
-    """
-    if filtered:
-        return 3 if spp < 16 else 4 if spp < 64 else 6 if spp < 256 else 8
-    return 4 if spp <= 64 else 6 if spp <= 256 else 8
+def grid_beside(spp: int) -> int:
+    """Direct rays a pixel side that go with indirect `spp`, so that direct light costs least error for its time."""
+    return 4 if spp < 16 else 5 if spp < 64 else 7 if spp < 256 else 9
 
 
 def reference_passes(transport: str, size: int) -> tuple[int, int]:
