@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.returns import Samples, no_samples, packed
+from render.returns import Samples, merge_by, no_samples, packed, with_energy
 from render.world import Float, UInt32, dr, mi
 
 UInt64 = mi.UInt64
@@ -61,15 +61,17 @@ def add_quanta(target: Any, amount: Any, index: Any, active: Any) -> None:
 
 
 class Rows:
-    """Accumulators of several rows (a pixel, or a pixel and batch, each): energy, and its moment within the cell.
+    """Accumulators of several rows (a pixel, or a pixel and batch, each).
+
+    Of each cell there are its energy and its first and second moment about the cell's beginning in the cell's width,
+    side by side, as they are needed together.
 
     `quantum` is the radiance of one unit. Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
     def __init__(self, rows: int, cells: Cells, quantum: float) -> None:
         self.rows, self.cells, self.quantum = rows, cells, quantum
-        self.energy = dr.zeros(UInt64, int(rows * cells.count))
-        self.moment = dr.zeros(UInt64, int(rows * cells.count))
+        self.moments = dr.zeros(UInt64, int(rows * cells.count) * 3)
         self._edges = Float(cells.edges_m)
         self._growth, self._width = dr.opaque(Float, cells.growth), dr.opaque(Float, cells.width_m)
         self._behind, self._count = dr.opaque(UInt32, cells.behind), dr.opaque(UInt32, cells.count)
@@ -81,17 +83,18 @@ class Rows:
         signed = dr.floor(dr.mulsign(number, x_m)) + Float(self._behind)
         return UInt32(dr.clip(signed, 0, Float(self._count) - 1))
 
-    def add(self, row: Any, x_m: Any, radiance: Any, active: Any) -> None:
-        """Add samples of radiance at x = path - origin to their rows' cells."""
+    def add(self, row: Any, x_m: Any, radiance: Any, active: Any, half_m: Any = 0.0) -> None:
+        """Add samples of radiance at x = path - origin, or even between x - half and x + half, to their rows' cells."""
         cell = self._cell(x_m)
         low, high = (
             dr.gather(Float, self._edges, cell, active),
             dr.gather(Float, self._edges, cell + 1, active),
         )
         share = dr.clip((x_m - low) / (high - low), 0, 1)
-        index = row * self._count + cell
-        add_quanta(self.energy, radiance * self.per_quantum, index, active)
-        add_quanta(self.moment, radiance * share * self.per_quantum, index, active)
+        second = dr.square(share) + dr.square(half_m / (high - low)) / 3
+        for number, factor in enumerate((1, share, second)):
+            index = (row * self._count + cell) * 3 + number
+            add_quanta(self.moments, radiance * factor * self.per_quantum, index, active)
 
     def add_between(self, row: Any, low_m: Any, high_m: Any, radiance: Any, active: Any) -> None:
         """Add radiance that is even between two values of x, no farther apart than cells are wide there, or little."""
@@ -99,57 +102,63 @@ class Rows:
         # beyond the last cell its end lies below both
         share = dr.clip((edge - low_m) / (high_m - low_m), 0, 1)
         below = dr.select(high_m > edge, share, 1)
-        self.add(row, 0.5 * (low_m + dr.minimum(high_m, edge)), radiance * below, active)
-        self.add(row, 0.5 * (edge + high_m), radiance * (1 - below), active & (below < 1))
+        end_m = dr.minimum(high_m, edge)
+        self.add(row, 0.5 * (low_m + end_m), radiance * below, active, 0.5 * (end_m - low_m))
+        self.add(row, 0.5 * (edge + high_m), radiance * (1 - below), active & (below < 1), 0.5 * (high_m - edge))
 
     def samples(self, pixels: np.ndarray, origin_m: np.ndarray) -> Samples:
-        """Merged samples, one for every cell that holds energy, of rows that belong to `pixels`.
-
-        Energy and centroid are exact; a sample is uniform over the widest interval around its centroid in its cell.
-        """
-        energy, moment = self.energy.numpy(), self.moment.numpy()
+        """Merged samples, one for every cell that holds energy, of rows that belong to `pixels`."""
+        moments = self.moments.numpy().reshape(-1, 3)
+        energy = moments[:, 0]
         found, done = no_samples(np.count_nonzero(energy)), 0
         for first in range(0, len(energy), READ):
             filled = np.flatnonzero(energy[first : first + READ]) + first
-            units, moments = energy[filled].astype(np.float64), moment[filled].astype(np.float64)
+            values = (moments[filled] * self.quantum).T
             row, cell = np.divmod(filled, self.cells.count)
-            share = np.clip(moments / units, 0, 1)
-            part = cell_samples(self.cells, pixels[row], origin_m[row], cell, units * self.quantum, share)
+            part = cell_samples(self.cells, pixels[row], origin_m[row], cell, *values)
             for column, values in zip(found, part, strict=True):
                 column[done : done + len(filled)] = values
             done += len(filled)
         return found
 
-    def sums(self) -> tuple[np.ndarray, np.ndarray]:
-        """Radiance of every cell, and its moment in the cell's width, (rows, cells) float64."""
-        shape = self.rows, self.cells.count
-        return self.energy.numpy().reshape(shape) * self.quantum, self.moment.numpy().reshape(shape) * self.quantum
+    def sums(self) -> tuple[np.ndarray, ...]:
+        """Radiance of every cell, and its two moments, (rows, cells) float64."""
+        shape = self.rows, self.cells.count, 3
+        return tuple(np.moveaxis(self.moments.numpy().reshape(shape) * self.quantum, -1, 0))
 
 
 def cell_samples(
-    cells: Cells, pixel: np.ndarray, origin_m: np.ndarray, cell: np.ndarray, radiance: np.ndarray, share: np.ndarray
+    cells: Cells,
+    pixel: np.ndarray,
+    origin_m: np.ndarray,
+    cell: np.ndarray,
+    radiance: np.ndarray,
+    moment: np.ndarray,
+    second: np.ndarray,
 ) -> Samples:
-    """Samples of filled cells, `share` of the cell's width being the centroid's place in it."""
+    """Samples of filled cells from their radiance and its moments: of the same energy, centroid and spread.
+
+    A sample is uniform over centroid +- sqrt(3 variance), as those of `merge_by`: one path stays a point, many that
+    are even fill their cell, and the mean of many renders has the moments of the light itself.
+    """
     low, width = cells.edges_m[cell], cells.width_of_m[cell]
+    share = np.clip(moment / radiance, 0, 1)
+    variance = np.clip(second / radiance - share**2, 0, share * (1 - share))  # rounding aside, these are its limits
     return packed(
         pixel,
         origin_m + low + share * width,
-        np.minimum(share, 1 - share) * width,
+        np.sqrt(3 * variance) * width,
         radiance,
         np.full(len(pixel), 2, dtype=np.uint8),
     )
 
 
 def coarsened(samples: Samples, cells: Cells, origin_m: np.ndarray) -> Samples:
-    """Samples merged into cells counted from their pixels' origins, as `Rows` would; radiance may be negative."""
-    x = samples.path_m - origin_m[samples.pixel]
-    cell = np.clip(np.searchsorted(cells.edges_m, x, side="right") - 1, 0, cells.count - 1)
-    key, place = np.unique(samples.pixel * np.int64(cells.count) + cell, return_inverse=True)
-    energy = np.bincount(place, weights=samples.radiance)
-    moment = np.bincount(place, weights=samples.radiance * (x - cells.edges_m[cell]) / cells.width_of_m[cell])
-    pixel, cell = np.divmod(key, cells.count)
-    share = np.clip(np.divide(moment, energy, out=np.full(len(key), 0.5), where=energy > 0), 0, 1)
-    return cell_samples(cells, pixel, origin_m[pixel], cell, energy, share)
+    """Samples merged into cells counted from their pixels' origins, as `Rows` would."""
+    samples = with_energy(samples)
+    origin = origin_m[samples.pixel]
+    cell = np.clip(np.searchsorted(cells.edges_m, samples.path_m - origin, side="right") - 1, 0, cells.count - 1)
+    return merge_by(samples, samples.pixel * np.int64(cells.count) + cell, origin + cells.edges_m[cell])
 
 
 def quantum_for(brightest: float) -> float:

@@ -19,7 +19,7 @@ from render.sums import Sums
 from render.turns import BLOCK, Turns, turns_of
 from render.world import Bool, Float, UInt32, World, dr, upload
 
-MOST_CELLS = 1 << 20  # of one launch: 16 MB of accumulators
+MOST_CELLS = 700_000  # of one launch: 17 MB of accumulators
 OVER = 0.3  # of a launch
 # Seconds of one path with its tail in units of one connection, on 2 cores. Only the choice of who shares depends on it.
 PATH_COST = 9.0
@@ -139,8 +139,8 @@ def allocate(
 
 
 class Watched(NamedTuple):
-    """Light of a few flat `pixels` by independent batches, in cells half as wide: radiance, and its moment about the
-    cell's beginning in the cell's width, (pixels, batches, cells) each.
+    """Light of a few flat `pixels` by independent batches, in cells half as wide: radiance and its two moments about
+    the cell's beginning in the cell's width, (pixels, batches, cells) each.
 
     Every batch estimates the whole indirect light.
     """
@@ -150,14 +150,13 @@ class Watched(NamedTuple):
     origin_m: np.ndarray
     radiance: np.ndarray
     moment: np.ndarray
+    second: np.ndarray
 
     def samples(self, turns: slice = slice(None)) -> Samples:
         """The mean of some batches as samples, their pixel an index into `pixels`."""
-        mean, moment = (values[:, turns].mean(axis=1) for values in (self.radiance, self.moment))
-        row, cell = np.nonzero(mean)
-        radiance = mean[row, cell]
-        share = np.clip(moment[row, cell] / radiance, 0, 1)
-        return cell_samples(self.cells, row, self.origin_m[row], cell, radiance, share)
+        means = [values[:, turns].mean(axis=1) for values in self[-3:]]
+        row, cell = np.nonzero(means[0])
+        return cell_samples(self.cells, row, self.origin_m[row], cell, *(mean[row, cell] for mean in means))
 
 
 class Chunk(NamedTuple):
@@ -186,8 +185,8 @@ def combined(one: IndirectLight, other: IndirectLight, share: np.ndarray) -> Ind
     def mean(first: Watched | None, second: Watched | None) -> Watched | None:
         if first is None or second is None:
             return None
-        both = (weight * a + (1 - weight) * b for a, b in zip(first[-2:], second[-2:], strict=True))
-        return Watched(*first[:-2], *both)
+        both = (weight * a + (1 - weight) * b for a, b in zip(first[-3:], second[-3:], strict=True))
+        return Watched(*first[:-3], *both)
 
     noise = np.hypot(share * one.noise, (1 - share) * other.noise)
     return IndirectLight(noise, mean(one.watched, other.watched), mean(one.plain, other.plain))
@@ -367,7 +366,7 @@ def indirect_light(
             noise[chunk.pixels[real]] = totals.std(axis=1, ddof=1) * np.sqrt(batches)
 
     def seen(rows: Rows | None) -> Watched:
-        sums = (np.zeros(0),) * 2 if rows is None else rows.sums()
+        sums = (np.zeros(0),) * 3 if rows is None else rows.sums()
         shape = len(watched), batches, fine.count
         return Watched(watched, fine, origin_m[watched], *(values.reshape(shape) for values in sums))
 

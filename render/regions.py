@@ -140,7 +140,7 @@ class Regions:
         self._first, self._cells = (upload(UInt32, np.append(part, 0)) for part in (np.cumsum(cells) - cells, cells))
         size = max(int(cells.sum()), 1)
         self.energy = dr.zeros(UInt64, size * self.batches)
-        self.growing = [dr.zeros(UInt64, size) for _ in range(3)]
+        self.growing = dr.zeros(UInt64, size * 3)
         self.paths, self.filled = dr.zeros(UInt64, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
 
     def _key(self, point: Point, level: Any) -> Any:
@@ -216,8 +216,8 @@ class Regions:
             index = dr.gather(UInt32, self._first, row, known) + cell
             add_quanta(self.energy, value, index * self.batches + batch, known)
             dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, known, mode=dr.ReduceMode.Direct)
-            for target, part in zip(self.growing, -towards, strict=True):
-                add_quanta(target, value * dr.clip(0.5 + 0.5 * part, 0, 1), index, known)
+            for axis, part in enumerate(-towards):
+                add_quanta(self.growing, value * dr.clip(0.5 + 0.5 * part, 0, 1), 3 * index + axis, known)
         return active & ~late
 
     def evaluate(self) -> None:
@@ -279,7 +279,7 @@ class Regions:
     def _growing(self, index: Any, energies: list) -> Any:
         """Mean direction in which the path of a cell's light grows; of all batches, whose energies these are."""
         energy = sum(energies[1:], energies[0])
-        parts = (2 * Float(dr.gather(UInt64, part, index)) - energy for part in self.growing)
+        parts = (2 * Float(dr.gather(UInt64, self.growing, 3 * index + axis)) - energy for axis in range(3))
         return dr.select(energy > 0, mi.Vector3f(*parts) / energy, 0)
 
     @dr.syntax

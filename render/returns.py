@@ -82,23 +82,35 @@ def concatenate(parts: list[Samples]) -> Samples:
 def merge(samples: Samples, tolerance_m: float) -> Samples:
     """Merge samples of one pixel whose path centres share a cell; direct and indirect samples stay apart.
 
-    Cells are `tolerance_m` wide. Energy, centroid and variance of the path length are kept: the merged sample is
-    uniform over centroid +- sqrt(3 variance), where one uniform over c +- h has variance h^2 / 3, and has the fewest
-    bounces of its parts. Samples without energy go; with a tolerance of 0 that is all. The sums
-    run over a stable sort in float64, so that the result depends on the samples' order alone.
+    Cells are `tolerance_m` wide. Samples without energy go; with a tolerance of 0 that is all.
     """
-    lit = samples.radiance > 0
-    if not lit.all():
-        samples = select(samples, lit)
+    samples = with_energy(samples)
     if len(samples.pixel) == 0 or tolerance_m == 0:
         return samples
     cell = np.floor(samples.path_m.astype(np.float64) / tolerance_m)
     number = np.clip(cell + (1 << 27), 0, (1 << 28) - 1).astype(np.int64)
     key = (samples.pixel.astype(np.int64) << 1 | (samples.bounces > 1)) << 28 | number
+    return merge_by(samples, key, cell * tolerance_m)
+
+
+def with_energy(samples: Samples) -> Samples:
+    """Those that carry light."""
+    lit = samples.radiance > 0
+    return samples if lit.all() else select(samples, lit)
+
+
+def merge_by(samples: Samples, key: np.ndarray, base: np.ndarray) -> Samples:
+    """Merge samples, each of positive energy, that have one key; their cell begins at `base` [m].
+
+    Energy, centroid and variance of the path length are kept: the merged sample is uniform over centroid +-
+    sqrt(3 variance), where one uniform over c +- h has variance h^2 / 3, and has the fewest bounces of its parts. The
+    sums run over a stable sort in float64, so that the result depends on the samples' order alone.
+    """
+    if len(key) == 0:
+        return samples
     order = np.argsort(key, kind="stable")
     key = key[order]
     first = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
-    base = cell * tolerance_m
     # moments about the cell's beginning: float64 holds them to 1e-16 of a cell
     offset, moments = samples.path_m - base, np.empty((3, len(key)))
     moments[0] = samples.radiance

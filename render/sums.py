@@ -89,4 +89,4 @@ class Sums:
     def evaluate(self) -> None:
         """Run what was added so far."""
         kept = [rows for rows in (self.rows, self.watched, self.plain) if rows is not None]
-        dr.eval(self.totals, [(rows.energy, rows.moment) for rows in kept])
+        dr.eval(self.totals, [rows.moments for rows in kept])

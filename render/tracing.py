@@ -100,6 +100,7 @@ def trace(
     pixels = np.arange(camera.height * camera.width)
     say("direct light", 0.05)
     direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, least_share=plan.least_share)
+    release(len(pixels))
     # only indirect light is counted from where direct light is
     origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m)

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from render.cells import Rows, make_cells
 from render.engine import render
 from render.error import response
 from render.planning import make_plan
@@ -14,7 +13,7 @@ from render.regions import READERS, SHRINKING, octaves
 from render.returns import Samples, select
 from render.settings import RenderSettings
 from render.tracing import trace
-from render.world import Bool, Float, UInt32, World, dr, upload
+from render.world import World, dr
 from scenes import Camera, InputError, Laser, Material, Scene, Surface, hard_cases
 from scenes.hard_cases import hard_case
 from scenes.shapes import box, sphere
@@ -52,28 +51,6 @@ def test_octaves_cover_every_path_and_narrow_with_more_paths():
     few, many = (octaves(paths, 0.05, 3.0, 40.0, 0.03, 0.05) for paths in (16, 256))
     assert few.size_m[0] / few.from_m[0] == pytest.approx(16**SHRINKING * many.size_m[0] / many.from_m[0])
     assert many.count < few.count
-
-
-@pytest.mark.parametrize("growth", [0.0, 0.05])
-def test_light_between_two_paths_keeps_its_energy_and_place(growth):
-    """Also beyond the last cell, where an interval reaches past the end of all cells."""
-    rng, cells = np.random.default_rng(1), make_cells(0.03, growth, -0.5, 5.0)
-    rows = Rows(1, cells, 2.0**-40)
-    low = rng.uniform(-0.6, 5.5, 5000)
-    high = low + rng.uniform(0, 0.03, len(low))
-    radiance = rng.uniform(0, 1, len(low))
-    columns = (upload(Float, part) for part in (low, high, radiance))
-    rows.add_between(UInt32(0), *columns, Bool(True))
-    dr.eval(rows.energy, rows.moment)
-    energy, moment = (values[0] for values in rows.sums())
-    assert energy.sum() == pytest.approx(radiance.sum(), rel=1e-6)
-    inside = (low > -0.4) & (high < 4.9)
-    rows = Rows(1, cells, 2.0**-40)
-    columns = (upload(Float, part[inside]) for part in (low, high, radiance))
-    rows.add_between(UInt32(0), *columns, Bool(True))
-    energy, moment = (values[0] for values in rows.sums())
-    mean = (energy * cells.edges_m[:-1] + moment * cells.width_of_m).sum() / energy.sum()
-    assert mean == pytest.approx(np.average((low + high)[inside] / 2, weights=radiance[inside]), abs=1e-6)
 
 
 @pytest.mark.parametrize("albedo", [0.5, 0.99])
