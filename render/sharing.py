@@ -29,10 +29,10 @@ from render.sums import Sums
 from render.turns import BLOCK, Turns
 from render.world import Bool, Float, UInt32, World, dr, mi
 
-# Of one launch, 40 and 75 MB in its course.
-LANES = 1 << 20  # connections
+# Of one launch, 30 and 75 MB in its course.
+LANES = 3 << 18  # connections
 PATHS = 1 << 18
-FILTERED_PATHS = 1 << 16  # which may have connections, too
+FILTERED_PATHS = 13 << 12  # which may have connections, too
 
 
 def add_paths(
