@@ -25,15 +25,15 @@ SCENES: dict[str, str] = {
 }
 EXTENSIONS = (*MESH_EXTENSIONS, ".xml")
 HARD = "hard-cases/"
-FAMILIES = (HARD, "tabletop/", "middlebury/", "rooms/")
+FAMILIES = (HARD, "tabletop/", "middlebury/", "rooms/", "clutter/")
 WIDTH, HEIGHT = 128, 96  # pixels, where neither the caller nor the file says
 
 
 def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
     """The scene of that name, or in that file (.obj .ply .stl .glb, or Mitsuba .xml).
 
-    Names: a key of SCENES, `hard-cases/NAME`, `tabletop/NAME`, `middlebury/NAME`, `rooms/SPLIT/NUMBER`; a folder with
-    view1.png, disp1.png and dmin.txt is a Middlebury scene too.
+    Names: a key of SCENES, `hard-cases/NAME`, `tabletop/NAME`, `middlebury/NAME`, `rooms/SPLIT/NUMBER`,
+    `clutter/SPLIT/NUMBER`; a folder with view1.png, disp1.png and dmin.txt is a Middlebury scene too.
 
     width, height: pixels; None is 128 x 96, or the film size of an .xml; one alone keeps the proportions. The seed
     matters to procedural scenes only. Raises InputError in one line for an unknown name or extension, or a bad file.
@@ -86,8 +86,9 @@ def _of_a_set(spec: str, seed: int, width: int | None, height: int | None) -> Sc
         return replace(scene, camera=scene.camera.resized(width, height))
     split, _, number = name.partition("/")
     if not number.isdecimal():
-        raise InputError(f"scene {spec!r}: expected rooms/train, rooms/val or rooms/test, / and the number of a view")
-    return scene_set(f"rooms/{split}").view(int(number), seed=seed, width=width, height=height)
+        splits = ", ".join(f"{family}/{split}" for split in ("train", "val", "test"))
+        raise InputError(f"scene {spec!r}: expected one of {splits}, then / and the number of a view")
+    return scene_set(f"{family}/{split}").view(int(number), seed=seed, width=width, height=height)
 
 
 def _hard_case(name: str, width: int | None, height: int | None) -> Scene:

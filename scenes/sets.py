@@ -12,6 +12,9 @@ SETS: dict[str, str] = {
     "rooms/train": "procedural furnished rooms, each seen by six cameras, without end (short: rooms)",
     "rooms/val": "rooms that are not in rooms/train",
     "rooms/test": "rooms that are in neither",
+    "clutter/train": "edge-rich procedural views, 0.3 to 13 m, without end (short: clutter)",
+    "clutter/val": "views that are not in clutter/train",
+    "clutter/test": "views that are in neither",
     "tabletop": "eight still lifes with fine structure, 1.1 to 2.9 m",
     "middlebury": "reliefs of the Middlebury 2006 scenes found beside the project",
     "hard-cases": "scenes that break renderers",
@@ -40,12 +43,16 @@ class SceneSet:
 
 
 def scene_set(name: str) -> SceneSet:
-    """The set of that name, `rooms` for `rooms/train`; InputError in one line for another name."""
-    name = "rooms/train" if name == "rooms" else name
+    """Return the set of that name, `rooms` and `clutter` for their training split.
+
+    Raises InputError in one line for another name.
+    """
+    name = f"{name}/train" if name in ENDLESS else name
     if name not in SETS:
         raise InputError(f"scene set {name!r}: expected one of {', '.join(SETS)}")
-    if name.startswith("rooms/"):
-        return _rooms(name, name.removeprefix("rooms/"))
+    family, _, split = name.partition("/")
+    if family in ENDLESS:
+        return ENDLESS[family](name, split)
     names, load = _named(name)
 
     def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
@@ -64,6 +71,18 @@ def _rooms(name: str, split: str) -> SceneSet:
         return room_view(index, split, seed=seed, width=width or height or 64, height=height or width or 64)
 
     return SceneSet(name, None, make, lambda index: room_name(index, split), VIEWS_PER_ROOM)
+
+
+def _clutter(name: str, split: str) -> SceneSet:
+    from scenes.clutter_set import clutter_view
+
+    def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
+        return clutter_view(index, split, seed=seed, width=width or height or 64, height=height or width or 64)
+
+    return SceneSet(name, None, make, lambda index: f"{name}/{index}")
+
+
+ENDLESS: dict[str, Callable[[str, str], SceneSet]] = {"rooms": _rooms, "clutter": _clutter}
 
 
 def _named(name: str) -> tuple[list[str], Callable[[str], Scene]]:
