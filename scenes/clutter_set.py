@@ -22,11 +22,12 @@ from scenes.rooms import one_of_each
 SPLITS = ("train", "val", "test")
 STREAM = 40  # of SeedSequence: nothing else draws from it
 FOV_DEG = (36.0, 66.0)
-BACK_M = (1.3, 13.0)  # camera to the wall that it faces; drawn evenly in its logarithm
+BACK_M = (1.3, 13.0)  # camera to the wall that it faces
+TOWARDS_NEAR = 1.5  # exponent of a uniform number, then between the logarithms of BACK_M: median 2.9 m
 NEAREST_M = 0.3
 NEAR_SHARE = (0.18, 0.6)  # nearest thing over the back wall's distance
 RARELY_NEAR, RARE_SHARE = 0.1, (0.06, 0.18)  # in a tenth of the views
-COUNT = (4, 40)
+COUNT = (5, 40)
 ANGLE_DEG = (2.5, 24.0)  # half the angle that a thing takes
 CLEAR_M = 0.02  # between a thing and a wall
 TEXTURES = ("painting", "print", "pattern", "wood", "cloth", "rug", "floor")
@@ -56,7 +57,7 @@ def clutter_view(index: int, split: str = "train", *, seed: int = 0, width: int 
 
 def _room(rng: Random, width: int, height: int) -> tuple[Camera, np.ndarray, np.ndarray]:
     """Draw a box-shaped room around a camera at the origin that faces one of its walls, often at an angle."""
-    back = math.exp(rng.uniform(*np.log(BACK_M)))
+    back = BACK_M[0] * (BACK_M[1] / BACK_M[0]) ** (rng.random() ** TOWARDS_NEAR)
     fov = rng.uniform(*FOV_DEG)
     reach = back * math.tan(math.radians(fov / 2))
     low = np.array((-rng.uniform(0.5, 1.3) * reach - 0.4, -rng.uniform(0.5, 1.3) * reach - 0.3, -back))
