@@ -28,7 +28,7 @@ NEAREST_M = 0.3
 NEAR_SHARE = (0.18, 0.6)  # nearest thing over the back wall's distance
 RARELY_NEAR, RARE_SHARE = 0.1, (0.06, 0.18)  # in a tenth of the views
 COUNT = (5, 40)
-ANGLE_DEG = (2.5, 24.0)  # half the angle that a thing takes
+ANGLE_DEG = (3.0, 30.0)  # half the angle that a thing takes
 CLEAR_M = 0.02  # between a thing and a wall
 TEXTURES = ("painting", "print", "pattern", "wood", "cloth", "rug", "floor")
 
@@ -114,9 +114,9 @@ def _things(palette: Palette, rng: Random, camera: Camera, low: np.ndarray, high
         ray = np.array((*(rng.uniform(-1.05, 1.05, 2) * tangent), 1.0))
         ray = camera.rotation @ (ray / np.linalg.norm(ray))
         radius = distance * math.tan(math.radians(math.exp(rng.uniform(*np.log(ANGLE_DEG)))))
-        # the whole thing stays behind the nearest distance
+        # the whole thing, which fills a ball of that radius, stays behind the nearest distance
         centre = ray * max(distance, nearest + radius)
-        vertices = shape[0] * radius + centre
+        vertices = shape[0] * (radius / np.linalg.norm(shape[0], axis=1).max()) + centre
         # what would stick through a wall is broken off
         inside = ((vertices > low + CLEAR_M) & (vertices < high - CLEAR_M)).all(axis=1)
         faces = shape[1][inside[shape[1]].all(axis=1)]
