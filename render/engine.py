@@ -25,6 +25,7 @@ from render.settings import BATCHES, FILTERED_BATCHES, MOST_AMBIENT_SPP, Plan, R
 from render.tracing import Progress, Traced, derived_seed, most_spp, spans_of, trace, traced_on
 from render.transient import Transient
 from render.world import World
+from scenes.limits import require_memory
 from scenes.model import Scene
 
 log = logging.getLogger(__name__)
@@ -35,6 +36,9 @@ AMBIENT_BOUNCES = 16  # most paths end long before, by chance
 MOST_MORE, MOST_MORE_FILTERED = 3.0, 15.0
 CLEAR = 3  # standard deviations above which a bias is believed
 MOST_FILTERED_PASSES, LEAST_ALLOWED = 3, 0.25
+# A plane under direct light, the least there is, takes 170 bytes a pixel (measured); its file holds four arrays a pixel
+# of some 120 bytes each when it is written.
+LEAST_PIXEL_BYTES = 170 + 4 * 120
 
 
 def render(
@@ -55,8 +59,9 @@ def render(
     """
     settings = settings or RenderSettings()
     say = progress or (lambda what, share: None)
-    world = World(scene) if world is None else world
     camera = scene.camera
+    require_memory(LEAST_PIXEL_BYTES * camera.width * camera.height, f"a render of {camera.width} x {camera.height}")
+    world = World(scene) if world is None else world
     say("plan", 0.0)
     plan = planned(world, settings, seed) if plan is None else plan
     checked = pilot_pixels(world, derived_seed(seed, STAGE_PLAN))

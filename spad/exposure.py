@@ -13,6 +13,7 @@ import torch
 
 from render.transient import Transient
 from scenes.errors import InputError
+from scenes.limits import require_memory
 from spad.flux import Rates, expected_counts
 from spad.laws import (
     Detected,
@@ -80,6 +81,7 @@ class Exposure:
 def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
     """(H, W, T) int32."""
     height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
+    require_memory(4 * height * width * bins, f"a histogram of {width} x {height} pixels and {bins} bins")
     counts = np.zeros((height * width, bins), dtype=np.int32)
 
     def fill(block: slice, drawn: np.ndarray) -> None:

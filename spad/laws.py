@@ -158,14 +158,14 @@ def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
     if dead == 0:
         return counts / cycles
     # A detection is at a uniform place in its bin, and so is the photon: the share of pairs at a distance under the
-    # dead time is the integral of a triangle. Bin k itself is the logarithm's part.
-    distance = torch.arange(1, int(dead) + 2, dtype=torch.float64, device=counts.device)
-    near = dead - distance
-    share = torch.where(
-        near >= 1, 1.0, torch.where(near >= 0, 1 - (1 - near) ** 2 / 2, (1 + near).clamp(min=0) ** 2 / 2)
-    )
-    kernel = torch.zeros(sensor.bins, dtype=torch.float64, device=counts.device)
-    kernel.index_add_(0, distance.long() % sensor.bins, share)
+    # dead time is the integral of a triangle. It is 1 up to `whole`, of which each period holds one of every bin: a
+    # dead time of many periods takes no more memory than a short one. Bin k itself is the logarithm's part.
+    whole = max(int(dead - 1), 0)
+    bins = torch.arange(sensor.bins, device=counts.device)
+    kernel = ((whole - bins) // sensor.bins + (bins > 0)).double()
+    for distance in range(whole + 1, int(dead) + 2):
+        near = dead - distance
+        kernel[distance % sensor.bins] += 1 - (1 - near) ** 2 / 2 if near >= 0 else (1 + near) ** 2 / 2
     if dead < 1:
         kernel[0] += dead - dead**2 / 2
     spectrum = torch.fft.rfft(counts) * torch.fft.rfft(kernel)

@@ -250,3 +250,12 @@ def test_camera_of_one_pixel():
     scene = Scene("one", (oracles.wall(3.0, 0.5, half_size_m=20),), Camera(oracles.camera().pose, 34.0, 1, 1))
     transient = render(scene)
     assert transient.depth_m.shape == (1, 1) and transient.depth_m[0, 0] == pytest.approx(3.0, abs=1e-5)
+
+
+def test_an_image_larger_than_memory_is_refused_before_anything_is_built(monkeypatch):
+    """16384 x 16384 needs 174 GB at least, a plane's: no machine is asked for what it has not."""
+    monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "32")
+    monkeypatch.setattr(engine, "World", lambda *_: pytest.fail("nothing may be built"))
+    scene = room(width=16384, height=16384)
+    with pytest.raises(InputError, match="a render of 16384 x 16384: needs 174 GB of memory, the limit is 32 GB"):
+        render(scene, RenderSettings(bounces=1))

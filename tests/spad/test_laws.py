@@ -8,6 +8,7 @@ import torch
 from scipy import stats
 from test_flux import transient_of
 
+from scenes import InputError
 from spad.detect import expected_in_pixel, sense, sense_timestamps, stream_timestamps
 from spad.laws import (
     Detected,
@@ -331,3 +332,28 @@ def test_parts_of_an_exposure_are_the_exposure(model: str) -> None:
     assert stats.chi2_contingency(both[:, both.sum(axis=0) > 20]).pvalue > 1e-3
     # forgetting the dead time at 40 seams would add 0.5 tau's worth of detections at each: 10 % here
     assert both.sum(axis=1)[0] == pytest.approx(both.sum(axis=1)[1], rel=5 * np.sqrt(2 / both[1].sum()))
+
+
+def test_a_dead_time_of_seconds_takes_no_more_memory_than_one_of_nanoseconds():
+    """1 s is 1e10 bins: the kernel of whole periods is a number per bin, not an entry per bin of the dead time."""
+    sensor = Sensor(reset="free-running", dead_time_s=1.0, exposure_s=1000.0)
+    flux = free_running_flux(torch.full((1, sensor.bins), 0.5), sensor.cycles, sensor)
+    # each of 512 detections blinds 1e7 of the 1e10 cycles
+    live = sensor.cycles - 512 * sensor.dead_time_s / sensor.period_s
+    assert torch.allclose(flux, torch.full_like(flux, 0.5 / live), rtol=1e-6)
+    short = Sensor(reset="free-running", dead_time_s=250e-9)
+    counts = torch.arange(short.bins).double()[None] % 7
+    dead = short.dead_time_s / short.bin_width_s
+    far = torch.arange(1, int(dead) + 2).double()
+    within = torch.where(
+        far <= dead - 1, 1.0, torch.where(far <= dead, 1 - (1 - dead + far) ** 2 / 2, (1 + dead - far) ** 2 / 2)
+    )
+    blind = sum(share * counts.roll(int(d), -1) for share, d in zip(within, far, strict=True))
+    plain = -torch.log1p(-counts / (short.cycles - blind))
+    assert torch.allclose(free_running_flux(counts, short.cycles, short), plain, rtol=1e-9)
+
+
+def test_a_histogram_larger_than_memory_is_refused_before_it_is_allocated(monkeypatch):
+    monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "1e-6")
+    with pytest.raises(InputError, match="a histogram of 1 x 1 pixels and 1024 bins: needs .* GB of memory"):
+        sense(transient_of([(4.0, 4.02, 1.0)]), Sensor(), PhotonBudget(40, 60))
