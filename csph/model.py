@@ -16,6 +16,7 @@ from csph.layer import CompressiveLayer
 from csph.quantise import encode_int16, quantised
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from spad.depth import radial_depth_of
 from spad.histogram import Histogram
 from spad.matching import normalised_correlation
 
@@ -79,7 +80,10 @@ class DepthModel(nn.Module):
 
     @torch.no_grad()
     def depth_of(self, histogram: Histogram, *, int8: bool = False) -> tuple[np.ndarray, int]:
-        """Depth map (H, W) float32 [m] of a histogram, and how many 16-bit sums wrapped (0 without int8)."""
+        """Estimate the radial depth (H, W) float32 [m], and count the 16-bit sums that wrapped (0 without int8).
+
+        With a displaced laser the network's half path becomes a distance by the histogram's geometry.
+        """
         self.check_histogram(histogram)
         device = next(self.parameters()).device
         rows, columns, bins = histogram.counts.shape
@@ -89,7 +93,7 @@ class DepthModel(nn.Module):
             depth, overflows = self.depth_int8_m(counts)
         else:
             depth, overflows = self.depth_m(counts.to(device, torch.float32)), 0
-        return depth[0].cpu().numpy(), overflows
+        return radial_depth_of(histogram, depth[0].cpu().numpy()), overflows
 
 
 def _weights_sha256(weights: dict[str, Tensor]) -> str:

@@ -79,6 +79,16 @@ class Transient:
         good &= self.path_far_m >= self.path_near_m
         if not good.all():
             raise InputError(f"transient: {(~good).sum()} of {good.size} returns are negative, not finite or reversed")
+        for name in ("ambient", "error"):
+            layer = getattr(self, name)
+            good = np.isfinite(layer) & (layer >= 0)
+            if not good.all():
+                row, column = np.argwhere(~good)[0]
+                count, value = (~good).sum(), layer[row, column]
+                raise InputError(
+                    f"transient: {count} of {good.size} values of {name} are negative or not finite: {value:g} in row "
+                    f"{row}, column {column}"
+                )
 
     @property
     def returns(self) -> int:

@@ -15,6 +15,8 @@ from scenes.shapes import axis_frame
 from scenes.textures import luminance, srgb_to_linear
 
 COLOUR_TAGS = ("float", "integer", "rgb", "srgb", "spectrum")
+# Of a matrix: what is beyond leaves the range of numbers when matrices are multiplied, inverted or decomposed.
+MAX_ENTRY = 1e15
 VALUE_TAGS = (*COLOUR_TAGS, "boolean", "string", "vector", "point", "blackbody", "transform")
 PLUGIN_TAGS = (
     *("bsdf", "shape", "emitter", "texture", "sensor", "film", "sampler", "rfilter", "integrator"),
@@ -213,6 +215,9 @@ class Plugin:
             raise self.fail(f"{name} is a <{element.tag}>, expected <transform>")
         for step in element:
             matrix = self._step(name, step) @ matrix
+            largest = float(np.abs(matrix).max())
+            if not largest <= MAX_ENTRY:
+                raise self.fail(f"{name}: <{step.tag}> makes an entry of {largest:g}, beyond {MAX_ENTRY:g}")
         if not np.isfinite(matrix).all() or not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-9):
             raise self.fail(f"{name}: the last row of the matrix is {matrix[3].tolist()}, expected 0 0 0 1")
         if abs(np.linalg.det(matrix[:3, :3])) < 1e-30:

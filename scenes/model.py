@@ -23,6 +23,10 @@ MaterialKind = Literal[
 LaserMode = Literal["flood", "line", "scan"]
 MATERIAL_KINDS: tuple[str, ...] = MaterialKind.__args__
 LASER_MODES: tuple[str, ...] = LaserMode.__args__
+# Spectral radiance [W/(m^2 sr nm)]: the sun's disk has 1e4; what lies far above is no light, and overflows in float32.
+MAX_RADIANCE = 1e9
+# Metres from the origin: float32, in which rays are traced, resolves 1 m there.
+MAX_COORDINATE_M = 1e7
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +53,14 @@ def _number(value: object, what: str) -> float:
     good = isinstance(value, (int, float, np.number)) and math.isfinite(value)
     require(good, f"{what} {value!r} is not a finite number")
     return float(value)
+
+
+def _radiance(value: object, what: str) -> float:
+    """`value` as a radiance, 0 to MAX_RADIANCE."""
+    value = _number(value, what)
+    require(value >= 0, f"{what} {value:g} is negative")
+    require(value <= MAX_RADIANCE, f"{what} {value:g} is above {MAX_RADIANCE:g} W/(m2 sr nm), no light is so bright")
+    return value
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -139,6 +151,8 @@ class Surface:
         if not np.isfinite(vertices).all():
             bad = int((~np.isfinite(vertices).all(axis=1)).sum())
             raise InputError(f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
+        farthest = float(np.abs(vertices).max())
+        require(farthest <= MAX_COORDINATE_M, f"{where}: a vertex at {farthest:g} m is beyond {MAX_COORDINATE_M:g} m")
         check_faces(faces, len(vertices), where)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
@@ -152,8 +166,7 @@ class Surface:
             object.__setattr__(self, label, array)
         textured = isinstance(self.material.albedo, Texture) or isinstance(self.material.opacity, Texture)
         require(self.uv is not None or not textured, f"{where}: its material has a texture, the mesh no uv coordinates")
-        object.__setattr__(self, "emission", _number(self.emission, f"{where}: emission"))
-        require(self.emission >= 0, f"{where}: emission {self.emission:g} is negative")
+        object.__setattr__(self, "emission", _radiance(self.emission, f"{where}: emission"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,8 +315,9 @@ class Ambient:
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radiance", _number(self.radiance, "ambient radiance"))
-        require(self.radiance >= 0, f"ambient radiance {self.radiance:g} is negative")
+        object.__setattr__(self, "radiance", _radiance(self.radiance, "ambient radiance"))
+        if self.environment is not None:
+            _radiance(self.environment.image.max(), f"environment map {self.environment.name}: radiance")
         both = self.environment is not None and self.radiance > 0
         require(not both, "ambient light is either a constant radiance or an environment map, not both")
         object.__setattr__(self, "pose", rigid_pose(self.pose, "environment pose"))

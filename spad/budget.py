@@ -22,6 +22,11 @@ BOLTZMANN_J_PER_K = 1.380649e-23
 SUN_TEMPERATURE_K = 5778.0
 # Luminous efficacy of radiation at 555 nm, where the eye is most sensitive.
 PEAK_EFFICACY_LM_PER_W = 683.0
+# Mean ambient radiance [W/(m^2 sr nm)] above which it is no radiance of daylight. White paper facing the sun: 100 klux
+# are 0.82 W/(m^2 nm) at 850 nm as a black body (`sunlight_w_per_m2_nm`), the direct sun of the reference spectrum ASTM
+# G-173 about 0.9, and / pi is 0.26 to 0.29; bright haze and sunlit clouds are about as bright. Silicon SPADs see most
+# of the sun, 1.6 W/(m^2 nm) outside the atmosphere, near 500 nm: 0.5.
+BRIGHT_SKY_W_PER_M2_SR_NM = 0.5
 
 
 @dataclass(frozen=True)
@@ -79,11 +84,20 @@ class Optics:
     ) -> PhotonBudget:
         """Mean signal and mean background of a scene: the budget by means that gives these very expected counts.
 
-        Background is ambient light through the filter and dark counts, the sensor's or a measured map's.
+        Background is ambient light through the filter and dark counts, the sensor's or a measured map's. Raises
+        InputError where the mean ambient radiance is above a bright sky's: then a scene file's lights are in units of
+        their own, as those made for pictures are.
         """
         pixels = transient.height * transient.width
+        radiance = float(transient.ambient.mean(dtype=np.float64))
+        require(
+            radiance <= BRIGHT_SKY_W_PER_M2_SR_NM,
+            f"ambient radiance of {radiance:.3g} W/(m2 sr nm) on average is above {BRIGHT_SKY_W_PER_M2_SR_NM:g}, a "
+            "bright sky's: the scene's lights are in other units; scale them in the scene, or state the photons by "
+            "--signal and --background instead of --radiometric",
+        )
         signal = self.signal_scale(sensor) * float(transient.radiance.sum(dtype=np.float64)) / pixels
-        ambient = float(transient.ambient.mean(dtype=np.float64)) * self.filter_nm * sensor.exposure_s
+        ambient = radiance * self.filter_nm * sensor.exposure_s
         dark_hz, _ = detector_maps(sensor, (transient.height, transient.width), dark_map_hz, seed)
         dark = float(dark_hz.mean()) * sensor.exposure_s
         return PhotonBudget(signal, ambient * self.detections_per_radiance(sensor) + dark)

@@ -25,6 +25,8 @@ from torch import Tensor
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError
+from scenes.model import Camera
+from spad.histogram import Histogram
 from spad.laws import linearised
 from spad.matching import (
     argmax_bins,
@@ -52,8 +54,11 @@ __all__ = [
     "depth_in_range",
     "estimate_depth",
     "grid_peak",
+    "histogram_depth_m",
+    "laser_baseline_m",
     "noise_free_bias_m",
     "radial_depth_m",
+    "radial_depth_of",
 ]
 
 _BIAS_PHASES = 16
@@ -136,10 +141,12 @@ def _require_method(method: str) -> None:
 
 
 def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched") -> Tensor:
-    """Depth [m] of a histogram of counts, (..., T) -> (...,) float32 in [0, range); NaN where a pixel has no count.
+    """Estimate half the optical path [m] from counts, (..., T) -> (...,) float32 in [0, range); NaN without counts.
 
-    Raises InputError for an unknown method, a wrong number of bins, negative or non-finite counts, and with `coates`
-    for counts that the sensor's detector cannot have made.
+    It is the depth where the laser is co-located with the camera. Counts know no laser: `histogram_depth_m` takes a
+    `Histogram`, which does, and gives the depth beside a displaced one too. Raises InputError for an unknown method, a
+    wrong number of bins, negative or non-finite counts, and with `coates` for counts that the sensor's detector cannot
+    have made.
     """
     _require_method(method)
     rows = checked_histogram(counts, sensor.bins)
@@ -203,6 +210,40 @@ def radial_depth_m(half_path_m: np.ndarray, directions: np.ndarray, baseline_m: 
     path, baseline = 2.0 * np.asarray(half_path_m, dtype=np.float64), np.asarray(tuple(baseline_m), dtype=np.float64)
     distance = (path**2 - baseline @ baseline) / (2 * (path - directions @ baseline))
     return distance.astype(np.float32)
+
+
+def laser_baseline_m(histogram: Histogram) -> tuple[float, ...]:
+    """Return the laser's place relative to the camera, in the camera's frame [m]; 0 0 0 if not told."""
+    return tuple(histogram.meta.get("transient", {}).get("laser", {}).get("baseline_m", (0.0, 0.0, 0.0)))
+
+
+def radial_depth_of(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
+    """Convert half the optical path (H, W) [m] into distance from the camera by the histogram's own camera and laser.
+
+    With a co-located laser, or where the histogram does not know of any, it is the same array.
+    """
+    baseline = laser_baseline_m(histogram)
+    if not any(baseline):
+        return half_path_m
+    camera = Camera(**histogram.meta["transient"]["camera"])
+    return radial_depth_m(half_path_m, camera.rays() @ camera.rotation, baseline)
+
+
+def histogram_depth_m(
+    histogram: Histogram, estimator: str | Callable[[Tensor, Sensor], Tensor] = "log-matched"
+) -> np.ndarray:
+    """Estimate the radial depth [m] of every pixel, (H, W) float32; NaN where a pixel has no count.
+
+    `estimator` is one of METHODS, or any function (counts (H, W, T), sensor) -> half the optical path (H, W) [m].
+    With a displaced laser that half path becomes a distance by the scene's geometry (`radial_depth_of`). Raises
+    InputError as `estimate_depth` does.
+    """
+    counts = torch.from_numpy(histogram.counts)
+    if isinstance(estimator, str):
+        half_path = estimate_depth(counts, histogram.sensor, estimator)
+    else:
+        half_path = estimator(counts, histogram.sensor)
+    return radial_depth_of(histogram, half_path.numpy())
 
 
 def depth_errors(

@@ -15,6 +15,7 @@ from render.transient import Transient
 from scenes.errors import InputError
 from spad.exposure import Exposure, Progress, counts_of, timestamps_of
 from spad.flux import expected_counts, rates_for
+from spad.glints import glint_warning, signal_shares
 from spad.histogram import Histogram
 from spad.laws import LOW_FLUX
 from spad.photons import expected_signal, light_of
@@ -41,13 +42,15 @@ def sense(
     poisson        n_i ~ Poisson(lambda_i) in every pixel and bin, independently: exact at low flux
     first-photon   a synchronous detector counts the first photon of each cycle: one multinomial over all cycles
     free-running   event by event, blind for the sensor's dead time after each detection
-    auto           poisson up to 1 % detections per cycle (or dead time, if longer) in the brightest pixel; above it
-                   first-photon where the detector is armed at every cycle, else free-running
+    auto           poisson up to 1 % primary detections per cycle (or dead time, if longer) in the brightest pixel;
+                   above it first-photon where the detector is armed at every cycle, else free-running
 
     Crosstalk is added where the sensor has it. `dark_map_hz` (H, W) takes the place of the sensor's dark count rate,
     NaN in dead pixels. Every 1024 pixels have a stream of their own, SeedSequence(seed, spawn_key=(stage, 0, block)).
-    `meta` holds the plan, the detections per cycle of the brightest pixel (`pile_up`), the share of signal detections
-    that wrapped around the period, and the share of the background that is dark counts. Raises InputError for an
+    `meta` holds the plan, `pile_up`: the expected primary detections per cycle of the brightest pixel, before dead time
+    and pile-up take theirs (what is counted after them is in `counts`); the share of signal detections that wrapped
+    around the period, the share of the background that is dark counts, the shares of the signal in the brightest pixel
+    and in the brightest thousandth of pixels, and the median pixel's signal (`spad.glints`). Raises InputError for an
     unknown law, one that the detector cannot follow, and more than 2^31 - 1 counts in a bin.
     """
     exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
@@ -130,6 +133,10 @@ def _planned(
     share = wrapped / (budget.signal * signal.size) if wrapped > 0 else 0.0
     if wrapped > 0:
         reasons.append(f"wrap: {share:.3%} of the signal arrives after the period of {sensor.range_m:.3f} m and wraps")
+    shares = signal_shares(signal)
+    warning = glint_warning(shares)
+    if warning is not None:
+        reasons.append(warning)
     meta = {
         "seed": seed,
         "model": chosen,
@@ -137,6 +144,9 @@ def _planned(
         "pile_up": pile_up,
         "wrapped": share,
         "dark_share": rates.dark_share,
+        "brightest_pixel": shares.brightest_pixel,
+        "brightest_thousandth": shares.brightest_thousandth,
+        "median_signal": shares.median,
         "transient": {**transient.meta, "sha256": _sha256(transient)},
         "versions": _versions(),
     }
@@ -164,7 +174,7 @@ def _versions() -> dict[str, str]:
 
 
 def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
-    """The detection law for `pile_up` primary detections per cycle in the brightest pixel, and why.
+    """Choose the detection law for `pile_up` primary detections per cycle in the brightest pixel, and say why.
 
     Raises InputError for the first-photon law where the dead time outlasts the period.
     """
@@ -174,7 +184,7 @@ def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
             f"model first-photon: the dead time of {sensor.dead_time_s:g} s is longer than the period of "
             f"{sensor.period_s:g} s, the detector is not armed at every cycle; use free-running"
         )
-    said = f"{pile_up:.2%} detections a cycle in the brightest pixel ({sensor.cycles:,.0f} cycles)"
+    said = f"{pile_up:.2%} primary detections a cycle in the brightest pixel ({sensor.cycles:,.0f} cycles)"
     blind = pile_up * max(1.0, sensor.dead_time_s / sensor.period_s)
     if outlasts:
         said += f", {blind:.2%} a dead time"

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.model import DepthModel, load_model
@@ -21,12 +20,12 @@ from render.engine import render
 from render.settings import RenderSettings
 from render.tracing import Progress
 from render.transient import Transient, write_transient
-from scenes import Camera, InputError, Laser, Scene
+from scenes import InputError, Laser, Scene
 from scenes.catalog import SCENES, WIDTH, load_scene
 from scenes.files import ATTRIBUTE, seal, whole_file
 from scenes.offsets import check_offset
 from scenes.sets import SETS, scene_set
-from spad.depth import depth_errors, estimate_depth, radial_depth_m
+from spad.depth import depth_errors, histogram_depth_m
 from spad.detect import sense
 from spad.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor import PhotonBudget, sensor_by_name
@@ -222,27 +221,17 @@ def depth_map(
     network: DepthModel | None = None,
     int8: bool = False,
 ) -> np.ndarray:
-    """Depth [m] of every pixel by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code.
-
-    With a displaced laser the arrival time is a path on an ellipsoid, and becomes a distance by the scene's geometry.
-    """
-    counts = torch.from_numpy(histogram.counts)
+    """Estimate depth [m] by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code."""
     if network is not None:
         depth, overflows = network.depth_of(histogram, int8=int8)
         if overflows:
             log.warning("%d sums of 16 bits wrapped around", overflows)
-    elif method == "compressive":
-        temporal = temporal_code(code, codes, histogram.sensor.bins, histogram.sensor, seed)
-        coding = CodingTensor(f"{code}-{codes}", temporal)
-        depth = decode_depth(encode(counts, coding), coding, histogram.sensor).numpy()
-    else:
-        depth = estimate_depth(counts, histogram.sensor, method).numpy()
-    geometry = histogram.meta.get("transient", {})
-    baseline = geometry.get("laser", {}).get("baseline_m", (0, 0, 0))
-    if not any(baseline):
         return depth
-    camera = Camera(**geometry["camera"])
-    return radial_depth_m(depth, camera.rays() @ camera.rotation, baseline)
+    if method != "compressive":
+        return histogram_depth_m(histogram, method)
+    temporal = temporal_code(code, codes, histogram.sensor.bins, histogram.sensor, seed)
+    coding = CodingTensor(f"{code}-{codes}", temporal)
+    return histogram_depth_m(histogram, lambda counts, sensor: decode_depth(encode(counts, coding), coding, sensor))
 
 
 def run_depth(command: commands.Depth, progress: Progress) -> dict:

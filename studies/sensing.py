@@ -15,7 +15,7 @@ import torch
 from render.transient import Transient, read_transient
 from scenes.errors import InputError, require
 from spad.budget import Optics
-from spad.depth import confidence
+from spad.depth import confidence, laser_baseline_m
 from spad.detect import sense
 from spad.histogram import Histogram, write_histogram
 from spad.mat import write_mat
@@ -100,7 +100,7 @@ def run(
     )
     seconds = time.perf_counter() - start
     for reason in histogram.meta["plan"]:
-        log.info("%s", reason)
+        log.log(logging.WARNING if reason.startswith("warning:") else logging.INFO, "%s", reason)
     write_histogram(histogram, out)
     result = {"seconds": seconds, **summary(histogram), "out": str(out)}
     if command.export == "mat":
@@ -112,13 +112,19 @@ def run(
 
 
 def summary(histogram: Histogram) -> dict:
-    """What the command reports of a histogram."""
+    """Summarise a histogram for the command's result.
+
+    `pile_up` is of primary detections, before dead time; `detections_per_cycle` what the brightest pixel counted.
+    """
     meta = histogram.meta
+    fullest = histogram.counts.sum(axis=2, dtype=np.int64).max(initial=0)
     return {
         "mean_signal": float(histogram.expected_signal.mean(dtype=np.float64)),
         "mean_background": float(histogram.expected_background.mean(dtype=np.float64)),
         "mean_counts": float(histogram.counts.sum(dtype=np.int64) / histogram.depth_m.size),
+        "detections_per_cycle": float(fullest / histogram.sensor.cycles),
         **{name: meta[name] for name in ("pile_up", "model", "wrapped", "dark_share")},
+        **{name: meta[name] for name in ("brightest_pixel", "brightest_thousandth", "median_signal")},
     }
 
 
@@ -141,8 +147,7 @@ def mean_confidence(histogram: Histogram, depth_m: np.ndarray) -> float:
 
     There the distance is not the arrival time that the probability is of.
     """
-    baseline = histogram.meta.get("transient", {}).get("laser", {}).get("baseline_m", (0, 0, 0))
-    if any(baseline) or np.isnan(depth_m).all():
+    if any(laser_baseline_m(histogram)) or np.isnan(depth_m).all():
         return math.nan
     share = confidence(torch.from_numpy(histogram.counts), torch.from_numpy(depth_m), histogram.sensor)
     return float(share.nanmean())

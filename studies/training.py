@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
@@ -24,7 +23,7 @@ from csph.views import Views, read_views, split_views
 from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import write_csv
-from spad.depth import METHODS, estimate_depth
+from spad.depth import METHODS, estimate_depth, histogram_depth_m
 from spad.histogram import Histogram
 from spad.sensor import Sensor, sensor_by_name
 from studies.commands import Evaluate, Train
@@ -155,7 +154,7 @@ def common_tile(models: Sequence[DepthModel]) -> tuple[int, int]:
 def baseline(name: str) -> Method:
     """A method without a network, by the names of `classical`."""
     depth_of = classical(name)
-    return lambda histogram: depth_of(torch.from_numpy(histogram.counts), histogram.sensor).numpy()
+    return lambda histogram: histogram_depth_m(histogram, depth_of)
 
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:

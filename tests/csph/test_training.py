@@ -20,7 +20,7 @@ from csph.loss import kl_divergence, pulse_target, total_variation
 from csph.model import DepthModel, load_model, save_model, weights_sha256
 from csph.training import train
 from csph.views import Views, packed_views, split_views
-from scenes import InputError
+from scenes import Camera, InputError
 from scenes.files import ATTRIBUTE
 from spad.detect import sense
 from spad.pulse import Pulse
@@ -331,3 +331,21 @@ def test_freed_memory_is_kept():
     pages = (8 << 21) // 4096
     first, later = map(int, said.split())
     assert first < 2 * pages and later < pages / 4  # once, not twenty times
+
+
+def test_a_networks_depth_knows_where_the_laser_is():
+    """A half path beside a displaced laser becomes a distance, for networks as for the filters."""
+    from spad.depth import radial_depth_m
+
+    camera = {"pose": np.eye(4).tolist(), "fov_deg": 60.0, "width": 16, "height": 16}
+    views, baseline = near_planes(1), (0.1, 0.0, 0.02)
+    model = DepthModel(MODEL).eval()
+
+    def depth(baseline_m: tuple[float, ...]) -> np.ndarray:
+        meta = {"camera": camera, "laser": {"mode": "flood", "baseline_m": list(baseline_m)}}
+        transient = replace(views.transients[0], meta=meta)
+        return model.depth_of(sense(transient, SMALL, PhotonBudget(20, 20), seed=1))[0]
+
+    rays = Camera(np.eye(4), 60.0, 16, 16).rays()
+    expected = radial_depth_m(depth((0.0, 0.0, 0.0)), rays, baseline)
+    assert np.array_equal(depth(baseline), expected) and not np.allclose(expected, depth((0.0, 0.0, 0.0)), atol=1e-3)

@@ -1,6 +1,7 @@
 """The transient's file: bit for bit, and every kind of damage refused in one line."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -165,3 +166,15 @@ def test_delay_moves_paths_by_twice_the_offset():
     assert np.allclose(later.mean_path_m(), transient.mean_path_m() + 14, atol=1e-5, equal_nan=True)
     assert np.allclose(later.depth_m, transient.depth_m + 7, equal_nan=True)
     assert (later.radiance == transient.radiance).all() and later.delayed(1.0).meta["time_offset_m"] == 8.0
+
+
+@pytest.mark.parametrize("layer", ["ambient", "error"])
+@pytest.mark.parametrize("bad", [np.nan, -0.5, np.inf])
+def test_one_bad_pixel_of_a_layer_is_refused(layer, bad):
+    good = make(300, 6, 8)
+    values = getattr(good, layer).copy()
+    values[2, 3] = bad
+    with pytest.raises(
+        InputError, match=rf"1 of 48 values of {layer} are negative or not finite: .* in row 2, column 3"
+    ):
+        replace(good, **{layer: values})

@@ -311,3 +311,28 @@ def test_artists_living_room() -> None:
     assert {s.material.kind for s in scene.surfaces} >= {"dielectric", "conductor", "roughconductor", "roughplastic"}
     assert all(surface.uv is not None for surface in scene.surfaces)
     assert len(scene.notes) == 1 and "nonlinear" in scene.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        (
+            f'{RECTANGLE}<emitter type="constant"><float name="radiance" value="1e300"/></emitter>',
+            "1e+300 is above 1e+09",
+        ),
+        (
+            '<shape type="rectangle"><emitter type="area"><float name="radiance" value="1e300"/></emitter></shape>',
+            "emission 1e+300 is above 1e+09",
+        ),
+        (
+            '<shape type="sphere"><transform name="to_world"><scale value="1e200"/></transform></shape>',
+            "to_world: <scale> makes an entry of 1e+200, beyond 1e+15",
+        ),
+        (
+            '<shape type="cube"><transform name="to_world"><scale value="1e9"/></transform></shape>',
+            "a vertex at 1e+09 m is beyond 1e+07 m",
+        ),
+    ],
+)
+def test_numbers_beyond_physics_are_refused_in_one_line(tmp_path: Path, body: str, words: str) -> None:
+    assert words in refusal(tmp_path, body)

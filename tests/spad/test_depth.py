@@ -1,6 +1,7 @@
 """Classical depth estimators against closed forms, the Cramer-Rao bound, and the laws that hold for each of them."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,11 +9,22 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from scenes import Camera
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
-from spad.depth import ESTIMATORS, METHODS, by_pixels, cramer_rao_m, depth_errors, estimate_depth, noise_free_bias_m
+from spad.depth import (
+    ESTIMATORS,
+    METHODS,
+    by_pixels,
+    cramer_rao_m,
+    depth_errors,
+    estimate_depth,
+    histogram_depth_m,
+    noise_free_bias_m,
+)
+from spad.histogram import Histogram
 from spad.matching import correlation, normalised_correlation
-from spad.sensor import Pulse, Sensor
+from spad.sensor import PhotonBudget, Pulse, Sensor
 from spad.template import binned_pulse, pulse_taps
 
 REFERENCE = Sensor()
@@ -313,3 +325,33 @@ def test_depth_errors_counts_what_it_leaves_out() -> None:
     assert nothing["pixels"] == 0 and nothing["missing"] == 1 and math.isnan(nothing["mae_mm"])
     with pytest.raises(InputError, match="alike"):
         depth_errors(np.zeros(3), np.zeros(4), range_m=1.0)
+
+
+def beside_a_displaced_laser(baseline_m: tuple[float, float, float]) -> Histogram:
+    """Bright pixels of an oblique wall, lit from `baseline_m`: arrival times by the two legs, without any formula."""
+    camera = Camera(np.eye(4), 60.0, 8, 6)
+    rays = camera.rays() @ camera.rotation
+    depth = 2.0 / (rays @ (0.3, 0.1, 0.95))
+    path = depth + np.linalg.norm(depth[..., None] * rays - baseline_m, axis=-1)
+    sensor = Sensor()
+    rate = 2e4 * binned_pulse(torch.from_numpy(path) / C, sensor)
+    geometry = {
+        "camera": {"pose": np.eye(4).tolist(), "fov_deg": 60.0, "width": 8, "height": 6},
+        "laser": {"mode": "flood", "baseline_m": list(baseline_m), "cone_deg": None},
+    }
+    zeros = np.zeros((6, 8), np.float32)
+    truth = (depth.astype(np.float32), zeros > 0, zeros.astype(np.float16), zeros, zeros)
+    counts = rate.round().to(torch.int32).numpy()
+    return Histogram(counts, sensor, PhotonBudget(1, 0), *truth, meta={"transient": geometry})
+
+
+@pytest.mark.parametrize("baseline_m", [(0.0, 0.0, 0.0), (0.8, -0.3, 0.2)])
+def test_depth_of_a_histogram_knows_where_the_laser_is(baseline_m):
+    """The library's function, not the command alone, gives distances from the camera beside a displaced laser."""
+    histogram = beside_a_displaced_laser(baseline_m)
+    for estimator in ("log-matched", lambda counts, sensor: estimate_depth(counts, sensor, "matched")):
+        assert np.abs(histogram_depth_m(histogram, estimator) - histogram.depth_m).max() < 2e-3
+    half_path = estimate_depth(torch.from_numpy(histogram.counts), histogram.sensor).numpy()
+    assert (np.abs(half_path - histogram.depth_m).max() > 0.03) == any(baseline_m)
+    blind = replace(histogram, meta={})
+    assert np.array_equal(histogram_depth_m(blind), half_path), "counts without a geometry stay half paths"

@@ -355,5 +355,5 @@ def test_a_dead_time_of_seconds_takes_no_more_memory_than_one_of_nanoseconds():
 
 def test_a_histogram_larger_than_memory_is_refused_before_it_is_allocated(monkeypatch):
     monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "1e-6")
-    with pytest.raises(InputError, match="a histogram of 1 x 1 pixels and 1024 bins: needs .* GB of memory"):
+    with pytest.raises(InputError, match=r"a histogram of 1 x 1 pixels and 1024 bins: needs .* GB of memory"):
         sense(transient_of([(4.0, 4.02, 1.0)]), Sensor(), PhotonBudget(40, 60))

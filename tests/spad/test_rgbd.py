@@ -327,3 +327,14 @@ def test_radiometric_and_mean_budget_meet() -> None:
 def test_bad_optics_are_refused(bad: dict) -> None:
     with pytest.raises(InputError, match="optics"):
         replace(EXAMPLE, **bad)
+
+
+def test_radiance_above_a_bright_sky_is_no_radiance_in_si() -> None:
+    """Sunlit white paper is below the limit, a lamp of a picture's scene far above it."""
+    paper = sunlight_w_per_m2_nm(1e5, 850e-9) / math.pi
+    lit = transient_of([(2.0, 2.1, 3e-4)], [(4.0, 4.0, 2e-4)], ambient=[paper, paper])
+    assert 0.2 < paper < 0.3 and EXAMPLE.budget(lit, SENSOR).background > 1e6
+    with pytest.raises(InputError) as error:
+        EXAMPLE.budget(replace(lit, ambient=np.full((1, 2), 1.4, np.float32)), SENSOR)
+    words = ("1.4 W/(m2 sr nm)", "above 0.5", "--signal and --background instead of --radiometric")
+    assert all(word in str(error.value) for word in words) and "\n" not in str(error.value)
