@@ -16,6 +16,8 @@ from csph.layer import CompressiveLayer
 from csph.quantise import encode_int16, quantised
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from scenes.inputs import regular_file
+from scenes.limits import require_memory
 from spad.depth import radial_depth_of
 from spad.histogram import Histogram
 from spad.matching import normalised_correlation
@@ -101,7 +103,7 @@ def _weights_sha256(weights: dict[str, Tensor]) -> str:
     for name in sorted(weights):
         array = weights[name].detach().cpu().contiguous()
         sha.update(f"{name}{array.dtype}{tuple(array.shape)}".encode())
-        sha.update(array.numpy().tobytes())
+        sha.update(array.view(-1).view(torch.uint8).numpy().tobytes())  # as bytes: numpy knows no bfloat16
     return sha.hexdigest()
 
 
@@ -127,15 +129,14 @@ def save_model(model: DepthModel, config: TrainConfig, state: dict, path: Path, 
 def checkpoint_file(path: Path) -> Path:
     """The checkpoint that a path names: the file, or `model.safetensors` in the folder of a run."""
     path = Path(path)
-    path = path / "model.safetensors" if path.is_dir() else path
-    require(path.is_file(), f"{path}: file not found")
-    return path
+    return regular_file(path / "model.safetensors" if path.is_dir() else path)
 
 
 def load_model(path: Path) -> tuple[DepthModel, TrainConfig, dict]:
     """A model as it was saved, in evaluation mode, its configuration, and the state it was saved in.
 
-    Raises InputError in one line for a missing, foreign or altered file, a newer schema, or weights of another design.
+    Weights in float16 or bfloat16 become float32. Raises InputError in one line for a missing, foreign or altered
+    file, a newer schema, or weights of another design or that are not finite.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -147,13 +148,41 @@ def load_model(path: Path) -> tuple[DepthModel, TrainConfig, dict]:
             meta, sha256 = open_seal(header, KIND)
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
         meta = check_seal(meta, sha256, _weights_sha256(weights))
-        config = TrainConfig.from_dict(meta["config"])
+        config, state = TrainConfig.from_dict(meta["config"]), meta["state"]
+        require(isinstance(state, dict), f"its state is a {type(state).__name__}, expected an object")
+        _check_design(config.model, sum(value.numel() for value in weights.values()))
         model = DepthModel(config.model, config.seed)
+        _check_weights(weights, model)
         model.load_state_dict(weights)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError, ArithmeticError) as error:
         raise InputError(f"{path}: not a readable checkpoint ({' '.join(str(error).split())[:120]})") from None
-    except RuntimeError:
-        raise InputError(f"{path}: its weights are of another design than {config.model.name}") from None
-    return model.eval(), config, meta["state"]
+    return model.eval(), config, state
+
+
+def _check_design(config: ModelConfig, stored: int) -> None:
+    """InputError for a coding tensor of more numbers than the file holds, before it is made."""
+    design = config.design
+    if design is None:
+        return
+    depth, pixels = design.block[0], design.size // design.block[0]
+    numbers = design.codes * (design.size if design.full else depth + (pixels if pixels > 1 else 0))
+    if config.layer.get("pulse_in_codes") or config.layer.get("pulse_in_decoder"):
+        require_memory(24 * depth**2, f"the pulse at every one of {depth} bins")
+    require(numbers <= stored, f"its design has {numbers} code entries, the file holds {stored} numbers")
+
+
+def _check_weights(weights: dict[str, Tensor], model: DepthModel) -> None:
+    """InputError that names the first tensor that is missing, too many, of another shape or kind, or not finite."""
+    expected = model.state_dict()
+    of = f"of another design than {model.config.name}:"
+    for name in sorted({*expected, *weights}):
+        require(name in weights, f"its weights are {of} tensor {name} is missing")
+        require(name in expected, f"its weights are {of} tensor {name} is one too many")
+        has, should = weights[name], expected[name]
+        shapes = f"{tuple(has.shape)}, expected {tuple(should.shape)}"
+        require(has.shape == should.shape, f"its weights are {of} tensor {name} is {shapes}")
+        alike = has.is_floating_point() == should.is_floating_point()
+        require(alike, f"tensor {name} holds {has.dtype}, expected {should.dtype}")
+        require(bool(has.isfinite().all()), f"tensor {name} holds NaN or infinite weights")

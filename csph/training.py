@@ -34,10 +34,12 @@ from csph.data import SetData
 from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
 from csph.snapshots import CodeEnergy
+from csph.torch_files import check_torch_file
 from csph.views import Views, packed_sha256, packed_views
 from render.heap import keep_freed_memory
 from scenes.errors import require
 from scenes.files import whole_file, write_csv
+from scenes.inputs import read_text
 from spad.fly import Batch
 
 log = logging.getLogger("csph")
@@ -132,7 +134,7 @@ def _claim(folder: Path, config: TrainConfig) -> None:
     text = json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n"
     path = folder / "config.json"
     if path.is_file():
-        same = path.read_text() == text
+        same = read_text(path, "configuration") == text
         require(same, f"{folder}: holds a run with other options or another set; choose another --out")
         return
     empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
@@ -209,6 +211,8 @@ def train(
     module = DepthTraining(config)
     resume = folder / "resume.ckpt"
     if not (folder / "last.safetensors").is_file():
+        if resume.is_file():
+            check_torch_file(resume)
         with _quiet():
             try:
                 runner.fit(module, module_data, ckpt_path=str(resume) if resume.is_file() else None, weights_only=True)

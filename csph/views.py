@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +10,8 @@ import numpy as np
 
 from render.pack import read_pack
 from render.transient import Transient, read_transient
-from scenes.errors import InputError, require
+from scenes.errors import require
+from scenes.set_index import read_set_index
 from spad.fly import PackedTransients, packed_transients
 
 VALIDATION_SHARE = 0.1  # of a set's scenes, its last, where no validation set is given
@@ -43,15 +43,9 @@ def read_views(path: Path) -> Views:
 
 
 def _from_folder(path: Path) -> tuple[list[Transient], list[str]]:
-    index = path / "index.jsonl"
-    require(index.is_file(), f"{path}: no set of scene2spad (no index.jsonl); make one with scene2spad dataset")
-    try:
-        records = [json.loads(line) for line in index.read_text().splitlines()]
-        good = [record for record in records if "failed" not in record]
-        files = [record["file"] for record in good]
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f"{index}: is damaged; run scene2spad dataset again") from None
-    return [read_transient(path / file) for file in files], [_scene(record, i) for i, record in enumerate(good)]
+    records = read_set_index(path)
+    transients = [read_transient(path / record["file"]) for record in records]
+    return transients, [_scene(record, i) for i, record in enumerate(records)]
 
 
 def _scene(meta: dict, number: int) -> str:

@@ -21,6 +21,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from scenes.inputs import parse_json
 
 PATH_STEP_M, WIDTH_STEP_M, DEPTH_STEP_M = 2.0**-10, 2.0**-8, 2.0**-12
 RADIANCE_STEPS, AMBIENT_STEPS = 125, 4  # per octave
@@ -293,7 +294,7 @@ def read_pack(path: Path) -> Pack:
             meta, sha256 = open_seal(file.attrs[ATTRIBUTE], "pack")
             arrays = _all_views(file)
             starts = np.asarray(file["start"][:], np.int64)
-            metas = tuple(json.loads(np.asarray(file["meta"][:], np.uint8).tobytes()))
+            metas = tuple(parse_json(np.asarray(file["meta"][:], np.uint8).tobytes()))
         returns = arrays["count"].sum(axis=(1, 2), dtype=np.int64)
         fits = len(returns) == len(metas) and np.array_equal(starts, np.concatenate(([0], returns.cumsum())))
         require(fits, "its views do not fit its returns")

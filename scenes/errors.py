@@ -5,7 +5,9 @@ class InputError(ValueError):
     """Bad input, in one line that names value, limit and place. The command line prints it and exits with 2."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(str(message).split()))
+        # a file's name may hold bytes that are no text: what is printed must be
+        text = str(message).encode("utf-8", "backslashreplace").decode()
+        super().__init__(" ".join(text.split()))
 
 
 def require(condition: bool, message: str) -> None:

@@ -14,6 +14,7 @@ from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 
 from scenes.errors import InputError
+from scenes.inputs import parse_json
 
 ATTRIBUTE = "scene2spad"
 SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 2, "network": 1}
@@ -65,8 +66,8 @@ def open_seal(text: str, kind: str) -> tuple[dict, str]:
     Raises InputError if it is something else, or of a newer schema.
     """
     try:
-        body = json.loads(text)
-    except (TypeError, ValueError):
+        body = parse_json(text)
+    except InputError:
         body = None
     if not isinstance(body, dict) or body.get("kind") not in SCHEMAS:
         raise InputError(f"its {ATTRIBUTE} attribute is not one of ours, expected a {kind}")

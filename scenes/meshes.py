@@ -5,10 +5,8 @@ A mesh file knows neither its unit nor, for STL, its upward axis; what is assume
 
 from __future__ import annotations
 
-import io
 import math
 import re
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +17,8 @@ import numpy as np
 from scenes import shapes
 from scenes.arrays import check_faces
 from scenes.errors import InputError
+from scenes.inputs import file_inside, read_bytes
+from scenes.mesh_files import MAX_COORDINATE, check_vertices, load_trimesh
 from scenes.model import Camera, Material, Scene, Surface, Texture
 from scenes.textures import load_texture, luminance, srgb_to_linear
 
@@ -29,7 +29,6 @@ SENSIBLE_EXTENT_M = (0.2, 2.5)  # a model whose largest extent lies in here is t
 UNITS_M = {"mm": 1e-3, "millimet": 1e-3, "cm": 1e-2, "centimet": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
 UNITS_M |= {"in": 0.0254, "ft": 0.3048, "met": 1.0, "m": 1.0}
 HEADER_BYTES = 4096  # where a comment may name the unit
-MAGIC = {b"ply": ".ply", b"glTF": ".glb", b"solid": ".stl"}
 WALL_GAP_M = 1.0
 FOV_DEG = 40.0
 ELEVATION_DEG, AZIMUTH_DEG = 15.0, 30.0  # a little from above, and from the side: what faces away shows its flank
@@ -119,44 +118,20 @@ def _read(path: Path) -> list[_Part]:
     kind = path.suffix.lower()
     if kind not in EXTENSIONS:
         raise InputError(f"{path}: extension {kind or '(none)'}, expected one of {' '.join(EXTENSIONS)}")
-    if not path.is_file():
-        raise InputError(f"{path}: mesh file not found")
+    loaded = load_trimesh(path, kind)
     try:
-        loaded = _load(path, kind)
         meshes = [(*loaded.graph[node], node) for node in loaded.graph.nodes_geometry]
         found = [_part(loaded.geometry[name], np.asarray(pose), node) for pose, name, node in meshes]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except Exception as error:  # every format of trimesh has its own exceptions
-        reason = (str(error).splitlines() or [""])[0]
-        # a missing import is how trimesh says that it cannot even guess the text encoding
-        told = reason[:200] if reason and not isinstance(error, ImportError) else "content not understood"
-        raise InputError(f"{path}: broken {kind} file ({told})") from None
+    except Exception as error:  # what trimesh works out only when it is asked for
+        raise InputError(f"{path}: broken {kind} file ({(str(error).splitlines() or [''])[0][:200]})") from None
     parts = [part for part in found if part is not None]
     if not found:
         raise InputError(f"{path}: empty, no mesh in it")
     if not parts:
         raise InputError(f"{path}: has no faces (a point cloud or lines only)")
     return [replace(parts[0], name=path.stem)] if len(parts) == 1 else parts
-
-
-def _load(path: Path, kind: str) -> Any:
-    """The trimesh.Scene of a file as it is: nothing merged, removed or reordered."""
-    import trimesh
-
-    content = path.read_bytes()
-    if not content.strip():
-        raise InputError("the file is empty")
-    actual = next((ext for magic, ext in MAGIC.items() if content.startswith(magic)), kind)
-    if actual != kind:
-        raise InputError(f"holds {actual} data, its extension says {kind}; rename it")
-    if kind == ".obj":
-        # Comments and names in an old encoding must not stop the geometry from being read.
-        content = content.decode("utf-8", errors="replace").encode()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        resolver = trimesh.resolvers.FilePathResolver(str(path))
-        return trimesh.load_scene(io.BytesIO(content), file_type=kind[1:], resolver=resolver, process=False)
 
 
 def _part(mesh: Any, pose: np.ndarray, name: str) -> _Part | None:
@@ -168,11 +143,8 @@ def _part(mesh: Any, pose: np.ndarray, name: str) -> _Part | None:
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise InputError(f"vertices of {name} are not x y z")
     check_faces(faces, len(vertices), name)
-    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-    if bad:
-        raise InputError(f"{bad} of {len(vertices)} vertices of {name} are NaN or infinite")
-    if abs(np.linalg.det(pose[:3, :3])) < 1e-30:
-        raise InputError(f"the transform of {name} is not invertible")
+    check_vertices(vertices, name)
+    _check_pose(pose, name)
     uv = getattr(mesh.visual, "uv", None)
     uv = None if uv is None or np.shape(uv) != (len(vertices), 2) or not np.isfinite(uv).all() else np.asarray(uv)
     # trimesh computes normals on demand; only those that it read from the file are in its cache before that.
@@ -183,6 +155,15 @@ def _part(mesh: Any, pose: np.ndarray, name: str) -> _Part | None:
     if np.linalg.det(pose[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored mesh would have its faces inside out
     return _Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual)
+
+
+def _check_pose(pose: np.ndarray, name: str) -> None:
+    """InputError unless a node's transform is affine, can be inverted, and keeps coordinates of a sensible size."""
+    largest = float(np.abs(pose).max()) if np.isfinite(pose).all() else math.inf
+    if largest > MAX_COORDINATE:
+        raise InputError(f"the transform of {name} holds {largest:g}, expected {MAX_COORDINATE:g} at the most")
+    if abs(np.linalg.det(pose[:3, :3])) < 1e-30:
+        raise InputError(f"the transform of {name} is not invertible")
 
 
 # --- Standing upright, at a sensible size, with sound faces ----------------------------------------------------------
@@ -343,24 +324,32 @@ def _read_mtl(path: Path, notes: list[str]) -> dict[str, _Entry]:
 
     trimesh reads the library too, but silently drops such textures and rounds Kd to 8 bits.
     """
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = _lenient_text(path)
     lines = [line.split(maxsplit=1) for line in text.splitlines() if line.startswith("mtllib")]
     named = [words[1].strip() for words in lines if len(words) == 2 and words[0] == "mtllib"]
     if not named:
         return {}
     if len(named) > 1:
         notes.append(f"of {len(named)} material files only {named[0]} is read")
-    library = path.parent / named[0].replace("\\", "/")
-    if not library.is_file():
+    if not (path.parent / named[0].replace("\\", "/")).exists():
         notes.append(f"material file {named[0]} not found")
         return {}
+    try:
+        library = file_inside(path.parent, named[0], "material file")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     return _read_library(library)
+
+
+def _lenient_text(path: Path) -> str:
+    """Names and comments in any encoding, numbers never."""
+    return read_bytes(path).decode("utf-8", errors="replace")
 
 
 def _read_library(library: Path) -> dict[str, _Entry]:
     entries: dict[str, _Entry] = {}
     name = ""
-    for line in library.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in _lenient_text(library).splitlines():
         key, rest = (*line.split(maxsplit=1), "", "")[:2]
         if key.lower() == "newmtl":
             name = " ".join(rest.split())
@@ -382,8 +371,9 @@ def _kd(library: Path, text: str) -> float:
 
 def _map_kd(library: Path, name: str, text: str) -> Path:
     """The texture file of a map_Kd line, whose options (-s 1 1 1 ...) are left out."""
-    file = text.strip().replace("\\", "/")
+    file = text.strip()
     file = file.split()[-1] if file.startswith("-") else file
-    if not (library.parent / file).is_file():
-        raise InputError(f"{library}: texture {file} of material {name} not found")
-    return library.parent / file
+    try:
+        return file_inside(library.parent, file, f"texture of material {name}")
+    except InputError as error:
+        raise InputError(f"{library}: {error}") from None

@@ -9,8 +9,10 @@ from typing import TypeVar
 from xml.etree import ElementTree
 
 from scenes.errors import InputError
+from scenes.inputs import file_inside, read_bytes
 
 MAX_INCLUDES = 256
+MAX_DEPTH = 64
 MAX_VALUE = 65536
 NOTE_NAMES = 8
 
@@ -37,7 +39,21 @@ class Notes:
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Refuses a document type, the only place where entities can be declared."""
+    """Refuses a document type, the only place where entities can be declared, and elements nested without end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> ElementTree.Element:
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise InputError(f"elements are nested more than {MAX_DEPTH} deep")
+        return super().start(tag, attributes)
+
+    def end(self, tag: str) -> ElementTree.Element:
+        self._depth -= 1
+        return super().end(tag)
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise InputError("a DOCTYPE or entity declaration is not read; write the values out")
@@ -152,17 +168,10 @@ class Document:
 
     def file(self, element: ElementTree.Element, name: str, what: str) -> Path:
         """A file inside the scene's folder; anything else is refused, symbolic links followed."""
-        path = self.path.parent / name.replace("\\", "/")
         try:
-            inside = path.resolve().is_relative_to(self.path.parent.resolve())
-            there = path.is_file()
-        except (OSError, RuntimeError, ValueError) as error:
-            raise self.error(element, f"{what} {name!r} cannot be looked up ({error})") from None
-        if not inside:
-            raise self.error(element, f"{what} {name!r} is outside the scene's folder, copy it there")
-        if not there:
-            raise self.error(element, f"{what} {name!r} not found in the scene's folder")
-        return path
+            return file_inside(self.path.parent, name, what, "the scene's folder")
+        except InputError as error:
+            raise self.error(element, str(error)) from None
 
 
 def _listed(names: list[str]) -> str:
@@ -173,10 +182,9 @@ def _listed(names: list[str]) -> str:
 def _parse(path: Path) -> ElementTree.Element:
     """The root element of an XML file without a document type."""
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        reason = "file not found" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
-        raise LocatedError(f"{path}: {reason}") from None
+        data = read_bytes(path)
+    except InputError as error:
+        raise LocatedError(str(error)) from None
     try:
         return ElementTree.fromstring(data, parser=ElementTree.XMLParser(target=_Builder()))
     except InputError as error:

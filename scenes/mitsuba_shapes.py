@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +11,8 @@ import numpy as np
 from scenes import shapes
 from scenes.arrays import check_faces
 from scenes.errors import InputError
+from scenes.inputs import read_bytes
+from scenes.mesh_files import check_vertices, load_trimesh
 from scenes.mitsuba_bsdf import Look, Materials
 from scenes.mitsuba_nodes import Document
 from scenes.mitsuba_plugin import Plugin
@@ -98,7 +98,9 @@ class Shapes:
         if key not in self._files:
             try:
                 self._files[key] = _read(path, kind)
-            except Exception as error:  # trimesh raises whatever its parsers run into
+            except InputError as error:
+                raise plugin.fail(f"{filename}: {str(error).removeprefix(f'{path}: ')}") from None
+            except Exception as error:  # what trimesh works out only when it is asked for
                 reason = (str(error).splitlines() or [type(error).__name__])[0]
                 raise plugin.fail(f"{filename}: broken .{kind} file ({reason})") from None
         mesh = self._files[key]
@@ -112,21 +114,17 @@ def _read(path: Path, kind: str) -> Mesh:
     """All parts of an .obj or .ply file as one mesh; materials in the file are not looked at."""
     import trimesh
 
-    data, options = path.read_bytes(), {}
-    if kind == "obj":
-        # Comments and names are in any encoding, numbers never: what is not UTF-8 does not matter.
-        data = data.decode("utf-8", "replace").encode()
-    else:
+    options = {}
+    if kind == "ply":
         # Only uv per face corner need vertices to be split; splitting loses the normals of the file.
-        options["fix_texture"] = b"texcoord" in data.partition(b"end_header")[0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True, **options)
+        options["fix_texture"] = b"texcoord" in read_bytes(path).partition(b"end_header")[0]
+    loaded = load_trimesh(path, f".{kind}", skip_materials=True, **options)
     parts = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
+    check_vertices(vertices, path.name)
     faces = np.concatenate([part.faces + start for part, start in zip(parts, first, strict=False)])
     uvs = [getattr(part.visual, "uv", None) for part in parts]
     # trimesh keeps the normals of a file in the cache, where its own exporters look for them too; None if absent.

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from scenes.errors import InputError, require
-from scenes.files import silenced
+from scenes.inputs import read_text
 from scenes.model import Camera, Material, Scene, Surface, Texture
 from scenes.parts import grid_faces
-from scenes.textures import load_texture
+from scenes.textures import exr_channels, load_texture, opened_image
 
 # Middlebury 2006: focal length [px] of the full-size images, baseline [m]; the files are half-size, and hold
 # disparities of the full size.
@@ -229,7 +229,7 @@ def middlebury(folder: Path, *, cosine: bool = False, width: int | None = None, 
         require((folder / file).is_file(), f"{folder / file}: file not found, expected in a Middlebury scene")
     disparity = read_levels(folder / "disp1.png")
     try:
-        least = float((folder / "dmin.txt").read_text().split()[0])
+        least = float(read_text(folder / "dmin.txt").split()[0])
     except (ValueError, IndexError):
         raise InputError(f"{folder / 'dmin.txt'}: holds no number") from None
     known = disparity > 0
@@ -295,16 +295,8 @@ def _albedo(path: Path, shape: tuple[int, int]) -> Texture:
 
 def read_levels(path: Path) -> np.ndarray:
     """A single-channel 8- or 16-bit image as whole numbers (h, w) float64, whatever its mode."""
-    from PIL import Image, UnidentifiedImageError
-
-    require(path.is_file(), f"{path}: depth image not found")
-    try:
-        with Image.open(path) as image:
-            values = np.asarray(image)
-    except UnidentifiedImageError:
-        raise InputError(f"{path}: not an image") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: broken image file ({str(error).splitlines()[0]})") from None
+    with opened_image(path, "depth image") as image:
+        values = np.asarray(image)
     if values.ndim == 3 and (values[..., :1] == values[..., :3]).all():
         values = values[..., 0]
     integer = values.ndim == 2 and np.issubdtype(values.dtype, np.integer)
@@ -314,14 +306,7 @@ def read_levels(path: Path) -> np.ndarray:
 
 def _exr_depth(path: Path) -> np.ndarray:
     """Channel Z, or Y, or the only one."""
-    import OpenEXR
-
-    require(path.is_file(), f"{path}: depth image not found")
-    try:
-        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
-            pixels = {name: np.asarray(part.pixels, np.float64) for name, part in file.channels().items()}
-    except Exception as error:  # OpenEXR raises bare exceptions of its own
-        raise InputError(f"{path}: broken EXR file ({(str(error).splitlines() or ['no reason given'])[0]})") from None
+    pixels = exr_channels(path, "depth image")
     name = next((n for n in ("Z", "depth", "Y") if n in pixels), next(iter(pixels)) if len(pixels) == 1 else None)
     require(name is not None, f"{path}: channels {', '.join(sorted(pixels))}, expected Z or Y")
     return pixels[name]

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.files import silenced
+from scenes.inputs import regular_file
 from scenes.model import Texture
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 MAX_PIXELS = 1 << 26
+MAX_EXR_VALUES = 1 << 27  # of all channels: 8192 x 4096 RGBA, 1 GiB as float64
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:
@@ -33,31 +41,18 @@ def load_texture(path: Path, *, linear: bool = False, channel: str = "luminance"
     always linear). `channel` is "luminance", or "alpha" for the alpha channel (luminance where there is none).
     Raises InputError naming the file when it is missing, broken or of another type.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: texture file not found")
+    path = regular_file(path, "texture file")
     if path.suffix.lower() == ".exr":
         return Texture(_exr_pixels(path, channel), path.name)
     return Texture(_image_pixels(path, linear, channel), path.name)
 
 
 def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise InputError(f"{path}: {image.width} x {image.height} pixels is over the limit of {MAX_PIXELS}")
-            if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV", "1"):
-                image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
-            bands = image.getbands()
-            values = np.asarray(image)
-    except InputError:
-        raise
-    except UnidentifiedImageError:
-        raise InputError(f"{path}: not an image this reader knows (.png .jpg .bmp .tga .tif .exr)") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: broken image file ({str(error).splitlines()[0]})") from None
+    with opened_image(path) as image:
+        if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV", "1"):
+            image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
+        bands = image.getbands()
+        values = np.asarray(image)
     values = values.reshape(*values.shape[:2], -1)
     alpha = channel == "alpha" and bands[-1] == "A"
     values = values[..., -1:] if alpha else values[..., :3]
@@ -74,14 +69,54 @@ def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
     return luminance(values) if len(bands) >= 3 else values[..., 0]
 
 
-def _exr_pixels(path: Path, channel: str) -> np.ndarray:
+@contextmanager
+def opened_image(path: Path, what: str = "image file") -> Iterator[Image.Image]:
+    """An image through Pillow, its declared size checked before any pixel is decoded.
+
+    What goes wrong while its pixels are taken is an InputError too, in one line that names the file.
+    """
+    from PIL import Image
+
+    path = regular_file(path, what)
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
+            size = image.width, image.height
+            require(size[0] * size[1] <= MAX_PIXELS, f"{size[0]} x {size[1]} pixels is over the limit of {MAX_PIXELS}")
+            yield image
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Image.UnidentifiedImageError:
+        raise InputError(f"{path}: not an image this reader knows (.png .jpg .bmp .tga .tif .exr)") from None
+    except Exception as error:  # each of Pillow's formats has its own
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: broken image file ({reason[:160]})") from None
+
+
+def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:
+    """The channels of a flat EXR, float64, by name, its declared size checked before any pixel is decoded."""
     import OpenEXR
 
+    path = regular_file(path, what)
     try:
-        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
-            pixels = {name: np.asarray(part.pixels, np.float64) for name, part in file.channels().items()}
+        with silenced():
+            with OpenEXR.File(str(path), header_only=True) as file:
+                low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
+                channels = len(file.header()["channels"])
+            wide, tall = (high - low + 1).tolist()
+            require(wide > 0 and tall > 0, f"data window of {wide} x {tall} pixels")
+            values = wide * tall * channels
+            said = f"{wide} x {tall} pixels of {channels} channels are over the limit of {MAX_EXR_VALUES} values"
+            require(values <= MAX_EXR_VALUES, said)
+            with OpenEXR.File(str(path), separate_channels=True) as file:
+                return {name: np.asarray(part.pixels, np.float64) for name, part in file.channels().items()}
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     except Exception as error:  # OpenEXR raises bare exceptions of its own
         raise InputError(f"{path}: broken EXR file ({(str(error).splitlines() or ['no reason given'])[0]})") from None
+
+
+def _exr_pixels(path: Path, channel: str) -> np.ndarray:
+    pixels = exr_channels(path, "texture file")
     if channel == "alpha" and "A" in pixels:
         return pixels["A"]
     if {"R", "G", "B"} <= pixels.keys():

@@ -26,10 +26,12 @@ import numpy as np
 from render.settings import SHARED_AMBIENT_SPP, Plan, RenderSettings
 from scenes.errors import InputError, require
 from scenes.files import whole_file
+from scenes.inputs import read_json_object
 from scenes.model import Scene
 from scenes.offsets import OffsetMode, check_offset
+from scenes.set_index import read_set_index
 from scenes.sets import scene_set
-from studies.set_folder import Done, Folder, file_name, read_index
+from studies.set_folder import Done, Folder, file_name
 from studies.workers import Run, executor
 
 if TYPE_CHECKING:
@@ -284,9 +286,9 @@ def _with_grid(job: Job, folder: Folder, run: Run, say: Progress) -> Job:
         with whole_file(path) as beside:
             beside.write_text(json.dumps({"grid": grid, "least_share": least_share, "errors": errors}) + "\n")
     try:
-        planned = json.loads(path.read_text())
+        planned = read_json_object(path)
         return replace(job, grid=planned["grid"], least_share=planned["least_share"])
-    except (ValueError, KeyError, TypeError):
+    except (InputError, KeyError, TypeError):
         raise InputError(f"{path}: is damaged; delete it, and it is made again") from None
 
 
@@ -338,7 +340,7 @@ def pack_set(folder: Path, path: Path, progress: Progress | None = None) -> int:
     from render.pack import write_pack
     from render.transient import read_transient
 
-    records = read_index(folder)
+    records = read_set_index(folder)
     say = progress or (lambda what, share: None)
 
     def views() -> Iterator[tuple]:

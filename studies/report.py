@@ -10,7 +10,6 @@ import csv
 import hashlib
 import importlib.metadata
 import io
-import json
 import platform
 import struct
 import time
@@ -26,6 +25,7 @@ from PIL import Image
 from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file
+from scenes.inputs import read_json_object
 from studies import report_html as html
 from studies import report_published as beside_print
 from studies.experiments import Report
@@ -138,14 +138,6 @@ def _number(text: str) -> int | float | str:
     return text
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """An object; ValueError for anything else."""
-    found = json.loads(path.read_text(encoding="utf-8"))
-    if not isinstance(found, dict):
-        raise ValueError("holds no object")
-    return found
-
-
 def run(command: Report, progress: Progress) -> dict:
     """Gather, compose, write; says what is in the page and what is not."""
     out = command.out
@@ -158,11 +150,12 @@ def run(command: Report, progress: Progress) -> dict:
     progress("compose", 0.4)
     text = compose(found)
     with whole_file(out) as beside:
-        beside.write_text(text, encoding="utf-8")
+        # names of files may hold bytes that are no text
+        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
     missing: list[Any] = [{"command": made, "files": names} for made, names in found.missing.items()]
     if not command.json:
         missing = [f"{made}: {', '.join(names)}" for made, names in found.missing.items()]
-    told = {"bytes": len(text.encode()), "figures": len(found.shown), "tables": found.tables}
+    told = {"bytes": out.stat().st_size, "figures": len(found.shown), "tables": found.tables}
     return {"out": str(out), **told, "problems": found.problems, "missing": missing}
 
 
@@ -224,7 +217,7 @@ def _notes(item: Item, found: Found) -> Iterator[str]:
     """What a study's own JSON says of the models that it stands on."""
     for name in dict.fromkeys(one.file for one in item.tables if one.file.endswith(".json")):
         path = found.newest(name)
-        numbers = None if path is None else found.read(path, read_json)
+        numbers = None if path is None else found.read(path, read_json_object)
         models = _rows((numbers or {}).get("models"))
         kinds = dict.fromkeys(f"{m.get('preset')}, {m.get('steps')} steps on {m.get('trained_on')}" for m in models)
         if kinds:
@@ -263,7 +256,7 @@ def _figure(read: tuple[bytes, tuple[int, int]], alt: str, caption: str, found: 
 
 def _rows_of(one: Table, found: Found) -> tuple[list[dict] | None, Path | None]:
     path = found.newest(one.file)
-    read = None if path is None else found.read(path, read_json if one.file.endswith(".json") else read_rows)
+    read = None if path is None else found.read(path, read_json_object if one.file.endswith(".json") else read_rows)
     rows = read.get(one.key) if isinstance(read, dict) else read
     good = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
     if read is not None and not good:
@@ -323,7 +316,7 @@ def _configurations(found: Found) -> Iterator[str]:
     yield html.table(versions, "Versions that this page was made with")
     for name in ("bench-render.json", "bench-encode.json"):
         path = found.newest(name)
-        machine = ((found.read(path, read_json) if path else None) or {}).get("machine")
+        machine = ((found.read(path, read_json_object) if path else None) or {}).get("machine")
         if machine:
             yield html.paragraph(f"{name} was measured on: {html.spelled(machine)}.")
     models = list(_models(found))
@@ -334,7 +327,7 @@ def _configurations(found: Found) -> Iterator[str]:
         rows = [
             {"folder": str(path.parent.relative_to(found.root)), **_flat(numbers, columns)}
             for path in found.configurations[name]
-            if (numbers := found.read(path, read_json)) is not None
+            if (numbers := found.read(path, read_json_object)) is not None
         ]
         if rows:
             found.tables += 1
@@ -344,7 +337,7 @@ def _configurations(found: Found) -> Iterator[str]:
 def _models(found: Found) -> Iterator[dict]:
     seen = set()
     for name, paths in sorted(found.files.items()):
-        numbers = found.read(paths[0], read_json) if name.endswith(".json") else None
+        numbers = found.read(paths[0], read_json_object) if name.endswith(".json") else None
         for model in _rows((numbers or {}).get("models")):
             digest = str(model.get("sha256", ""))
             if digest not in seen:
@@ -385,7 +378,7 @@ def _not_measured(found: Found) -> Iterator[str]:
 def _undecided(found: Found) -> Iterator[str]:
     """Conclusions whose interval leaves them open, by study."""
     for name, paths in sorted(found.files.items()):
-        numbers = found.read(paths[0], read_json) if name.endswith(".json") else None
+        numbers = found.read(paths[0], read_json_object) if name.endswith(".json") else None
         for one in _rows((numbers or {}).get("conclusions")):
             whole = "ranking" not in one or one.get("levels") == "all"
             if whole and "not decided" in (one.get("verdict"), one.get("ranking")):

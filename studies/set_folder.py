@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from scenes.errors import InputError, require
 from scenes.files import whole_file
+from scenes.inputs import read_text, read_whole_lines
 
 
 class Done(NamedTuple):
@@ -41,7 +42,7 @@ class Folder:
         asked = json.dumps(made, sort_keys=True, indent=1) + "\n"
         config = path / "set.json"
         if config.is_file():
-            if config.read_text() != asked:
+            if read_text(config) != asked:
                 raise InputError(
                     f"{path}: holds a set that was made with other options or another version; choose another --out"
                 )
@@ -60,19 +61,18 @@ class Folder:
 
     def _known(self) -> Iterator[dict]:
         for name in ("index.jsonl", "journal.jsonl"):
-            path = self.path / name
-            for line in path.read_text().splitlines() if path.is_file() else ():
-                try:
-                    record = json.loads(line)
-                except ValueError:
-                    continue  # a line that was cut when the process was killed
+            for record in read_whole_lines(self.path / name):
                 if isinstance(record, dict) and isinstance(record.get("view"), int):
                     yield record
 
     def _stands(self, record: dict) -> bool:
         """Whether the view of a record is there in full; failed ones are tried again."""
-        path = self.path / str(record.get("file", ""))
-        return "failed" not in record and path.is_file() and path.stat().st_size == record.get("bytes")
+        if "failed" in record or record.get("file") != file_name(record["view"]):
+            return False
+        path = self.path / record["file"]
+        if not isinstance(record.get("error"), (int, float)):
+            return False
+        return path.is_file() and path.stat().st_size == record.get("bytes")
 
     def add(self, done: Done) -> None:
         """The file first, then the line that vouches for it."""
@@ -97,11 +97,3 @@ class Folder:
             lines = (json.dumps(self.records[view], sort_keys=True) + "\n" for view in sorted(self.records))
             beside.write_text("".join(lines))
         (self.path / "journal.jsonl").unlink(missing_ok=True)
-
-
-def read_index(folder: Path) -> list[dict]:
-    """The finished views of a set's folder in order, failed ones left out; InputError if there is no index."""
-    path = Path(folder) / "index.jsonl"
-    require(path.is_file(), f"{path}: no index; run `scene2spad dataset` to its end first")
-    records = [json.loads(line) for line in path.read_text().splitlines()]
-    return [record for record in records if "failed" not in record]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenes.files import whole_file
+from scenes.inputs import read_whole_lines
 
 
 class Store:
@@ -58,10 +59,8 @@ def _text(key: dict[str, object]) -> str:
 
 def _lines(path: Path) -> list[tuple[str, Any]]:
     found = []
-    for line in path.read_text().splitlines() if path.is_file() else ():
-        try:
-            key, value = json.loads(line)
-        except ValueError:
-            continue
-        found.append((key, value))
+    for line in read_whole_lines(path):
+        match line:
+            case [str(key), value]:
+                found.append((key, value))
     return found

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +11,10 @@ from matplotlib.figure import SubFigure
 from torch import Tensor
 
 from csph import CodingTensor, Design, make_coding
+from csph.torch_files import load_torch_file
 from render.tracing import Progress
 from scenes.errors import InputError, require
+from scenes.inputs import regular_file
 from studies.experiments import Study
 from studies.figures import save
 
@@ -63,27 +63,25 @@ def coding_of(path: Path) -> CodingTensor:
     """The coding tensor in a file: a checkpoint whose state holds `temporal` and maybe `spatial` (of one layer,
     under any prefix), or a .npy array (K, Mt) or (K, Mt, Mr, Mc). Raises InputError in one line.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: file not found")
-    try:
-        if path.suffix == ".npy":
+    regular_file(path)
+    if path.suffix == ".npy":
+        try:
             return CodingTensor(path.stem, torch.from_numpy(np.load(path, allow_pickle=False)))
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except (
-        OSError,
-        RuntimeError,
-        ValueError,
-        TypeError,
-        EOFError,
-        pickle.UnpicklingError,
-        zipfile.BadZipFile,
-    ) as error:
-        said = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: no checkpoint of tensors alone and no .npy array ({said})") from None
+        except (OSError, ValueError, TypeError, EOFError) as error:
+            raise InputError(f"{path}: no .npy array of codes ({' '.join(str(error).split())[:120]})") from None
+    state = load_torch_file(path)
     state = state.get("state_dict", state) if isinstance(state, dict) else {}
     found = [name for name in state if name.split(".")[-1] == "temporal" and isinstance(state[name], Tensor)]
     require(len(found) == 1, f"{path}: holds {len(found)} coding tensors (entries named temporal), expected one")
-    return CodingTensor(path.stem, state[found[0]], state.get(found[0].removesuffix("temporal") + "spatial"))
+    beside = found[0].removesuffix("temporal") + "spatial"
+    for name in (found[0], beside):
+        part = state.get(name)
+        good = part is None or (isinstance(part, Tensor) and part.is_floating_point() and bool(part.isfinite().all()))
+        require(good, f"{path}: {name} is no tensor of finite numbers")
+    try:
+        return CodingTensor(path.stem, state[found[0]], state.get(beside))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def temporal_matrix(coding: CodingTensor) -> Tensor:

@@ -28,6 +28,7 @@ from render.tracing import Progress
 from render.transient import Transient, read_transient, write_transient
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv
+from scenes.inputs import read_whole_lines
 from scenes.model import Ambient, Laser, Scene
 from scenes.sets import scene_set
 from spad.histogram import Histogram
@@ -241,13 +242,10 @@ def _described(place: Place) -> dict[str, Any]:
 def _seconds(folder: Path) -> dict[tuple[str, str], dict[str, float]]:
     """{(scene, laser): {full, planned: seconds}}, the latest where something was rendered again."""
     found: dict[tuple[str, str], dict[str, float]] = {}
-    path = folder / "timings.jsonl"
-    for line in path.read_text().splitlines() if path.is_file() else ():
-        try:
-            told = json.loads(line)
-        except ValueError:  # cut when a run was killed
-            continue
-        found.setdefault((told["scene"], told["laser"]), {})[told["kind"]] = told["seconds"]
+    for told in read_whole_lines(folder / "timings.jsonl"):
+        match told:
+            case {"scene": str(scene), "laser": str(laser), "kind": str(kind), "seconds": float(seconds)}:
+                found.setdefault((scene, laser), {})[kind] = seconds
     return found
 
 

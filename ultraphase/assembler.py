@@ -22,6 +22,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from scenes.errors import InputError
+from scenes.inputs import file_inside, read_text
 from ultraphase.chip import ChipSpec
 from ultraphase.isa import BY_NAME, DIRECTIONS, REGISTERS, VALUE_BITS, Instruction
 from ultraphase.program import KINDS, Program, Region
@@ -30,8 +31,11 @@ from ultraphase.source import Cursor, Line, Token, source_lines
 _REGISTER = re.compile(r"r(\d+)\Z")
 _MOST_STATEMENTS = 20_000
 _MOST_INCLUDES = 8
-_MOST_NESTED = 32
+_MOST_NESTED = 32  # parentheses and signs, and loops
+_MOST_REPEATED = 1 << 18  # lines of all loops' turns, those of loops inside others counted each time
+_MOST_BYTES = 1 << 22
 _MOST_VALUE = 1 << 31
+_MOST_DIGITS = 64
 
 Reader = Callable[[str], str]
 
@@ -68,16 +72,15 @@ def assemble_file(
     path = Path(path)
 
     def read(name: str) -> str:
-        try:
-            return (path.parent / name).read_text(encoding="utf-8")
-        except FileNotFoundError:
-            raise InputError(f"{path.parent / name}: file not found") from None
-        except UnicodeDecodeError:
-            raise InputError(f"{path.parent / name}: is not text, expected assembler source") from None
+        return _source_text(file_inside(path.parent, name, "included file", "the program's folder"))
 
     assembly = _Assembly(chip or ChipSpec(), dict(constants or {}), read)
-    assembly.take(source_lines(path.name, read(path.name)))
+    assembly.take(source_lines(path.name, _source_text(path)))
     return assembly.program(name or path.name)
+
+
+def _source_text(path: Path) -> str:
+    return read_text(path, "assembler source", most_bytes=_MOST_BYTES)
 
 
 class _Assembly:
@@ -90,7 +93,7 @@ class _Assembly:
         self.regions: list[Region] = []
         self.labels: dict[str, int] = {}
         self.pending: list[tuple[Cursor, Instruction, dict[str, Token]]] = []
-        self.includes = self.statements = 0
+        self.includes = self.statements = self.repeated = self.loops = 0
 
     def take(self, lines: list[Line]) -> None:
         """All lines of a file, or of one turn of a loop."""
@@ -127,9 +130,17 @@ class _Assembly:
         cursor.expect("..")
         last = self._expression(cursor)
         cursor.end()
+        column = head.tokens[0].column
+        if self.loops >= _MOST_NESTED:
+            raise head.fail(column, f".for inside {_MOST_NESTED} others, expected fewer")
+        self.repeated += max(0, last - first + 1) * max(1, len(body))
+        if self.repeated > _MOST_REPEATED:
+            raise head.fail(column, f"loops repeat {self.repeated} lines, expected {_MOST_REPEATED} at the most")
+        self.loops += 1
         for value in range(first, last + 1):
             loops = {**head.loops, variable.text: value}
             self.take([Line(line.file, line.number, line.text, line.tokens, loops) for line in body])
+        self.loops -= 1
 
     def _statement(self, line: Line) -> None:
         cursor = Cursor(line)
@@ -336,7 +347,9 @@ class _Assembly:
         token = cursor.next
         if token.kind == "number":
             cursor.at += 1
-            value = int(token.text, {"0x": 16, "0b": 2}.get(token.text[:2].lower(), 10))
+            base = {"0x": 16, "0b": 2}.get(token.text[:2].lower(), 10)
+            # Python refuses to convert very long decimals
+            value = int(token.text, base) if len(token.text) <= _MOST_DIGITS else _MOST_VALUE
             if value >= _MOST_VALUE:
                 raise cursor.line.fail(token.column, f"{token.text} does not fit into 32 bits")
             return value

@@ -211,7 +211,7 @@ def test_several_materials_make_several_surfaces(tmp_path):
 
 def test_missing_or_broken_textures_are_refused_by_name(tmp_path):
     path = textured_obj(tmp_path, "newmtl old wood\nmap_Kd gone.png\n")
-    with pytest.raises(InputError, match=r"^[^\n]*wood\.mtl: texture gone\.png of material old wood not found$"):
+    with pytest.raises(InputError, match=r"^[^\n]*wood\.mtl: texture [^\n]*'gone\.png' not found [^\n]*$"):
         load_mesh(path)
     write(tmp_path / "gone.png", "not an image")
     with pytest.raises(InputError, match=r"^[^\n]*gone\.png: [^\n]*$"):
@@ -297,7 +297,7 @@ def test_refuses_a_missing_file_a_folder_and_an_unknown_kind(tmp_path):
         ("flat.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "not x y z"),
         ("needle.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "all of its faces are degenerate"),
         ("dot.obj", "v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "largest extent is 0"),
-        ("vast.obj", "v -1e308 0 0\nv 1e308 0 0\nv 0 1 0\nf 1 2 3\n", "largest extent is inf"),
+        ("vast.obj", "v -1e308 0 0\nv 1e308 0 0\nv 0 1 0\nf 1 2 3\n", "1e+308, expected 1e+12 at the most"),
         ("empty.ply", "", "empty"),
         ("garbage.ply", "no mesh\n", "broken .ply"),
         ("garbage.stl", "no mesh\n", "empty"),

@@ -104,7 +104,7 @@ def test_a_mesh_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ('<shape type="obj"><string name="filename" value="../none.obj"/></shape>', "outside the scene's folder"),
         ('<shape type="obj"><string name="filename" value="link.obj"/></shape>', "outside the scene's folder"),
         (f'<shape type="obj"><string name="filename" value="{"x" * 400}"/></shape>', "cannot be looked up"),
-        ('<shape type="obj"><string name="filename" value="nan.obj"/></shape>', "nan.obj: mesh nan: 1 of 3 vertices"),
+        ('<shape type="obj"><string name="filename" value="nan.obj"/></shape>', "nan.obj: 1 of 3 vertices"),
         ('<shape type="obj"><string name="filename" value="empty.obj"/></shape>', "empty.obj: holds no triangles"),
         ('<shape type="obj"><string name="filename" value="bad.obj"/></shape>', "bad.obj: broken .obj file"),
         ('<shape type="ply"><string name="filename" value="bad.ply"/></shape>', "bad.ply: broken .ply file"),

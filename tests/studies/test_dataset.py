@@ -16,10 +16,11 @@ import pytest
 from render.pack import PATH_STEP_M, read_pack
 from render.transient import read_transient
 from scenes import InputError
+from scenes.set_index import read_set_index
 from studies import dataset
 from studies.cli import main
 from studies.dataset import Job, make_set, pack_set, render_view
-from studies.set_folder import Folder, read_index
+from studies.set_folder import Folder
 
 # hard cases 0 to 7: walls at 0.05 to 500 m, quick to build and to render
 JOB = Job("hard-cases", width=12, height=9, bounces=1, grid=2)
@@ -58,7 +59,7 @@ def whole(tmp_path_factory) -> Path:
 def test_a_set_has_its_files_and_an_index_in_order(whole):
     names = {f"views/{i:06d}.exr" for i in range(COUNT)}
     assert set(contents(whole)) == names | {"set.json", "index.jsonl"}
-    records = read_index(whole)
+    records = read_set_index(whole)
     assert [r["view"] for r in records] == list(range(COUNT))
     for record in records:
         transient = read_transient(whole / record["file"])
@@ -147,7 +148,7 @@ def test_an_endless_set_has_one_grid_however_many_views_are_asked(tmp_path, monk
     for name in ("grid.json", "index.jsonl", "views/000000.exr", "views/000004.exr"):
         assert (steps / name).read_bytes() == (once / name).read_bytes()
     planned = json.loads((once / "grid.json").read_text())
-    assert len(planned["errors"]) == 6 and {r["plan"]["grid"] for r in read_index(once)} == {planned["grid"]}
+    assert len(planned["errors"]) == 6 and {r["plan"]["grid"] for r in read_set_index(once)} == {planned["grid"]}
     make_set(replace(job, grid=3), 1, tmp_path / "forced")
     assert not (tmp_path / "forced" / "grid.json").exists()
     (once / "grid.json").write_text("{")
@@ -199,7 +200,7 @@ def test_the_command_line_packs(whole, tmp_path, capsys):
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["scenes"] == 3 and said["failed"] == [] and said["bytes_per_scene"] > 0 and "scenes_per_second" in said
     views = read_pack(pack)
-    for i, record in enumerate(read_index(out)):
+    for i, record in enumerate(read_set_index(out)):
         transient = read_transient(out / record["file"])
         assert views.metas[i]["scene"] == record["scene"] and (views[i].offsets == transient.offsets).all()
         centre, expected = ((v.path_near_m.astype(float) + v.path_far_m) / 2 for v in (views[i], transient))
