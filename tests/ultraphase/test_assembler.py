@@ -162,7 +162,7 @@ def test_mistakes_are_refused_with_line_and_column(source, said):
 
 def test_files_that_are_missing_or_no_text(tmp_path):
     (tmp_path / "a.s").write_text('HALT\n.include "b.s"\n')
-    with pytest.raises(InputError, match=r"a\.s:2:11: .*b\.s: file not found"):
+    with pytest.raises(InputError, match=r"a\.s:2:11: .*'b\.s' not found"):
         assemble_file(tmp_path / "a.s")
     (tmp_path / "b.s").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match="is not text"):
