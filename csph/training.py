@@ -33,6 +33,7 @@ from csph.config import TrainConfig
 from csph.data import SetData
 from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
+from csph.resume import RESUME, WholeFileCheckpoints, check_resume
 from csph.snapshots import CodeEnergy
 from csph.torch_files import check_torch_file
 from csph.views import Views, packed_sha256, packed_views
@@ -126,7 +127,7 @@ class Record(pl.Callback):
                 "step %d of %d: loss %.4f, validation RMSE %.1f mm, MAE %.1f mm",
                 *(row["step"], module.config.steps, row["train_loss"], row["val_rmse_mm"], row["val_mae_mm"]),
             )
-        trainer.save_checkpoint(self.folder / "resume.ckpt")  # on all devices; Lightning writes it whole
+        trainer.save_checkpoint(self.folder / RESUME)  # on all devices
 
 
 def _claim(folder: Path, config: TrainConfig) -> None:
@@ -171,6 +172,7 @@ def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
         enable_progress_bar=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
+        plugins=[WholeFileCheckpoints()],
         reload_dataloaders_every_n_epochs=1,
         **more,
     )
@@ -209,7 +211,9 @@ def train(
     keep_freed_memory()
     start = time.perf_counter()
     module = DepthTraining(config)
-    resume = folder / "resume.ckpt"
+    resume = folder / RESUME
+    if resume.is_file():
+        check_resume(resume, module)
     if not (folder / "last.safetensors").is_file():
         if resume.is_file():
             check_torch_file(resume)

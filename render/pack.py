@@ -21,6 +21,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from scenes.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
 from scenes.inputs import parse_json
 
 PATH_STEP_M, WIDTH_STEP_M, DEPTH_STEP_M = 2.0**-10, 2.0**-8, 2.0**-12
@@ -213,32 +214,40 @@ def write_pack(views: Iterable[tuple[Transient, dict]], path: Path) -> int:
 
     One view is in memory at a time. Raises InputError for views of different sizes, or none.
     """
+    with whole_file(path) as beside:
+        with h5py.File(beside, "w", track_order=False, userblock_size=USER_BLOCK) as file:
+            count = _append_views(views, file)
+        add_checksum(beside)
+    return count
+
+
+def _append_views(views: Iterable[tuple[Transient, dict]], file: h5py.File) -> int:
+    """Append view after view, then their records and the seal; returns how many."""
     metas: list[dict] = []
     starts = [0]
     sha = hashlib.sha256()
-    with whole_file(path) as beside, h5py.File(beside, "w", track_order=False) as file:
-        sets: dict[str, h5py.Dataset] = {}
-        for view, meta in views:
-            arrays = _arrays(view)
-            if not sets:
-                sets = _datasets(file, view.height, view.width)
-            same = arrays["count"].shape == sets["count"].shape[1:]
-            require(same, f"view {len(metas)} is {view.width} x {view.height} pixels, those before it are not")
-            stored = _differences(arrays)
-            for name, dataset in sets.items():
-                rows = stored[name][None] if name in PER_VIEW else stored[name]
-                dataset.resize(len(dataset) + len(rows), axis=0)
-                dataset[len(dataset) - len(rows) :] = rows
-            for name in (*PER_VIEW, *PER_RETURN):
-                sha.update(np.ascontiguousarray(arrays[name]).tobytes())
-            starts.append(starts[-1] + view.returns)
-            metas.append(meta)
-        require(bool(metas), "there is no view to pack")
-        file.create_dataset("start", data=np.array(starts, np.int64), track_times=False)
-        records = json.dumps(metas, sort_keys=True).encode()
-        file.create_dataset("meta", data=np.frombuffer(records, np.uint8), **PACKED)
-        sha.update(records)
-        file.attrs[ATTRIBUTE] = seal({"views": len(metas)}, "pack", sha.hexdigest())
+    sets: dict[str, h5py.Dataset] = {}
+    for view, meta in views:
+        arrays = _arrays(view)
+        if not sets:
+            sets = _datasets(file, view.height, view.width)
+        same = arrays["count"].shape == sets["count"].shape[1:]
+        require(same, f"view {len(metas)} is {view.width} x {view.height} pixels, those before it are not")
+        stored = _differences(arrays)
+        for name, dataset in sets.items():
+            rows = stored[name][None] if name in PER_VIEW else stored[name]
+            dataset.resize(len(dataset) + len(rows), axis=0)
+            dataset[len(dataset) - len(rows) :] = rows
+        for name in (*PER_VIEW, *PER_RETURN):
+            sha.update(np.ascontiguousarray(arrays[name]).tobytes())
+        starts.append(starts[-1] + view.returns)
+        metas.append(meta)
+    require(bool(metas), "there is no view to pack")
+    file.create_dataset("start", data=np.array(starts, np.int64), track_times=False)
+    records = json.dumps(metas, sort_keys=True).encode()
+    file.create_dataset("meta", data=np.frombuffer(records, np.uint8), **PACKED)
+    sha.update(records)
+    file.attrs[ATTRIBUTE] = seal({"views": len(metas)}, "pack", sha.hexdigest())
     return len(metas)
 
 
@@ -261,12 +270,8 @@ def _datasets(file: h5py.File, height: int, width: int) -> dict[str, h5py.Datase
 
 def _all_views(file: h5py.File) -> dict[str, np.ndarray]:
     """The whole numbers of all views of a pack, those of returns one after the other."""
-    stored = {name: np.asarray(file[name][:], dtype) for name, dtype in STORED_VIEW.items()}
-    stored |= {
-        f"{part} {name}": np.asarray(file[f"{part} {name}"][:], dtype)
-        for part in PARTS
-        for name, dtype in STORED.items()
-    }
+    names = STORED_VIEW | {f"{part} {name}": dtype for part in PARTS for name, dtype in STORED.items()}
+    stored = {name: np.asarray(read_dataset(file, name), dtype) for name, dtype in names.items()}
     counts = stored["count"].reshape(len(stored["count"]), -1)
     ends = {"first": (counts > 0).sum(axis=1).cumsum()}
     ends["further"] = counts.sum(axis=1, dtype=np.int64).cumsum() - ends["first"]
@@ -289,19 +294,19 @@ def read_pack(path: Path) -> Pack:
     path = Path(path)
     require(path.is_file(), f"{path}: file not found")
     try:
-        with h5py.File(path, "r") as file:
+        with open_checked(path) as file:
             require(ATTRIBUTE in file.attrs, f"no pack of scene2spad (no attribute {ATTRIBUTE})")
             meta, sha256 = open_seal(file.attrs[ATTRIBUTE], "pack")
             arrays = _all_views(file)
-            starts = np.asarray(file["start"][:], np.int64)
-            metas = tuple(parse_json(np.asarray(file["meta"][:], np.uint8).tobytes()))
+            starts = np.asarray(read_dataset(file, "start"), np.int64)
+            metas = tuple(parse_json(np.asarray(read_dataset(file, "meta"), np.uint8).tobytes()))
         returns = arrays["count"].sum(axis=(1, 2), dtype=np.int64)
         fits = len(returns) == len(metas) and np.array_equal(starts, np.concatenate(([0], returns.cumsum())))
         require(fits, "its views do not fit its returns")
         check_seal(meta, sha256, _sha256(arrays, starts, metas))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (OSError, KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError, IndexError, TypeError, AttributeError, MemoryError) as error:
         told = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a readable pack ({told or type(error).__name__})") from None
     for array in arrays.values():

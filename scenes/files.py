@@ -7,11 +7,15 @@ import ctypes
 import hashlib
 import io
 import json
+import math
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
+from tokenize import TokenError
+
+import numpy as np
 
 from scenes.errors import InputError
 from scenes.inputs import parse_json
@@ -36,11 +40,50 @@ def whole_file(path: Path) -> Iterator[Path]:
             raise InputError(f"{path}: is a folder, expected a file name")
         try:
             yield beside
+            _flush_to_disk(beside)
             beside.replace(path)
+            _flush_to_disk(path.parent)
         finally:
             beside.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or str(error).splitlines()[0]})") from None
+
+
+def _flush_to_disk(path: Path) -> None:
+    """Wait until a file's bytes, or a folder's names, are on the disk: a rename alone survives no power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def read_array(path: Path) -> np.ndarray:
+    """Read one array of numbers from a .npy file.
+
+    Raises InputError in one line that names the file: missing, no .npy file, cut short, of objects, or with a stated
+    shape that is not that of its bytes.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: file not found")
+    try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            shape, columns_first, dtype = header[version](file)
+            if dtype.kind not in "biuf":
+                raise InputError(f"{path}: holds {dtype}, expected numbers")
+            left = path.stat().st_size - file.tell()
+            if math.prod(shape) * dtype.itemsize != left:
+                raise InputError(f"{path}: states shape {shape} of {dtype}, {left} bytes follow")
+            values = np.fromfile(file, dtype)
+    except InputError:
+        raise
+    # numpy's header is Python, and so are the errors of a damaged one
+    except (OSError, ValueError, KeyError, EOFError, SyntaxError, TypeError, RecursionError, TokenError) as error:
+        raise InputError(f"{path}: not a readable .npy file ({' '.join(str(error).split())[:80]})") from None
+    return values.reshape(shape, order="F" if columns_first else "C")
 
 
 def write_csv(rows: Sequence[Mapping[str, object]], path: Path) -> Path:

@@ -11,6 +11,8 @@ import numpy as np
 
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from scenes.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
+from scenes.limits import require_memory
 from spad.sensor import PhotonBudget, Sensor
 from spad.timestamps import counts_from_timestamps, timestamps_from_counts
 
@@ -71,7 +73,9 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
     meta = {**histogram.meta, "sensor": histogram.sensor.to_dict(), "budget": histogram.budget.to_dict()}
     packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     buffer = io.BytesIO()  # HDF5 itself does not survive a full disk
-    with h5py.File(buffer, "w", libver="latest") as file:  # older layouts hold no metadata over 64 kB
+    with h5py.File(
+        buffer, "w", libver="latest", userblock_size=USER_BLOCK
+    ) as file:  # older layouts hold no metadata over 64 kB
         file.attrs[ATTRIBUTE] = seal(meta, "histogram", histogram.sha256())
         if int(histogram.counts.sum(dtype=np.int64)) * 2 < histogram.counts.nbytes:
             stamps, offsets = histogram.timestamps()
@@ -83,6 +87,7 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
             file.create_dataset(name, data=getattr(histogram, name), **packed)
     with whole_file(path) as beside:
         beside.write_bytes(buffer.getbuffer())
+        add_checksum(beside)
 
 
 def read_histogram(path: Path) -> Histogram:
@@ -90,17 +95,18 @@ def read_histogram(path: Path) -> Histogram:
 
     Raises InputError in one line for a missing, foreign, truncated or altered file, or one of a newer schema.
     """
-    import h5py
-
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: file not found")
     try:
-        with h5py.File(path, "r") as file:
+        with open_checked(path) as file:
             if ATTRIBUTE not in file.attrs:
                 raise InputError("not a file of scene2spad")
             meta, sha256 = open_seal(file.attrs[ATTRIBUTE], "histogram")
-            histogram = _assemble(meta, {name: dataset[()] for name, dataset in file.items()})
+            unknown = sorted(set(file) - {*TRUTH, "counts", "timestamps", "offsets"})
+            if unknown:
+                raise InputError(f"holds {', '.join(unknown)[:80]}, which no histogram has")
+            histogram = _assemble(meta, {name: read_dataset(file, name) for name in file})
         meta = check_seal(meta, sha256, histogram.sha256())
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -114,6 +120,7 @@ def _assemble(meta: dict, data: dict[str, np.ndarray]) -> Histogram:
         raise InputError(f"datasets are missing, there are {', '.join(sorted(data)) or 'none'}")
     sensor, budget = Sensor.from_dict(meta["sensor"]), PhotonBudget(**meta["budget"])
     counts = data.get("counts")
+    require_memory(5 * data["depth_m"].size * sensor.bins, f"a histogram of {data['depth_m'].size} pixels")
     if counts is None:
         flat = counts_from_timestamps(data["timestamps"], data["offsets"], sensor.bins)
         counts = flat.reshape(*data["depth_m"].shape, sensor.bins)

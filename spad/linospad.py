@@ -16,8 +16,9 @@ import numpy as np
 import scipy.io
 import scipy.sparse
 
-from scenes.errors import InputError, require
+from scenes.errors import require
 from scenes.files import whole_file
+from spad.matfile import load_mat
 from spad.sensor import Sensor
 from spad.timestamps import Timestamps
 
@@ -68,13 +69,7 @@ def read_linospad(path: Path, frame: int = 0, *, bins: int = BINS) -> Capture:
     a frame that is not there, images that are not square, and counts that are negative or not finite.
     """
     path = Path(path)
-    require(path.is_file(), f"{path}: file not found")
-    try:
-        contents = scipy.io.loadmat(path, variable_names=[COUNTS, IMAGES])
-    except NotImplementedError:
-        raise InputError(f"{path}: a .mat file of version 7.3; save it again with -v7") from None
-    except Exception as error:  # scipy raises bare and varied exceptions on damage
-        raise InputError(f"{path}: not a readable .mat file ({' '.join(str(error).split())[:80]})") from None
+    contents = load_mat(path, [COUNTS, IMAGES])
     require(COUNTS in contents, f"{path}: holds no {COUNTS}, it is no LinoSPAD capture")
     frames = _entries(contents[COUNTS])
     require(0 <= frame < len(frames), f"{path}: frame {frame} is not one of its {len(frames)}, from 0")

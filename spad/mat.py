@@ -17,13 +17,17 @@ import torch
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require
 from scenes.files import whole_file
+from scenes.limits import require_memory
 from spad.depth import estimate_depth
 from spad.histogram import Histogram
+from spad.matfile import load_mat
 from spad.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
 from spad.template import binned_pulse
 
 RATES_EPSILON = 1e-8
+NO_BIN = 1  # what MATLAB's maximum of an empty histogram answers
+PEAK_ARRIVALS = 64
 ESTIMATES = {"argmax": "argmax", "lmf": "lmf-published", "zncc": "correlation"}
 
 
@@ -32,8 +36,11 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
 
     rates (H, W, T) is the signal's share of the expected counts: S times the binned pulse at the true depth, min-max
     normalised in every pixel, 0 where there is no depth or no signal; rates_norm_params undoes that. Estimates are
-    ours, in whole bins from 1 without the published offset of one; `bin` is 0 where nothing is. Raises InputError in
-    one line where the file cannot be written, and for sensors whose bins do not cover the period.
+    ours, in whole bins from 1 without the published offset of one. `bin` is the fullest bin of the noise-free pulse,
+    as published, and `bin_hr` the arrival moved by as much as that bin stands off the pulse's centroid on average.
+    Where nothing is, and where nothing was detected, bins are 1: published loaders subtract 1 from unsigned numbers.
+    Raises InputError in one line where the file cannot be written, for sensors whose bins do not cover the period, and
+    where the folder holds the pulse of another sensor.
     """
     import scipy.io
 
@@ -44,10 +51,14 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     size = 8 * height * width * bins
     require(size < 2**31, f"{path}: {height} x {width} x {bins} rates take {size} bytes, a version 5 file holds 2^31")
     contents = _frame(histogram)
-    with whole_file(path) as beside:
-        scipy.io.savemat(beside, contents, do_compression=True)
     pulse = path.with_name(f"PSF_used_for_simulation_nr-{height}_nc-{width}.mat")
     taps = _centred_taps(sensor)
+    if pulse.is_file():
+        known = load_mat(pulse, ["psf"]).get("psf", np.zeros(0)).ravel()
+        same = known.shape == taps.shape and np.allclose(known, taps, rtol=1e-6, atol=0)
+        require(same, f"{pulse}: holds the pulse of another sensor; export to another folder")
+    with whole_file(path) as beside:
+        scipy.io.savemat(beside, contents, do_compression=True)
     psf = {"PSF_img": np.broadcast_to(taps, (height, width, len(taps))), "psf": taps, "pulse_len": float(len(taps))}
     with whole_file(pulse) as beside:
         scipy.io.savemat(beside, psf, do_compression=True)
@@ -56,10 +67,11 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
 
 def _frame(histogram: Histogram) -> dict:
     sensor, depth = histogram.sensor, histogram.depth_m.astype(np.float64)
-    rates, offset, scaling = _normalised_rates(histogram)
-    known = np.isfinite(depth)
-    fine = np.where(known, np.remainder(depth, sensor.range_m) / sensor.bin_depth_m + 0.5, 0)
-    index = np.where(known, np.floor(fine + 0.5), 0).astype(np.uint16)
+    pulses, known = _pulses(histogram), np.isfinite(depth)
+    rates, offset, scaling = _normalised_rates(histogram, pulses)
+    arrival = np.remainder(depth, sensor.range_m) / sensor.bin_depth_m
+    fine = np.where(known, arrival + 0.5 + _peak_offset_bins(sensor), NO_BIN)
+    index = np.where(known, pulses.argmax(axis=-1) + 1, NO_BIN).astype(np.uint16)
     counts = torch.from_numpy(histogram.counts)
     estimates = {
         f"est_range_bins_{name}": _whole_bins(estimate_depth(counts, sensor, method).numpy(), sensor)
@@ -86,22 +98,33 @@ def _frame(histogram: Histogram) -> dict:
     }
 
 
-def _normalised_rates(histogram: Histogram) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pulses(histogram: Histogram) -> np.ndarray:
+    """Bin the noise-free pulse of every pixel's true depth, (H, W, T); of depth 0 where there is none."""
+    depth = histogram.depth_m.astype(np.float64)
+    arrival = torch.from_numpy(np.where(np.isfinite(depth), 2 * depth / SPEED_OF_LIGHT_M_PER_S, 0))
+    return np.stack([binned_pulse(row, histogram.sensor).numpy() for row in arrival])
+
+
+def _peak_offset_bins(sensor: Sensor) -> float:
+    """Average over arrivals within a bin how far the middle of the fullest bin stands behind the centroid [bins]."""
+    middle = sensor.bins // 2 + (np.arange(PEAK_ARRIVALS) + 0.5) / PEAK_ARRIVALS
+    fullest = binned_pulse(torch.from_numpy(middle * sensor.bin_width_s), sensor).numpy().argmax(axis=-1)
+    return float((fullest + 0.5 - middle).mean())
+
+
+def _normalised_rates(histogram: Histogram, pulses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Each pixel's (rate - min) / (max - min + 1e-8), with min and 1 / (max - min + 1e-8)."""
-    depth, signal = histogram.depth_m.astype(np.float64), histogram.expected_signal.astype(np.float64)
-    known = np.isfinite(depth)
-    arrival = torch.from_numpy(np.where(known, 2 * depth / SPEED_OF_LIGHT_M_PER_S, 0))
-    rows = [binned_pulse(row, histogram.sensor).numpy() for row in arrival]
-    rates = np.stack(rows) * np.where(known, signal, 0)[..., None]
+    signal = np.where(np.isfinite(histogram.depth_m), histogram.expected_signal.astype(np.float64), 0)
+    rates = pulses * signal[..., None]
     low, high = rates.min(axis=-1), rates.max(axis=-1)
     scaling = 1 / (high - low + RATES_EPSILON)
     return (rates - low[..., None]) * scaling[..., None], low, scaling
 
 
 def _whole_bins(depth_m: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Bin from 1 that a depth lies in, 0 for none, (H, W) uint16."""
+    """Return the bin from 1 that a depth lies in, NO_BIN for none, (H, W) uint16."""
     inside = np.floor(np.nan_to_num(depth_m.astype(np.float64)) / sensor.bin_depth_m) % sensor.bins
-    return np.where(np.isnan(depth_m), 0, inside + 1).astype(np.uint16)
+    return np.where(np.isnan(depth_m), NO_BIN, inside + 1).astype(np.uint16)
 
 
 def _sparse(counts: np.ndarray) -> object:
@@ -129,14 +152,8 @@ def read_mat(path: Path) -> Histogram:
 
     Raises InputError in one line for a file that is none.
     """
-    import scipy.io
-
     path = Path(path)
-    require(path.is_file(), f"{path}: file not found")
-    try:
-        contents = scipy.io.loadmat(path)
-    except Exception as error:  # scipy raises bare and varied exceptions on damage
-        raise InputError(f"{path}: not a readable .mat file ({' '.join(str(error).split())[:80]})") from None
+    contents = load_mat(path)
     missing = {"spad", "SBR", "photons"} - {*contents} | (set() if {"bin", "range_bins"} & {*contents} else {"bin"})
     require(not missing, f"{path}: {', '.join(sorted(missing))} are missing, there are {', '.join(sorted(contents))}")
     try:
@@ -150,10 +167,13 @@ def read_mat(path: Path) -> Histogram:
 def _histogram(contents: dict) -> Histogram:
     index = contents["bin" if "bin" in contents else "range_bins"].astype(np.int64)
     height, width = index.shape
+    require(contents["spad"].ndim == 2, f"spad has {contents['spad'].ndim} dimensions, expected 2")
+    require_memory(12 * math.prod(contents["spad"].shape), f"spad of shape {contents['spad'].shape}")
     dense = np.asarray(contents["spad"].todense() if hasattr(contents["spad"], "todense") else contents["spad"])
     if dense.shape[0] != height * width:
         raise InputError(f"spad has {dense.shape[0]} rows for {height} x {width} pixels")
-    if (dense < 0).any() or (dense != np.floor(dense)).any():
+    counts_only = np.isrealobj(dense) and bool(np.isfinite(dense).all() and (dense >= 0).all())
+    if not counts_only or (dense != np.floor(dense)).any() or dense.max(initial=0) > np.iinfo(np.int32).max:
         raise InputError("spad holds values that are no counts")
     counts = dense.reshape(width, height, -1).swapaxes(0, 1).astype(np.int32)
     if "bin_size" in contents:

@@ -16,6 +16,7 @@ from scipy.special import erfc, ndtr
 
 from scenes.constants import REFERENCE_PULSE_SIGMA_S
 from scenes.errors import InputError, require
+from scenes.files import read_array
 
 MOST_SAMPLES = 1 << 16
 # Steps of a table that stands for two kernels in one, per standard deviation of the narrower: the table widens the
@@ -199,11 +200,7 @@ def read_pulse(path: Path, sample_s: float) -> SampledPulse:
     rolled until their circular centroid is in the middle.
     """
     path = Path(path)
-    require(path.is_file(), f"{path}: file not found")
-    try:
-        samples = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a readable .npy file ({' '.join(str(error).split())[:80]})") from None
+    samples = read_array(path)
     good = samples.ndim == 1 and samples.dtype.kind in "fiu"
     require(good, f"{path}: {samples.dtype}{samples.shape}, expected one dimension of numbers")
     samples = samples.astype(np.float64)

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from render.transient import Transient, read_transient
-from scenes.errors import InputError, require
+from scenes.errors import require
+from scenes.files import read_array
 from spad.budget import Optics
 from spad.depth import confidence, laser_baseline_m
 from spad.detect import sense
@@ -131,11 +132,7 @@ def summary(histogram: Histogram) -> dict:
 def _dark_map(path: Path | None, transient: Transient) -> np.ndarray | None:
     if path is None:
         return None
-    require(path.is_file(), f"{path}: file not found")
-    try:
-        rates = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a readable .npy file ({' '.join(str(error).split())[:80]})") from None
+    rates = read_array(path)
     shape = (transient.height, transient.width)
     good = rates.dtype.kind in "fiu" and rates.shape == shape
     require(good, f"{path}: {rates.dtype}{rates.shape}, expected numbers {shape}")

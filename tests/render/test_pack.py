@@ -22,6 +22,7 @@ from render.pack import (
 from render.transient import Transient
 from scenes import InputError
 from scenes.files import ATTRIBUTE
+from scenes.hdf5 import add_checksum
 
 
 def transient(seed: int, height: int = 6, width: int = 5) -> Transient:
@@ -104,10 +105,14 @@ def test_damage_is_refused_in_one_line(packed, tmp_path):
             read_pack(tmp_path / "cut.h5")
     with h5py.File(packed, "r+") as file:
         file["first radiance"][3] += 1
+    with pytest.raises(InputError, match="bytes do not match their SHA-256"):
+        read_pack(packed)
+    add_checksum(packed)
     with pytest.raises(InputError, match="SHA-256"):
         read_pack(packed)
     with h5py.File(packed, "r+") as file:
         file.attrs[ATTRIBUTE] = file.attrs[ATTRIBUTE].replace('"schema": 2', '"schema": 1')
+    add_checksum(packed)
     with pytest.raises(InputError, match="pack of schema 1, this program reads 2"):
         read_pack(packed)
     with pytest.raises(InputError, match="not found"):

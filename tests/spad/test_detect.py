@@ -11,6 +11,7 @@ from scipy import stats
 from test_flux import transient_of
 
 from scenes import InputError
+from scenes.hdf5 import add_checksum
 from spad.detect import expected_in_pixel, sense
 from spad.flux import expected_counts, rates_for
 from spad.histogram import Histogram, read_histogram, write_histogram
@@ -176,6 +177,7 @@ def test_foreign_and_newer_files_are_refused_by_name(tmp_path):
     ):
         with h5py.File(tmp_path / "h.h5", "r+") as file:
             file.attrs["scene2spad"] = json.dumps({**meta, **change})
+        add_checksum(tmp_path / "h.h5")
         with pytest.raises(InputError, match=message):
             read_histogram(tmp_path / "h.h5")
     with h5py.File(tmp_path / "g.h5", "w") as file:

@@ -184,7 +184,7 @@ def test_exported_frame_for_an_independent_reader(tmp_path: Path) -> None:
     assert width_s == Sensor().bin_width_s
     # 1-based index of the bin that holds the arrival, and the pulse's peak with it
     assert (frame["bin"][known] == np.floor(2 * depth[known] / (C * width_s)) + 1).all()
-    assert (frame["bin"] == frame["range_bins"]).all() and frame["bin"].dtype == np.uint16 and frame["bin"][2, 3] == 0
+    assert (frame["bin"] == frame["range_bins"]).all() and frame["bin"].dtype == np.uint16 and frame["bin"][2, 3] == 1
     assert (np.round(frame["bin_hr"][known] + 1e-9) == frame["bin"][known]).all()
     rates = frame["rates"]
     assert rates.shape == (5, 7, 1024) and rates.min() == 0 and rates[known].max(axis=-1).min() > 0.999999

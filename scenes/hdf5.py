@@ -1,0 +1,129 @@
+"""HDF5 files that may be damaged: checked before the HDF5 library sees them, and read within stated sizes.
+
+The library trusts what a file states: a flipped bit can make it loop for ever or allocate petabytes. So the first 512
+bytes of our files, HDF5's user block, hold a SHA-256 of all others. Files without one, of earlier versions or made by
+others, are first read in a process of their own that may be killed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import mmap
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scenes.errors import InputError, require
+from scenes.limits import memory_limit, require_memory
+
+if TYPE_CHECKING:
+    import h5py
+
+USER_BLOCK = 512
+MARK = b"scene2spad SHA-256 of what follows byte 512: "
+MAX_DEFLATE_RATIO = 1032  # of zlib's format
+SLACK_BYTES = 1 << 16
+PROBE_SECONDS, PROBE_BYTES_PER_SECOND = 30, 20_000_000
+PROBE = """
+import resource, sys, h5py
+resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), int(sys.argv[2])))
+with h5py.File(sys.argv[1], "r") as file:
+    dict(file.attrs)
+    for name in file:
+        dataset = file[name]
+        dataset.shape, dataset.dtype, dataset.id.get_storage_size()
+        for chunk in dataset.iter_chunks() if dataset.chunks else ():
+            dataset[chunk]
+"""
+
+
+def add_checksum(path: Path) -> None:
+    """Write the checksum into the user block of a finished HDF5 file that was made with `userblock_size=512`."""
+    with Path(path).open("r+b") as file:
+        line = MARK + _digest(file).encode() + b"\n"
+        file.seek(0)
+        file.write(line.ljust(USER_BLOCK, b"\0"))
+
+
+def _digest(file: object) -> str:
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
+        return hashlib.sha256(memoryview(contents)[USER_BLOCK:]).hexdigest()
+
+
+@contextmanager
+def open_checked(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading once its bytes are known to be sound.
+
+    Raises InputError, without the file's name, for bytes that changed since the checksum was written, and for a file
+    without one that another process cannot read in time.
+    """
+    import h5py
+
+    with path.open("rb") as file:
+        start = file.read(USER_BLOCK)
+        if start.startswith(MARK):
+            require(len(start) == USER_BLOCK, "is cut short")
+            expected = start[len(MARK) : len(MARK) + 64].decode("ascii", "replace")
+            blank = start[len(MARK) + 65 :].strip(b"\0") == b""
+            size = path.stat().st_size
+            sound = blank and size > USER_BLOCK and _digest(file) == expected
+            require(sound, "its bytes do not match their SHA-256: the file is damaged or was altered")
+        else:
+            _probe(path)
+    with h5py.File(path, "r") as opened:
+        yield opened
+
+
+def _probe(path: Path) -> None:
+    """Read a file without a checksum in another process; InputError where that dies, or takes too long."""
+    require(_has_signature(path), "no HDF5 file")
+    seconds = PROBE_SECONDS + path.stat().st_size / PROBE_BYTES_PER_SECOND
+    limit = min(memory_limit(), 4 << 30)
+    command = [sys.executable, "-c", PROBE, str(path), str(limit)]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"the HDF5 library does not come to an end of it in {seconds:.0f} s: it is damaged") from None
+    if done.returncode:
+        words = (done.stderr.decode(errors="replace").split("\n")[-2:-1] or [""])[0]
+        raise InputError(f"the HDF5 library cannot read it ({words[:120] or f'status {done.returncode}'})")
+
+
+def _has_signature(path: Path) -> bool:
+    """Look for HDF5's signature where it may stand: at 0, 512, 1024, 2048, ..."""
+    size, at = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while at + 8 <= size:
+            file.seek(at)
+            if file.read(8) == b"\x89HDF\r\n\x1a\n":
+                return True
+            at = max(USER_BLOCK, 2 * at)
+    return False
+
+
+def read_dataset(file: h5py.File, name: str) -> np.ndarray:
+    """Read a dataset whole after its stated size is compared with the bytes that the file holds of it.
+
+    Raises InputError for a name that is no dataset inside this file, one of numbers only, and a size beyond what
+    the stored bytes can hold or the memory limit allows.
+    """
+    import h5py
+
+    inside = isinstance(file.get(name, getlink=True), h5py.HardLink)
+    dataset = file[name] if inside else None
+    require(isinstance(dataset, h5py.Dataset), f"{name} is no dataset of this file")
+    require(dataset.dtype.kind in "biuf" and dataset.shape is not None, f"{name} holds no numbers")
+    require(not dataset.is_virtual and not dataset.external, f"{name} lies in another file")
+    size = dataset.dtype.itemsize
+    for side in dataset.shape:
+        size *= int(side)
+    stored = dataset.id.get_storage_size()
+    most = stored * (MAX_DEFLATE_RATIO if dataset.compression == "gzip" else 1) + SLACK_BYTES
+    require(size <= most, f"{name} states {size} bytes, the {stored} that are stored hold at most {most}")
+    require_memory(size, name)
+    return np.asarray(dataset[()])

@@ -1,0 +1,161 @@
+"""Files of ours: whole or not there, checked before a library trusts them, and within memory."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from scenes import InputError
+from scenes.files import open_seal, read_array, whole_file
+from scenes.hdf5 import MARK, USER_BLOCK, add_checksum, open_checked, read_dataset
+
+
+def test_a_file_and_its_folder_are_flushed_before_and_after_the_rename(tmp_path, monkeypatch):
+    """A rename may reach the disk before the bytes do: then a power cut leaves an empty file under the final name."""
+    order, fsync, replace = [], os.fsync, Path.replace
+
+    def flushed(descriptor: int) -> None:
+        order.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        fsync(descriptor)
+
+    def renamed(self: Path, target: Path) -> Path:
+        order.append("rename")
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", flushed)
+    monkeypatch.setattr(Path, "replace", renamed)
+    with whole_file(tmp_path / "a.txt") as beside:
+        beside.write_text("all of it")
+    assert order == [beside.name, "rename", tmp_path.name]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_deeply_nested_seal_is_no_seal_of_ours():
+    with pytest.raises(InputError, match="not one of ours"):
+        open_seal('{"a":' * 100_000, "histogram")
+
+
+def test_arrays_of_every_layout_read_as_numpy_reads_them(tmp_path):
+    rng = np.random.default_rng(0)
+    for array in (
+        rng.random(5),
+        rng.random((2, 3)).astype(np.float32),
+        np.asfortranarray(rng.random((3, 4))),
+        np.eye(0),
+    ):
+        np.save(tmp_path / "a.npy", array)
+        assert np.array_equal(read_array(tmp_path / "a.npy"), array)
+
+
+def test_arrays_that_are_none_are_refused_in_one_line(tmp_path):
+    np.save(tmp_path / "o.npy", np.array([{}], object), allow_pickle=True)
+    np.save(tmp_path / "s.npy", np.zeros(3))
+    data = (tmp_path / "s.npy").read_bytes()
+    (tmp_path / "huge.npy").write_bytes(data.replace(b"(3,)", b"(3000000000000,)"[:4].ljust(4)))
+    (tmp_path / "cut.npy").write_bytes(data[:-1])
+    (tmp_path / "magic.npy").write_bytes(b"\0" * 8 + data[8:])
+    for name in ("o.npy", "huge.npy", "cut.npy", "magic.npy", "none.npy"):
+        with pytest.raises(InputError, match=rf"^[^\n]*{name}[^\n]*$"):
+            read_array(tmp_path / name)
+
+
+def hdf5(path: Path, **datasets) -> Path:
+    with h5py.File(path, "w", userblock_size=USER_BLOCK) as file:
+        for name, made in datasets.items():
+            made(file, name)
+    add_checksum(path)
+    return path
+
+
+def test_a_flipped_bit_of_a_checked_file_is_seen_before_hdf5_reads_it(tmp_path):
+    path = hdf5(tmp_path / "a.h5", x=lambda file, name: file.create_dataset(name, data=np.arange(10)))
+    with open_checked(path) as file:
+        assert (read_dataset(file, "x") == np.arange(10)).all()
+    with h5py.File(path) as file:  # HDF5's own tools read it too
+        assert (file["x"][:] == np.arange(10)).all()
+    data = path.read_bytes()
+    for byte in range(0, len(data), 37):
+        path.write_bytes(data[:byte] + bytes([data[byte] ^ 4]) + data[byte + 1 :])
+        if byte < len(MARK):  # no checksum of ours any more: HDF5 does not look there
+            with open_checked(path) as file:
+                assert (read_dataset(file, "x") == np.arange(10)).all()
+            continue
+        with pytest.raises(InputError), open_checked(path):
+            pass
+
+
+def test_a_file_without_a_checksum_is_read_by_another_process_first(tmp_path):
+    """As written before there were checksums; and damaged so that the library fails or never ends."""
+    with h5py.File(tmp_path / "old.h5", "w") as file:
+        file.create_dataset("x", data=np.arange(1000), chunks=(100,), compression="gzip")
+    with open_checked(tmp_path / "old.h5") as file:
+        assert (read_dataset(file, "x") == np.arange(1000)).all()
+    data = (tmp_path / "old.h5").read_bytes()
+    (tmp_path / "cut.h5").write_bytes(data[: len(data) // 2])
+    (tmp_path / "none.h5").write_bytes(b"nothing" * 99)
+    for name in ("cut.h5", "none.h5"):
+        with pytest.raises(InputError), open_checked(tmp_path / name):
+            pass
+
+
+def test_datasets_larger_than_their_bytes_or_elsewhere_are_refused(tmp_path):
+    (tmp_path / "raw.bin").write_bytes(bytes(80))
+    hdf5(tmp_path / "other.h5", x=lambda file, name: file.create_dataset(name, data=np.arange(3)))
+    virtual = h5py.VirtualLayout((3,), np.int64)
+    virtual[:] = h5py.VirtualSource(tmp_path / "other.h5", "x", (3,))
+    path = hdf5(
+        tmp_path / "a.h5",
+        bomb=lambda file, name: file.create_dataset(name, (10**9, 1000), np.int32, chunks=(1024, 1000)),
+        external=lambda file, name: file.create_dataset(
+            name, (10,), np.int64, external=[(tmp_path / "raw.bin", 0, 80)]
+        ),
+        link=lambda file, name: file.__setitem__(name, h5py.ExternalLink(str(tmp_path / "other.h5"), "x")),
+        virtual=lambda file, name: file.create_virtual_dataset(name, virtual),
+        words=lambda file, name: file.create_dataset(name, data="text"),
+        group=lambda file, name: file.create_group(name),
+    )
+    with open_checked(path) as file:
+        for name, why in (
+            ("bomb", "states 4000000000000 bytes"),
+            ("external", "another file"),
+            ("virtual", "another file"),
+        ):
+            with pytest.raises(InputError, match=why):
+                read_dataset(file, name)
+        for name in ("link", "words", "group", "none"):
+            with pytest.raises(InputError):
+                read_dataset(file, name)
+
+
+def test_a_small_histogram_that_states_gigabytes_is_refused_within_its_size(tmp_path):
+    """7 kB that took 3.3 GB, and an unknown data set that took 3.5: read in a process with 1.5 GB."""
+    code = f"""
+import resource, sys
+sys.path.insert(0, {str(Path(__file__).parents[1] / "support")!r})
+from pathlib import Path
+import h5py, json
+import readers
+from scenes import InputError
+from scenes.hdf5 import add_checksum
+from spad.histogram import read_histogram
+path = Path({str(tmp_path / "h.h5")!r})
+for extra in ("unknown", "counts"):
+    readers.READERS["histogram"].make(path)
+    with h5py.File(path, "r+") as file:
+        if extra in file: del file[extra]
+        file.create_dataset(extra, (900, 1000, 1000), "i4", chunks=(64, 100, 100), compression="gzip")
+    add_checksum(path)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try: read_histogram(path)
+    except InputError as error: print(json.dumps(str(error)))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    told = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(told) == 2 and "unknown" in told[0] and "states 3600000000 bytes" in told[1]

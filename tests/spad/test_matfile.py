@@ -1,0 +1,148 @@
+"""MATLAB files: what is sound reads as scipy reads it, what states more than it holds never reaches scipy."""
+
+import struct
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse
+from test_rgbd import made
+
+from scenes import InputError
+from spad.histogram import Histogram
+from spad.linospad import read_linospad
+from spad.mat import read_mat, write_mat
+from spad.matfile import checked_contents, load_mat
+from spad.sensor import Sensor, sensor_by_name
+
+
+def saved(path: Path, compressed: bool = False, **variables) -> Path:
+    scipy.io.savemat(path, variables, do_compression=compressed)
+    return path
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_every_class_that_we_read_comes_as_from_scipy(compressed, tmp_path):
+    cell = np.empty((1, 2), object)
+    cell[0, 0], cell[0, 1] = scipy.sparse.csc_matrix(np.eye(3)), np.zeros((0, 4))
+    variables = {
+        "a": np.arange(6.0).reshape(2, 3), "b": np.uint16([1, 2, 3]), "c": "text", "d": {"x": 1, "y": np.eye(2)},
+        "e": scipy.sparse.csc_matrix(np.diag([1.0, 0, 2])), "f": 1 + 2j * np.ones(2), "g": cell, "h": np.array([True]),
+    }  # fmt: skip
+    path = saved(tmp_path / "a.mat", compressed, **variables)
+    expected, found = scipy.io.loadmat(path), load_mat(path)
+    assert found.keys() == variables.keys()
+    for name in "abcfh":
+        assert np.array_equal(found[name], expected[name]) and found[name].dtype == expected[name].dtype
+    assert (found["e"].todense() == np.diag([1.0, 0, 2])).all() and (found["g"][0, 0].todense() == np.eye(3)).all()
+    assert found["d"][0, 0]["y"].shape == (2, 2) and list(load_mat(path, ["a"])) == ["a"]
+
+
+def sparse_with(tmp_path: Path, old: tuple[int, ...], new: tuple[int, ...], compressed: bool) -> Path:
+    """A sparse (3, 2) matrix whose int32 indices `old` are replaced, its compressed stream made anew."""
+    path = saved(tmp_path / "s.mat", spad=scipy.sparse.csc_matrix(np.array([[1.0, 0], [2, 0], [0, 3]])))
+    data = path.read_bytes()
+    before, after = (np.array(values, "<i4").tobytes() for values in (old, new))
+    assert data.count(before) == 1
+    data = data.replace(before, after)
+    if compressed:
+        body = zlib.compress(data[128:])
+        data = data[:128] + struct.pack("<II", 15, len(body)) + body
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("index", [3, 1 << 30, -1])
+def test_sparse_indices_out_of_range_are_refused(index, compressed, tmp_path):
+    """They ended the process by a segmentation fault, or lost photons in silence."""
+    with pytest.raises(InputError, match=r"s\.mat: .*row index is outside 0 to 2"):
+        load_mat(sparse_with(tmp_path, (0, 1, 2), (0, 1, index), compressed))
+
+
+@pytest.mark.parametrize("starts", [(0, 3, 2), (1, 2, 3), (0, 2, 9), (0, -1, 3)])
+def test_column_starts_that_do_not_rise_to_their_number_are_refused(starts, tmp_path):
+    with pytest.raises(InputError, match="column starts"):
+        load_mat(sparse_with(tmp_path, (0, 2, 3), starts, compressed=True))
+
+
+def test_declared_sizes_are_compared_with_the_bytes(tmp_path, monkeypatch):
+    path = saved(tmp_path / "a.mat", a=np.zeros((5, 7)))
+    data = path.read_bytes()
+    shape = np.array((5, 7), "<i4").tobytes()
+    for other in ((5, 8), (1 << 20, 1 << 10), (-5, 7)):
+        path.write_bytes(data.replace(shape, np.array(other, "<i4").tobytes()))
+        with pytest.raises(InputError, match="dimensions"):
+            load_mat(path)
+    monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "0.01")
+    bomb = zlib.compress(bytes(1 << 25))
+    path.write_bytes(data[:128] + struct.pack("<II", 15, len(bomb)) + bomb)
+    with pytest.raises(InputError, match="memory"):
+        load_mat(path)
+
+
+def test_versions_and_cells_without_end_are_named(tmp_path):
+    (tmp_path / "new.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n" + bytes(100))
+    with pytest.raises(InputError, match=r"version 7\.3; save it again with -v7"):
+        read_linospad(tmp_path / "new.mat")
+    value: object = 1
+    for _ in range(40):
+        cell = np.empty((1, 1), object)
+        cell[0, 0] = value
+        value = cell
+    with pytest.raises(InputError, match="nested"):
+        checked_contents(saved(tmp_path / "deep.mat", x=value).read_bytes())
+
+
+# --- The published loaders -------------------------------------------------------------------------------------------
+
+
+def empty_in_places(histogram: Histogram) -> Histogram:
+    counts = histogram.counts.copy()
+    counts[0, :3] = 0
+    return replace(histogram, counts=counts)
+
+
+def test_no_exported_bin_is_zero_also_where_nothing_was_detected(tmp_path):
+    """Published loaders subtract 1 from uint16 bins: a 0 becomes 65535, an IndexError or the next frame in silence."""
+    histogram = empty_in_places(made())
+    write_mat(histogram, tmp_path / "f.mat")
+    frame = load_mat(tmp_path / "f.mat")
+    for name in ("bin", "range_bins", "est_range_bins_argmax", "est_range_bins_lmf", "est_range_bins_zncc"):
+        index = frame[name] - np.uint16(1)
+        assert index.dtype == np.uint16 and index.max() < histogram.sensor.bins, name
+    counts = np.asarray(frame["spad"].todense()).reshape(7, 5, -1).swapaxes(0, 1)
+    some = counts.any(axis=-1)
+    assert (frame["est_range_bins_argmax"][some] == counts.argmax(axis=-1)[some] + 1).mean() > 0.95
+
+
+@pytest.mark.parametrize("name", ["reference", "iccv2023-train"])
+def test_bin_is_the_fullest_bin_of_the_pulse(name, tmp_path):
+    """With a measured, lopsided pulse it stood a bin behind in two thirds of the pixels."""
+    sensor = sensor_by_name(name)
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.5, 11, (24, 32))
+    image = np.ones(depth.shape)
+    from spad.detect import sense
+    from spad.rgbd import transient_from_rgbd
+    from spad.sensor import PhotonBudget
+
+    histogram = sense(transient_from_rgbd(depth, image, image), sensor, PhotonBudget(100, 10), seed=0)
+    write_mat(histogram, tmp_path / "f.mat")
+    frame = load_mat(tmp_path / "f.mat")
+    assert (frame["bin"] == frame["rates"].argmax(axis=-1) + 1).all()
+    assert np.abs(frame["bin_hr"] - frame["bin"]).max() <= 1.01
+    assert abs(float((frame["bin_hr"] - frame["bin"]).mean())) < 0.05
+
+
+def test_the_pulse_of_another_sensor_is_not_overwritten(tmp_path):
+    write_mat(made(), tmp_path / "a.mat")
+    write_mat(made(), tmp_path / "b.mat")
+    other = replace(made(), sensor=Sensor(pulse=sensor_by_name("linospad").pulse))
+    with pytest.raises(InputError, match=r"PSF.*holds the pulse of another sensor"):
+        write_mat(other, tmp_path / "c.mat")
+    assert not (tmp_path / "c.mat").exists()
+    assert (read_mat(tmp_path / "a.mat").counts == made().counts).all()

@@ -1,0 +1,275 @@
+"""Every reader of files: a small good file of its kind, and all numbers that reading it hands out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+Numbers = Iterable[tuple[np.ndarray, bool]]  # arrays, and whether they may hold NaN
+
+
+@dataclass(frozen=True)
+class Reader:
+    """suffix, how a good file is made, what is read of it, and whether a checksum rules out silent changes."""
+
+    suffix: str
+    make: Callable[[Path], None]
+    read: Callable[[Path], Numbers]
+    checked: bool = False
+
+
+def _transient():
+    from spad.rgbd import transient_from_rgbd
+
+    rng = np.random.default_rng(3)
+    depth = rng.uniform(0.5, 6, (4, 6))
+    depth[1, 2] = np.nan
+    image = rng.uniform(0.2, 1, (4, 6))
+    return transient_from_rgbd(depth, image, image)
+
+
+def _histogram():
+    from spad.detect import sense
+    from spad.sensor import PhotonBudget, Sensor
+
+    return sense(_transient(), Sensor(bins=64), PhotonBudget(20, 10), seed=1)
+
+
+def _of_histogram(histogram) -> Numbers:
+    yield histogram.counts, False
+    for name in ("depth_m", "mixed", "albedo", "expected_signal", "expected_background"):
+        yield getattr(histogram, name), True
+
+
+def _of_transient(transient) -> Numbers:
+    for name in ("offsets", "path_near_m", "path_far_m", "radiance", "bounces"):
+        yield getattr(transient, name), False
+    for name in ("depth_m", "normal", "albedo", "ambient", "mixed", "error"):
+        yield getattr(transient, name), True
+
+
+def _write_histogram(path: Path) -> None:
+    from spad.histogram import write_histogram
+
+    write_histogram(_histogram(), path)
+
+
+def _read_histogram(path: Path) -> Numbers:
+    from spad.histogram import read_histogram
+
+    return _of_histogram(read_histogram(path))
+
+
+def _write_transient(path: Path) -> None:
+    from render.transient import write_transient
+
+    write_transient(_transient(), path)
+
+
+def _read_transient(path: Path) -> Numbers:
+    from render.transient import read_transient
+
+    return _of_transient(read_transient(path))
+
+
+def _write_pack(path: Path) -> None:
+    from render.pack import rounded, write_pack
+
+    write_pack([(rounded(_transient()), {"scene": "a"})] * 2, path)
+
+
+def _read_pack(path: Path) -> Numbers:
+    from render.pack import read_pack
+
+    for transient in read_pack(path):
+        yield from _of_transient(transient)
+
+
+def _write_frame(path: Path) -> None:
+    from spad.mat import write_mat
+
+    write_mat(_histogram(), path)
+
+
+def _read_frame(path: Path) -> Numbers:
+    from spad.mat import read_mat
+
+    return _of_histogram(read_mat(path))
+
+
+def _write_capture(path: Path) -> None:
+    import scipy.sparse
+
+    from spad.linospad import Capture, write_linospad
+
+    counts = scipy.sparse.random(64, 16, 0.2, "csc", rng=np.random.default_rng(0))
+    counts.data = np.ceil(9 * counts.data)
+    write_linospad([Capture(counts, np.arange(16.0).reshape(4, 4))], path)
+
+
+def _read_capture(path: Path) -> Numbers:
+    from spad.linospad import read_linospad, resampled
+
+    capture = read_linospad(path, bins=64)
+    yield resampled(capture, 32, 2), False
+    if capture.image is not None:
+        yield capture.image, True
+
+
+def _write_weights(path: Path) -> None:
+    from csph.config import ModelConfig, TrainConfig
+    from csph.design import Design
+    from csph.model import DepthModel, save_model
+    from spad.sensor import Sensor
+
+    design = Design.named("learned", (16, 2, 2), codes=8)
+    config = TrainConfig(model=ModelConfig(design=design, sensor=Sensor(bins=64)))
+    save_model(DepthModel(config.model, 0), config, {"step": 1}, path, half=True)
+
+
+def _read_weights(path: Path) -> Numbers:
+    from csph.model import load_model
+
+    model, _, _ = load_model(path)
+    return ((value.numpy(), False) for value in model.state_dict().values())
+
+
+def _write_numbers(path: Path) -> None:
+    np.save(path, np.abs(np.random.default_rng(0).normal(0, 1, 40)).astype(np.float32))
+
+
+def _read_pulse(path: Path) -> Numbers:
+    from spad.pulse import read_pulse
+
+    yield np.array(read_pulse(path, 1e-11).samples), False
+
+
+def _write_mesh(path: Path) -> None:
+    import trimesh
+
+    trimesh.creation.icosphere(subdivisions=1, radius=0.5).export(path)
+
+
+def _read_scene(path: Path) -> Numbers:
+    from scenes.catalog import load_scene
+
+    for surface in load_scene(str(path), width=16, height=12).surfaces:
+        yield surface.vertices, False
+        yield surface.faces, False
+
+
+XML = """<scene version="3.0.0">
+  <sensor type="perspective"><float name="fov" value="40"/>
+    <transform name="to_world"><lookat origin="0, 1, 4" target="0, 0.5, 0" up="0, 1, 0"/></transform></sensor>
+  <bsdf type="roughplastic" id="paint"><rgb name="diffuse_reflectance" value="0.4, 0.3, 0.2"/>
+    <float name="alpha" value="0.2"/></bsdf>
+  <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/></transform>
+    <ref id="paint"/></shape>
+  <shape type="sphere"><float name="radius" value="0.5"/><point name="center" x="0" y="0.5" z="0"/>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
+  <emitter type="constant"><rgb name="radiance" value="0.01"/></emitter>
+</scene>
+"""
+
+
+def _write_image(path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)).save(path)
+
+
+def _read_texture(path: Path) -> Numbers:
+    from scenes.textures import load_texture
+
+    yield load_texture(path).image, False
+
+
+def _write_depth_image(path: Path) -> None:
+    from PIL import Image
+
+    levels = np.random.default_rng(0).integers(800, 3000, (24, 32)).astype(np.uint16)
+    Image.fromarray(levels).save(path)
+
+
+def _read_rgbd(path: Path) -> Numbers:
+    from scenes.relief import RgbdFiles, rgbd
+
+    photograph = path.parent / "photograph.bmp"
+    if not photograph.is_file():
+        photograph = Path(path.parent.parent / "photograph.bmp")
+        _write_grey(photograph)
+    scene = rgbd(RgbdFiles(photograph, path, 40.0, 0.001, False), width=16)
+    for surface in scene.surfaces:
+        yield surface.vertices, False
+
+
+def _write_grey(path: Path) -> None:
+    from PIL import Image
+
+    if not path.is_file():
+        Image.fromarray(np.random.default_rng(1).integers(20, 255, (24, 32), np.uint8)).save(path)
+
+
+def _write_assembly(path: Path) -> None:
+    path.write_text(
+        ".equ K, 4\n.space codes, s16, K\n.reg t, r1\nloop:   BNT idle\n        RDT t\n.for k in 0..K - 1\n"
+        "        ADDM [codes + 2*k], t\n.end\n        JMP loop\nidle:   BFE end\n        JMP loop\nend:    HALT\n"
+    )
+
+
+def _read_assembly(path: Path) -> Numbers:
+    from ultraphase import ChipSpec, assemble_file
+
+    program = assemble_file(path)
+    program.check(ChipSpec())
+    yield np.array(program.words, np.int64), False
+
+
+def _write_index(path: Path) -> None:
+    import json
+
+    lines = [{"view": i, "file": f"views/{i:06d}.exr", "error": 0.01, "place": f"room {i}"} for i in range(4)]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def _read_index(path: Path) -> Numbers:
+    """The reader takes a folder: the damaged index is put into one."""
+    import shutil
+    import tempfile
+
+    from scenes.errors import InputError
+    from scenes.set_index import read_set_index
+
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copy(path, Path(folder) / "index.jsonl")
+        (Path(folder) / "views").mkdir()
+        for view in range(4):
+            (Path(folder) / f"views/{view:06d}.exr").touch()
+        try:
+            records = read_set_index(Path(folder))
+        except InputError as error:
+            raise InputError(f"{path.name}: {error}") from None
+    yield np.array([record["view"] for record in records]), False
+
+
+READERS: dict[str, Reader] = {
+    "obj": Reader(".obj", _write_mesh, _read_scene),
+    "ply": Reader(".ply", _write_mesh, _read_scene),
+    "stl": Reader(".stl", _write_mesh, _read_scene),
+    "glb": Reader(".glb", _write_mesh, _read_scene),
+    "xml": Reader(".xml", lambda path: path.write_text(XML) and None, _read_scene),
+    "texture": Reader(".png", _write_image, _read_texture),
+    "rgbd": Reader(".png", _write_depth_image, _read_rgbd),
+    "transient": Reader(".exr", _write_transient, _read_transient, checked=True),
+    "histogram": Reader(".h5", _write_histogram, _read_histogram, checked=True),
+    "pack": Reader(".h5", _write_pack, _read_pack, checked=True),
+    "index": Reader(".jsonl", _write_index, _read_index),
+    "frame": Reader(".mat", _write_frame, _read_frame),
+    "capture": Reader(".mat", _write_capture, _read_capture),
+    "weights": Reader(".safetensors", _write_weights, _read_weights, checked=True),
+    "pulse": Reader(".npy", _write_numbers, _read_pulse),
+    "assembly": Reader(".s", _write_assembly, _read_assembly),
+}

@@ -1,0 +1,50 @@
+"""Damaged files of every kind that we read: refused in one line, or read as numbers that are finite.
+
+Files with a checksum must be refused or equal the original. Others may hold another mesh or image after a flipped
+digit, but never an infinite one. Seeds are fixed; a file that fails can be made again by reader and number.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "support"))
+
+from damage import MEMORY_BYTES, SECONDS, damaged, read_all
+from readers import READERS
+
+
+def check(reader: str, count: int, folder: Path, first: int = 0) -> None:
+    """Damage a good file `count` times, and read the copies in processes of their own."""
+    of = READERS[reader]
+    good = folder / f"good{of.suffix}"
+    of.make(good)
+    copies = folder / "copies"
+    copies.mkdir()
+    data = good.read_bytes()
+    for number in range(first, first + count):
+        rng = np.random.default_rng(np.random.SeedSequence(27, spawn_key=(list(READERS).index(reader), number)))
+        (copies / f"d{number:05d}{of.suffix}").write_bytes(damaged(data, rng))
+    verdicts = read_all(reader, copies, good)
+    assert len(verdicts) == count
+    accepted = {"refused", "same"} if of.checked else {"refused", "same", "changed"}
+    faults = [v for v in verdicts if v.outcome not in accepted or v.seconds > SECONDS or v.memory_bytes > MEMORY_BYTES]
+    assert not faults, f"{len(faults)} of {count}: {faults[:5]}"
+    assert sum(v.outcome == "refused" for v in verdicts) > count // 20, "the damage was not damage"
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_damaged_files_are_refused_or_finite(reader: str, tmp_path: Path) -> None:
+    check(reader, 32, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", READERS)
+def test_many_damaged_files_are_refused_or_finite(reader: str, tmp_path: Path) -> None:
+    """16 readers, 640 files each: 10,240."""
+    check(reader, int(os.environ.get("DAMAGED_FILES", "640")), tmp_path, first=100)
