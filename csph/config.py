@@ -39,6 +39,8 @@ class ModelConfig:
     def __post_init__(self) -> None:
         require(self.front in FRONTS, f"front {self.front!r} is unknown, expected one of {', '.join(FRONTS)}")
         require(self.network in NETWORKS, f"network {self.network!r} is unknown, expected {', '.join(NETWORKS)}")
+        switches = isinstance(self.layer, dict) and all(isinstance(value, bool) for value in self.layer.values())
+        require(switches, f"layer {self.layer!r}: expected switches by name")
         coded = self.front == "codes"
         require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
         if self.design is not None:

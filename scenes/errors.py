@@ -5,9 +5,12 @@ class InputError(ValueError):
     """Bad input, in one line that names value, limit and place. The command line prints it and exits with 2."""
 
     def __init__(self, message: str) -> None:
-        # a file's name may hold bytes that are no text: what is printed must be
-        text = str(message).encode("utf-8", "backslashreplace").decode()
-        super().__init__(" ".join(text.split()))
+        super().__init__(" ".join(printable(str(message)).split()))
+
+
+def printable(text: str) -> str:
+    """Return text that UTF-8 can hold: bytes of a file's name that are no text become escapes."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def require(condition: bool, message: str) -> None:

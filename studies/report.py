@@ -23,7 +23,7 @@ from typing import Any
 from PIL import Image
 
 from render.tracing import Progress
-from scenes.errors import InputError, require
+from scenes.errors import InputError, printable, require
 from scenes.files import whole_file
 from scenes.inputs import read_json_object
 from studies import report_html as html
@@ -88,6 +88,7 @@ class Found:
             return None
 
     def problem(self, line: str) -> None:
+        line = printable(line)
         if line not in self.problems:
             self.problems.append(line)
 

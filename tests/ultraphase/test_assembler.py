@@ -1,5 +1,7 @@
 """Source to words and back: what the assembler takes, what it refuses, and where it says so."""
 
+import os
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -209,3 +211,44 @@ def test_a_learned_temporal_tensor_does_not_fit(codes, bits):
 def test_names_that_are_no_program(name):
     with pytest.raises(InputError):
         method(name).program()
+
+
+# --- Sources that would hang or take all memory ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        (".for h in 1..2000000000\n.end\nHALT\n", "p.s:1:1: loops repeat 2000000000 lines"),
+        (".for h in 1..2000000000\nHALT\n.end\n", "p.s:1:1: loops repeat"),
+        (".for h in 1..20000\n.for i in 1..20000\n.end\n.end\nHALT\n", "p.s:2:1: loops repeat"),
+        (".for h in 1..9999\n.for i in 2..1\n" + "HALT\n" * 5000 + ".end\n.end\n", "p.s:1:1: loops repeat"),
+        (".for h in 1..1\n" * 200 + ".end\n" * 200, "p.s:33:1: .for inside 32 others"),
+        (f".equ A, {'(' * 5000}1{')' * 5000}\n", "more than 32 parentheses"),
+        (f".equ A, {'-' * 5000}1\n", "more than 32 parentheses"),
+        (f".equ A, {'9' * 5000}\n", "does not fit into 32 bits"),
+    ],
+)
+def test_loops_and_nesting_without_end_are_refused_at_once(source, said):
+    with pytest.raises(InputError) as refused:
+        assemble(source, name="p.s")
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_source_includes_regular_files_of_its_folder_alone(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (tmp_path / "out.s").write_text("HALT\n")
+    (folder / "link.s").symlink_to(tmp_path / "out.s")
+    os.mkfifo(folder / "pipe.s")
+    named = (("/dev/zero", "outside"), ("../out.s", "outside"), ("link.s", "outside"), ("pipe.s", "not a regular file"))
+    for name, said in named:
+        (folder / "a.s").write_text(f'.include "{name}"\nHALT\n')
+        with pytest.raises(InputError, match=rf"a\.s:1:11: included file .*{said}"):
+            assemble_file(folder / "a.s")
+    with pytest.raises(InputError, match=r"pipe\.s: is a device, pipe or socket"):
+        assemble_file(folder / "pipe.s")
+    with (folder / "big.s").open("wb") as file:
+        file.truncate(1 << 33)
+    with pytest.raises(InputError, match=r"big\.s: 8589934592 bytes"):
+        assemble_file(folder / "big.s")
