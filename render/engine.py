@@ -13,7 +13,16 @@ import numpy as np
 from render.ambient import AmbientLight, ambient_light
 from render.cells import coarsened
 from render.direct import centre_layers
-from render.error import ErrorEstimate, estimate, noise_of_responses, noise_power, response
+from render.error import (
+    ErrorEstimate,
+    estimate,
+    is_met,
+    noise_of_responses,
+    noise_power,
+    response,
+    target_verdict,
+    worst_share_of,
+)
 from render.indirect import (
     Schedule,
     Watched,
@@ -91,6 +100,10 @@ def render(
         told = f"ambient light: {ambient.spp} paths a pixel, noise {ambient.error:.2g} of its mean"
         plan = replace(plan, reasons=(*plan.reasons, told))
         log.info("%s", told)
+    verdict = target_verdict(error, plan.target, len(noise))
+    plan = replace(plan, reasons=(*plan.reasons, verdict))
+    if len(traced.samples.pixel):
+        log.log(logging.INFO if is_met(error, plan.target) else logging.WARNING, "%s", verdict)
     say("done", 1.0)
     return Transient(
         camera.height,
@@ -183,7 +196,8 @@ def _estimated(
     variance = traced.indirect.noise**2
     of_checked = variance[checked].mean()
     typical = variance.mean() / of_checked if of_checked > 0 else 1.0
-    return estimate(coarse, fine, indirect, noise * typical, merging, bias)
+    error = estimate(coarse, fine, indirect, noise * typical, merging, bias)
+    return replace(error, worst_share=worst_share_of(traced.indirect.noise, error))
 
 
 def _filter_bias(filtered: list[np.ndarray], plain: Watched, place: np.ndarray) -> np.ndarray | float:
@@ -232,6 +246,7 @@ def _meta(scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: 
         "rays": int(traced.rays),
         "clipped_footprints": traced.clipped,
         "relative_error": error.to_dict(),
+        "target_met": is_met(error, plan.target),
         "versions": dict(_versions()),
     }
 

@@ -172,7 +172,7 @@ def traced_on(
     share[pixels[real]] = np.repeat(before.rounds / (before.rounds + more.rounds), BLOCK)[real]
     cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
     merged = combined_samples(traced.indirect_samples, light.finished(), share, cells, traced.origin_m)
-    reason = f"indirect light: the work of {more.cost:.0f} paths a pixel on top, to meet the target"
+    reason = f"indirect light: the work of {more.cost:.0f} paths a pixel on top, as the target was missed"
     return traced._replace(
         samples=concatenate([traced.direct, traced.specular, merged]),
         indirect=combined(traced.indirect, added, share),

@@ -104,7 +104,7 @@ class Job:
     def made(self) -> dict:
         """All that decides the bytes of its views, this version's choices included."""
         tolerances = [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, self.settings().aim]
-        return asdict(self) | {"schema": 6, "tolerances": tolerances}
+        return asdict(self) | {"schema": 7, "tolerances": tolerances}
 
 
 def render_view(job: Job, view: int, again: int = 0) -> Done:
@@ -201,6 +201,8 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         "seed": seed,
         "plan": {key: plan[key] for key in ("bounces", "spp", "grid", "least_share", "ambient")},
         "error": transient.meta["relative_error"]["total"],
+        "target": plan["target"],
+        "target_met": transient.meta["target_met"],
         "depth_m": dict(zip(("min", "q01", "median", "q99", "max"), np.round(quantiles, 4).tolist(), strict=True)),
         "empty": round(1 - depth.size / transient.depth_m.size, 6),
         "returns": transient.returns,
@@ -320,6 +322,13 @@ def make_set(
     seconds = time.perf_counter() - start
     records = [folder.records[view] for view in range(count)]
     good = [record for record in records if "failed" not in record]
+    missed = [record for record in good if not record["target_met"]]
+    if missed:
+        worst = max(missed, key=lambda record: record["error"] / record["target"])
+        log.warning(
+            "warning: %d of %d views end above their error target; the worst is view %d with %.2g (target %.2g)",
+            *(len(missed), len(good), worst["view"], worst["error"], worst["target"]),
+        )
     return {
         "scenes": len(good),
         "failed": [record["view"] for record in records if "failed" in record],
@@ -327,6 +336,7 @@ def make_set(
         "seconds": seconds,
         "scenes_per_second": len(todo) / seconds if todo else 0.0,
         "bytes_per_scene": sum(record["bytes"] for record in good) / max(len(good), 1),
+        "target_missed": len(missed),
         "error_median": float(np.median([record["error"] for record in good])) if good else float("nan"),
         "out": str(out),
     }

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import importlib.metadata
-import io
 import platform
 import struct
 import time
@@ -26,9 +25,11 @@ from render.tracing import Progress
 from scenes.errors import InputError, printable, require
 from scenes.files import whole_file
 from scenes.inputs import read_json_object
+from scenes.set_index import read_set_index
 from studies import report_html as html
 from studies import report_published as beside_print
 from studies.experiments import Report
+from studies.report_files import read_png, read_rows
 from studies.report_plan import NEVER, SECTIONS, Item, Picture, Table
 
 TITLE = "scene2spad: results"
@@ -107,36 +108,6 @@ def gather(root: Path) -> Found:
     for paths in files.values():
         paths.sort(key=lambda path: (-path.stat().st_mtime, path))
     return Found(root, files, configurations)
-
-
-def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
-    """A PNG's bytes and size; ValueError or OSError where it is none or cut."""
-    data = path.read_bytes()
-    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-        image.verify()
-    if not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
-        raise ValueError("its end is missing")
-    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-        return data, image.size
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of a table; ValueError where lines are cut."""
-    with path.open(newline="", encoding="utf-8") as lines:
-        rows = list(csv.DictReader(lines, strict=True))
-    if any(None in row or None in row.values() for row in rows):
-        raise ValueError("rows of other lengths than its head")
-    return [{key: _number(text) for key, text in row.items()} for row in rows]
-
-
-def _number(text: str) -> int | float | str:
-    """A table's cell as the number that it spells, if it does."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
 
 
 def run(command: Report, progress: Progress) -> dict:
@@ -326,13 +297,27 @@ def _configurations(found: Found) -> Iterator[str]:
         yield html.table(models, "Models that studies stood on", MOST_CONFIGURATIONS)
     for name, (title, columns) in CONFIGURATIONS.items():
         rows = [
-            {"folder": str(path.parent.relative_to(found.root)), **_flat(numbers, columns)}
+            {
+                "folder": str(path.parent.relative_to(found.root)),
+                **(_views_of(path.parent, found) if name == "set.json" else {}),
+                **_flat(numbers, columns),
+            }
             for path in found.configurations[name]
             if (numbers := found.read(path, read_json_object)) is not None
         ]
         if rows:
             found.tables += 1
             yield html.table(rows, f"{title} ({name} of each)", MOST_CONFIGURATIONS)
+
+
+def _views_of(folder: Path, found: Found) -> dict[str, Any]:
+    """Number of a set's views, and of those that end above their error target; nothing where there is no index."""
+    index = folder / "index.jsonl"
+    records = found.read(index, lambda path: read_set_index(path.parent)) if index.is_file() else None
+    if records is None:
+        return {}
+    missed = sum(record.get("target_met") is False for record in records)
+    return {"views": len(records), "above the error target": f"{missed} (!)" if missed else missed}
 
 
 def _models(found: Found) -> Iterator[dict]:

@@ -204,7 +204,7 @@ def run_render(command: commands.Render, progress: Progress) -> dict:
     }
     if command.figure:
         result["figure"] = str(figures.draw_transient(transient, _picture(out, "transient")))
-    return result
+    return result | {"target_met": transient.meta["target_met"]}
 
 
 def run_sense(command: commands.Sense, progress: Progress) -> dict:
@@ -315,6 +315,7 @@ def run_demo(command: commands.Demo, progress: Progress) -> dict:
         "seconds_sense": sensed - rendered,
         "seconds_depth": estimated - sensed,
         "relative_error": transient.meta["relative_error"]["total"],
+        "target_met": transient.meta["target_met"],
         "mae_mm": {name: e["mae_mm"] for name, e in errors.items()},
         "within_10mm": {name: e["within_10mm"] for name, e in errors.items()},
         "figure": str(figure),

@@ -1,5 +1,6 @@
 """The whole render: determinism, the plan and its reasons, the error estimate, hard and empty cases."""
 
+import logging
 import math
 from dataclasses import replace
 
@@ -8,7 +9,7 @@ import pytest
 
 from render import engine, tracing
 from render.engine import render
-from render.error import BIN_M, SIGMA_M, response
+from render.error import BIN_M, PULSE_POWER, SIGMA_M, estimate, response, target_verdict, worst_share_of
 from render.planning import _bounces, make_plan, rays_for_all
 from render.returns import Samples
 from render.settings import RenderSettings
@@ -259,3 +260,49 @@ def test_an_image_larger_than_memory_is_refused_before_anything_is_built(monkeyp
     scene = room(width=16384, height=16384)
     with pytest.raises(InputError, match="a render of 16384 x 16384: needs 174 GB of memory, the limit is 32 GB"):
         render(scene, RenderSettings(bounces=1))
+
+
+@pytest.mark.parametrize("asked", [{"error": 1e-3}, {"budget": (1e5, 0.0)}])
+def test_a_missed_target_is_said_last(asked, caplog, monkeypatch):
+    """16 paths a pixel do not meet such targets: the last line says so, and the metadata."""
+    monkeypatch.setattr(logging.getLogger("render"), "propagate", True)  # the command line stops it there
+    with caplog.at_level(logging.INFO, logger="render"):
+        transient = render(room(), RenderSettings(bounces=3, spp=16, grid=2, **asked))
+    meta = transient.meta
+    assert meta["relative_error"]["total"] > meta["plan"]["target"] and meta["target_met"] is False
+    last = caplog.records[-1]
+    assert last.levelno == logging.WARNING and last.getMessage() == meta["plan"]["reasons"][-1]
+    assert last.getMessage().startswith("warning: the stated error of") and "MISSES the target" in last.getMessage()
+
+
+def test_a_target_that_is_met_is_said_last(caplog, monkeypatch):
+    monkeypatch.setattr(logging.getLogger("render"), "propagate", True)
+    with caplog.at_level(logging.INFO, logger="render"):
+        transient = render(room(), RenderSettings(bounces=3, spp=64, grid=4, error=0.5))
+    assert transient.meta["target_met"] is True
+    assert caplog.records[-1].getMessage() == transient.meta["plan"]["reasons"][-1]
+    assert "meets the target of 0.5" in caplog.records[-1].getMessage()
+
+
+def test_one_firefly_misses_the_target_and_is_named():
+    """A path that one batch of 16 met, a thousand times as bright as its pixel: it rules numerator and denominator."""
+    rng = np.random.default_rng(0)
+    pixels, batches, path_m = 3072, 16, 8.0
+    light = np.ones((pixels, batches)) + 0.02 * 4 * rng.normal(size=(pixels, batches))
+    light[1234, 5] = 1000 * batches
+
+    def of_batch(radiance: np.ndarray) -> Samples:
+        at, zero = np.full(pixels, path_m), np.zeros(pixels)
+        return Samples(np.arange(pixels), at, zero, radiance, np.full(pixels, 2))
+
+    noise = light.std(axis=1, ddof=1) / np.sqrt(batches)
+    mean = response(of_batch(light.mean(axis=1)), np.arange(pixels))
+    stated = estimate(0 * mean, 0 * mean, mean, noise**2 * PULSE_POWER)
+    stated = replace(stated, worst_share=worst_share_of(noise, stated))
+    assert stated.total > 0.9 and stated.pixel_median < 0.03 and stated.worst_share > 0.99
+    told = target_verdict(stated, 0.05, pixels)
+    assert "MISSES the target of 0.05" in told and "100% of its square lies in the worst 16 of 3072 pixels" in told
+    even = replace(stated, worst_share=worst_share_of(np.ones(pixels), stated))
+    assert even.worst_share == pytest.approx(16 / 3072, rel=0.01) and "fireflies" not in target_verdict(
+        even, 0.05, pixels
+    )

@@ -39,7 +39,17 @@ def test_render_sense_depth(capfd, folder):
     status, out, _ = run(capfd, "render", "living-room", *SMALL, "--error", "0.1", "--json")
     result = json.loads(out)
     assert status == 0 and len(out.splitlines()) == 1
-    assert {"seconds", "rays", "spp", "returns", "indirect_fraction", "relative_error", "plan", "out"} <= result.keys()
+    assert {
+        "seconds",
+        "rays",
+        "spp",
+        "returns",
+        "indirect_fraction",
+        "relative_error",
+        "target_met",
+        "plan",
+        "out",
+    } <= result.keys()
     assert 0 < result["relative_error"] < 0.1 and 0 < result["indirect_fraction"] < 0.5
     transient = read_transient(folder / "living-room.exr")
     assert transient.returns == result["returns"] and transient.depth_m.shape == (12, 16)

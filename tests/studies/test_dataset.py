@@ -1,6 +1,7 @@
 """Sets of views: the same bytes however they are made, killed, resumed or shared out; failures recorded."""
 
 import json
+import logging
 import os
 import random
 import signal
@@ -206,6 +207,21 @@ def test_the_command_line_packs(whole, tmp_path, capsys):
         centre, expected = ((v.path_near_m.astype(float) + v.path_far_m) / 2 for v in (views[i], transient))
         assert centre == pytest.approx(expected, abs=0.51 * PATH_STEP_M)
     assert pack_set(out, tmp_path / "again.h5") == pack.stat().st_size
+
+
+def test_views_above_their_error_target_are_counted(tmp_path, caplog, monkeypatch):
+    """Two rays a side do not meet 1e-4: every view says so in the index, the set in its result and in one warning."""
+    job = replace(CLI_JOB, error=1e-4)
+    monkeypatch.setattr(logging.getLogger("scene2spad"), "propagate", True)  # the command line stops it there
+    with caplog.at_level(logging.WARNING, logger="scene2spad"):
+        result = make_set(job, 3, tmp_path / "set")
+    records = read_set_index(tmp_path / "set")
+    assert [record["target_met"] for record in records] == [record["error"] <= 1e-4 for record in records]
+    missed = sum(not record["target_met"] for record in records)
+    assert result["target_missed"] == missed > 0
+    assert caplog.records[-1].getMessage().startswith(f"warning: {missed} of 3 views end above their error target")
+    assert read_transient(tmp_path / "set" / records[0]["file"]).meta["target_met"] == records[0]["target_met"]
+    assert make_set(replace(CLI_JOB, error=1.0), 3, tmp_path / "easy")["target_missed"] == 0
 
 
 @pytest.mark.parametrize(

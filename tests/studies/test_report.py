@@ -188,6 +188,19 @@ def test_configurations_and_versions(tree, capfd):
     assert "abababababab" in words and "ab" * 7 not in words
 
 
+def test_sets_with_views_above_their_error_target_are_marked(tree, capfd):
+    folder = tree / "study/smoke/sets/tabletop"
+    lines = [json.dumps({"view": i, "file": "view.exr", "target_met": i > 1}) for i in range(5)]
+    put(folder / "index.jsonl", "\n".join(lines) + "\n")
+    put(folder / "view.exr", b"")
+    put(tree / "study/smoke/sets/rooms/set.json", {"set": "rooms"})
+    put(tree / "study/smoke/sets/rooms/index.jsonl", "{cut")
+    told, text = made(tree, capfd)
+    words = Page(text[text.index('id="configurations"') :]).words
+    assert "above the error target" in words and "2 (!)" in words
+    assert any("rooms/index.jsonl: cannot be read" in line for line in told["problems"])
+
+
 def test_only_the_chief_ratios_are_shown(tree, capfd):
     words = Page(made(tree, capfd)[1]).words
     assert "12.35" in words and "not chief" not in words
