@@ -336,8 +336,9 @@ def _highlight(one: Cells, other: Cells) -> Any:
     """Mean radiance of a cell that holds the highlight between two neighbours on a surface that bends.
 
     Between them the tilt off its middle, in units of the roughness, runs from one's to the other's, and in the
-    neighbouring rows as far to the side as half the step. GGX falls as 1 / (1 + t^2)^2 with the tilt t; a highlight
-    narrower than the step fills a part of the cell.
+    neighbouring rows as far to the side as half the step. GGX falls as 1 / (1 + t^2)^2 with the tilt t, Beckmann
+    faster: its edges are followed where they need not be, none is missed. A highlight narrower than the step fills a
+    part of the cell.
     """
     step_x, step_y = other.tilt_x - one.tilt_x, other.tilt_y - one.tilt_y
     step2 = dr.square(step_x) + dr.square(step_y)

@@ -9,7 +9,8 @@ Both ways sample paths C ... y x L whose last point x before the laser is such m
     c = r / (1 + r),   r = RATIO pi D / (4 cos) (|y - C| / |x - L|)^2,
 
 the other 1 - c: the balance heuristic (Veach 1997, eq. 9.8) for the two densities of the pair x, y, a GGX lobe's D / 4
-beside a diffuse one's cos / pi. Whatever c is, the sum of both is right, as long as both take it from the same points.
+beside a diffuse one's cos / pi. Beckmann lobes, of the same peak, take it too. Whatever c is, the sum of both is right,
+as long as both take it from the same points.
 """
 
 from __future__ import annotations

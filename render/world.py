@@ -211,9 +211,9 @@ def _opaque(vector: np.ndarray) -> Any:
 _PARAMETERS = {
     "diffuse": (),
     "plastic": ("specular", "ior"),
-    "roughplastic": ("specular", "ior", "roughness"),
+    "roughplastic": ("specular", "ior", "roughness", "distribution"),
     "conductor": ("specular", "eta", "k"),
-    "roughconductor": ("specular", "eta", "k", "roughness"),
+    "roughconductor": ("specular", "eta", "k", "roughness", "distribution"),
     "dielectric": ("ior",),
     "thindielectric": ("ior",),
 }
@@ -244,8 +244,8 @@ def _specular_albedo(material: Material) -> float:
 
 
 def _peak(material: Material) -> float:
-    """f cos of a rough lobe at the middle of its highlight seen along the light, F_0 / (4 pi alpha^2) [1/sr] (GGX with
-    all cosines 1); 0 below GLINT."""
+    """f cos of a rough lobe at the middle of its highlight seen along the light, F_0 / (4 pi alpha^2) [1/sr] (GGX or
+    Beckmann with all cosines 1); 0 below GLINT."""
     if material.kind == "roughconductor":
         mirrored = _specular_albedo(material)
     elif material.kind == "roughplastic":
@@ -352,7 +352,7 @@ def _bsdf(material: Material, albedo: dict[str, Any] | None) -> dict[str, Any]:
             "ext_ior": 1.0,
         }
     if kind.startswith("rough") and kind != "roughdiffuse":
-        inner |= {"alpha": material.roughness, "distribution": "ggx"}
+        inner |= {"alpha": material.roughness, "distribution": material.distribution}
     return {"type": "twosided", "nested": inner}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scenes.errors import InputError
 from scenes.mitsuba_nodes import Document
 from scenes.mitsuba_plugin import Plugin
-from scenes.model import Material, Texture
+from scenes.model import DISTRIBUTIONS, Material, Texture
 from scenes.textures import load_texture
 
 MAX_NESTING = 16
@@ -226,20 +226,26 @@ def _relative_index(plugin: Plugin, inside: str) -> float:
     return int_ior / ext_ior
 
 
-def _roughness(materials: Materials, plugin: Plugin, default: float) -> float:
-    """GGX alpha; one number stands for two directions and for a texture."""
+def _microfacets(materials: Materials, plugin: Plugin, default: float) -> dict:
+    """Alpha and distribution of the normals; one number stands for two directions and for a texture."""
     plugin.ignore(("sample_visible",))
-    if plugin.string("distribution", "beckmann") != "ggx":
-        plugin.note("microfacet distribution taken as ggx with the same alpha")
+    distribution = plugin.string("distribution", "beckmann")
+    if distribution == "phong":
+        plugin.note("phong microfacets are taken as beckmann with the same alpha")
+        distribution = "beckmann"
+    elif distribution not in DISTRIBUTIONS:
+        raise plugin.fail(f"distribution {distribution!r}, expected one of {', '.join(DISTRIBUTIONS)}")
     if plugin.has("alpha_u") or plugin.has("alpha_v"):
         plugin.note("alpha_u and alpha_v are replaced by their mean")
-        return (plugin.number("alpha_u", default) + plugin.number("alpha_v", default)) / 2
-    return materials.mean(plugin, "alpha", default)
+        alpha = (plugin.number("alpha_u", default) + plugin.number("alpha_v", default)) / 2
+    else:
+        alpha = materials.mean(plugin, "alpha", default)
+    return {"roughness": alpha, "distribution": distribution}
 
 
-def _rough(values: dict, smooth: str, roughness: float) -> dict:
-    """`values` with a roughness; alpha 0 is the smooth kind."""
-    return values | ({"kind": smooth} if roughness == 0 else {"roughness": roughness})
+def _rough(values: dict, smooth: str, rough: dict) -> dict:
+    """`values` with what makes them rough; alpha 0 is the smooth kind."""
+    return values | ({"kind": smooth} if rough["roughness"] == 0 else rough)
 
 
 def _diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
@@ -248,7 +254,7 @@ def _diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
 
 def _rough_diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
     plugin.ignore(("use_fast_approx",))
-    return _rough(_diffuse(materials, plugin, uv), "diffuse", materials.mean(plugin, "alpha", 0.2))
+    return _rough(_diffuse(materials, plugin, uv), "diffuse", {"roughness": materials.mean(plugin, "alpha", 0.2)})
 
 
 def _plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
@@ -262,7 +268,7 @@ def _plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
 
 
 def _rough_plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
-    return _rough(_plastic(materials, plugin, uv), "plastic", _roughness(materials, plugin, 0.1))
+    return _rough(_plastic(materials, plugin, uv), "plastic", _microfacets(materials, plugin, 0.1))
 
 
 def _conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
@@ -291,7 +297,7 @@ def _complex_index(materials: Materials, plugin: Plugin) -> tuple[float, float]:
 
 
 def _rough_conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
-    return _rough(_conductor(materials, plugin, uv), "conductor", _roughness(materials, plugin, 0.1))
+    return _rough(_conductor(materials, plugin, uv), "conductor", _microfacets(materials, plugin, 0.1))
 
 
 def _dielectric(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:

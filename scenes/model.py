@@ -20,9 +20,13 @@ from scenes.errors import InputError, require
 MaterialKind = Literal[
     "diffuse", "roughdiffuse", "plastic", "roughplastic", "conductor", "roughconductor", "dielectric", "thindielectric"
 ]
+MicrofacetDistribution = Literal["ggx", "beckmann"]
 LaserMode = Literal["flood", "line", "scan"]
 MATERIAL_KINDS: tuple[str, ...] = MaterialKind.__args__
 LASER_MODES: tuple[str, ...] = LaserMode.__args__
+DISTRIBUTIONS: tuple[str, ...] = MicrofacetDistribution.__args__
+# Fields that came later, left out of a hash at these values: what was there before keeps its hash.
+_ADDED_AT = {"distribution": "ggx"}
 # Spectral radiance [W/(m^2 sr nm)]: the sun's disk has 1e4; what lies far above is no light, and overflows in float32.
 MAX_RADIANCE = 1e9
 # Metres from the origin: float32, in which rays are traced, resolves 1 m there.
@@ -84,7 +88,9 @@ class Material:
 
     kind        the reflectance model; names and meaning are those of Mitsuba 3
     albedo      diffuse reflectance, number or texture (diffuse, roughdiffuse, plastic, roughplastic)
-    roughness   GGX alpha of the rough kinds; Oren-Nayar alpha of roughdiffuse
+    roughness   alpha of the rough kinds' microfacets; Oren-Nayar alpha of roughdiffuse
+    distribution  of the microfacets' normals (roughplastic, roughconductor): ggx or beckmann. At one alpha both have
+                the same peak, and ggx the longer tails
     specular    scale of the specular reflectance (plastic, conductor)
     ior         interior index of refraction (plastic, dielectric)
     eta, k      complex index of a conductor; (0, 1) is a perfect mirror
@@ -94,6 +100,7 @@ class Material:
     kind: MaterialKind = "diffuse"
     albedo: float | Texture = 0.5
     roughness: float = 0.1
+    distribution: MicrofacetDistribution = field(default="ggx", kw_only=True)
     specular: float = 1.0
     ior: float = 1.5
     eta: float = 0.0
@@ -106,6 +113,8 @@ class Material:
         require(
             self.kind in MATERIAL_KINDS, f"{where}: kind {self.kind!r}, expected one of {', '.join(MATERIAL_KINDS)}"
         )
+        known = self.distribution in DISTRIBUTIONS
+        require(known, f"{where}: distribution {self.distribution!r}, expected one of {', '.join(DISTRIBUTIONS)}")
         for label in ("albedo", "specular", "opacity"):
             object.__setattr__(self, label, _fraction(getattr(self, label), f"{where}: {label}"))
         for label in ("roughness", "ior", "eta", "k"):
@@ -379,8 +388,9 @@ def _digest(value: object) -> bytes:
         sha.update(np.ascontiguousarray(value).data)
     elif isinstance(value, (Texture, Material, Surface, Camera, Laser, Ambient)):
         for item in fields(value):
-            if item.name != "name":
-                sha.update(_digest(getattr(value, item.name)))
+            part = getattr(value, item.name)
+            if item.name != "name" and not (item.name in _ADDED_AT and part == _ADDED_AT[item.name]):
+                sha.update(_digest(part))
         if isinstance(value, (Texture, Material, Surface)):
             object.__setattr__(value, "_digest", sha.digest())
     else:

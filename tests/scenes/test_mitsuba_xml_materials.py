@@ -88,6 +88,15 @@ def test_metals_reflect_as_metals_do(tmp_path: Path, metal: str, reflectance: fl
     assert fresnel == pytest.approx(reflectance, abs=0.025)
 
 
+@pytest.mark.parametrize("kind", ["roughplastic", "roughconductor"])
+def test_microfacets_are_what_the_file_says(tmp_path: Path, kind: str) -> None:
+    """Beckmann, where nothing is said too: that is the format's default."""
+    for said, expected in (("", "beckmann"), ("beckmann", "beckmann"), ("ggx", "ggx")):
+        line = f'<string name="distribution" value="{said}"/>' if said else ""
+        found = material(tmp_path, f'<bsdf type="{kind}">{line}<float name="alpha" value="0.3"/></bsdf>')
+        assert (found.kind, found.roughness, found.distribution) == (kind, 0.3, expected)
+
+
 def test_one_material_object_for_all_its_shapes(tmp_path: Path) -> None:
     body = f'<bsdf type="diffuse" id="m">{GREY}</bsdf><alias id="m" as="n"/><rgb id="white" name="x" value="0.9"/>'
     body += '<shape type="sphere"><ref id="m"/></shape><shape type="cube"><ref name="bsdf" id="n"/></shape>'
@@ -143,7 +152,8 @@ def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
     bsdfs = [
         '<bsdf type="diffuse" id="white"><rgb name="reflectance" value="1.5"/></bsdf>',
         f'<bsdf type="bumpmap" id="bumpy">{texture.format("", clamp)}<bsdf type="diffuse"/></bsdf>',
-        '<bsdf type="roughplastic" id="beck"><boolean name="nonlinear" value="true"/></bsdf>',
+        '<bsdf type="roughplastic" id="old"><string name="distribution" value="phong"/>'
+        '<boolean name="nonlinear" value="true"/></bsdf>',
         f'<bsdf type="plastic" id="mean">{texture.format("specular_reflectance", clamp)}</bsdf>',
         '<bsdf type="twosided" id="two"><bsdf type="diffuse"/><bsdf type="plastic"/></bsdf>',
         '<bsdf type="diffuse" id="typo"><rgb name="reflectence" value="0.1"/></bsdf>',
@@ -152,7 +162,12 @@ def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
     body = '<path value="x"/>' + "".join(f'<shape type="rectangle">{bsdf}</shape>' for bsdf in bsdfs)
     scene = load(tmp_path, body)
     assert scene.surfaces[0].material.albedo == 1
-    expected = ["over 1 is clipped to 1: white", "bumpmap is left out", "as ggx with the same alpha: beck", "nonlinear"]
+    expected = [
+        "over 1 is clipped to 1: white",
+        "bumpmap is left out",
+        "phong microfacets are taken as beckmann with the same alpha: old",
+        "nonlinear",
+    ]
     expected += ["its mean is used: mean", "taken as repeat: mean", "back side", "reflectence is not used: typo"]
     expected += ["specular_transmittance is left out", "<path>"]
     for words in expected:
@@ -192,6 +207,10 @@ def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
         ('<bsdf type="dielectric"><float name="int_ior" value="1"/></bsdf>', "not above 1"),
         ('<bsdf type="dielectric"><string name="int_ior" value="jelly"/></bsdf>', "'jelly'"),
         ('<bsdf type="roughplastic"><float name="alpha" value="3"/></bsdf>', "roughness 3"),
+        (
+            '<bsdf type="roughconductor"><string name="distribution" value="hills"/></bsdf>',
+            "distribution 'hills', expected one of ggx, beckmann",
+        ),
     ],
 )
 def test_bad_materials_are_refused(tmp_path: Path, bsdf: str, words: str) -> None:
