@@ -47,6 +47,9 @@ class DeepBoosting(nn.Module):
     Raises InputError for another number of bins.
     """
 
+    reach = 41  # pixels around one that its answer depends on: 3 + 4 + 10 x 3 + 4
+    coarsest = 1
+
     def __init__(self, *, can_die: bool = True) -> None:
         super().__init__()
         self.can_die = can_die

@@ -125,6 +125,20 @@ def uniform_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
     return (2 * torch.rand(shape, generator=generator) - 1) / math.sqrt(taps)
 
 
+def orthogonal_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
+    """Codes (K, ...) of `taps` entries, float32: rows of random orthogonal matrices, one under the other.
+
+    All rows have the root mean square length of `uniform_start`'s, 1/sqrt(3). Any `taps` rows that follow one another
+    from a multiple of `taps` are orthogonal; of K a multiple of `taps` so are the columns, and the rank is full.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    stacked = []
+    for _ in range(math.ceil(shape[0] / taps)):
+        factor, triangle = torch.linalg.qr(torch.randn(taps, taps, generator=generator, dtype=torch.float64))
+        stacked.append(factor * triangle.diagonal().sign())  # then every orthogonal matrix is as likely
+    return (torch.cat(stacked)[: shape[0]] / math.sqrt(3)).reshape(shape).float()
+
+
 def bin_energy(temporal: Tensor) -> np.ndarray:
     """(Mt,) float64: mean over K (and pixels) of C~^2 in each time bin, C~ = C less its mean over time."""
     code = temporal.detach().double().cpu()

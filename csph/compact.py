@@ -57,6 +57,9 @@ class Compact(nn.Module):
     Raises InputError for another number of bins.
     """
 
+    reach = 20  # pixels around one that its answer depends on
+    coarsest = 4  # pixels of a cell of its coarsest level, whose grid begins at the image's first
+
     def __init__(self) -> None:
         super().__init__()
         near, middle, far = 16, 32, 48

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from csph import blocks
-from csph.codes import circle_of, temporal_code, uniform_start
+from csph import blocks, rank
+from csph.codes import circle_of, orthogonal_start, temporal_code, uniform_start
 from csph.coding import CodingTensor, full_tensor
 from csph.design import Design
 from csph.photons import encode_photons, photon_table
@@ -24,6 +25,8 @@ from scenes.errors import require
 from spad.sensor import Sensor
 from spad.template import binned_pulse
 
+SpatialStart = Literal["uniform", "orthogonal"]
+STARTS: tuple[str, ...] = ("uniform", "orthogonal")
 KEEP_MEAN_UP_TO = 4  # codes; see LayerOptions
 
 
@@ -46,9 +49,12 @@ class LayerOptions:
     pulse_in_codes: bool = False
 
 
-def make_coding(design: Design, sensor: Sensor | None = None, seed: int = 0) -> CodingTensor:
+def make_coding(
+    design: Design, sensor: Sensor | None = None, seed: int = 0, spatial_start: SpatialStart = "uniform"
+) -> CodingTensor:
     """The coding tensor that a design begins with: fixed codes, and learned parts uniform in +-1/sqrt(n), n the entries
-    of one code of that part. `sensor` (default: the reference) lends its pulse to Gray Fourier.
+    of one code of that part; a spatial part may begin orthogonal instead, with the same mean square. `sensor` (default:
+    the reference) lends its pulse to Gray Fourier.
 
     Raises InputError where K does not fit the code.
     """
@@ -61,7 +67,8 @@ def make_coding(design: Design, sensor: Sensor | None = None, seed: int = 0) -> 
     else:
         temporal = temporal_code(design.code, codes, bins, sensor or Sensor())
     # a seed of its own: the two factors must not be slices of one stream
-    spatial = uniform_start((codes, rows, columns), rows * columns, seed + (1 << 32)) if design.has_spatial else None
+    start = orthogonal_start if spatial_start == "orthogonal" else uniform_start
+    spatial = start((codes, rows, columns), rows * columns, seed + (1 << 32)) if design.has_spatial else None
     return CodingTensor(design.name, temporal, spatial, computed=design.computed)
 
 
@@ -101,11 +108,19 @@ class CompressiveLayer(nn.Module):
         self.register_buffer("background", self._background(background), persistent=False)
 
     @classmethod
-    def of(cls, design: Design, *, sensor: Sensor | None = None, seed: int = 0, **options: bool) -> CompressiveLayer:
+    def of(
+        cls,
+        design: Design,
+        *,
+        sensor: Sensor | None = None,
+        seed: int = 0,
+        spatial_start: SpatialStart = "uniform",
+        **options: bool,
+    ) -> CompressiveLayer:
         """The layer of a design at its start; `options` are switches of LayerOptions."""
         switches = LayerOptions(zero_mean=design.zero_mean)
         return cls(
-            make_coding(design, sensor, seed),
+            make_coding(design, sensor, seed, spatial_start),
             learned=design.learned,
             options=replace(switches, **options),
             sensor=sensor,
@@ -143,6 +158,11 @@ class CompressiveLayer(nn.Module):
     def coding(self) -> CodingTensor:
         """The weights as they are now, constraint and pulse applied; separable ones stay so."""
         return CodingTensor(self.name, self._temporal_part(), self.spatial, computed=self.computed)
+
+    def pixel_gram(self) -> Tensor:
+        """Inner products of the codes of each two pixels of a block, (Mr Mc, Mr Mc): see `csph.rank`."""
+        temporal = self._temporal_part()
+        return rank.pixel_gram(temporal) if self.spatial is None else rank.separable_gram(temporal, self.spatial)
 
     def _forms(self, counts: int) -> bool:
         return self.spatial is None or blocks.forms(self.codes, self.block, counts)

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import math
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from csph.backbone import DeepBoosting, parameters_of, soft_argmax
+from csph.backbone import DeepBoosting, parameters_of
 from csph.compact import Compact
 from csph.config import ModelConfig, TrainConfig
+from csph.grid import published_position
+from csph.images import TILE, WHOLE_PIXELS, Span, spans
 from csph.layer import CompressiveLayer
+from csph.posterior import Decoder, confidence, decoded
 from csph.quantise import encode_int16, quantised
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
@@ -25,6 +32,19 @@ from spad.matching import normalised_correlation
 KIND = "network"
 
 
+class Estimate(NamedTuple):
+    """What a network says of an image.
+
+    depth_m      (H, W) float32 [m]
+    confidence   (H, W) float32: share of the posterior within 3 bins of the answer (`csph.posterior.confidence`)
+    overflows    16-bit sums that wrapped
+    """
+
+    depth_m: np.ndarray
+    confidence: np.ndarray
+    overflows: int
+
+
 class DepthModel(nn.Module):
     """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin."""
 
@@ -33,7 +53,8 @@ class DepthModel(nn.Module):
         self.config = config
         self.layer = None
         if config.design is not None:
-            self.layer = CompressiveLayer.of(config.design, sensor=config.sensor, seed=seed, **config.layer)
+            start = {"seed": seed, "spatial_start": config.spatial_start}
+            self.layer = CompressiveLayer.of(config.design, sensor=config.sensor, **start, **config.layer)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             compact = config.network == "compact"
@@ -53,49 +74,95 @@ class DepthModel(nn.Module):
             return normalised_correlation(counts.float().flatten(3).squeeze(1), self.config.sensor).view(counts.shape)
         return torch.zeros(counts.shape, device=counts.device).scatter_(2, counts.argmax(2, keepdim=True), 1.0)
 
+    def windowed(self, counts: Tensor, first_bin: Tensor, window: int) -> Tensor:
+        """Logits (B, window, R, C) of the bins from `first_bin` (B,) on, whose blocks alone are encoded."""
+        coded = self.layer is not None
+        whole = counts if coded else self.seen(counts)
+        firsts = first_bin.tolist()
+        cut = torch.stack([one[:, first : first + window] for one, first in zip(whole, firsts, strict=True)])
+        return self.network(self.layer(cut) if coded else cut)
+
     def forward(self, counts: Tensor) -> Tensor:
         return self.network(self.seen(counts))
 
-    def depth_m(self, counts: Tensor) -> Tensor:
-        """Soft-argmax on bin centres, (B, R, C) [m]."""
-        return soft_argmax(self(counts)) * self.config.sensor.bin_depth_m
+    def position(self, logits: Tensor, decoder: Decoder | None = None) -> Tensor:
+        """The answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C); decoder None: the configuration's."""
+        return self._on_grid(decoded(logits, decoder or self.config.decoder))
 
-    def depth_int8_m(self, counts: Tensor) -> tuple[Tensor, int]:
-        """Depth from codes of 8-bit weights summed in 16 bits, and how many sums wrapped; the decoder keeps float32."""
-        if self.layer is None:
-            raise InputError(f"{self.config.name}: has no codes to hold in 8 bits")
-        tensor = quantised(self.layer.coding())
-        codes, overflows = encode_int16(counts, tensor)
-        logits = self.network(self.layer.decode(codes.float() * tensor.scale))
-        return soft_argmax(logits) * self.config.sensor.bin_depth_m, overflows
+    def _on_grid(self, bins: Tensor) -> Tensor:
+        return bins if self.config.grid == "continuous" else published_position(bins, self.config.sensor.bins)
+
+    def depth_m(self, counts: Tensor, decoder: Decoder | None = None) -> Tensor:
+        """Depth of counts (B, 1, T, R, C) that blocks tile, (B, R, C) [m]; decoder as in `position`."""
+        return self.position(self(counts), decoder) * self.config.sensor.bin_depth_m
 
     def check_histogram(self, histogram: Histogram) -> None:
-        """InputError unless the histogram is of the sensor that the model was trained for, and tiled by its blocks."""
+        """InputError unless the histogram is of the sensor that the model was trained for."""
         mine, other = self.config.sensor, histogram.sensor
         alike = (mine.bins, mine.bin_width_s, mine.response) == (other.bins, other.bin_width_s, other.response)
         told = ", ".join(f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps)" for s in (mine, other))
         require(alike, f"the network was trained for another sensor or pulse than the histogram's: {told}")
-        size, block = histogram.counts.shape[:2], self.config.block[1:]
-        tiled = all(side >= part and side % part == 0 for side, part in zip(size, block, strict=True))
-        said = f"image of {size[1]} x {size[0]} pixels is not tiled by the network's blocks of"
-        require(tiled, f"{said} {block[1]} x {block[0]}")
+
+    def _tiles(self, rows: int, columns: int, tile: int | None) -> Iterator[tuple[Span, Span]]:
+        _, height, width = self.config.block
+        units = (math.lcm(side, self.network.coarsest) for side in (height, width))
+        axes = zip((rows, columns), (height, width), units, strict=True)
+        return product(*(spans(*axis, self.network.reach, tile) for axis in axes))
 
     @torch.no_grad()
-    def depth_of(self, histogram: Histogram, *, int8: bool = False) -> tuple[np.ndarray, int]:
-        """Estimate the radial depth (H, W) float32 [m], and count the 16-bit sums that wrapped (0 without int8).
+    def estimate(
+        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None, tile: int | None = None
+    ) -> Estimate:
+        """Estimate radial depth and confidence of a histogram of any size; decoder as in `position`.
 
         With a displaced laser the network's half path becomes a distance by the histogram's geometry.
+
+        What blocks do not tile is reflected at the end; images over `WHOLE_PIXELS` go through in tiles of `tile` pixels
+        (default: `TILE`; smaller images in tiles only if it is given) whose halo holds all that the network sees.
+        `int8`: codes of 8-bit weights summed in 16 bits; the decoder keeps float32. Raises InputError for another
+        sensor's histogram.
         """
         self.check_histogram(histogram)
         device = next(self.parameters()).device
         rows, columns, bins = histogram.counts.shape
-        # turned over as a matrix, which torch does in tiles: a third of the time
-        counts = torch.from_numpy(histogram.counts).reshape(-1, bins).T.contiguous().view(1, 1, bins, rows, columns)
-        if int8:
-            depth, overflows = self.depth_int8_m(counts)
-        else:
-            depth, overflows = self.depth_m(counts.to(device, torch.float32)), 0
-        return radial_depth_of(histogram, depth[0].cpu().numpy()), overflows
+        tile = tile or (TILE if rows * columns > WHOLE_PIXELS else None)
+        depth, sure = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
+        overflows = 0
+        for down, across in self._tiles(rows, columns, tile):
+            part = histogram.counts
+            if len(down.read) != rows or len(across.read) != columns:
+                part = part[down.read[:, None], across.read]
+            # turned over as a matrix, which torch does in tiles: a third of the time
+            size = (1, 1, bins, len(down.read), len(across.read))
+            counts = torch.from_numpy(part).reshape(-1, bins).T.contiguous().view(size)
+            inside = tuple(slice(one.inner, one.inner + one.own.stop - one.own.start) for one in (down, across))
+            logits, wrapped = self._logits_int8(counts, inside) if int8 else (self(counts.to(device).float()), 0)
+            overflows += wrapped
+            logits = logits[..., inside[0], inside[1]]
+            place = decoded(logits, decoder or self.config.decoder)
+            sure[down.own, across.own] = confidence(logits, place)[0].cpu()
+            depth[down.own, across.own] = (self._on_grid(place) * self.config.sensor.bin_depth_m)[0].cpu()
+        return Estimate(radial_depth_of(histogram, depth), sure, overflows)
+
+    def _logits_int8(self, counts: Tensor, inside: tuple[slice, slice]) -> tuple[Tensor, int]:
+        """Logits from codes of 8-bit weights, and how many sums wrapped of the blocks that reach `inside`."""
+        if self.layer is None:
+            raise InputError(f"{self.config.name}: has no codes to hold in 8 bits")
+        tensor = quantised(self.layer.coding())
+        codes, _ = encode_int16(counts, tensor)
+        logits = self.network(self.layer.decode(codes.float() * tensor.scale))
+        blocks = (
+            slice(one.start, -(-one.stop // side) * side)
+            for one, side in zip(inside, self.config.block[1:], strict=True)
+        )
+        return logits, encode_int16(counts[(..., *blocks)], tensor).overflows
+
+    def depth_of(
+        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None
+    ) -> tuple[np.ndarray, int]:
+        """Depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped (0 without int8)."""
+        found = self.estimate(histogram, int8=int8, decoder=decoder)
+        return found.depth_m, found.overflows
 
 
 def _weights_sha256(weights: dict[str, Tensor]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import nn
 
+from csph.torch_files import load_torch_file
 from scenes.errors import InputError
 from scenes.files import whole_file
 
@@ -38,15 +37,9 @@ def check_resume(path: Path, module: nn.Module) -> None:
     and shapes of the weights are the module's.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            bad = archive.testzip()
-        if bad is not None:
-            raise InputError(f"{path}: is damaged in {bad}; {CURE}")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except InputError:
-        raise
-    except (OSError, RuntimeError, ValueError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
-        raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())[:80]}); {CURE}") from None
+        state = load_torch_file(path)
+    except InputError as error:
+        raise InputError(f"{error}; {CURE}") from None
     missing = [key for key in KEYS if not isinstance(state, dict) or key not in state]
     if missing:
         raise InputError(f"{path}: is no state of an interrupted run, {', '.join(missing)} are missing; {CURE}")

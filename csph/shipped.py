@@ -8,6 +8,7 @@ NAME.energy.csv   the energy of its temporal code while it was trained, where on
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,11 @@ def shipped_file(name: str, folder: Path = WEIGHTS) -> Path:
     return folder / f"{name}.safetensors"
 
 
+def file_names(paths: str | Sequence[str]) -> str | list[str]:
+    """Names of a set's file, or of several sets' files, without their folders."""
+    return Path(paths).name if isinstance(paths, str) else [Path(path).name for path in paths]
+
+
 def ship(run: Path, name: str, folder: Path = WEIGHTS) -> Path:
     """Make the shipped form of a finished run's best weights; returns the file.
 
@@ -34,7 +40,7 @@ def ship(run: Path, name: str, folder: Path = WEIGHTS) -> Path:
     model, config, state = load_model(run)
     log = checkpoint_file(run).with_name("log.csv")
     require(log.is_file(), f"{log}: file not found, a shipped model needs its training log")
-    data = {key: Path(v).name if key in ("training", "validation") else v for key, v in config.data.items()}
+    data = {key: file_names(v) if key in ("training", "validation") else v for key, v in config.data.items()}
     config = replace(config, data=data)
     folder.mkdir(parents=True, exist_ok=True)
     for source, suffix in _BESIDE.items():

@@ -46,5 +46,5 @@ class CodeEnergy(pl.Callback):
     def _keep(self, module: pl.LightningModule, step: int) -> None:
         layer = module.model.layer
         if layer is not None and layer.temporal.requires_grad:
-            energy = grouped_energy(layer.temporal)
+            energy = grouped_energy(module.kept.layer.temporal)
             self.rows = [*self.rows, {"step": step, **{f"group_{i}": float(e) for i, e in enumerate(energy)}}]

@@ -1,7 +1,8 @@
 """Training by Lightning: a run is a folder with one configuration, a log, the best weights, and what it resumes from.
 
     config.json         every number of the run, written before its first step
-    log.csv             one row an epoch: step, learning rate, training loss, validation RMSE and MAE
+    log.csv             one row an epoch: step, learning rate, training loss, validation RMSE and MAE by both decoders,
+                        participation rank of spatial codes
     model.safetensors   weights of the lowest validation RMSE, with the configuration in the header
     energy.csv          energy of a learned temporal code by groups of time bins, now and then from the start on
     last.safetensors    weights after the last step
@@ -17,31 +18,35 @@ import logging
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from csph.backbone import soft_argmax
 from csph.config import TrainConfig
-from csph.data import SetData
+from csph.data import SetData, TrainBatch
+from csph.grid import on_published_grid, published_target
 from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
+from csph.posterior import DECODERS
+from csph.rank import coherence, participation_rank
 from csph.resume import RESUME, WholeFileCheckpoints, check_resume
+from csph.schedule import rate_factor
 from csph.snapshots import CodeEnergy
-from csph.torch_files import check_torch_file
 from csph.views import Views, packed_sha256, packed_views
 from render.heap import keep_freed_memory
-from scenes.errors import require
+from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv
-from scenes.inputs import read_text
-from spad.fly import Batch
+from scenes.inputs import read_json_object
 
 log = logging.getLogger("csph")
 
@@ -49,39 +54,72 @@ Progress = Callable[[str, float], None]
 
 
 class DepthTraining(pl.LightningModule):
-    """KL divergence to the pulse at the label, plus total variation where asked; Adam with a rate that steps down."""
+    """KL divergence to the pulse at the label, plus total variation and coherence where asked; Adam, and an average of
+    the weights where asked."""
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__()
         self.config = config
         self.model = DepthModel(config.model, config.seed)
+        self.averaged: DepthModel | None = None
+        if config.average:  # a module of its own: Lightning's checkpoint then holds it
+            self.averaged = deepcopy(self.model).requires_grad_(False).eval()
         self.train_loss = MeanMetric()
-        self.squared_m2, self.absolute_m = MeanMetric(), MeanMetric()
+        self.squared_m2 = nn.ModuleDict({name: MeanMetric() for name in DECODERS})
+        self.absolute_m = nn.ModuleDict({name: MeanMetric() for name in DECODERS})
 
-    def loss(self, batch: Batch) -> Tensor:
-        logits = self.model(batch.counts)
-        loss = kl_divergence(logits, batch.depth_m, batch.valid, self.config.model.sensor)
-        if self.config.tv_weight and self.global_step >= self.config.tv_start:
-            loss = loss + self.config.tv_weight * total_variation(soft_argmax(logits) / logits.shape[1])
+    @property
+    def kept(self) -> DepthModel:
+        """What is validated and kept: the averaged weights, or the weights themselves."""
+        return self.model if self.averaged is None else self.averaged
+
+    def loss(self, batch: TrainBatch) -> Tensor:
+        config, sensor, depth = self.config, self.config.model.sensor, batch.depth_m
+        if config.model.grid == "published":
+            depth = published_target(depth, sensor)
+        if config.window and bool((batch.first_bin >= 0).all()):
+            logits = self.model.windowed(batch.counts, batch.first_bin, config.window)
+            near = batch.first_bin.view(-1, 1, 1) * sensor.bin_depth_m
+            depth = depth - near
+            valid = batch.valid & (depth >= 0) & (depth < config.window * sensor.bin_depth_m)
+            # gated: what of the pulse falls outside the window is left out
+            sensor = replace(sensor, bins=config.window)
+        else:
+            logits, valid = self.model(batch.counts), batch.valid
+        loss = kl_divergence(logits, depth, valid, sensor)
+        if config.tv_weight and self.global_step >= config.tv_start:
+            loss = loss + config.tv_weight * total_variation(soft_argmax(logits) / config.model.sensor.bins)
+        if config.coherence and self.model.layer is not None:
+            loss = loss + config.coherence * coherence(self.model.layer.pixel_gram())
         return loss
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
+    def training_step(self, batch: TrainBatch, _: int) -> Tensor:
         loss = self.loss(batch)
         self.train_loss.update(loss.detach())
         return loss
 
-    def validation_step(self, batch: Batch, _: int) -> None:
-        depth = self.model.depth_m(batch.counts)
+    def optimizer_step(self, *args: Any, **more: Any) -> None:
+        super().optimizer_step(*args, **more)
+        if self.averaged is not None:
+            # the first steps are forgotten sooner
+            past = min(self.config.average, (1 + self.global_step) / (10 + self.global_step))
+            with torch.no_grad():
+                torch._foreach_lerp_(list(self.averaged.parameters()), list(self.model.parameters()), 1 - past)
+
+    def validation_step(self, batch: TrainBatch, _: int, dataloader_idx: int = 0) -> None:
+        logits = self.kept(batch.counts)
         # pixels without a truth have weight 0
-        error = torch.where(batch.valid, depth - batch.depth_m, 0.0)
         weight = batch.valid.float()
-        self.squared_m2.update(error**2, weight)
-        self.absolute_m.update(error.abs(), weight)
+        for decoder in DECODERS:
+            depth = self.kept.position(logits, decoder) * self.config.model.sensor.bin_depth_m
+            error = torch.where(batch.valid, depth - batch.depth_m, 0.0)
+            self.squared_m2[decoder].update(error**2, weight)
+            self.absolute_m[decoder].update(error.abs(), weight)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        adam = torch.optim.Adam(self.parameters(), lr=self.config.rate, fused=True)
+        adam = torch.optim.Adam(self.model.parameters(), lr=self.config.rate, fused=True)
         # a function of the step alone: nothing about it has to be restored
-        steps = torch.optim.lr_scheduler.LambdaLR(adam, lambda s: self.config.decay ** (s // self.config.decay_steps))
+        steps = torch.optim.lr_scheduler.LambdaLR(adam, partial(rate_factor, config=self.config))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": steps, "interval": "step"}}
 
 
@@ -113,15 +151,17 @@ class Record(pl.Callback):
             "step": trainer.global_step,
             "rate": trainer.optimizers[0].param_groups[0]["lr"],
             "train_loss": float(module.train_loss.compute()),
-            "val_rmse_mm": float(module.squared_m2.compute()) ** 0.5 * 1e3,
-            "val_mae_mm": float(module.absolute_m.compute()) * 1e3,
+            **_validation_mm(module),
         }
-        for metric in (module.train_loss, module.squared_m2, module.absolute_m):
+        layer = module.kept.layer
+        if layer is not None and math.prod(layer.block[1:]) > 1:
+            row["spatial_rank"] = participation_rank(layer.pixel_gram().detach())
+        for metric in (module.train_loss, *module.squared_m2.values(), *module.absolute_m.values()):
             metric.reset()
         self.rows = [*self.rows, row]
         if trainer.is_global_zero:
             if row["val_rmse_mm"] < best or not (self.folder / "model.safetensors").is_file():
-                save_model(module.model, module.config, row, self.folder / "model.safetensors")
+                save_model(module.kept, module.config, row, self.folder / "model.safetensors")
             write_csv(self.rows, self.folder / "log.csv")
             log.info(
                 "step %d of %d: loss %.4f, validation RMSE %.1f mm, MAE %.1f mm",
@@ -130,12 +170,31 @@ class Record(pl.Callback):
         trainer.save_checkpoint(self.folder / RESUME)  # on all devices
 
 
+def _validation_mm(module: DepthTraining) -> dict[str, float]:
+    """Validation RMSE and MAE [mm] as the model is decoded, and by each decoder."""
+    squared, absolute = module.squared_m2, module.absolute_m
+    errors = {
+        name: (float(squared[name].compute()) ** 0.5 * 1e3, float(absolute[name].compute()) * 1e3) for name in DECODERS
+    }
+    own = errors[module.config.model.decoder]
+    return {
+        "val_rmse_mm": own[0],
+        "val_mae_mm": own[1],
+        **{f"val_mae_mm_{name}": absolute for name, (_, absolute) in errors.items()},
+    }
+
+
 def _claim(folder: Path, config: TrainConfig) -> None:
     """Write the configuration, or see that the folder holds the same; InputError for another one's folder."""
     text = json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n"
     path = folder / "config.json"
     if path.is_file():
-        same = read_text(path, "configuration") == text
+        try:  # by what it says: a file of before an option was there means its default
+            same = TrainConfig.from_dict(read_json_object(path, "configuration")) == TrainConfig.from_dict(
+                json.loads(text)
+            )
+        except InputError:
+            same = False
         require(same, f"{folder}: holds a run with other options or another set; choose another --out")
         return
     empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
@@ -143,6 +202,10 @@ def _claim(folder: Path, config: TrainConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as beside:
         beside.write_text(text)
+
+
+def _listed(views: Views | Sequence[Views]) -> list[Views]:
+    return [views] if isinstance(views, Views) else list(views)
 
 
 @contextmanager
@@ -184,8 +247,8 @@ def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
 
 def train(
     config: TrainConfig,
-    training: Views,
-    validation: Views,
+    training: Views | Sequence[Views],
+    validation: Views | Sequence[Views],
     folder: Path,
     *,
     workers: int = 0,
@@ -194,13 +257,19 @@ def train(
 ) -> dict[str, Any]:
     """Run a configuration to its end in a folder, or go on where an interrupted run of the same configuration stopped.
 
-    `trainer` holds further arguments of Lightning's Trainer (accelerator, devices, strategy). Returns steps, seconds
-    (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of parameters. Raises InputError
-    for sets that do not fit, and a folder of another run.
+    Sets are one or several; patches are drawn from the training sets by `config.weights`. `trainer` holds further
+    arguments of Lightning's Trainer (accelerator, devices, strategy). Returns steps, seconds (of this call),
+    val_rmse_mm of the weights kept, their checkpoint, and the number of parameters. Raises InputError for sets that do
+    not fit, and a folder of another run.
     """
-    sets = [packed_views(views) for views in (training, validation)]
-    data = {name: packed_sha256(packed) for name, packed in zip(("training", "validation"), sets, strict=True)}
-    config = replace(config, data={**config.data, **{f"{name}_sha256": sha for name, sha in data.items()}})
+    sets = [[packed_views(one) for one in _listed(views)] for views in (training, validation)]
+    data = {}
+    for name, packs in zip(("training", "validation"), sets, strict=True):
+        hashes = [packed_sha256(packed) for packed in packs]
+        data[f"{name}_sha256"] = hashes[0] if len(hashes) == 1 else hashes
+    config = replace(config, data={**config.data, **data})
+    if config.model.grid == "published":
+        sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
     module_data = SetData(*sets, config, workers)
     record = Record(folder, progress or (lambda what, share: None))
     with _quiet():
@@ -215,15 +284,13 @@ def train(
     if resume.is_file():
         check_resume(resume, module)
     if not (folder / "last.safetensors").is_file():
-        if resume.is_file():
-            check_torch_file(resume)
         with _quiet():
             try:
                 runner.fit(module, module_data, ckpt_path=str(resume) if resume.is_file() else None, weights_only=True)
             except SystemExit:  # what Lightning makes of Ctrl-C
                 raise KeyboardInterrupt from None
         if runner.is_global_zero:
-            save_model(module.model, config, record.rows[-1], folder / "last.safetensors")
+            save_model(module.kept, config, record.rows[-1], folder / "last.safetensors")
         runner.strategy.barrier()
     _, _, best = load_model(folder)
     _, _, last = load_model(folder / "last.safetensors")

@@ -239,12 +239,15 @@ class Train(Common):
     """A full coding tensor instead of a separable one."""
     layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes"], ...] = ()
     """Switches of the layer that differ from the published one."""
-    set: Path = Path("planes")
-    """Folder of a set that `dataset` rendered, or its pack (.h5); planes: random planes, no renderer needed."""
-    validation: Annotated[Path | None, may_stay_open("SET")] = None
-    """Set to validate on (default: the last tenth of the scenes)."""
-    preset: Literal["smoke", "laptop", "paper"] = "laptop"
-    """smoke: seconds; laptop: 3,000 steps of the compact network; paper: the published network and schedule (GPU)."""
+    set: tuple[Path, ...] = (Path("planes"),)
+    """Folders of sets that `dataset` rendered, or their packs (.h5); planes: random planes, no renderer needed."""
+    set_weights: tuple[float, ...] = ()
+    """How often patches are drawn from each set (default: alike)."""
+    validation: tuple[Path, ...] = ()
+    """Sets to validate on (default: the last tenth of the scenes)."""
+    preset: Literal["smoke", "laptop", "workstation", "laptop-v1", "paper"] = "laptop"
+    """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; paper: the
+    published network and schedule (GPU); laptop-v1: the recipe of the first models."""
     network: Annotated[
         Literal["compact", "published", "published-signed"] | None,
         may_stay_open("{compact,published,published-signed}"),
@@ -259,7 +262,19 @@ class Train(Common):
     crop: Pixels = None
     """Side of a patch (default: the preset's)."""
     rate: Number = None
-    """Learning rate at the start (default: the preset's)."""
+    """Learning rate at the start, or after the warm-up (default: the preset's)."""
+    levels: Annotated[Literal["continuous", "paper"] | None, may_stay_open("{continuous,paper}")] = None
+    """Photon levels: signal from 1 to 100 over every background of the tests, or the paper's nine (default: the
+    preset's)."""
+    window: Count = None
+    """Train on so many bins around a label but for the last tenth of the run; 0: all (default: the preset's, where the
+    codes allow it)."""
+    grid: Literal["continuous", "published"] = "continuous"
+    """Labels: continuous, or on whole bins and decoded as published, for comparison with print."""
+    spatial_start: Annotated[Literal["uniform", "orthogonal"] | None, may_stay_open("{uniform,orthogonal}")] = None
+    """Start of learned spatial codes (default: orthogonal; uniform with paper and laptop-v1)."""
+    coherence: Number = None
+    """Weight of the penalty on codes that are alike for two pixels of a block (default: 0)."""
     tv: Number = None
     """Weight of the mean total variation of depth / range; 41.9 is the published 1e-5 (default: 0, or the preset's)."""
     tv_start: Count = None

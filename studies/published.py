@@ -207,7 +207,7 @@ def _drawn(pair: Pair, level: tuple[float, float], offset_m: float, key: tuple[i
 
 def _errors(subject: Subject, histogram: Histogram) -> dict[str, float]:
     sensor = histogram.sensor
-    depth, _ = subject.model.depth_of(histogram)
+    depth, _ = subject.model.depth_of(histogram, decoder="soft-argmax")  # as published
     bins = depth.astype(np.float64) / sensor.bin_depth_m
     step_m = PUBLISHED_SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s / 2
     taps = published_taps(sensor)

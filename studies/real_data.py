@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from csph.backbone import soft_argmax
 from csph.model import DepthModel, load_model
 from render.engine import render
 from render.settings import RenderSettings
@@ -244,7 +243,7 @@ def network(model: DepthModel) -> Method:
             for left in range(0, width, TILE):
                 rows, columns = (slice(max(at - MARGIN, 0), at + TILE + MARGIN) for at in (top, left))
                 seen = counts[rows, columns].permute(2, 0, 1)[None, None].contiguous()
-                found = soft_argmax(model(seen))[0] * sensor.bin_depth_m
+                found = model.position(model(seen))[0] * sensor.bin_depth_m
                 inner = found[top - rows.start :, left - columns.start :][:TILE, :TILE]
                 depth[top : top + TILE, left : left + TILE] = inner
         return depth

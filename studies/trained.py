@@ -17,7 +17,7 @@ import torch
 from csph.config import ModelConfig, TrainConfig
 from csph.design import Design
 from csph.model import DepthModel, load_model, weights_sha256
-from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, ship, shipped_file
+from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
 from render.tracing import Progress
 from scenes.errors import require
 from spad.histogram import Histogram
@@ -75,7 +75,7 @@ class Wanted:
             preset=preset,
             seed=self.seed,
             time_offset=self.time_offset_m or None,
-            set=training,
+            set=(training,),
             out=folder / self.name,
         )
 
@@ -140,7 +140,7 @@ class Trained:
             "steps": self.config.steps,
             "best_step": self.state.get("step"),
             "val_rmse_mm": self.state.get("val_rmse_mm"),
-            "trained_on": Path(str(self.config.data.get("training", ""))).name,
+            "trained_on": file_names(self.config.data.get("training", "")),
             "shipped": self.shipped,
             "sha256": self.digest,
         }

@@ -19,6 +19,7 @@ from csph.design import Design
 from csph.evaluation import LEVEL_GROUPS, Evaluation, Method, as_dicts, evaluate
 from csph.metrics import PHOTON_LEVELS
 from csph.model import DepthModel, load_model
+from csph.posterior import Decoder
 from csph.views import Views, read_views, split_views
 from render.tracing import Progress
 from scenes.errors import InputError, require
@@ -32,7 +33,7 @@ from studies.planes import random_planes
 log = logging.getLogger("scene2spad")
 
 PLANES = "planes"  # the set that needs no renderer
-PLANE_SCENES = {"smoke": 20, "laptop": 2000, "paper": 13851}
+PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "paper": 13851}
 SMOKE_PIXELS = 32
 
 
@@ -49,7 +50,11 @@ def config_of(command: Train) -> TrainConfig:
             command.design, command.block, codes=command.codes, compression=compression, full=command.full
         )
     layer = dict.fromkeys(command.layer, True)
-    model = ModelConfig(front=front, design=design, layer=layer, network=network, sensor=sensor)
+    # the first models' and the published start, which their recipes reproduce
+    start = command.spatial_start or ("uniform" if command.preset in ("paper", "laptop-v1") else "orthogonal")
+    start = start if design is not None and "spatial" in design.learned else "uniform"
+    made = {"network": network, "sensor": sensor, "grid": command.grid, "spatial_start": start}
+    model = ModelConfig(front=front, design=design, layer=layer, **made)
     config = preset(
         command.preset,
         model,
@@ -62,6 +67,10 @@ def config_of(command: Train) -> TrainConfig:
         precision=command.precision,
         threads=command.threads,
         time_offset_m=command.time_offset,
+        levels=command.levels,
+        window=command.window,
+        weights=command.set_weights or None,
+        coherence=command.coherence,
     )
     if command.steps is None:
         return config
@@ -70,19 +79,33 @@ def config_of(command: Train) -> TrainConfig:
     epochs = min(config.epochs, command.steps)
     each = -(-command.steps // epochs)
     decay_steps = max(1, round(config.decay_steps * each / config.steps_per_epoch))
-    return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps)
+    warmup = min(config.warmup, command.steps // 10)
+    return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps, warmup=warmup)
 
 
-def views_of(command: Train) -> tuple[Views, Views, dict[str, Any]]:
-    """Training and validation views, and the words that say which they are."""
-    if str(command.set) == PLANES:
-        pixels = SMOKE_PIXELS if command.preset == "smoke" else 64
-        views = random_planes(PLANE_SCENES[command.preset], size=pixels, seed=command.seed)
+def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, Any]]:
+    """Training and validation views of every set, and the words that say which they are."""
+    sets = [_views_of_set(path, command) for path in command.set]
+    said = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
+    if command.validation:
+        training, validation = sets, [read_views(path) for path in command.validation]
     else:
-        views = read_views(command.set)
-    said = {"training": str(command.set), "validation": str(command.validation or "its last scenes")}
-    training, validation = split_views(views) if command.validation is None else (views, read_views(command.validation))
-    return training, validation, {**said, "training_reach_m": training_reach_m(training)}
+        parts = [split_views(views) for views in sets]
+        training, validation = [first for first, _ in parts], [second for _, second in parts]
+    return training, validation, {**said, "training_reach_m": max(map(training_reach_m, training))}
+
+
+def _views_of_set(path: Path, command: Train) -> Views:
+    if str(path) != PLANES:
+        return read_views(path)
+    pixels = SMOKE_PIXELS if command.preset == "smoke" else 64
+    return random_planes(PLANE_SCENES[command.preset], size=pixels, seed=command.seed)
+
+
+def _paths(paths: Sequence[Path]) -> str | list[str]:
+    """A set's path as it was given; a list of several."""
+    said = [str(path) for path in paths]
+    return said if len(said) > 1 else "".join(said)
 
 
 def training_reach_m(views: Views) -> float:
@@ -96,6 +119,7 @@ def run_train(command: Train, progress: Progress) -> dict:
     from csph.training import train  # and Lightning, which takes seconds to import
 
     config = config_of(command)
+    require(bool(command.set), "train: --set without a set")
     training, validation, said = views_of(command)
     name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
     folder = command.out or Path("out/train") / name
@@ -108,14 +132,16 @@ def run_train(command: Train, progress: Progress) -> dict:
         progress=progress,
         devices=command.devices or "auto",
     )
-    return {"model": config.model.name, "views": len(training.transients), **result}
+    return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
 
 
-def network_method(model: DepthModel, *, int8: bool = False, overflows: list[int] | None = None) -> Method:
+def network_method(
+    model: DepthModel, *, int8: bool = False, decoder: Decoder | None = None, overflows: list[int] | None = None
+) -> Method:
     """Depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`."""
 
     def method(histogram: Histogram) -> np.ndarray:
-        depth, wrapped = model.depth_of(histogram, int8=int8)
+        depth, wrapped = model.depth_of(histogram, int8=int8, decoder=decoder)
         if overflows is not None:
             overflows.append(wrapped)
         return depth

@@ -92,7 +92,8 @@ def test_half_precision_changes_depths_by_far_less_than_they_err(tmp_path):
     float32, half = load_model(folder)[0], load_model(ship(folder, "half", tmp_path))[0]
     histogram = sense(random_planes(1, size=24, seed=9).transients[0], Sensor(), PhotonBudget(50, 10), seed=1)
     known = np.isfinite(histogram.depth_m)
-    depths = [model.depth_of(histogram)[0][known] for model in (float32, half)]
+    # read by the mean: after a few steps a posterior has two halves, and its median jumps between them
+    depths = [model.depth_of(histogram, decoder="soft-argmax")[0][known] for model in (float32, half)]
     errors_m = [np.abs(depth - histogram.depth_m[known]).mean() for depth in depths]
     assert errors_m[0] < 0.2 and errors_m[1] == pytest.approx(errors_m[0], rel=0.01)
     assert 0 < np.abs(depths[1] - depths[0]).mean() < 0.02 * errors_m[0]

@@ -1,0 +1,194 @@
+"""The training recipe: levels over their range, one cosine, averaged weights, windows, several sets, published grid."""
+
+import json
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from test_training import FEW, MODEL, SMALL, Stopped, near_planes
+
+from csph.config import RECIPE, ModelConfig, TrainConfig, preset
+from csph.data import Samples, SetData, _sensed
+from csph.design import Design
+from csph.grid import on_published_grid, published_centroid_bins, published_position, published_target
+from csph.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
+from csph.metrics import PHOTON_LEVELS, TRAIN_LEVELS
+from csph.model import load_model, weights_sha256
+from csph.schedule import rate_factor
+from csph.training import DepthTraining, train
+from csph.views import packed_views, split_views
+from scenes import InputError
+from spad.sensor import Sensor
+from studies.planes import random_planes
+
+CODED = ModelConfig(design=Design("learned", (256, 2, 2), 8))
+
+
+def test_levels_are_drawn_over_the_whole_range_of_the_tests():
+    rng = np.random.default_rng(0)
+    drawn = np.array([draw_level(rng, "continuous") for _ in range(20_000)])
+    signal, background = drawn.T
+    assert SIGNAL[0] <= signal.min() < 1.02 and 98 < signal.max() <= SIGNAL[1]
+    assert BACKGROUND[0] <= background.min() < 0.6 and 1100 < background.max() <= BACKGROUND[1]
+    assert (signal / np.sqrt(background)).min() >= HARDEST * (1 - 1e-12)
+    # every test level, and little background, has neighbours within a factor of 1.5 in both numbers
+    for level in (*PHOTON_LEVELS, (100.0, 1.0), (50.0, 0.6)):
+        assert (np.abs(np.log(drawn / level)) < math.log(1.5)).all(1).sum() > 20, level
+    # the harder half of the backgrounds' logarithms: 1 - 0.5^(1 / 0.6) of the draws, within five sigma
+    bright = signal > 20
+    hard = np.log(background[bright]) > np.log(BACKGROUND).mean()
+    share = 1 - 0.5 ** (1 / 0.6)
+    assert abs(hard.mean() - share) < 5 * math.sqrt(share * (1 - share) / hard.size)
+    assert {draw_level(rng, TRAIN_LEVELS) for _ in range(200)} == set(TRAIN_LEVELS)
+
+
+def test_one_cosine_after_a_linear_warm_up():
+    config = preset("smoke", CODED, epochs=10, steps_per_epoch=100, warmup=50)
+    factors = [rate_factor(step, config) for step in range(1001)]
+    assert factors[0] == pytest.approx(1 / 50, rel=1e-3) and max(factors) == pytest.approx(1, abs=0.01)
+    assert factors[500] == pytest.approx(0.02 + 0.98 / 2) and factors[1000] == pytest.approx(0.02)
+    assert all(a > b for a, b in pairwise(factors[50:]))
+    old = preset("laptop-v1", CODED)
+    assert [rate_factor(step, old) for step in (0, 249, 250, 500)] == [1, 1, 0.75, 0.75**2]
+
+
+def test_configurations_of_before_mean_what_they_meant():
+    """A JSON without the new entries is the recipe of the first models."""
+    config = preset("laptop-v1", CODED)
+    values = json.loads(json.dumps(config.to_dict()))
+    for name in ("schedule", "warmup", "rate_end", "average", "window", "weights", "coherence"):
+        values.pop(name)
+    for name in ("grid", "spatial_start"):
+        values["model"].pop(name)
+    assert TrainConfig.from_dict(values) == config
+    assert (config.levels, config.epochs, config.steps_per_epoch) == (TRAIN_LEVELS, 12, 250)
+    recipe = preset("laptop", CODED)
+    assert TrainConfig.from_dict(json.loads(json.dumps(recipe.to_dict()))) == recipe
+
+
+def test_windows_are_left_out_where_they_would_lie():
+    """Long blocks would not see the range, and moved scenes would lose the bias that the offset study is about."""
+    assert preset("laptop", CODED).window == RECIPE["window"] == 512
+    assert preset("laptop", ModelConfig(front="matched")).window == 512
+    long = ModelConfig(design=Design("learned", (1024, 2, 2), 8))
+    assert preset("laptop", long).window == preset("laptop", CODED, time_offset_m=8.0).window == 0
+    assert preset("laptop", CODED, window=0).window == preset("laptop", MODEL).window == 0
+    with pytest.raises(InputError, match="do not hold codes over blocks of 1024 bins"):
+        preset("laptop", long, window=512)
+    with pytest.raises(InputError, match="no multiple of 256"):
+        preset("laptop", CODED, window=100)
+    with pytest.raises(InputError, match="windows and random time offsets do not go together"):
+        preset("laptop", CODED, window=512, time_offset_m=8.0)
+
+
+@pytest.mark.parametrize(
+    "model", [CODED, ModelConfig(front="matched"), ModelConfig(front="peak")], ids=lambda m: m.name
+)
+def test_a_window_is_a_cut_of_the_whole(model):
+    """What the network sees of a window is that part of what it sees of all bins, and its labels move with it."""
+    packs = [packed_views(random_planes(2, size=16, seed=5))]
+    config = preset("smoke", model)
+    batch = _sensed(packs, model.sensor, (8, 8), 512, [Samples(packs, config, 0)[i] for i in range(4)])
+    start = batch.first_bin
+    assert (start % 256 == 0).all() and (start >= 0).all() and (start <= 512).all()
+    training = DepthTraining(config)
+    seen = []
+    training.model.network.register_forward_hook(lambda module, given, _: seen.append(given[0]))
+    training.model.windowed(batch.counts, start, 512)
+    training.model(batch.counts)
+    for i, first in enumerate(start.tolist()):
+        torch.testing.assert_close(seen[0][i], seen[1][i, :, first : first + 512], rtol=1e-4, atol=1e-5)
+        bins = batch.depth_m[i][batch.valid[i]] / model.sensor.bin_depth_m
+        assert ((bins >= first) & (bins < first + 512)).any()
+    assert math.isfinite(float(training.loss(batch).detach()))
+
+
+def test_the_last_tenth_is_at_full_length():
+    packs = [packed_views(random_planes(3, size=16, seed=5))]
+    data = SetData(packs, packs, preset("smoke", CODED, epochs=10, steps_per_epoch=1))
+
+    class At:
+        current_epoch = 8
+
+    data.trainer = At
+    assert bool((next(iter(data.train_dataloader())).first_bin >= 0).all())
+    At.current_epoch = 9
+    assert bool((next(iter(data.train_dataloader())).first_bin < 0).all())
+
+
+def test_sets_are_mixed_by_their_weights():
+    """Of different sizes; a batch keeps the order of its samples."""
+    packs = [packed_views(random_planes(3, size=16, seed=1)), packed_views(random_planes(2, size=24, seed=2))]
+    config = preset("smoke", CODED, weights=(1.0, 3.0), steps_per_epoch=1000)
+    samples = Samples(packs, config, 0)
+    second = np.array([samples[i].source for i in range(2000)])
+    assert abs(second.mean() - 0.75) < 5 * math.sqrt(0.75 * 0.25 / 2000)
+    requests = [samples[i] for i in range(8)]
+    assert len({one.source for one in requests}) == 2
+    batch = _sensed(packs, config.model.sensor, (8, 8), 0, requests)
+    for i, one in enumerate(requests):
+        alone = _sensed(packs, config.model.sensor, (8, 8), 0, [one])
+        assert torch.equal(batch.counts[i], alone.counts[0]) and torch.equal(batch.valid[i], alone.valid[0])
+    with pytest.raises(InputError, match="3 set weights for 2 training sets"):
+        Samples(packs, replace(config, weights=(1.0, 1.0, 1.0)), 0)
+
+
+def test_the_average_is_what_is_kept_and_resumes_exactly(tmp_path):
+    """Two sets, averaged weights, one cosine: a run that stopped goes on to the same bytes."""
+    views = [split_views(near_planes(6, seed=seed)) for seed in (0, 1)]
+    training, validation = ([pair[i] for pair in views] for i in (0, 1))
+    model = replace(MODEL, spatial_start="orthogonal")
+    config = preset("smoke", model, **FEW, weights=(1.0, 2.0), coherence=0.1)
+    train(config, training, validation, tmp_path / "whole")
+
+    def stop(what: str, share: float) -> None:
+        if what == "step 5 of 9":
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        train(config, training, validation, tmp_path / "parts", progress=stop)
+    train(config, training, validation, tmp_path / "parts")
+    for name in ("last.safetensors", "model.safetensors", "log.csv", "config.json", "energy.csv"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
+    header = (tmp_path / "whole" / "log.csv").read_text().splitlines()[0].split(",")
+    assert {"val_mae_mm_soft-argmax", "val_mae_mm_median", "spatial_rank"} <= set(header)
+    plain = train(replace(config, average=0.0), training, validation, tmp_path / "plain")
+    assert plain["steps"] == 9
+    kept, last = (load_model(tmp_path / name / "last.safetensors")[0] for name in ("whole", "plain"))
+    assert weights_sha256(kept) != weights_sha256(last)
+
+
+def test_the_published_grid_puts_one_return_where_print_has_it():
+    sensor = Sensor()
+    packed = packed_views(random_planes(2, size=16, seed=3))
+    grid = on_published_grid(packed, sensor)
+    known = np.isfinite(packed.depth_m) & (packed.depth_m < sensor.range_m)
+    fullest = np.rint(packed.depth_m[known] / sensor.bin_depth_m) - 1
+    np.testing.assert_allclose(grid.depth_m[known] / sensor.bin_depth_m, fullest + 0.5, rtol=1e-5)
+    early = published_centroid_bins(sensor)
+    assert early == pytest.approx(-0.441, abs=1e-3)
+    arrivals = grid.path_near_m / (2 * sensor.bin_depth_m)
+    np.testing.assert_allclose(arrivals, fullest + 0.5 + early, atol=2e-4)
+    assert (np.diff(grid.offsets).reshape(known.shape) == known).all()
+    np.testing.assert_allclose(grid.mean_radiance, packed.mean_radiance, rtol=1e-5)
+
+
+def test_the_published_decoding_of_the_target_is_the_label():
+    sensor, fullest = Sensor(), torch.tensor([1.0, 117.0, 1000.0])
+    label = (fullest + 0.5) * sensor.bin_depth_m
+    stands = published_target(label, sensor) / sensor.bin_depth_m
+    # weights i / 1023 of the range, in bins from the edge of bin 0 of a grid of 1024: bin k is k + 1/2 of ours
+    torch.testing.assert_close(published_position(stands, sensor.bins), fullest + 0.5)
+    torch.testing.assert_close((stands - 0.5) / 1023 * 1024, fullest)
+    with pytest.raises(InputError, match="published grid and random time offsets"):
+        preset("laptop-v1", replace(CODED, grid="published"), time_offset_m=1.0)
+    assert (CODED.decoder, replace(CODED, grid="published").decoder) == ("median", "soft-argmax")
+
+
+def test_training_on_the_published_grid(tmp_path):
+    model = replace(MODEL, grid="published")
+    train(preset("smoke", model, **FEW), *split_views(near_planes(3)), tmp_path / "run")
+    assert load_model(tmp_path / "run")[0].config.grid == "published" and SMALL.bins == 64
