@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 # the tests' own helpers are imported by name; the packages are installed
-sys.path[:0] = [str(Path(__file__).parent / package) for package in ("spad", "scenes")]
+sys.path[:0] = [str(Path(__file__).parent / package) for package in ("spad", "scenes", "csph")]
 
 
 @pytest.fixture(scope="session")
