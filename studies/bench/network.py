@@ -27,7 +27,7 @@ from render.heap import keep_freed_memory
 from render.tracing import Progress
 from scenes.errors import require
 from scenes.files import write_csv
-from spad.fly import Patch, sense_patches
+from spad.fly import sense_patches
 from studies.experiments import Bench
 from studies.planes import random_planes
 
@@ -143,9 +143,9 @@ def train_for(model: DepthModel, limit_s: float, seed: int) -> tuple[int, float,
     adam = torch.optim.Adam(model.parameters(), lr=config.rate, fused=True)
     from csph.data import Samples  # and Lightning, which takes seconds to import
 
-    samples, step, start = Samples(packed, replace(config, steps_per_epoch=1 << 20), 0), 0, time.perf_counter()
+    samples, step, start = Samples([packed], replace(config, steps_per_epoch=1 << 20), 0), 0, time.perf_counter()
     while step == 0 or time.perf_counter() - start < limit_s:
-        requests: list[Patch] = [samples[step * config.batch + i] for i in range(config.batch)]
+        requests = [samples[step * config.batch + i].patch for i in range(config.batch)]
         batch = sense_patches(packed, sensor, requests, size=(config.crop, config.crop))
         adam.zero_grad()
         kl_divergence(model(batch.counts), batch.depth_m, batch.valid, sensor).backward()

@@ -97,7 +97,7 @@ def test_unfinished_runs_are_left_out(folder, tmp_path, caplog):
 def test_other_models_under_its_name_are_refused_in_one_line(folder, tmp_path):
     model, config, state = load_model(folder / LEARNED.name)
     for changes, said in (
-        ({"time_offset_m": 8.0}, r"random time offsets \[m\] 8.0, expected 0.0"),
+        ({"time_offset_m": 8.0, "window": 0}, r"random time offsets \[m\] 8.0, expected 0.0"),
         ({"seed": 5}, "seed 5, expected 1"),
         ({"model": replace(config.model, layer={"keep_mean": True})}, "layer"),
     ):
