@@ -5,14 +5,13 @@ Everything has the scene's axes, and the camera at the origin.
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import NamedTuple
 
 import numpy as np
 
 from render.world import World
-from scenes.errors import require
+from scenes.errors import listed, require
 from scenes.model import Surface
 
 MAX_ORDER = 3  # mirrors in a row
@@ -64,8 +63,9 @@ def find_mirrors(world: World) -> tuple[Mirrors, list[str]]:
                 _add_plane(planes, plane)
         rows += [(*plane, shape, kind == "conductor", kind == "dielectric") for plane in planes]
     if curved:
-        names = ", ".join(itertools.islice(curved, 4)) + (" and others" if len(curved) > 4 else "")
-        notes.append(f"specular light: curved smooth surfaces ({names}): glints and what they mirror are left out")
+        notes.append(
+            f"specular light: curved smooth surfaces ({listed(curved)}): glints and what they mirror are left out"
+        )
     kinds = {surface.material.kind for surface in world.scene.surfaces}
     if kinds & {"dielectric", "thindielectric"}:
         notes.append("glass: its own return is rendered; other light that it reflects is left out")
@@ -198,19 +198,25 @@ def check_slabs(world: World) -> list[str]:
 
     Raises InputError where that is more than 10 mm of path beside a displaced laser.
     """
+    errors = slab_error_m(world)
+    lenses, slabs = [e.name for e in errors if not e.flat], [e for e in errors if e.flat]
     notes = []
-    for error in slab_error_m(world):
-        if not error.flat:
-            notes.append(f"glass {error.name}: bends light as a lens does, crossed here in a straight line")
-            continue
-        off = f"{1e3 * error.shift_m:.1f} mm beside it, {1e3 * error.path_m:.1f} mm of path"
-        allowed = world.scene.laser.is_colocated or error.path_m <= MOST_SLAB_ERROR_M
-        limit = f"the limit with a displaced laser is {1e3 * MOST_SLAB_ERROR_M:.0f} mm"
-        require(
-            allowed, f"glass {error.name}: a straight line through it is up to {off} off the refracted one; {limit}"
-        )
-        notes.append(f"glass {error.name}: crossed in a straight line, up to {off} off the refracted one")
-    return notes
+    if lenses:
+        notes.append(f"glass {_gathered(lenses)}: bends light as a lens does, crossed here in a straight line")
+    if not slabs:
+        return notes
+    worst = max(slabs, key=lambda error: error.path_m)
+    off = f"{1e3 * max(e.shift_m for e in slabs):.1f} mm beside it, {1e3 * worst.path_m:.1f} mm of path"
+    allowed = world.scene.laser.is_colocated or worst.path_m <= MOST_SLAB_ERROR_M
+    limit = f"the limit with a displaced laser is {1e3 * MOST_SLAB_ERROR_M:.0f} mm"
+    require(allowed, f"glass {worst.name}: a straight line through it is up to {off} off the refracted one; {limit}")
+    names = _gathered([error.name for error in slabs])
+    return [*notes, f"glass {names}: crossed in a straight line, up to {off} off the refracted one"]
+
+
+def _gathered(names: list[str]) -> str:
+    """The name of one, the number and the first names of several."""
+    return names[0] if len(names) == 1 else f"({len(names)} solids: {listed(names)})"
 
 
 def slab_error_m(world: World) -> list[SlabError]:

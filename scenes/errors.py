@@ -1,4 +1,10 @@
-"""The one exception a user's mistake ends in."""
+"""The one exception a user's mistake ends in, and how its message names things."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+MAX_NAMES = 8
 
 
 class InputError(ValueError):
@@ -17,3 +23,10 @@ def require(condition: bool, message: str) -> None:
     """InputError with `message` unless `condition` holds."""
     if not condition:
         raise InputError(message)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Join the first MAX_NAMES of distinct names by commas, and count the rest."""
+    distinct = list(dict.fromkeys(names))
+    more = f" and {len(distinct) - MAX_NAMES} more" if len(distinct) > MAX_NAMES else ""
+    return ", ".join(distinct[:MAX_NAMES]) + more

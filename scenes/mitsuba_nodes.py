@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TypeVar
 from xml.etree import ElementTree
 
-from scenes.errors import InputError
+from scenes.errors import InputError, listed
 from scenes.inputs import file_inside, read_bytes
 
 MAX_INCLUDES = 256
 MAX_DEPTH = 64
 MAX_VALUE = 65536
-NOTE_NAMES = 8
 
 Made = TypeVar("Made")
 
@@ -35,7 +34,7 @@ class Notes:
             names[name] = None
 
     def lines(self) -> tuple[str, ...]:
-        return tuple(text if not names else f"{text}: {_listed(list(names))}" for text, names in self._names.items())
+        return tuple(text if not names else f"{text}: {listed(list(names))}" for text, names in self._names.items())
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -157,7 +156,7 @@ class Document:
     def target(self, element: ElementTree.Element, name: str) -> ElementTree.Element:
         """The element that carries an id."""
         if name not in self._ids:
-            raise self.error(element, f"unknown id {name!r}, known: {_listed(sorted(self._ids)) or 'none'}")
+            raise self.error(element, f"unknown id {name!r}, known: {listed(sorted(self._ids)) or 'none'}")
         return self._ids[name]
 
     def shared(self, element: ElementTree.Element, make: Callable[[], Made]) -> Made:
@@ -172,11 +171,6 @@ class Document:
             return file_inside(self.path.parent, name, what, "the scene's folder")
         except InputError as error:
             raise self.error(element, str(error)) from None
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - NOTE_NAMES} more" if len(names) > NOTE_NAMES else ""
-    return ", ".join(names[:NOTE_NAMES]) + more
 
 
 def _parse(path: Path) -> ElementTree.Element:

@@ -20,6 +20,8 @@ from matplotlib.figure import Figure
 
 DEPTH_COLOURS = matplotlib.colormaps["viridis_r"].with_extremes(bad="lightgrey")
 ERROR_COLOURS = matplotlib.colormaps["magma"].with_extremes(bad="lightgrey")
+# What lies further beyond these quantiles than so many times their distance does not decide a colour scale.
+COMMON, FAR_BEYOND = (0.005, 0.995), 0.5
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -44,11 +46,13 @@ def plain_log(axes: Axes) -> None:
 
 
 def _image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: object) -> None:
+    """Show an image with its colour bar, whose ends are pointed where values lie beyond them."""
     shown = axes.imshow(image, interpolation="nearest", **options)
     axes.set_title(title, fontsize=10)
     axes.set_xticks([])
     axes.set_yticks([])
-    bar = axes.figure.colorbar(shown, ax=axes, fraction=0.046 * image.shape[0] / image.shape[1] + 0.01, pad=0.02)
+    size = {"fraction": 0.046 * image.shape[0] / image.shape[1] + 0.01, "pad": 0.02}
+    bar = axes.figure.colorbar(shown, ax=axes, extend=_beyond(image, *shown.get_clim()), **size)
     bar.set_label(unit, fontsize=8)
     bar.ax.tick_params(labelsize=8)
 
@@ -59,9 +63,21 @@ def display(radiance: np.ndarray, white: float = 0.99) -> np.ndarray:
     return np.clip(radiance / top, 0, 1) ** (1 / 2.2)
 
 
-def _depth_limits(depth_m: np.ndarray) -> dict[str, float]:
+def _beyond(image: np.ndarray, low: float, high: float) -> str:
+    """Which ends of a colour scale are exceeded, in matplotlib's words."""
+    known = image[np.isfinite(image)]
+    below, above = bool((known < low).any()), bool((known > high).any())
+    return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
+
+
+def depth_limits(depth_m: np.ndarray) -> dict[str, float]:
+    """Return the ends of a colour scale of depths [m]: all of them, but for a few that lie far from the others."""
     known = depth_m[np.isfinite(depth_m)]
-    low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    if known.size:
+        first, last = (float(value) for value in np.quantile(known, COMMON))
+        far = max(FAR_BEYOND * (last - first), 0.1)
+        low, high = low if low >= first - far else first, high if high <= last + far else last
     margin = max(0.02 * (high - low), 0.01)
     return {"vmin": max(low - margin, 0.0), "vmax": high + margin}
 
@@ -81,7 +97,7 @@ def draw_transient(transient: Transient, path: Path) -> Path:
         "depth at pixel centres",
         "m",
         cmap=DEPTH_COLOURS,
-        **_depth_limits(transient.depth_m),
+        **depth_limits(transient.depth_m),
     )
     _image(axes[0, 2], 100 * share, "indirect share of the laser light", "%", cmap=ERROR_COLOURS, vmin=0)
     axes[1, 0].imshow(np.abs(transient.normal.astype(float)))
@@ -137,7 +153,7 @@ def draw_histogram(histogram: Histogram, path: Path) -> Path:
 def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: dict, path: Path) -> Path:
     """Truth, estimate and absolute error."""
     figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
-    limits = _depth_limits(histogram.depth_m)
+    limits = depth_limits(histogram.depth_m)
     _image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     title = f"{method}: MAE {errors['mae_mm']:.1f} mm, {errors['within_10mm']:.0%} within 10 mm"
     _image(axes[1], depth_m, title, "m", cmap=DEPTH_COLOURS, **limits)
@@ -152,7 +168,7 @@ def draw_demo(
     """Intensity, true depth, every estimate with its error, and one pixel from returns to detections."""
     figure = plt.figure(figsize=(14, 11.5), layout="constrained")
     panels = figure.subplot_mosaic("ABC;DEF;GGG;HHH", height_ratios=(1, 1, 0.45, 0.6))
-    limits = _depth_limits(histogram.depth_m)
+    limits = depth_limits(histogram.depth_m)
     _image(panels["A"], histogram.expected_signal, "expected signal", "photons per pixel", cmap="gray", vmin=0,
            vmax=np.quantile(histogram.expected_signal, 0.98))  # fmt: skip
     _image(panels["B"], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)

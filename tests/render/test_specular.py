@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from render.direct import centre_layers, direct_light
-from render.mirrors import find_mirrors, slab_error_m
+from render.mirrors import check_slabs, find_mirrors, slab_error_m
 from render.specular import specular_light
 from render.world import World
 from scenes import Camera, InputError, Laser, Material, Scene, Surface, Texture
@@ -363,3 +363,24 @@ def test_planes_of_a_box():
     vertices, faces, uv = box((1, 2, 3))
     mirrors, _ = find_mirrors(World(scene_of(Surface(vertices - (0, 0, 9), faces, GOOD_MIRROR, uv=uv))))
     assert sorted(np.abs(mirrors.offset).tolist()) == pytest.approx([0.5, 0.5, 1, 1, 7.5, 10.5])
+
+
+def test_many_panes_and_lenses_take_one_line_each_kind():
+    """A scene with a hundred glass bulbs printed a line for each of them."""
+    panes = [replace(slab(-1 - 0.1 * i, 0.01 * (1 + i % 3)), name=f"pane {i}") for i in range(12)]
+    vertices, faces, _ = sphere(0.1, 2)
+    bulbs = [Surface(vertices - (0, 0, 4 + i), faces, panes[0].material, name=f"bulb {i}") for i in range(104)]
+    notes = check_slabs(World(scene_of(*panes, *bulbs)))
+    assert len(notes) == 2
+    assert (
+        "104 solids" in notes[0]
+        and "bends light as a lens does" in notes[0]
+        and "bulb 7 and 96 more" in notes[0]
+        and "bulb 8" not in notes[0]
+    )
+    worst = max(slab_error_m(World(scene_of(*panes))), key=lambda error: error.path_m)
+    assert (
+        "12 solids" in notes[1]
+        and "crossed in a straight line" in notes[1]
+        and f"{1e3 * worst.path_m:.1f} mm of path" in notes[1]
+    )
