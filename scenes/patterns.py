@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from scipy import fft
 
 from scenes.model import Surface, Texture
 from scenes.parts import Random
@@ -15,6 +14,8 @@ from scenes.parts import Random
 
 def soft_noise(rng: Random, shape: tuple[int, int], size_px: tuple[float, float]) -> np.ndarray:
     """Gaussian noise of unit variance blurred to blobs of `size_px` (rows, columns); periodic, so that it tiles."""
+    from scipy import fft  # 0.2 s of CPU, which a list of scenes need not wait for
+
     rows, columns = (
         np.exp(-2 * np.pi**2 * (frequency * size) ** 2).astype(np.float32)
         for frequency, size in zip((np.fft.fftfreq(shape[0]), np.fft.rfftfreq(shape[1])), size_px, strict=True)

@@ -17,11 +17,10 @@ import numpy as np
 from csph.evaluation import Evaluation, Row, as_dicts
 from csph.metrics import PHOTON_LEVELS
 from render.tracing import Progress
-from scenes.files import whole_file, write_csv
+from scenes.files import finite, whole_file, write_csv
 from studies import ablation_figures as figures
 from studies import published
 from studies.ablation_plan import ALIKE_WITHIN, BETTER, CLAIMS, LEVELS, Claim, Sheet, sheets_of
-from studies.cli import finite
 from studies.depth_offset_plan import SHOWN_VIEWS, SMOKE, TEST_SET
 from studies.depth_offset_tables import summary_rows
 from studies.experiments import Study

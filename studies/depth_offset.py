@@ -21,11 +21,10 @@ from csph.model import DepthModel, weights_sha256
 from csph.views import read_views, split_views
 from render.tracing import Progress
 from scenes.errors import InputError, require
-from scenes.files import whole_file, write_csv
+from scenes.files import finite, whole_file, write_csv
 from studies import depth_offset_figures as figures
 from studies import depth_offset_tables as tables
 from studies import published
-from studies.cli import finite
 from studies.depth_offset_plan import OFFSET_M, RELIEF, SHOWN_LEVELS, SHOWN_VIEWS, TEST_SET, Level, Plan, plan_of
 from studies.experiments import Study
 from studies.obtained import obtain

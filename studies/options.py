@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 Positional = tyro.conf.Positional
+Progress = Callable[[str, float], None]
 
 
 def may_stay_open(metavar: str) -> object:

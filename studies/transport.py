@@ -27,7 +27,7 @@ from render.settings import RenderSettings
 from render.tracing import Progress
 from render.transient import Transient, read_transient, write_transient
 from scenes.errors import InputError, require
-from scenes.files import whole_file, write_csv
+from scenes.files import finite, whole_file, write_csv
 from scenes.inputs import read_whole_lines
 from scenes.model import Ambient, Laser, Scene
 from scenes.sets import scene_set
@@ -36,7 +36,6 @@ from spad.rgbd import transient_from_rgbd
 from spad.sensor import Sensor
 from studies import transport_figures as figures
 from studies.bench.references import key_of
-from studies.cli import finite
 from studies.experiments import Study
 from studies.obtained import Obtained, obtain
 from studies.real_data import sun_and_sky

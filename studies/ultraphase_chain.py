@@ -14,9 +14,11 @@ from csph import CodingTensor, decode_depth, encode, truncated_fourier
 from scenes.errors import require
 from spad.histogram import Histogram
 from spad.sensor import Sensor
-from ultraphase import CoreArray, Method
-from ultraphase.catalog import TIMESTAMPS
+from studies.options import Progress
+from ultraphase import CoreArray, Method, method
+from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.core import Counters
+from ultraphase.power import Cost, measured_cost
 from ultraphase.tables import INT8_SCALE, int8_codes, spatial_sum
 from ultraphase.verify import verify
 
@@ -184,3 +186,13 @@ def verified(method: Method) -> dict:
         "clocks_max": int(proof.clocks.max()),
         "overflow": "saturates" if proof.saturates.any() else "wraps",
     }
+
+
+def all_costs(progress: Progress, methods: list[Method] | None = None) -> dict[str, Cost]:
+    """Emulated cost of every method by its name."""
+    chosen = methods or [method(name) for name in PUBLISHED]
+    costs = {}
+    for number, one in enumerate(chosen):
+        progress(one.name, number / len(chosen))
+        costs[one.name] = measured_cost(one, int8_temporal(one))
+    return costs

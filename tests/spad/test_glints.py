@@ -9,7 +9,7 @@ from test_flux import transient_of
 from spad.detect import sense
 from spad.glints import glint_warning, signal_shares
 from spad.sensor import PhotonBudget, Sensor
-from studies.sensing import summary
+from studies.cli.sensing import summary
 
 SENSOR = Sensor()
 

@@ -115,7 +115,7 @@ def test_flood_light_is_reported_beside_the_scan(capsys):
 @pytest.mark.parametrize("baseline", [(0.5, 0.0, 0.0), (0.0, 0.2, -0.3)])
 def test_displaced_laser_is_decoded_by_its_ellipsoid(baseline):
     from scenes.catalog import load_scene
-    from studies.run import depth_map
+    from studies.cli.depth import depth_map
 
     scene = replace(load_scene("plane", width=24, height=18), laser=Laser("flood", baseline, 120.0))
     transient = render(scene, RenderSettings(bounces=1))

@@ -246,6 +246,6 @@ def test_interrupt_ends_with_its_own_status(capfd, folder, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("studies.run.render", stop)
+    monkeypatch.setattr("render.engine.render", stop)
     status, out, err = run(capfd, "render", "sphere", *SMALL)
     assert status == 130 and out == "" and "interrupted" in err and list(folder.iterdir()) == []

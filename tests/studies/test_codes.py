@@ -23,7 +23,7 @@ from spad.template import binned_pulse
 from studies import codes, memory, tensors
 from studies.bench import encode as bench_encode
 from studies.cli import main
-from studies.run import depth_map
+from studies.cli.depth import depth_map
 
 
 def run(capfd, *argv: str) -> tuple[int, dict, str]:

@@ -11,7 +11,7 @@ import tyro
 
 from csph.model import load_model, save_model
 from scenes import InputError
-from studies import commands
+from studies.cli.main import Command
 from studies.planes import random_planes
 from studies.store import Store
 from studies.trained import Library, Wanted, check, ship_all
@@ -56,7 +56,7 @@ def test_names_and_labels():
 )
 def test_spelled_command_is_the_command(wanted):
     spelled = shlex.split(wanted.spelled("laptop", Path("rooms.h5"), Path("runs")))
-    parsed = tyro.cli(commands.Command, args=spelled[1:])
+    parsed = tyro.cli(Command, args=spelled[1:])
     assert parsed.out == Path("runs") / wanted.name
     assert config_of(parsed) == config_of(wanted.command("laptop", Path("rooms.h5"), Path("runs")))
     check(config_of(parsed), wanted, Path("model"))

@@ -12,8 +12,8 @@ import numpy as np
 from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file
-from studies.commands import Ultraphase
-from studies.ultraphase_chain import fixed_spatial, int8_temporal, verified
+from studies.cli.ultraphase import Ultraphase
+from studies.ultraphase_chain import all_costs, fixed_spatial, int8_temporal, verified
 from ultraphase import ChipSpec, Core, CoreArray, Method, Program, assemble_file, listing, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.chip import ASSUMPTIONS
@@ -24,7 +24,7 @@ _MOST_WATCHED = 100
 
 
 def run(command: Ultraphase, progress: Progress) -> dict:
-    """One action; see `commands.Ultraphase`."""
+    """One action; see `Ultraphase`."""
     actions = {"table": _table, "run": _run, "asm": _asm, "list": _list, "verify": _verify, "sweep": _sweep}
     needs = command.action in ("run", "asm", "list", "verify")
     require(bool(command.program) == needs, f"ultraphase {command.action}: {_arity(needs)}")
@@ -47,16 +47,6 @@ def load(command: Ultraphase) -> tuple[Program, Method | None]:
         require(found is not None, f"--define {text!r}: expected NAME=VALUE with a whole number")
         constants[found[1]] = int(found[2])
     return assemble_file(Path(command.program), constants), None
-
-
-def all_costs(progress: Progress, methods: list[Method] | None = None) -> dict[str, Cost]:
-    """Emulated cost of every method by its name."""
-    chosen = methods or [method(name) for name in PUBLISHED]
-    costs = {}
-    for number, one in enumerate(chosen):
-        progress(one.name, number / len(chosen))
-        costs[one.name] = measured_cost(one, int8_temporal(one))
-    return costs
 
 
 def _write(path: Path | None, text: str) -> dict[str, str]:

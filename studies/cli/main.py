@@ -6,18 +6,48 @@ import contextlib
 import io
 import json
 import logging
-import math
 import re
 import sys
 from collections.abc import Callable, Iterator
+from typing import Annotated, Any
 
 import tyro
 
 from scenes.errors import InputError
-from studies import commands
+from scenes.files import finite
+from studies.cli import bench, dataset, demo, depth, evaluate, render, report, scenes, sense, study, train, ultraphase
+from studies.options import Common, Progress
 
 log = logging.getLogger("scene2spad")
 DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."
+Command = (
+    Annotated[demo.Demo, tyro.conf.subcommand("demo")]
+    | Annotated[scenes.Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[render.Render, tyro.conf.subcommand("render")]
+    | Annotated[dataset.Dataset, tyro.conf.subcommand("dataset")]
+    | Annotated[sense.Sense, tyro.conf.subcommand("sense")]
+    | Annotated[depth.Depth, tyro.conf.subcommand("depth")]
+    | Annotated[train.Train, tyro.conf.subcommand("train")]
+    | Annotated[evaluate.Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[ultraphase.Ultraphase, tyro.conf.subcommand("ultraphase")]
+    | Annotated[study.Study, tyro.conf.subcommand("study")]
+    | Annotated[bench.Bench, tyro.conf.subcommand("bench")]
+    | Annotated[report.Report, tyro.conf.subcommand("report")]
+)
+RUNNERS: dict[type, Callable[[Any, Progress], dict]] = {
+    demo.Demo: demo.run,
+    scenes.Scenes: scenes.run,
+    render.Render: render.run,
+    dataset.Dataset: dataset.run,
+    sense.Sense: sense.run,
+    depth.Depth: depth.run,
+    train.Train: train.run,
+    evaluate.Evaluate: evaluate.run,
+    ultraphase.Ultraphase: ultraphase.run,
+    study.Study: study.run,
+    bench.Bench: bench.run,
+    report.Report: report.run,
+}
 
 
 def script() -> None:
@@ -38,11 +68,8 @@ def main(argv: list[str]) -> int:
     if command.seed < 0:
         return _refuse(f"seed {command.seed} is negative, expected 0 or more")
     try:
-        # heavy imports (torch, Mitsuba) only once the command line is known to be good
-        from studies import run
-
         with _progress() as progress:
-            result = run.RUNNERS[type(command)](command, progress)
+            result = RUNNERS[type(command)](command, progress)
     except InputError as error:
         return _refuse(str(error))
     except OSError as error:
@@ -59,11 +86,11 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _parse(argv: list[str]) -> commands.Common:
+def _parse(argv: list[str]) -> Common:
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(commands.Command, prog="scene2spad", description=DESCRIPTION, args=argv)
+            return tyro.cli(Command, prog="scene2spad", description=DESCRIPTION, args=argv)
     except SystemExit as stop:
         if stop.code:
             print(f"scene2spad: {_one_line(said.getvalue())}", file=sys.stderr)
@@ -85,15 +112,6 @@ def _one_line(box: str) -> str:
 def _refuse(reason: str) -> int:
     print(f"scene2spad: {' '.join(reason.split())}", file=sys.stderr)
     return 2
-
-
-def finite(value: object) -> object:
-    """JSON knows no NaN: null instead."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _prose(result: dict) -> str:
@@ -125,7 +143,7 @@ def _log_to_stderr() -> None:
 
 
 @contextlib.contextmanager
-def _progress() -> Iterator[Callable[[str, float], None]]:
+def _progress() -> Iterator[Progress]:
     """A progress bar on stderr, and the function that moves it; silent where nobody looks."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn

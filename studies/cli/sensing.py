@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,14 +21,16 @@ from spad.histogram import Histogram, write_histogram
 from spad.mat import write_mat
 from spad.pulse import Pulse, read_pulse
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
-from studies import commands, figures
+from studies.cli.paths import input_file, output_file, picture
+from studies.cli.sense import Sense
+from studies.options import Progress
 
 log = logging.getLogger("scene2spad")
 
 DEFAULT_PHOTONS = 50.0
 
 
-def sensor_of(command: commands.Sense) -> Sensor:
+def sensor_of(command: Sense) -> Sensor:
     """The preset with what the options change."""
     asked = {
         "dark_count_rate_hz": command.dark_count_rate,
@@ -55,7 +56,7 @@ def sensor_of(command: commands.Sense) -> Sensor:
     )
 
 
-def optics_of(command: commands.Sense) -> Optics | None:
+def optics_of(command: Sense) -> Optics | None:
     """The optics of a radiometric budget, None without one."""
     if not command.radiometric:
         return None
@@ -72,20 +73,13 @@ def optics_of(command: commands.Sense) -> Optics | None:
     )
 
 
-def budget_of(command: commands.Sense) -> PhotonBudget:
+def budget_of(command: Sense) -> PhotonBudget:
     """The budget by means that the options ask for."""
     asked = (DEFAULT_PHOTONS if value is None else value for value in (command.signal, command.background))
     return PhotonBudget(*asked)
 
 
-def run(
-    command: commands.Sense,
-    progress: Callable[[str, float], None],
-    *,
-    input_file: Callable[[Path], Path],
-    output_file: Callable[[Path, str, str], Path],
-    picture: Callable[[Path, str], Path],
-) -> dict:
+def run(command: Sense, progress: Progress) -> dict:
     """Transient -> histogram, its picture, and the .mat layout where asked."""
     sensor, optics = sensor_of(command), optics_of(command)
     budget = budget_of(command) if optics is None else None
@@ -108,6 +102,8 @@ def run(
         mat = out.with_suffix(".mat")
         result.update({"pulse_file": str(write_mat(histogram, mat)), "export": str(mat)})
     if command.figure:
+        from studies import figures
+
         result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram")))
     return result
 

@@ -1,0 +1,5 @@
+"""`python -m studies.cli COMMAND`."""
+
+from studies.cli import script
+
+script()

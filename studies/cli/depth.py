@@ -1,0 +1,133 @@
+"""Estimate depth from a histogram, and compare it with the truth."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from scenes.errors import InputError
+from scenes.files import ATTRIBUTE, seal, whole_file
+from studies.cli.paths import input_file, output_file, picture
+from studies.options import Common, File, Positional, Progress
+
+if TYPE_CHECKING:
+    from csph.model import DepthModel
+    from spad.histogram import Histogram
+
+log = logging.getLogger("scene2spad")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Depth(Common):
+    """Estimate depth from a histogram and compare it with the truth; writes the depth map and a picture."""
+
+    file: Positional[Path]
+    """A histogram written by `sense` (.h5)."""
+    out: File = None
+    """The depth map (.exr) to write (default: the histogram's and the method's name)."""
+    method: Literal[
+        "argmax", "matched", "log-matched", "correlation", "lmf-published", "coates", "compressive", "network"
+    ] = "log-matched"
+    """Estimator; log-matched is the Poisson maximum likelihood, coates the same after the pile-up is undone."""
+    checkpoint: File = None
+    """A checkpoint of `train`, or its folder, for `--method network`."""
+    int8: bool = False
+    """Codes of `--method network` in 8 bits, summed in 16."""
+    code: Literal["fourier", "gray", "coarse", "hadamard", "random"] = "fourier"
+    """Temporal code of `--method compressive`: truncated Fourier, Gray Fourier, coarse histogram, Walsh-Hadamard."""
+    codes: int = 16
+    """Number K of codes kept per pixel by `--method compressive`."""
+    figure: bool = True
+    """Draw estimate, truth and error beside the file."""
+
+
+def run(command: Depth, progress: Progress) -> dict:
+    """Histogram -> depth map, error figures and a picture."""
+    from spad.depth import depth_errors
+    from spad.histogram import read_histogram
+    from studies.cli.sensing import mean_confidence
+
+    label = command.method if command.method != "compressive" else f"{command.code}-{command.codes}"
+    source = input_file(command.file)
+    out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
+    histogram = read_histogram(source)
+    progress(command.method, 0.1)
+    network = _network(command)
+    start = time.perf_counter()
+    depth = depth_map(histogram, command.method, command.codes, command.code, command.seed, network, command.int8)
+    seconds = time.perf_counter() - start
+    sure = mean_confidence(histogram, depth)
+    range_m = histogram.sensor.range_m
+    errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
+    _write_depth(depth, out, {"method": label, "histogram_sha256": histogram.sha256()})
+    result = {
+        "seconds": seconds,
+        "method": label,
+        **errors,
+        "confidence": sure,
+        "unmixed": depth_errors(depth, histogram.depth_m, range_m=range_m, exclude=histogram.mixed),
+        "out": str(out),
+    }
+    if command.figure:
+        from studies import figures
+
+        result["figure"] = str(figures.draw_depth(histogram, depth, label, errors, picture(out, "depth")))
+    return result
+
+
+def depth_map(
+    histogram: Histogram,
+    method: str,
+    codes: int = 16,
+    code: str = "fourier",
+    seed: int = 0,
+    network: DepthModel | None = None,
+    int8: bool = False,
+) -> np.ndarray:
+    """Estimate depth [m] by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code."""
+    from spad.depth import histogram_depth_m
+
+    if network is not None:
+        depth, overflows = network.depth_of(histogram, int8=int8)
+        if overflows:
+            log.warning("%d sums of 16 bits wrapped around", overflows)
+        return depth
+    if method != "compressive":
+        return histogram_depth_m(histogram, method)
+    from csph import CodingTensor, decode_depth, encode, temporal_code
+
+    temporal = temporal_code(code, codes, histogram.sensor.bins, histogram.sensor, seed)
+    coding = CodingTensor(f"{code}-{codes}", temporal)
+    return histogram_depth_m(histogram, lambda counts, sensor: decode_depth(encode(counts, coding), coding, sensor))
+
+
+def _network(command: Depth) -> DepthModel | None:
+    wanted = command.method == "network"
+    if wanted != (command.checkpoint is not None) or (command.int8 and not wanted):
+        raise InputError("depth: --method network and --checkpoint go together, and --int8 with both")
+    if not wanted:
+        return None
+    from csph.model import load_model
+
+    return load_model(command.checkpoint)[0]
+
+
+def _write_depth(depth_m: np.ndarray, path: Path, meta: dict) -> None:
+    import OpenEXR
+
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        ATTRIBUTE: seal({**meta, "unit": "m"}, "depth", hashlib.sha256(depth_m.tobytes()).hexdigest()),
+    }
+    with whole_file(path) as beside:
+        try:
+            OpenEXR.File(header, {"Z": np.ascontiguousarray(depth_m, dtype=np.float32)}).write(str(beside))
+        except RuntimeError as error:
+            raise OSError(str(error)) from None
