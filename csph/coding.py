@@ -41,6 +41,7 @@ class CodingTensor:
             part = getattr(self, label)
             if part is None and label == "spatial":
                 continue
+            part = torch.as_tensor(part)
             shape = tuple(part.shape)
             if part.ndim not in ranks or 0 in shape or not bool(part.isfinite().all()):
                 raise InputError(
@@ -129,9 +130,11 @@ def _per_pixel(coding: CodingTensor) -> None:
 def encode(counts: Tensor, coding: CodingTensor) -> Tensor:
     """y = C n of every pixel: counts (..., T) -> codes (..., K) float32, C over one pixel and all T bins.
 
-    Raises InputError for another number of bins. Blocks of several pixels: `csph.blocks.encode_blocks`.
+    `counts` may be a numpy array. Raises InputError for another number of bins.
+    Blocks of several pixels: `csph.blocks.encode_blocks`.
     """
     _per_pixel(coding)
+    counts = torch.as_tensor(counts)
     if counts.ndim < 1 or counts.shape[-1] != coding.bins:
         shape = tuple(counts.shape)
         raise InputError(f"histogram of shape {shape}: the last axis must be the {coding.bins} bins of {coding.name}")

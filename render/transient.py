@@ -19,7 +19,7 @@ RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bo
 LAYER_CHANNELS = ("depth", "normal.X", "normal.Y", "normal.Z", "albedo", "ambient", "mixed", "error")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Transient:
     """Per-pixel time-resolved radiance as a ragged list of returns, and flat layers beside it.
 
@@ -89,6 +89,13 @@ class Transient:
                     f"transient: {count} of {good.size} values of {name} are negative or not finite: {value:g} in row "
                     f"{row}, column {column}"
                 )
+
+    def __repr__(self) -> str:
+        paths = f"paths {self.path_near_m.min():.3f} to {self.path_far_m.max():.3f} m, " if self.returns else ""
+        return (
+            f"Transient({self.meta.get('scene', 'unnamed')!r}, {self.height} x {self.width} pixels (rows x columns), "
+            f"{self.returns} returns, {paths}{self.indirect_fraction:.1%} indirect)"
+        )
 
     @property
     def returns(self) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes import shapes
-from scenes.errors import InputError
+from scenes.errors import InputError, did_you_mean
 from scenes.gallery import gallery
 from scenes.living_room import living_room
 from scenes.meshes import EXTENSIONS as MESH_EXTENSIONS
@@ -52,7 +52,7 @@ def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: in
         families = ", ".join(f"{family}NAME" for family in FAMILIES)
         raise InputError(
             f"scene {spec!r}: expected one of {', '.join(SCENES)}, {families}, "
-            f"or a file with extension {' '.join(EXTENSIONS)}"
+            f"or a file with extension {' '.join(EXTENSIONS)}{did_you_mean(spec, SCENES)}"
         )
     if kind == ".xml":
         from scenes.mitsuba_xml import load_mitsuba_xml

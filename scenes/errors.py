@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 MAX_NAMES = 8
 
@@ -30,3 +31,12 @@ def listed(names: Iterable[str]) -> str:
     distinct = list(dict.fromkeys(names))
     more = f" and {len(distinct) - MAX_NAMES} more" if len(distinct) > MAX_NAMES else ""
     return ", ".join(distinct[:MAX_NAMES]) + more
+
+
+def did_you_mean(word: str, choices: Iterable[str]) -> str:
+    """Return "; did you mean 'x'?" for the choice that a mistyped word is close to, else an empty string.
+
+    Example: `did_you_mean("galery", ["gallery", "plane"])` is "; did you mean 'gallery'?".
+    """
+    close = get_close_matches(word, list(choices), n=1, cutoff=0.6)
+    return f"; did you mean '{close[0]}'?" if close else ""

@@ -332,7 +332,7 @@ class Ambient:
         object.__setattr__(self, "pose", rigid_pose(self.pose, "environment pose"))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Everything that is there. `notes` says, one line each, what a loader changed, assumed or left out."""
 
@@ -347,6 +347,13 @@ class Scene:
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
         object.__setattr__(self, "notes", tuple(" ".join(note.split()) for note in self.notes))
         require(len(self.surfaces) > 0, f"scene {self.name}: has no surfaces")
+
+    def __repr__(self) -> str:
+        camera, laser = self.camera, self.laser
+        return (
+            f"Scene({self.name!r}, {len(self.surfaces)} surfaces, {self.triangles} triangles, "
+            f"{camera.width} x {camera.height} pixels, fov {camera.fov_deg:g} deg, {laser.mode} laser)"
+        )
 
     @property
     def triangles(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from scenes.errors import InputError, require
+from scenes.errors import InputError, did_you_mean, require
 from scenes.model import Scene
 
 SETS: dict[str, str] = {
@@ -49,7 +49,7 @@ def scene_set(name: str) -> SceneSet:
     """
     name = f"{name}/train" if name in ENDLESS else name
     if name not in SETS:
-        raise InputError(f"scene set {name!r}: expected one of {', '.join(SETS)}")
+        raise InputError(f"scene set {name!r}: expected one of {', '.join(SETS)}{did_you_mean(name, SETS)}")
     family, _, split = name.partition("/")
     if family in ENDLESS:
         return ENDLESS[family](name, split)

@@ -19,7 +19,7 @@ from spad.timestamps import counts_from_timestamps, timestamps_from_counts
 TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Histogram:
     """Photon counts of every pixel and time bin.
 
@@ -53,6 +53,15 @@ class Histogram:
             if array.shape != self.counts.shape[:2]:
                 raise InputError(f"histogram: {name} is {array.shape}, expected {self.counts.shape[:2]}")
             array.setflags(write=False)
+
+    def __repr__(self) -> str:
+        (height, width, bins), sensor = self.counts.shape, self.sensor
+        return (
+            f"Histogram({height} x {width} pixels (rows x columns) x {bins} bins of "
+            f"{sensor.bin_width_s * 1e12:.4g} ps, "
+            f"{int(self.counts.sum(dtype=np.int64))} detections, signal {self.budget.signal:g} + background "
+            f"{self.budget.background:g} a pixel, sensor {sensor.name!r})"
+        )
 
     def timestamps(self) -> tuple[np.ndarray, np.ndarray]:
         """Sparse form: time bin of every detection (uint16, ascending in a pixel), and (H*W + 1,) int64 offsets."""

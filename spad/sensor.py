@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import require
+from scenes.errors import did_you_mean, require
 from spad.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
 from spad.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_from_dict
 
@@ -167,7 +167,10 @@ PRESETS: dict[str, Sensor] = {
 
 def sensor_by_name(name: str) -> Sensor:
     """The preset of that name, or an InputError that lists the names."""
-    require(name in PRESETS, f"sensor {name!r} is unknown, expected one of {', '.join(PRESETS)}")
+    require(
+        name in PRESETS,
+        f"sensor {name!r} is unknown{did_you_mean(name, PRESETS)}, expected one of {', '.join(PRESETS)}",
+    )
     return PRESETS[name]
 
 

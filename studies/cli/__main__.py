@@ -1,5 +1,5 @@
 """`python -m studies.cli COMMAND`."""
 
-from studies.cli import script
+from studies.start import script
 
 script()

@@ -13,7 +13,7 @@ import numpy as np
 
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, seal, whole_file
-from studies.cli.paths import input_file, output_file, picture
+from studies.cli.paths import holds_kind, input_file, output_file, picture
 from studies.options import Common, File, Positional, Progress
 
 if TYPE_CHECKING:
@@ -53,8 +53,9 @@ def run(command: Depth, progress: Progress) -> dict:
     from spad.histogram import read_histogram
     from studies.cli.sensing import mean_confidence
 
-    label = command.method if command.method != "compressive" else f"{command.code}-{command.codes}"
+    label = depth_label(command)
     source = input_file(command.file)
+    _expect_histogram(source)
     out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
     histogram = read_histogram(source)
     progress(command.method, 0.1)
@@ -79,6 +80,29 @@ def run(command: Depth, progress: Progress) -> dict:
 
         result["figure"] = str(figures.draw_depth(histogram, depth, label, errors, picture(out, "depth")))
     return result
+
+
+def depth_label(command: Depth) -> str:
+    """Name a depth map after its method, so that results of two checkpoints do not overwrite one another."""
+    if command.method == "compressive":
+        return f"{command.code}-{command.codes}"
+    if command.method != "network" or command.checkpoint is None:
+        return command.method
+    from csph.shipped import RUN_WEIGHTS
+
+    checkpoint = command.checkpoint
+    if checkpoint.is_dir():
+        return f"network-{checkpoint.resolve().name}"
+    run = f"{checkpoint.resolve().parent.name}-" if checkpoint.stem in RUN_WEIGHTS else ""
+    return f"network-{run}{checkpoint.stem}"
+
+
+def _expect_histogram(path: Path) -> None:
+    """Refuse a file of another of our kinds by its name, with the command that takes it."""
+    if path.suffix.lower() == ".exr" and holds_kind(path, "transient"):
+        raise InputError(f"{path}: is a transient, expected a histogram; run `scene2spad sense {path}` first")
+    if path.suffix.lower() == ".safetensors":
+        raise InputError(f"{path}: is a checkpoint, expected a histogram; give it as --method network --checkpoint")
 
 
 def depth_map(

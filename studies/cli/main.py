@@ -9,11 +9,13 @@ import logging
 import re
 import sys
 from collections.abc import Callable, Iterator
-from typing import Annotated, Any
+from dataclasses import fields
+from importlib.metadata import version
+from typing import Annotated, Any, get_args
 
 import tyro
 
-from scenes.errors import InputError
+from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
 from studies.cli import bench, dataset, demo, depth, evaluate, render, report, scenes, sense, study, train, ultraphase
 from studies.options import Common, Progress
@@ -50,15 +52,15 @@ RUNNERS: dict[type, Callable[[Any, Progress], dict]] = {
 }
 
 
-def script() -> None:
-    """Entry point of the console script."""
-    sys.exit(main(sys.argv[1:]))
-
-
 def main(argv: list[str]) -> int:
     """Run one command and return the exit status: 0 done, 2 bad input, 130 interrupted. Bad input never raises."""
     try:
-        command = _parse(argv)
+        if argv == ["--version"]:
+            print(f"scene2spad {version('scene2spad')}")
+            return 0
+        command = _parse(argv or ["--help"])
+    except InputError as error:
+        return _refuse(str(error))
     except SystemExit as stop:
         return int(stop.code or 0)
     except BrokenPipeError:  # --help into a reader that has gone
@@ -83,10 +85,42 @@ def main(argv: list[str]) -> int:
         print(json.dumps(finite(result), allow_nan=False) if command.json else _prose(result), flush=True)
     except BrokenPipeError:
         sys.stdout = None  # the reader has gone: Python must not try to flush again
+    except OSError as error:
+        sys.stdout = None
+        return _refuse(f"standard output: {error.strerror or error}")
     return 0
 
 
+def _commands() -> dict[str, type[Common]]:
+    """Return each command's options by its name, from the union that tyro parses."""
+    found = {}
+    for one in get_args(Command):
+        options, *notes = get_args(one)
+        found[next(note.name for note in notes if hasattr(note, "name"))] = options
+    return found
+
+
+def _check_words(argv: list[str]) -> None:
+    """Raise InputError for a command or an option that does not exist, with the one that was probably meant."""
+    known = _commands()
+    name = argv[0]
+    if name.startswith("-"):
+        require(name in ("-h", "--help"), f"no option {name}{did_you_mean(name, ('--help', '--version'))}")
+        return
+    require(name in known, f"no command {name!r}{did_you_mean(name, known)} (there are {', '.join(known)})")
+    options = {f"--{field.name.replace('_', '-')}" for field in fields(known[name])}
+    switches = {f"--no-{field.name.replace('_', '-')}" for field in fields(known[name]) if field.type in ("bool", bool)}
+    options |= switches | {"--help"}
+    for word in argv[1:]:
+        option = word.partition("=")[0].replace("_", "-")
+        if option.startswith("--") and option not in options:
+            raise InputError(
+                f"{name}: no option {option}{did_you_mean(option, options)} (see scene2spad {name} --help)"
+            )
+
+
 def _parse(argv: list[str]) -> Common:
+    _check_words(argv)
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -104,7 +138,11 @@ def _one_line(box: str) -> str:
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
     lines = [re.sub(r"[│╭╮╰╯─|]+", " ", line).strip() for line in plain.splitlines()]
     text = " ".join(line for line in lines if line and not set(line) <= set("-=_ "))
-    text = re.sub(r"\s+", " ", text).removeprefix("Parsing error ").strip()
+    text = re.sub(r"\s+", " ", text).removeprefix("Parsing error ").removeprefix("Invalid choice ").strip()
+    choice = re.search(r"invalid choice '(.*?)' for argument '.*?'\. Expected one of \((.*?)\)", text)
+    if choice is not None:
+        meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2]))
+        text = text.replace(choice[0], f"{choice[0]}{meant}", 1)
     text = re.sub(r" no type matching .*?could be instantiated from (\[.*?\])\. Got errors.*", r" cannot be \1", text)
     return re.sub(r"For full helptext, run (.*)$", r"(see \1)", text) or "bad command line; see scene2spad --help"
 

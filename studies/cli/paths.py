@@ -31,9 +31,14 @@ def output_file(path: Path, suffix: str, kind: str) -> Path:
     for target in (path, picture(path, kind)):
         if target.is_dir():
             raise InputError(f"{target}: is a folder, expected a file name")
-    if path.is_file() and not _holds(path, f'"kind": "{kind}"'.encode()):
+    if path.is_file() and not holds_kind(path, kind):
         raise InputError(f"{path}: exists and is no {kind} of scene2spad; choose another --out")
     return path
+
+
+def holds_kind(path: Path, kind: str) -> bool:
+    """Tell whether a file carries the seal of one of our kinds of file."""
+    return _holds(path, f'"kind": "{kind}"'.encode())
 
 
 def _holds(path: Path, words: bytes) -> bool:

@@ -84,6 +84,8 @@ def run(command: Sense, progress: Progress) -> dict:
     sensor, optics = sensor_of(command), optics_of(command)
     budget = budget_of(command) if optics is None else None
     source = input_file(command.file)
+    histogram_given = source.suffix.lower() in (".h5", ".hdf5")
+    require(not histogram_given, f"{source}: is an HDF5 file, expected a transient (.exr) that `render` wrote")
     out = output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
     transient = read_transient(source)
     dark_map = _dark_map(command.dark_map, transient)

@@ -123,7 +123,6 @@ def test_help_needs_neither_torch_nor_mitsuba():
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        ([], "subcommand"),
         (["bogus"], "bogus"),
         (["render", "--widht", "3"], "--widht"),
         (["render", "living-room", "--width", "many"], "--width"),
