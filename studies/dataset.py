@@ -323,11 +323,13 @@ def make_set(
     records = [folder.records[view] for view in range(count)]
     good = [record for record in records if "failed" not in record]
     missed = [record for record in good if not record["target_met"]]
+    together = math.sqrt(np.mean([record["error"] ** 2 for record in good])) if good else math.nan
     if missed:
         worst = max(missed, key=lambda record: record["error"] / record["target"])
         log.warning(
-            "warning: %d of %d views end above their error target; the worst is view %d with %.2g (target %.2g)",
-            *(len(missed), len(good), worst["view"], worst["error"], worst["target"]),
+            "warning: %d of %d views end above their error target of %.2g, the worst, view %d, at %.2g; all together "
+            "(root mean square) are at %.2g, which is what a set is planned for",
+            *(len(missed), len(good), worst["target"], worst["view"], worst["error"], together),
         )
     return {
         "scenes": len(good),
@@ -337,6 +339,7 @@ def make_set(
         "scenes_per_second": len(todo) / seconds if todo else 0.0,
         "bytes_per_scene": sum(record["bytes"] for record in good) / max(len(good), 1),
         "target_missed": len(missed),
+        "error_together": together,
         "error_median": float(np.median([record["error"] for record in good])) if good else float("nan"),
         "out": str(out),
     }

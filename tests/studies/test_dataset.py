@@ -219,6 +219,7 @@ def test_views_above_their_error_target_are_counted(tmp_path, caplog, monkeypatc
     assert [record["target_met"] for record in records] == [record["error"] <= 1e-4 for record in records]
     missed = sum(not record["target_met"] for record in records)
     assert result["target_missed"] == missed > 0
+    assert result["error_together"] == pytest.approx(np.sqrt(np.mean([record["error"] ** 2 for record in records])))
     assert caplog.records[-1].getMessage().startswith(f"warning: {missed} of 3 views end above their error target")
     assert read_transient(tmp_path / "set" / records[0]["file"]).meta["target_met"] == records[0]["target_met"]
     assert make_set(replace(CLI_JOB, error=1.0), 3, tmp_path / "easy")["target_missed"] == 0
