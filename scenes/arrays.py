@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from scenes.errors import InputError, require
+
+# Spectral radiance [W/(m^2 sr nm)]: the sun's disk has 1e4; what lies far above is no light, and overflows in float32.
+MAX_RADIANCE = 1e9
 
 
 def frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: str) -> np.ndarray:
@@ -40,3 +45,18 @@ def rigid_pose(value: object, what: str) -> np.ndarray:
     last_row = np.abs(pose[3] - (0, 0, 0, 1)).max() <= 1e-6
     require(bool(last_row), f"{what}: the last row is {pose[3].tolist()}, expected 0 0 0 1")
     return pose
+
+
+def finite_number(value: object, what: str) -> float:
+    """`value` as a finite float, or an InputError."""
+    good = isinstance(value, (int, float, np.number)) and math.isfinite(value)
+    require(good, f"{what} {value!r} is not a finite number")
+    return float(value)
+
+
+def checked_radiance(value: object, what: str) -> float:
+    """`value` as a radiance, 0 to MAX_RADIANCE."""
+    value = finite_number(value, what)
+    require(value >= 0, f"{what} {value:g} is negative")
+    require(value <= MAX_RADIANCE, f"{what} {value:g} is above {MAX_RADIANCE:g} W/(m2 sr nm), no light is so bright")
+    return value

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from scenes.arrays import check_faces, frozen_array, rigid_pose
+from scenes.arrays import check_faces, checked_radiance, finite_number, frozen_array, rigid_pose
 from scenes.errors import InputError, require
 
 MaterialKind = Literal[
@@ -27,8 +27,6 @@ LASER_MODES: tuple[str, ...] = LaserMode.__args__
 DISTRIBUTIONS: tuple[str, ...] = MicrofacetDistribution.__args__
 # Fields that came later, left out of a hash at these values: what was there before keeps its hash.
 _ADDED_AT = {"distribution": "ggx"}
-# Spectral radiance [W/(m^2 sr nm)]: the sun's disk has 1e4; what lies far above is no light, and overflows in float32.
-MAX_RADIANCE = 1e9
 # Metres from the origin: float32, in which rays are traced, resolves 1 m there.
 MAX_COORDINATE_M = 1e7
 
@@ -52,21 +50,6 @@ class Texture:
         object.__setattr__(self, "image", image)
 
 
-def _number(value: object, what: str) -> float:
-    """`value` as a finite float, or an InputError."""
-    good = isinstance(value, (int, float, np.number)) and math.isfinite(value)
-    require(good, f"{what} {value!r} is not a finite number")
-    return float(value)
-
-
-def _radiance(value: object, what: str) -> float:
-    """`value` as a radiance, 0 to MAX_RADIANCE."""
-    value = _number(value, what)
-    require(value >= 0, f"{what} {value:g} is negative")
-    require(value <= MAX_RADIANCE, f"{what} {value:g} is above {MAX_RADIANCE:g} W/(m2 sr nm), no light is so bright")
-    return value
-
-
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Of two vectors; numpy's takes longer to see that they are."""
     (ax, ay, az), (bx, by, bz) = a, b
@@ -76,7 +59,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _fraction(value: float | Texture, what: str) -> float | Texture:
     """`value`, a number or a texture, if it lies in [0, 1], as a reflectance or an opacity does."""
     if not isinstance(value, Texture):
-        value = _number(value, what)
+        value = finite_number(value, what)
     low, high = (value.image.min(), value.image.max()) if isinstance(value, Texture) else (value, value)
     require(bool(low >= 0 and high <= 1), f"{what}: {low:g} to {high:g} is outside [0, 1]")
     return value
@@ -118,7 +101,7 @@ class Material:
         for label in ("albedo", "specular", "opacity"):
             object.__setattr__(self, label, _fraction(getattr(self, label), f"{where}: {label}"))
         for label in ("roughness", "ior", "eta", "k"):
-            object.__setattr__(self, label, _number(getattr(self, label), f"{where}: {label}"))
+            object.__setattr__(self, label, finite_number(getattr(self, label), f"{where}: {label}"))
         require(0 < self.roughness <= 1, f"{where}: roughness {self.roughness:g} is outside (0, 1]")
         require(1 < self.ior <= 5, f"{where}: index of refraction {self.ior:g} is outside (1, 5]")
         for label in ("eta", "k"):
@@ -175,7 +158,7 @@ class Surface:
             object.__setattr__(self, label, array)
         textured = isinstance(self.material.albedo, Texture) or isinstance(self.material.opacity, Texture)
         require(self.uv is not None or not textured, f"{where}: its material has a texture, the mesh no uv coordinates")
-        object.__setattr__(self, "emission", _radiance(self.emission, f"{where}: emission"))
+        object.__setattr__(self, "emission", checked_radiance(self.emission, f"{where}: emission"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,11 +173,11 @@ class Camera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", rigid_pose(self.pose, "camera pose"))
         for label, value in (("width", self.width), ("height", self.height)):
-            value = _number(value, f"camera {label}")
+            value = finite_number(value, f"camera {label}")
             good = value == int(value) and 1 <= value <= 16384
             require(good, f"camera {label} {value:g} is outside 1 to 16384 whole pixels")
             object.__setattr__(self, label, int(value))
-        object.__setattr__(self, "fov_deg", _number(self.fov_deg, "camera fov"))
+        object.__setattr__(self, "fov_deg", finite_number(self.fov_deg, "camera fov"))
         require(0.01 <= self.fov_deg <= 170, f"camera fov {self.fov_deg:g} degrees is outside 0.01 to 170")
 
     @classmethod
@@ -324,9 +307,9 @@ class Ambient:
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "radiance", _radiance(self.radiance, "ambient radiance"))
+        object.__setattr__(self, "radiance", checked_radiance(self.radiance, "ambient radiance"))
         if self.environment is not None:
-            _radiance(self.environment.image.max(), f"environment map {self.environment.name}: radiance")
+            checked_radiance(self.environment.image.max(), f"environment map {self.environment.name}: radiance")
         both = self.environment is not None and self.radiance > 0
         require(not both, "ambient light is either a constant radiance or an environment map, not both")
         object.__setattr__(self, "pose", rigid_pose(self.pose, "environment pose"))
