@@ -18,6 +18,7 @@ from scenes.files import whole_file
 
 WEIGHTS = Path(__file__).parent / "weights"
 RUN_WEIGHTS = ("model", "last")  # files of a run; shipped ones have the models' names
+TIMINGS = "timings.jsonl"  # of a run: seconds of each epoch, wall clock and CPU
 _BESIDE = {"log.csv": ".csv", "energy.csv": ".energy.csv"}
 
 
@@ -31,8 +32,10 @@ def file_names(paths: str | Sequence[str]) -> str | list[str]:
     return Path(paths).name if isinstance(paths, str) else [Path(path).name for path in paths]
 
 
-def ship(run: Path, name: str, folder: Path = WEIGHTS) -> Path:
+def ship(run: Path, name: str, folder: Path = WEIGHTS, *, errors: dict[str, dict[str, float]] | None = None) -> Path:
     """Make the shipped form of a finished run's best weights; returns the file.
+
+    Its card (`csph.cards`) gets the CPU-minutes of the run's timings and `errors`, MAE [mm] by set and level.
 
     What it was trained on is told by file name and SHA-256: folders of one machine mean nothing on another. Raises
     InputError for a folder without a checkpoint or a training log.
@@ -48,10 +51,20 @@ def ship(run: Path, name: str, folder: Path = WEIGHTS) -> Path:
             with whole_file(folder / f"{name}{suffix}") as beside:
                 beside.write_bytes(log.with_name(source).read_bytes())
     with whole_file(folder / f"{name}.json") as beside:
-        beside.write_text(json.dumps({"config": config.to_dict(), "state": state}, indent=1, sort_keys=True) + "\n")
+        card = {"config": config.to_dict(), "state": state, "cpu_minutes": cpu_minutes(log.parent)}
+        card |= {"errors": errors} if errors else {}
+        beside.write_text(json.dumps(card, indent=1, sort_keys=True) + "\n")
     path = shipped_file(name, folder)
     save_model(model, config, state, path, half=True)
     return path
+
+
+def cpu_minutes(run: Path) -> float | None:
+    """CPU-minutes of a run's epochs as far as `timings.jsonl` tells them; None without that file."""
+    path = run / TIMINGS
+    if not path.is_file():
+        return None
+    return round(sum(json.loads(line)["cpu_s"] for line in path.read_text().splitlines()) / 60, 1)
 
 
 def beside(checkpoint: Path, kind: str) -> Path:

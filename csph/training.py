@@ -4,6 +4,7 @@
     log.csv             one row an epoch: step, learning rate, training loss, validation RMSE and MAE by both decoders,
                         participation rank of spatial codes
     model.safetensors   weights of the lowest validation RMSE, with the configuration in the header
+    timings.jsonl       seconds of each epoch
     energy.csv          energy of a learned temporal code by groups of time bins, now and then from the start on
     last.safetensors    weights after the last step
     resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
@@ -41,6 +42,7 @@ from csph.posterior import DECODERS
 from csph.rank import coherence, participation_rank
 from csph.resume import RESUME, WholeFileCheckpoints, check_resume
 from csph.schedule import rate_factor
+from csph.shipped import TIMINGS
 from csph.snapshots import CodeEnergy
 from csph.views import Views, packed_sha256, packed_views
 from render.heap import keep_freed_memory
@@ -129,6 +131,15 @@ class Record(pl.Callback):
     def __init__(self, folder: Path, progress: Progress) -> None:
         self.folder, self.progress = folder, progress
         self.rows: list[dict[str, float]] = []
+        self.noted = (time.perf_counter(), time.process_time())
+
+    def _note_time(self, epoch: int) -> None:
+        """Append an epoch's seconds, for whom results are not to depend on."""
+        now = (time.perf_counter(), time.process_time())
+        wall, cpu = (round(end - start, 3) for end, start in zip(now, self.noted, strict=True))
+        self.noted = now
+        with (self.folder / TIMINGS).open("a") as lines:
+            lines.write(json.dumps({"epoch": epoch, "wall_s": wall, "cpu_s": cpu}) + "\n")
 
     @property
     def best_mm(self) -> float:
@@ -167,6 +178,8 @@ class Record(pl.Callback):
                 "step %d of %d: loss %.4f, validation RMSE %.1f mm, MAE %.1f mm",
                 *(row["step"], module.config.steps, row["train_loss"], row["val_rmse_mm"], row["val_mae_mm"]),
             )
+        if trainer.is_global_zero:
+            self._note_time(trainer.current_epoch + 1)
         trainer.save_checkpoint(self.folder / RESUME)  # on all devices
 
 

@@ -87,7 +87,12 @@ class Evaluate(Common):
     """Trained networks beside classical estimators on a rendered set, at the paper's 16 photon levels."""
 
     checkpoints: Positional[tuple[Path, ...]]
-    """Checkpoints of `train`, or their folders; the first is the one that the others are compared with."""
+    """Checkpoints of `train`, their folders, or names of models (see `models`); the first is the one that the others
+    are compared with."""
+    decoder: Annotated[Literal["soft-argmax", "median"] | None, may_stay_open("{soft-argmax,median}")] = None
+    """How posteriors are read: their mean, or their median (default: each model's)."""
+    tiled: bool = False
+    """Cut images to what the blocks of all networks tile, instead of reflecting what is missing."""
     set: Path
     """Folder of a set that `dataset` rendered, or its pack (.h5)."""
     baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")

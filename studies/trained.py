@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import logging
 import time
 from collections.abc import Sequence
@@ -118,7 +119,9 @@ class Trained:
 
     @property
     def subject(self) -> Subject:
-        return Subject(self.wanted.name, self.model, self.digest)
+        # results of the same weights read by another decoder are other results
+        read = hashlib.sha256(f"{self.digest} {self.config.model.decoder}".encode()).hexdigest()
+        return Subject(self.wanted.name, self.model, read)
 
     @property
     def shipped(self) -> bool:

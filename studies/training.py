@@ -14,6 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
+from csph.cards import checkpoint_of
 from csph.config import ModelConfig, TrainConfig, preset
 from csph.design import Design
 from csph.evaluation import LEVEL_GROUPS, Evaluation, Method, as_dicts, evaluate
@@ -185,7 +186,7 @@ def baseline(name: str) -> Method:
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     """Networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
-    models = [load_model(path)[0] for path in command.checkpoints]
+    models = [load_model(checkpoint_of(path))[0] for path in command.checkpoints]
     require(bool(models), "evaluate: give at least one checkpoint")
     sensor = models[0].config.sensor
     others = [model.config.sensor.name for model in models if model.config.sensor != sensor]
@@ -201,7 +202,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     groups: dict[str, list[str]] = {}  # trainings of one design by different seeds are one group
     for path, model in zip(command.checkpoints, models, strict=True):
         for suffix, int8 in (("", False), (" int8", True))[: 1 + command.int8]:
-            methods[f"{path}{suffix}"] = network_method(model, int8=int8, overflows=overflows)
+            methods[f"{path}{suffix}"] = network_method(model, int8=int8, decoder=command.decoder, overflows=overflows)
             groups.setdefault(f"{model.config.name}{suffix}", []).append(f"{path}{suffix}")
     methods |= {name: baseline(name) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
@@ -210,7 +211,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         views,
         sensor,
         levels=PHOTON_LEVELS,
-        tile=common_tile(models),
+        tile=common_tile(models) if command.tiled else (1, 1),
         offset_m=command.offset,
         seed=command.seed,
         progress=progress,

@@ -7,14 +7,14 @@ import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, seal, whole_file
 from studies.cli.paths import holds_kind, input_file, output_file, picture
-from studies.options import Common, File, Positional, Progress
+from studies.options import Common, File, Positional, Progress, may_stay_open
 
 if TYPE_CHECKING:
     from csph.model import DepthModel
@@ -37,6 +37,10 @@ class Depth(Common):
     """Estimator; log-matched is the Poisson maximum likelihood, coates the same after the pile-up is undone."""
     checkpoint: File = None
     """A checkpoint of `train`, or its folder, for `--method network`."""
+    model: Annotated[str | None, may_stay_open("NAME")] = None
+    """A model that comes with the package (see `models`), instead of --checkpoint."""
+    decoder: Annotated[Literal["soft-argmax", "median"] | None, may_stay_open("{soft-argmax,median}")] = None
+    """How `--method network` reads the posterior: its mean, or its median (default: the model's)."""
     int8: bool = False
     """Codes of `--method network` in 8 bits, summed in 16."""
     code: Literal["fourier", "gray", "coarse", "hadamard", "random"] = "fourier"
@@ -59,14 +63,19 @@ def run(command: Depth, progress: Progress) -> dict:
     out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
     histogram = read_histogram(source)
     progress(command.method, 0.1)
-    network = _network(command)
+    network, share = _network(command), None
     start = time.perf_counter()
-    depth = depth_map(histogram, command.method, command.codes, command.code, command.seed, network, command.int8)
+    if network is None:
+        depth = depth_map(histogram, command.method, command.codes, command.code, command.seed)
+    else:
+        depth, share, overflows = network.estimate(histogram, int8=command.int8, decoder=command.decoder)
+        if overflows:
+            log.warning("%d sums of 16 bits wrapped around", overflows)
     seconds = time.perf_counter() - start
     sure = mean_confidence(histogram, depth)
     range_m = histogram.sensor.range_m
     errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
-    _write_depth(depth, out, {"method": label, "histogram_sha256": histogram.sha256()})
+    _write_depth(depth, out, {"method": label, "histogram_sha256": histogram.sha256()}, share)
     result = {
         "seconds": seconds,
         "method": label,
@@ -75,6 +84,8 @@ def run(command: Depth, progress: Progress) -> dict:
         "unmixed": depth_errors(depth, histogram.depth_m, range_m=range_m, exclude=histogram.mixed),
         "out": str(out),
     }
+    if share is not None:
+        result["posterior_within_3_bins"] = float(share.mean())
     if command.figure:
         from studies import figures
 
@@ -86,6 +97,8 @@ def depth_label(command: Depth) -> str:
     """Name a depth map after its method, so that results of two checkpoints do not overwrite one another."""
     if command.method == "compressive":
         return f"{command.code}-{command.codes}"
+    if command.method == "network" and command.model is not None:
+        return f"network-{command.model}"
     if command.method != "network" or command.checkpoint is None:
         return command.method
     from csph.shipped import RUN_WEIGHTS
@@ -105,23 +118,10 @@ def _expect_histogram(path: Path) -> None:
         raise InputError(f"{path}: is a checkpoint, expected a histogram; give it as --method network --checkpoint")
 
 
-def depth_map(
-    histogram: Histogram,
-    method: str,
-    codes: int = 16,
-    code: str = "fourier",
-    seed: int = 0,
-    network: DepthModel | None = None,
-    int8: bool = False,
-) -> np.ndarray:
+def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:
     """Estimate depth [m] by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code."""
     from spad.depth import histogram_depth_m
 
-    if network is not None:
-        depth, overflows = network.depth_of(histogram, int8=int8)
-        if overflows:
-            log.warning("%d sums of 16 bits wrapped around", overflows)
-        return depth
     if method != "compressive":
         return histogram_depth_m(histogram, method)
     from csph import CodingTensor, decode_depth, encode, temporal_code
@@ -133,25 +133,35 @@ def depth_map(
 
 def _network(command: Depth) -> DepthModel | None:
     wanted = command.method == "network"
-    if wanted != (command.checkpoint is not None) or (command.int8 and not wanted):
-        raise InputError("depth: --method network and --checkpoint go together, and --int8 with both")
+    given = (command.checkpoint is not None) + (command.model is not None)
+    if wanted != (given == 1) or (not wanted and (given or command.int8 or command.decoder)):
+        raise InputError(
+            "depth: --method network and --checkpoint or --model go together, and --int8, --decoder with them"
+        )
     if not wanted:
         return None
+    from csph.cards import shipped_model
     from csph.model import load_model
 
-    return load_model(command.checkpoint)[0]
+    return load_model(command.checkpoint or shipped_model(command.model))[0]
 
 
-def _write_depth(depth_m: np.ndarray, path: Path, meta: dict) -> None:
+def _write_depth(depth_m: np.ndarray, path: Path, meta: dict, confidence: np.ndarray | None = None) -> None:
+    """Write a depth map (Z [m]), and beside it how sure a network is of it (`confidence`, in [0, 1])."""
     import OpenEXR
+
+    # of the depth alone, as before confidence was written, where there is none
+    sha256 = hashlib.sha256(depth_m.tobytes() + (b"" if confidence is None else confidence.tobytes())).hexdigest()
+    layers = {"Z": depth_m} if confidence is None else {"Z": depth_m, "confidence": confidence}
+    channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
 
     header = {
         "type": OpenEXR.scanlineimage,
         "compression": OpenEXR.ZIP_COMPRESSION,
-        ATTRIBUTE: seal({**meta, "unit": "m"}, "depth", hashlib.sha256(depth_m.tobytes()).hexdigest()),
+        ATTRIBUTE: seal({**meta, "unit": "m"}, "depth", sha256),
     }
     with whole_file(path) as beside:
         try:
-            OpenEXR.File(header, {"Z": np.ascontiguousarray(depth_m, dtype=np.float32)}).write(str(beside))
+            OpenEXR.File(header, channels).write(str(beside))
         except RuntimeError as error:
             raise OSError(str(error)) from None

@@ -17,7 +17,21 @@ import tyro
 
 from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
-from studies.cli import bench, dataset, demo, depth, evaluate, render, report, scenes, sense, study, train, ultraphase
+from studies.cli import (
+    bench,
+    dataset,
+    demo,
+    depth,
+    evaluate,
+    models,
+    render,
+    report,
+    scenes,
+    sense,
+    study,
+    train,
+    ultraphase,
+)
 from studies.options import Common, Progress
 
 log = logging.getLogger("scene2spad")
@@ -30,6 +44,7 @@ Command = (
     | Annotated[sense.Sense, tyro.conf.subcommand("sense")]
     | Annotated[depth.Depth, tyro.conf.subcommand("depth")]
     | Annotated[train.Train, tyro.conf.subcommand("train")]
+    | Annotated[models.Models, tyro.conf.subcommand("models")]
     | Annotated[evaluate.Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[ultraphase.Ultraphase, tyro.conf.subcommand("ultraphase")]
     | Annotated[study.Study, tyro.conf.subcommand("study")]
@@ -44,6 +59,7 @@ RUNNERS: dict[type, Callable[[Any, Progress], dict]] = {
     sense.Sense: sense.run,
     depth.Depth: depth.run,
     train.Train: train.run,
+    models.Models: models.run,
     evaluate.Evaluate: evaluate.run,
     ultraphase.Ultraphase: ultraphase.run,
     study.Study: study.run,

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from csph.metrics import PHOTON_LEVELS
@@ -100,6 +101,21 @@ def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
     depth = run(capfd, "depth", "planes.h5", "--method", "network", "--checkpoint", "run", "--no-figure")
     assert depth["pixels"] == np.isfinite(histogram.depth_m).sum() and depth["method"] == "network"
     assert Path("planes-network.exr").is_file()
+    assert 0 < depth["posterior_within_3_bins"] <= 1
+    mean = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--decoder", "soft-argmax")
+    median = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--no-figure")
+    assert median["mae_mm"] < mean["mae_mm"]
+    layers = OpenEXR.File("planes-network.exr", separate_channels=True).channels()
+    assert set(layers) == {"Z", "confidence"}
+    sure = layers["confidence"].pixels
+    assert sure.shape == (16, 16) and sure.mean() == pytest.approx(median["posterior_within_3_bins"], abs=1e-6)
+
+
+def test_models_are_listed_with_their_limits(capfd):
+    found = {card["name"]: card for card in run(capfd, "models")["models"]}
+    assert found["none-s0"]["compression"] == 1 and found["none-s0"]["training"] == ["rooms2.h5"]
+    assert run(capfd, "models", "none-s0") == found["none-s0"]
+    assert "model 'nonne-s0' is unknown, like none-s0" in refused(capfd, "models", "nonne-s0")
 
 
 def test_folder_of_a_set(capfd, tmp_path):

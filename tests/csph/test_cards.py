@@ -1,0 +1,64 @@
+"""Cards of shipped models; training on a machine without a renderer and a command line."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from test_training import FEW, MODEL, near_planes
+
+from csph.cards import cards, checkpoint_of, read_card, shipped_model
+from csph.config import preset
+from csph.shipped import WEIGHTS, ship
+from csph.training import train
+from csph.views import split_views
+from scenes import InputError
+
+
+def test_every_shipped_model_has_a_card():
+    found = cards()
+    assert {card.name for card in found} == {path.stem for path in WEIGHTS.glob("*.safetensors")}
+    for card in found:
+        assert card.training and all(len(one) == 64 for one in card.training_sha256) and card.val_mae_mm > 0
+        assert card.levels.startswith("signal ") and len(card.not_for) >= 2
+    (long,) = [card for card in found if card.name == "learned-1024x4x4-128x-s0"]
+    assert "depths beyond those of its training set" in long.not_for[-1] and long.compression == 128
+
+
+def test_a_shipped_run_tells_its_cpu_minutes_and_errors(tmp_path):
+    train(preset("smoke", MODEL, **FEW), *split_views(near_planes(3)), tmp_path / "run")
+    epochs = [json.loads(line) for line in (tmp_path / "run/timings.jsonl").read_text().splitlines()]
+    assert [one["epoch"] for one in epochs] == [1, 2, 3] and all(one["cpu_s"] > 0 for one in epochs)
+    ship(tmp_path / "run", "small", tmp_path / "weights", errors={"rooms/test": {"10 + 10": 21.5}})
+    card = read_card(tmp_path / "weights/small.json")
+    assert card.cpu_minutes == pytest.approx(sum(one["cpu_s"] for one in epochs) / 60, abs=0.06)
+    assert card.errors == {"rooms/test": {"10 + 10": 21.5}} and card.levels == "signal 1 to 100, background 0.5 to 1200"
+
+
+def test_models_are_found_by_name_or_path(tmp_path):
+    assert checkpoint_of("none-s0") == shipped_model("none-s0") == WEIGHTS / "none-s0.safetensors"
+    assert checkpoint_of(tmp_path) == tmp_path
+    with pytest.raises(InputError, match="model 'nonee-s0' is unknown, like none-s0"):
+        checkpoint_of("nonee-s0")
+    with pytest.raises(InputError, match="nowhere/run: file not found"):
+        checkpoint_of("nowhere/run")
+    (tmp_path / "bad.json").write_text("{}")
+    with pytest.raises(InputError, match=r"bad\.json: is no card of a model"):
+        read_card(tmp_path / "bad.json")
+
+
+def test_training_needs_no_renderer_and_no_command_line():
+    """A packed set is carried to another machine: Mitsuba, OpenEXR and tyro are not asked for."""
+    script = (
+        "import sys\n"
+        "for name in ('mitsuba', 'drjit', 'OpenEXR', 'tyro'):\n"
+        "    sys.modules[name] = None\n"
+        "import csph.training, csph.cards, csph.evaluation\n"
+        "from csph.model import load_model\n"
+        "from csph.views import read_views\n"
+        "from csph.cards import shipped_model\n"
+        "print(load_model(shipped_model('none-s0'))[0].parameters_count)\n"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert said.returncode == 0, said.stderr
+    assert int(said.stdout) > 100_000
