@@ -119,4 +119,7 @@ def checkpoint_of(name_or_path: Path | str, folder: Path = WEIGHTS) -> Path:
     if path.exists() or path.suffix or len(path.parts) > 1:
         require(path.exists(), f"{path}: file not found")
         return path
-    return shipped_model(str(name_or_path), folder)
+    try:
+        return shipped_model(str(name_or_path), folder)
+    except InputError as error:
+        raise InputError(f"{path}: file not found, and {error}") from None

@@ -18,6 +18,7 @@ import torch
 from csph.config import ModelConfig, TrainConfig
 from csph.design import Design
 from csph.model import DepthModel, load_model, weights_sha256
+from csph.posterior import Decoder
 from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
 from render.tracing import Progress
 from scenes.errors import require
@@ -92,7 +93,9 @@ class Wanted:
 class FindsDepth(Protocol):
     """What evaluation asks of a model."""
 
-    def depth_of(self, histogram: Histogram, *, int8: bool = False) -> tuple[np.ndarray, int]: ...
+    def depth_of(
+        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None
+    ) -> tuple[np.ndarray, int]: ...
 
 
 class Subject(NamedTuple):

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from csph.evaluation import as_dicts
+from csph.posterior import Decoder
 from csph.views import Views
 from render.engine import render
 from render.settings import RenderSettings
@@ -58,7 +59,9 @@ class WithoutNetwork:
     def __init__(self, name: str) -> None:
         self._depth_of = baseline(name)
 
-    def depth_of(self, histogram: Histogram, *, int8: bool = False) -> tuple[np.ndarray, int]:
+    def depth_of(
+        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None
+    ) -> tuple[np.ndarray, int]:
         return self._depth_of(histogram), 0
 
 

@@ -38,7 +38,7 @@ def test_a_shipped_run_tells_its_cpu_minutes_and_errors(tmp_path):
 def test_models_are_found_by_name_or_path(tmp_path):
     assert checkpoint_of("none-s0") == shipped_model("none-s0") == WEIGHTS / "none-s0.safetensors"
     assert checkpoint_of(tmp_path) == tmp_path
-    with pytest.raises(InputError, match="model 'nonee-s0' is unknown, like none-s0"):
+    with pytest.raises(InputError, match="nonee-s0: file not found, and model 'nonee-s0' is unknown, like none-s0"):
         checkpoint_of("nonee-s0")
     with pytest.raises(InputError, match="nowhere/run: file not found"):
         checkpoint_of("nowhere/run")
