@@ -99,13 +99,13 @@ def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
     histogram = sense(random_planes(1, size=16, seed=4).transients[0], Sensor(), PhotonBudget(50, 50))
     write_histogram(histogram, Path("planes.h5"))
     depth = run(capfd, "depth", "planes.h5", "--method", "network", "--checkpoint", "run", "--no-figure")
-    assert depth["pixels"] == np.isfinite(histogram.depth_m).sum() and depth["method"] == "network"
-    assert Path("planes-network.exr").is_file()
+    assert depth["pixels"] == np.isfinite(histogram.depth_m).sum() and depth["method"] == "network-run"
+    assert Path("planes-network-run.exr").is_file()
     assert 0 < depth["posterior_within_3_bins"] <= 1
     mean = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--decoder", "soft-argmax")
     median = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--no-figure")
     assert median["mae_mm"] < mean["mae_mm"]
-    layers = OpenEXR.File("planes-network.exr", separate_channels=True).channels()
+    layers = OpenEXR.File("planes-network-none-s0.exr", separate_channels=True).channels()
     assert set(layers) == {"Z", "confidence"}
     sure = layers["confidence"].pixels
     assert sure.shape == (16, 16) and sure.mean() == pytest.approx(median["posterior_within_3_bins"], abs=1e-6)
