@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -41,7 +42,7 @@ class CodingTensor:
             part = getattr(self, label)
             if part is None and label == "spatial":
                 continue
-            part = torch.as_tensor(part)
+            part = as_tensor(part)
             shape = tuple(part.shape)
             if part.ndim not in ranks or 0 in shape or not bool(part.isfinite().all()):
                 raise InputError(
@@ -127,14 +128,25 @@ def _per_pixel(coding: CodingTensor) -> None:
     require(single, f"coding tensor {coding.name} is over {coding.rows} x {coding.columns} pixels, expected 1 x 1")
 
 
-def encode(counts: Tensor, coding: CodingTensor) -> Tensor:
+def as_tensor(values: Tensor | np.ndarray) -> Tensor:
+    """Return a tensor as it is, and a numpy array as one, copied where it is read-only, as arrays of files are.
+
+    Raises InputError for anything else.
+    """
+    if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
+        return torch.from_numpy(np.require(values, requirements=["C", "W"]))
+    require(isinstance(values, Tensor), f"expected a tensor or an array of numbers, got {type(values).__name__}")
+    return values
+
+
+def encode(counts: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
     """y = C n of every pixel: counts (..., T) -> codes (..., K) float32, C over one pixel and all T bins.
 
     `counts` may be a numpy array. Raises InputError for another number of bins.
     Blocks of several pixels: `csph.blocks.encode_blocks`.
     """
     _per_pixel(coding)
-    counts = torch.as_tensor(counts)
+    counts = as_tensor(counts)
     if counts.ndim < 1 or counts.shape[-1] != coding.bins:
         shape = tuple(counts.shape)
         raise InputError(f"histogram of shape {shape}: the last axis must be the {coding.bins} bins of {coding.name}")

@@ -1,6 +1,7 @@
 """Truncated Fourier compressive histograms: what encoding keeps, and that depth comes back out of it."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -202,3 +203,15 @@ def test_wrong_shapes_are_refused() -> None:
         decode_depth(torch.zeros(3, 8), coding, REFERENCE)
     with pytest.raises(InputError, match="finite"):
         decode_depth(torch.full((3, 8), math.nan), coding, SMALL)
+
+
+def test_read_only_arrays_are_encoded_without_a_warning():
+    counts = np.ones((2, 16), np.int32)
+    counts.setflags(write=False)
+    coding = CodingTensor("fourier-4", truncated_fourier(4, 16))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        codes = encode(counts, coding)
+    assert torch.equal(codes, encode(torch.ones(2, 16), coding))
+    with pytest.raises(InputError, match="got list"):
+        encode([[1, 2]], coding)
