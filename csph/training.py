@@ -202,10 +202,9 @@ def _claim(folder: Path, config: TrainConfig) -> None:
     text = json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n"
     path = folder / "config.json"
     if path.is_file():
+        known = read_json_object(path, "configuration")
         try:  # by what it says: a file of before an option was there means its default
-            same = TrainConfig.from_dict(read_json_object(path, "configuration")) == TrainConfig.from_dict(
-                json.loads(text)
-            )
+            same = TrainConfig.from_dict(known) == TrainConfig.from_dict(json.loads(text))
         except InputError:
             same = False
         require(same, f"{folder}: holds a run with other options or another set; choose another --out")
