@@ -50,6 +50,7 @@ def run(command: Study, progress: Progress) -> dict:
     # published numbers are means of all test levels
     pair_options = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, PHOTON_LEVELS)
     numbers: dict[str, Any] = {
+        "preset": command.preset,
         **models.described(),
         "conclusions": [decided(claim, [*rows, *repeated], {**models.found, **again}) for claim in claims],
         "published": published.compared(store, subjects, *pair_options, (0.0,), **options),

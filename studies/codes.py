@@ -229,7 +229,9 @@ def draw(groups: list[dict], scene: str, path: Path) -> Path:
                 axes.axhline(bound, color="k", lw=1, ls=":", label="Cramer-Rao, uncompressed")
             axes.set_title(title, fontsize=10)
         row[0].set_ylabel(label)
-    panels[0, 0].legend(fontsize=8)
+    # outside: within a panel it would hide the bound, the lowest line of all
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
     for axes in panels[1]:
         axes.set_xlabel("codes per pixel K")
     figure.suptitle(f"Depth decoded by correlation over K, no network: {scene}")

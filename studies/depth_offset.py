@@ -23,6 +23,7 @@ from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import finite, whole_file, write_csv
 from studies import depth_offset_figures as figures
+from studies import depth_offset_range as range_end
 from studies import depth_offset_tables as tables
 from studies import published
 from studies.depth_offset_plan import OFFSET_M, RELIEF, SHOWN_LEVELS, SHOWN_VIEWS, TEST_SET, Level, Plan, plan_of
@@ -99,7 +100,7 @@ def run(command: Study, progress: Progress) -> dict:
     study = Session(plan, models.found, Store(folder / "results"), folder / "sets", command.seed, progress, command.set)
     _ = study.reach_m  # a bad --set is told now, not after an hour
     numbers, drawn = _measured_and_drawn(study, command.out)
-    numbers = {**models.described(), **numbers}
+    numbers = {"preset": command.preset, **models.described(), **numbers}
     written = {"": study.rows, "-summary": numbers["summary"], "-published": numbers["published"]}
     made = [write_csv(rows, command.out / f"depth-offset{name}.csv") for name, rows in written.items() if rows]
     with whole_file(command.out / "depth-offset.json") as beside:
@@ -125,6 +126,7 @@ def _measured_and_drawn(study: Session, out: Path) -> tuple[dict[str, Any], list
         "modes": _modes(study, near, far),
         "relief": _relief(study),
         "sweep": _sweep(study, base),
+        "range_end": _range_end(study, base),
         "cure": _cure(study, base),
         "swap": _swap(study, base),
         "energy": _energies(study),
@@ -140,6 +142,8 @@ def _measured_and_drawn(study: Session, out: Path) -> tuple[dict[str, Any], list
     ]
     if numbers["sweep"]["curves"]:
         drawn.append(figures.sweep(numbers["sweep"], out / "depth-offset-sweep.png"))
+    if numbers["range_end"]["walls"]:
+        drawn.append(figures.range_end(numbers["range_end"], out / "depth-offset-range.png"))
     if numbers["cure"]:
         drawn.append(figures.bars_of(numbers["cure"], numbers["swap"], OFFSET_M, out / "depth-offset-cause.png"))
     energies = {w: study.models[w] for w in study.models if w.name in {e["model"] for e in numbers["energy"]}}
@@ -198,6 +202,43 @@ def _sweep(study: Session, base: TestSet) -> dict[str, Any]:
     leaves = None if reach is None else [reach - depth_m for depth_m in span]
     ends = {"training_reach_m": reach, "test_depths_m": span, "leaves_training_at_m": leaves}
     return {"offsets_m": [*plan.sweep_m], "curves": curves, **ends, **told}
+
+
+def _range_end(study: Session, base: TestSet) -> dict[str, Any]:
+    """Beyond what was decided beforehand: every seed up to the end of the range, which step fails there, and walls."""
+    plan, test = study.plan, base.first(study.plan.sweep_views)
+    mine = [w for w in (*plan.every_seed, *plan.cured) if w in study.models]
+    arms = range_end.arm_rows(_arm_errors(study, [study.models[w] for w in mine if w.design == "fourier"], test))
+    rows = {m: study.measure("range end", study.named(mine), test, plan.sweep_levels, m) for m in plan.end_m}
+    first = [study.models[w] for w in mine if w.seed == 0]
+    before_walls = [one.subject for one in first]
+    before_walls += [range_end.arm(t, n) for t in first if t.wanted.design == "fourier" for n in range_end.DELAY_FREE]
+    walls = [
+        {"model": subject.name, **row}
+        for subject in before_walls
+        for row in range_end.wall_errors(study.store, subject, plan.walls_m, plan.wall_level, study.seed)
+    ]
+    return {
+        "levels": [list(level) for level in plan.sweep_levels],
+        "wall_level": list(plan.wall_level),
+        "designs": range_end.seed_rows(rows, mine),
+        "arms": arms,
+        "observation": range_end.observation(arms, tables.BREAKS_AT),
+        "walls": walls,
+    }
+
+
+def _arm_errors(study: Session, fixed: Sequence[Trained], test: TestSet) -> dict[tuple[str, float], list[float]]:
+    """MAE [mm] of every seed of truncated Fourier, by what is changed and offset."""
+    plan, errors = study.plan, {}
+    for name in range_end.ARMS if fixed else ():
+        # without a network all seeds are one
+        models = fixed[:1] if name == "correlation" else fixed
+        for metres in plan.end_m:
+            subjects = [range_end.arm(one, name, metres) for one in models]
+            found = study.measure("range end, arms", subjects, test, plan.sweep_levels, metres)
+            errors[name, metres] = [tables.mean_error(found, s.name) for s in subjects]
+    return errors
 
 
 def _cure(study: Session, base: TestSet) -> list[dict]:
@@ -302,7 +343,7 @@ def _depth_images(study: Session, base: TestSet, shown: Sequence[int], out: Path
 
 
 def _told(numbers: dict[str, Any]) -> dict[str, list[str]]:
-    """What the terminal shows: the bars, every seed's ratio, the energies, where designs break."""
+    """What the terminal shows: the bars, every seed's ratio, the energies, where designs break, what fails far out."""
     holds = {True: "holds", False: "does not hold", None: "not decided"}
     bars = [f"{b['design']}: {b['geometric_mean']:.2f}, {b['bar']}: {holds[b['holds']]}" for b in numbers["bars"]]
     ratios = [
@@ -330,6 +371,7 @@ def _told(numbers: dict[str, Any]) -> dict[str, list[str]]:
         "ratios": ratios,
         "code_energy": energy,
         "breaks": breaks,
+        "range_end_fourier": numbers["range_end"]["observation"] or ["left out"],
         "absent": absent,
     }
 

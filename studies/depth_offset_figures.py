@@ -1,4 +1,5 @@
-"""Figures of `study depth-offset`: 1, 2, 3 and 17 of the supplement, the sweep of offsets, cause and cure, energies."""
+"""Figures of `study depth-offset`: 1, 2, 3 and 17 of the supplement, the sweep of offsets, the end of the range, cause
+and cure, energies."""
 
 from __future__ import annotations
 
@@ -181,6 +182,41 @@ def sweep(found: dict, path: Path) -> Path:
     panel.grid(alpha=0.3, which="both")
     panel.legend(fontsize=8)
     return save(figure, path)
+
+
+def range_end(found: dict, path: Path) -> Path:
+    """Up to the end of the range: MAE of truncated Fourier by what is changed, and bias before a wall."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(14, 5.5), layout="constrained")
+    for number, name in enumerate(dict.fromkeys(row["arm"] for row in found["arms"])):
+        mine = [row for row in found["arms"] if row["arm"] == name]
+        low, mean, high = ([row[key] for row in mine] for key in ("least_mm", "mae_mm", "largest_mm"))
+        at = [row["offset_m"] for row in mine]
+        left.plot(at, mean, marker="o", ms=4, color=f"C{number}", label=name)
+        left.fill_between(at, low, high, color=f"C{number}", alpha=0.15)
+    plain_log(left)
+    left.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
+    left.set_title(f"truncated Fourier, 128x, photons {_levels([found])}: mean and span of seeds", fontsize=10)
+    for model in dict.fromkeys(row["model"] for row in found["walls"]):
+        mine = [row for row in found["walls"] if row["model"] == model]
+        name, _, changed = model.partition(", ")
+        style = {"ls": ":" if changed else "-", "lw": 1.2, "color": _model_colour(name)}
+        right.plot([r["depth_m"] for r in mine], [r["bias_mm"] for r in mine], label=model, **style)
+    right.set_yscale("symlog", linthresh=10)
+    right.set(xlabel="depth of the wall [m]", ylabel="mean signed error [mm], linear within 10 mm")
+    right.set_title("a wall, photons [{:g}, {:g}], seed 0".format(*found["wall_level"]), fontsize=10)
+    for panel in (left, right):
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize=8)
+    return save(figure, path)
+
+
+def _model_colour(name: str) -> str:
+    """Colour of a model's design by its file's name; those trained with offsets are like no other."""
+    if "-t" in name:
+        return "tab:purple" if "1x1" in name else "tab:olive"
+    designs = {label.replace(" ", "-"): colour for label, colour in COLOURS.items()}
+    designs["none"] = COLOURS["no compression"]
+    return next(colour for start, colour in designs.items() if name.startswith(start))
 
 
 def bars_of(cure: Sequence[dict], swap: Sequence[dict], offset_m: float, path: Path) -> Path:

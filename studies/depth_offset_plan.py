@@ -23,7 +23,9 @@ class Plan:
     """How much is run. `compressions` and `seeds` (at 128x; one elsewhere) decide the models; None views are all.
 
     Beside the headline, which takes every model and level: `space_levels` of ray and rigid offsets, `relief_levels` of
-    the reliefs, `pair_levels` of the photographs, each with seed 0 alone.
+    the reliefs, `pair_levels` of the photographs, each with seed 0 alone. Beyond what was decided beforehand, up to the
+    end of the range: `end_m`, at which every seed at 128x and every arm of `depth_offset_range` is measured (the last
+    one leaves the farthest pixel in range), and `walls_m`, a wall at each depth.
     """
 
     compressions: tuple[int, ...] = (64, 128)
@@ -34,7 +36,10 @@ class Plan:
     levels: tuple[Level, ...] = RATIO_LEVELS
     views: int | None = None
     size: tuple[int, int] | None = None
-    sweep_m: tuple[float, ...] = tuple(i / 2 for i in range(17))
+    sweep_m: tuple[float, ...] = (*(i / 2 for i in range(17)), 9.0, 10.0, 10.5, 11.0, 11.5, 12.0)
+    end_m: tuple[float, ...] = (0.0, 9.0, 10.0, 11.0, 12.0)
+    walls_m: tuple[float, ...] = (0.4, *map(float, range(1, 12)), 12.0, 12.5, 13.0, 13.5, 14.0, 14.5)
+    wall_level: Level = (50.0, 50.0)
     sweep_levels: tuple[Level, ...] = SHOWN_LEVELS[:1]
     sweep_views: int | None = 3
     space_levels: tuple[Level, ...] = SHOWN_LEVELS[:1]
@@ -55,6 +60,11 @@ class Plan:
         return (*coded, *(Wanted(design) for design in self.baselines))
 
     @property
+    def every_seed(self) -> tuple[Wanted, ...]:
+        """Every seed at 128x, and the lines without codes."""
+        return tuple(one for one in self.headline if one.compression == 128 or not one.coded)
+
+    @property
     def cured(self) -> tuple[Wanted, ...]:
         return tuple(Wanted(design, block, 128, time_offset_m=CURE_M) for design, block in self.cures)
 
@@ -73,6 +83,8 @@ SMOKE = Plan(
     views=2,
     size=(24, 20),
     sweep_m=(0.0, 4.0, 8.0),
+    end_m=(0.0, 12.0),
+    walls_m=(1.0, 14.5),
     sweep_views=1,
     relief=False,
     pairs=1,

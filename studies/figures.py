@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
@@ -124,30 +125,70 @@ def _mean_transient(axes: Axes, transient: Transient) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_histogram(histogram: Histogram, path: Path) -> Path:
-    """Counts per pixel, expected signal share, and three pixels' histograms."""
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+SHOWN_RANKS = {"dark": 0.1, "median": 0.5, "bright": 0.9}  # of expected signal, among pixels of one known surface
+WINDOW_NS = (4.0, 12.0)  # before and after the true arrival
+
+
+def draw_histogram(
+    histogram: Histogram, path: Path, *, expected: Callable[[int, int], np.ndarray] | None = None
+) -> Path:
+    """Draw detections per pixel, expected signal to background, and three pixels around their true depths.
+
+    `expected(row, column)` gives the rates (T,) that a pixel's counts were drawn from: a line over the counts, without
+    which a pixel of few photons tells nothing.
+    """
+    figure = plt.figure(figsize=(15, 4.8), layout="constrained")
+    panels = figure.subplot_mosaic([["A", "B", name] for name in SHOWN_RANKS], width_ratios=(1, 1, 1.15))
     counts = histogram.counts.sum(axis=2, dtype=np.int64)
     ratio = histogram.expected_signal / np.maximum(histogram.expected_background, 1e-12)
-    _image(
-        axes[0], counts, "detections per pixel", "photons", cmap="gray", vmin=0, vmax=max(np.quantile(counts, 0.995), 1)
-    )
+    bright = max(np.quantile(counts, 0.995), 1)
+    _image(panels["A"], counts, "detections per pixel", "photons", cmap="gray", vmin=0, vmax=bright)
     decibels = 10 * np.log10(np.maximum(ratio, 1e-12))
     low, high = np.quantile(decibels[ratio > 0], (0.01, 0.99)) if (ratio > 0).any() else (0, 1)
-    _image(axes[1], decibels, "expected signal to background", "dB", cmap=ERROR_COLOURS, vmin=low, vmax=high)
-    time_ns = (np.arange(histogram.sensor.bins) + 0.5) * histogram.sensor.bin_width_s * 1e9
-    order = np.argsort(histogram.expected_signal, axis=None, kind="stable")
-    for name, share in (("dark", 0.1), ("median", 0.5), ("bright", 0.9)):
-        row, column = np.unravel_index(order[int(share * (order.size - 1))], counts.shape)
-        axes[2].plot(time_ns, histogram.counts[row, column], lw=0.8, label=f"{name} pixel ({row}, {column})")
-    axes[2].set(xlabel="time [ns]", ylabel="counts per bin", title="three pixels")
-    axes[2].title.set_fontsize(10)
-    axes[2].legend(fontsize=8)
+    _image(panels["B"], decibels, "expected signal to background", "dB", cmap=ERROR_COLOURS, vmin=low, vmax=high)
+    for number, (name, (row, column)) in enumerate(shown_pixels(histogram).items()):
+        for key in "AB":
+            panels[key].plot(column, row, "o", mfc="none", mec=f"C{number + 1}", ms=8, mew=1.5)
+        rate = None if expected is None else expected(row, column)
+        _pixel_counts(panels[name], histogram, row, column, rate, f"C{number + 1}", name)
+    panels[[*SHOWN_RANKS][-1]].set_xlabel("time since the laser's emission [ns]")
     budget = histogram.budget
     figure.suptitle(
-        f"{histogram.sensor.name} sensor, {budget.signal:g} + {budget.background:g} photons per pixel on average"
+        f"{histogram.sensor.name} sensor, {budget.signal:g} + {budget.background:g} photons per pixel on average; "
+        "right: pixels whose expected signal is above that of 10, 50 and 90 % of pixels"
     )
     return save(figure, path)
+
+
+def shown_pixels(histogram: Histogram) -> dict[str, tuple[int, int]]:
+    """Row and column of the pixels at SHOWN_RANKS of expected signal, among those of one surface of known depth (all
+    where there is none)."""
+    candidates = np.flatnonzero(np.isfinite(histogram.depth_m) & ~histogram.mixed & (histogram.expected_signal > 0))
+    if not candidates.size:
+        candidates = np.arange(histogram.depth_m.size)
+    ranked = candidates[np.argsort(histogram.expected_signal.ravel()[candidates], kind="stable")]
+    places = {name: int(ranked[int(rank * (ranked.size - 1))]) for name, rank in SHOWN_RANKS.items()}
+    return {name: divmod(place, histogram.depth_m.shape[1]) for name, place in places.items()}
+
+
+def _pixel_counts(
+    axes: Axes, histogram: Histogram, row: int, column: int, rate: np.ndarray | None, colour: str, name: str
+) -> None:
+    """Counts of one pixel as bars, the expected rate as a line over them, its true depth dotted."""
+    edges_ns = np.arange(histogram.sensor.bins + 1) * histogram.sensor.bin_width_s * 1e9
+    axes.stairs(histogram.counts[row, column], edges_ns, fill=True, color="0.7", label="detections")
+    if rate is not None:
+        axes.stairs(rate, edges_ns, color=colour, lw=1.4, label="expected")
+    depth_m = float(histogram.depth_m[row, column])
+    if np.isfinite(depth_m):
+        true_ns = 2e9 * depth_m / SPEED_OF_LIGHT_M_PER_S % edges_ns[-1]
+        axes.axvline(true_ns, color="k", lw=0.8, ls=":", label="true depth")
+        axes.set_xlim(max(true_ns - WINDOW_NS[0], 0), min(true_ns + WINDOW_NS[1], edges_ns[-1]))
+    signal, background = (float(v[row, column]) for v in (histogram.expected_signal, histogram.expected_background))
+    axes.set_title(f"{name} pixel ({row}, {column}): {signal:.3g} + {background:.3g} photons expected", fontsize=9)
+    axes.set_ylabel("per bin", fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.legend(fontsize=7, loc="upper right")
 
 
 def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: dict, path: Path) -> Path:

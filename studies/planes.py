@@ -103,3 +103,10 @@ def _transient(depth: np.ndarray, spread: np.ndarray, radiance: np.ndarray, albe
         error=np.zeros((size, size), np.float32),
         meta={"scene": "planes"},
     )
+
+
+def wall(depth_m: float, size: int = 32) -> Transient:
+    """A wall of `size` x `size` pixels all of which are `depth_m` away: one return a pixel, of one length."""
+    require(depth_m > 0 and size >= 1, f"wall: {size} pixels at {depth_m:g} m, expected positive numbers")
+    even = np.ones((size, size))
+    return _transient(depth_m * even, 0 * even, even, 0.5 * even)

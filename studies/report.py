@@ -6,108 +6,28 @@ is absent or cannot be read costs a line in the page, never the page.
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import importlib.metadata
 import platform
-import struct
-import time
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from render.tracing import Progress
-from scenes.errors import InputError, printable, require
+from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.inputs import read_json_object
 from scenes.set_index import read_set_index
 from studies import report_html as html
 from studies import report_published as beside_print
 from studies.experiments import Report
-from studies.report_files import read_png, read_rows
+from studies.report_files import CONFIGURATIONS, Found, gather, read_png, read_rows, rows_in
 from studies.report_plan import NEVER, SECTIONS, Item, Picture, Table
 
 TITLE = "scene2spad: results"
-# What studies keep for themselves: renders, sets, captures, kept results, trained models.
-INSIDE = ("sets", "renders", "captures", "results", "maps", "models", "emulated")
-ENDINGS = (".png", ".csv", ".json")
-# Titles, and the columns that are shown, all where none is named.
-CONFIGURATIONS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "config.json": (
-        "Trainings",
-        ("preset", "seed", "epochs", "steps_per_epoch", "batch", "crop", "rate", "tv_weight", "time_offset_m",
-         "precision", "model network", "data training", "data training_reach_m"),
-    ),
-    "set.json": ("Rendered sets", ()),
-}  # fmt: skip
 PACKAGES = ("scene2spad", "mitsuba", "drjit", "torch", "pytorch-lightning", "numpy", "scipy", "OpenEXR", "matplotlib")
 MOST_CONFIGURATIONS = 200
-# what readers of tables, JSON and pictures raise for damaged files
-UNREADABLE = (
-    OSError, ValueError, TypeError, KeyError, SyntaxError, RecursionError, csv.Error, struct.error, zlib.error,
-    Image.DecompressionBombError,
-)  # fmt: skip
-
-
-@dataclass
-class Found:
-    """The results' files by name, the newest of each first, and what went wrong with them on the way."""
-
-    root: Path
-    files: dict[str, list[Path]]
-    configurations: dict[str, list[Path]]
-    problems: list[str] = field(default_factory=list)
-    missing: dict[str, list[str]] = field(default_factory=dict)  # by command
-    used: set[Path] = field(default_factory=set)
-    shown: set[str] = field(default_factory=set)  # anchors of pictures, by their contents
-    tables: int = 0
-
-    def newest(self, name: str) -> Path | None:
-        """The file of that name; all of them count as used."""
-        paths = self.files.get(name, [])
-        self.used.update(paths)
-        return paths[0] if paths else None
-
-    def told(self, path: Path) -> str:
-        """Its place in the folder and its day, and how many older ones of its name were passed over."""
-        day = time.strftime("%Y-%m-%d", time.gmtime(path.stat().st_mtime))
-        older = len(self.files.get(path.name, [])) - 1
-        return f"{path.relative_to(self.root)}, {day}{f'; {older} older of that name not shown' if older > 0 else ''}"
-
-    def read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
-        """What a reader makes of a file; None, and a problem, where it cannot."""
-        try:
-            return reader(path)
-        except UNREADABLE as error:
-            said = " ".join(str(error).split())[:120]
-            self.problem(f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {said})")
-            return None
-
-    def problem(self, line: str) -> None:
-        line = printable(line)
-        if line not in self.problems:
-            self.problems.append(line)
-
-
-def gather(root: Path) -> Found:
-    """All pictures, tables and configurations in a folder. Raises InputError where there is none."""
-    require(root.is_dir(), f"{root}: no folder of results; benches and studies fill one")
-    files: dict[str, list[Path]] = {}
-    configurations: dict[str, list[Path]] = {name: [] for name in CONFIGURATIONS}
-    for path in sorted(path for path in root.rglob("*") if path.is_file()):
-        inside = path.relative_to(root).parts[:-1]
-        if path.name in configurations:
-            configurations[path.name].append(path)
-        elif path.suffix in ENDINGS and not path.name.startswith(".") and not {*inside} & {*INSIDE}:
-            files.setdefault(path.name, []).append(path)
-    for paths in files.values():
-        paths.sort(key=lambda path: (-path.stat().st_mtime, path))
-    return Found(root, files, configurations)
 
 
 def run(command: Report, progress: Progress) -> dict:
@@ -135,11 +55,14 @@ def compose(found: Found) -> str:
     """The page."""
     body, contents = [], []
     for part in SECTIONS:
-        body.append(html.section(part.anchor, part.title, [_item(item, found) for item in part.items]))
-        contents.append((part.anchor, part.title, [(item.anchor, item.title) for item in part.items]))
-    configurations, more = list(_configurations(found)), _others(found)
+        items = [(item, text) for item in part.items if (text := _item(item, found))]
+        if items:
+            body.append(html.section(part.anchor, part.title, [text for _, text in items]))
+            contents.append((part.anchor, part.title, [(item.anchor, item.title) for item, _ in items]))
+    configurations, more, toys = list(_configurations(found)), _others(found), _smoke(found)
     ends = (
         ("others", "Other results", more) if more else None,
+        ("smoke", "Smoke runs: toy sizes, no results", toys) if toys else None,
         ("configurations", "Configurations and versions", configurations),
         ("not-measured", "What was not measured", list(_not_measured(found))),
     )
@@ -152,37 +75,28 @@ def compose(found: Found) -> str:
             f"{len(found.shown)} figures and {found.tables} tables from {found.root.name or 'results'}, "
             f"{size:.1f} MiB. The page holds everything it shows and loads nothing."
         ),
-        html.paragraph(_absent_in_words(found), "first"),
     ]
     return html.page(TITLE, lead, contents, body)
-
-
-def _absent_in_words(found: Found) -> str:
-    count = sum(map(len, found.missing.values()))
-    said = f"{count} files that belong here were not found" if count else "Everything that belongs here is here"
-    broken = f", {len(found.problems)} could not be read" if found.problems else ""
-    return f"{said}{broken}: the last section says which, and what makes them."
 
 
 # Items
 
 
 def _item(item: Item, found: Found) -> str:
-    parts = [html.paragraph(item.text)] if item.text else []
-    parts += [html.paragraph(note) for note in _notes(item, found)]
-    parts += beside_print.published_tables(item.published, lambda name: _rows_of(Table(name, ""), found)[0])
-    found.tables += sum("<table>" in part for part in parts)
+    """What was measured of an item; nothing where that is nothing. What is missing goes into the list at the end."""
     absent: dict[str, list[str]] = {}
-    for one in item.pictures:
-        parts.append(_picture(one, item, found, absent))
-    for one in item.tables:
-        parts.append(_table(one, item, found, absent))
+    parts = beside_print.published_tables(item.published, lambda name: _rows_of(Table(name, ""), found)[0])
+    found.tables += sum("<table>" in part for part in parts)
+    parts += [_picture(one, item, found, absent) for one in item.pictures]
+    parts += [_table(one, item, found, absent) for one in item.tables]
     parts += [_named(name, item, found, absent) for name in item.data]
     for command, names in absent.items():
         found.missing.setdefault(command, []).extend(n for n in names if n not in found.missing.get(command, []))
-    lines = [f"{', '.join(map(html.code, names))}, made by {html.code(command)}" for command, names in absent.items()]
-    parts += [f'<p class="missing">Not measured: {line}.</p>' for line in lines]
-    return html.section(item.anchor, item.title, filter(None, parts), level=3)
+    measured = [part for part in parts if part]
+    if not measured:
+        return ""
+    told = [html.paragraph(text) for text in (item.text, *_notes(item, found)) if text]
+    return html.section(item.anchor, item.title, [*told, *measured], level=3)
 
 
 def _notes(item: Item, found: Found) -> Iterator[str]:
@@ -190,7 +104,7 @@ def _notes(item: Item, found: Found) -> Iterator[str]:
     for name in dict.fromkeys(one.file for one in item.tables if one.file.endswith(".json")):
         path = found.newest(name)
         numbers = None if path is None else found.read(path, read_json_object)
-        models = _rows((numbers or {}).get("models"))
+        models = rows_in((numbers or {}).get("models"))
         kinds = dict.fromkeys(f"{m.get('preset')}, {m.get('steps')} steps on {m.get('trained_on')}" for m in models)
         if kinds:
             yield f"{len(models)} trained models: {'; '.join(kinds)}."
@@ -277,6 +191,22 @@ def _others(found: Found) -> list[str]:
     return [*parts, *([html.paragraph("Named alone:"), html.bullets(names)] if names else [])]
 
 
+def _smoke(found: Found) -> list[str]:
+    """Pictures of smoke runs, and the names of their tables: never beside printed numbers."""
+    if not found.smoke:
+        return []
+    said = "Made with --preset smoke, in a minute, to see that all runs. These numbers say nothing of the methods."
+    parts, names = [html.paragraph(said, "problem")], []
+    for path in found.smoke:
+        told = f"smoke: {path.relative_to(found.root)}"
+        read = found.read(path, read_png) if path.suffix == ".png" else None
+        if read is not None:
+            parts.append(_figure(read, f"{told}.", told, found))
+        elif path.suffix != ".png":
+            names.append(html.code(str(path.relative_to(found.root))))
+    return [*parts, html.bullets(names)] if names else parts
+
+
 def _configurations(found: Found) -> Iterator[str]:
     versions = [{"what": "Python", "version": platform.python_version()}]
     for name in PACKAGES:
@@ -324,7 +254,7 @@ def _models(found: Found) -> Iterator[dict]:
     seen = set()
     for name, paths in sorted(found.files.items()):
         numbers = found.read(paths[0], read_json_object) if name.endswith(".json") else None
-        for model in _rows((numbers or {}).get("models")):
+        for model in rows_in((numbers or {}).get("models")):
             digest = str(model.get("sha256", ""))
             if digest not in seen:
                 seen.add(digest)
@@ -365,12 +295,8 @@ def _undecided(found: Found) -> Iterator[str]:
     """Conclusions whose interval leaves them open, by study."""
     for name, paths in sorted(found.files.items()):
         numbers = found.read(paths[0], read_json_object) if name.endswith(".json") else None
-        for one in _rows((numbers or {}).get("conclusions")):
+        for one in rows_in((numbers or {}).get("conclusions")):
             whole = "ranking" not in one or one.get("levels") == "all"
             if whole and "not decided" in (one.get("verdict"), one.get("ranking")):
                 told = one.get("claim") or f"ranking of codes, {one.get('laser')} laser, step {one.get('step')}"
                 yield f"{Path(name).stem}: {told}{f' ({why})' if (why := one.get('why')) else ''}"
-
-
-def _rows(value: Any) -> Sequence[Mapping[str, Any]]:
-    return [row for row in value if isinstance(row, Mapping)] if isinstance(value, list) else []

@@ -161,6 +161,7 @@ _FIGURES = Section(
                 Picture("depth-offset-2.png", "Error against compression near and 7 m farther, by design"),
                 Picture("depth-offset-ratios.png", "Far over near error of every seed, beside the bars set before"),
                 Picture("depth-offset-sweep.png", "Error against the offset, and where training depths end"),
+                Picture("depth-offset-range.png", "The end of the range: which step fails, and a wall"),
                 Picture("depth-offset-cause.png", "Cause and cure: random offsets in training, swapped codes"),
                 Picture("depth-offset-energy.png", "Energy of learned codes by time bin over the training"),
             ),
@@ -265,6 +266,17 @@ _BEYOND = Section(
                 Table("transport.json", "Scenes: indirect light, mixed pixels, rays", "scenes"),
             ),
             tuple(f"transport{name}.csv" for name in ("", "-summary", "-ranking", "-planned", "-scenes")),
+        ),
+        Item(
+            "multipath",
+            "Networks and the filter where light takes several paths",
+            "scene2spad study multipath",
+            (Picture("multipath.png", "Error against background of networks and filter, with and without multipath"),),
+            (
+                Table("multipath.json", "Networks beside the filter at 50 + 50 photons", "conclusions"),
+                Table("multipath.json", "MAE [mm] by room", "by_scene"),
+            ),
+            ("multipath.csv",),
         ),
         Item(
             "render-error",

@@ -26,7 +26,8 @@ def published_tables(which: str, rows_of: RowsOf) -> list[str]:
     if not which:
         return []
     if which == "power":
-        return [html.table(power_rows(rows_of("ultraphase.csv") or ()), "Published and emulated, program by program")]
+        rows = power_rows(rows_of("ultraphase.csv") or ())
+        return [html.table(rows, "Published and emulated, program by program")] if rows else []
     if which == "memory":
         return [html.table(statements(), "What S.6 states, and the same from the equations of Table 1")]
     study, _, figure = which.partition("/")
@@ -35,7 +36,7 @@ def published_tables(which: str, rows_of: RowsOf) -> list[str]:
         "MAE [mm] over the 5 Middlebury pairs at hand in the published convention, beside the published one over 8 "
         f"scenes and 16 photon levels; marked where ours is more than {WORSE:g} times that"
     )
-    return [html.table(rows, caption, most=200)]
+    return [html.table(rows, caption, most=200)] if rows else []
 
 
 def _wanted(study: str, figure: str) -> list[Wanted]:
@@ -47,11 +48,11 @@ def _wanted(study: str, figure: str) -> list[Wanted]:
 
 
 def error_rows(wanted: Iterable[Wanted], measured: Sequence[dict], far: bool) -> list[dict[str, object]]:
-    """A row a model: published and ours, as they are and with `far` 7 m farther too."""
+    """A row a measured model: published and ours, as they are and with `far` 7 m farther too."""
     ours, rows = {row.get("model"): row for row in measured}, []
     for one in wanted:
         print_, mine = printed(one), ours.get(one.name)
-        if print_ is None and mine is None:
+        if mine is None:
             continue
         row: dict[str, object] = {"design": one.label, "compression": f"{one.compression}x" if one.coded else "none"}
         for place in ("near", "far") if far else ("near",):
@@ -70,10 +71,12 @@ def _ratio(found: float | None, published: float | None) -> str:
 
 
 def power_rows(measured: Sequence[dict]) -> list[dict[str, object]]:
-    """A row a program: every published number, and the emulated one where it was measured."""
+    """A row a measured program: every published number, and the emulated one."""
     ours, rows = {row.get("name"): row for row in measured}, []
     for name, published in PUBLISHED.items():
-        mine, row = ours.get(name, {}), {"program": name}
+        mine, row = ours.get(name), {"program": name}
+        if mine is None:
+            continue
         for column in POWER_COLUMNS:
             row[f"{column} published"] = asdict(published)[column]
             row[f"{column} emulated"] = mine.get(f"emulated.{column}", NOT_MEASURED)

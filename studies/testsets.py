@@ -167,7 +167,7 @@ def _evaluate(
 
         return kept
 
-    draw = (seed * 1000 + view) * len(PHOTON_LEVELS) + PHOTON_LEVELS.index(level)
+    draw = _draw(seed, view, level)
     methods = {subject.digest: method(subject) for subject in subjects}
     found = evaluate(methods, one_view, Sensor(), levels=(level,), tile=TILE, offset_m=delay_m, seed=draw)
     for subject in subjects:
@@ -175,3 +175,11 @@ def _evaluate(
             store.put_map(estimates[subject.digest], subject.digest, **key)
         rows = [row for row in as_dicts(found.rows) if row["method"] == subject.digest]
         store.put(subject.digest, rows, **key)
+
+
+def _draw(seed: int, view: int, level: tuple[float, float]) -> int:
+    """Seed of the photons of a view at a level: numbered where it is one of the paper's, by its photons elsewhere."""
+    if level in PHOTON_LEVELS:
+        return (seed * 1000 + view) * len(PHOTON_LEVELS) + PHOTON_LEVELS.index(level)
+    milli = [round(1000 * photons) for photons in level]
+    return int(np.random.SeedSequence((seed, view, *milli)).generate_state(1)[0])

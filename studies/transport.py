@@ -65,6 +65,11 @@ class WithoutNetwork:
         return self._depth_of(histogram), 0
 
 
+def without_network(name: str) -> Subject:
+    """A method without a network, whose results are kept by its name."""
+    return Subject(name, WithoutNetwork(name), hashlib.sha256(f"{name} {FORMAT}".encode()).hexdigest())
+
+
 def run(command: Study, progress: Progress) -> dict:
     """Render, measure every design at every step, rank, compare plans; tables, JSON and figures in `command.out`."""
     plan, folder = PLANS[command.preset], command.out / command.preset
@@ -77,6 +82,7 @@ def run(command: Study, progress: Progress) -> dict:
     checked = [one for one in contenders if one.name in CHECKED]
     planned = planned_rows(places, checked, (plan.draws, plan.most_draws), store, command.seed, progress)
     numbers: dict[str, Any] = {
+        "preset": command.preset,
         **models.described(),
         "steps": STEPS,
         "conclusions": conclusions(ranked),
@@ -121,10 +127,9 @@ def contenders_of(plan: Plan, models: Obtained) -> list[Contender]:
     """The uncompressed estimator, codes decoded by correlation, and the networks that were found."""
     found = []
     for name in (UNCOMPRESSED, *plan.codes):
-        digest = hashlib.sha256(f"{name} {FORMAT}".encode()).hexdigest()
         ratio = 1 if name == UNCOMPRESSED else Sensor().bins // int(name.rpartition("-")[2])
         decoder = "likelihood" if name == UNCOMPRESSED else "correlation"
-        found.append(Contender(Subject(name, WithoutNetwork(name), digest), decoder, ratio))
+        found.append(Contender(without_network(name), decoder, ratio))
     for wanted, trained in models.found.items():
         found.append(Contender(trained.subject, "network", wanted.compression if wanted.coded else 1))
     return found
@@ -150,13 +155,13 @@ def _scenes(plan: Plan, seed: int) -> Iterator[tuple[str, str, Scene]]:
 
 def _place(name: str, laser: str, scene: Scene, plan: Plan, seed: int, folder: Path, progress: Progress) -> Place:
     progress(f"{scene.name}, {laser}", 0.0)
-    full = _rendered(scene, plan.full, seed, "full", folder, progress)
+    full = rendered_once(scene, plan.full, seed, "full", folder, progress)
     # its noise is its own
-    planned = _rendered(scene, plan.planned, seed + 1, "planned", folder, progress)
+    planned = rendered_once(scene, plan.planned, seed + 1, "planned", folder, progress)
     return Place(scene.name, name, laser, full, planned)
 
 
-def _rendered(
+def rendered_once(
     scene: Scene, settings: RenderSettings, seed: int, kind: str, folder: Path, progress: Progress
 ) -> Transient:
     """From the folder or made now; seconds go to timings.jsonl beside the results."""

@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from scenes.errors import require
 from scenes.files import read_array
 from spad.budget import Optics
 from spad.depth import confidence, laser_baseline_m
-from spad.detect import sense
+from spad.detect import expected_in_pixel, sense
 from spad.histogram import Histogram, write_histogram
 from spad.mat import write_mat
 from spad.pulse import Pulse, read_pulse
@@ -106,7 +107,9 @@ def run(command: Sense, progress: Progress) -> dict:
     if command.figure:
         from studies import figures
 
-        result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram")))
+        # a map of dark counts is not part of the rates that the figure could draw
+        rate = partial(expected_in_pixel, transient, sensor, budget, seed=command.seed) if dark_map is None else None
+        result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram"), expected=rate))
     return result
 
 

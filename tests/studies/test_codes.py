@@ -234,3 +234,26 @@ def test_both_ways_to_a_dense_histogram_agree():
     stamps, offsets = bench_encode.photons(np.random.default_rng(3), 2, (32, 4, 4))
     one, other = (way(stamps, offsets, (32, 4, 4)) for way in (bench_encode.dense, bench_encode.dense_of_sensor))
     assert torch.equal(one, other) and int(one.sum()) == len(stamps)
+
+
+def test_the_bound_is_not_hidden_behind_the_legend(tmp_path, monkeypatch):
+    """The legend lies outside every panel, and the line of the Cramer-Rao bound inside its own."""
+    kinds = [f"{kind}_{group}" for kind in ("mae_mm", "median_abs_mm", "bound_mm") for group in codes.GROUPS]
+    lines = [
+        {"method": method, "codes": number, **dict.fromkeys(kinds, 100.0 / (number or 512) + 1)}
+        for method, number in (("log-matched", 0), ("fourier", 8), ("fourier", 64))
+    ]
+    kept = []
+    monkeypatch.setattr(codes, "save", lambda figure, path: kept.append(figure) or path)
+    codes.draw(lines, "made up", tmp_path / "codes.png")
+    (figure,) = kept
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    panels = [axes.get_window_extent() for axes in figure.axes]
+    assert all(axes.get_legend() is None for axes in figure.axes)
+    assert not any(panel.overlaps(legend.get_window_extent()) for panel in panels)
+    assert "Cramer-Rao, uncompressed" in [text.get_text() for text in legend.get_texts()]
+    for axes in figure.axes[:2]:
+        bound = next(line for line in axes.lines if line.get_label() == "Cramer-Rao, uncompressed")
+        low, high = axes.get_ylim()
+        assert low < bound.get_ydata()[0] < high

@@ -87,7 +87,7 @@ def tree(tmp_path) -> Path:
     put(root / "bench/bench-sense.csv", 'name,seconds\n"cut')
     model = {
         "name": "fourier-1024x1x1-128x-s0",
-        "preset": "smoke",
+        "preset": "laptop",
         "steps": 8,
         "trained_on": "planes",
         "sha256": "ab" * 32,
@@ -128,10 +128,13 @@ def test_every_section_is_there_and_every_link_leads_somewhere(tree, capfd):
     ids = [attrs["id"] for _, attrs in page.seen if "id" in attrs]
     assert len(ids) == len(set(ids))
     expected = [one.anchor for part in SECTIONS for one in (part, *part.items)]
-    assert [one for one in ids if one in expected] == expected  # and in order: speed against error first
-    assert {"configurations", "not-measured", "others"} <= set(ids)
+    shown = [one for one in ids if one in expected]
+    # what was measured, in order, speed against error first; what was not makes no heading
+    assert shown == [one for one in expected if one in shown]
+    assert {"speed", "bench-render", "bench-hard-cases", "figure-12"} <= set(shown) and "bench-encode" not in shown
+    assert ids[-1] == "not-measured" and {"configurations", "others"} <= set(ids)
     links = [attrs["href"] for attrs in page.of("a")]
-    assert set(links) == {href for href in links if href[1:] in ids} and len(links) >= len(expected)
+    assert set(links) == {href for href in links if href[1:] in ids} and len(links) >= len(shown)
     assert text.startswith("<!DOCTYPE html>") and page.of("html")[0]["lang"] == "en"
     assert [tag for tag, _ in page.seen].count("h1") == 1 and len(page.of("title")) == 1
 
@@ -206,6 +209,28 @@ def test_only_the_chief_ratios_are_shown(tree, capfd):
     assert "12.35" in words and "not chief" not in words
 
 
+def test_measured_things_come_first_and_missing_ones_in_one_list_at_the_end(tree, capfd):
+    _, text = made(tree, capfd)
+    before, _, end = text.partition('<section id="not-measured"')
+    assert 'class="missing"' not in text and "not measured" not in before.partition("<main>")[2].lower()
+    assert "bench-encode.png" not in before and "bench-encode.png" in end
+    first = re.search(r"<h3>(.*?)</h3>", before)
+    assert first is not None and first[1] == "Rendering"
+
+
+def test_smoke_results_stand_apart_and_never_beside_print(tree, capfd):
+    numbers = json.loads((tree / "study/fourier.json").read_text())
+    for told in ({"preset": "smoke"}, {"models": [{**numbers["models"][0], "preset": "smoke"}]}):
+        put(tree / "study/fourier.json", {**numbers, **told})
+        _, text = made(tree, capfd)
+        page = Page(text)
+        ids = [attrs["id"] for _, attrs in page.seen if "id" in attrs]
+        assert "smoke" in ids and "80.68" not in text and "40.34" not in text
+        smoke = text[text.index('<section id="smoke"') : text.index('<section id="configurations"')]
+        assert base64.b64encode(png(3)).decode() in smoke + text and "smoke: study/fourier-12-128x.png" in smoke
+        assert "study/fourier-published.csv" in smoke and not page.wrong and not page.open
+
+
 def test_an_empty_folder_makes_a_page_of_what_is_missing(tmp_path, capfd):
     (tmp_path / "results").mkdir()
     told, text = made(tmp_path / "results", capfd)
@@ -213,7 +238,7 @@ def test_an_empty_folder_makes_a_page_of_what_is_missing(tmp_path, capfd):
     assert not page.wrong and not page.open and told["figures"] == 0
     expected = {name.file for part in SECTIONS for item in part.items for name in (*item.pictures, *item.tables)}
     assert expected <= {name for one in told["missing"] for name in one["files"]}
-    assert "not measured" in page.words  # beside every published number
+    assert not page.of("img") and page.words.count("Not found, and the command that makes it") == 1
 
 
 def test_the_same_results_give_the_same_page(tree, capfd):
@@ -268,7 +293,7 @@ def test_published_numbers_stand_beside_ours():
     one, other = Wanted("fourier", (1024, 1, 1)), Wanted("gray", (1024, 1, 1))
     rows = report_published.error_rows([one, other], [{"model": one.name, "near_mae_mm_label": 80.68}], far=False)
     assert rows[0]["near published"] == 40.34 and rows[0]["near ours / published"] == "2.00 worse"
-    assert rows[1]["near ours"] == "not measured" and rows[1]["near ours / published"] == ""
+    assert len(rows) == 1  # print stands beside what was measured, alone beside nothing
 
 
 @pytest.mark.parametrize(

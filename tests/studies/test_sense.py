@@ -2,16 +2,21 @@
 
 import csv
 import json
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import scipy.io
 
 from render.transient import write_transient
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from spad.detect import expected_in_pixel, sense
 from spad.histogram import read_histogram
 from spad.mat import read_mat
 from spad.rgbd import transient_from_rgbd
-from spad.sensor import sensor_by_name
+from spad.sensor import PhotonBudget, sensor_by_name
+from studies import figures
 from studies.bench import estimators
 from studies.bench.sense import alternating, one_law, relief
 from studies.cli import main
@@ -133,3 +138,30 @@ def test_bench_sense(tmp_path, capfd):
     assert all(row["same_law_p"] is None or row["same_law_p"] > 1e-4 for row in said["rows"])
     with (tmp_path / "b" / "bench-sense.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(said["rows"])
+
+
+def test_the_figure_shows_pixels_by_a_stated_rule_with_their_rates_over_the_counts(scene, tmp_path, monkeypatch):
+    """At 10 + 200 photons the rate still peaks at the true depth, where counts alone would not."""
+    budget = PhotonBudget(10, 200)
+    histogram = sense(scene, sensor_by_name("reference"), budget, seed=1)
+    shown = figures.shown_pixels(histogram)
+    signal = histogram.expected_signal
+    for name, rank in (("dark", 0.1), ("median", 0.5), ("bright", 0.9)):
+        below = (signal < signal[shown[name]]).mean()
+        assert abs(below - rank) < 0.02  # 80 pixels
+    mixed = replace(histogram, mixed=signal > np.median(signal))
+    assert all(not mixed.mixed[place] for place in figures.shown_pixels(mixed).values())
+    kept = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: kept.append(figure) or path)
+    rate = partial(expected_in_pixel, scene, histogram.sensor, budget)
+    figures.draw_histogram(histogram, tmp_path / "h.png", expected=rate)
+    panels = {axes.get_title().split(" pixel")[0]: axes for axes in kept[0].axes if " pixel (" in axes.get_title()}
+    assert [*panels] == ["dark", "median", "bright"]
+    for name, axes in panels.items():
+        counts, expected = axes.patches
+        depth_ns = 2e9 * float(histogram.depth_m[shown[name]]) / SPEED_OF_LIGHT_M_PER_S
+        values, edges, _ = expected.get_data()
+        centre = 0.5 * (edges[values.argmax()] + edges[values.argmax() + 1])
+        assert abs(centre - depth_ns) < 0.1  # one bin
+        assert counts.get_data()[0].sum() == histogram.counts[shown[name]].sum()
+        assert axes.get_xlim()[0] < depth_ns < axes.get_xlim()[1]
