@@ -1,0 +1,317 @@
+"""The chain in functions: a scene is rendered, sensed and turned into depth, with NumPy arrays between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from scenes.errors import InputError, did_you_mean
+
+if TYPE_CHECKING:
+    from csph.cards import Card
+    from csph.coding import CodingTensor
+    from csph.model import DepthModel
+    from render.transient import Transient
+    from scenes.model import Scene
+    from spad.budget import Optics
+    from spad.histogram import Histogram
+    from spad.sensor import Sensor
+
+Progress = Callable[[str, float], None]
+Law = Literal["auto", "poisson", "first-photon", "free-running"]
+
+
+def render(
+    scene: Scene | str | Path,
+    *,
+    seed: int = 0,
+    width: int | None = None,
+    height: int | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> Transient:
+    """Render the time-resolved radiance of a scene.
+
+    Parameters
+    ----------
+    scene : Scene, str or Path
+        A scene, the name of a built-in one (``scene2spad scenes`` lists them), or a file: a mesh (.obj .ply .stl .glb)
+        or a Mitsuba scene (.xml).
+    seed : int
+        Seed of everything random. The same seed gives the same bytes.
+    width, height : int, optional
+        Image size in pixels of a scene that is loaded by name or from a file. One alone keeps the proportions.
+    progress : callable, optional
+        Called with what is done and the share that is done, 0 to 1.
+    **settings
+        Fields of `RenderSettings`, above all ``error`` (target of the relative error, 0.02 if left out), ``budget``
+        (signal and background photons per pixel: as fine as their shot noise can show), ``bounces`` (1: direct light
+        alone), ``spp`` and ``filter``.
+
+    Returns
+    -------
+    Transient
+        Returns of every pixel: intervals of path length [m] and radiance [1/(m^2 sr)] per joule of the pulse, with
+        depth [m], normals and albedo beside them. ``meta["relative_error"]`` holds the error that the render states,
+        ``meta["target_met"]`` whether that is within the target.
+
+    Raises
+    ------
+    InputError
+        For an unknown name or setting, a bad file, or a value out of range.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> transient = s2s.render("plane", width=8, height=6, bounces=1)
+    >>> transient.depth_m.shape
+    (6, 8)
+    """
+    from render.engine import render as render_scene
+    from render.settings import RenderSettings
+    from scenes.catalog import load_scene
+    from scenes.model import Scene
+
+    known = [field.name for field in fields(RenderSettings)]
+    for name in settings:
+        if name not in known:
+            raise InputError(f"render: setting {name!r} is unknown{did_you_mean(name, known)}")
+    if not isinstance(scene, Scene):
+        scene = load_scene(str(scene), seed=seed, width=width, height=height)
+    elif width is not None or height is not None:
+        raise InputError("render: a Scene has its own camera; width and height go with a name or a file")
+    return render_scene(scene, RenderSettings(**settings), seed=seed, progress=progress)
+
+
+def sense(
+    transient: Transient,
+    *,
+    signal: float = 50.0,
+    background: float = 50.0,
+    sensor: Sensor | str = "reference",
+    optics: Optics | None = None,
+    law: Law = "auto",
+    seed: int = 0,
+) -> Histogram:
+    """Record one exposure of a transient with a single-photon sensor.
+
+    Parameters
+    ----------
+    transient : Transient
+        What `render` or `read_transient` gives.
+    signal, background : float
+        Mean detections per pixel and exposure, over all pixels. The background includes dark counts. With `optics`
+        they are computed instead.
+    sensor : Sensor or str
+        A sensor, or the name of a preset: reference, iccv2023-train, linospad.
+    optics : Optics, optional
+        Laser energy, lens and filter: the photon budget is computed from them.
+    law : str
+        Detection law: auto, poisson, first-photon or free-running. ``meta["plan"]`` says why auto chose one.
+    seed : int
+        Seed of the photons.
+
+    Returns
+    -------
+    Histogram
+        ``counts`` (H, W, T) int32, with the sensor, and the true ``depth_m`` (H, W) beside them.
+
+    Raises
+    ------
+    InputError
+        For an unknown sensor or law, or a budget out of range.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> transient = s2s.render("plane", width=8, height=6, bounces=1)
+    >>> s2s.sense(transient, signal=20, background=5).counts.shape
+    (6, 8, 1024)
+    """
+    from spad.detect import sense as sense_exposure
+    from spad.sensor import PhotonBudget, sensor_by_name
+
+    chosen = sensor_by_name(sensor) if isinstance(sensor, str) else sensor
+    budget = optics.budget(transient, chosen) if optics is not None else PhotonBudget(signal, background)
+    return sense_exposure(transient, chosen, budget, seed=seed, model=law)
+
+
+def estimate_depth(histogram: Histogram, method: str | CodingTensor | DepthModel = "log-matched") -> np.ndarray:
+    """Estimate the radial depth of every pixel.
+
+    Parameters
+    ----------
+    histogram : Histogram
+        What `sense`, `read_histogram` or `read_mat` gives.
+    method : str, CodingTensor or DepthModel
+        A classical estimator (argmax, matched, log-matched, correlation, coates), the name or file of a trained
+        network (`models` lists those that come with the package), a network that `load_model` gave, or a temporal
+        coding tensor, whose codes are decoded by correlation.
+
+    Returns
+    -------
+    numpy.ndarray
+        Depth in metres, (H, W) float32. NaN where a classical estimator finds no photon. A displaced laser is
+        corrected for.
+
+    Raises
+    ------
+    InputError
+        For an unknown method, or a network of another sensor.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> transient = s2s.render("plane", width=8, height=8, bounces=1)
+    >>> histogram = s2s.sense(transient, signal=200, background=20, seed=3)
+    >>> depth_m = s2s.estimate_depth(histogram, "log-matched")
+    >>> bool(abs(depth_m - histogram.depth_m).max() < 0.05)
+    True
+    >>> coded = s2s.estimate_depth(histogram, s2s.coding_tensor("fourier", 16))
+    >>> coded.shape
+    (8, 8)
+    """
+    from spad.depth import METHODS, histogram_depth_m
+
+    if isinstance(method, str) and method in METHODS:
+        return histogram_depth_m(histogram, method)
+    from csph import CodingTensor, decode_depth, encode
+
+    if isinstance(method, CodingTensor):
+        coding = method
+        return histogram_depth_m(histogram, lambda counts, sensor: decode_depth(encode(counts, coding), coding, sensor))
+    if isinstance(method, str):
+        try:
+            method = load_model(method)
+        except InputError as error:
+            raise InputError(
+                f"depth method {method!r} is none of {', '.join(METHODS)}, and no network: {error}"
+            ) from None
+    return method.estimate(histogram).depth_m
+
+
+def coding_tensor(code: str, codes: int, sensor: Sensor | str = "reference", *, seed: int = 0) -> CodingTensor:
+    """Make the coding tensor of a pixel on its own: K codes of all time bins.
+
+    Parameters
+    ----------
+    code : str
+        fourier (truncated), gray, coarse, hadamard or random.
+    codes : int
+        The number K of codes, at least 2.
+    sensor : Sensor or str
+        The sensor whose bins are coded.
+    seed : int
+        Seed of random codes.
+
+    Returns
+    -------
+    CodingTensor
+        ``temporal`` (K, T): a detection in bin t adds column t to the pixel's K codes.
+
+    Raises
+    ------
+    InputError
+        For an unknown code, or more codes than it has.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> tuple(s2s.coding_tensor("gray", 16).temporal.shape)
+    (16, 1024)
+    """
+    from csph import CodingTensor, temporal_code
+    from spad.sensor import sensor_by_name
+
+    chosen = sensor_by_name(sensor) if isinstance(sensor, str) else sensor
+    return CodingTensor(f"{code}-{codes}", temporal_code(code, codes, chosen.bins, chosen, seed))
+
+
+def depth_errors(depth_m: np.ndarray, histogram: Histogram, *, unmixed: bool = False) -> dict[str, float | int]:
+    """Compare a depth map with the truth that a histogram carries.
+
+    Parameters
+    ----------
+    depth_m : numpy.ndarray
+        Depth in metres, (H, W).
+    histogram : Histogram
+        The histogram that the depth was estimated from.
+    unmixed : bool
+        Leave out pixels that see surfaces more than 50 mm apart.
+
+    Returns
+    -------
+    dict
+        ``mae_mm``, ``rmse_mm``, ``median_mm`` (signed) and ``within_10mm`` (a share) over ``pixels`` pixels; the
+        numbers of pixels left out are ``empty``, ``beyond_range`` and ``missing``.
+
+    Raises
+    ------
+    InputError
+        For a depth map of another size.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> histogram = s2s.sense(s2s.render("plane", width=8, height=6, bounces=1))
+    >>> s2s.depth_errors(histogram.depth_m, histogram)["mae_mm"]
+    0.0
+    """
+    from spad.depth import depth_errors as compared
+
+    exclude = histogram.mixed if unmixed else None
+    return compared(depth_m, histogram.depth_m, range_m=histogram.sensor.range_m, exclude=exclude)
+
+
+def models() -> list[Card]:
+    """List the networks that come with the package.
+
+    Returns
+    -------
+    list of Card
+        Of each its ``name``, design, training set, photon levels, error, and what it must not be used for.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> "learned-256x4x4-128x-s0" in [card.name for card in s2s.models()]
+    True
+    """
+    from csph.cards import cards
+
+    return cards()
+
+
+def load_model(name: str | Path) -> DepthModel:
+    """Load a trained depth network.
+
+    Parameters
+    ----------
+    name : str or Path
+        The name of a network that comes with the package (see `models`), a checkpoint (.safetensors), or the folder
+        of a run of ``scene2spad train``.
+
+    Returns
+    -------
+    DepthModel
+        A torch module in evaluation mode. ``estimate(histogram)`` gives its depth and confidence.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or a file that is no checkpoint.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> s2s.load_model("learned-256x4x4-128x-s0").config.block
+    (256, 4, 4)
+    """
+    from csph.cards import checkpoint_of
+    from csph.model import load_model as load
+
+    return load(checkpoint_of(name))[0]

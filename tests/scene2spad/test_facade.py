@@ -1,0 +1,78 @@
+"""The public names: they exist, they start nothing, and their examples run."""
+
+import doctest
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import scene2spad as s2s
+from spad.depth import histogram_depth_m
+
+HEAVY = ("mitsuba", "drjit", "torch", "matplotlib", "scipy", "h5py", "OpenEXR", "trimesh")
+
+
+def test_importing_starts_nothing():
+    asked = f"import sys, scene2spad; print([n for n in {HEAVY} if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def test_every_public_name_is_there_and_listed_once():
+    assert len(set(s2s.__all__)) == len(s2s.__all__) == len(s2s._HOME)
+    assert set(s2s.__all__) == set(s2s._HOME) <= set(dir(s2s))
+    for name in s2s.__all__:
+        assert getattr(s2s, name).__doc__, name
+    assert s2s.__version__.count(".") == 2
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'rendr'"):
+        s2s.rendr  # noqa: B018
+
+
+@pytest.mark.parametrize("name", s2s._MODULE_OF["scene2spad.chain"])
+def test_examples_of_the_chain_run(name):
+    found = doctest.DocTestFinder().find(getattr(s2s, name), name, globs={})
+    assert any(one.examples for one in found)
+    for one in found:
+        assert doctest.DocTestRunner().run(one).failed == 0
+
+
+@pytest.fixture(scope="module")
+def histogram():
+    return s2s.sense(s2s.render("plane", width=16, height=16, bounces=1), signal=100, background=20, seed=2)
+
+
+def test_depth_is_that_of_the_parts(histogram):
+    assert np.array_equal(s2s.estimate_depth(histogram, "matched"), histogram_depth_m(histogram, "matched"))
+    model = s2s.load_model("learned-256x4x4-128x-s0")
+    by_name = s2s.estimate_depth(histogram, "learned-256x4x4-128x-s0")
+    assert np.array_equal(by_name, s2s.estimate_depth(histogram, model))
+    assert s2s.depth_errors(by_name, histogram)["mae_mm"] < 100
+
+
+def test_optics_compute_the_photon_budget():
+    transient = s2s.render("plane", width=8, height=6, bounces=1)
+    lens = {"focal_length_m": 0.01, "f_number": 2.0, "pixel_pitch_m": 20e-6}
+    twice = [s2s.sense(transient, optics=s2s.Optics(pulse_energy_j=energy, **lens)) for energy in (1e-9, 2e-9)]
+    ratio = twice[1].expected_signal.mean() / twice[0].expected_signal.mean()
+    assert ratio == pytest.approx(2, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda h: s2s.render("plane", eror=0.1), "setting 'eror' is unknown; did you mean 'error'"),
+        (lambda h: s2s.render(s2s.load_scene("plane"), width=8), "own camera"),
+        (lambda h: s2s.render("galery"), "gallery"),
+        (lambda h: s2s.estimate_depth(h, "log-machted"), "log-matched"),
+        (lambda h: s2s.load_model("nosuch"), "nosuch"),
+        (lambda h: s2s.coding_tensor("furier", 8), "furier"),
+    ],
+)
+def test_mistakes_are_one_line(histogram, call, said):
+    with pytest.raises(s2s.InputError, match=said) as caught:
+        call(histogram)
+    assert "\n" not in str(caught.value)
