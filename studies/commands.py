@@ -94,7 +94,8 @@ class Evaluate(Common):
     tiled: bool = False
     """Cut images to what the blocks of all networks tile, instead of reflecting what is missing."""
     set: Path
-    """Folder of a set that `dataset` rendered, or its pack (.h5)."""
+    """Folder of a set that `dataset` rendered, or its pack (.h5); published: the paper's pairs that lie beside the
+    project, in its own simulation, read by both decoders."""
     baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
     """Estimators of `depth`, and CODE-K decoded without a network."""
     views: Count = None

@@ -20,6 +20,7 @@ from csph import CodingTensor, blocks, decode_depth, encode
 from csph.evaluation import Row
 from csph.layer import CompressiveLayer
 from csph.model import DepthModel
+from csph.posterior import Decoder
 from spad.detect import sense
 from spad.histogram import Histogram
 from spad.sensor import PhotonBudget, Sensor
@@ -57,6 +58,7 @@ class NearPlace(nn.Module):
     def __init__(self, network: nn.Module, bins: int) -> None:
         super().__init__()
         self.network, self.bins = network, bins
+        self.coarsest, self.reach = network.coarsest, network.reach  # what cuts images into tiles asks for them
 
     def forward(self, x: Tensor) -> Tensor:
         return self.network(x.roll(-self.bins, 2)).roll(self.bins, 1)
@@ -80,7 +82,9 @@ class Correlated:
     def __init__(self, coding: CodingTensor) -> None:
         self.coding = coding
 
-    def depth_of(self, histogram: Histogram, *, int8: bool = False) -> tuple[np.ndarray, int]:
+    def depth_of(
+        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None
+    ) -> tuple[np.ndarray, int]:
         codes = encode(torch.from_numpy(histogram.counts), self.coding)
         return decode_depth(codes, self.coding, histogram.sensor).numpy(), 0
 

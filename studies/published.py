@@ -20,9 +20,14 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from csph.cards import checkpoint_of
+from csph.grid import published_centroid_bins
 from csph.metrics import PHOTON_LEVELS, image_errors
+from csph.model import DepthModel, load_model
+from csph.posterior import DECODERS, Decoder
 from render.tracing import Progress
-from scenes.errors import InputError
+from scenes.errors import InputError, require
+from scenes.files import write_csv
 from scenes.relief import (
     MIDDLEBURY_BASELINE_M,
     MIDDLEBURY_FOCAL_PX,
@@ -32,10 +37,11 @@ from scenes.relief import (
     read_levels,
 )
 from spad.histogram import Histogram
-from spad.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, from_rgbd, published_taps
+from spad.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, from_rgbd
 from spad.sensor import PhotonBudget, Sensor
+from studies.commands import Evaluate
 from studies.store import Store
-from studies.trained import Subject, Wanted
+from studies.trained import FindsDepth, Subject, Wanted
 
 log = logging.getLogger("scene2spad")
 
@@ -206,17 +212,71 @@ def _drawn(pair: Pair, level: tuple[float, float], offset_m: float, key: tuple[i
 
 
 def _errors(subject: Subject, histogram: Histogram) -> dict[str, float]:
+    return errors_as_published(subject.model, histogram, "soft-argmax")
+
+
+def errors_as_published(model: FindsDepth, histogram: Histogram, decoder: Decoder) -> dict[str, float]:
+    """Compare a model with the published label and with the pulse's arrival: MAE, RMSE [mm], share within 10 mm.
+
+    Models of the published grid know the label alone: their columns of the arrival mean nothing.
+    """
     sensor = histogram.sensor
-    depth, _ = subject.model.depth_of(histogram, decoder="soft-argmax")  # as published
+    depth, _ = model.depth_of(histogram, decoder=decoder)
     bins = depth.astype(np.float64) / sensor.bin_depth_m
     step_m = PUBLISHED_SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s / 2
-    taps = published_taps(sensor)
-    early = float(taps @ np.arange(len(taps)) - taps.argmax())  # of the centroid, in bins after the fullest
+    early = published_centroid_bins(sensor)  # in bins after the fullest
     found = {}
     for name, estimate in (("label", bins - 0.5), ("arrival", bins - 0.5 - early)):
         errors = image_errors(estimate * step_m, histogram.depth_m, range_m=np.inf)
         found |= {f"{figure}_{name}": errors[figure] for figure in ("mae_mm", "rmse_mm", "within_10mm")}
     return found
+
+
+def evaluate_as_published(
+    models: Mapping[str, DepthModel], *, seed: int = 0, offset_m: float = 0.0, progress: Progress
+) -> list[dict[str, object]]:
+    """Evaluate models on the paper's pairs in its own simulation, a row a model, pair, level and decoder.
+
+    `reference` is what a model is compared with: the published label for models of the published grid, the pulse's
+    arrival for ours, whose labels are centred on the pulse. Raises InputError where no pair is found.
+    """
+    photographs, rows = pairs(), []
+    for number, pair in enumerate(photographs):
+        for place, level in enumerate(PHOTON_LEVELS):
+            progress(f"{pair.name}, {level[0]:g} + {level[1]:g}", number / len(photographs))
+            histogram = _drawn(pair, level, offset_m, (seed, number, place))
+            for name, model in models.items():
+                reference = "label" if model.config.grid == "published" else "arrival"
+                for decoder in DECODERS:
+                    errors = errors_as_published(model, histogram, decoder)
+                    told = {"model": name, "pair": pair.name, "signal": level[0], "background": level[1]}
+                    told |= {"decoder": decoder, "reference": reference}
+                    kept = {figure: errors[f"{figure}_{reference}"] for figure in ("mae_mm", "rmse_mm", "within_10mm")}
+                    rows.append({**told, **kept, "mae_mm_label": errors["mae_mm_label"]})
+    return rows
+
+
+def run_evaluate(command: Evaluate, progress: Progress) -> dict:
+    """Networks on the paper's pairs in its own simulation, by both decoders: a table (.csv), and the means."""
+    named = {str(path): load_model(checkpoint_of(path))[0] for path in command.checkpoints}
+    require(bool(named), "evaluate: give at least one checkpoint")
+    rows = evaluate_as_published(named, seed=command.seed, offset_m=command.offset, progress=progress)
+    command.out.mkdir(parents=True, exist_ok=True)
+    table = write_csv(rows, command.out / "evaluation-published.csv")
+    return {"means": told_as_published(rows), "csv": str(table)} | ({"rows": rows} if command.json else {})
+
+
+def told_as_published(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    """Say the means over pairs and levels of `evaluate_as_published`, a line a model and decoder."""
+    said = []
+    for name, decoder in dict.fromkeys((row["model"], row["decoder"]) for row in rows):
+        mine = [row for row in rows if (row["model"], row["decoder"]) == (name, decoder)]
+        means = {figure: float(np.mean([row[figure] for row in mine])) for figure in ("mae_mm", "rmse_mm")}
+        said.append(
+            f"{name}, {decoder}: MAE {means['mae_mm']:.2f} mm, RMSE {means['rmse_mm']:.2f} mm against the "
+            f"{mine[0]['reference']}"
+        )
+    return said
 
 
 def available(count: int | None) -> tuple[list[Pair], str]:

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from csph.cards import shipped_model
 from csph.evaluation import Row
+from csph.model import load_model
 from render.pack import write_pack
 from spad.detect import sense
 from spad.rgbd import from_rgbd, published_taps
@@ -202,6 +204,24 @@ def test_published_rows_stand_beside_ours(tmp_path):
 
 def run(out: Path, *more: str) -> int:
     return main(["study", "depth-offset", "--preset", "smoke", "--out", str(out), "--json", *more])
+
+
+def test_evaluate_on_the_published_pairs_reads_both_decoders(tmp_path, monkeypatch, capfd):
+    """Ours against the arrival, those of the published grid against the label; soft-argmax as the study has it."""
+    rng = np.random.default_rng(5)
+    pair = published.Pair("made-up", 1.5 + 0.2 * rng.random((16, 16)), 0.2 + 0.6 * rng.random((16, 16)))
+    monkeypatch.setattr(published, "pairs", lambda count=None: [pair])
+    monkeypatch.setattr(published, "PHOTON_LEVELS", ((50.0, 50.0),))
+    name = "learned-256x4x4-128x-s0"
+    assert main(["evaluate", name, "--set", "published", "--out", str(tmp_path), "--json"]) == 0
+    told = json.loads(capfd.readouterr().out.splitlines()[-1])
+    soft, median = told["rows"]
+    assert (soft["decoder"], median["decoder"]) == ("soft-argmax", "median") and soft["reference"] == "arrival"
+    model = load_model(shipped_model(name))[0]
+    drawn = published._drawn(pair, (50.0, 50.0), 0.0, (0, 0, 0))
+    assert soft["mae_mm"] == published.errors_as_published(model, drawn, "soft-argmax")["mae_mm_arrival"]
+    assert len(told["means"]) == 2 and (tmp_path / "evaluation-published.csv").is_file()
+    assert 0 < median["mae_mm"] < 100
 
 
 def test_no_model_and_bad_models_are_one_line(capfd, tmp_path, monkeypatch):

@@ -1,0 +1,79 @@
+"""README and guides: short, every link leads somewhere, every command exists, the Python example runs."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from studies.cli.main import RUNNERS, main
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+COMMANDS = {command.__name__.lower() for command in RUNNERS}
+WORDS = 1000
+IN_CODE = re.compile(r"`[^`\n]+`|^    .*$|```.*?```", re.M | re.S)
+
+
+def _links(page: Path) -> list[str]:
+    return re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+
+
+def test_the_front_page_is_one_page():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= WORDS
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page):
+    for link in _links(page):
+        name, _, anchor = link.partition("#")
+        if name.startswith(("http:", "https:")):
+            continue
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), f"{page.name}: {link}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), re.M)
+            anchors = [re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings]
+            assert anchor in anchors, f"{page.name}: {link}"
+
+
+def test_every_page_can_be_reached_from_the_front_page():
+    reached, waiting = set(), [ROOT / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        if page in reached or page.suffix != ".md":
+            continue
+        reached.add(page)
+        waiting += [(page.parent / link.partition("#")[0]).resolve() for link in _links(page) if "://" not in link]
+    assert {page.resolve() for page in PAGES} == {page.resolve() for page in reached}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_named_exists(page):
+    code = "\n".join(IN_CODE.findall(page.read_text(encoding="utf-8")))
+    named = set(re.findall(r"(?<!import )scene2spad ([a-z][a-z-]*)", code))
+    assert named <= COMMANDS, f"{page.name}: {sorted(named - COMMANDS)}"
+
+
+def test_the_worked_example_of_the_photon_budget_runs(tmp_path, monkeypatch, capfd):
+    """The page's wall, its command and its numbers: 163.9 signal and 408,089 background photons."""
+    text = (ROOT / "docs/radiometric.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block, "radiometric.md", "exec"), {})
+    (command,) = re.findall(r"scene2spad (sense wall\.exr.*?)\n    scene2spad", text, re.S)
+    assert main([*command.replace("\\\n", " ").split(), "--no-figure", "--json"]) == 0
+    told = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert told["mean_signal"] == pytest.approx(163.9, abs=0.1)
+    assert told["mean_background"] == pytest.approx(408089, rel=2e-4)
+    assert told["model"] == "first-photon"
+
+
+@pytest.mark.slow
+def test_the_python_example_of_the_front_page_runs(tmp_path):
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    done = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "mae_mm" in done.stdout
