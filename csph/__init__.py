@@ -5,7 +5,7 @@ from csph.coding import CodingTensor, encode, encode_timestamps
 from csph.decode import decode_depth
 from csph.design import Design
 from csph.layer import CompressiveLayer, LayerOptions, make_coding
-from csph.quantise import Quantised, encode_int16, quantised
+from csph.quantise import Quantised, encode_int16, published_int8, quantised
 
 __all__ = [
     "CodingTensor",
@@ -18,6 +18,7 @@ __all__ = [
     "encode_int16",
     "encode_timestamps",
     "make_coding",
+    "published_int8",
     "quantised",
     "temporal_code",
     "truncated_fourier",

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from scenes.errors import InputError, require
 
-CODES = ("learned", "fourier", "gray", "coarse", "hadamard", "random")
-_QUARTER_WAVE = ("fourier", "gray")
+CODES = ("learned", "fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
+_QUARTER_WAVE = ("fourier", "gray", "fourier-published", "gray-published")
 _COUNTED = ("coarse", "hadamard")  # an entry follows from its place: nothing is stored
 
 

@@ -14,13 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from csph.backbone import DeepBoosting, parameters_of
+from csph.blocks import encode_blocks
 from csph.compact import Compact
 from csph.config import ModelConfig, TrainConfig
 from csph.grid import published_position
 from csph.images import TILE, WHOLE_PIXELS, Span, spans
 from csph.layer import CompressiveLayer
 from csph.posterior import Decoder, confidence, decoded
-from csph.quantise import encode_int16, quantised
+from csph.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8, quantised
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.inputs import regular_file
@@ -111,7 +112,13 @@ class DepthModel(nn.Module):
 
     @torch.no_grad()
     def estimate(
-        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None, tile: int | None = None
+        self,
+        histogram: Histogram,
+        *,
+        int8: bool = False,
+        int8_rule: Int8Rule = "calibrated",
+        decoder: Decoder | None = None,
+        tile: int | None = None,
     ) -> Estimate:
         """Estimate radial depth and confidence of a histogram of any size; decoder as in `position`.
 
@@ -119,9 +126,11 @@ class DepthModel(nn.Module):
 
         What blocks do not tile is reflected at the end; images over `WHOLE_PIXELS` go through in tiles of `tile` pixels
         (default: `TILE`; smaller images in tiles only if it is given) whose halo holds all that the network sees.
-        `int8`: codes of 8-bit weights summed in 16 bits; the decoder keeps float32. Raises InputError for another
-        sensor's histogram.
+        `int8`: codes of 8-bit weights summed in 16 bits (`csph.quantise.quantised`), or with the rule "published" of
+        weights rounded to 8 bits and summed in float32 (`published_int8`); the decoder keeps float32. Raises InputError
+        for another sensor's histogram.
         """
+        require(int8_rule in INT8_RULES, f"8-bit rule {int8_rule!r} is unknown, expected {' or '.join(INT8_RULES)}")
         self.check_histogram(histogram)
         device = next(self.parameters()).device
         rows, columns, bins = histogram.counts.shape
@@ -136,7 +145,10 @@ class DepthModel(nn.Module):
             size = (1, 1, bins, len(down.read), len(across.read))
             counts = torch.from_numpy(part).reshape(-1, bins).T.contiguous().view(size)
             inside = tuple(slice(one.inner, one.inner + one.own.stop - one.own.start) for one in (down, across))
-            logits, wrapped = self._logits_int8(counts, inside) if int8 else (self(counts.to(device).float()), 0)
+            if int8:
+                logits, wrapped = self._logits_int8(counts, inside, int8_rule)
+            else:
+                logits, wrapped = self(counts.to(device).float()), 0
             overflows += wrapped
             logits = logits[..., inside[0], inside[1]]
             place = decoded(logits, decoder or self.config.decoder)
@@ -144,13 +156,17 @@ class DepthModel(nn.Module):
             depth[down.own, across.own] = (self._on_grid(place) * self.config.sensor.bin_depth_m)[0].cpu()
         return Estimate(radial_depth_of(histogram, depth), sure, overflows)
 
-    def _logits_int8(self, counts: Tensor, inside: tuple[slice, slice]) -> tuple[Tensor, int]:
+    def _logits_int8(self, counts: Tensor, inside: tuple[slice, slice], rule: Int8Rule) -> tuple[Tensor, int]:
         """Logits from codes of 8-bit weights, and how many sums wrapped of the blocks that reach `inside`."""
         if self.layer is None:
             raise InputError(f"{self.config.name}: has no codes to hold in 8 bits")
-        tensor = quantised(self.layer.coding())
+        coding = self.layer.coding()
+        if rule == "published":
+            weights = published_int8(coding).tensor.to(self.layer.temporal.device)
+            return self.network(self.layer.decode(encode_blocks(counts.to(weights.device), weights))), 0
+        tensor = quantised(coding)
         codes, _ = encode_int16(counts, tensor)
-        logits = self.network(self.layer.decode(codes.float() * tensor.scale))
+        logits = self.network(self.layer.decode(codes.to(self.layer.temporal.device).float() * tensor.scale))
         blocks = (
             slice(one.start, -(-one.stop // side) * side)
             for one, side in zip(inside, self.config.block[1:], strict=True)
@@ -158,10 +174,15 @@ class DepthModel(nn.Module):
         return logits, encode_int16(counts[(..., *blocks)], tensor).overflows
 
     def depth_of(
-        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None
+        self,
+        histogram: Histogram,
+        *,
+        int8: bool = False,
+        int8_rule: Int8Rule = "calibrated",
+        decoder: Decoder | None = None,
     ) -> tuple[np.ndarray, int]:
         """Depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped (0 without int8)."""
-        found = self.estimate(histogram, int8=int8, decoder=decoder)
+        found = self.estimate(histogram, int8=int8, int8_rule=int8_rule, decoder=decoder)
         return found.depth_m, found.overflows
 
 

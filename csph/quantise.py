@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -11,11 +11,14 @@ from torch import Tensor
 
 from csph.blocks import encode_blocks
 from csph.coding import CodingTensor
-from scenes.errors import require
 
+Int8Rule = Literal["calibrated", "published"]
+INT8_RULES: tuple[str, ...] = get_args(Int8Rule)
 LEVELS = 127  # +-: symmetric, -128 is left out so that a sign can always be turned
 PRODUCT_SHIFT = 7  # bits that the product of two 8-bit factors is shifted by, back into 8 bits
 ACCUMULATOR_BITS = 16
+# 255 steps over [-1, 1] for every factor; in single precision as published, so that 1 is 127 steps and not 127.5
+PUBLISHED_STEP = float(np.float32(2 / 255))
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +30,6 @@ class Quantised:
     scale              value of one step of `tensor`
     temporal, spatial  the int8 factors, (K, Mt) or (K, Mt, Mr, Mc), and (K, Mr, Mc) or None
     temporal_scale, spatial_scale   value of one step of each
-    clipped            how many entries lay beyond the range and were clamped to it
     """
 
     name: str
@@ -37,7 +39,6 @@ class Quantised:
     temporal_scale: float
     spatial: np.ndarray | None
     spatial_scale: float
-    clipped: int
 
     def coding(self) -> CodingTensor:
         """The values that the 8-bit tensor stands for."""
@@ -46,35 +47,44 @@ class Quantised:
         )
 
 
-def _to_int8(values: Tensor, top: float | None) -> tuple[np.ndarray, float, int]:
+def _to_int8(values: Tensor, scale: float | None = None) -> tuple[np.ndarray, float]:
+    """Round to steps of `scale` (default: 1/127 of the largest magnitude), clamped to +-127; and the scale."""
     array = values.double().cpu().numpy()
-    top = float(np.abs(array).max()) if top is None else top
-    scale = top / LEVELS if top > 0 else 1.0
-    steps = np.rint(array / scale)
-    clipped = int((np.abs(steps) > LEVELS).sum())
-    return np.clip(steps, -LEVELS, LEVELS).astype(np.int8), scale, clipped
+    if scale is None:
+        scale = float(np.abs(array).max()) / LEVELS or 1.0
+    return np.clip(np.rint(array / scale), -LEVELS, LEVELS).astype(np.int8), scale
 
 
-def quantised(
-    coding: CodingTensor, scaling: Literal["calibrated", "fixed"] = "calibrated", *, top: float = 1.0
-) -> Quantised:
-    """Round every factor to the nearest of 255 steps between -top and top, clamped.
+def quantised(coding: CodingTensor) -> Quantised:
+    """Round every factor to the nearest of 255 steps between plus and minus its largest magnitude.
 
-    calibrated: top is each factor's largest magnitude, nothing is clamped. fixed: `top` for all (1 as published, where
-    what lay beyond wrapped around instead). Raises InputError for another scaling or a top that is not positive.
+    This is what an in-pixel core computes with: one 8-bit tensor, of separable factors their product in integers.
     """
-    require(scaling in ("calibrated", "fixed"), f"quantisation {scaling!r}: expected calibrated or fixed")
-    require(scaling == "calibrated" or 0 < top < np.inf, f"quantisation: top {top:g} is not a positive number")
-    asked = None if scaling == "calibrated" else top
-    temporal, temporal_scale, clipped = _to_int8(coding.temporal, asked)
+    temporal, temporal_scale = _to_int8(coding.temporal)
     if coding.spatial is None:
         tensor = temporal.reshape(coding.codes, *coding.block)
-        return Quantised(coding.name, tensor, temporal_scale, temporal, temporal_scale, None, 1.0, clipped)
-    spatial, spatial_scale, more = _to_int8(coding.spatial, asked)
+        return Quantised(coding.name, tensor, temporal_scale, temporal, temporal_scale, None, 1.0)
+    spatial, spatial_scale = _to_int8(coding.spatial)
     product = temporal[:, :, None, None].astype(np.int16) * spatial[:, None].astype(np.int16)
     tensor = ((product + (1 << PRODUCT_SHIFT - 1)) >> PRODUCT_SHIFT).astype(np.int8)
     scale = temporal_scale * spatial_scale * (1 << PRODUCT_SHIFT)
-    return Quantised(coding.name, tensor, scale, temporal, temporal_scale, spatial, spatial_scale, clipped + more)
+    return Quantised(coding.name, tensor, scale, temporal, temporal_scale, spatial, spatial_scale)
+
+
+def published_int8(coding: CodingTensor) -> CodingTensor:
+    """Round every factor to the published 8 bits, q = round(127.5 w), and return the values that they stand for.
+
+    Each factor (temporal, spatial, or the full tensor) has steps of 2/255 whatever its largest value, and factors are
+    multiplied in floating point: an emulation, not what one 8-bit tensor holds (`quantised`). Weights beyond +-1 are
+    clamped, where the published code wraps around. It also casts counts to 8 bits; here they stay as they are.
+    """
+
+    def rounded(part: Tensor) -> Tensor:
+        steps, scale = _to_int8(part, PUBLISHED_STEP)
+        return torch.from_numpy(steps.astype(np.float32) * np.float32(scale))
+
+    spatial = None if coding.spatial is None else rounded(coding.spatial)
+    return replace(coding, name=f"{coding.name} int8 as published", temporal=rounded(coding.temporal), spatial=spatial)
 
 
 class IntegerCodes(NamedTuple):

@@ -200,7 +200,8 @@ def coding_tensor(code: str, codes: int, sensor: Sensor | str = "reference", *, 
     Parameters
     ----------
     code : str
-        fourier (truncated), gray, coarse, hadamard or random.
+        fourier (truncated), gray, coarse, hadamard or random; fourier-published and gray-published have the published
+        rows, cos and -sin at whole bins.
     codes : int
         The number K of codes, at least 2.
     sensor : Sensor or str

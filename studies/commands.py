@@ -15,7 +15,8 @@ class Train(Common):
 
     design: str = "learned"
     """learned, fourier, gray, coarse, hadamard or random; with +learned for a fixed temporal code and a learned spatial
-    part; none for the counts themselves, peak for their fullest bins."""
+    part; fourier-published and gray-published have the published rows (cos and -sin at whole bins); none for the counts
+    themselves, peak for their fullest bins."""
     block: tuple[int, int, int] = (256, 4, 4)
     """Block of the codes: time bins, rows, columns."""
     compression: float = 128.0
@@ -104,5 +105,7 @@ class Evaluate(Common):
     """Move every scene this many metres away in time alone; other offsets are rendered: `dataset --offset-mode`."""
     int8: bool = False
     """Codes in 8 bits as well, summed in 16."""
+    int8_rule: Annotated[Literal["calibrated", "published"] | None, may_stay_open("{calibrated,published}")] = None
+    """How --int8 rounds weights: 255 steps over each factor's own range (default), or over -1 to 1 as published."""
     out: Path = Path("out/evaluate")
     """Folder for the table (.csv)."""

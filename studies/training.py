@@ -21,6 +21,7 @@ from csph.evaluation import LEVEL_GROUPS, Evaluation, Method, as_dicts, evaluate
 from csph.metrics import PHOTON_LEVELS
 from csph.model import DepthModel, load_model
 from csph.posterior import Decoder
+from csph.quantise import Int8Rule
 from csph.views import Views, read_views, split_views
 from render.tracing import Progress
 from scenes.errors import InputError, require
@@ -137,12 +138,17 @@ def run_train(command: Train, progress: Progress) -> dict:
 
 
 def network_method(
-    model: DepthModel, *, int8: bool = False, decoder: Decoder | None = None, overflows: list[int] | None = None
+    model: DepthModel,
+    *,
+    int8: bool = False,
+    int8_rule: Int8Rule = "calibrated",
+    decoder: Decoder | None = None,
+    overflows: list[int] | None = None,
 ) -> Method:
     """Depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`."""
 
     def method(histogram: Histogram) -> np.ndarray:
-        depth, wrapped = model.depth_of(histogram, int8=int8, decoder=decoder)
+        depth, wrapped = model.depth_of(histogram, int8=int8, int8_rule=int8_rule, decoder=decoder)
         if overflows is not None:
             overflows.append(wrapped)
         return depth
@@ -188,6 +194,9 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     """Networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
     models = [load_model(checkpoint_of(path))[0] for path in command.checkpoints]
     require(bool(models), "evaluate: give at least one checkpoint")
+    require(command.int8 or command.int8_rule is None, "evaluate: --int8-rule goes with --int8")
+    rule = command.int8_rule or "calibrated"
+    in_8_bits = " int8" if rule == "calibrated" else f" int8 {rule}"
     sensor = models[0].config.sensor
     others = [model.config.sensor.name for model in models if model.config.sensor != sensor]
     require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
@@ -201,8 +210,9 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     methods: dict[str, Method] = {}
     groups: dict[str, list[str]] = {}  # trainings of one design by different seeds are one group
     for path, model in zip(command.checkpoints, models, strict=True):
-        for suffix, int8 in (("", False), (" int8", True))[: 1 + command.int8]:
-            methods[f"{path}{suffix}"] = network_method(model, int8=int8, decoder=command.decoder, overflows=overflows)
+        for suffix, int8 in (("", False), (in_8_bits, True))[: 1 + command.int8]:
+            read = {"int8": int8, "int8_rule": rule, "decoder": command.decoder}
+            methods[f"{path}{suffix}"] = network_method(model, **read, overflows=overflows)
             groups.setdefault(f"{model.config.name}{suffix}", []).append(f"{path}{suffix}")
     methods |= {name: baseline(name) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
@@ -218,7 +228,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     )
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
-    first = f"{models[0].config.name}{' int8' if command.int8 else ''}"
+    first = f"{models[0].config.name}{in_8_bits if command.int8 else ''}"
     return {**results(found, groups, first, command.json), "overflows": sum(overflows), "csv": str(table)}
 
 

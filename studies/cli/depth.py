@@ -43,8 +43,11 @@ class Depth(Common):
     """How `--method network` reads the posterior: its mean, or its median (default: the model's)."""
     int8: bool = False
     """Codes of `--method network` in 8 bits, summed in 16."""
-    code: Literal["fourier", "gray", "coarse", "hadamard", "random"] = "fourier"
-    """Temporal code of `--method compressive`: truncated Fourier, Gray Fourier, coarse histogram, Walsh-Hadamard."""
+    int8_rule: Annotated[Literal["calibrated", "published"] | None, may_stay_open("{calibrated,published}")] = None
+    """How --int8 rounds weights: 255 steps over each factor's own range (default), or over -1 to 1 as published."""
+    code: Literal["fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published"] = "fourier"
+    """Temporal code of `--method compressive`: truncated Fourier, Gray Fourier, coarse histogram, Walsh-Hadamard; or
+    the first two in their published rows."""
     codes: int = 16
     """Number K of codes kept per pixel by `--method compressive`."""
     figure: bool = True
@@ -68,7 +71,10 @@ def run(command: Depth, progress: Progress) -> dict:
     if network is None:
         depth = depth_map(histogram, command.method, command.codes, command.code, command.seed)
     else:
-        depth, share, overflows = network.estimate(histogram, int8=command.int8, decoder=command.decoder)
+        rule = command.int8_rule or "calibrated"
+        depth, share, overflows = network.estimate(
+            histogram, int8=command.int8, int8_rule=rule, decoder=command.decoder
+        )
         if overflows:
             log.warning("%d sums of 16 bits wrapped around", overflows)
     seconds = time.perf_counter() - start
@@ -138,6 +144,8 @@ def _network(command: Depth) -> DepthModel | None:
         raise InputError(
             "depth: --method network and --checkpoint or --model go together, and --int8, --decoder with them"
         )
+    if command.int8_rule and not command.int8:
+        raise InputError("depth: --int8-rule goes with --int8")
     if not wanted:
         return None
     from csph.cards import shipped_model
