@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from studies.options import Common, File, Number, Positional, Progress, may_stay_open
+from studies.options import Common, Count, File, Number, Positional, Progress, may_stay_open
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,8 +17,15 @@ class Sense(Common):
     """A transient written by `render` (.exr)."""
     out: File = None
     """The .h5 file (default: the transient's name)."""
-    sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
-    """Sensor preset."""
+    sensor: str = "reference"
+    """Sensor preset (reference, iccv2023-train, linospad, linospad2, pf32, swissspad3, tmf8820, tmf8828, vl53l1x,
+    vl53l8ch, ads6311) or a sensor file (.toml)."""
+    bins: Count = None
+    """Time bins of the histogram (default: the preset's)."""
+    bin_width: Number = None
+    """Width of a bin [s] (default: the preset's)."""
+    period: Number = None
+    """Period of the laser [s], whole bins (default: the preset's, or what new --bins cover)."""
     signal: Number = None
     """Mean signal photons per pixel and exposure (default: 50, or what the --radiometric optics give)."""
     background: Number = None
@@ -43,32 +50,36 @@ class Sense(Common):
     """Measured pulse (.npy, one dimension) in steps of --pulse-step, instead of the preset's."""
     pulse_step: Number = None
     """Time step of --pulse [s]."""
+    pulse_fwhm: Number = None
+    """Full width at half maximum of a Gaussian pulse [s], instead of the preset's."""
+    pulse_tail: float = 0.0
+    """Time constant of its exponential tail [s]; needs --pulse-fwhm."""
     pde: Number = None
     """Photon detection efficiency, 0 to 1: a --radiometric budget counts with it (default: the preset's)."""
-    crosstalk: float = 0.0
-    """Probability that a detection fires a given neighbour."""
-    hot_pixels: float = 0.0
-    """Share of hot pixels, placed by the seed."""
-    hot_rate: float = 1e4
-    """Dark counts per second of a hot pixel [Hz]."""
-    dead_pixels: float = 0.0
-    """Share of dead pixels, placed by the seed."""
+    crosstalk: Number = None
+    """Probability that a detection fires a given neighbour (default: the preset's)."""
+    hot_pixels: Number = None
+    """Share of hot pixels, placed by the seed (default: the preset's)."""
+    hot_rate: Number = None
+    """Dark counts per second of a hot pixel [Hz] (default: the preset's, or 1e4)."""
+    dead_pixels: Number = None
+    """Share of dead pixels, placed by the seed (default: the preset's)."""
     radiometric: bool = False
     """Compute the photon budget from the optics below, instead of --signal and --background."""
-    pulse_energy: float = 10e-9
-    """Energy of one laser pulse [J], over the whole cone."""
-    focal_length: float = 10e-3
-    """Focal length of the lens [m]."""
-    f_number: float = 2.0
-    """Focal length over aperture diameter."""
-    pixel_pitch: float = 20e-6
-    """Side of a pixel's active square [m]."""
-    transmission: float = 0.8
-    """Transmission of lens and filter."""
-    filter_width: float = 10.0
-    """Width of the band that the filter lets through [nm]."""
-    wavelength: float = 850e-9
-    """Wavelength of the laser [m]."""
+    pulse_energy: Number = None
+    """Energy of one laser pulse [J], over the whole cone (default: the sensor file's, or 10e-9)."""
+    focal_length: Number = None
+    """Focal length of the lens [m] (default: the sensor file's, or 10e-3)."""
+    f_number: Number = None
+    """Focal length over aperture diameter (default: the sensor file's, or 2)."""
+    pixel_pitch: Number = None
+    """Side of a pixel's active square [m] (default: the sensor file's, or 20e-6)."""
+    transmission: Number = None
+    """Transmission of lens and filter (default: the sensor file's, or 0.8)."""
+    filter_width: Number = None
+    """Width of the band that the filter lets through [nm] (default: the sensor file's, or 10)."""
+    wavelength: Number = None
+    """Wavelength of the laser [m] (default: the sensor file's, or 850e-9)."""
     export: Annotated[Literal["mat"] | None, may_stay_open("mat")] = None
     """Write the published .mat layout, and its pulse, beside the .h5 file."""
     figure: bool = True

@@ -20,8 +20,9 @@ from spad.depth import confidence, laser_baseline_m
 from spad.detect import expected_in_pixel, sense
 from spad.histogram import Histogram, write_histogram
 from spad.mat import write_mat
-from spad.pulse import Pulse, read_pulse
-from spad.sensor import PhotonBudget, Sensor, sensor_by_name
+from spad.pulse import AnyPulse, Pulse, read_pulse
+from spad.sensor import PhotonBudget, Sensor
+from spad.sensor_files import FWHM_PER_SIGMA, load_sensor
 from studies.cli.paths import input_file, output_file, picture
 from studies.cli.sense import Sense
 from studies.options import Progress
@@ -29,49 +30,70 @@ from studies.options import Progress
 log = logging.getLogger("scene2spad")
 
 DEFAULT_PHOTONS = 50.0
+HOT_RATE_HZ = 1e4
+DEFAULT_OPTICS = Optics(10e-9, 10e-3, 2.0, 20e-6, 0.8, 10.0, 850e-9)
 
 
 def sensor_of(command: Sense) -> Sensor:
-    """The preset with what the options change."""
+    """Return the preset, or the sensor of a file, with what the options change."""
+    return changed_sensor(load_sensor(command.sensor).sensor, command)
+
+
+def changed_sensor(sensor: Sensor, command: Sense) -> Sensor:
+    """Return the sensor with the fields that the options set."""
     asked = {
+        "bins": command.bins,
+        "bin_width_s": command.bin_width,
+        "period_s": command.period,
         "dark_count_rate_hz": command.dark_count_rate,
         "reset": command.reset,
         "dead_time_s": command.dead_time,
         "exposure_s": command.exposure,
         "pde": command.pde,
+        "crosstalk": command.crosstalk,
+        "hot_share": command.hot_pixels,
+        "hot_rate_hz": command.hot_rate,
+        "dead_share": command.dead_pixels,
     }
     changes = {name: value for name, value in asked.items() if value is not None}
-    require(command.jitter is not None or not command.jitter_tail, "--jitter-tail needs --jitter")
-    require((command.pulse is None) == (command.pulse_step is None), "--pulse and --pulse-step go together")
+    if ("bins" in changes or "bin_width_s" in changes) and command.period is None:
+        changes["period_s"] = None
+    if command.hot_pixels and command.hot_rate is None and not sensor.hot_rate_hz:
+        changes["hot_rate_hz"] = HOT_RATE_HZ
     if command.jitter is not None:
         changes["jitter"] = Pulse(command.jitter, command.jitter_tail)
+    require(command.jitter is not None or not command.jitter_tail, "--jitter-tail needs --jitter")
+    pulse = _asked_pulse(command)
+    return replace(sensor, **changes, **({} if pulse is None else {"pulse": pulse}))
+
+
+def _asked_pulse(command: Sense) -> AnyPulse | None:
+    """Return the pulse that the options ask for, None where they leave the preset's."""
+    require((command.pulse is None) == (command.pulse_step is None), "--pulse and --pulse-step go together")
+    require(command.pulse is None or command.pulse_fwhm is None, "give --pulse or --pulse-fwhm, not both")
+    require(command.pulse_fwhm is not None or not command.pulse_tail, "--pulse-tail needs --pulse-fwhm")
     if command.pulse is not None:
-        changes["pulse"] = read_pulse(command.pulse, command.pulse_step)
-    return replace(
-        sensor_by_name(command.sensor),
-        crosstalk=command.crosstalk,
-        hot_share=command.hot_pixels,
-        hot_rate_hz=command.hot_rate if command.hot_pixels else 0.0,
-        dead_share=command.dead_pixels,
-        **changes,
-    )
+        return read_pulse(command.pulse, command.pulse_step)
+    return None if command.pulse_fwhm is None else Pulse(command.pulse_fwhm / FWHM_PER_SIGMA, command.pulse_tail)
 
 
 def optics_of(command: Sense) -> Optics | None:
-    """The optics of a radiometric budget, None without one."""
+    """Return the optics of a radiometric budget, None without one: the sensor file's with what the options change."""
     if not command.radiometric:
         return None
     given = command.signal is not None or command.background is not None
     require(not given, "--radiometric computes the photon budget: leave out --signal and --background")
-    return Optics(
-        pulse_energy_j=command.pulse_energy,
-        focal_length_m=command.focal_length,
-        f_number=command.f_number,
-        pixel_pitch_m=command.pixel_pitch,
-        transmission=command.transmission,
-        filter_nm=command.filter_width,
-        wavelength_m=command.wavelength,
-    )
+    asked = {
+        "pulse_energy_j": command.pulse_energy,
+        "focal_length_m": command.focal_length,
+        "f_number": command.f_number,
+        "pixel_pitch_m": command.pixel_pitch,
+        "transmission": command.transmission,
+        "filter_nm": command.filter_width,
+        "wavelength_m": command.wavelength,
+    }
+    optics = load_sensor(command.sensor).optics or DEFAULT_OPTICS
+    return replace(optics, **{name: value for name, value in asked.items() if value is not None})
 
 
 def budget_of(command: Sense) -> PhotonBudget:

@@ -11,11 +11,13 @@ import scipy.io
 
 from render.transient import write_transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from spad.budget import Optics
 from spad.detect import expected_in_pixel, sense
 from spad.histogram import read_histogram
 from spad.mat import read_mat
 from spad.rgbd import transient_from_rgbd
-from spad.sensor import PhotonBudget, sensor_by_name
+from spad.sensor import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor_files import SensorFile, write_sensor
 from studies import figures
 from studies.bench import estimators
 from studies.bench.sense import alternating, one_law, relief
@@ -67,6 +69,23 @@ def test_detector_options_reach_the_sensor(scene, capfd, tmp_path):
     assert status == 0 and said["dark_share"] == pytest.approx(3 / 50)
 
 
+def test_a_sensor_file_is_the_sensor_and_options_change_it(scene, capfd, tmp_path):
+    """Every field of the sensor has an option; one that the file sets and no option names stays as it is."""
+    sensor = Sensor(name="mine", bins=512, bin_width_s=2e-10, crosstalk=0.01, hot_share=0.1, hot_rate_hz=3e3)
+    write_sensor(SensorFile(sensor, Optics(1e-9, 5e-3, 1.4, 1e-5)), tmp_path / "mine.toml")
+    status, _, _ = run(capfd, "sense", "s.exr", "--sensor", "mine.toml")
+    assert status == 0 and read_histogram(tmp_path / "s.h5").sensor == sensor
+    options = "--bins 256 --bin-width 4e-10 --pulse-fwhm 1e-9 --pulse-tail 2e-10 --crosstalk 0 --hot-pixels 0"
+    assert run(capfd, "sense", "s.exr", "--sensor", "mine.toml", *options.split())[0] == 0
+    changed = read_histogram(tmp_path / "s.h5").sensor
+    assert (changed.bins, changed.bin_width_s, changed.period_s) == (256, 4e-10, 256 * 4e-10)
+    assert changed.pulse.fwhm_s == pytest.approx(1e-9) and changed.pulse.tail_s == 2e-10
+    assert changed.crosstalk == changed.hot_share == 0
+    _, ours, _ = run(capfd, "sense", "s.exr", "--sensor", "mine.toml", "--radiometric")
+    _, lens, _ = run(capfd, "sense", "s.exr", "--sensor", "mine.toml", "--radiometric", "--f-number", "2.8")
+    assert ours["mean_signal"] == pytest.approx(4 * lens["mean_signal"], rel=1e-4)
+
+
 def test_radiometric_budget_by_command(scene, capfd):
     status, said, _ = run(capfd, "sense", "s.exr", "--radiometric", "--pde", "0.2", "--pulse-energy", "1e-9")
     assert status == 0 and said["mean_signal"] > 0 and said["mean_background"] > 0
@@ -93,6 +112,10 @@ def test_export_by_command(scene, capfd, tmp_path):
         (["--dead-time", "1e-6", "--model", "first-photon"], "use free-running"),
         (["--exposure", "1e-12"], "shorter than the period"),
         (["--sensor", "retina"], "retina"),
+        (["--sensor", "mine.toml"], "mine.toml: sensor file not found"),
+        (["--pulse-tail", "1e-10"], "needs --pulse-fwhm"),
+        (["--pulse", "p.npy", "--pulse-step", "1e-11", "--pulse-fwhm", "1e-10"], "not both"),
+        (["--bins", "100", "--period", "1e-12"], "is not a whole number of bin widths"),
     ],
 )
 def test_bad_options_are_refused_in_one_line(scene, capfd, tmp_path, options, words):

@@ -1,0 +1,63 @@
+"""Numbers with units as people write them in a file: "91 ps", "0.4 mm", "2.5 kHz". Exact both ways."""
+
+from __future__ import annotations
+
+import math
+import re
+from decimal import Decimal, InvalidOperation
+
+from scenes.errors import InputError, require
+
+# Powers of ten of each unit, the base unit first: SI, but for bandwidths of filters, which are nanometres everywhere.
+UNITS: dict[str, dict[str, int]] = {
+    "time": {"s": 0, "ms": -3, "us": -6, "ns": -9, "ps": -12, "fs": -15},
+    "rate": {"Hz": 0, "kHz": 3, "MHz": 6},
+    "length": {"m": 0, "mm": -3, "um": -6, "nm": -9},
+    "bandwidth": {"nm": 0, "um": 3},
+    "energy": {"J": 0, "mJ": -3, "uJ": -6, "nJ": -9, "pJ": -12, "fJ": -15},
+}
+_QUANTITY = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf)\s*(\S*)\s*")
+
+
+def parse_quantity(value: object, dimension: str, where: str) -> float:
+    """Return a quantity in its dimension's base unit.
+
+    `value` is a number where `dimension` is empty, else a text of number and unit.
+
+    Raises InputError, which begins with `where`, for a value that is no finite number of 0 or more, and for a unit that
+    is missing or of another dimension.
+    """
+    if not dimension:
+        number = not isinstance(value, bool) and isinstance(value, (int, float))
+        require(number, f"{where}: {value!r} is no number")
+        return _checked(float(value), value, where)
+    units = UNITS[dimension]
+    example = f'a {dimension} in {", ".join(units)}, as "1 {next(iter(units))}"'
+    require(isinstance(value, str), f"{where}: {value!r} has no unit, expected {example}")
+    found = _QUANTITY.fullmatch(value)
+    require(found is not None, f"{where}: {value!r} is no number with a unit, expected {example}")
+    number, unit = found.groups()
+    meant = "".join(f"; did you mean '{known}'?" for known in units if known.lower() == unit.lower())
+    named = f"the unit {unit}" if unit else "no unit"
+    require(unit in units, f"{where}: {value!r} has {named}, expected {example}{meant}")
+    try:
+        exact = Decimal(number).scaleb(units[unit])
+    except InvalidOperation:
+        raise InputError(f"{where}: {value!r} is no number with a unit, expected {example}") from None
+    return _checked(float(exact), value, where)
+
+
+def _checked(number: float, value: object, where: str) -> float:
+    require(math.isfinite(number), f"{where}: {value!r} is not finite")
+    require(number >= 0, f"{where}: {value!r} is negative, expected 0 or more")
+    return number
+
+
+def format_quantity(value: float, dimension: str) -> str:
+    """Write a value in the unit that leaves 1 to 999 before the point; `parse_quantity` returns the same float."""
+    units = UNITS[dimension]
+    exact = Decimal(repr(float(value)))
+    fitting = [unit for unit, power in units.items() if exact and abs(exact) >= Decimal(1).scaleb(power)]
+    largest = max(fitting, key=units.get) if fitting else next(iter(units))
+    number = exact.scaleb(-units[largest]).normalize()
+    return f"{number:f} {largest}" if abs(number.adjusted()) < 12 else f"{number} {largest}"

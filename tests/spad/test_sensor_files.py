@@ -1,0 +1,140 @@
+"""Sensor files: round trips to the last bit, every preset by its data sheet, one line for every mistake in a file."""
+
+import math
+from dataclasses import fields
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scenes.errors import InputError
+from spad.budget import Optics
+from spad.pulse import Pulse, SampledPulse
+from spad.quantities import UNITS, format_quantity, parse_quantity
+from spad.sensor import PRESETS, Sensor
+from spad.sensor_files import (
+    DETECTOR,
+    HISTOGRAM,
+    OPTICS,
+    TABLES,
+    SensorFile,
+    load_sensor,
+    preset_files,
+    read_sensor,
+    sensor_names,
+    write_sensor,
+)
+from spad.toml import read_toml
+
+PLAIN = """name = "mine"
+[histogram]
+bins = 128
+bin_width = "91 ps"
+[pulse]
+fwhm = "200 ps"
+"""
+WIDE = Sensor(
+    name="wide",
+    bins=77,
+    bin_width_s=9.1e-11 / 3,
+    period_s=100 * (9.1e-11 / 3),
+    exposure_s=1e-3,
+    pulse=SampledPulse((0.1, 1 / 3, 2e-9, 7.0), 1.7e-11),
+    jitter=Pulse(3.3e-11, 1e-10),
+    dark_count_rate_hz=(1 / 3, 2e5),
+    pde=0.123,
+    hot_share=0.01,
+    hot_rate_hz=1e4 / 7,
+    dead_share=0.02,
+    reset="free-running",
+    dead_time_s=1.1e-8,
+    crosstalk=0.003,
+)
+
+
+@pytest.mark.parametrize("sensor", [*PRESETS.values(), WIDE], ids=lambda sensor: sensor.name)
+@pytest.mark.parametrize("optics", [None, Optics(1e-9 / 3, 4e-4, 1.33, 2.55e-5, 0.7, 12.3, 9.4e-7)])
+def test_a_sensor_comes_back_from_its_file_to_the_last_bit(sensor, optics, tmp_path):
+    whole = SensorFile(sensor, optics, 'all "fields"', {"histogram.bins": "a\nsheet"})
+    assert read_sensor(write_sensor(whole, tmp_path / "s.toml")) == whole
+
+
+def test_every_field_of_a_sensor_has_a_key():
+    keyed = {key.field for table in (HISTOGRAM, DETECTOR) for key in table.values()} | {"name", "pulse", "jitter"}
+    assert keyed == {field.name for field in fields(Sensor)}
+    assert {key.field for key in OPTICS.values()} == {field.name for field in fields(Optics)}
+
+
+@settings(deadline=None, derandomize=True)
+@given(st.floats(0, 1e20), st.sampled_from(sorted(UNITS)))
+def test_a_quantity_comes_back_to_the_last_bit(value, dimension):
+    assert parse_quantity(format_quantity(value, dimension), dimension, "x") == value
+
+
+def test_a_width_is_read_as_sigma_or_as_full_width_at_half_maximum(tmp_path):
+    (tmp_path / "s.toml").write_text(PLAIN)
+    sensor = read_sensor(tmp_path / "s.toml").sensor
+    assert sensor.pulse.fwhm_s == pytest.approx(200e-12) and sensor.bin_width_s == 91e-12
+    assert sensor.period_s == 128 * 91e-12 and sensor.name == "mine"
+
+
+@pytest.mark.parametrize("name", sorted(preset_files()))
+def test_a_preset_states_the_source_of_every_number(name):
+    found, tables = load_sensor(name), read_toml(preset_files()[name])
+    numbers = {f"{table}.{key}" for table in TABLES if table in tables for key in tables[table]}
+    assert found.sensor.name == name and numbers == {*found.sources} and found.description
+    assert all(source.strip() for source in found.sources.values())
+    assert math.isfinite(found.sensor.range_m)
+
+
+def test_the_presets_that_were_there_keep_their_names_and_values():
+    assert all(load_sensor(name).sensor == sensor for name, sensor in PRESETS.items())
+    assert not {*PRESETS} & {*preset_files()} and sensor_names()[0] == "reference"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "meant"),
+    [
+        ("bin_width", "binwidth", "unknown key histogram.binwidth; did you mean 'bin_width'?"),
+        ("[histogram]", "[histogramm]", "unknown key histogramm; did you mean 'histogram'?"),
+        ('"91 ps"', '"91 mm"', "histogram.bin_width: '91 mm' has the unit mm, expected a time in s"),
+        ('"91 ps"', '"91 pS"', "did you mean 'ps'?"),
+        ('"91 ps"', '"91"', "'91' has no unit"),
+        ('"91 ps"', "91e-12", "has no unit"),
+        ('"91 ps"', '"-91 ps"', "histogram.bin_width: '-91 ps' is negative"),
+        ('"91 ps"', '"inf ps"', "is not finite"),
+        ('"91 ps"', '"1.2.3 ps"', "is no number with a unit"),
+        ('"91 ps"', '"0 ps"', "bin width 0 s is outside"),
+        ('bin_width = "91 ps"', "", "histogram.bin_width is missing"),
+        ("bins = 128", "", "histogram.bins is missing"),
+        ("bins = 128", "bins = 12.5", "histogram.bins: 12.5 is no whole number"),
+        ("bins = 128", "bins = -4", "-4 bins is outside 1 to 65536"),
+        ('name = "mine"', "", "name is missing"),
+        ("[pulse]", "[jitter]", "table [pulse] is missing"),
+        ('fwhm = "200 ps"', "", "pulse: expected one of sigma, fwhm, or samples with step, there are 0"),
+        ('fwhm = "200 ps"', "samples = [1, 2]", "pulse.step is missing"),
+        ('fwhm = "200 ps"', 'samples = [1, -2]\nstep = "9 ps"', "pulse.samples[1]: -2 is negative"),
+        ('fwhm = "200 ps"', 'samples = 3\nstep = "9 ps"', "pulse.samples: expected a list"),
+        ('"200 ps"', '"200 ps"\n[detector]\npde = 1.5', "PDE 1.5 is outside (0, 1]"),
+        ('"200 ps"', '"200 ps"\n[detector]\nreset = "never"', "reset 'never' is unknown"),
+        ('"200 ps"', '"200 ps"\n[optics]\nf_number = 2', "optics.pulse_energy, focal_length, pixel_pitch is missing"),
+        ('"200 ps"', '"200 ps"\n[sources]\n"histogram.bin" = "x"', "did you mean 'histogram.bins'?"),
+        ('name = "mine"', 'schema = "2.0"\nname = "mine"', "sensor file of schema 2.0, this program reads 1"),
+        ('name = "mine"', "name = ", "is no TOML"),
+    ],
+)
+def test_a_mistake_in_a_file_is_one_line_that_names_it(old, new, meant, tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text(PLAIN.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        read_sensor(path)
+    assert str(caught.value).startswith(f"{path}: ") and meant in str(caught.value)
+
+
+def test_a_name_that_is_none_lists_those_there_are(tmp_path):
+    with pytest.raises(InputError, match="did you mean 'tmf8820'"):
+        load_sensor("tmf820")
+    with pytest.raises(InputError, match="file not found"):
+        load_sensor(str(tmp_path / "none.toml"))
+    with pytest.raises(InputError, match=r"must end in \.toml"):
+        write_sensor(SensorFile(Sensor()), tmp_path / "s.txt")
