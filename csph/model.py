@@ -97,6 +97,15 @@ class DepthModel(nn.Module):
         """Depth of counts (B, 1, T, R, C) that blocks tile, (B, R, C) [m]; decoder as in `position`."""
         return self.position(self(counts), decoder) * self.config.sensor.bin_depth_m
 
+    def depth_of_codes(self, codes: Tensor, decoder: Decoder | None = None) -> Tensor:
+        """Depth (B, R, C) [m] from codes (B, K, T/Mt, R/Mr, C/Mc) that a sensor has made; decoder as in `position`.
+
+        Raises InputError for a model without codes, and codes of another shape.
+        """
+        require(self.layer is not None, f"{self.config.name}: has no codes to find depth from")
+        logits = self.network(self.layer.decode(codes))
+        return self.position(logits, decoder) * self.config.sensor.bin_depth_m
+
     def check_histogram(self, histogram: Histogram) -> None:
         """InputError unless the histogram is of the sensor that the model was trained for."""
         mine, other = self.config.sensor, histogram.sensor

@@ -10,7 +10,7 @@ parentheses over numbers, `.equ` names, region names (their byte address) and lo
     .table NAME, kind, count[, values]   RAM filled before the program runs; kind is u8, s8 or s16
     .space NAME, kind, count     RAM that the program writes
     .for h in a..b / .end        the lines between, once for every h from a to b, both included
-    .include "file"              the lines of another file
+    .include "file"              the lines of another file; inside a loop they see its variables
 
 Errors are InputErrors that begin with file, line and column.
 """
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from scenes.errors import InputError
@@ -30,7 +31,7 @@ from ultraphase.source import Cursor, Line, Token, source_lines
 
 _REGISTER = re.compile(r"r(\d+)\Z")
 _MOST_STATEMENTS = 20_000
-_MOST_INCLUDES = 8
+_MOST_INCLUDES = 8  # inside one another
 _MOST_NESTED = 32  # parentheses and signs, and loops
 _MOST_REPEATED = 1 << 18  # lines of all loops' turns, those of loops inside others counted each time
 _MOST_BYTES = 1 << 22
@@ -185,14 +186,15 @@ class _Assembly:
 
     def _include(self, line: Line) -> None:
         at = line.tokens[-1]
-        self.includes += 1
-        if self.read is None or self.includes > _MOST_INCLUDES or at.kind != "file":
-            raise line.fail(at.column, f'.include "file" is not possible here, or more than {_MOST_INCLUDES} times')
+        if self.read is None or self.includes >= _MOST_INCLUDES or at.kind != "file":
+            raise line.fail(at.column, f'.include "file" is not possible here, or more than {_MOST_INCLUDES} deep')
         try:
             text = self.read(at.text)
         except InputError as error:
             raise line.fail(at.column, str(error)) from None
-        self.take(source_lines(at.text, text))
+        self.includes += 1
+        self.take([replace(one, loops=line.loops) for one in source_lines(at.text, text)])
+        self.includes -= 1
 
     def _new_name(self, cursor: Cursor, *, rebind: bool = False) -> str:
         token = cursor.take("name", "a name")

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -25,6 +25,7 @@ from scenes.errors import require
 from ultraphase.array import CoreArray
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS, Method
 from ultraphase.chip import ChipSpec
+from ultraphase.program import Program
 
 MICRO, KILO = 1e6, 1e-3
 READINGS = {
@@ -97,12 +98,23 @@ def measured_cost(method: Method, temporal: np.ndarray | None, chip: ChipSpec | 
 
     temporal   int8 temporal tensor (K, Mt) of the method, None for coarse histograms
     """
-    program, tables = method.program(chip), method.tables(temporal)
+    tables = method.tables(temporal)
+    return cost_of(method.program(chip), method.block, tables, tables, chip)
+
+
+def cost_of(
+    program: Program,
+    block: tuple[int, int],
+    core_tables: Mapping[str, np.ndarray],
+    block_tables: Mapping[str, np.ndarray],
+    chip: ChipSpec | None = None,
+) -> Cost:
+    """`measured_cost` of any program: tables of one core, and of the block of cores whose codes leave as one."""
     stamps = np.arange(TIMESTAMPS)
-    photons = CoreArray(program, (1, TIMESTAMPS), tables, chip=chip)
+    photons = CoreArray(program, (1, TIMESTAMPS), core_tables, chip=chip)
     per_photon = photons.frame(stamps, np.arange(TIMESTAMPS + 1), park=True).cycles.mean()
-    array = CoreArray(program, method.block, tables, chip=chip)
-    cores = method.block[0] * method.block[1]
+    array = CoreArray(program, block, block_tables, chip=chip)
+    cores = block[0] * block[1]
     frame = array.frame(np.zeros(0, np.int64), np.zeros(cores + 1, np.int64))
     waits = float(frame.stalls.mean())
     return Cost(float(per_photon), float(frame.cycles.mean()) - waits, float(frame.out_bits.sum() / cores), waits)

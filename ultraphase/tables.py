@@ -5,6 +5,8 @@ A matrix is (codes, timestamps) int64: a photon at timestamp t adds column t to 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from scenes.errors import require
@@ -39,8 +41,8 @@ def _whole_wave(quarter: np.ndarray) -> np.ndarray:
     return np.concatenate([quarter, -quarter[::-1], -quarter, quarter[::-1]])
 
 
-def fourier_matrix(quarter: np.ndarray, codes: int) -> np.ndarray:
-    """What `fourier.s` adds, (K, 4 Q): rows cos and sin in turn of harmonics h = 1 .. K/2 from a quarter wave (Q,).
+def wave_matrix(quarter: np.ndarray, harmonics: Sequence[int]) -> np.ndarray:
+    """What the Fourier programs add, (2 H, 4 Q): rows cos and sin in turn of each harmonic h from a quarter wave (Q,).
 
     w[h t + floor(h / 2)] and a quarter later, w the whole wave with its half-step: phase h (t + 1/2) exactly for odd h,
     half a step more for even h, where a table of Q entries has no better one.
@@ -48,10 +50,15 @@ def fourier_matrix(quarter: np.ndarray, codes: int) -> np.ndarray:
     wave = _whole_wave(np.asarray(quarter, np.int64))
     t = np.arange(wave.size)
     rows = []
-    for harmonic in range(1, codes // 2 + 1):
+    for harmonic in harmonics:
         phase = harmonic * t + harmonic // 2
         rows += [wave[phase % wave.size], wave[(phase - len(quarter)) % wave.size]]
     return np.stack(rows)
+
+
+def fourier_matrix(quarter: np.ndarray, codes: int) -> np.ndarray:
+    """What `fourier.s` adds, (K, 4 Q): the `wave_matrix` of harmonics 1 .. K/2."""
+    return wave_matrix(quarter, range(1, codes // 2 + 1))
 
 
 def block_matrix(temporal: np.ndarray, timestamps: int) -> np.ndarray:
@@ -70,8 +77,8 @@ def coarse_matrix(codes: int, timestamps: int) -> np.ndarray:
 
 
 def spatial_sum(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The frame end of 2 x 2 cores (`sum2x2.s`): sum over the cores of w s / 128, rounded (halves up), then saturated
-    to 16 bits.
+    """The frame end of a block of cores (`sum2x2.s`, `sumblock.s`): sum over the cores of w s / 128, rounded (halves
+    up), then saturated to 16 bits.
 
     sums (..., cores, blocks, K) and weights (cores, K), both integer -> (..., blocks, K) int64.
     """

@@ -11,16 +11,19 @@ from studies.options import Common, File, Positional, Progress
 @dataclass(frozen=True, kw_only=True)
 class Ultraphase(Common):
     """Compressive histograms as programs on the emulated UltraPhase processor: `table` (Supplementary Figure 5 beside
-    the emulation), `run PROGRAM`, `asm FILE`, `list FILE`, `verify PROGRAM`, `sweep`."""
+    the emulation), `compile MODEL` (a trained model's codes), `run PROGRAM`, `asm FILE`, `list FILE`, `verify PROGRAM`,
+    `sweep`."""
 
-    action: Positional[Literal["table", "run", "asm", "list", "verify", "sweep"]] = "table"
+    action: Positional[Literal["table", "compile", "run", "asm", "list", "verify", "sweep"]] = "table"
     """What is done."""
     program: Positional[str] = ""
-    """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s)."""
+    """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s); of compile, a
+    shipped model's name or a checkpoint."""
     define: tuple[str, ...] = ()
     """Constants of a source file, as NAME=VALUE."""
     out: File = None
-    """File for the words (asm: one hexadecimal word a line), the listing (list) or the rows (table, sweep: .csv)."""
+    """File for the words (asm: one hexadecimal word a line), the listing (list; compile: with the tables) or the rows
+    (table, sweep: .csv)."""
     photons: tuple[float, ...] = (550.0,)
     """Photons a pixel and frame, background included; `run` takes one number, `sweep` several."""
     signal: float = 50.0

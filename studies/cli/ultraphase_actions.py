@@ -26,12 +26,15 @@ _MOST_WATCHED = 100
 def run(command: Ultraphase, progress: Progress) -> dict:
     """One action; see `Ultraphase`."""
     actions = {"table": _table, "run": _run, "asm": _asm, "list": _list, "verify": _verify, "sweep": _sweep}
-    needs = command.action in ("run", "asm", "list", "verify")
-    require(bool(command.program) == needs, f"ultraphase {command.action}: {_arity(needs)}")
+    actions["compile"] = _compile
+    needs = command.action in ("compile", "run", "asm", "list", "verify")
+    require(bool(command.program) == needs, f"ultraphase {command.action}: {_arity(command.action, needs)}")
     return actions[command.action](command, progress)
 
 
-def _arity(needs: bool) -> str:
+def _arity(action: str, needs: bool) -> str:
+    if action == "compile":
+        return "which model? a name of `scene2spad models`, or a checkpoint"
     return "which program? a name such as fourier-16, or a file (.s)" if needs else "takes no program"
 
 
@@ -98,6 +101,43 @@ def _asm(command: Ultraphase, progress: Progress) -> dict:
     regions = {r.name: {"kind": r.kind, "count": r.count, "address": r.address} for r in program.regions}
     written = _write(command.out, "\n".join(words) + "\n")
     return {"program": program.name, "words": words, "ram_bits": program.ram_bits, "ram": regions, **written}
+
+
+def _compile(command: Ultraphase, progress: Progress) -> dict:
+    """A trained model's program: what it takes, what it costs, and that it computes the torch path's integers."""
+    from csph.cards import checkpoint_of
+    from csph.model import load_model
+    from csph.shipped import RUN_WEIGHTS
+    from studies.chip_chain import measured, trial
+    from studies.chip_code import compile_model, listing_with_tables
+
+    require(not command.define, "constants by --define are for source files")
+    path = checkpoint_of(command.program)
+    run = path if path.is_dir() else path.parent if path.stem in RUN_WEIGHTS else path.with_suffix("")
+    compiled = compile_model(load_model(path)[0], run.resolve().name).compiled
+    cost, text = measured(compiled), listing_with_tables(compiled)
+    result = {
+        "model": compiled.name,
+        "words": len(compiled.program.words),
+        "words_there": compiled.chip.program_words,
+        "ram_bytes": compiled.layout.total,
+        "ram_bytes_there": compiled.chip.ram_bytes,
+        "ram": asdict(compiled.layout),
+        "loop_order": compiled.loop_order,
+        "block_of_cores": compiled.block,
+        "clocks_per_photon": cost.clocks_per_photon,
+        "clocks_per_frame_end": cost.clocks_per_frame,
+        "waits_per_frame_end": cost.waits_per_frame,
+        "bytes_per_pixel": cost.bits_per_pixel / 8,
+        **trial(compiled, command.seed),
+    }
+    if not compiled.on_the_chip:
+        down, right = compiled.chip.cores
+        blocks = f"blocks of {compiled.block[1]} x {compiled.block[0]} cores"
+        result["array"] = f"{blocks} need a larger array than the fabricated {right} x {down}"
+    if not command.json:
+        result["ram"] = str(compiled.layout)
+    return {**result, "listing": text, **_write(command.out, text)}
 
 
 def _list(command: Ultraphase, progress: Progress) -> dict:

@@ -170,7 +170,7 @@ def test_files_that_are_missing_or_no_text(tmp_path):
     with pytest.raises(InputError, match="is not text"):
         assemble_file(tmp_path / "a.s")
     (tmp_path / "b.s").write_text('.include "a.s"')
-    with pytest.raises(InputError, match="more than 8 times"):
+    with pytest.raises(InputError, match="more than 8 deep"):
         assemble_file(tmp_path / "a.s")
 
 
@@ -252,3 +252,10 @@ def test_a_source_includes_regular_files_of_its_folder_alone(tmp_path):
         file.truncate(1 << 33)
     with pytest.raises(InputError, match=r"big\.s: 8589934592 bytes"):
         assemble_file(folder / "big.s")
+
+
+def test_an_included_file_sees_the_variables_of_the_loop_around_it():
+    source = '.for n in 1..12\n.include "one.s"\n.end\nHALT\n'
+    found = assemble(source, read={"one.s": "label{n}: MOV r1, #n\n"}.__getitem__)
+    assert [one.value for one in found.instructions[:-1]] == list(range(1, 13))
+    assert found.labels["label12"] == 11

@@ -21,27 +21,5 @@
 .for h in 1..K/2
         .reg step, t + (h + 1) % 2             ; t for odd h, u = t + 1 for even h
         ADD  p, p, step
-        AND  i, p, #QUARTER - 1
-        LDB  a, [quarter + i]
-        XOR  i, i, #QUARTER - 1
-        LDB  b, [quarter + i]
-        BBS  p, #BIT + 1, half{h}
-        BBS  p, #BIT, second{h}
-        ADDM [place + 4*h - 4], a              ; first quadrant: cos = a, sin = b
-        ADDM [place + 4*h - 2], b
-        JMP  next{h}
-second{h}:
-        SUBM [place + 4*h - 4], b
-        ADDM [place + 4*h - 2], a
-        JMP  next{h}
-half{h}:
-        BBS  p, #BIT, fourth{h}
-        SUBM [place + 4*h - 4], a
-        SUBM [place + 4*h - 2], b
-        JMP  next{h}
-fourth{h}:
-        ADDM [place + 4*h - 4], b
-        SUBM [place + 4*h - 2], a
-        JMP  next{h}
-next{h}:
+.include "harmonic.s"
 .end

@@ -1,0 +1,141 @@
+"""Compiled codes: every timestamp, the frame's end of blocks of cores, and what does not fit."""
+
+import numpy as np
+import pytest
+
+from scenes.errors import InputError
+from ultraphase import ChipSpec, CoreArray, verify
+from ultraphase.compiler import compile_code
+from ultraphase.integer_code import IntegerCode, folded_temporal
+from ultraphase.tables import spatial_sum
+
+
+def waves(harmonics: tuple[int, ...], bins: int) -> np.ndarray:
+    """Int8 cosine and sine at bin centres, by their definition."""
+    angle = 2 * np.pi * np.array(harmonics)[:, None] * (np.arange(bins) + 0.5) / bins
+    return np.rint(127 * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(int).reshape(-1, bins)
+
+
+def fourier(harmonics: tuple[int, ...], bins: int, block: tuple[int, int] = (1, 1), seed: int = 0) -> IntegerCode:
+    spatial = None
+    if block != (1, 1):
+        spatial = np.random.default_rng(seed).integers(-127, 128, (2 * len(harmonics), *block))
+    return IntegerCode("waves", waves(harmonics, bins), spatial, harmonics)
+
+
+def learned(codes: int, bins: int, block: tuple[int, int] = (1, 1), *, full: bool = False) -> IntegerCode:
+    random = np.random.default_rng(codes)
+    if full:
+        return IntegerCode("full", random.integers(-127, 128, (codes, bins, *block)))
+    spatial = None if block == (1, 1) else random.integers(-127, 128, (codes, *block))
+    return IntegerCode("learned", random.integers(-127, 128, (codes, bins)), spatial)
+
+
+CODES = {
+    "truncated Fourier": fourier((1, 2, 3, 4), 1024),
+    "Gray Fourier": fourier((1, 2, 4, 8, 16, 3, 5, 12), 1024),
+    "Fourier of short blocks": fourier((1, 2, 3), 64),
+    "Fourier + learned": fourier(tuple(range(1, 9)), 256, (2, 2)),
+    "a loop over harmonics": fourier(tuple(range(1, 17)), 256, (4, 4)),
+    "a loop without blocks": fourier(tuple(range(1, 17)), 1024),
+    "learned, 64 bins": learned(3, 64, (2, 2)),
+    "learned, 16 bins": learned(2, 16, (4, 4)),
+    "learned, single pixels": learned(3, 128),
+    "full": learned(2, 16, (1, 2), full=True),
+    "a row of three": learned(2, 32, (1, 3)),
+    "a column of three": learned(1, 32, (3, 1)),
+}
+
+
+def of_core(compiled, row: int, column: int) -> dict[str, np.ndarray]:
+    tables = compiled.tables(compiled.block)
+    return {name: values if values.ndim == 1 else values[row, column] for name, values in tables.items()}
+
+
+@pytest.mark.parametrize("name", CODES)
+def test_every_timestamp_adds_its_column(name):
+    compiled = compile_code(CODES[name])
+    last = compiled.block[0] - 1, compiled.block[1] - 1
+    for core in {(0, 0), last}:
+        proof = verify(compiled.program, compiled.matrix[core], of_core(compiled, *core))
+        assert (proof.clocks == proof.clocks[0]).all()  # no timestamp takes longer than another
+    assert compiled.program.ram_bytes == compiled.layout.total <= 512
+
+
+@pytest.mark.parametrize("name", CODES)
+def test_blocks_of_cores_put_out_their_weighted_sum(name):
+    compiled, random = compile_code(CODES[name]), np.random.default_rng(3)
+    (down, right), codes = compiled.block, compiled.code.codes
+    shape = 2 * down, 2 * right
+    histograms = random.poisson(0.2, (*shape, 1024))
+    array = CoreArray(compiled.program, shape, compiled.tables(shape))
+    flat = histograms.reshape(-1, 1024)
+    for _ in range(2):  # the first frame leaves zeros behind
+        stamps = np.concatenate([np.repeat(np.arange(1024), row) for row in flat])
+        frame = array.frame(stamps, np.concatenate([[0], np.cumsum(flat.sum(axis=1))]))
+        for n, (row, column) in enumerate(np.ndindex(2, 2)):
+            block = histograms[row * down : (row + 1) * down, column * right : (column + 1) * right]
+            sums = np.einsum("rct,rcnt->rcn", block, compiled.matrix).reshape(down * right, -1, codes)
+            if compiled.block == (1, 1):
+                expected = sums[0]
+            elif compiled.weights is None:
+                expected = sums.sum(axis=0)
+            else:
+                expected = spatial_sum(sums, compiled.weights.reshape(down * right, codes))
+            assert np.array_equal(frame.out[n].reshape(-1, codes), expected)
+
+
+def test_an_even_harmonic_is_half_a_step_late_and_an_odd_one_exact():
+    code = fourier((1, 2, 3, 4), 256)
+    folded = folded_temporal(code)
+    assert np.array_equal(folded[[0, 1, 4, 5]], code.temporal[[0, 1, 4, 5]])
+    assert 0 < np.abs(folded - code.temporal).max() <= 127 * np.pi / 256 + 1
+
+
+def test_the_fastest_loop_that_the_store_holds_is_taken():
+    compiled = compile_code(CODES["a loop over harmonics"])
+    assert compiled.loop_order.startswith("2 turns of 8 harmonics") and len(compiled.program.words) <= 256
+    assert compile_code(fourier(tuple(range(1, 9)), 256)).loop_order.startswith("8 harmonics one after the other")
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (
+            learned(8, 256, (2, 2)),
+            r"2,121 bytes of RAM a core \(table 2,048, spatial weights 8, ways 1, sums 64\)",
+        ),
+        (learned(8, 256, (2, 2)), r"would fit: 1 code of 256 bins, or a Fourier code"),
+        (learned(8, 64, (4, 4)), r"777 bytes .* would fit: 5 codes of 64 bins, or its table shared by the 16 cores"),
+        (learned(2, 256), r"528 bytes .* would fit: 1 code of 256 bins, or 2 codes of blocks of 128 bins"),
+        (learned(127, 1024), r"neither fewer codes nor a shorter block nor a shared table nor a Fourier code"),
+        (fourier((1, 2, 4, 8, 16, 32, 64, 128, 3, 5, 6, 7), 1024), r"over the 256 of the core; would fit: 22 codes"),
+        (learned(2, 48), r"blocks of 48 bins, expected a power of two"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_what_would(code, said):
+    with pytest.raises(InputError, match=said) as refusal:
+        compile_code(code)
+    assert "\n" not in str(refusal.value)
+
+
+def test_what_would_fit_does():
+    for fewer in (learned(1, 256, (2, 2)), learned(5, 64, (4, 4)), learned(1, 256), learned(2, 128)):
+        compile_code(fewer)
+    compile_code(fourier((1, 2, 4, 8, 16, 32, 64, 128, 3, 5, 6), 1024))
+
+
+def test_a_larger_chip_takes_more():
+    code = learned(8, 256, (2, 2))
+    chip = ChipSpec(ram_bits=8 * 2128)
+    compiled = compile_code(code, chip)
+    assert verify(compiled.program, compiled.matrix[0, 0], of_core(compiled, 0, 0), chip=chip).states >= 7
+
+
+def test_codes_of_other_shapes_are_refused():
+    with pytest.raises(InputError, match="expected \\(K, Mt\\) and \\(K, Mr, Mc\\)"):
+        IntegerCode("odd", np.zeros((2, 16), int), np.zeros((3, 2, 2), int))
+    with pytest.raises(InputError, match="128 is outside"):
+        IntegerCode("large", np.full((2, 16), 128))
+    with pytest.raises(InputError, match="3 x 2 cores does not divide into blocks of 2 x 2"):
+        compile_code(learned(2, 16, (2, 2))).tables((2, 3))

@@ -1,0 +1,224 @@
+"""From a trained int8 coding tensor to a core's program and tables, or to one line that says what does not fit.
+
+A core keeps K sums of 16 bits for every block of Mt timestamps, and what the temporal codes come from: a quarter wave
+where they are Fourier codes (Mt/4 bytes, whatever K), else the table itself (K Mt bytes). Over a block of Mr x Mc
+cores each core holds its own spatial weights, a byte a code: sum_n w c(t_n) = w sum_n c(t_n), so that they are used
+once a frame and not once a photon, and the cores' sums are added on their way to the core that puts them out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from scenes.errors import InputError, require
+from scenes.inputs import read_text
+from ultraphase.assembler import assemble
+from ultraphase.catalog import FOLDER, Method
+from ultraphase.chip import ChipSpec
+from ultraphase.codegen import loop_order, source_of, turns_of
+from ultraphase.integer_code import IntegerCode, folded_temporal
+from ultraphase.program import Program
+from ultraphase.tables import block_matrix, quarter_wave
+
+_EAST, _WEST, _SOUTH, _NORTH = 1, 2, 4, 8  # bits of a core's `ways`, as `sumblock.s` reads them
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Bytes of one core's RAM: `table` (quarter wave or temporal codes), `weights`, `ways`, `sums`."""
+
+    table: int
+    weights: int
+    ways: int
+    sums: int
+
+    @property
+    def total(self) -> int:
+        return self.table + self.weights + self.ways + self.sums
+
+    def __str__(self) -> str:
+        parts = {"table": self.table, "spatial weights": self.weights, "ways": self.ways, "sums": self.sums}
+        return ", ".join(f"{name} {size:,}" for name, size in parts.items() if size)
+
+
+def layout(
+    codes: int, bins: int, cores: int, chip: ChipSpec, *, folded: bool, weighted: bool, shared: int = 1
+) -> Layout:
+    """RAM of one core for K codes over blocks of `bins` timestamps and `cores` cores; `shared`: cores that hold the
+    table together. Sums begin at an even address, in front."""
+    table = bins // 4 if folded else -(-codes * bins // shared)
+    many = cores > 1
+    return Layout(table, codes if many and weighted else 0, int(many), 2 * codes * (chip.timestamps // bins))
+
+
+@dataclass(frozen=True, eq=False)
+class Compiled:
+    """A code's program, checked against the chip.
+
+    source      the assembler text that it comes from
+    loop_order  how a photon goes through the codes, in words
+    matrix      (Mr, Mc, numbers, timestamps) integers that a photon adds to the numbers of each core of the block
+    """
+
+    code: IntegerCode
+    program: Program
+    source: str
+    loop_order: str
+    layout: Layout
+    matrix: np.ndarray
+    chip: ChipSpec
+
+    @property
+    def name(self) -> str:
+        return self.code.name
+
+    @property
+    def block(self) -> tuple[int, int]:
+        return self.code.block
+
+    @cached_property
+    def weights(self) -> np.ndarray | None:
+        """Spatial weights of the cores of one block, (Mr, Mc, K); None where nothing is multiplied."""
+        spatial = self.code.spatial
+        return None if spatial is None or self.block == (1, 1) else np.moveaxis(spatial, 0, -1).astype(np.int64)
+
+    @property
+    def on_the_chip(self) -> bool:
+        """Whether the fabricated array has as many rows and columns of cores as the block; else a larger one is due."""
+        return all(part <= whole for part, whole in zip(self.block, self.chip.cores, strict=True))
+
+    def tables(self, shape: tuple[int, int]) -> dict[str, np.ndarray]:
+        """Contents of RAM for an array of rows x columns cores, as `CoreArray` takes them.
+
+        Raises InputError for an array that blocks do not tile.
+        """
+        fits = all(whole % part == 0 for whole, part in zip(shape, self.block, strict=True))
+        blocks = f"blocks of {self.block[1]} x {self.block[0]}"
+        require(fits, f"array of {shape[1]} x {shape[0]} cores does not divide into {blocks}")
+        repeats = (shape[0] // self.block[0], shape[1] // self.block[1], 1)
+        found: dict[str, np.ndarray] = {}
+        if self.code.counters:
+            return found
+        if self.code.harmonics:
+            found["quarter"] = quarter_wave(self.code.temporal)
+        elif self.code.temporal.ndim == 2:
+            found["temporal"] = self.code.temporal.reshape(-1)
+        else:
+            own = self.code.temporal.transpose(2, 3, 0, 1).reshape(*self.block, -1)
+            found["temporal"] = np.tile(own, repeats)
+        if self.weights is not None:
+            found["weight"] = np.tile(self.weights, repeats)
+        if self.block != (1, 1):
+            found["ways"] = np.tile(_ways(self.block)[..., None], repeats)
+        return found
+
+
+def _ways(block: tuple[int, int]) -> np.ndarray:
+    """What each core of a block takes and gives at the frame's end: the tree of `sumblock.s`, (Mr, Mc)."""
+    row, column = np.indices(block)
+    first = column == 0
+    return (
+        _EAST * (column + 1 < block[1])
+        + _WEST * ~first
+        + _SOUTH * (first & (row + 1 < block[0]))
+        + _NORTH * (first & (row > 0))
+    )
+
+
+def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
+    """Program and tables of a code. Raises InputError in one line that names the bytes needed and there, and what
+    would fit: fewer codes, a shorter block, or a table that the cores of a block share."""
+    chip = chip or ChipSpec()
+    known = chip.timestamps % code.bins == 0 and code.bins & (code.bins - 1) == 0
+    require(known, f"code {code.name}: blocks of {code.bins} bins, expected a power of two up to {chip.timestamps}")
+    if code.counters:
+        return _counters(code, chip)
+    cores, folded = code.block[0] * code.block[1], bool(code.harmonics)
+    weighted = code.spatial is not None
+    ram = layout(code.codes, code.bins, cores, chip, folded=folded, weighted=weighted)
+    if ram.total > chip.ram_bytes:
+        needs = f"needs {ram.total:,} bytes of RAM a core ({ram}), {chip.ram_bytes:,} are there"
+        raise InputError(f"code {code.name} {needs}; {_what_fits(code, chip)}")
+    source, order, program = _program(code, chip)
+    return Compiled(code, program, source, order, ram, _matrix(code, chip), chip)
+
+
+def _what_fits(code: IntegerCode, chip: ChipSpec) -> str:
+    """Which change of one thing would make the RAM do."""
+    cores, folded = code.block[0] * code.block[1], bool(code.harmonics)
+
+    def fits(codes: int, bins: int, shared: int = 1) -> bool:
+        weighted = code.spatial is not None
+        found = layout(codes, bins, cores, chip, folded=folded, weighted=weighted, shared=shared)
+        return found.total <= chip.ram_bytes
+
+    found = []
+    fewer = max((k for k in range(1, code.codes) if fits(k, code.bins)), default=0)
+    if fewer:
+        found.append(f"{fewer} code{'s' if fewer > 1 else ''} of {code.bins} bins")
+    shorter = [1 << n for n in range(2, code.bins.bit_length() - 1) if fits(code.codes, 1 << n)]
+    if shorter:
+        found.append(f"{code.codes} codes of blocks of {shorter[-1]} bins")
+    if cores > 1 and not folded and fits(code.codes, code.bins, cores):
+        found.append(f"its table shared by the {cores} cores of a block")
+    if not folded and code.codes % 2 == 0 and _fourier_fits(code, cores, chip):
+        found.append("a Fourier code of the same size")
+    if found:
+        return "would fit: " + ", or ".join(found)
+    return "neither fewer codes nor a shorter block nor a shared table nor a Fourier code of its size would fit"
+
+
+def _fourier_fits(code: IntegerCode, cores: int, chip: ChipSpec) -> bool:
+    found = layout(code.codes, code.bins, cores, chip, folded=True, weighted=True)
+    return code.codes <= code.bins - 2 and found.total <= chip.ram_bytes
+
+
+def _counters(code: IntegerCode, chip: ChipSpec) -> Compiled:
+    """A coarse histogram is a program of the catalogue."""
+    chosen = Method("coarse", code.codes)
+    program = chosen.program(chip)
+    ram = Layout(0, 0, 0, program.ram_bytes)
+    text = (FOLDER / "coarse.s").read_text()
+    return Compiled(code, program, text, "one counter a photon", ram, chosen.matrix()[None, None], chip)
+
+
+def _matrix(code: IntegerCode, chip: ChipSpec) -> np.ndarray:
+    if code.temporal.ndim == 4:
+        rows, columns = code.block
+        parts = [block_matrix(code.temporal[:, :, r, c], chip.timestamps) for r in range(rows) for c in range(columns)]
+        return np.stack(parts).reshape(rows, columns, -1, chip.timestamps)
+    temporal = folded_temporal(code) if code.harmonics else code.temporal
+    one = block_matrix(temporal, chip.timestamps)
+    return np.broadcast_to(one, (*code.block, *one.shape))
+
+
+def _program(code: IntegerCode, chip: ChipSpec) -> tuple[str, str, Program]:
+    """The fastest text that the program store holds: all harmonics one after the other, else in a loop."""
+    refused: InputError | None = None
+    for turns in turns_of(code):
+        source = source_of(code, chip, turns)
+        try:
+            return source, loop_order(code, turns), _assembled(source, code.name, chip)
+        except InputError as error:
+            refused = refused or error
+    raise InputError(f"{refused}; would fit: {_fewer_codes(code, chip)} codes")
+
+
+def _assembled(source: str, name: str, chip: ChipSpec) -> Program:
+    return assemble(source, name=name, chip=chip, read=lambda file: read_text(FOLDER / file, "assembler source"))
+
+
+def _fewer_codes(code: IntegerCode, chip: ChipSpec) -> int:
+    """The most codes of a Fourier code whose program the store holds."""
+    for codes in range(code.codes - 2, 0, -2):
+        spatial = None if code.spatial is None else code.spatial[:codes]
+        less = replace(code, temporal=code.temporal[:codes], spatial=spatial, harmonics=code.harmonics[: codes // 2])
+        try:
+            _assembled(source_of(less, chip, 1), code.name, chip)
+        except InputError:
+            continue
+        return codes
+    return 0
