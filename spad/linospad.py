@@ -8,9 +8,10 @@ pixels. Bins and pixels are put together by sums alone, so that counts are conse
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.io
@@ -18,8 +19,10 @@ import scipy.sparse
 
 from scenes.errors import require
 from scenes.files import whole_file
+from scenes.limits import require_memory
+from spad.histogram import Histogram
 from spad.matfile import load_mat
-from spad.sensor import Sensor
+from spad.sensor import PhotonBudget, Sensor, sensor_by_name
 from spad.timestamps import Timestamps
 
 BINS = 1536
@@ -68,8 +71,11 @@ def read_linospad(path: Path, frame: int = 0, *, bins: int = BINS) -> Capture:
     Raises InputError in one line for a file that is missing, damaged, of MATLAB's version 7.3 or of another layout,
     a frame that is not there, images that are not square, and counts that are negative or not finite.
     """
-    path = Path(path)
-    contents = load_mat(path, [COUNTS, IMAGES])
+    return frame_of(load_mat(path, [COUNTS, IMAGES]), Path(path), frame, bins=bins)
+
+
+def frame_of(contents: Mapping[str, Any], path: Path, frame: int, *, bins: int = BINS) -> Capture:
+    """Return one frame of a file's variables, as `read_linospad` does."""
     require(COUNTS in contents, f"{path}: holds no {COUNTS}, it is no LinoSPAD capture")
     frames = _entries(contents[COUNTS])
     require(0 <= frame < len(frames), f"{path}: frame {frame} is not one of its {len(frames)}, from 0")
@@ -97,6 +103,35 @@ def _checked(counts: object, where: str, bins: int) -> scipy.sparse.csc_matrix:
     good = bool(np.isfinite(found.data).all() and (found.data >= 0).all())
     require(good, f"{where}: holds counts that are negative or not finite")
     return found
+
+
+def capture_histogram(capture: Capture, sensor: Sensor | None = None) -> Histogram:
+    """Return a capture as a histogram without truth: depth, expected signal and background are NaN in every pixel.
+
+    `sensor` (default: the `linospad` preset) has the capture's bins. A capture does not say which photons are signal,
+    so that the budget states all of them as background. Raises InputError for counts that are no whole numbers or of
+    another number of bins, and images that need more memory than the limit.
+    """
+    sensor, side = sensor or sensor_by_name("linospad"), capture.side
+    bins, pixels = capture.counts.shape
+    require(bins == sensor.bins, f"capture of {bins} bins, sensor {sensor.name} has {sensor.bins}")
+    require_memory(12 * bins * pixels, f"a capture of {pixels} pixels")
+    found = capture.counts.data
+    whole = bool((found == np.floor(found)).all() and found.max(initial=0) <= np.iinfo(np.int32).max)
+    require(whole, "holds counts that are no whole numbers of 32 bits")
+    columns_first = capture.counts.astype(np.int32).T.toarray().reshape(side, side, bins)
+    unknown = np.full((side, side), np.nan, np.float32)
+    return Histogram(
+        counts=np.ascontiguousarray(columns_first.swapaxes(0, 1)),
+        sensor=sensor,
+        budget=PhotonBudget(0.0, float(found.sum() / pixels)),
+        depth_m=unknown,
+        mixed=np.zeros((side, side), bool),
+        albedo=unknown.astype(np.float16),
+        expected_signal=unknown.copy(),
+        expected_background=unknown.copy(),
+        meta={"model": "poisson", "plan": ["read from a capture"], "pile_up": 0.0, "wrapped": 0.0, "dark_share": 0.0},
+    )
 
 
 def rebinning(bins: int, new_bins: int) -> scipy.sparse.csr_matrix:

@@ -1,4 +1,4 @@
-"""The `.mat` files of the Lindell / Peng / ICCV 2023 family: their old frames read, the newer layout written and read.
+"""The `.mat` files of the Lindell / Peng / ICCV 2023 family: frames and captures read, the newer layout written.
 
 Indices are MATLAB's, from 1; images are (row, column); `spad` is a sparse (rows x columns, bins) matrix whose pixels
 run down the columns first. `bin` is the bin that the pulse's peak lies in. Depth in our files is exact in `dist`; the
@@ -20,6 +20,7 @@ from scenes.files import whole_file
 from scenes.limits import require_memory
 from spad.depth import estimate_depth
 from spad.histogram import Histogram
+from spad.linospad import COUNTS, capture_histogram, frame_of
 from spad.matfile import load_mat
 from spad.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
@@ -143,17 +144,25 @@ def _centred_taps(sensor: Sensor) -> np.ndarray:
     return pulse[held[0] : held[-1] + 1]
 
 
-def read_mat(path: Path) -> Histogram:
-    """Read a frame of either layout.
+def read_mat(path: Path, frame: int = 0) -> Histogram:
+    """Read a frame of either layout, or one `frame`, from 0, of a capture in the prototype's layout.
 
     The old one (`photons`, `SBR`, no `bin_size`) is that of the training set: its sensor is `iccv2023-train`, and depth
     that of `bin` by the published rounding, bin x c Delta / 2 with c = 3e8 m/s. Others say their bin width, and get the
     reference pulse. Expected signal and background are the frame's means: files of this family hold no maps.
+    A capture (`spad.linospad`) has no truth; its sensor is `linospad`.
 
-    Raises InputError in one line for a file that is none.
+    Raises InputError in one line for a file that is none of these, and a frame that is not there.
     """
     path = Path(path)
     contents = load_mat(path)
+    if COUNTS in contents:
+        capture = frame_of(contents, path, frame)
+        try:
+            return capture_histogram(capture)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+    require(frame == 0, f"{path}: is one frame and no capture of several, frame {frame} is not there")
     missing = {"spad", "SBR", "photons"} - {*contents} | (set() if {"bin", "range_bins"} & {*contents} else {"bin"})
     require(not missing, f"{path}: {', '.join(sorted(missing))} are missing, there are {', '.join(sorted(contents))}")
     try:

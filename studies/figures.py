@@ -192,7 +192,11 @@ def _pixel_counts(
 
 
 def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: dict, path: Path) -> Path:
-    """Truth, estimate and absolute error."""
+    """Truth, estimate and absolute error; the estimate alone where no truth is known."""
+    if np.isnan(histogram.depth_m).all():
+        figure, axes = plt.subplots(figsize=(6, 5), layout="constrained")
+        _image(axes, depth_m, f"{method}, no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
+        return save(figure, path)
     figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
     limits = depth_limits(histogram.depth_m)
     _image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)

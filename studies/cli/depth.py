@@ -28,7 +28,7 @@ class Depth(Common):
     """Estimate depth from a histogram and compare it with the truth; writes the depth map and a picture."""
 
     file: Positional[Path]
-    """A histogram written by `sense` (.h5)."""
+    """A histogram written by `sense` (.h5), or a frame or capture of the published family (.mat)."""
     out: File = None
     """The depth map (.exr) to write (default: the histogram's and the method's name)."""
     method: Literal[
@@ -50,6 +50,8 @@ class Depth(Common):
     the first two in their published rows."""
     codes: int = 16
     """Number K of codes kept per pixel by `--method compressive`."""
+    frame: int = 0
+    """Frame of a capture (.mat) of several, from 0."""
     figure: bool = True
     """Draw estimate, truth and error beside the file."""
 
@@ -57,14 +59,13 @@ class Depth(Common):
 def run(command: Depth, progress: Progress) -> dict:
     """Histogram -> depth map, error figures and a picture."""
     from spad.depth import depth_errors
-    from spad.histogram import read_histogram
     from studies.cli.sensing import mean_confidence
 
     label = depth_label(command)
     source = input_file(command.file)
     _expect_histogram(source)
     out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
-    histogram = read_histogram(source)
+    histogram = _read(source, command.frame)
     progress(command.method, 0.1)
     network, share = _network(command), None
     start = time.perf_counter()
@@ -81,6 +82,8 @@ def run(command: Depth, progress: Progress) -> dict:
     sure = mean_confidence(histogram, depth)
     range_m = histogram.sensor.range_m
     errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
+    if np.isnan(histogram.depth_m).all():
+        log.info("%s: holds no true depth, so that no error can be stated", source)
     _write_depth(depth, out, {"method": label, "histogram_sha256": histogram.sha256()}, share)
     result = {
         "seconds": seconds,
@@ -122,6 +125,18 @@ def _expect_histogram(path: Path) -> None:
         raise InputError(f"{path}: is a transient, expected a histogram; run `scene2spad sense {path}` first")
     if path.suffix.lower() == ".safetensors":
         raise InputError(f"{path}: is a checkpoint, expected a histogram; give it as --method network --checkpoint")
+
+
+def _read(path: Path, frame: int) -> Histogram:
+    if path.suffix.lower() == ".mat":
+        from spad.mat import read_mat
+
+        return read_mat(path, frame)
+    from spad.histogram import read_histogram
+
+    if frame:
+        raise InputError(f"{path}: --frame {frame} is for captures (.mat)")
+    return read_histogram(path)
 
 
 def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:

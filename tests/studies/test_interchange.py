@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
+import scipy.sparse
 
 from csph.config import ModelConfig, TrainConfig
 from csph.design import Design
@@ -13,7 +15,9 @@ from render.pack import write_pack
 from scenes.errors import InputError
 from spad.detect import sense
 from spad.histogram import Histogram, write_histogram
-from spad.sensor import PhotonBudget, Sensor
+from spad.linospad import Capture, write_linospad
+from spad.mat import read_mat, write_mat
+from spad.sensor import PhotonBudget, Sensor, sensor_by_name
 from studies.cli import main
 from studies.commands import Train
 from studies.planes import random_planes
@@ -83,3 +87,65 @@ def test_int8_follows_the_published_rule_where_it_is_asked_to(capfd, folder):
     assert "--int8-rule goes with --int8" in refused(capfd, *evaluate)
     table = run(capfd, *evaluate, "--int8", "--baselines", "argmax")
     assert table["method"] == "learned 256x4x4 K32, compact int8 published"
+
+
+def test_depth_reads_a_published_frame(capfd, folder):
+    histogram = planes()
+    write_histogram(histogram, Path("planes.h5"))
+    write_mat(histogram, Path("frame.mat"))
+    for method in (["log-matched"], ["network", "--model", "learned-256x4x4-128x-s0"]):
+        ours = run(capfd, "depth", "planes.h5", "--method", *method, "--no-figure")
+        theirs = run(capfd, "depth", "frame.mat", "--method", *method)
+        assert theirs["mae_mm"] == ours["mae_mm"] and theirs["pixels"] == ours["pixels"]
+        assert Path(f"frame-{ours['method']}.exr").is_file() and Path(theirs["figure"]).is_file()
+
+
+def test_depth_reads_an_old_published_frame(capfd, folder, shared_data):
+    """A frame of the training set, whose pulse stands 0.27 bins (3 mm) behind its rounded label: 0.77 less a half."""
+    found = run(capfd, "depth", str(shared_data / "nyuv2/spad_0071_p1.mat"), "--out", "nyu.exr", "--no-figure")
+    assert found["pixels"] + found["missing"] == 4096  # some have no photon of 10 + 2
+    assert found["within_10mm"] > 0.5 and abs(found["median_mm"]) < 6
+
+
+def capture(side: int = 8, frames: int = 2) -> Path:
+    """Captures whose pixel (row, column) of frame f has all photons in the bin 100 + 10 row + column + 200 f."""
+    made, row, column = [], *np.divmod(np.arange(side * side), side)
+    for number in range(frames):
+        bins = 100 + 10 * row + column + 200 * number
+        columns_first = column * side + row
+        made.append(Capture(scipy.sparse.csc_matrix((np.full(len(row), 40.0), (bins, columns_first)), (1536, side**2))))
+    write_linospad(made, Path("capture.mat"))
+    return Path("capture.mat")
+
+
+def test_depth_reads_a_frame_of_a_capture(capfd, folder):
+    capture()
+    sensor = sensor_by_name("linospad")
+    for number, first in ((0, 100), (1, 300)):
+        histogram = read_mat(Path("capture.mat"), number)
+        assert histogram.sensor == sensor and np.isnan(histogram.depth_m).all()
+        bins = first + 10 * np.arange(8)[:, None] + np.arange(8)
+        assert (histogram.counts.argmax(axis=-1) == bins).all() and (histogram.counts.sum(axis=-1) == 40).all()
+    found = run(capfd, "depth", "capture.mat", "--frame", "1", "--method", "argmax")
+    assert found["mae_mm"] is None and found["empty"] == 64 and Path(found["figure"]).is_file()
+    status = main(["depth", "capture.mat", "--no-figure"])
+    assert status == 0 and "holds no true depth" in capfd.readouterr().err
+
+
+def test_mat_files_that_are_none_end_in_one_line(capfd, folder):
+    capture()
+    assert "frame 2 is not one of its 2" in refused(capfd, "depth", "capture.mat", "--frame", "2")
+    write_mat(planes(8), Path("frame.mat"))
+    assert "frame.mat: is one frame and no capture" in refused(capfd, "depth", "frame.mat", "--frame", "1")
+    write_histogram(planes(8), Path("planes.h5"))
+    assert "--frame 1 is for captures" in refused(capfd, "depth", "planes.h5", "--frame", "1")
+    scipy.io.savemat("other.mat", {"a": 1})
+    assert "other.mat: SBR, bin, photons, spad are missing" in refused(capfd, "depth", "other.mat")
+    Path("cut.mat").write_bytes(Path("frame.mat").read_bytes()[:3000])
+    assert "cut.mat: not a readable .mat file" in refused(capfd, "depth", "cut.mat")
+    halves = Capture(scipy.sparse.csc_matrix(([0.5], ([7], [0])), (1536, 4)))
+    write_linospad([halves], Path("halves.mat"))
+    assert "halves.mat: holds counts that are no whole numbers" in refused(capfd, "depth", "halves.mat")
+    network = ["--method", "network", "--model", "learned-256x4x4-128x-s0"]
+    assert "trained for another sensor" in refused(capfd, "depth", "capture.mat", *network)
+    assert not list(Path().glob("*.exr"))
