@@ -180,7 +180,7 @@ def sweep(found: dict, path: Path) -> Path:
     scenes = f"{found['scenes']} scene{'s' if found['scenes'] != 1 else ''}"
     panel.set_title(f"Error against offset, 128x, seed 0, {scenes}, photons {levels}", fontsize=10)
     panel.grid(alpha=0.3, which="both")
-    panel.legend(fontsize=8)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     return save(figure, path)
 
 
@@ -199,7 +199,8 @@ def range_end(found: dict, path: Path) -> Path:
     for model in dict.fromkeys(row["model"] for row in found["walls"]):
         mine = [row for row in found["walls"] if row["model"] == model]
         name, _, changed = model.partition(", ")
-        style = {"ls": ":" if changed else "-", "lw": 1.2, "color": _model_colour(name)}
+        dashes = {"": "-", "mean kept": ":", "correlation": "-."}[changed]
+        style = {"ls": dashes, "lw": 1.2, "color": _model_colour(name)}
         right.plot([r["depth_m"] for r in mine], [r["bias_mm"] for r in mine], label=model, **style)
     right.set_yscale("symlog", linthresh=10)
     right.set(xlabel="depth of the wall [m]", ylabel="mean signed error [mm], linear within 10 mm")
