@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from csph.metrics import (
     is_low_sbr,
     paired_difference,
 )
+from csph.posterior import Decoder
 from csph.views import Views
 from render.heap import keep_freed_memory
 from scenes.errors import require
@@ -41,6 +42,12 @@ LEVEL_GROUPS: dict[str, Callable[[float, float], bool]] = {
 
 Method = Callable[[Histogram], np.ndarray]
 Progress = Callable[[str, float], None]
+
+
+class FindsDepth(Protocol):
+    """What evaluation asks of a model, or of what stands for one."""
+
+    def depth_of(self, histogram: Histogram, *, decoder: Decoder | None = None) -> tuple[np.ndarray, int]: ...
 
 
 @dataclass(frozen=True)

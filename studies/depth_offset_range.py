@@ -82,9 +82,7 @@ class Correlated:
     def __init__(self, coding: CodingTensor) -> None:
         self.coding = coding
 
-    def depth_of(
-        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None
-    ) -> tuple[np.ndarray, int]:
+    def depth_of(self, histogram: Histogram, *, decoder: Decoder | None = None) -> tuple[np.ndarray, int]:
         codes = encode(torch.from_numpy(histogram.counts), self.coding)
         return decode_depth(codes, self.coding, histogram.sensor).numpy(), 0
 

@@ -21,6 +21,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from csph.cards import checkpoint_of
+from csph.evaluation import FindsDepth
 from csph.grid import published_centroid_bins
 from csph.metrics import PHOTON_LEVELS, image_errors
 from csph.model import DepthModel, load_model
@@ -41,7 +42,7 @@ from spad.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, from_rgbd
 from spad.sensor import PhotonBudget, Sensor
 from studies.commands import Evaluate
 from studies.store import Store
-from studies.trained import FindsDepth, Subject, Wanted
+from studies.trained import Subject, Wanted
 
 log = logging.getLogger("scene2spad")
 

@@ -10,19 +10,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-import numpy as np
 import torch
 
 from csph.config import ModelConfig, TrainConfig
 from csph.design import Design
+from csph.evaluation import FindsDepth
 from csph.model import DepthModel, load_model, weights_sha256
-from csph.posterior import Decoder
 from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
 from render.tracing import Progress
 from scenes.errors import require
-from spad.histogram import Histogram
 from studies.commands import Train
 from studies.training import config_of, run_train
 
@@ -88,14 +86,6 @@ class Wanted:
         more += f" --time-offset {self.time_offset_m:g}" if self.time_offset_m else ""
         made = f"--preset {preset} --seed {self.seed} --set {training} --out {folder / self.name}"
         return f"scene2spad train --design {self.design}{coded}{more} {made}"
-
-
-class FindsDepth(Protocol):
-    """What evaluation asks of a model."""
-
-    def depth_of(
-        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None
-    ) -> tuple[np.ndarray, int]: ...
 
 
 class Subject(NamedTuple):

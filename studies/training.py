@@ -17,11 +17,9 @@ from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.cards import checkpoint_of
 from csph.config import ModelConfig, TrainConfig, preset
 from csph.design import Design
-from csph.evaluation import LEVEL_GROUPS, Evaluation, Method, as_dicts, evaluate
+from csph.evaluation import LEVEL_GROUPS, Evaluation, FindsDepth, Method, as_dicts, evaluate
 from csph.metrics import PHOTON_LEVELS
 from csph.model import DepthModel, load_model
-from csph.posterior import Decoder
-from csph.quantise import Int8Rule
 from csph.views import Views, read_views, split_views
 from render.tracing import Progress
 from scenes.errors import InputError, require
@@ -137,18 +135,14 @@ def run_train(command: Train, progress: Progress) -> dict:
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
 
 
-def network_method(
-    model: DepthModel,
-    *,
-    int8: bool = False,
-    int8_rule: Int8Rule = "calibrated",
-    decoder: Decoder | None = None,
-    overflows: list[int] | None = None,
-) -> Method:
-    """Depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`."""
+def network_method(model: FindsDepth, *, overflows: list[int] | None = None, **reading: Any) -> Method:
+    """Depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`.
+
+    `reading` is passed on to `DepthModel.depth_of`: int8, int8_rule, decoder.
+    """
 
     def method(histogram: Histogram) -> np.ndarray:
-        depth, wrapped = model.depth_of(histogram, int8=int8, int8_rule=int8_rule, decoder=decoder)
+        depth, wrapped = model.depth_of(histogram, **reading)
         if overflows is not None:
             overflows.append(wrapped)
         return depth

@@ -59,9 +59,7 @@ class WithoutNetwork:
     def __init__(self, name: str) -> None:
         self._depth_of = baseline(name)
 
-    def depth_of(
-        self, histogram: Histogram, *, int8: bool = False, decoder: Decoder | None = None
-    ) -> tuple[np.ndarray, int]:
+    def depth_of(self, histogram: Histogram, *, decoder: Decoder | None = None) -> tuple[np.ndarray, int]:
         return self._depth_of(histogram), 0
 
 

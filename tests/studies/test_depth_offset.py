@@ -34,7 +34,7 @@ class Counting(torch.nn.Module):
 
     asked = 0
 
-    def depth_of(self, histogram, *, int8=False, decoder=None):
+    def depth_of(self, histogram, *, decoder=None):
         type(self).asked += 1
         counts = histogram.counts.astype(np.float64)
         centres = np.arange(histogram.sensor.bins) + 0.5
