@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 import zipfile
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +12,31 @@ from scenes.errors import InputError, require
 from scenes.inputs import regular_file
 
 
-def load_torch_file(path: Path) -> Any:
+class _EmptyInstead:
+    """Stands for a class or function of another library: whatever is made with it is an empty dictionary."""
+
+    def __new__(cls, *_: object) -> OrderedDict:  # type: ignore[misc]
+        return OrderedDict()
+
+
+def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
     """Return what torch.save wrote, tensors and plain values alone, on the CPU.
 
-    Raises InputError in one line for a missing or foreign file, one whose checksums do not fit (torch does not look at
-    them), and one that holds other objects, which could run code.
+    `foreign`: in the place of objects of other libraries, such as the settings that a trainer keeps beside its weights,
+    there are dictionaries; nothing of those libraries is imported or called. Raises InputError in one line for a
+    missing or foreign file, one whose checksums do not fit (torch does not look at them), and one that holds other
+    objects, which could run code.
     """
     import torch
+    from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
 
     path = regular_file(path, "checkpoint")
     check_torch_file(path)
     try:
         with warnings.catch_warnings(action="ignore"):
-            return torch.load(path, map_location="cpu", weights_only=True)
+            names = get_unsafe_globals_in_checkpoint(path) if foreign else []
+            with safe_globals([(_EmptyInstead, name) for name in names]):
+                return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # unpickling raises whatever the pickle asks for
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path}: no checkpoint of tensors alone ({reason})") from None

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.sparse
+import torch
 
 from csph.config import ModelConfig, TrainConfig
 from csph.design import Design
@@ -149,3 +150,58 @@ def test_mat_files_that_are_none_end_in_one_line(capfd, folder):
     network = ["--method", "network", "--model", "learned-256x4x4-128x-s0"]
     assert "trained for another sensor" in refused(capfd, "depth", "capture.mat", *network)
     assert not list(Path().glob("*.exr"))
+
+
+def published_checkpoint(path: Path) -> Path:
+    """A Lightning checkpoint as the published code writes it, of Fourier rows before the published network."""
+    design = Design("fourier-published", (1024, 1, 1), 8)
+    model = DepthModel(ModelConfig(design=design, network="published"), seed=2)
+    weights = {f"backbone_net.{name}": value.detach() for name, value in model.network.named_parameters()}
+    weights["csph3d_layer.Cmat_tdim"] = model.layer.temporal[:, None, :, None, None]
+    weights["csph3d_layer.irf_weights"] = torch.zeros(1, 1, 16, 1, 1)
+    torch.save({"state_dict": weights, "epoch": 6, "global_step": 5194}, path)
+    return path
+
+
+def test_a_published_checkpoint_is_imported_and_used(capfd, folder):
+    published_checkpoint(Path("epoch=6.ckpt"))
+    made = run(capfd, "models", "import", "epoch=6.ckpt", "--out", "imported")
+    assert made["model"] == "fourier-published 1024x1x1 K8, published" and made["compression"] == 128
+    assert made["sensor"] == "iccv2023-train" and made["decoder"] == "soft-argmax, published grid"
+    assert made["checkpoint"] == "imported/model.safetensors" and made["parameters"] == 568278
+    histogram = planes(8, sensor_by_name("iccv2023-train"))
+    write_histogram(histogram, Path("planes.h5"))
+    depth = ["depth", "planes.h5", "--method", "network", "--no-figure", "--checkpoint"]
+    found = run(capfd, *depth, "imported")
+    direct = load_model(Path("imported"))[0].depth_of(histogram)[0]
+    known = np.isfinite(histogram.depth_m)
+    assert found["mae_mm"] == pytest.approx(1e3 * np.abs(direct - histogram.depth_m)[known].mean(), rel=1e-4)
+    # print trains on the one and tests on the other: what was learned of pulses was in bins
+    run(capfd, "models", "import", "epoch=6.ckpt", "--sensor", "reference", "--out", "for-tests")
+    write_histogram(planes(8), Path("reference.h5"))
+    run(capfd, "depth", "reference.h5", "--method", "network", "--no-figure", "--checkpoint", "for-tests")
+    assert "trained for another sensor" in refused(capfd, *depth, "for-tests")
+
+
+@pytest.mark.slow
+def test_an_imported_model_is_evaluated(capfd, folder):
+    published_checkpoint(Path("epoch=6.ckpt"))
+    run(capfd, "models", "import", "epoch=6.ckpt", "--sensor", "reference", "--out", "imported")
+    view = random_planes(1, size=8, seed=4)
+    write_pack([(view.transients[0], {"scene": view.scenes[0]})], Path("set.h5"))
+    table = run(capfd, "evaluate", "imported", "--set", "set.h5", "--baselines", "argmax")
+    assert table["method"] == "fourier-published 1024x1x1 K8, published" and table["mae_mm"] > 0
+
+
+def test_imports_that_cannot_be_end_in_one_line(capfd, folder):
+    assert "import without a checkpoint" in refused(capfd, "models", "import")
+    assert "none.ckpt: checkpoint not found" in refused(capfd, "models", "import", "none.ckpt")
+    assert "go with import" in refused(capfd, "models", "--out", "x")
+    torch.save({"state_dict": {"layer.weight": torch.zeros(3)}}, "other.ckpt")
+    said = refused(capfd, "models", "import", "other.ckpt")
+    assert "other.ckpt: tensor layer.weight is of no published compressive model" in said
+    published_checkpoint(Path("good.ckpt"))
+    assert "sensor 'guess' is unknown" in refused(capfd, "models", "import", "good.ckpt", "--sensor", "guess")
+    said = refused(capfd, "models", "import", "good.ckpt", "--sensor", "linospad")
+    assert "good.ckpt: blocks of 1024 bins do not divide the sensor's 1536" in said
+    assert not Path("out").exists()
