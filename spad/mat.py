@@ -22,13 +22,15 @@ from spad.depth import estimate_depth
 from spad.histogram import Histogram
 from spad.linospad import COUNTS, capture_histogram, frame_of
 from spad.matfile import load_mat
-from spad.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S
+from spad.pulse import SampledPulse
+from spad.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_taps
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
 from spad.template import binned_pulse
 
 RATES_EPSILON = 1e-8
 NO_BIN = 1  # what MATLAB's maximum of an empty histogram answers
 PEAK_ARRIVALS = 64
+SAME_PULSE = 1e-3  # of a pulse's sum: taps that differ by less in every bin are of the same pulse
 ESTIMATES = {"argmax": "argmax", "lmf": "lmf-published", "zncc": "correlation"}
 
 
@@ -52,7 +54,7 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     size = 8 * height * width * bins
     require(size < 2**31, f"{path}: {height} x {width} x {bins} rates take {size} bytes, a version 5 file holds 2^31")
     contents = _frame(histogram)
-    pulse = path.with_name(f"PSF_used_for_simulation_nr-{height}_nc-{width}.mat")
+    pulse = _pulse_file(path, height, width)
     taps = _centred_taps(sensor)
     if pulse.is_file():
         known = load_mat(pulse, ["psf"]).get("psf", np.zeros(0)).ravel()
@@ -64,6 +66,11 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     with whole_file(pulse) as beside:
         scipy.io.savemat(beside, psf, do_compression=True)
     return pulse
+
+
+def _pulse_file(path: Path, height: int, width: int) -> Path:
+    """Return the pulse's file beside a frame, as the family names it."""
+    return path.with_name(f"PSF_used_for_simulation_nr-{height}_nc-{width}.mat")
 
 
 def _frame(histogram: Histogram) -> dict:
@@ -148,9 +155,10 @@ def read_mat(path: Path, frame: int = 0) -> Histogram:
     """Read a frame of either layout, or one `frame`, from 0, of a capture in the prototype's layout.
 
     The old one (`photons`, `SBR`, no `bin_size`) is that of the training set: its sensor is `iccv2023-train`, and depth
-    that of `bin` by the published rounding, bin x c Delta / 2 with c = 3e8 m/s. Others say their bin width, and get the
-    reference pulse. Expected signal and background are the frame's means: files of this family hold no maps.
-    A capture (`spad.linospad`) has no truth; its sensor is `linospad`.
+    that of `bin` by the published rounding, bin x c Delta / 2 with c = 3e8 m/s. Others say their bin width; their pulse
+    is in a file beside them, as `write_mat` and the published simulation leave it: that of a preset where it is one,
+    else its taps; the reference pulse where there is no such file. Expected signal and background are the frame's
+    means: files of this family hold no maps. A capture (`spad.linospad`) has no truth; its sensor is `linospad`.
 
     Raises InputError in one line for a file that is none of these, and a frame that is not there.
     """
@@ -166,14 +174,34 @@ def read_mat(path: Path, frame: int = 0) -> Histogram:
     missing = {"spad", "SBR", "photons"} - {*contents} | (set() if {"bin", "range_bins"} & {*contents} else {"bin"})
     require(not missing, f"{path}: {', '.join(sorted(missing))} are missing, there are {', '.join(sorted(contents))}")
     try:
-        return _histogram(contents)
+        return _histogram(contents, path)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(f"{path}: not a frame of this family ({' '.join(str(error).split())[:80]})") from None
 
 
-def _histogram(contents: dict) -> Histogram:
+def _newer_sensor(contents: dict, bins: int, pulse_file: Path) -> Sensor:
+    """Return the sensor of a frame that says its bin width, with the pulse of the file beside it."""
+    plain = Sensor(name="mat", bins=bins, bin_width_s=float(contents["bin_size"].item()))
+    if not pulse_file.is_file():
+        return plain
+    taps = load_mat(pulse_file, ["psf"]).get("psf", np.zeros(0))
+    good = taps.dtype.kind in "uif" and 1 <= taps.size <= bins and bool(np.isfinite(taps).all())
+    require(good and taps.min() >= 0 and taps.sum() > 0, f"{pulse_file}: holds no pulse of 1 to {bins} taps (psf)")
+    taps = taps.ravel() / taps.sum(dtype=np.float64)
+    train = replace(plain, pulse=sensor_by_name("iccv2023-train").pulse)
+    for known, form in ((plain, _centred_taps), (plain, published_taps), (train, _centred_taps)):
+        if _same_pulse(taps, form(known)):
+            return known
+    return replace(plain, pulse=SampledPulse(tuple(taps), plain.bin_width_s))
+
+
+def _same_pulse(taps: np.ndarray, other: np.ndarray) -> bool:
+    return taps.shape == other.shape and bool(np.abs(taps - other).max() < SAME_PULSE)
+
+
+def _histogram(contents: dict, path: Path) -> Histogram:
     index = contents["bin" if "bin" in contents else "range_bins"].astype(np.int64)
     height, width = index.shape
     require(contents["spad"].ndim == 2, f"spad has {contents['spad'].ndim} dimensions, expected 2")
@@ -186,7 +214,7 @@ def _histogram(contents: dict) -> Histogram:
         raise InputError("spad holds values that are no counts")
     counts = dense.reshape(width, height, -1).swapaxes(0, 1).astype(np.int32)
     if "bin_size" in contents:
-        sensor = Sensor(name="mat", bins=counts.shape[2], bin_width_s=float(contents["bin_size"].item()))
+        sensor = _newer_sensor(contents, counts.shape[2], _pulse_file(path, height, width))
     else:
         sensor = replace(sensor_by_name("iccv2023-train"), bins=counts.shape[2], period_s=None)
     signal, sbr = float(contents["photons"].item()), float(contents["SBR"].item())

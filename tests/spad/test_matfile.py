@@ -1,5 +1,6 @@
 """MATLAB files: what is sound reads as scipy reads it, what states more than it holds never reaches scipy."""
 
+import math
 import struct
 import zlib
 from dataclasses import replace
@@ -12,11 +13,15 @@ import scipy.sparse
 from test_rgbd import made
 
 from scenes import InputError
+from spad.depth import histogram_depth_m
+from spad.detect import sense
 from spad.histogram import Histogram
 from spad.linospad import read_linospad
 from spad.mat import read_mat, write_mat
 from spad.matfile import checked_contents, load_mat
-from spad.sensor import Sensor, sensor_by_name
+from spad.pulse import Pulse, SampledPulse
+from spad.rgbd import published_taps, transient_from_rgbd
+from spad.sensor import PhotonBudget, Sensor, sensor_by_name
 
 
 def saved(path: Path, compressed: bool = False, **variables) -> Path:
@@ -126,10 +131,6 @@ def test_bin_is_the_fullest_bin_of_the_pulse(name, tmp_path):
     rng = np.random.default_rng(0)
     depth = rng.uniform(0.5, 11, (24, 32))
     image = np.ones(depth.shape)
-    from spad.detect import sense
-    from spad.rgbd import transient_from_rgbd
-    from spad.sensor import PhotonBudget
-
     histogram = sense(transient_from_rgbd(depth, image, image), sensor, PhotonBudget(100, 10), seed=0)
     write_mat(histogram, tmp_path / "f.mat")
     frame = load_mat(tmp_path / "f.mat")
@@ -146,3 +147,49 @@ def test_the_pulse_of_another_sensor_is_not_overwritten(tmp_path):
         write_mat(other, tmp_path / "c.mat")
     assert not (tmp_path / "c.mat").exists()
     assert (read_mat(tmp_path / "a.mat").counts == made().counts).all()
+
+
+@pytest.mark.parametrize("name", ["reference", "iccv2023-train"])
+def test_an_exported_frame_comes_back_with_its_sensor(name, tmp_path):
+    """The pulse lies beside the frame: a measured one was read as the reference Gaussian, 1 to 8 mm off."""
+    sensor = sensor_by_name(name)
+    histogram = sensed(replace(sensor, dark_count_rate_hz=0.0))
+    write_mat(histogram, tmp_path / "f.mat")
+    again = read_mat(tmp_path / "f.mat")
+    same = (again.sensor.bins, again.sensor.bin_width_s, again.sensor.response)
+    assert same == (sensor.bins, sensor.bin_width_s, sensor.response)
+    next(tmp_path.glob("PSF*")).unlink()
+    assert read_mat(tmp_path / "f.mat").sensor.pulse == Sensor().pulse
+
+
+def test_a_pulse_that_is_no_preset_is_read_by_its_taps(tmp_path):
+    slow = Pulse(300e-12, 400e-12)
+    histogram = sensed(Sensor(pulse=slow))
+    write_mat(histogram, tmp_path / "f.mat")
+    again = read_mat(tmp_path / "f.mat")
+    assert isinstance(again.sensor.pulse, SampledPulse)
+    # its bins blur it once more, by a twelfth of a bin squared
+    assert again.sensor.pulse.std_s == pytest.approx(math.hypot(slow.std_s, Sensor().bin_width_s / 6**0.5), rel=0.01)
+    medians = []
+    for read in (again, replace(again, sensor=Sensor())):
+        error = histogram_depth_m(read, "matched") - read.depth_m
+        medians.append(abs(float(np.median(error))) * 1e3)
+    assert medians[0] < 1 and medians[1] > 15  # mm
+
+
+def test_the_published_taps_of_the_reference_pulse_are_the_reference(tmp_path):
+    write_mat(made(), tmp_path / "f.mat")
+    pulse = next(tmp_path.glob("PSF*"))
+    scipy.io.savemat(pulse, {"psf": published_taps(Sensor())})
+    assert read_mat(tmp_path / "f.mat").sensor.pulse == Sensor().pulse
+    for taps in (np.zeros(5), np.full(5, np.nan), np.ones(2000), np.zeros(0)):
+        scipy.io.savemat(pulse, {"psf": taps})
+        with pytest.raises(InputError, match=r"PSF_used_for_simulation_nr-5_nc-7\.mat: holds no pulse of 1 to 1024"):
+            read_mat(tmp_path / "f.mat")
+
+
+def sensed(sensor: Sensor) -> Histogram:
+    """An image of 24 x 32 depths with 1,000 photons each."""
+    depth = np.random.default_rng(0).uniform(0.5, 11, (24, 32))
+    image = np.ones(depth.shape)
+    return sense(transient_from_rgbd(depth, image, image), sensor, PhotonBudget(1000, 1), seed=0)
