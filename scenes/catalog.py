@@ -15,6 +15,7 @@ from scenes.living_room import living_room
 from scenes.meshes import EXTENSIONS as MESH_EXTENSIONS
 from scenes.meshes import load_mesh
 from scenes.model import Camera, Material, Scene, Surface
+from scenes.placing import AS_IT_IS, Placing, placed
 
 SCENES: dict[str, str] = {
     "living-room": "a furnished room made from the seed, 0.8 to 6.2 m, with a window and a lamp as ambient light",
@@ -25,21 +26,41 @@ SCENES: dict[str, str] = {
 }
 EXTENSIONS = (*MESH_EXTENSIONS, ".xml")
 HARD = "hard-cases/"
+WALL = "wall@"
 FAMILIES = (HARD, "tabletop/", "middlebury/", "rooms/", "clutter/")
 WIDTH, HEIGHT = 128, 96  # pixels, where neither the caller nor the file says
 
 
-def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
+def load_scene(
+    spec: str,
+    *,
+    seed: int = 0,
+    width: int | None = None,
+    height: int | None = None,
+    placing: Placing = AS_IT_IS,
+) -> Scene:
     """The scene of that name, or in that file (.obj .ply .stl .glb, or Mitsuba .xml).
 
-    Names: a key of SCENES, `hard-cases/NAME`, `tabletop/NAME`, `middlebury/NAME`, `rooms/SPLIT/NUMBER`,
-    `clutter/SPLIT/NUMBER`; a folder with view1.png, disp1.png and dmin.txt is a Middlebury scene too.
+    Names: a key of SCENES, `wall@METRES` (a frontal wall there, as `plane`), `hard-cases/NAME`, `tabletop/NAME`,
+    `middlebury/NAME`, `rooms/SPLIT/NUMBER`, `clutter/SPLIT/NUMBER`; a folder with view1.png, disp1.png and dmin.txt is
+    a Middlebury scene too.
 
     width, height: pixels; None is 128 x 96, or the film size of an .xml; one alone keeps the proportions. The seed
-    matters to procedural scenes only. Raises InputError in one line for an unknown name or extension, or a bad file.
+    matters to procedural scenes only. `placing` states size, upward axis (meshes) and camera. Raises InputError in one
+    line for an unknown name or extension, or a bad file.
     """
     spec = str(spec)
+    if Path(spec).suffix.lower() in MESH_EXTENSIONS:
+        size = _looking_ahead(WIDTH, HEIGHT).resized(width, height)
+        return load_mesh(Path(spec), width=size.width, height=size.height, placing=placing)
+    return placed(_loaded(spec, seed, width, height), placing)
+
+
+def _loaded(spec: str, seed: int, width: int | None, height: int | None) -> Scene:
+    """A scene that is no mesh file, as its name or its file has it."""
     kind = Path(spec).suffix.lower()
+    if spec.startswith(WALL):
+        return _wall_at(spec, _looking_ahead(WIDTH, HEIGHT).resized(width, height))
     if spec.startswith(HARD):
         return _hard_case(spec.removeprefix(HARD), width, height)
     if spec.startswith(FAMILIES[1:]) and not Path(spec).exists():
@@ -51,7 +72,7 @@ def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: in
     if spec not in SCENES and kind not in EXTENSIONS:
         families = ", ".join(f"{family}NAME" for family in FAMILIES)
         raise InputError(
-            f"scene {spec!r}: expected one of {', '.join(SCENES)}, {families}, "
+            f"scene {spec!r}: expected one of {', '.join(SCENES)}, {WALL}METRES, {families}, "
             f"or a file with extension {' '.join(EXTENSIONS)}{did_you_mean(spec, SCENES)}"
         )
     if kind == ".xml":
@@ -59,14 +80,23 @@ def load_scene(spec: str, *, seed: int = 0, width: int | None = None, height: in
 
         return load_mitsuba_xml(Path(spec), width=width, height=height)
     size = _looking_ahead(WIDTH, HEIGHT).resized(width, height)
-    if kind in MESH_EXTENSIONS:
-        return load_mesh(Path(spec), width=size.width, height=size.height)
     if spec == "living-room":
         return living_room(seed, width=size.width, height=size.height)
     if spec == "gallery":
         return gallery(width=size.width, height=size.height)
     make = {"plane": _plane, "sphere": _sphere, "corner": _corner}[spec]
     return Scene(spec, make(), size)
+
+
+def _wall_at(spec: str, camera: Camera) -> Scene:
+    """`plane` at another distance, as large as the image needs."""
+    try:
+        distance_m = float(spec.removeprefix(WALL))
+    except ValueError:
+        distance_m = math.nan
+    if not 0.01 <= distance_m <= 1e5:
+        raise InputError(f"scene {spec!r}: expected {WALL} and metres from 0.01 to 100,000")
+    return Scene(spec, _plane(distance_m, 8 / 3 * distance_m), camera)
 
 
 def _of_a_set(spec: str, seed: int, width: int | None, height: int | None) -> Scene:

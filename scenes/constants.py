@@ -7,3 +7,6 @@ SPEED_OF_LIGHT_M_PER_S = 299_792_458.0
 REFERENCE_BINS = 1024
 REFERENCE_PERIOD_S = 100e-9
 REFERENCE_PULSE_SIGMA_S = 135e-12
+
+# Of lasers whose wavelength nobody states: where light at this wavelength is needed (sunlight, a photon budget).
+DEFAULT_WAVELENGTH_M = 850e-9

@@ -20,6 +20,7 @@ from scenes.errors import InputError
 from scenes.inputs import file_inside, read_bytes
 from scenes.mesh_files import MAX_COORDINATE, check_vertices, load_trimesh
 from scenes.model import Camera, Material, Scene, Surface, Texture
+from scenes.placing import AS_IT_IS, Placing
 from scenes.textures import load_texture, luminance, srgb_to_linear
 
 EXTENSIONS = (".obj", ".ply", ".stl", ".glb")
@@ -33,6 +34,12 @@ WALL_GAP_M = 1.0
 FOV_DEG = 40.0
 ELEVATION_DEG, AZIMUTH_DEG = 15.0, 30.0  # a little from above, and from the side: what faces away shows its flank
 FILL = 0.7  # share of the smaller image dimension that the model's bounding sphere takes
+# Rotations that bring an axis of the file upwards (to +y).
+TURNS = {
+    "x": np.array(((0.0, -1, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))),
+    "y": np.eye(4),
+    "z": np.array(((1.0, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))),
+}
 ZERO_AREA = 1e-12  # a face with a smaller area than this, for a model of unit extent, is degenerate
 
 
@@ -48,27 +55,39 @@ class _Part:
     visual: Any
 
 
-def load_mesh(path: Path, *, width: int = 128, height: int = 96) -> Scene:
+def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placing = AS_IT_IS) -> Scene:
     """The scene of one mesh file, metres, y up: floor at y = 0, wall behind, camera before the model's +z side.
 
     The model keeps its size if its largest extent is 0.2 to 2.5 m. Otherwise the unit that the file names is taken (a
     comment or header such as "units: mm"), else millimetres or inches where these make 0.2 to 2.5 m of it, else it is
     scaled to 1 m; each with a warning in the notes. Every surface is
-    diffuse with the file's colour as albedo (luminance of linear colour), 0.6 where the file has none. Raises
-    InputError in one line for a file that is missing, of another kind, broken, empty, without faces or with NaNs.
+    diffuse with the file's colour as albedo (luminance of linear colour), 0.6 where the file has none. `placing` states
+    size, upward axis and camera instead. Raises InputError in one line for a file that is missing, of another kind,
+    broken, empty, without faces or with NaNs, and for a camera that floor and wall cannot be put around.
     """
     path = Path(path)
     parts = _read(path)
     notes: list[str] = []
-    parts = _stand(path, parts, notes)
+    parts = _stand(path, parts, notes, placing)
     low = np.min([part.vertices.min(axis=0) for part in parts], axis=0)
     high = np.max([part.vertices.max(axis=0) for part in parts], axis=0)
     centre = (low + high) / 2
     radius = max(float(np.linalg.norm(part.vertices - centre, axis=1).max()) for part in parts)
-    camera = _camera(centre, radius, width, height)
+    camera = placing.camera(_camera(centre, radius, width, height), centre)
+    wall_z = low[2] - WALL_GAP_M
+    around = [] if placing.bare else _around(path, camera, wall_z)
     paint = _Paint(path, notes)
     surfaces = [_surface(part, paint) for part in parts]
-    return Scene(path.stem, (*surfaces, *backdrop(camera, low[2] - WALL_GAP_M)), camera, notes=tuple(notes))
+    return Scene(path.stem, (*surfaces, *around), camera, notes=tuple(notes))
+
+
+def _around(path: Path, camera: Camera, wall_z: float) -> list[Surface]:
+    """Floor and wall, which a camera that was placed must stand before."""
+    top = camera.rays(np.array([0.0, camera.width]), np.zeros(2))
+    good = camera.origin[1] > 0 and camera.origin[2] > wall_z and bool((top[:, 2] < 0).all())
+    if not good:
+        raise InputError(f"{path}: the camera does not stand above the floor and look at the wall behind; use --bare")
+    return backdrop(camera, wall_z)
 
 
 def _camera(centre: np.ndarray, radius: float, width: int, height: int) -> Camera:
@@ -169,19 +188,19 @@ def _check_pose(pose: np.ndarray, name: str) -> None:
 # --- Standing upright, at a sensible size, with sound faces ----------------------------------------------------------
 
 
-def _stand(path: Path, parts: list[_Part], notes: list[str]) -> list[_Part]:
+def _stand(path: Path, parts: list[_Part], notes: list[str], placing: Placing) -> list[_Part]:
     """The parts y up, in metres, without useless faces, resting on y = 0 with their middle at x = z = 0."""
-    turn = np.eye(4)
-    if path.suffix.lower() == ".stl":
-        turn = np.array(((1.0, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)))
-        notes.append("z taken as up, as is usual for .stl")
+    up = placing.up or ("z" if path.suffix.lower() == ".stl" else "y")
+    turn = TURNS[up]
+    if placing.up is None and up == "z":
+        notes.append("z taken as up, as is usual for .stl; --up says otherwise")
     points = np.concatenate([part.vertices[np.unique(part.faces)] for part in parts]) @ turn[:3, :3].T
     low, high = points.min(axis=0), points.max(axis=0)
     with np.errstate(over="ignore"):
         extent = float((high - low).max())
     if not 0 < extent < math.inf:
         raise InputError(f"{path}: its largest extent is {extent:g}, expected a solid body of finite size")
-    scale, warning = _scale(path, extent)
+    scale, warning = _scale(path, extent) if placing.scale is None else (placing.scale, [])
     size = (
         f"{extent:.4g} m kept" if scale == 1 else f"scaled by {scale:.3g}: {extent:.4g} to {round(scale * extent, 4)} m"
     )

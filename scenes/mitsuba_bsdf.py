@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,6 +77,17 @@ class Materials:
             raise shape.fail(f"has {len(bsdfs)} bsdfs, expected one")
         return self.look(bsdfs[0]) if bsdfs else self._default
 
+    def check(self, shape: Plugin) -> None:
+        """Refuse a shape whose bsdf has no counterpart here, in one line, before any file is read."""
+        for plugin in shape.nested("bsdf"):
+            for _ in range(MAX_NESTING):
+                inside = plugin.nested("bsdf")
+                if plugin.type not in _WRAPPERS or not inside:
+                    break
+                plugin = inside[0]
+            if plugin.type not in (*_KINDS, *_WRAPPERS):
+                raise plugin.fail(_no_counterpart(plugin.type))
+
     def look(self, plugin: Plugin) -> Look:
         if plugin not in self._looks:
             self._looks[plugin] = self._build(plugin)
@@ -85,7 +97,7 @@ class Materials:
         uv = _Uv()
         inner, opacity = self._unwrap(plugin, uv)
         if inner.type not in _KINDS:
-            raise inner.fail(f"bsdf {inner.type!r} is not supported, expected one of {', '.join(_KINDS)} or a wrapper")
+            raise inner.fail(_no_counterpart(inner.type))
         values = _KINDS[inner.type](self, inner, uv)
         inner.note_unused()
         values.setdefault("kind", inner.type)
@@ -174,6 +186,13 @@ class Materials:
         if key not in self._images:
             self._images[key] = load_texture(path, linear=linear, channel=channel)
         return self._images[key]
+
+
+def _no_counterpart(kind: str) -> str:
+    """Say that a bsdf is not supported, with the way round."""
+    if kind in _WAYS_ROUND:
+        return f"bsdf {kind!r} is not supported, {_WAYS_ROUND[kind]}"
+    return f"bsdf {kind!r} is not supported, expected one of {', '.join(_KINDS)} or a wrapper"
 
 
 def _clipped(plugin: Plugin, name: str, value: float) -> float:
@@ -300,6 +319,24 @@ def _rough_conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
     return _rough(_conductor(materials, plugin, uv), "conductor", _microfacets(materials, plugin, 0.1))
 
 
+def _phong(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+    """Phong's lobe as rough plastic of the same width: alpha = sqrt(2 / (exponent + 2)) (Walter et al. 2007, 5.2)."""
+    exponent = materials.mean(plugin, "exponent", 30.0)
+    if exponent < 0:
+        raise plugin.fail(f"exponent {exponent:g} is negative")
+    share = materials.mean(plugin, "specular_reflectance", 0.2)
+    fresnel = ((INDICES["polypropylene"] - 1) / (INDICES["polypropylene"] + 1)) ** 2
+    plugin.note("phong is taken as rough plastic of the same width, whose highlight grows towards grazing angles")
+    return {
+        "kind": "roughplastic",
+        "albedo": materials.fraction(plugin, "diffuse_reflectance", 0.5, uv),
+        "specular": min(share / fresnel, 1.0),
+        "ior": INDICES["polypropylene"],
+        "roughness": min(max(math.sqrt(2 / (exponent + 2)), 1e-3), 1.0),
+        "distribution": "beckmann",
+    }
+
+
 def _dielectric(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
     for name in ("specular_reflectance", "specular_transmittance"):
         if materials.mean(plugin, name, 1.0) != 1:
@@ -316,4 +353,15 @@ _KINDS: dict[str, Callable[[Materials, Plugin, _Uv], dict]] = {
     "roughconductor": _rough_conductor,
     "dielectric": _dielectric,
     "thindielectric": _dielectric,
+    "phong": _phong,
+}
+_WRAPPERS = ("twosided", "mask", "bumpmap", "normalmap")
+_WAYS_ROUND = {
+    "roughdielectric": "no light is bent or scattered by glass here; write dielectric, or diffuse for frosted glass",
+    "blendbsdf": "write the stronger of its two bsdfs alone",
+    "principled": "write roughplastic or roughconductor with the same base colour and roughness",
+    "hk": "light inside bodies is not followed; write diffuse",
+    "difftrans": "light does not pass matte surfaces here; write diffuse",
+    "ward": "write roughconductor or roughplastic with alpha for its two widths",
+    "null": "remove the shape, which nothing would see",
 }

@@ -88,9 +88,11 @@ class Document:
             for inner in element.iter():
                 self._sources[inner] = source
                 self._fill_in(inner)
+                if inner.tag == "default":
+                    self._defaults.setdefault(self.need(inner, "name"), self.need(inner, "value"))
             if element.tag == "default":
-                self._defaults.setdefault(self.need(element, "name"), self.need(element, "value"))
-            elif element.tag == "include":
+                continue
+            if element.tag == "include":
                 self._include(element, stack)
             elif element.tag == "alias":
                 self._register(element, self.need(element, "as"), self.target(element, self.need(element, "id")))

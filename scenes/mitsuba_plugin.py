@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from scenes.blackbody import seen_radiance_w_per_m2_sr_nm
 from scenes.errors import InputError
 from scenes.mitsuba_nodes import Document
 from scenes.shapes import axis_frame
@@ -50,6 +51,8 @@ class Plugin:
 
     def _add(self, child: Element) -> None:
         target = child
+        if child.tag == "default":
+            return  # its value has been filled in
         if child.tag == "ref":
             target = self.document.target(child, self.document.need(child, "id"))
         name = snake_case(child.get("name", ""))
@@ -161,6 +164,8 @@ class Plugin:
         return self._luminance(name, element)
 
     def _luminance(self, name: str, element: Element) -> float:
+        if element.tag == "blackbody" or element.get("type") == "blackbody":
+            return self._blackbody(name, element)
         if element.tag not in COLOUR_TAGS:
             raise self.fail(f"{name} is a <{element.tag}>, expected <rgb>, <spectrum> or <float>")
         if element.get("type") or element.get("filename"):
@@ -177,6 +182,17 @@ class Plugin:
             rgb = np.broadcast_to(srgb_to_linear(np.array(rgb)) if encoded else np.array(rgb), 3)
             return float(luminance(rgb))
         return self.numbers(text, name, 1)[0]
+
+    def _blackbody(self, name: str, element: Element) -> float:
+        """Radiance [W/(m^2 sr nm)] of <blackbody temperature="5000K"/> (version 0.6), or of version 3's spectrum."""
+        inside = {child.get("name"): child.get("value", "") for child in element}
+        text = element.get("temperature") or inside.get("temperature") or ""
+        temperature = self.numbers(re.sub(r"\s*[kK]\s*$", "", text), f"temperature of {name}", 1)[0]
+        if not 100 <= temperature <= 1e5:
+            raise self.fail(f"temperature of {name} is {temperature:g} K, expected 100 to 100,000")
+        scale = element.get("scale") or inside.get("scale") or "1"
+        self.note("a black body's radiance is its mean over the eye's response, in W/(m2 sr nm)")
+        return self.numbers(scale, f"scale of {name}", 1)[0] * seen_radiance_w_per_m2_sr_nm(temperature)
 
     def _hex(self, name: str, text: str) -> list[float]:
         if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):

@@ -17,6 +17,7 @@ from scenes.mitsuba_bsdf import Look, Materials
 from scenes.mitsuba_nodes import Document
 from scenes.mitsuba_plugin import Plugin
 from scenes.model import Surface
+from scenes.serialized import read_serialized
 
 # At 128 segments a disk's area is 4e-4 too small, at 5 subdivisions a sphere's 3e-4: under the 1e-3 that is promised.
 SEGMENTS = 128
@@ -55,15 +56,19 @@ class Shapes:
     def __init__(self, document: Document, materials: Materials) -> None:
         self._document = document
         self._materials = materials
-        self._files: dict[Path, Mesh] = {}
+        self._files: dict[tuple[Path, int], Mesh] = {}
 
-    def surface(self, plugin: Plugin) -> Surface:
-        """The surface of a <shape>, in the world, with its material and its light."""
-        if plugin.type in ("serialized", "shapegroup", "instance"):
+    def check(self, plugin: Plugin) -> None:
+        """Refuse a <shape> that has no counterpart here, in one line, before any file is read."""
+        if plugin.type in ("shapegroup", "instance"):
             raise plugin.fail(f"shape {plugin.type!r} is not supported, write every copy out as .obj or .ply")
         if plugin.type not in _BUILDERS:
             raise plugin.fail(f"shape {plugin.type!r} is not supported, expected one of {', '.join(_BUILDERS)}")
         plugin.refuse("medium", "volume", "phase", "subsurface", "sensor", "shape")
+        self._materials.check(plugin)
+
+    def surface(self, plugin: Plugin) -> Surface:
+        """The surface of a <shape>, in the world, with its material and its light."""
         name = plugin.id or Path(plugin.string("filename", plugin.type).replace("\\", "/")).stem
         mesh = _placed(_BUILDERS[plugin.type](self, plugin), plugin)
         look = self._materials.of_shape(plugin)
@@ -94,10 +99,11 @@ class Shapes:
         """A mesh file with the uv and vertex normals that it carries, v as the file has it."""
         filename = plugin.string("filename")
         path = self._document.file(plugin.element, filename, "mesh")
-        key = path.resolve()
+        index = plugin.integer("shape_index", 0) if kind == "serialized" else 0
+        key = path.resolve(), index
         if key not in self._files:
             try:
-                self._files[key] = _read(path, kind)
+                self._files[key] = _read(path, kind) if kind != "serialized" else _read_serialized(path, index)
             except InputError as error:
                 raise plugin.fail(f"{filename}: {str(error).removeprefix(f'{path}: ')}") from None
             except Exception as error:  # what trimesh works out only when it is asked for
@@ -132,6 +138,13 @@ def _read(path: Path, kind: str) -> Mesh:
     return Mesh(vertices, faces, _joined(uvs), _joined(normals))
 
 
+def _read_serialized(path: Path, index: int) -> Mesh:
+    """One mesh of a .serialized file."""
+    found = read_serialized(path, index)
+    check_vertices(found.vertices, path.name)
+    return Mesh(found.vertices, found.faces, found.uv, found.normals)
+
+
 def _joined(arrays: list[np.ndarray | None]) -> np.ndarray | None:
     return None if any(array is None for array in arrays) else np.concatenate(arrays)
 
@@ -142,6 +155,11 @@ def _obj(builder: Shapes, plugin: Plugin) -> Mesh:
 
 def _ply(builder: Shapes, plugin: Plugin) -> Mesh:
     return _from_file(builder.file(plugin, "ply"), plugin, flip_v=False)
+
+
+def _serialized(builder: Shapes, plugin: Plugin) -> Mesh:
+    plugin.ignore(("max_smooth_angle",))
+    return _from_file(builder.file(plugin, "serialized"), plugin, flip_v=False)
 
 
 def _from_file(mesh: Mesh, plugin: Plugin, *, flip_v: bool) -> Mesh:
@@ -190,6 +208,7 @@ def _cylinder(builder: Shapes, plugin: Plugin) -> Mesh:
 _BUILDERS: dict[str, Callable[[Shapes, Plugin], Mesh]] = {
     "obj": _obj,
     "ply": _ply,
+    "serialized": _serialized,
     "rectangle": _rectangle,
     "cube": _cube,
     "sphere": _sphere,

@@ -52,11 +52,14 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
             raise document.error(element, "is not supported, remove it")
         elif element.tag not in _DEFINITIONS:
             raise document.error(element, "unknown element in a scene")
-    surfaces: list[Surface] = [shapes.surface(plugin) for plugin in found["shape"]]
-    if not surfaces:
+    if not found["shape"]:
         raise InputError("holds no shapes")
+    # what has no counterpart is told before meshes and images are read, which may take minutes
+    for plugin in found["shape"]:
+        shapes.check(plugin)
     camera = _camera(document, found["sensor"]).resized(width, height)
     ambient = _ambient(document, materials, found["emitter"])
+    surfaces: list[Surface] = [shapes.surface(plugin) for plugin in found["shape"]]
     stem = document.path.stem
     name = document.path.resolve().parent.name if stem == "scene" else stem
     return Scene(name or stem, tuple(surfaces), camera, ambient=ambient, notes=document.notes.lines())
@@ -178,6 +181,8 @@ def _ambient(document: Document, materials: Materials, emitters: list[Plugin]) -
 def _constant(materials: Materials, emitter: Plugin) -> Ambient:
     try:
         return Ambient(radiance=materials.mean(emitter, "radiance", 1.0))
+    except LocatedError:
+        raise
     except InputError as error:
         raise emitter.fail(str(error)) from None
 

@@ -12,16 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.transient import Transient
-from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.blackbody import PLANCK_J_S
+from scenes.constants import DEFAULT_WAVELENGTH_M, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
 from spad.flux import detector_maps
 from spad.sensor import PhotonBudget, Sensor
 
-PLANCK_J_S = 6.62607015e-34
-BOLTZMANN_J_PER_K = 1.380649e-23
-SUN_TEMPERATURE_K = 5778.0
-# Luminous efficacy of radiation at 555 nm, where the eye is most sensitive.
-PEAK_EFFICACY_LM_PER_W = 683.0
 # Mean ambient radiance [W/(m^2 sr nm)] above which it is no radiance of daylight. White paper facing the sun: 100 klux
 # are 0.82 W/(m^2 nm) at 850 nm as a black body (`sunlight_w_per_m2_nm`), the direct sun of the reference spectrum ASTM
 # G-173 about 0.9, and / pi is 0.26 to 0.29; bright haze and sunlit clouds are about as bright. Silicon SPADs see most
@@ -47,7 +43,7 @@ class Optics:
     pixel_pitch_m: float
     transmission: float = 1.0
     filter_nm: float = 10.0
-    wavelength_m: float = 850e-9
+    wavelength_m: float = DEFAULT_WAVELENGTH_M
 
     def __post_init__(self) -> None:
         for name in ("pulse_energy_j", "focal_length_m", "f_number", "pixel_pitch_m", "filter_nm", "wavelength_m"):
@@ -101,32 +97,3 @@ class Optics:
         dark_hz, _ = detector_maps(sensor, (transient.height, transient.width), dark_map_hz, seed)
         dark = float(dark_hz.mean()) * sensor.exposure_s
         return PhotonBudget(signal, ambient * self.detections_per_radiance(sensor) + dark)
-
-
-def planck_w_per_m2_nm(wavelength_m: np.ndarray | float, temperature_k: float = SUN_TEMPERATURE_K) -> np.ndarray:
-    """Spectral exitance of a black body [W/(m^2 nm)], 2 pi h c^2 / lambda^5 / (exp(h c / (lambda k T)) - 1)."""
-    wavelength = np.asarray(wavelength_m, dtype=np.float64)
-    energy = PLANCK_J_S * SPEED_OF_LIGHT_M_PER_S / (wavelength * BOLTZMANN_J_PER_K * temperature_k)
-    exitance = 2 * math.pi * PLANCK_J_S * SPEED_OF_LIGHT_M_PER_S**2 / wavelength**5 / np.expm1(energy)
-    return exitance * 1e-9
-
-
-def photopic(wavelength_m: np.ndarray) -> np.ndarray:
-    """CIE 1931 luminous efficiency V(lambda), 0 to 1, by the two-lobe fit of Wyman, Sloan and Shirley (2013)."""
-    nm = np.asarray(wavelength_m, dtype=np.float64) * 1e9
-    return 0.821 * _lobe(nm, 568.8, 46.9, 40.5) + 0.286 * _lobe(nm, 530.9, 16.3, 31.1)
-
-
-def _lobe(nm: np.ndarray, centre: float, left: float, right: float) -> np.ndarray:
-    return np.exp(-0.5 * ((nm - centre) / np.where(nm < centre, left, right)) ** 2)
-
-
-def sunlight_w_per_m2_nm(illuminance_lux: float, wavelength_m: float) -> float:
-    """Spectral irradiance of sunlight of a given illuminance [W/(m^2 nm)]: the sun as a black body of 5778 K.
-
-    E(lambda) = illuminance M(lambda) / (683 lm/W x integral of V M). The black body knows nothing of the atmosphere's
-    absorption bands: there the real sunlight is weaker.
-    """
-    grid = np.arange(360e-9, 830e-9, 1e-9)
-    luminous = PEAK_EFFICACY_LM_PER_W * float((photopic(grid) * planck_w_per_m2_nm(grid)).sum())
-    return illuminance_lux * float(planck_w_per_m2_nm(wavelength_m)) / luminous

@@ -18,6 +18,7 @@ def may_stay_open(metavar: str) -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
+Metres = tuple[float, float, float] | None
 Pixels = Annotated[int | None, may_stay_open("PIXELS")]
 Count = Annotated[int | None, may_stay_open("N")]
 Number = Annotated[float | None, may_stay_open("X")]

@@ -124,7 +124,7 @@ def _check_words(argv: list[str]) -> None:
         require(name in ("-h", "--help"), f"no option {name}{did_you_mean(name, ('--help', '--version'))}")
         return
     require(name in known, f"no command {name!r}{did_you_mean(name, known)} (there are {', '.join(known)})")
-    options = {f"--{field.name.replace('_', '-')}" for field in fields(known[name])}
+    options = {f"--{field.name.rstrip('_').replace('_', '-')}" for field in fields(known[name])}
     switches = {f"--no-{field.name.replace('_', '-')}" for field in fields(known[name]) if field.type in ("bool", bool)}
     options |= switches | {"--help"}
     for word in argv[1:]:

@@ -2,20 +2,44 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
+import tyro
+
 from render.settings import RenderSettings
-from scenes import InputError, Laser, Scene
+from scenes import Ambient, InputError, Laser, Scene
+from scenes.blackbody import sunlit_sky_w_per_m2_sr_nm
 from scenes.catalog import WIDTH, load_scene
+from scenes.constants import DEFAULT_WAVELENGTH_M
+from scenes.errors import require
 from scenes.offsets import check_offset
+from scenes.placing import Placing
 from studies.cli.paths import output_file, picture
-from studies.options import Common, Count, File, Mode, Number, Offset, Pixels, Positional, Progress, may_stay_open
+from studies.options import (
+    Common,
+    Count,
+    File,
+    Metres,
+    Mode,
+    Number,
+    Offset,
+    Pixels,
+    Positional,
+    Progress,
+    may_stay_open,
+)
 
 if TYPE_CHECKING:
     from render.transient import Transient
+
+log = logging.getLogger("scene2spad")
+SENSIBLE_DEPTH_M = (0.01, 1000.0)
+MOST_LUX = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +56,24 @@ class Render(Common):
     """Image height, pixels."""
     laser: Mode = None
     """What is lit: the field of view, the row being measured, or the pixel being measured (default: the scene's)."""
+    baseline: Annotated[Metres, may_stay_open("X Y Z")] = None
+    """Laser minus camera [m], in the camera's frame: x right, y down, z forward (default: the scene's)."""
+    sunlight: Annotated[float | None, may_stay_open("LUX")] = None
+    """Ambient light instead of the scene's own: an even sky as bright as sunlight of this illuminance, at 850 nm."""
+    scale: Annotated[float | None, may_stay_open("METRES")] = None
+    """Metres per unit of a mesh or an .xml (default: metres, or what a mesh's size suggests)."""
+    up: Annotated[Literal["x", "y", "z"] | None, may_stay_open("{x,y,z}")] = None
+    """Axis of a mesh that points up (default: z of .stl, else y)."""
+    from_: Annotated[
+        tuple[float, float, float] | None, tyro.conf.arg(name="from", metavar="X Y Z", help_behavior_hint="")
+    ] = None
+    """Where the camera stands [m], y up (default: the scene's own)."""
+    look_at: Annotated[Metres, may_stay_open("X Y Z")] = None
+    """What the middle of the image shows [m] (default: the scene's own; with --from the middle of the scene)."""
+    fov: Annotated[float | None, may_stay_open("DEGREES")] = None
+    """Full horizontal angle of the camera (default: the scene's own)."""
+    bare: bool = False
+    """A mesh alone, without the floor and the wall that are put around it."""
     bounces: Count = None
     """Surfaces light may meet, 1 = direct only (default: planned from a pilot)."""
     spp: Count = None
@@ -86,8 +128,7 @@ def run(command: Render, progress: Progress) -> dict:
         output_file(command.out, ".exr", "transient")
     scene = _load(command)
     out = command.out or output_file(Path(f"{scene.name}.exr"), ".exr", "transient")
-    if command.laser is not None:
-        scene = replace(scene, laser=Laser(command.laser, scene.laser.baseline_m))
+    scene = _lit(scene, command)
     start = time.perf_counter()
     if command.offset and command.offset_mode != "time":
         from studies.moving import moved
@@ -97,6 +138,7 @@ def run(command: Render, progress: Progress) -> dict:
     seconds = time.perf_counter() - start
     if command.offset and command.offset_mode == "time":
         transient = transient.delayed(command.offset)
+    _question_unit(transient, scene.name)
     write_transient(transient, out)
     error, plan = transient.meta["relative_error"], transient.meta["plan"]
     result = {
@@ -119,12 +161,44 @@ def run(command: Render, progress: Progress) -> dict:
 def _load(command: Render) -> Scene:
     if command.depth or command.focal or command.depth_scale:
         return _rgbd(command)
-    return load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
+    return load_scene(
+        command.scene, seed=command.seed, width=command.width, height=command.height, placing=_placing(command)
+    )
+
+
+def _placing(command: Render) -> Placing:
+    return Placing(command.up, command.scale, command.from_, command.look_at, command.fov, command.bare)
+
+
+def _lit(scene: Scene, command: Render) -> Scene:
+    """The scene under the laser and the ambient light that are asked for."""
+    laser = scene.laser
+    if command.laser is not None:
+        laser = Laser(command.laser, laser.baseline_m)
+    if command.baseline is not None:
+        laser = replace(laser, baseline_m=command.baseline)
+    if command.sunlight is None:
+        return replace(scene, laser=laser)
+    require(0 <= command.sunlight <= MOST_LUX, f"--sunlight {command.sunlight:g} lux is outside 0 to {MOST_LUX:g}")
+    sky = Ambient(radiance=sunlit_sky_w_per_m2_sr_nm(command.sunlight, DEFAULT_WAVELENGTH_M))
+    return replace(scene, laser=laser, ambient=sky)
+
+
+def _question_unit(transient: Transient, name: str) -> None:
+    """Warn of depths that no laser range finder of this kind looks at: the file's unit is then probably not metres."""
+    seen = transient.depth_m[np.isfinite(transient.depth_m)]
+    median = float(np.median(seen)) if seen.size else 1.0
+    if not SENSIBLE_DEPTH_M[0] <= median <= SENSIBLE_DEPTH_M[1]:
+        log.warning(
+            "warning: the median depth of %s is %.4g m; if its unit is not metres, say so by --scale", name, median
+        )
 
 
 def _rgbd(command: Render) -> Scene:
     """The relief of a photograph and its depth image."""
     from scenes.relief import RgbdFiles, rgbd
+
+    require(_placing(command) == Placing(), f"{command.scene}: an RGB-D pair has its own size and camera")
 
     if command.depth is None or command.focal is None:
         raise InputError(f"{command.scene}: an RGB-D pair needs --depth FILE and --focal PIXELS (and --depth-scale)")

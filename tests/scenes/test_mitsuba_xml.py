@@ -204,7 +204,7 @@ def test_lights(tmp_path: Path) -> None:
         ('<emitter type="area"/>', "inside its <shape>"),
         ('<emitter type="glow"/>', "'glow'"),
         ('<emitter type="constant"><rgb name="radiance" value="-1"/></emitter>', "negative"),
-        ('<emitter type="constant"><blackbody name="radiance" value="3000"/></emitter>', "<blackbody>"),
+        ('<emitter type="constant"><blackbody name="radiance" value="3000"/></emitter>', "temperature of radiance"),
     ],
 )
 def test_bad_lights_are_refused(tmp_path: Path, emitter: str, words: str) -> None:

@@ -93,7 +93,7 @@ def test_a_mesh_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("shape", "words"),
     [
-        ('<shape type="serialized"/>', "'serialized'"),
+        ('<shape type="serialized"/>', 'lacks <string name="filename"'),
         ('<shape type="shapegroup"/>', "'shapegroup'"),
         ('<shape type="instance"/>', "'instance'"),
         ('<shape type="hair"/>', "'hair'"),

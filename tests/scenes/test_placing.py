@@ -1,0 +1,182 @@
+"""What a user says of a scene beyond its file: unit, upward axis, camera, floor and wall; and constructs of others."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xml_files
+
+from scenes import InputError
+from scenes.blackbody import planck_w_per_m2_nm, seen_radiance_w_per_m2_sr_nm, sunlit_sky_w_per_m2_sr_nm
+from scenes.catalog import load_scene
+from scenes.meshes import load_mesh
+from scenes.placing import Placing, scaled
+
+# A tetrahedron whose tip lies along z, half a unit tall.
+TIP = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0.2 0.2 0.5\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+@pytest.fixture
+def tip(tmp_path) -> Path:
+    path = tmp_path / "tip.obj"
+    path.write_text(TIP)
+    return path
+
+
+@pytest.mark.parametrize(("up", "height"), [("x", 1.0), ("y", 1.0), ("z", 0.5)])
+def test_the_axis_that_is_said_to_be_up_is(tip, up, height):
+    """The body is as tall as the file is along that axis, stays right-handed and stands on the floor."""
+    surface = load_mesh(tip, placing=Placing(up=up, bare=True)).surfaces[0]
+    assert np.ptp(surface.vertices[:, 1]) == pytest.approx(height) and surface.vertices[:, 1].min() == 0
+    corners = surface.vertices[surface.faces]
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert volume == pytest.approx(0.5 / 6)
+
+
+def test_a_stated_scale_is_taken_without_a_guess(tip):
+    scene = load_mesh(tip, placing=Placing(scale=0.01))
+    assert np.ptp(scene.surfaces[0].vertices[:, 0]) == pytest.approx(0.01)
+    assert not any("warning" in note for note in scene.notes)
+
+
+def test_bare_leaves_the_mesh_alone_and_a_camera_stands_where_it_is_put(tip):
+    placing = Placing(origin=(0.0, 3.0, 0.1), target=(0.0, 0.0, 0.0), fov_deg=25.0, bare=True)
+    scene = load_mesh(tip, placing=placing)
+    assert len(scene.surfaces) == 1 and scene.camera.fov_deg == 25
+    assert np.allclose(scene.camera.origin, (0, 3, 0.1))
+    with pytest.raises(InputError, match="use --bare"):
+        load_mesh(tip, placing=Placing(origin=(0.0, 1.0, -9.0), target=(0.0, 0.0, 0.0)))
+
+
+def test_a_larger_scene_looks_the_same(tmp_path):
+    path = xml_files.write(
+        tmp_path, '<shape type="rectangle"><transform name="toWorld"><translate z="4"/></transform></shape>'
+    )
+    small, large = (load_scene(str(path), placing=Placing(scale=scale)) for scale in (None, 0.01))
+    assert np.allclose(large.surfaces[0].vertices, 0.01 * small.surfaces[0].vertices)
+    back = scaled(large, 100.0)
+    assert np.allclose(back.camera.pose, small.camera.pose)
+    with pytest.raises(InputError, match="for mesh files"):
+        load_scene(str(path), placing=Placing(up="z"))
+
+
+def test_a_camera_looks_at_what_is_asked_for_in_any_scene():
+    scene = load_scene("plane", placing=Placing(target=(1.0, 0.0, -3.0)))
+    axis = scene.camera.pose[:3, 2]
+    assert np.allclose(axis, np.array((1, 0, -3)) / math.sqrt(10))
+
+
+@pytest.mark.parametrize("distance_m", [0.4, 50.0, 2000.0])
+def test_a_wall_stands_where_its_name_says(distance_m):
+    scene = load_scene(f"wall@{distance_m:g}", width=16, height=64)
+    wall = scene.surfaces[0].vertices
+    assert np.allclose(wall[:, 2], -distance_m)
+    assert np.abs(wall[:, :2]).min() > distance_m * math.tan(math.radians(scene.camera.fov_deg / 2)) * 4
+
+
+@pytest.mark.parametrize("name", ["wall@", "wall@zero", "wall@0", "wall@-3", "wall@1e9", "wall@nan"])
+def test_a_wall_at_no_place_is_refused(name):
+    with pytest.raises(InputError, match="metres from"):
+        load_scene(name)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"up": "w"}, {"scale": 0.0}, {"scale": math.nan}, {"origin": (0.0, math.inf, 0.0)}, {"target": (math.nan,) * 3}],
+)
+def test_a_placing_that_makes_no_sense_is_refused(values):
+    with pytest.raises(InputError):
+        Placing(**values)
+
+
+# Light
+
+
+def test_a_black_body_has_its_luminance():
+    """At 2,856 K (CIE illuminant A) the eye's weighted mean is near Planck's law at some 575 nm."""
+    assert seen_radiance_w_per_m2_sr_nm(2856) == pytest.approx(planck_w_per_m2_nm(575e-9, 2856) / math.pi, rel=0.1)
+    assert seen_radiance_w_per_m2_sr_nm(6500) > 30 * seen_radiance_w_per_m2_sr_nm(2856)
+
+
+def test_a_sky_as_bright_as_sunlight():
+    """100 klux are 0.82 W/(m2 nm) at 850 nm (docs/radiometric.md); an even sky of E / pi gives a level surface E."""
+    assert sunlit_sky_w_per_m2_sr_nm(1e5, 850e-9) * math.pi == pytest.approx(0.8175, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("body", "version"),
+    [
+        ('<blackbody name="radiance" temperature="5000K"/>', "0.6.0"),
+        ('<spectrum name="radiance" type="blackbody"><float name="temperature" value="5000"/></spectrum>', "3.0.0"),
+    ],
+)
+def test_lamps_that_are_black_bodies(tmp_path, body, version):
+    scene = xml_files.load(
+        tmp_path, f'<shape type="rectangle"><emitter type="area">{body}</emitter></shape>', version=version
+    )
+    assert scene.surfaces[0].emission == pytest.approx(seen_radiance_w_per_m2_sr_nm(5000))
+
+
+# Constructs of other people's files
+
+
+def test_a_default_inside_an_element_counts(tmp_path):
+    body = '<bsdf type="diffuse" id="b"><default name="r" value="0.25"/><float name="reflectance" value="$r"/></bsdf>'
+    scene = xml_files.load(tmp_path, f'{body}<shape type="rectangle"><ref id="b"/></shape>')
+    assert scene.surfaces[0].material.albedo == 0.25
+
+
+def test_phong_becomes_plastic_of_the_same_width(tmp_path):
+    found = xml_files.material(
+        tmp_path,
+        '<bsdf type="phong"><float name="exponent" value="198"/><float name="diffuseReflectance" value="0.3"/></bsdf>',
+    )
+    assert (found.kind, found.albedo, found.distribution) == ("roughplastic", 0.3, "beckmann")
+    assert found.roughness == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ('<shape type="rectangle"><bsdf type="roughdielectric"/></shape>', "write dielectric"),
+        ('<shape type="rectangle"><bsdf type="twosided"><bsdf type="principled"/></bsdf></shape>', "roughplastic or"),
+        ('<shape type="rectangle"><medium type="homogeneous" name="interior"/></shape>', "remove it"),
+        ('<shape type="instance"/>', "write every copy out"),
+        ('<shape type="hair"/>', "expected one of obj"),
+    ],
+)
+def test_refusals_name_the_way_round_before_meshes_are_read(tmp_path, body, said):
+    """The mesh before it is broken and would be refused first if it were read first."""
+    (tmp_path / "broken.obj").write_text("v 0 0\n")
+    first = '<shape type="obj"><string name="filename" value="broken.obj"/></shape>'
+    assert said in xml_files.refusal(tmp_path, first + body)
+
+
+# The command line
+
+
+def test_render_takes_size_camera_laser_and_sunlight(tip, tmp_path, capfd):
+    from render.transient import read_transient
+    from studies.cli import main
+
+    out = tmp_path / "tip.exr"
+    words = "--up z --scale 2 --from 1 1 4 --look-at 0 0.5 0 --fov 30 --baseline 0.05 0 0 --sunlight 5e4 --bare"
+    command = ["render", str(tip), *words.split(), "--width", "16", "--bounces", "1", "--no-figure", "--out", str(out)]
+    assert main([*command, "--ambient", "on", "--ambient-spp", "4", "--json"]) == 0
+    capfd.readouterr()
+    seen = read_transient(out)
+    assert np.nanmin(seen.depth_m) == pytest.approx(math.dist((1, 1, 4), (0, 0.5, 0)), abs=1.0)
+    assert seen.meta["laser"]["baseline_m"] == [0.05, 0.0, 0.0]
+    # an even sky on what reflects 60 %, nothing around it to shade it
+    sky = sunlit_sky_w_per_m2_sr_nm(5e4, 850e-9)
+    lit = seen.ambient[np.isfinite(seen.depth_m)].astype(float)
+    assert np.median(lit) == pytest.approx(0.6 * sky, rel=0.15)
+
+
+def test_a_scene_in_other_units_is_questioned(tmp_path, capfd):
+    from studies.cli import main
+
+    command = ["render", "wall@2000", "--width", "8", "--bounces", "1", "--grid", "2", "--no-figure"]
+    assert main([*command, "--out", str(tmp_path / "w.exr")]) == 0
+    assert "say so by --scale" in capfd.readouterr().err
