@@ -73,7 +73,7 @@ def test_int8_follows_the_published_rule_where_it_is_asked_to(capfd, folder):
         model.depth_of(histogram, **read, **more)[0]
         for more in ({}, {"int8": True}, {"int8": True, "int8_rule": "published"})
     )
-    # the layer's codes are 2 and 6 % off
+    # codes are 2 and 7 % off
     assert 0 < np.abs(calibrated - exact).mean() < np.abs(published - exact).mean()
     with pytest.raises(InputError, match="8-bit rule 'fixed' is unknown"):
         model.estimate(histogram, int8=True, int8_rule="fixed")
