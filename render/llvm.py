@@ -8,7 +8,7 @@ render (their x86 back end cannot lower `llvm.minimum`), so anything below 19 is
 
 from __future__ import annotations
 
-import ctypes.util
+import ctypes
 import importlib.metadata
 import logging
 import os
@@ -88,7 +88,16 @@ def backends() -> list[str]:
 
 def _found(library: str, variable: str) -> bool:
     explicit = os.environ.get(variable)
-    return Path(explicit).is_file() if explicit else ctypes.util.find_library(library) is not None
+    return Path(explicit).is_file() if explicit else _loads(f"lib{library}.so.1")
+
+
+def _loads(library: str) -> bool:
+    """Whether the dynamic linker loads it. ctypes.util.find_library would run a compiler, whose files a kill leaves."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
 
 
 def start_mitsuba() -> ModuleType:

@@ -143,9 +143,7 @@ def machine(monkeypatch):
             monkeypatch.delenv(name, raising=False)
         if backend is not None:
             monkeypatch.setenv(llvm.BACKEND_VARIABLE, backend)
-        monkeypatch.setattr(
-            llvm.ctypes.util, "find_library", lambda name: f"lib{name}.so.1" if name in libraries else None
-        )
+        monkeypatch.setattr(llvm, "_loads", lambda name: name in {f"lib{library}.so.1" for library in libraries})
         drjit = types.ModuleType("drjit")
         drjit.detail = types.SimpleNamespace(llvm_version=lambda: version)
         mitsuba = FakeMitsuba(*works)
@@ -154,6 +152,17 @@ def machine(monkeypatch):
         return mitsuba
 
     return set_up
+
+
+def test_a_library_is_looked_for_without_a_compiler(monkeypatch):
+    """Killed in that moment, a compiler leaves its temporary files."""
+
+    def started(*_, **__):
+        raise AssertionError("a process was started")
+
+    monkeypatch.setattr("subprocess.Popen", started)
+    monkeypatch.setattr("os.popen", started)
+    assert llvm._loads("libc.so.6") and not llvm._loads("libnobody-has-this.so.1")
 
 
 BOTH = ("cuda", "nvoptix")
