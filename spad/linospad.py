@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 import scipy.sparse
 
 from scenes.errors import require
-from scenes.files import whole_file
 from scenes.limits import require_memory
 from spad.histogram import Histogram
-from spad.matfile import load_mat
+from spad.matfile import load_mat, save_mat
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
 from spad.timestamps import Timestamps
 
@@ -61,8 +59,7 @@ def write_linospad(captures: Sequence[Capture], path: Path) -> None:
     for number, capture in enumerate(captures):
         frames[0, number] = capture.counts
         images[0, number] = np.zeros((capture.side, capture.side)) if capture.image is None else capture.image
-    with whole_file(path) as beside:
-        scipy.io.savemat(beside, {COUNTS: frames, IMAGES: images}, do_compression=True)
+    save_mat({COUNTS: frames, IMAGES: images}, path)
 
 
 def read_linospad(path: Path, frame: int = 0, *, bins: int = BINS) -> Capture:

@@ -16,12 +16,11 @@ import torch
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require
-from scenes.files import whole_file
 from scenes.limits import require_memory
 from spad.depth import estimate_depth
 from spad.histogram import Histogram
 from spad.linospad import COUNTS, capture_histogram, frame_of
-from spad.matfile import load_mat
+from spad.matfile import load_mat, save_mat
 from spad.pulse import SampledPulse
 from spad.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_taps
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
@@ -45,8 +44,6 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     Raises InputError in one line where the file cannot be written, for sensors whose bins do not cover the period, and
     where the folder holds the pulse of another sensor.
     """
-    import scipy.io
-
     path, sensor = Path(path), histogram.sensor
     require(path.suffix == ".mat", f"{path}: the output must end in .mat")
     require(sensor.bins == sensor.bins_per_period, f"{path}: the layout needs bins that cover the period")
@@ -60,11 +57,9 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
         known = load_mat(pulse, ["psf"]).get("psf", np.zeros(0)).ravel()
         same = known.shape == taps.shape and np.allclose(known, taps, rtol=1e-6, atol=0)
         require(same, f"{pulse}: holds the pulse of another sensor; export to another folder")
-    with whole_file(path) as beside:
-        scipy.io.savemat(beside, contents, do_compression=True)
+    save_mat(contents, path)
     psf = {"PSF_img": np.broadcast_to(taps, (height, width, len(taps))), "psf": taps, "pulse_len": float(len(taps))}
-    with whole_file(pulse) as beside:
-        scipy.io.savemat(beside, psf, do_compression=True)
+    save_mat(psf, pulse)
     return pulse
 
 

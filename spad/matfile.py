@@ -1,4 +1,4 @@
-"""Read MATLAB's version 5 files that may be damaged: their structure is checked before scipy sees it.
+"""Write MATLAB's version 5 files, and read those that may be damaged: their structure is checked before scipy sees it.
 
 scipy.io trusts sizes and indices that a file states: a damaged one ends the process, or reads memory that is not
 its own. Layout: MathWorks, *MAT-File Format*, "Level 5 MAT-File Format".
@@ -10,13 +10,14 @@ import io
 import math
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scenes.errors import InputError, require
+from scenes.files import whole_file
 from scenes.limits import require_memory
 
 HEADER_BYTES = 128
@@ -27,6 +28,24 @@ CELL, STRUCT, CHAR, SPARSE = 1, 2, 4, 5
 NUMERIC = range(6, 16)  # double, single, int8 .. uint64
 COMPLEX_FLAG = 0x0800
 MAX_NESTING = 16
+# scipy's says when a file was made, and on what system: the same data would be other bytes
+HEADER_TEXT = b"MATLAB 5.0 MAT-file, written by scene2spad"
+HEADER_TEXT_BYTES = 116
+
+
+def save_mat(contents: Mapping[str, Any], path: Path) -> None:
+    """Write variables as a compressed .mat file of version 5, whole or not at all; the same data give the same bytes.
+
+    Raises InputError where it cannot be written.
+    """
+    import scipy.io
+
+    made = io.BytesIO()
+    scipy.io.savemat(made, contents, do_compression=True)
+    made.seek(0)
+    made.write(HEADER_TEXT.ljust(HEADER_TEXT_BYTES))
+    with whole_file(path) as beside:
+        beside.write_bytes(made.getbuffer())
 
 
 def load_mat(path: Path, names: Sequence[str] | None = None) -> dict[str, Any]:

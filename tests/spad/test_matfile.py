@@ -18,7 +18,7 @@ from spad.detect import sense
 from spad.histogram import Histogram
 from spad.linospad import read_linospad
 from spad.mat import read_mat, write_mat
-from spad.matfile import checked_contents, load_mat
+from spad.matfile import checked_contents, load_mat, save_mat
 from spad.pulse import Pulse, SampledPulse
 from spad.rgbd import published_taps, transient_from_rgbd
 from spad.sensor import PhotonBudget, Sensor, sensor_by_name
@@ -193,3 +193,14 @@ def sensed(sensor: Sensor) -> Histogram:
     depth = np.random.default_rng(0).uniform(0.5, 11, (24, 32))
     image = np.ones(depth.shape)
     return sense(transient_from_rgbd(depth, image, image), sensor, PhotonBudget(1000, 1), seed=0)
+
+
+def test_the_same_data_give_the_same_bytes_whenever_they_are_written(tmp_path, monkeypatch):
+    """scipy's header tells the time and the system."""
+    save_mat({"a": np.arange(3.0)}, tmp_path / "a.mat")
+    monkeypatch.setattr("time.asctime", lambda *_: "another day")
+    save_mat({"a": np.arange(3.0)}, tmp_path / "b.mat")
+    data = (tmp_path / "a.mat").read_bytes()
+    assert data == (tmp_path / "b.mat").read_bytes()
+    assert data[:19] == b"MATLAB 5.0 MAT-file" and data[124:128] == b"\x00\x01IM"
+    assert (load_mat(tmp_path / "b.mat")["a"].ravel() == np.arange(3.0)).all()
