@@ -13,6 +13,7 @@ from csph.levels import CONTINUOUS, Levels
 from csph.metrics import TRAIN_LEVELS
 from csph.posterior import Decoder
 from scenes.errors import InputError, require
+from scenes.limits import require_memory
 from spad.sensor import Sensor
 
 Network = Literal["compact", "published", "published-signed"]
@@ -22,6 +23,8 @@ FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
 Schedule = Literal["steps", "cosine"]
 SCHEDULES: tuple[str, ...] = ("steps", "cosine")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+MAX_STEPS, MAX_THREADS = 10**8, 1024
+COUNT_BYTES = 4 * 4  # of a batch: counts, logits, their gradient and the target, in float32
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name in ("epochs", "steps_per_epoch", "batch", "crop", "decay_steps", "validation_views"):
             require(getattr(self, name) >= 1, f"training: {name} {getattr(self, name)} is below 1")
+        require(self.steps <= MAX_STEPS, f"training: {self.steps} steps are above {MAX_STEPS}")
+        require(0 <= self.threads <= MAX_THREADS, f"training: threads {self.threads} is outside 0 to {MAX_THREADS}")
         require(0 < self.rate < 1, f"training: learning rate {self.rate:g} is outside 0 to 1")
         require(0 < self.decay <= 1, f"training: decay {self.decay:g} is outside (0, 1]")
         require(self.tv_weight >= 0, f"training: weight {self.tv_weight:g} of the total variation is negative")
@@ -164,6 +169,12 @@ class TrainConfig:
     @property
     def steps(self) -> int:
         return self.epochs * self.steps_per_epoch
+
+    def check_memory(self) -> None:
+        """Raise InputError unless the least that one step holds fits in memory: ask before sets are read."""
+        counts = self.batch * self.crop**2 * self.model.sensor.bins
+        told = f"a step of {self.batch} patches of {self.crop} x {self.crop} pixels and {self.model.sensor.bins} bins"
+        require_memory(COUNT_BYTES * counts, told)
 
     def to_dict(self) -> dict:
         return asdict(self)

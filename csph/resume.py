@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,11 @@ class WholeFileCheckpoints(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None) -> None:
+        # by way of memory: torch would name the archive after the temporary file, and has no OSError for a full disk
+        state = io.BytesIO()
+        torch.save(checkpoint, state)
         with whole_file(Path(path)) as beside:
-            torch.save(checkpoint, beside)
+            beside.write_bytes(state.getbuffer())
 
 
 def check_resume(path: Path, module: nn.Module) -> None:

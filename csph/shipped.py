@@ -15,6 +15,7 @@ from pathlib import Path
 from csph.model import checkpoint_file, load_model, save_model
 from scenes.errors import require
 from scenes.files import whole_file
+from scenes.inputs import read_whole_lines
 
 WEIGHTS = Path(__file__).parent / "weights"
 RUN_WEIGHTS = ("model", "last")  # files of a run; shipped ones have the models' names
@@ -60,11 +61,19 @@ def ship(run: Path, name: str, folder: Path = WEIGHTS, *, errors: dict[str, dict
 
 
 def cpu_minutes(run: Path) -> float | None:
-    """CPU-minutes of a run's epochs as far as `timings.jsonl` tells them; None without that file."""
+    """CPU-minutes of a run's epochs as far as `timings.jsonl` tells them; None without that file.
+
+    An epoch that was done again after a kill counts once.
+    """
     path = run / TIMINGS
     if not path.is_file():
         return None
-    return round(sum(json.loads(line)["cpu_s"] for line in path.read_text().splitlines()) / 60, 1)
+    seconds = {}
+    for told in read_whole_lines(path):
+        match told:
+            case {"epoch": int(epoch), "cpu_s": float(cpu) | int(cpu)}:
+                seconds[epoch] = cpu
+    return round(sum(seconds.values()) / 60, 1)
 
 
 def beside(checkpoint: Path, kind: str) -> Path:

@@ -47,7 +47,7 @@ from csph.snapshots import CodeEnergy
 from csph.views import Views, packed_sha256, packed_views
 from render.heap import keep_freed_memory
 from scenes.errors import InputError, require
-from scenes.files import whole_file, write_csv
+from scenes.files import append_line, is_unclaimed, whole_file, write_csv
 from scenes.inputs import read_json_object
 
 log = logging.getLogger("csph")
@@ -138,8 +138,7 @@ class Record(pl.Callback):
         now = (time.perf_counter(), time.process_time())
         wall, cpu = (round(end - start, 3) for end, start in zip(now, self.noted, strict=True))
         self.noted = now
-        with (self.folder / TIMINGS).open("a") as lines:
-            lines.write(json.dumps({"epoch": epoch, "wall_s": wall, "cpu_s": cpu}) + "\n")
+        append_line(self.folder / TIMINGS, json.dumps({"epoch": epoch, "wall_s": wall, "cpu_s": cpu}))
 
     @property
     def best_mm(self) -> float:
@@ -209,8 +208,7 @@ def _claim(folder: Path, config: TrainConfig) -> None:
             same = False
         require(same, f"{folder}: holds a run with other options or another set; choose another --out")
         return
-    empty = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
-    require(empty, f"{folder}: is not an empty folder and holds no run; choose another --out")
+    require(is_unclaimed(folder), f"{folder}: is not an empty folder and holds no run; choose another --out")
     folder.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as beside:
         beside.write_text(text)
@@ -274,6 +272,7 @@ def train(
     val_rmse_mm of the weights kept, their checkpoint, and the number of parameters. Raises InputError for sets that do
     not fit, and a folder of another run.
     """
+    config.check_memory()
     sets = [[packed_views(one) for one in _listed(views)] for views in (training, validation)]
     data = {}
     for name, packs in zip(("training", "validation"), sets, strict=True):

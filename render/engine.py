@@ -30,7 +30,7 @@ from render.indirect import (
 )
 from render.planning import finer_pilot, make_plan, pilot_pixels
 from render.returns import concatenate, no_samples, of_pixels, to_returns
-from render.settings import BATCHES, FILTERED_BATCHES, MOST_AMBIENT_SPP, Plan, RenderSettings
+from render.settings import BATCHES, FILTERED_BATCHES, MIN_PIXEL_BYTES, MOST_AMBIENT_SPP, Plan, RenderSettings
 from render.tracing import Progress, Traced, derived_seed, most_spp, spans_of, trace, traced_on
 from render.transient import Transient
 from render.world import World
@@ -45,9 +45,6 @@ AMBIENT_BOUNCES = 16  # most paths end long before, by chance
 MOST_MORE, MOST_MORE_FILTERED = 3.0, 15.0
 CLEAR = 3  # standard deviations above which a bias is believed
 MOST_FILTERED_PASSES, LEAST_ALLOWED = 3, 0.25
-# A plane under direct light, the least there is, takes 170 bytes a pixel (measured); its file holds four arrays a pixel
-# of some 120 bytes each when it is written.
-LEAST_PIXEL_BYTES = 170 + 4 * 120
 
 
 def render(
@@ -69,7 +66,7 @@ def render(
     settings = settings or RenderSettings()
     say = progress or (lambda what, share: None)
     camera = scene.camera
-    require_memory(LEAST_PIXEL_BYTES * camera.width * camera.height, f"a render of {camera.width} x {camera.height}")
+    require_memory(MIN_PIXEL_BYTES * camera.width * camera.height, f"a render of {camera.width} x {camera.height}")
     world = World(scene) if world is None else world
     say("plan", 0.0)
     plan = planned(world, settings, seed) if plan is None else plan

@@ -21,7 +21,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
-from scenes.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
+from scenes.hdf5 import Sink, add_checksum, new_hdf5, open_checked, read_dataset
 from scenes.inputs import parse_json
 
 PATH_STEP_M, WIDTH_STEP_M, DEPTH_STEP_M = 2.0**-10, 2.0**-8, 2.0**-12
@@ -215,19 +215,20 @@ def write_pack(views: Iterable[tuple[Transient, dict]], path: Path) -> int:
     One view is in memory at a time. Raises InputError for views of different sizes, or none.
     """
     with whole_file(path) as beside:
-        with h5py.File(beside, "w", track_order=False, userblock_size=USER_BLOCK) as file:
-            count = _append_views(views, file)
+        with new_hdf5(beside) as (file, sink):
+            count = _append_views(views, file, sink)
         add_checksum(beside)
     return count
 
 
-def _append_views(views: Iterable[tuple[Transient, dict]], file: h5py.File) -> int:
+def _append_views(views: Iterable[tuple[Transient, dict]], file: h5py.File, sink: Sink) -> int:
     """Append view after view, then their records and the seal; returns how many."""
     metas: list[dict] = []
     starts = [0]
     sha = hashlib.sha256()
     sets: dict[str, h5py.Dataset] = {}
     for view, meta in views:
+        sink.check()
         arrays = _arrays(view)
         if not sets:
             sets = _datasets(file, view.height, view.width)

@@ -7,6 +7,8 @@ One render serves every sensor: nothing here is tied to a bin width. The file is
 from __future__ import annotations
 
 import hashlib
+import os
+import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -151,6 +153,26 @@ class Transient:
 
 def write_transient(transient: Transient, path: Path) -> None:
     """Write the multi-part EXR, whole or not at all."""
+    with whole_file(path) as beside:
+        _write_exr(transient, beside)
+
+
+def exr_bytes(transient: Transient) -> bytes:
+    """Return what `write_transient` writes.
+
+    OpenEXR writes to paths alone. On Linux that of a file without a name, which no killed process can leave behind.
+    """
+    if not hasattr(os, "memfd_create"):
+        with tempfile.TemporaryDirectory(prefix="scene2spad-") as folder:
+            _write_exr(transient, Path(folder) / "transient.exr")
+            return (Path(folder) / "transient.exr").read_bytes()
+    with os.fdopen(os.memfd_create("transient.exr"), "rb") as file:
+        _write_exr(transient, Path(f"/proc/self/fd/{file.fileno()}"))
+        return file.read()
+
+
+def _write_exr(transient: Transient, path: Path) -> None:
+    """Write the multi-part EXR; OSError where that fails."""
     import OpenEXR
 
     deep = {
@@ -170,11 +192,10 @@ def write_transient(transient: Transient, path: Path) -> None:
     }
     flat_header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     parts = [OpenEXR.Part(deep_header, deep, "transient"), OpenEXR.Part(flat_header, flat, "layers")]
-    with whole_file(path) as beside:
-        try:
-            OpenEXR.File(parts).write(str(beside))
-        except RuntimeError as error:
-            raise OSError(str(error)) from None
+    try:
+        OpenEXR.File(parts).write(str(path))
+    except RuntimeError as error:
+        raise OSError(str(error)) from None
 
 
 def _ragged(values: np.ndarray, transient: Transient) -> np.ndarray:

@@ -9,9 +9,11 @@ import io
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
+from functools import lru_cache
 from pathlib import Path
 from tokenize import TokenError
 
@@ -28,16 +30,18 @@ SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 2, "network": 1}
 def whole_file(path: Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; renamed to `path` at the end, removed if anything goes wrong.
 
-    Raises InputError in one line when the folder is missing, the disk is full, or writing is not allowed.
+    What killed processes of this machine left in the folder is removed before the first file goes there. Raises
+    InputError in one line when the folder is missing, the disk is full, or writing is not allowed.
     """
     path = Path(path)
     # the suffix stays last: some libraries choose the format by it
-    beside = path.with_name(f".{path.stem[:100]}.{os.getpid()}.part{path.suffix}")
+    beside = path.with_name(f".{path.stem[:80]}.{_machine()}.{os.getpid()}.part{path.suffix}")
     try:
         if not path.parent.is_dir():
             raise InputError(f"{path}: folder {path.parent} does not exist")
         if path.is_dir():
             raise InputError(f"{path}: is a folder, expected a file name")
+        _sweep(path.parent.resolve())
         try:
             yield beside
             _flush_to_disk(beside)
@@ -47,6 +51,56 @@ def whole_file(path: Path) -> Iterator[Path]:
             beside.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or str(error).splitlines()[0]})") from None
+
+
+def _machine() -> str:
+    """Return the name of this machine, or container: process numbers mean something on it alone."""
+    return os.uname().nodename[:40]
+
+
+@lru_cache(maxsize=1024)  # once a process: a set's folder may hold a million files
+def _sweep(folder: Path) -> None:
+    """Remove the temporary files in a folder whose processes, of this machine, are gone."""
+    for path in abandoned_files(folder):
+        owner = re.search(rf"\.{re.escape(_machine())}\.(\d{{1,9}})\.part", path.name)
+        if owner is not None and not _is_running(int(owner[1])):
+            path.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        return True
+    return True
+
+
+def abandoned_files(folder: Path) -> list[Path]:
+    """Return the temporary files of `whole_file` in a folder: what killed processes left, unless somebody writes."""
+    return sorted(folder.glob(".*.part*"))
+
+
+def is_unclaimed(folder: Path) -> bool:
+    """Tell whether a folder is not there, or holds nothing but what a process left that was killed at its start."""
+    if not folder.exists():
+        return True
+    return folder.is_dir() and {*folder.iterdir()} <= {*abandoned_files(folder)}
+
+
+def append_line(path: Path, text: str) -> None:
+    """Append one line to a journal, which `scenes.inputs.read_whole_lines` reads.
+
+    A kill or a full disk costs no more than the line that it cuts: the next begins on a line of its own. Raises
+    InputError naming the file where it cannot be written.
+    """
+    try:
+        with path.open("ab+") as file:
+            cut = file.tell() > 0 and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n"
+            file.write(b"\n" * cut + text.encode() + b"\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 def _flush_to_disk(path: Path) -> None:

@@ -8,6 +8,7 @@ others, are first read in a process of their own that may be killed.
 from __future__ import annotations
 
 import hashlib
+import io
 import mmap
 import subprocess
 import sys
@@ -40,6 +41,52 @@ with h5py.File(sys.argv[1], "r") as file:
         for chunk in dataset.iter_chunks() if dataset.chunks else ():
             dataset[chunk]
 """
+
+
+class Sink(io.RawIOBase):
+    """A file for HDF5 to write to, which keeps an error of writing to itself until `check` is called.
+
+    Where HDF5 meets a full disk it prints tracebacks while it closes its objects, and may crash as the process ends.
+    """
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file, self._error = file, None
+        self.seek, self.tell, self.readinto = file.seek, file.tell, file.readinto
+
+    def write(self, data: bytes) -> int:
+        left = memoryview(data).cast("B")
+        while self._error is None and len(left):
+            try:
+                left = left[self._file.write(left) :]
+            except OSError as error:
+                self._error = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+            return size or 0
+
+    def check(self) -> None:
+        """Raise the OSError of writing, if there was one."""
+        if self._error is not None:
+            raise self._error
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[tuple[h5py.File, Sink]]:
+    """Create an HDF5 file that can hold a checksum; OSError where its bytes cannot be written."""
+    import h5py
+
+    with path.open("w+b", buffering=0) as file:
+        sink = Sink(file)
+        try:
+            with h5py.File(sink, "w", track_order=False, userblock_size=USER_BLOCK) as made:
+                yield made, sink
+        finally:
+            sink.check()  # before what HDF5 made of it
 
 
 def add_checksum(path: Path) -> None:

@@ -29,6 +29,7 @@ DISTRIBUTIONS: tuple[str, ...] = MicrofacetDistribution.__args__
 _ADDED_AT = {"distribution": "ggx"}
 # Metres from the origin: float32, in which rays are traced, resolves 1 m there.
 MAX_COORDINATE_M = 1e7
+MAX_IMAGE_SIDE = 16384  # pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +175,8 @@ class Camera:
         object.__setattr__(self, "pose", rigid_pose(self.pose, "camera pose"))
         for label, value in (("width", self.width), ("height", self.height)):
             value = finite_number(value, f"camera {label}")
-            good = value == int(value) and 1 <= value <= 16384
-            require(good, f"camera {label} {value:g} is outside 1 to 16384 whole pixels")
+            good = value == int(value) and 1 <= value <= MAX_IMAGE_SIDE
+            require(good, f"camera {label} {value:g} is outside 1 to {MAX_IMAGE_SIDE} whole pixels")
             object.__setattr__(self, label, int(value))
         object.__setattr__(self, "fov_deg", finite_number(self.fov_deg, "camera fov"))
         require(0.01 <= self.fov_deg <= 170, f"camera fov {self.fov_deg:g} degrees is outside 0.01 to 170")

@@ -9,10 +9,8 @@ import json
 import logging
 import math
 import os
-import shutil
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -23,16 +21,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from render.settings import SHARED_AMBIENT_SPP, Plan, RenderSettings
+from render.settings import MIN_PIXEL_BYTES, SHARED_AMBIENT_SPP, Plan, RenderSettings
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.inputs import read_json_object
-from scenes.model import Scene
+from scenes.limits import require_memory
+from scenes.model import MAX_IMAGE_SIDE, Scene
 from scenes.offsets import OffsetMode, check_offset
 from scenes.set_index import read_set_index
-from scenes.sets import scene_set
+from scenes.sets import LARGEST, scene_set
 from studies.set_folder import Done, Folder, file_name
-from studies.workers import Run, executor
+from studies.workers import Run, check_workers, executor
 
 if TYPE_CHECKING:
     from render.world import World
@@ -48,8 +47,6 @@ DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 AIM, INDIRECT_AIM = 0.95, 1.4
 PLANNED_PLACES, OF_A_PLACE = 8, 3  # views that tell how many rays an endless set takes
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
-# where Linux keeps files in memory: a view is written and read back there, if so many bytes are free
-MEMORY, LARGEST_VIEW = Path("/dev/shm"), 1 << 28
 # of the last place
 _WORLDS: dict[tuple, World] = {}
 _PLANS: dict[tuple[Job, str], Plan] = {}
@@ -170,7 +167,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     from render.engine import render
     from render.pack import rounded
     from render.thinning import thinned
-    from render.transient import write_transient
+    from render.transient import exr_bytes
     from studies.moving import moved
 
     scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
@@ -185,10 +182,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         transient = transient.delayed(job.offset_m)
     require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
     transient = rounded(thinned(transient, job.merging * THINNED))
-    with tempfile.TemporaryDirectory(prefix="scene2spad-", dir=_memory()) as folder:
-        path = Path(folder) / "view.exr"
-        write_transient(transient, path)
-        exr = path.read_bytes()
+    exr = exr_bytes(transient)
     depth = transient.depth_m[np.isfinite(transient.depth_m)]
     quantiles = np.quantile(depth, (0, 0.01, 0.5, 0.99, 1)) if depth.size else np.full(5, np.nan)
     plan = transient.meta["plan"]
@@ -210,13 +204,6 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         "triangles": scene.triangles,
     }
     return record, exr
-
-
-def _memory() -> Path | None:
-    """Where files are kept in memory; None where there is no such place, or little room: a container may have 64 MB."""
-    if os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > LARGEST_VIEW:
-        return MEMORY
-    return None
 
 
 def _seed(job: Job, view: int, again: int = 0) -> int:
@@ -265,10 +252,25 @@ def _forget() -> None:
 # --- Running ---------------------------------------------------------------------------------------------------------
 
 
-def _runs(job: Job, views: Sequence[int]) -> list[tuple[int, ...]]:
+def _runs(job: Job, views: Iterable[int]) -> Iterator[tuple[int, ...]]:
     """Views of one place together, in order."""
     chosen = scene_set(job.set)
-    return [tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place)]
+    return (tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place))
+
+
+def _check_asked(job: Job, count: int, workers: int) -> None:
+    """Raise InputError for a set that is too large, or views that do not fit in memory, before anything is made."""
+    size = scene_set(job.set).size
+    most = LARGEST if size is None else size
+    require(1 <= count <= most, f"set {job.set}: count {count} is outside 1 to {most}")
+    check_workers(workers)
+    sides = [side for side in (job.width, job.height) if side is not None]
+    for side in sides:
+        require(1 <= side <= MAX_IMAGE_SIDE, f"image side {side} is outside 1 to {MAX_IMAGE_SIDE} pixels")
+    if sides:
+        width, height = sides[0], sides[-1]
+        told = f"views of {width} x {height} pixels on {workers} process{'es' * (workers > 1)}"
+        require_memory(workers * MIN_PIXEL_BYTES * width * height, told)
 
 
 def _with_grid(job: Job, folder: Folder, run: Run, say: Progress) -> Job:
@@ -302,22 +304,20 @@ def make_set(
     workers: processes on this machine; scheduler: address of a running Dask scheduler instead, whose workers send the
     files back, so that no file system need be shared. Returns numbers for the command line.
     """
-    size = scene_set(job.set).size
-    require(
-        count >= 1 and (size is None or count <= size), f"set {job.set}: count {count} is outside 1 to {size or 'any'}"
-    )
-    require(1 <= workers <= 256, f"workers {workers} is outside 1 to 256")
+    _check_asked(job, count, workers)
     folder = Folder(out, job.made())
-    todo = [view for view in range(count) if view not in folder.records]
+    missing = count - sum(view < count for view in folder.records)
+    todo = (view for view in range(count) if view not in folder.records)
     say = progress or (lambda what, share: None)
     start = time.perf_counter()
-    with executor(workers if todo else 1, scheduler if todo else None) as run:
-        job = _with_grid(job, folder, run, say) if todo and size is None and job.grid is None else job
+    with executor(workers if missing else 1, scheduler if missing else None) as run:
+        endless = scene_set(job.set).size is None
+        job = _with_grid(job, folder, run, say) if missing and endless and job.grid is None else job
         for number, done in enumerate(run(partial(render_views, job), _runs(job, todo), _lost), 1):
             folder.add(done)
             if "failed" in done.record:
                 log.warning("view %d failed: %s", done.record["view"], done.record["failed"])
-            say(f"view {count - len(todo) + number} of {count}", (count - len(todo) + number) / count)
+            say(f"view {count - missing + number} of {count}", (count - missing + number) / count)
     folder.close()
     seconds = time.perf_counter() - start
     records = [folder.records[view] for view in range(count)]
@@ -334,9 +334,9 @@ def make_set(
     return {
         "scenes": len(good),
         "failed": [record["view"] for record in records if "failed" in record],
-        "rendered_now": len(todo),
+        "rendered_now": missing,
         "seconds": seconds,
-        "scenes_per_second": len(todo) / seconds if todo else 0.0,
+        "scenes_per_second": missing / seconds if missing else 0.0,
         "bytes_per_scene": sum(record["bytes"] for record in good) / max(len(good), 1),
         "target_missed": len(missed),
         "error_together": together,

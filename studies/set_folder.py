@@ -11,13 +11,12 @@ timings.jsonl seconds and places, kept out of the index so that two runs are the
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from scenes.errors import InputError, require
-from scenes.files import whole_file
+from scenes.files import abandoned_files, append_line, is_unclaimed, whole_file
 from scenes.inputs import read_text, read_whole_lines
 
 
@@ -47,16 +46,13 @@ class Folder:
                     f"{path}: holds a set that was made with other options or another version; choose another --out"
                 )
         else:
-            require(
-                not path.exists() or not any(path.iterdir()),
-                f"{path}: is not empty and holds no set; choose another --out",
-            )
-            (path / "views").mkdir(parents=True, exist_ok=True)
+            require(is_unclaimed(path), f"{path}: is not empty and holds no set; choose another --out")
+            path.mkdir(parents=True, exist_ok=True)
             with whole_file(config) as beside:
                 beside.write_text(asked)
         (path / "views").mkdir(exist_ok=True)
-        for left in (*path.glob(".*.part*"), *(path / "views").glob(".*.part*")):
-            left.unlink()  # of a run that was killed while it wrote
+        for left in (*abandoned_files(path), *abandoned_files(path / "views")):
+            left.unlink(missing_ok=True)
         self.records = {r["view"]: r for r in self._known() if self._stands(r)}
 
     def _known(self) -> Iterator[dict]:
@@ -81,15 +77,9 @@ class Folder:
             with whole_file(self.path / file_name(view)) as beside:
                 beside.write_bytes(done.exr)
         self.records[view] = done.record
-        self._append("journal.jsonl", done.record)
-        self._append("timings.jsonl", {"view": view, "seconds": round(done.seconds, 4), "where": done.where})
-
-    def _append(self, name: str, value: dict) -> None:
-        path = self.path / name
-        with path.open("ab+") as file:
-            if file.tell() and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
-                file.write(b"\n")  # after a line that was cut
-            file.write(json.dumps(value, sort_keys=True).encode() + b"\n")
+        timing = {"view": view, "seconds": round(done.seconds, 4), "where": done.where}
+        append_line(self.path / "journal.jsonl", json.dumps(done.record, sort_keys=True))
+        append_line(self.path / "timings.jsonl", json.dumps(timing, sort_keys=True))
 
     def close(self) -> None:
         """The index in the order of the views, then no journal."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.files import whole_file
+from scenes.files import append_line, whole_file
 from scenes.inputs import read_whole_lines
 
 
@@ -30,10 +30,7 @@ class Store:
     def put(self, digest: str, value: Any, **key: object) -> None:
         known = self._of(digest)
         path = self.folder / f"{digest[:32]}.jsonl"
-        line = json.dumps([_text(key), value]) + "\n"
-        with path.open("ab+") as file:
-            cut = file.tell() > 0 and (file.seek(-1, 2), file.read(1))[1] != b"\n"
-            file.write(b"\n" * cut + line.encode())
+        append_line(path, json.dumps([_text(key), value]))
         known[_text(key)] = value
 
     def map_file(self, digest: str, **key: object) -> Path:

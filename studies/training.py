@@ -29,6 +29,7 @@ from spad.histogram import Histogram
 from spad.sensor import Sensor, sensor_by_name
 from studies.commands import Evaluate, Train
 from studies.planes import random_planes
+from studies.workers import check_workers
 
 log = logging.getLogger("scene2spad")
 
@@ -116,10 +117,12 @@ def training_reach_m(views: Views) -> float:
 
 def run_train(command: Train, progress: Progress) -> dict:
     """Train one model, or go on with an interrupted run in the same folder."""
+    config = config_of(command)
+    config.check_memory()
+    require(bool(command.set), "train: --set without a set")
+    check_workers(command.workers, least=0)
     from csph.training import train  # and Lightning, which takes seconds to import
 
-    config = config_of(command)
-    require(bool(command.set), "train: --set without a set")
     training, validation, said = views_of(command)
     name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
     folder = command.out or Path("out/train") / name

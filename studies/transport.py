@@ -28,7 +28,7 @@ from render.settings import RenderSettings
 from render.tracing import Progress
 from render.transient import Transient, read_transient, write_transient
 from scenes.errors import InputError, require
-from scenes.files import finite, whole_file, write_csv
+from scenes.files import append_line, finite, whole_file, write_csv
 from scenes.inputs import read_whole_lines
 from scenes.model import Ambient, Laser, Scene
 from scenes.sets import scene_set
@@ -175,8 +175,7 @@ def rendered_once(
     transient = render(scene, settings, seed=seed, progress=progress)
     told = {"scene": scene.name, "laser": scene.laser.mode, "kind": kind, "seconds": time.perf_counter() - start}
     write_transient(transient, path)
-    with (folder / "timings.jsonl").open("a") as file:
-        file.write(json.dumps(told) + "\n")
+    append_line(folder / "timings.jsonl", json.dumps(told))
     return read_transient(path)
 
 
