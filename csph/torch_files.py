@@ -19,13 +19,23 @@ class _EmptyInstead:
         return OrderedDict()
 
 
+class _NothingInstead:
+    """Stands for a class or function of NumPy, whose state is no dictionary: made of anything, it keeps nothing."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        pass
+
+
 def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
     """Return what torch.save wrote, tensors and plain values alone, on the CPU.
 
-    `foreign`: in the place of objects of other libraries, such as the settings that a trainer keeps beside its weights,
-    there are dictionaries; nothing of those libraries is imported or called. Raises InputError in one line for a
-    missing or foreign file, one whose checksums do not fit (torch does not look at them), and one that holds other
-    objects, which could run code.
+    `foreign`: objects of other libraries, such as the settings that a trainer keeps beside its weights, are replaced by
+    empty ones; none of those libraries is imported or called. Raises InputError in one line for a missing or foreign
+    file, one whose checksums do not fit (torch does not look at them), and one that holds other objects, which could
+    run code.
     """
     import torch
     from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
@@ -35,7 +45,8 @@ def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
     try:
         with warnings.catch_warnings(action="ignore"):
             names = get_unsafe_globals_in_checkpoint(path) if foreign else []
-            with safe_globals([(_EmptyInstead, name) for name in names]):
+            empty = [(_NothingInstead if name.startswith("numpy.") else _EmptyInstead, name) for name in names]
+            with safe_globals(empty):
                 return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # unpickling raises whatever the pickle asks for
         reason = " ".join(str(error).split())[:120] or type(error).__name__

@@ -140,6 +140,7 @@ def test_what_a_trainer_keeps_beside_its_weights_is_left_out(tmp_path):
         "hyper_parameters": settings,
         "callbacks": {ModelCheckpoint: {"best_model_path": "x.ckpt"}},
         "hparams_type": AttributeDict,
+        "scores": [np.float64(3), np.arange(3), torch.nn.Linear(2, 2)],
     }
     path = checkpoint(tmp_path / "whole.ckpt", renamed(direct(DESIGNS[2])), **more)
     with pytest.raises(InputError, match="no checkpoint of tensors alone"):
