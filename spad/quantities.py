@@ -19,18 +19,18 @@ UNITS: dict[str, dict[str, int]] = {
 _QUANTITY = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf)\s*(\S*)\s*")
 
 
-def parse_quantity(value: object, dimension: str, where: str) -> float:
+def parse_quantity(value: object, dimension: str, where: str, *, signed: bool = False) -> float:
     """Return a quantity in its dimension's base unit.
 
     `value` is a number where `dimension` is empty, else a text of number and unit.
 
-    Raises InputError, which begins with `where`, for a value that is no finite number of 0 or more, and for a unit that
-    is missing or of another dimension.
+    Raises InputError, which begins with `where`, for a value that is no finite number of 0 or more (`signed`: of any
+    sign), and for a unit that is missing or of another dimension.
     """
     if not dimension:
         number = not isinstance(value, bool) and isinstance(value, (int, float))
         require(number, f"{where}: {value!r} is no number")
-        return _checked(float(value), value, where)
+        return _checked(float(value), value, where, signed)
     units = UNITS[dimension]
     example = f'a {dimension} in {", ".join(units)}, as "1 {next(iter(units))}"'
     require(isinstance(value, str), f"{where}: {value!r} has no unit, expected {example}")
@@ -44,12 +44,12 @@ def parse_quantity(value: object, dimension: str, where: str) -> float:
         exact = Decimal(number).scaleb(units[unit])
     except InvalidOperation:
         raise InputError(f"{where}: {value!r} is no number with a unit, expected {example}") from None
-    return _checked(float(exact), value, where)
+    return _checked(float(exact), value, where, signed)
 
 
-def _checked(number: float, value: object, where: str) -> float:
+def _checked(number: float, value: object, where: str, signed: bool) -> float:
     require(math.isfinite(number), f"{where}: {value!r} is not finite")
-    require(number >= 0, f"{where}: {value!r} is negative, expected 0 or more")
+    require(signed or number >= 0, f"{where}: {value!r} is negative, expected 0 or more")
     return number
 
 

@@ -1,7 +1,7 @@
 """Sensor files: a `Sensor`, with its optics, as TOML, every quantity with its unit; the presets that come as files.
 
-A file holds `name`, `description`, the tables `histogram`, `pulse`, `jitter`, `detector` and `optics`, of which
-`histogram` (bins, bin_width) and `pulse` must be there, and `sources`: where each number comes from.
+A file holds `name`, `description`, the tables `histogram`, `pulse`, `jitter`, `detector`, `optics` and `zones`, of
+which `histogram` (bins, bin_width) and `pulse` must be there, and `sources`: where each number comes from.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from scenes.errors import InputError, did_you_mean, listed, require
 from scenes.files import whole_file
@@ -20,6 +20,7 @@ from spad.pulse import AnyPulse, Pulse, SampledPulse
 from spad.quantities import format_quantity, parse_quantity
 from spad.sensor import PRESETS, Sensor
 from spad.toml import format_toml, read_toml
+from spad.zones import ZoneArray
 
 SCHEMA = "1.0"
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
@@ -27,11 +28,14 @@ KINDS_OF_PULSE = "sigma, fwhm, or samples with step"
 
 
 class Key(NamedTuple):
-    """One key of a table: the field that it sets, its dimension ("" a number, "word" a text), whether it must be."""
+    """One key of a table: the field that it sets, its dimension ("" a number, "word" a text), whether it must be there,
+    may be negative, and is a list (or may be one)."""
 
     field: str
     dimension: str = ""
     required: bool = False
+    signed: bool = False
+    many: Literal["no", "may", "must"] = "no"
 
 
 HISTOGRAM = {
@@ -42,7 +46,7 @@ HISTOGRAM = {
 }
 DETECTOR = {
     "pde": Key("pde"),
-    "dark_count_rate": Key("dark_count_rate_hz", "rate"),
+    "dark_count_rate": Key("dark_count_rate_hz", "rate", many="may"),
     "hot_fraction": Key("hot_share"),
     "hot_rate": Key("hot_rate_hz", "rate"),
     "dead_fraction": Key("dead_share"),
@@ -63,10 +67,37 @@ PULSE = {
     "sigma": Key("sigma_s", "time"),
     "fwhm": Key("fwhm_s", "time"),
     "tail": Key("tail_s", "time"),
-    "samples": Key("samples"),
+    "samples": Key("samples", many="must"),
     "step": Key("sample_s", "time"),
 }
-TABLES = {"histogram": HISTOGRAM, "pulse": PULSE, "jitter": PULSE, "detector": DETECTOR, "optics": OPTICS}
+ZONES = {
+    "centre_x": Key("centre_x", required=True, signed=True, many="must"),
+    "centre_y": Key("centre_y", required=True, signed=True, many="must"),
+    "width": Key("width", required=True, many="must"),
+    "height": Key("height", required=True, many="must"),
+    "gain": Key("gain", many="must"),
+    "delay": Key("delay_s", "time", signed=True, many="must"),
+    "clock": Key("clock", many="must"),
+    "background": Key("background", many="must"),
+    "crosstalk": Key("crosstalk"),
+    "trials": Key("trials", many="must"),
+    "recovery": Key("recovery"),
+    "compression": Key("compression"),
+    "illumination_x": Key("illumination_x", signed=True),
+    "illumination_y": Key("illumination_y", signed=True),
+    "curvature_x": Key("curvature_x"),
+    "curvature_y": Key("curvature_y"),
+    "baseline": Key("baseline_m", "length", signed=True, many="must"),
+    "aperture": Key("aperture_m", "length"),
+}
+TABLES = {
+    "histogram": HISTOGRAM,
+    "pulse": PULSE,
+    "jitter": PULSE,
+    "detector": DETECTOR,
+    "optics": OPTICS,
+    "zones": ZONES,
+}
 TOP = ("schema", "name", "description")
 
 
@@ -76,12 +107,14 @@ class SensorFile:
 
     sensor       the detector and its histogram
     optics       lens, filter and laser of a radiometric budget; None where the file has none
+    zones        zones of a multi-zone sensor; None for one that has pixels
     description  one line for people
     sources      where the numbers come from, by "table.key"; what is not public says "assumed"
     """
 
     sensor: Sensor
     optics: Optics | None = None
+    zones: ZoneArray | None = None
     description: str = ""
     sources: Mapping[str, str] = field(default_factory=dict)
 
@@ -144,7 +177,8 @@ def sensor_from_tables(contents: Mapping[str, object]) -> SensorFile:
         if table in tables:
             values[table] = _pulse(tables[table], table)
     optics = Optics(**tables["optics"]) if "optics" in tables else None
-    return SensorFile(Sensor(**values), optics, description, _sources(contents))
+    zones = ZoneArray(**tables["zones"]) if "zones" in tables else None
+    return SensorFile(Sensor(**values), optics, zones, description, _sources(contents))
 
 
 def _check_schema(contents: Mapping[str, object]) -> None:
@@ -180,9 +214,11 @@ def _field(value: object, key: Key, where: str) -> object:
         whole = isinstance(value, int) and not isinstance(value, bool)
         require(whole, f"{where}: {value!r} is no whole number")
         return value
-    if isinstance(value, list) and key.field in ("dark_count_rate_hz", "samples"):
-        return tuple(parse_quantity(item, key.dimension, f"{where}[{at}]") for at, item in enumerate(value))
-    return parse_quantity(value, key.dimension, where)
+    require(isinstance(value, list) or key.many != "must", f"{where}: expected a list of numbers")
+    if isinstance(value, list) and key.many != "no":
+        named = ((item, f"{where}[{at}]") for at, item in enumerate(value))
+        return tuple(parse_quantity(item, key.dimension, name, signed=key.signed) for item, name in named)
+    return parse_quantity(value, key.dimension, where, signed=key.signed)
 
 
 def _pulse(values: Mapping[str, object], where: str) -> AnyPulse:
@@ -191,7 +227,6 @@ def _pulse(values: Mapping[str, object], where: str) -> AnyPulse:
     if ways == ["samples"]:
         require("sample_s" in values, f"{where}.step is missing: the time step of {where}.samples")
         require("tail_s" not in values, f"{where}.tail does not go with samples")
-        require(isinstance(values["samples"], tuple), f"{where}.samples: expected a list of numbers")
         return SampledPulse(values["samples"], values["sample_s"])
     require("sample_s" not in values, f"{where}.step goes with samples alone")
     sigma = values["sigma_s"] if "sigma_s" in values else values["fwhm_s"] / FWHM_PER_SIGMA
@@ -234,16 +269,26 @@ def sensor_tables(contents: SensorFile) -> dict[str, object]:
         tables["detector"] = detector
     if optics is not None:
         tables["optics"] = dict(_written(optics, OPTICS))
+    if (zones := contents.zones) is not None:
+        views = ("centre_x", "centre_y", "width", "height")
+        plain = ZoneArray(*(getattr(zones, name) for name in views))
+        used = {name: key for name, key in ZONES.items() if name in views} | _differing(ZONES, zones, plain)
+        tables["zones"] = dict(_written(zones, used))
     if contents.sources:
         tables["sources"] = dict(contents.sources)
     return tables
+
+
+def _differing(keys: Mapping[str, Key], holder: object, ideal: object) -> dict[str, Key]:
+    """Return the keys whose fields are not as in an ideal sensor."""
+    return {name: key for name, key in keys.items() if getattr(holder, key.field) != getattr(ideal, key.field)}
 
 
 def _written(holder: object, keys: Mapping[str, Key]) -> Iterator[tuple[str, object]]:
     for name, key in keys.items():
         value = getattr(holder, key.field)
         if key.dimension in ("", "word"):
-            yield name, value
+            yield name, list(value) if isinstance(value, tuple) else value
         elif isinstance(value, tuple):
             yield name, [format_quantity(item, key.dimension) for item in value]
         else:

@@ -19,6 +19,7 @@ from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
 from studies.cli import (
     bench,
+    calibrate,
     dataset,
     demo,
     depth,
@@ -43,6 +44,7 @@ Command = (
     | Annotated[dataset.Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[sense.Sense, tyro.conf.subcommand("sense")]
     | Annotated[depth.Depth, tyro.conf.subcommand("depth")]
+    | Annotated[calibrate.Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[train.Train, tyro.conf.subcommand("train")]
     | Annotated[models.Models, tyro.conf.subcommand("models")]
     | Annotated[evaluate.Evaluate, tyro.conf.subcommand("evaluate")]
@@ -58,6 +60,7 @@ RUNNERS: dict[type, Callable[[Any, Progress], dict]] = {
     dataset.Dataset: dataset.run,
     sense.Sense: sense.run,
     depth.Depth: depth.run,
+    calibrate.Calibrate: calibrate.run,
     train.Train: train.run,
     models.Models: models.run,
     evaluate.Evaluate: evaluate.run,

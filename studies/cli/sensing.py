@@ -23,6 +23,8 @@ from spad.mat import write_mat
 from spad.pulse import AnyPulse, Pulse, read_pulse
 from spad.sensor import PhotonBudget, Sensor
 from spad.sensor_files import FWHM_PER_SIGMA, load_sensor
+from spad.zone_histogram import sense_zones, with_budget
+from spad.zones import ZoneArray
 from studies.cli.paths import input_file, output_file, picture
 from studies.cli.sense import Sense
 from studies.options import Progress
@@ -104,12 +106,12 @@ def budget_of(command: Sense) -> PhotonBudget:
 
 def run(command: Sense, progress: Progress) -> dict:
     """Transient -> histogram, its picture, and the .mat layout where asked."""
+    zones = load_sensor(command.sensor).zones
+    if zones is not None:
+        return _run_zones(command, zones)
     sensor, optics = sensor_of(command), optics_of(command)
     budget = budget_of(command) if optics is None else None
-    source = input_file(command.file)
-    histogram_given = source.suffix.lower() in (".h5", ".hdf5")
-    require(not histogram_given, f"{source}: is an HDF5 file, expected a transient (.exr) that `render` wrote")
-    out = output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
+    source, out = _files(command)
     transient = read_transient(source)
     dark_map = _dark_map(command.dark_map, transient)
     if optics is not None:
@@ -132,6 +134,41 @@ def run(command: Sense, progress: Progress) -> dict:
         # a map of dark counts is not part of the rates that the figure could draw
         rate = partial(expected_in_pixel, transient, sensor, budget, seed=command.seed) if dark_map is None else None
         result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram"), expected=rate))
+    return result
+
+
+def _files(command: Sense) -> tuple[Path, Path]:
+    """Return the transient's file and the histogram's, checked."""
+    source = input_file(command.file)
+    histogram_given = source.suffix.lower() in (".h5", ".hdf5")
+    require(not histogram_given, f"{source}: is an HDF5 file, expected a transient (.exr) that `render` wrote")
+    return source, output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
+
+
+def _run_zones(command: Sense, zones: ZoneArray) -> dict:
+    """Transient -> histogram of a multi-zone sensor, whose gains are its own unless a budget is asked for."""
+    pixels_alone = ("radiometric", "dark_map", "export", "dark_count_rate", "dead_time", "crosstalk", "hot_pixels")
+    for option in (*pixels_alone, "dead_pixels", "reset"):
+        given = getattr(command, option) not in (None, False)
+        require(not given, f"--{option.replace('_', '-')} does not go with a sensor of zones")
+    require(command.model == "auto", f"--model {command.model} does not go with a sensor of zones")
+    sensor = sensor_of(command)
+    source, out = _files(command)
+    transient = read_transient(source)
+    start = time.perf_counter()
+    asked = command.signal is not None or command.background is not None
+    if asked or set(zones.gain) == {1.0}:  # not calibrated
+        zones = with_budget(zones, transient, sensor, budget_of(command))
+    histogram = sense_zones(transient, sensor, zones, seed=command.seed)
+    seconds = time.perf_counter() - start
+    for reason in histogram.meta["plan"]:
+        log.info("%s", reason)
+    write_histogram(histogram, out)
+    result = {"seconds": seconds, **summary(histogram), "out": str(out)}
+    if command.figure:
+        from studies import figures
+
+        result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram"), expected=None))
     return result
 
 

@@ -24,7 +24,9 @@ from spad.sensor_files import (
     sensor_names,
     write_sensor,
 )
+from spad.sensor_files import ZONES as ZONE_KEYS
 from spad.toml import read_toml
+from spad.zones import ZoneArray
 
 PLAIN = """name = "mine"
 [histogram]
@@ -33,6 +35,7 @@ bin_width = "91 ps"
 [pulse]
 fwhm = "200 ps"
 """
+TWO_ZONES = "[zones]\ncentre_x = [0, 1]\ncentre_y = [0, 1]\nwidth = [1, 1]\nheight = [1]\n"
 WIDE = Sensor(
     name="wide",
     bins=77,
@@ -51,11 +54,32 @@ WIDE = Sensor(
     crosstalk=0.003,
 )
 
+ZONES = ZoneArray(
+    (-0.1, 0.1 / 3),
+    (0.0, 0.2),
+    (0.1, 0.2),
+    (0.3, 0.4),
+    gain=(1e9 / 7, 2.0),
+    delay_s=(-1e-9 / 3, 1.2e-9),
+    clock=(1.01, 1 / 1.01),
+    background=(190.0, 0.0),
+    crosstalk=1e-3,
+    trials=(5e6, 4e6),
+    recovery=0.7,
+    compression=1.1,
+    illumination_x=-0.02,
+    illumination_y=0.1,
+    curvature_x=25.0,
+    curvature_y=14.5,
+    baseline_m=(0.0, 0.003, -1e-4),
+    aperture_m=3e-4,
+)
+
 
 @pytest.mark.parametrize("sensor", [*PRESETS.values(), WIDE], ids=lambda sensor: sensor.name)
 @pytest.mark.parametrize("optics", [None, Optics(1e-9 / 3, 4e-4, 1.33, 2.55e-5, 0.7, 12.3, 9.4e-7)])
 def test_a_sensor_comes_back_from_its_file_to_the_last_bit(sensor, optics, tmp_path):
-    whole = SensorFile(sensor, optics, 'all "fields"', {"histogram.bins": "a\nsheet"})
+    whole = SensorFile(sensor, optics, ZONES, 'all "fields"', {"histogram.bins": "a\nsheet"})
     assert read_sensor(write_sensor(whole, tmp_path / "s.toml")) == whole
 
 
@@ -63,6 +87,7 @@ def test_every_field_of_a_sensor_has_a_key():
     keyed = {key.field for table in (HISTOGRAM, DETECTOR) for key in table.values()} | {"name", "pulse", "jitter"}
     assert keyed == {field.name for field in fields(Sensor)}
     assert {key.field for key in OPTICS.values()} == {field.name for field in fields(Optics)}
+    assert {key.field for key in ZONE_KEYS.values()} == {field.name for field in fields(ZoneArray)}
 
 
 @settings(deadline=None, derandomize=True)
@@ -121,6 +146,11 @@ def test_the_presets_that_were_there_keep_their_names_and_values():
         ('"200 ps"', '"200 ps"\n[sources]\n"histogram.bin" = "x"', "did you mean 'histogram.bins'?"),
         ('name = "mine"', 'schema = "2.0"\nname = "mine"', "sensor file of schema 2.0, this program reads 1"),
         ('name = "mine"', "name = ", "is no TOML"),
+        ('"200 ps"', '"200 ps"\n[zones]\nwidth = [1]', "zones.centre_x, centre_y, height is missing"),
+        ('"200 ps"', '"200 ps"\n' + TWO_ZONES, "zones: 1 numbers of height for 2 zones"),
+        ('"200 ps"', '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, -1]"), "zones.height[1]: -1 is negative"),
+        ('"200 ps"', '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, 1]\ncrosstalk = 1.5"), "crosstalk 1.5 is outside"),
+        ('"200 ps"', '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, 1]\nbaseline = [3, 0, 0]"), "3 has no unit"),
     ],
 )
 def test_a_mistake_in_a_file_is_one_line_that_names_it(old, new, meant, tmp_path):

@@ -1,0 +1,135 @@
+"""Calibration: the fit's model is the sensor's, and simulated captures give back the truth within its own errors."""
+
+import math
+
+import numpy as np
+import pytest
+
+from scenes.errors import InputError
+from spad.calibration import (
+    PulseBasis,
+    ZoneCapture,
+    ZoneModel,
+    as_sensor,
+    calibrate,
+    fit,
+    natural,
+    parameter_names,
+    poisson_deviance,
+    standard_errors,
+)
+from spad.pulse import Pulse
+from spad.saturation import draw_saturated
+from spad.sensor import Sensor
+from spad.zones import ZoneArray, ZoneReturns, expected_zone_counts, zone_flux
+
+ZONES = ZoneArray((-0.2, 0.0, 0.2), (0.0, 0.0, 0.0), (0.1,) * 3, (0.1,) * 3)
+SENSOR = Sensor(name="s", bins=40, bin_width_s=1e-10, pulse=Pulse(1e-10))
+FREE = ("pulse", "gain", "delay", "clock", "bin_width", "background", "trials", "recovery")
+
+
+def light(distance_m: float) -> list[ZoneReturns]:
+    """Three zones that see paths of a few interval lengths, falling with the square of the distance."""
+    near = 2 * distance_m * np.linspace(1, 1.05, 7)
+    return [
+        ZoneReturns(near * stretch, near * stretch * 1.01, np.full(7, 0.1 / distance_m**2))
+        for stretch in (1, 1.02, 1.04)
+    ]
+
+
+def truth() -> tuple[ZoneModel, dict[str, np.ndarray]]:
+    basis = PulseBasis.made(6, 3, 4)
+    steps = np.arange(basis.matrix.shape[1])
+    pulse = 6000 * (np.exp(-(((steps - 8) / 4) ** 2)) + 0.3)
+    one = np.ones(1)
+    return ZoneModel(basis, SENSOR.bins, 3, 1), {
+        "pulse": pulse,
+        "gain": np.array([0.6, 1.0, 1.4]),
+        "delay": np.array([0.4, 0.0, -0.3]),
+        "clock": np.array([1.01, 1.0, 0.99]),
+        "bin_width": 1e-10 * one,
+        "background": np.array([600.0, 800.0, 500.0]),
+        "trials": 4e7 * one,
+        "recovery": 0.8 * one,
+        "compression": 0.0 * one,
+        "crosstalk": 0.0 * one,
+    }
+
+
+def captures(model: ZoneModel, values: dict, number: int, seed: int) -> list[ZoneCapture]:
+    rng, found = np.random.default_rng(seed), []
+    sensor, zones = as_sensor(model, values, SENSOR, ZONES)
+    for distance in np.linspace(0.1, 0.3, number):
+        returns = light(distance)
+        flux = zone_flux(returns, sensor, zones)
+        found.append(ZoneCapture(returns, draw_saturated(flux, np.asarray(zones.trials), zones.recovery, rng)))
+    return found
+
+
+def test_the_fits_model_is_the_sensors():
+    """Two routes to expected counts: linear in the pulse's steps, and pulse by pulse over each return's interval."""
+    model, values = truth()
+    values["crosstalk"], values["compression"] = np.array([0.01]), np.array([0.7])
+    sensor, zones = as_sensor(model, values, SENSOR, ZONES)
+    for distance, drift in ((0.1, 0.0), (0.27, 3e-11)):
+        capture = ZoneCapture(light(distance), np.zeros((3, 40)), drift)
+        direct = expected_zone_counts(capture.returns, sensor, zones, drift)
+        assert model.expected(values, capture) == pytest.approx(direct, rel=1e-9, abs=1e-6)
+
+
+def test_the_jacobian_is_the_finite_difference():
+    model, values = truth()
+    values["crosstalk"], values["compression"] = np.array([0.01]), np.array([0.7])
+    capture = ZoneCapture(light(0.17), np.zeros((3, 40)))
+    names = parameter_names(values, (*FREE, "crosstalk", "compression"), 1)
+    _, slope = model.jacobian(values, capture, names)
+    for column, (name, at) in enumerate(names):
+        size = abs(values[name][at])
+        step = 1e-5 * (size if name == "bin_width" else max(size, 0.1))
+        pair = []
+        for sign in (1, -1):
+            moved = {key: value.copy() for key, value in values.items()}
+            moved[name][at] += sign * step
+            pair.append(model.expected(moved, capture))
+        expected = (pair[0] - pair[1]) / (2 * step)
+        assert np.abs(slope[:, :, column] - expected).max() < 2e-3 * np.abs(expected).max(), (name, at)
+
+
+def repeated(repetitions: int) -> dict[str, float]:
+    """Share of the fits whose 95 % interval holds the truth, by parameter, averaged over zones."""
+    model, values = truth()
+    right, inside = natural(model, values), {}
+    for seed in range(repetitions):
+        found, information, names = fit(model, captures(model, values, 12, seed), values, FREE, steps=8)
+        errors, numbers = standard_errors(model, found, information, names), natural(model, found)
+        for name in ("gain", "delay_s", "clock", "bin_width_s", "background", "trials", "recovery"):
+            used = errors[name] > 0  # the gauge has none
+            off = np.abs(numbers[name] - right[name])[used] / errors[name][used]
+            inside.setdefault(name, []).append(float((off < 1.96).mean()))
+    return {name: float(np.mean(shares)) for name, shares in inside.items()}
+
+
+def test_a_calibration_of_simulated_captures_is_near_the_truth():
+    assert min(repeated(6).values()) > 0.6
+
+
+@pytest.mark.slow
+def test_standard_errors_cover_the_truth():
+    """200 repetitions. Saturation spreads counts a little less than Poisson does: intervals cover a little more."""
+    covered = repeated(200)
+    assert all(0.90 <= share <= 0.985 for share in covered.values()), covered
+    assert 0.90 <= np.mean([*covered.values()]) <= 0.98
+
+
+def test_deviance_of_the_truth_is_one_a_bin():
+    rng = np.random.default_rng(1)
+    expected = rng.uniform(20, 5000, 20_000)
+    assert poisson_deviance(rng.poisson(expected), expected) / 20_000 == pytest.approx(1, abs=5 * math.sqrt(2 / 20_000))
+    assert poisson_deviance(np.zeros(3), np.ones(3)) == pytest.approx(6)
+
+
+def test_what_cannot_be_fitted_is_refused():
+    with pytest.raises(InputError, match="gravity cannot be fitted"):
+        calibrate([], SENSOR, ZONES, free=("gravity",))
+    with pytest.raises(InputError, match="0 captures, expected 8 or more"):
+        calibrate([], SENSOR, ZONES)

@@ -1,0 +1,175 @@
+"""Multi-zone sensors: each effect against its own closed form or an event-by-event simulation, all off the identity."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from render.transient import Transient
+from scenes.errors import InputError
+from spad.pulse import Pulse
+from spad.saturation import draw_saturated, saturated, saturated_jacobian
+from spad.sensor import PhotonBudget, Sensor
+from spad.zone_histogram import sense_zones, with_budget, zone_grid
+from spad.zones import EFFECTS, ZoneArray, ZoneReturns, expected_zone_counts, zone_returns, zone_signal
+
+SENSOR = Sensor(name="s", bins=64, bin_width_s=1e-10, pulse=Pulse(1e-10))
+TWO = ZoneArray((-0.2, 0.2), (0.0, 0.0), (0.3, 0.3), (0.5, 0.5))
+
+
+def view(depth_m: float = 0.3, pixels: int = 40, fov_deg: float = 60.0, baseline=(0.0, 0.0, 0.0)):
+    """A frontal plane at `depth_m`, one return a pixel at its radial distance, radiance 1."""
+    focal = pixels / 2 / math.tan(math.radians(fov_deg / 2))
+    at = (np.arange(pixels) + 0.5 - pixels / 2) / focal
+    x, y = np.meshgrid(at, at)
+    radial = depth_m * np.sqrt(1 + x * x + y * y)
+    path, shape = (2 * radial).astype(np.float32).ravel(), (pixels, pixels)
+    return Transient(
+        pixels,
+        pixels,
+        np.arange(pixels * pixels + 1, dtype=np.int64),
+        path,
+        path,
+        np.ones(pixels * pixels, np.float32),
+        np.ones(pixels * pixels, np.uint8),
+        depth_m=radial.astype(np.float32),
+        normal=np.zeros((*shape, 3), np.float16),
+        albedo=np.ones(shape, np.float16),
+        ambient=np.zeros(shape, np.float32),
+        mixed=np.zeros(shape, bool),
+        error=np.zeros(shape, np.float32),
+        meta={"camera": {"fov_deg": fov_deg}, "laser": {"baseline_m": list(baseline)}},
+    )
+
+
+def test_with_all_effects_off_a_zone_is_the_sum_of_its_light():
+    """The integral of cos^4 over the zone's tangents, by quadrature, and the pulses of a plain sensor."""
+    found = zone_returns(view(pixels=200), TWO)
+    grid = (np.arange(400) + 0.5) / 400
+    x, y = np.meshgrid(-0.35 + 0.3 * grid, -0.25 + 0.5 * grid)
+    expected = float(((1 + x * x + y * y) ** -2).mean()) * 0.15
+    assert [returns.light.sum() for returns in found] == pytest.approx([expected] * 2, rel=1e-4)
+    counts = expected_zone_counts(found, SENSOR, TWO)
+    assert counts.sum(axis=1) == pytest.approx([expected] * 2, rel=1e-4)
+    assert not any(effect_changes(TWO, effect) for effect in EFFECTS)
+
+
+def effect_changes(zones: ZoneArray, effect: str) -> bool:
+    return zones.without(effect) != zones
+
+
+def test_every_effect_can_be_switched_off_alone():
+    on = replace(
+        TWO,
+        gain=(2.0, 3.0),
+        delay_s=(1e-10, 3e-10),
+        clock=(1.01, 1.0),
+        background=(1.0, 2.0),
+        crosstalk=0.1,
+        trials=(1e4, 1e4),
+        recovery=1.0,
+        compression=1.0,
+        curvature_x=3.0,
+        baseline_m=(0.003, 0.0, 0.0),
+        aperture_m=1e-3,
+    )
+    assert all(effect_changes(on, effect) for effect in EFFECTS)
+    with pytest.raises(InputError, match="effect 'gravity' is unknown"):
+        on.without("gravity")
+
+
+def test_the_aperture_blurs_a_zones_edge_and_keeps_its_light():
+    plain, blurred = (zone_returns(view(0.05), replace(TWO, aperture_m=size)) for size in (0.0, 5e-3))
+    assert len(blurred[0].light) > len(plain[0].light)
+    assert blurred[0].light.sum() == pytest.approx(plain[0].light.sum(), rel=0.02)
+
+
+def test_the_emitters_profile_moves_with_parallax():
+    """Light of exp(-k u^2 / 2), u the tangent seen from the emitter: at 10 mm a baseline of 2 mm shifts it by 0.2."""
+    zones = replace(TWO, curvature_x=40.0)
+    near = zone_returns(view(0.01, baseline=(0.002, 0, 0)), replace(zones, baseline_m=(0.002, 0.0, 0.0)))
+    left, right = (returns.light.sum() for returns in near)
+    assert right > 3 * left
+    far = zone_returns(view(2.0, baseline=(0.002, 0, 0)), replace(zones, baseline_m=(0.002, 0.0, 0.0)))
+    left, right = (returns.light.sum() for returns in far)
+    assert right == pytest.approx(left, rel=0.02)
+    with pytest.raises(InputError, match="emitter at 0 0 0 mm, the zones' is at 2 0 0 mm"):
+        zone_returns(view(), replace(zones, baseline_m=(0.002, 0.0, 0.0)))
+
+
+def test_delay_clock_and_crosstalk_by_their_definitions():
+    one = [ZoneReturns(np.array([0.3]), np.array([0.3]), np.array([5.0])) for _ in range(2)]
+    zones = replace(TWO, delay_s=(1e-9, 0.0), clock=(1.0, 1.25), gain=(2.0, 1.0), crosstalk=0.1)
+    own = zone_signal(one, SENSOR, replace(zones, crosstalk=0.0))
+    centre = own @ (np.arange(64) + 0.5) / own.sum(axis=1) * 1e-10
+    arrival = 0.3 / 299792458
+    assert centre == pytest.approx([arrival + 1e-9, arrival / 1.25], rel=1e-6)
+    assert zone_signal(one, SENSOR, zones) == pytest.approx(own + 0.1 * own.sum(axis=0))
+    late = zone_signal(one, SENSOR, zones, drift_s=2e-10)
+    assert late[:, 2:] == pytest.approx(zone_signal(one, SENSOR, zones)[:, :-2], abs=1e-9)
+
+
+def simulate(mu: np.ndarray, trials: int, recovery: float, rng: np.random.Generator) -> np.ndarray:
+    """Event by event: cycles of one detector one after the other, blind ones counted down."""
+    photons = rng.poisson(mu, (trials, len(mu))) > 0
+    first = np.where(photons.any(axis=1), photons.argmax(axis=1), -1)
+    counts, blind = np.zeros(len(mu), np.int64), 0
+    for at in first:
+        if blind:
+            blind -= 1
+        elif at >= 0:
+            counts[at] += 1
+            blind = math.floor(recovery) + (rng.random() < recovery % 1)
+    return counts
+
+
+@pytest.mark.parametrize("recovery", [0.0, 0.6, 1.0, 2.3])
+def test_saturation_is_the_event_by_event_simulation(recovery):
+    """Chi-square over bins at 0.1 %, with the variance of the law's own draws; their mean and spread as well."""
+    rng, trials = np.random.default_rng(5), 40_000
+    mu = np.concatenate([np.full(6, 0.01), [0.2, 0.5, 0.3, 0.1], np.full(6, 0.02)])
+    flux, many = mu[None] * trials, np.array([float(trials)])
+    expected = saturated(flux, many, recovery)[0]
+    counts = simulate(mu, trials, recovery, rng)
+    statistic = float(((counts - expected) ** 2 / expected).sum())
+    assert statistic < chi2.ppf(0.999, len(mu))  # counts are sub-Poisson: conservative
+    drawn = np.array([draw_saturated(flux, many, recovery, rng)[0] for _ in range(400)])
+    assert np.abs(drawn.mean(axis=0) - expected).max() < 5 * np.sqrt(expected.max() / 400)
+    events = np.array([simulate(mu, 2000, recovery, rng).sum() for _ in range(300)])
+    short = np.array([draw_saturated(mu[None] * 2000, many / 20, recovery, rng).sum() for _ in range(300)])
+    assert short.mean() == pytest.approx(events.mean(), abs=5 * events.std() / math.sqrt(150))
+    assert short.std() == pytest.approx(events.std(), rel=5 / math.sqrt(300))
+
+
+def test_without_trials_to_lose_nothing_saturates_and_compression_is_as_stated():
+    flux = np.array([[3.0, 100.0, 7.0]])
+    assert saturated(flux, np.array([math.inf]), 3.0, 2.0) == pytest.approx(flux)
+    first = saturated(flux, np.array([1e3]), 0.5)
+    assert saturated(flux, np.array([1e3]), 0.5, 2.0) == pytest.approx(first / (1 + 2 * first / 1e3))
+
+
+def test_the_derivative_of_saturation_is_its_finite_difference():
+    rng = np.random.default_rng(3)
+    flux, slope = rng.uniform(1, 300, (2, 9)), rng.normal(size=(2, 9, 3))
+    trials = np.array([900.0, math.inf])
+    found = saturated_jacobian(flux, slope, trials, 0.7, 1.3)
+    for column in range(3):
+        up, down = (saturated(flux + sign * 1e-4 * slope[..., column], trials, 0.7, 1.3) for sign in (1, -1))
+        assert found[..., column] == pytest.approx((up - down) / 2e-4, rel=1e-5, abs=1e-7)
+
+
+def test_zones_are_laid_out_as_they_look_and_take_a_budget():
+    nine = ZoneArray(*zip(*[(x, y, 0.1, 0.1) for x in (0.2, 0.0, -0.2) for y in (0.2, 0.0, -0.2)], strict=True))
+    rows, columns, order = zone_grid(nine)
+    assert (rows, columns) == (3, 3) and order.tolist() == [8, 5, 2, 7, 4, 1, 6, 3, 0]
+    transient = view()
+    budgeted = with_budget(nine, transient, SENSOR, PhotonBudget(2000.0, 640.0))
+    histogram = sense_zones(transient, SENSOR, budgeted, seed=1)
+    assert histogram.counts.shape == (3, 3, 64) and histogram.expected_signal.mean() == pytest.approx(2000, rel=1e-5)
+    assert histogram.counts.sum() == pytest.approx(9 * 2640, abs=5 * math.sqrt(9 * 2640))
+    again = sense_zones(transient, SENSOR, budgeted, seed=1)
+    assert (again.counts == histogram.counts).all()
+    with pytest.raises(InputError, match="look beside the image"):
+        sense_zones(view(fov_deg=20.0), SENSOR, nine)
