@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import require
+from scenes.errors import did_you_mean, require
 from spad.pulse import SampledPulse
 from spad.saturation import saturated, saturated_jacobian
 from spad.sensor import Sensor
@@ -358,6 +358,13 @@ def starting_values(
     }
 
 
+def check_effects(free: Sequence[str]) -> None:
+    """Raise InputError for an effect that cannot be fitted."""
+    for name in free:
+        known = f"{did_you_mean(name, OPTIONAL)}, expected among {', '.join(OPTIONAL)}"
+        require(name in OPTIONAL, f"calibrate: {name} cannot be fitted{known}")
+
+
 def calibrate(
     captures: Sequence[ZoneCapture],
     sensor: Sensor,
@@ -373,8 +380,7 @@ def calibrate(
     First the pulse, gains, delays and background from every fourth capture, then all from every second, then from all;
     from `start`, all at once. Raises InputError for fewer than eight captures without a start.
     """
-    unknown = [name for name in free if name not in OPTIONAL]
-    require(not unknown, f"calibrate: {', '.join(unknown)} cannot be fitted, expected among {', '.join(OPTIONAL)}")
+    check_effects(free)
     require(start is not None or len(captures) >= 8, f"calibrate: {len(captures)} captures, expected 8 or more")
     reference = zones.count // 2
     if start is not None:

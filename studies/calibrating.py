@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from scenes.errors import require
-from spad.calibration import Calibration, ZoneCapture, calibrate, poisson_deviance
+from spad.calibration import Calibration, ZoneCapture, calibrate, check_effects, poisson_deviance
 from spad.sensor_files import SensorFile, load_sensor, write_sensor
 from spad.zones import expected_zone_counts
 from studies.cli.calibrate import Calibrate
@@ -26,6 +26,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
     require(command.out.parent.is_dir(), f"{command.out}: folder {command.out.parent} does not exist")
     require(command.every >= 2, f"--every {command.every} leaves no capture to be held out, expected 2 or more")
     require(0 <= command.model_error < 1, f"--model-error {command.model_error:g} is outside 0 to 1")
+    check_effects(command.effects)
     start = load_sensor(command.sensor)
     require(start.zones is not None, f"sensor {start.sensor.name} has no zones: its file needs a table [zones]")
     path = shipped_captures() if str(command.captures) == "shipped" else command.captures
