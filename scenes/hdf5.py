@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import mmap
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -26,13 +28,17 @@ if TYPE_CHECKING:
     import h5py
 
 USER_BLOCK = 512
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
 MARK = b"scene2spad SHA-256 of what follows byte 512: "
 MAX_DEFLATE_RATIO = 1032  # of zlib's format
 SLACK_BYTES = 1 << 16
-PROBE_SECONDS, PROBE_BYTES_PER_SECOND = 30, 20_000_000
+# Of the processor, not of the clock: a busy machine must not make a sound file look damaged.
+PROBE_SECONDS, PROBE_BYTES_PER_SECOND = 4, 20_000_000
+WAITING = 15  # times as long by the clock
 PROBE = """
 import resource, sys, h5py
-resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), int(sys.argv[2])))
+for kind, limit in zip((resource.RLIMIT_AS, resource.RLIMIT_CPU), map(int, sys.argv[2:])):
+    resource.setrlimit(kind, (limit, limit))
 with h5py.File(sys.argv[1], "r") as file:
     dict(file.attrs)
     for name in file:
@@ -121,6 +127,8 @@ def open_checked(path: Path) -> Iterator[h5py.File]:
             sound = blank and size > USER_BLOCK and _digest(file) == expected
             require(sound, "its bytes do not match their SHA-256: the file is damaged or was altered")
         else:
+            # ours begin with the mark, or, made by earlier versions, with HDF5's own signature
+            require(start.startswith(SIGNATURE), "is no HDF5 file of ours, or the mark of its checksum is damaged")
             _probe(path)
     with h5py.File(path, "r") as opened:
         yield opened
@@ -128,29 +136,18 @@ def open_checked(path: Path) -> Iterator[h5py.File]:
 
 def _probe(path: Path) -> None:
     """Read a file without a checksum in another process; InputError where that dies, or takes too long."""
-    require(_has_signature(path), "no HDF5 file")
-    seconds = PROBE_SECONDS + path.stat().st_size / PROBE_BYTES_PER_SECOND
-    limit = min(memory_limit(), 4 << 30)
-    command = [sys.executable, "-c", PROBE, str(path), str(limit)]
+    seconds = math.ceil(PROBE_SECONDS + path.stat().st_size / PROBE_BYTES_PER_SECOND)
+    limits = min(memory_limit(), 4 << 30), seconds
+    command = [sys.executable, "-c", PROBE, str(path), *map(str, limits)]
+    endless = f"the HDF5 library does not come to an end of it in {seconds} s: it is damaged"
     try:
-        done = subprocess.run(command, capture_output=True, timeout=seconds, check=False)
+        done = subprocess.run(command, capture_output=True, timeout=WAITING * seconds, check=False)
     except subprocess.TimeoutExpired:
-        raise InputError(f"the HDF5 library does not come to an end of it in {seconds:.0f} s: it is damaged") from None
+        raise InputError(endless) from None
+    require(done.returncode not in (-signal.SIGXCPU, -signal.SIGKILL), endless)
     if done.returncode:
         words = (done.stderr.decode(errors="replace").split("\n")[-2:-1] or [""])[0]
         raise InputError(f"the HDF5 library cannot read it ({words[:120] or f'status {done.returncode}'})")
-
-
-def _has_signature(path: Path) -> bool:
-    """Look for HDF5's signature where it may stand: at 0, 512, 1024, 2048, ..."""
-    size, at = path.stat().st_size, 0
-    with path.open("rb") as file:
-        while at + 8 <= size:
-            file.seek(at)
-            if file.read(8) == b"\x89HDF\r\n\x1a\n":
-                return True
-            at = max(USER_BLOCK, 2 * at)
-    return False
 
 
 def read_dataset(file: h5py.File, name: str) -> np.ndarray:
