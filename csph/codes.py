@@ -19,18 +19,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from csph.waves import Rows, truncated_waves, waves
 from scenes.errors import InputError, require
 from spad.rgbd import published_taps
 from spad.sensor import Sensor
 from spad.template import binned_pulse
 
-Rows = Literal["centred", "published"]
 FIXED_CODES = ("fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 GROUPS = 64  # of neighbouring time bins that `grouped_energy` tells apart
 BAND_LIMIT = 0.2  # of the pulse's spectrum at harmonic 1: what Gray Fourier keeps
@@ -55,19 +54,6 @@ def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 
     return makers[name]()
 
 
-def _waves(harmonics: Tensor, bins: int, rows: Rows) -> Tensor:
-    """Return cos and sin in turn of each harmonic f, (2F, Mt) float32: cos(2 pi f (i + 1/2) / Mt) at the bin centres.
-
-    published: cos and -sin at 2 pi f i / Mt, the real and imaginary part of a discrete Fourier transform.
-    """
-    published = rows == "published"
-    # The phase in half bins, an integer reduced before it becomes an angle: exact for every harmonic.
-    half_bins = (harmonics.unsqueeze(-1) * (2 * torch.arange(bins) + (not published))) % (2 * bins)
-    angle = half_bins.double() * (math.pi / bins)
-    sine = -angle.sin() if published else angle.sin()
-    return torch.stack([angle.cos(), sine], dim=1).reshape(-1, bins).float()
-
-
 def truncated_fourier(codes: int, bins: int, rows: Rows = "centred") -> Tensor:
     """Return cos and sin in turn of harmonics f = 1 .. K/2, (K, T) float32: cos(2 pi f (i + 1/2) / T), and sin.
 
@@ -75,11 +61,7 @@ def truncated_fourier(codes: int, bins: int, rows: Rows = "centred") -> Tensor:
     leaves no trace; none from T/2 on, where the sine or the cosine vanishes. Raises InputError unless K is even and
     2 <= K <= T - 2.
     """
-    if codes % 2 or not 2 <= codes <= bins - 2:
-        raise InputError(
-            f"truncated Fourier: {codes} codes, expected an even number from 2 to {bins - 2} for {bins} bins"
-        )
-    return _waves(torch.arange(1, codes // 2 + 1), bins, rows)
+    return torch.from_numpy(truncated_waves(codes, bins, rows))
 
 
 def block_pulse(bins: int, sensor: Sensor) -> Tensor:
@@ -121,7 +103,7 @@ def gray_fourier(codes: int, bins: int, pulse: Tensor, rows: Rows = "centred") -
             f"Gray Fourier: {codes} codes, expected an even number from 2 to {2 * len(frequencies)}: the pulse's band "
             f"holds {len(frequencies)} harmonics of {bins} bins"
         )
-    return _waves(torch.tensor(frequencies[: codes // 2]), bins, rows)
+    return torch.from_numpy(waves(frequencies[: codes // 2], bins, rows))
 
 
 def coarse_gates(codes: int, bins: int) -> Tensor:

@@ -23,7 +23,8 @@ from spad.sensor import PhotonBudget, sensor_by_name
 from studies import figures
 from studies.experiments import Study
 from studies.figures import DEPTH_COLOURS, plt
-from studies.ultraphase_chain import Emulated, all_costs, by_torch, decode, emulate, int8_temporal, shared_core_depths
+from studies.program_tables import all_costs, int8_temporal
+from studies.ultraphase_chain import Emulated, by_torch, decode, emulate, shared_core_depths
 from ultraphase import Method, method
 from ultraphase.catalog import PUBLISHED
 from ultraphase.core import Counters

@@ -10,17 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from csph import CodingTensor, decode_depth, encode, truncated_fourier
+from csph import CodingTensor, decode_depth, encode
 from scenes.errors import require
 from spad.histogram import Histogram
 from spad.sensor import Sensor
-from studies.options import Progress
-from ultraphase import CoreArray, Method, method
-from ultraphase.catalog import PUBLISHED, TIMESTAMPS
+from studies.program_tables import fixed_spatial, int8_temporal
+from ultraphase import CoreArray, Method
+from ultraphase.catalog import TIMESTAMPS
 from ultraphase.core import Counters
-from ultraphase.power import Cost, measured_cost
-from ultraphase.tables import INT8_SCALE, int8_codes, spatial_sum
-from ultraphase.verify import verify
+from ultraphase.tables import spatial_sum
 
 _CORES = 1 << 16  # emulated at a time
 INT16 = 1 << 15
@@ -38,19 +36,6 @@ class Emulated:
     codes: np.ndarray
     counters: Counters
     bits: int
-
-
-def int8_temporal(method: Method) -> np.ndarray | None:
-    """The csph truncated-Fourier tensor (K, Mt) of a method in int8 steps; None for coarse histograms."""
-    if method.temporal_bins == 0:
-        return None
-    return int8_codes(truncated_fourier(method.codes, method.temporal_bins).numpy())
-
-
-def fixed_spatial(method: Method) -> np.ndarray | None:
-    """Spatial weights (rows, columns, K) in int8 steps that stand in for learned ones where none are given: all pixels
-    of a block alike. None for a method without a block."""
-    return None if method.block == (1, 1) else np.full((*method.block, method.codes), INT8_SCALE, np.int64)
 
 
 def emulate(counts: np.ndarray, method: Method, spatial: np.ndarray | None = None) -> Emulated:
@@ -168,31 +153,3 @@ def shared_core_depths(histogram: Histogram, codes: int = 8) -> dict[str, np.nda
         "addresses lost": np.repeat(np.repeat(depth_pooled, side, axis=0), side, axis=1),
         "addresses kept": depth_own,
     }
-
-
-def verified(method: Method) -> dict:
-    """Proof of one program against its integer matrix, as numbers for a table."""
-    temporal = int8_temporal(method)
-    program = method.program()
-    proof = verify(program, method.matrix(temporal), method.tables(temporal))
-    return {
-        "name": method.name,
-        "words": len(program.instructions),
-        "ram_bits": program.ram_bits,
-        "timestamps": len(proof.table),
-        "states": proof.states,
-        "clocks_min": int(proof.clocks.min()),
-        "clocks_mean": float(proof.clocks.mean()),
-        "clocks_max": int(proof.clocks.max()),
-        "overflow": "saturates" if proof.saturates.any() else "wraps",
-    }
-
-
-def all_costs(progress: Progress, methods: list[Method] | None = None) -> dict[str, Cost]:
-    """Emulated cost of every method by its name."""
-    chosen = methods or [method(name) for name in PUBLISHED]
-    costs = {}
-    for number, one in enumerate(chosen):
-        progress(one.name, number / len(chosen))
-        costs[one.name] = measured_cost(one, int8_temporal(one))
-    return costs

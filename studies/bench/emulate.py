@@ -12,7 +12,8 @@ import numpy as np
 from render.tracing import Progress
 from scenes.errors import require
 from scenes.files import whole_file
-from studies.ultraphase_chain import int8_temporal, timestamps_of
+from studies.program_tables import int8_temporal
+from studies.ultraphase_chain import timestamps_of
 from ultraphase import Core, CoreArray, Method, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.tables import INT8_SCALE, spatial_sum

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from scenes.catalog import load_scene
 from scenes.errors import InputError
-from spad.sensor import PhotonBudget, sensor_by_name
 from studies.cli.depth import depth_map
 from studies.cli.paths import output_file
 from studies.cli.render import in_view
@@ -40,6 +39,7 @@ def run(command: Demo, progress: Progress) -> dict:
     from spad.depth import depth_errors
     from spad.detect import sense
     from spad.histogram import write_histogram
+    from spad.sensor import PhotonBudget, sensor_by_name
     from studies import figures
 
     budget = PhotonBudget(command.signal, command.background)

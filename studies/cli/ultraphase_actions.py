@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from render.tracing import Progress
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from studies.cli.ultraphase import Ultraphase
-from studies.ultraphase_chain import all_costs, fixed_spatial, int8_temporal, verified
+from studies.options import Progress
+from studies.program_tables import all_costs, fixed_spatial, int8_temporal, verified
 from ultraphase import ChipSpec, Core, CoreArray, Method, Program, assemble_file, listing, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.chip import ASSUMPTIONS

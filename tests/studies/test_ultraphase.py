@@ -9,7 +9,8 @@ from scenes.errors import InputError
 from spad.sensor import sensor_by_name
 from studies.bench import emulate as bench
 from studies.cli import main
-from studies.ultraphase_chain import by_torch, decode, emulate, int8_temporal
+from studies.program_tables import int8_temporal
+from studies.ultraphase_chain import by_torch, decode, emulate
 from ultraphase import method
 from ultraphase.catalog import FOLDER, PUBLISHED
 
