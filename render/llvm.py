@@ -29,6 +29,8 @@ CUDA_LIBRARIES = {"cuda": "DRJIT_LIBCUDA_PATH", "nvoptix": "DRJIT_LIBOPTIX_PATH"
 OLDEST_LLVM = 19
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 WHEEL = "karellen-llvm-core"
+RELOADABLE_DRJIT = "1.5.0"
+LLVM_BACKEND = 1 << 2  # of Dr.Jit's backends, a bit each
 SYSTEM_PATTERNS = ("lib/*/libLLVM*.so*", "lib/llvm-*/lib/libLLVM*.so*", "lib64/libLLVM*.so*", "local/lib/libLLVM*.so*")
 REMEDY = f"install the pinned wheel ({WHEEL}) or set {PATH_VARIABLE} to a libLLVM.so of version {OLDEST_LLVM} or newer"
 
@@ -107,11 +109,12 @@ def start_mitsuba() -> ModuleType:
     LLVM is missing or older than 19, also when the user imported Dr.Jit first or chose an old library by the variable.
     """
     wanted = backends()
-    if "drjit" not in sys.modules:
-        library = choose_llvm() if "llvm" in wanted else None
-        if library is not None:
-            os.environ[PATH_VARIABLE] = str(library)
-            log.debug("LLVM: %s", library)
+    library = choose_llvm() if "llvm" in wanted else None
+    if library is not None and "drjit" not in sys.modules:
+        os.environ[PATH_VARIABLE] = str(library)
+        log.debug("LLVM: %s", library)
+    elif library is not None and tuple(sys.modules["drjit"].detail.llvm_version())[:1] < (OLDEST_LLVM,):
+        reload_llvm(library)
     for backend in wanted:
         try:
             with silenced():  # Dr.Jit prints lines of its own before it raises
@@ -135,10 +138,37 @@ def start_mitsuba() -> ModuleType:
     return mi
 
 
+def reload_llvm(library: Path) -> bool:
+    """Start Dr.Jit again on another LLVM, where the user imported it first and it took an old one; whether it did.
+
+    Done before any variant is set, when nothing has been computed, and with the Dr.Jit whose functions are known: its
+    shared library has no public way. Otherwise nothing is changed, and the version is refused later.
+    """
+    drjit, mitsuba = sys.modules["drjit"], sys.modules.get("mitsuba")
+    fresh = mitsuba is None or mitsuba.variant() is None
+    if not fresh or getattr(drjit, "__version__", "") != RELOADABLE_DRJIT:
+        return False
+    try:
+        core = ctypes.CDLL(str(Path(drjit.__file__).with_name("libdrjit-core.so")))
+        shut_down, start = (
+            core._Z12jit_shutdowni,
+            core._Z8jit_initj,
+        )  # jit_shutdown(int light), jit_init(uint32 backends)
+    except (OSError, AttributeError):
+        return False
+    os.environ[PATH_VARIABLE] = str(library)
+    with silenced():
+        shut_down(0)
+        start(LLVM_BACKEND)
+    return True
+
+
 def check_llvm_version(version: tuple[int, ...]) -> None:
     """Refuse a version that would abort the process in the first render."""
     if not version or version[0] < OLDEST_LLVM:
         found = ".".join(map(str, version))
+        wheel = None if os.environ.get(PATH_VARIABLE) else wheel_llvm()
+        remedy = REMEDY if wheel is None else f"set {PATH_VARIABLE}={wheel} before Dr.Jit is imported"
         raise InputError(
-            f"LLVM {found or 'none'} would abort in the first render, {OLDEST_LLVM} is the oldest; {REMEDY}"
+            f"LLVM {found or 'none'} would abort in the first render, {OLDEST_LLVM} is the oldest; {remedy}"
         )

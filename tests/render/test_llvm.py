@@ -70,6 +70,26 @@ drjit.detail.llvm_version = lambda: {version}
     assert len(done.stdout.splitlines()) == 1
 
 
+@pytest.mark.parametrize("first", ["import mitsuba", "import drjit", "import mitsuba; import drjit"])
+def test_mitsuba_imported_first_takes_the_pinned_llvm(first):
+    """Dr.Jit has then chosen the system's newest LLVM, which may be one that aborts."""
+    done = run(f"{first}\n{START}\nprint(tuple(dr.detail.llvm_version())[0])")
+    assert done.returncode == 0 and done.stdout.split()[:2] == ["rendered", "True"], done.stdout + done.stderr
+    assert int(done.stdout.split()[2]) >= llvm.OLDEST_LLVM
+
+
+def test_where_dr_jit_cannot_start_again_the_wheel_is_named():
+    """Another Dr.Jit, whose functions are not known: one line with the exact path to set."""
+    code = f"""
+import mitsuba, drjit
+drjit.__version__ = "9.9.9"
+drjit.detail.llvm_version = lambda: (15, 0, 6)
+{START}"""
+    done = run(code)
+    assert done.returncode == 0 and done.stdout.startswith("refused: LLVM 15.0.6"), done.stdout + done.stderr
+    assert f"set DRJIT_LIBLLVM_PATH={llvm.wheel_llvm()} before" in done.stdout
+
+
 def test_no_llvm_at_all_is_one_line():
     # a name that exists nowhere stands for a machine without any LLVM; the check of the variable is stepped over
     code = START.replace("try:", "import render.llvm\nrender.llvm.choose_llvm = lambda: None\ntry:", 1)
