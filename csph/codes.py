@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from csph.waves import Rows, truncated_waves, waves
-from scenes.errors import InputError, require
+from scenes.errors import InputError, did_you_mean, require
 from spad.rgbd import published_taps
 from spad.sensor import Sensor
 from spad.template import binned_pulse
@@ -49,7 +49,8 @@ def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 
         "fourier-published": lambda: truncated_fourier(codes, bins, "published"),
         "gray-published": lambda: gray_fourier(codes, bins, published_pulse(bins, sensor), "published"),
     }
-    require(name in makers, f"temporal code {name!r} is unknown, expected one of {', '.join(FIXED_CODES)}")
+    meant = did_you_mean(name, FIXED_CODES)
+    require(name in makers, f"temporal code {name!r} is unknown{meant}, expected one of {', '.join(FIXED_CODES)}")
     require(codes >= 1, f"{name} code: {codes} codes, expected 1 or more")
     return makers[name]()
 

@@ -62,6 +62,8 @@ class ModelConfig:
         if self.design is not None:
             bins, block = self.sensor.bins, self.design.block
             require(bins % block[0] == 0, f"blocks of {block[0]} bins do not divide the sensor's {bins}")
+            said = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
+            require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{said}, or --layer keep_mean")
 
     @property
     def block(self) -> tuple[int, int, int]:

@@ -76,6 +76,8 @@ def decode_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
     """
     if coding.bins != sensor.bins:
         raise InputError(f"coding tensor {coding.name} has {coding.bins} bins, sensor {sensor.name} has {sensor.bins}")
+    if coding.codes < 2:
+        raise InputError(f"{coding.name}: 1 code tells nothing but a sign, correlation over K needs 2 or more")
     if codes.ndim < 1 or codes.shape[-1] != coding.codes:
         raise InputError(
             f"codes of shape {tuple(codes.shape)}: the last axis must be the {coding.codes} of {coding.name}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from scenes.errors import InputError, require
+from scenes.errors import InputError, did_you_mean, require
 
 CODES = ("learned", "fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 _QUARTER_WAVE = ("fourier", "gray", "fourier-published", "gray-published")
@@ -32,7 +32,8 @@ class Design:
     zero_mean: bool | None = None
 
     def __post_init__(self) -> None:
-        require(self.code in CODES, f"design {self.code!r} is unknown, expected one of {', '.join(CODES)}")
+        meant = did_you_mean(self.code, CODES)
+        require(self.code in CODES, f"design {self.code!r} is unknown{meant}, expected one of {', '.join(CODES)}")
         good = len(self.block) == 3 and all(isinstance(n, int) and n >= 1 for n in self.block)
         require(good, f"block {self.block}: expected three positive numbers of bins, rows and columns")
         most = self.size if self.code in ("learned", "random") else self.block[0]
@@ -60,7 +61,8 @@ class Design:
         """
         code, plus, second = name.partition("+")
         require(not plus or second == "learned", f"design {name!r}: expected CODE or CODE+learned")
-        require(code in CODES, f"design {name!r} is unknown, expected one of {', '.join(CODES)}, or CODE+learned")
+        known = f"expected one of {', '.join(CODES)}, or CODE+learned"
+        require(code in CODES, f"design {name!r} is unknown{did_you_mean(code, CODES)}, {known}")
         alone = code in ("learned", "random") or plus or math.prod(block[1:]) == 1
         require(bool(alone), f"design {name!r} over {block[1]} x {block[2]} pixels has no spatial part: {code}+learned")
         if (codes is None) == (compression is None):

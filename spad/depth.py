@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError
+from scenes.errors import InputError, did_you_mean
 from scenes.model import Camera
 from spad.histogram import Histogram
 from spad.laws import linearised
@@ -137,7 +137,8 @@ def _method_bias_m(method: str, sensor: Sensor) -> float:
 
 def _require_method(method: str) -> None:
     if method not in METHODS:
-        raise InputError(f"depth method {method!r} is unknown, expected one of {', '.join(METHODS)}")
+        meant = did_you_mean(method, METHODS)
+        raise InputError(f"depth method {method!r} is unknown{meant}, expected one of {', '.join(METHODS)}")
 
 
 def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched") -> Tensor:

@@ -18,6 +18,7 @@ from csph.codes import (
     walsh_hadamard,
 )
 from csph.coding import CodingTensor, encode
+from csph.config import ModelConfig
 from csph.decode import decode_depth
 from csph.design import Design
 from csph.layer import CompressiveLayer
@@ -172,3 +173,24 @@ def test_all_codes_but_coarse_and_random_sum_to_zero():
 
 def test_gray_fourier_takes_any_pulse():
     assert gray_fourier(4, 16, torch.eye(16)[0]).shape == (4, 16)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: ModelConfig(design=Design("learned", (256, 1, 1), 1)), "leaves zeros"),
+        (lambda: Design("furier", (256, 1, 1), 4), "did you mean 'fourier'"),
+        (lambda: Design.named("lerned", (256, 1, 1), codes=4), "did you mean 'learned'"),
+        (lambda: temporal_code("hadamrd", 4, 256, Sensor()), "did you mean 'hadamard'"),
+    ],
+)
+def test_designs_that_are_none_are_told_what_would_be_one(make, said):
+    with pytest.raises(InputError, match=said):
+        make()
+
+
+def test_one_code_tells_no_depth():
+    coding = CodingTensor("coarse-1", temporal_code("coarse", 1, 1024, Sensor()))
+    with pytest.raises(InputError, match="nothing but a sign"):
+        decode_depth(torch.ones(4, 1), coding, Sensor())
+    assert ModelConfig(design=Design("learned", (256, 1, 1), 1), layer={"keep_mean": True}).design.codes == 1
