@@ -1,8 +1,9 @@
 """HDF5 files that may be damaged: checked before the HDF5 library sees them, and read within stated sizes.
 
 The library trusts what a file states: a flipped bit can make it loop for ever or allocate petabytes. So the first 512
-bytes of our files, HDF5's user block, hold a SHA-256 of all others. Files without one, of earlier versions or made by
-others, are first read in a process of their own that may be killed.
+bytes of our files, HDF5's user block, hold a SHA-256 of all others. Somebody may have made the checksum fit: the
+structure of every file is first walked through in a copy of the process that may be killed, and files without a
+checksum, of earlier versions, are read there whole.
 """
 
 from __future__ import annotations
@@ -11,18 +12,19 @@ import hashlib
 import io
 import math
 import mmap
+import os
 import signal
-import subprocess
-import sys
-from collections.abc import Iterator
+import time
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
-from scenes.errors import InputError, require
-from scenes.limits import memory_limit, require_memory
+from scenes.errors import require
+from scenes.limits import require_memory
 
 if TYPE_CHECKING:
     import h5py
@@ -34,19 +36,8 @@ MAX_DEFLATE_RATIO = 1032  # of zlib's format
 SLACK_BYTES = 1 << 16
 # Of the processor, not of the clock: a busy machine must not make a sound file look damaged.
 PROBE_SECONDS, PROBE_BYTES_PER_SECOND = 4, 20_000_000
+PROBE_BYTES = 4 << 30
 WAITING = 15  # times as long by the clock
-PROBE = """
-import resource, sys, h5py
-for kind, limit in zip((resource.RLIMIT_AS, resource.RLIMIT_CPU), map(int, sys.argv[2:])):
-    resource.setrlimit(kind, (limit, limit))
-with h5py.File(sys.argv[1], "r") as file:
-    dict(file.attrs)
-    for name in file:
-        dataset = file[name]
-        dataset.shape, dataset.dtype, dataset.id.get_storage_size()
-        for chunk in dataset.iter_chunks() if dataset.chunks else ():
-            dataset[chunk]
-"""
 
 
 class Sink(io.RawIOBase):
@@ -126,28 +117,93 @@ def open_checked(path: Path) -> Iterator[h5py.File]:
             size = path.stat().st_size
             sound = blank and size > USER_BLOCK and _digest(file) == expected
             require(sound, "its bytes do not match their SHA-256: the file is damaged or was altered")
+            _probe(path, contents=False)
         else:
             # ours begin with the mark, or, made by earlier versions, with HDF5's own signature
             require(start.startswith(SIGNATURE), "is no HDF5 file of ours, or the mark of its checksum is damaged")
-            _probe(path)
+            _probe(path, contents=True)
     with h5py.File(path, "r") as opened:
         yield opened
 
 
-def _probe(path: Path) -> None:
-    """Read a file without a checksum in another process; InputError where that dies, or takes too long."""
+def _probe(path: Path, *, contents: bool) -> None:
+    """Look into a file in a process of its own; InputError where that dies, or takes too long.
+
+    Its structure is walked through, down to the places of all chunks, and `contents` reads these, too.
+    """
+    if not hasattr(os, "fork"):
+        return
     seconds = math.ceil(PROBE_SECONDS + path.stat().st_size / PROBE_BYTES_PER_SECOND)
-    limits = min(memory_limit(), 4 << 30), seconds
-    command = [sys.executable, "-c", PROBE, str(path), *map(str, limits)]
+    status, words = in_child(lambda: _walk(path, contents), seconds)
     endless = f"the HDF5 library does not come to an end of it in {seconds} s: it is damaged"
+    require(status not in (-signal.SIGXCPU, -signal.SIGKILL), endless)
+    require(status == 0, f"the HDF5 library cannot read it ({words[:120] or f'status {status}'})")
+
+
+def _walk(path: Path, contents: bool) -> None:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        dict(file.attrs)
+        for name in file:
+            dataset = file[name]
+            if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+                continue
+            _ = dataset.dtype, dataset.id.get_storage_size()
+            if dataset.chunks:
+                for number in range(dataset.id.get_num_chunks()):
+                    dataset.id.get_chunk_info(number)
+            for chunk in dataset.iter_chunks() if contents and dataset.chunks else ():
+                dataset[chunk]
+
+
+def in_child(work: Callable[[], None], cpu_seconds: int) -> tuple[int, str]:
+    """Do something in a copy of this process that may be killed: its status as of `subprocess`, and its last words.
+
+    The copy has `cpu_seconds` of the processor and may allocate PROBE_BYTES. Nobody is inside HDF5 while it is made.
+    """
+    import h5py
+
+    reading, writing = os.pipe()
+    with h5py._hl.base.phil, warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of copying a process with threads: this one stays in HDF5
+        child = os.fork()
+        if child == 0:
+            _die_working(work, cpu_seconds, writing)
+    os.close(writing)
+    status = _wait_for(child, WAITING * cpu_seconds)
+    with os.fdopen(reading, "rb") as words:
+        return status, words.read(1 << 12).decode(errors="replace")
+
+
+def _die_working(work: Callable[[], None], cpu_seconds: int, writing: int) -> NoReturn:
+    """In the copy: work within limits, write what went wrong, and end without a word to anybody else."""
+    import resource  # not on Windows
+
+    status = 1
     try:
-        done = subprocess.run(command, capture_output=True, timeout=WAITING * seconds, check=False)
-    except subprocess.TimeoutExpired:
-        raise InputError(endless) from None
-    require(done.returncode not in (-signal.SIGXCPU, -signal.SIGKILL), endless)
-    if done.returncode:
-        words = (done.stderr.decode(errors="replace").split("\n")[-2:-1] or [""])[0]
-        raise InputError(f"the HDF5 library cannot read it ({words[:120] or f'status {done.returncode}'})")
+        own = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (own + PROBE_BYTES, own + PROBE_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (cpu_seconds, cpu_seconds))
+        work()
+        status = 0
+    except BaseException as error:
+        os.write(writing, " ".join(str(error).split())[:1000].encode())
+    finally:
+        os._exit(status)
+
+
+def _wait_for(child: int, seconds: float) -> int:
+    """Wait for a process, and kill it where it takes longer; its status, negative for a signal."""
+    end, pause = time.monotonic() + seconds, 0.0005
+    while True:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > end:
+            os.kill(child, signal.SIGKILL)
+        time.sleep(pause)
+        pause = min(2 * pause, 0.05)
 
 
 def read_dataset(file: h5py.File, name: str) -> np.ndarray:

@@ -18,6 +18,8 @@ sys.path.insert(0, str(Path(__file__).parent / "support"))
 from damage import MEMORY_BYTES, SECONDS, damaged, read_all
 from readers import READERS
 
+from scenes.hdf5 import USER_BLOCK, add_checksum
+
 
 def check(reader: str, count: int, folder: Path, first: int = 0) -> None:
     """Damage a good file `count` times, and read the copies in processes of their own."""
@@ -41,6 +43,40 @@ def check(reader: str, count: int, folder: Path, first: int = 0) -> None:
 @pytest.mark.parametrize("reader", READERS)
 def test_damaged_files_are_refused_or_finite(reader: str, tmp_path: Path) -> None:
     check(reader, 32, tmp_path)
+
+
+def check_resealed(reader: str, count: int, folder: Path) -> None:
+    """Damage what lies behind the checksum of an HDF5 file, and make the checksum fit: the library meets the damage."""
+    of = READERS[reader]
+    good = folder / f"good{of.suffix}"
+    of.make(good)
+    copies = folder / "copies"
+    copies.mkdir()
+    data = good.read_bytes()
+    for number in range(count):
+        rng = np.random.default_rng(np.random.SeedSequence(28, spawn_key=(list(READERS).index(reader), number)))
+        path = copies / f"d{number:05d}{of.suffix}"
+        path.write_bytes(data[:USER_BLOCK] + damaged(data[USER_BLOCK:], rng) + b" ")
+        add_checksum(path)
+    verdicts = read_all(reader, copies, good)
+    faults = [
+        v
+        for v in verdicts
+        if v.outcome not in ("refused", "same") or v.seconds > SECONDS or v.memory_bytes > MEMORY_BYTES
+    ]
+    assert len(verdicts) == count and not faults, f"{len(faults)} of {count}: {faults[:5]}"
+
+
+@pytest.mark.parametrize("reader", ["histogram", "pack"])
+def test_damage_behind_a_checksum_that_fits_is_refused(reader: str, tmp_path: Path) -> None:
+    check_resealed(reader, 16, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", ["histogram", "pack"])
+def test_much_damage_behind_a_checksum_that_fits_is_refused(reader: str, tmp_path: Path) -> None:
+    """Two in a hundred such histograms make the HDF5 library loop for ever."""
+    check_resealed(reader, 320, tmp_path)
 
 
 @pytest.mark.slow
