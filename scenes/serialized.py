@@ -92,6 +92,11 @@ class _Stream:
         del self._ready[:size]
         return taken
 
+    def end(self) -> None:
+        """Meet the end of the stream, where its checksum is compared; InputError where there is none."""
+        more = self._inflate.decompress(self._packed, CHUNK)
+        require(self._inflate.eof and not more and not self._ready, "holds more, or less, than its mesh")
+
     def numbers(self, form: str) -> tuple:
         return struct.unpack(f"<{form}", self.take(struct.calcsize(f"<{form}")))
 
@@ -114,6 +119,7 @@ def _mesh(stream: _Stream, version: int) -> SerializedMesh:
     if flags & COLOURS:
         stream.array(vertices, 3, real)
     faces = stream.array(triangles, 3, "<u8" if vertices >= WIDE_INDICES else "<u4").astype(np.int64)
+    stream.end()
     kept = None if flags & FACE_NORMALS or normals is None else normals.astype(np.float64)
     return SerializedMesh(points.astype(np.float64), faces, None if uv is None else uv.astype(np.float64), kept, name)
 

@@ -82,5 +82,5 @@ def test_much_damage_behind_a_checksum_that_fits_is_refused(reader: str, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("reader", READERS)
 def test_many_damaged_files_are_refused_or_finite(reader: str, tmp_path: Path) -> None:
-    """16 readers, 640 files each: 10,240."""
+    """18 readers, 640 files each: 11,520."""
     check(reader, int(os.environ.get("DAMAGED_FILES", "640")), tmp_path, first=100)

@@ -255,6 +255,51 @@ def _read_index(path: Path) -> Numbers:
     yield np.array([record["view"] for record in records]), False
 
 
+def _write_state(path: Path) -> None:
+    """The state of an interrupted run, small: what Lightning keeps, and two layers' weights."""
+    import torch
+
+    from csph.resume import KEYS, WholeFileCheckpoints
+
+    weights = torch.nn.Linear(7, 5, dtype=torch.float64).state_dict()
+    weights = {name: torch.linspace(-1, 1, value.numel()).reshape(value.shape) for name, value in weights.items()}
+    state = {key: {"plain": [1, 2.5, "text"]} for key in KEYS} | {"state_dict": weights}
+    WholeFileCheckpoints().save_checkpoint(state, path)
+
+
+def _read_state(path: Path) -> Numbers:
+    import torch
+
+    from csph.resume import check_resume
+    from csph.torch_files import load_torch_file
+
+    check_resume(path, torch.nn.Linear(7, 5))
+    for value in load_torch_file(path)["state_dict"].values():
+        yield value.numpy(), False
+
+
+def _write_serialized(path: Path) -> None:
+    """One mesh of Mitsuba's format, version 4, with normals."""
+    import struct
+    import zlib
+
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
+    body = struct.pack("<I", 0x1001) + b"ball\0" + struct.pack("<QQ", len(ball.vertices), len(ball.faces))
+    body += np.asarray(ball.vertices, "<f4").tobytes() + np.asarray(ball.vertex_normals, "<f4").tobytes()
+    body += np.asarray(ball.faces, "<u4").tobytes()
+    path.write_bytes(struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1))
+
+
+def _read_serialized(path: Path) -> Numbers:
+    from scenes.serialized import read_serialized
+
+    found = read_serialized(path)
+    yield found.vertices, True
+    yield found.faces, False
+
+
 READERS: dict[str, Reader] = {
     "obj": Reader(".obj", _write_mesh, _read_scene),
     "ply": Reader(".ply", _write_mesh, _read_scene),
@@ -272,4 +317,6 @@ READERS: dict[str, Reader] = {
     "weights": Reader(".safetensors", _write_weights, _read_weights, checked=True),
     "pulse": Reader(".npy", _write_numbers, _read_pulse),
     "assembly": Reader(".s", _write_assembly, _read_assembly),
+    "state": Reader(".ckpt", _write_state, _read_state, checked=True),
+    "serialized": Reader(".serialized", _write_serialized, _read_serialized),
 }
