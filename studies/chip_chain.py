@@ -7,6 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from csph.posterior import Decoder
+from csph.quantise import Int8Rule
+from scenes.errors import require
+from spad.depth import radial_depth_of
+from spad.histogram import Histogram
 from studies.chip_code import ChipModel, codes_by_torch, leave_sensor
 from studies.ultraphase_chain import timestamps_of
 from ultraphase import CoreArray
@@ -81,6 +86,9 @@ class FastCores:
     def frame(self, counts: np.ndarray) -> tuple[np.ndarray, int]:
         """Codes (H / Mr, W / Mc, numbers) of counts (H, W, 1024), and how many of the cores' sums do not fit."""
         rows, columns = self.compiled.block
+        tiled = counts.shape[0] % rows == 0 and counts.shape[1] % columns == 0
+        size = f"image of {counts.shape[1]} x {counts.shape[0]} pixels"
+        require(tiled, f"{size} does not divide into the blocks of {columns} x {rows} cores")
         held = np.empty((*counts.shape[:2], self.compiled.matrix.shape[2]), np.int64)
         over = 0
         for row, proofs in enumerate(self.proofs):
@@ -108,11 +116,39 @@ def trial(compiled: Compiled, seed: int) -> dict[str, int]:
 
 
 @torch.no_grad()
-def network_depth(chip: ChipModel, codes: np.ndarray) -> np.ndarray:
+def network_depth(chip: ChipModel, codes: np.ndarray, decoder: Decoder | None = None) -> np.ndarray:
     """Depth (H, W) float32 [m] that the model's own network finds from what left the sensor.
 
-    The integers are scaled to the model's codes, zero-normalised and back-projected by its layer.
+    The integers are scaled to the model's codes, zero-normalised, and back-projected with the chip's tensor.
     """
-    model, count = chip.model, chip.compiled.code.codes
+    count = chip.compiled.code.codes
     numbers = torch.from_numpy(codes).view(*codes.shape[:2], -1, count).permute(3, 2, 0, 1)[None]
-    return model.depth_of_codes(numbers.float() * chip.scale)[0].numpy()
+    return chip.reader.depth_of_codes(numbers.float() * chip.scale, decoder)[0].numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class ChipDepth:
+    """Depth by way of the chip: all photons through the cores, codes in 16 bits, the model's network behind them."""
+
+    chip: ChipModel
+    fast: FastCores
+
+    @classmethod
+    def of(cls, chip: ChipModel) -> ChipDepth:
+        return cls(chip, FastCores.of(chip.compiled))
+
+    def depth_of(
+        self,
+        histogram: Histogram,
+        *,
+        int8: bool = False,
+        int8_rule: Int8Rule = "calibrated",
+        decoder: Decoder | None = None,
+    ) -> tuple[np.ndarray, int]:
+        """Depth map (H, W) float32 [m], and how many of the cores' sums wrapped; always in 8 bits.
+
+        Raises InputError for another sensor's histogram, and an image that blocks do not tile.
+        """
+        self.chip.model.check_histogram(histogram)
+        codes, over = self.fast.frame(histogram.counts)
+        return radial_depth_of(histogram, network_depth(self.chip, codes, decoder)), over

@@ -49,7 +49,8 @@ ABLATIONS = ("spatial-block", "tensor-size", "fourier")
 @dataclass(frozen=True, kw_only=True)
 class Study(Common):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
-    decoded from codes without a network, and the in-pixel processor's power (4, 5); of trained models: scenes moved out
+    decoded from codes without a network, and the in-pixel processor's power (4, 5); trained codes on that processor,
+    beside the same models in floating point; of trained models: scenes moved out
     of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
     captures (13, 14); how much the error of a rendered set itself matters to depth; what a renderer adds to RGB-D
     simulation, step by step; and networks beside the filter where light takes several paths."""
@@ -60,6 +61,7 @@ class Study(Common):
             "memory",
             "codes",
             "power",
+            "chip",
             "depth-offset",
             "spatial-block",
             "tensor-size",

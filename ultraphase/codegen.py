@@ -66,8 +66,9 @@ def _table_lines(code: IntegerCode, many: bool) -> list[str]:
     else:
         lines = [f".equ BINS, {code.bins}", ".table temporal, s8, K * BINS"]
     if many:
-        weighted = code.spatial is not None
+        weighted, shift = code.spatial is not None, code.output_shift
         lines += [f".equ WEIGHTED, {int(weighted)}", *([".table weight, s8, K"] * weighted), ".table ways, u8, 1"]
+        lines += [f".equ SHIFT, {shift}", f".equ HALF, {1 << shift >> 1}"]
     return lines
 
 

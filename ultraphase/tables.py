@@ -77,10 +77,20 @@ def coarse_matrix(codes: int, timestamps: int) -> np.ndarray:
 
 
 def spatial_sum(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The frame end of a block of cores (`sum2x2.s`, `sumblock.s`): sum over the cores of w s / 128, rounded (halves
-    up), then saturated to 16 bits.
+    """The frame end of 2 x 2 cores (`sum2x2.s`): sum over the cores of w s / 128, rounded (halves up), then saturated
+    to 16 bits.
 
     sums (..., cores, blocks, K) and weights (cores, K), both integer -> (..., blocks, K) int64.
     """
     total = (np.asarray(sums, np.int64) * np.asarray(weights, np.int64)[:, None, :]).sum(axis=-3)
     return ((total + 64) >> 7).clip(-(1 << 15), (1 << 15) - 1)
+
+
+def block_sum(sums: np.ndarray, weights: np.ndarray | None, shift: int) -> np.ndarray:
+    """The frame end of a block of cores (`sumblock.s`): sum over the cores of w s / 2^shift, rounded, halves up.
+
+    sums and weights as of `spatial_sum`; weights None: of s / 2^shift.
+    """
+    held = np.asarray(sums, np.int64)
+    total = (held if weights is None else held * np.asarray(weights, np.int64)[:, None, :]).sum(axis=-3)
+    return (total + (1 << shift >> 1)) >> shift

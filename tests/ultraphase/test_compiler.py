@@ -7,7 +7,7 @@ from scenes.errors import InputError
 from ultraphase import ChipSpec, CoreArray, verify
 from ultraphase.compiler import compile_code
 from ultraphase.integer_code import IntegerCode, folded_temporal
-from ultraphase.tables import spatial_sum
+from ultraphase.tables import block_sum
 
 
 def waves(harmonics: tuple[int, ...], bins: int) -> np.ndarray:
@@ -78,11 +78,30 @@ def test_blocks_of_cores_put_out_their_weighted_sum(name):
             sums = np.einsum("rct,rcnt->rcn", block, compiled.matrix).reshape(down * right, -1, codes)
             if compiled.block == (1, 1):
                 expected = sums[0]
-            elif compiled.weights is None:
-                expected = sums.sum(axis=0)
             else:
-                expected = spatial_sum(sums, compiled.weights.reshape(down * right, codes))
+                weights = None if compiled.weights is None else compiled.weights.reshape(down * right, codes)
+                expected = block_sum(sums, weights, compiled.code.output_shift)
             assert np.array_equal(frame.out[n].reshape(-1, codes), expected)
+
+
+@pytest.mark.parametrize("name", ["Fourier + learned", "learned, 16 bins", "full", "a row of three"])
+def test_a_blocks_sum_never_leaves_16_bits(name):
+    """All cores at the ends of their sums, weights of either sign: nothing wraps on the way out."""
+    compiled = compile_code(CODES[name])
+    for value in (-32768, 32767):
+        array = CoreArray(compiled.program, compiled.block, compiled.tables(compiled.block))
+        region = compiled.program.region("codes")
+        array.ram[:, region.address : region.end] = np.full(region.count, value, np.int16).view(np.uint8)
+        if compiled.weights is not None:
+            weight = compiled.program.region("weight")
+            array.ram[:, weight.address : weight.end] = np.full(weight.count, 127, np.uint8)
+        cores = compiled.block[0] * compiled.block[1]
+        frame = array.frame(np.zeros(0, int), np.zeros(cores + 1, int))
+        sums = np.full((cores, region.count // compiled.code.codes, compiled.code.codes), value)
+        weights = None if compiled.weights is None else np.full((cores, compiled.code.codes), 127)
+        expected = block_sum(sums, weights, compiled.code.output_shift)
+        assert np.array_equal(frame.out.ravel(), expected.ravel()) and frame.counters.wraps == 0
+        assert np.abs(expected).max() > 16383  # and no more than one bit is given away
 
 
 def test_an_even_harmonic_is_half_a_step_late_and_an_odd_one_exact():

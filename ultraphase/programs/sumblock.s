@@ -3,9 +3,10 @@
 ;
 ; A row's cores pass their part sums west, and the first column's then north. What a core takes and gives is told by a
 ; byte of its RAM, `ways`: bit 0 takes from the east, 1 gives to the west, 2 takes from the south, 3 gives to the north.
-; Products and their sum are 32-bit words; weights are in 1/128, so one rounding by 7 bits follows (WEIGHTED 1).
-; Without weights (0: a full tensor, whose tables hold them) the plain sums are added.
-; Before it:  codes, SUMS of them, K, weight where WEIGHTED, ways, and the register place.
+; Products and their sum are 32-bit words; one rounding by SHIFT bits follows, with HALF of a step added before it: as
+; many bits as no sum of 16-bit numbers can need more than 16 afterwards. Without weights (WEIGHTED 0: a full tensor,
+; whose tables hold them) the plain sums are added.
+; Before it:  codes, SUMS of them, K, WEIGHTED, weight where that is 1, ways, SHIFT, HALF, and the register place.
 
 .reg links, r1
 .reg k, r2
@@ -35,16 +36,13 @@ row:    BBS  links, #1, give_west
         RECV b, south
         ADD  a, a, b
 column: BBS  links, #3, give_north
-.for n in 1..WEIGHTED
-        ADD  a, a, #64
-.end
-.for n in 1..WEIGHTED * 7 / MAX_SHIFT
+        ADD  a, a, #HALF
+.for n in 1..SHIFT / MAX_SHIFT
         SAR  a, a, #MAX_SHIFT
 .end
-.for n in 1..WEIGHTED * (7 % MAX_SHIFT)        ; the rest, bit by bit
-        SAR  a, a, #1
+.for n in 1..(SHIFT % MAX_SHIFT + MAX_SHIFT - 1) / MAX_SHIFT
+        SAR  a, a, #SHIFT % MAX_SHIFT          ; the rest
 .end
-        SATH a, a
         OUTH a
         JMP  done
 give_north:
