@@ -1,4 +1,5 @@
-"""`study power`: Supplementary Figures 4 and 5, from emulated programs on a rendered scene."""
+"""`study power`: Supplementary Figures 4 and 5, from emulated programs on a rendered scene; the front of depth error
+against power, bytes and clocks."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from render.engine import render
 from render.tracing import Progress
 from scenes.catalog import load_scene
 from scenes.errors import require
-from scenes.files import whole_file
+from scenes.files import whole_file, write_csv
 from spad.depth import depth_errors
 from spad.detect import sense
 from spad.histogram import Histogram
@@ -23,6 +24,8 @@ from spad.sensor import PhotonBudget, sensor_by_name
 from studies import figures
 from studies.experiments import Study
 from studies.figures import DEPTH_COLOURS, plt
+from studies.power_front import designs, front_rows, loss_rows, printed_rows
+from studies.power_front_figure import draw_front
 from studies.program_tables import all_costs, int8_temporal
 from studies.ultraphase_chain import Emulated, by_torch, decode, emulate, shared_core_depths
 from ultraphase import Method, method
@@ -57,7 +60,13 @@ def run(command: Study, progress: Progress) -> dict:
     with whole_file(out / "ultraphase.csv") as beside:
         beside.write_text(as_csv(printed))
     errors = {name: _errors(depth, dim) for name, depth in shared.items()}
+    found, absent = designs(command.models or out / command.preset / "models")
+    front = front_rows(found, transient, command.seed, progress)
+    losses, print_points = loss_rows(found, command.seed, progress), printed_rows()
+    write_csv(front, out / "ultraphase-front.csv")
+    write_csv(losses, out / "ultraphase-lost.csv")
     drawn = [
+        draw_front(found, front, losses, print_points, out / "ultraphase-front.png"),
         draw_power(costs, out / "ultraphase-power.png"),
         draw_depths(histogram, depths, rows, out / "ultraphase-depth.png"),
         _draw_shared(dim, shared, errors, out / "ultraphase-shared-core.png"),
@@ -66,6 +75,10 @@ def run(command: Study, progress: Progress) -> dict:
         "rows": printed,
         "depth": rows,
         "shared_core": errors,
+        "front": front,
+        "lost_photons": losses,
+        "front_published": print_points,
+        "front_absent": absent,
         "spatial_weights": SPATIAL,
         "readings": READINGS,
         "figures": [str(path) for path in drawn],

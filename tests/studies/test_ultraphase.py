@@ -180,7 +180,12 @@ def test_study_power(capfd, folder):
     assert set(result["shared_core"]) == {"addresses lost", "addresses kept"}
     for figure in result["figures"]:
         assert (folder / figure).read_bytes()[:4] == b"\x89PNG"
-    assert (folder / "study" / "ultraphase.csv").is_file()
+    for table in ("ultraphase", "ultraphase-front", "ultraphase-lost"):
+        assert (folder / "study" / f"{table}.csv").is_file()
+    names = {row["name"] for row in result["front"]}
+    assert {"coarse histogram, K = 64", "fourier 1024x1x1, K = 8"} <= names
+    assert len(result["front"]) == 5 * 4 * len(names) and len(result["lost_photons"]) == len(names)
+    assert all(row["lost"] < row["lost_16_spads"] < 1 for row in result["front"])
     kept = {path: path.stat().st_mtime_ns for path in (folder / "study" / "emulated").iterdir()}
     broken = sorted(kept)[0]
     broken.write_bytes(b"no archive")

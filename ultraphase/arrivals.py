@@ -1,0 +1,179 @@
+"""Photons that come while a core is busy: emulation with arrival times, and the queue's closed form.
+
+A core's port holds `port` timestamps; one that comes while it is full is lost. The core looks at its port when it is
+done with a photon, and otherwise every few instructions of its idle loop. What follows, for a port of one timestamp and
+Poisson arrivals of rate r: let D be the clocks from one look at a full port to the next, L those from a look at an
+empty one to the next, and e those from the look to the instruction that reads, and so empties the port. A look finds
+the port full with probability 1 - exp(-r (D - e)) after a full look and 1 - exp(-r L) after an empty one, so that
+
+    f = (1 - q) / (1 - q + p),    p = mean of exp(-r (D - e)),    q = exp(-r L)
+
+of the looks are full, each of which is a photon read, and the share of photons lost is
+
+    1 - f / (r (f D + (1 - f) L)).
+
+For L and e to 0 this is the queue M/D/1 with one place to wait, 1 - 1 / (rho + exp(-rho)), rho = r D; without the
+place (M/D/1/1, Erlang's formula) it would be rho / (1 + rho).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.errors import InputError, require
+from ultraphase.chip import ChipSpec
+from ultraphase.core import PATIENCE, Core
+from ultraphase.program import Program
+
+_PORT_INSTRUCTIONS = ("BNT", "RDT", "BFE")
+
+
+@dataclass(frozen=True)
+class TimedFrame:
+    """One frame with arrival times: photons that came, were read and were lost, what left, and clocks to its HALT."""
+
+    arrived: int
+    read: int
+    lost: int
+    out: tuple[int, ...]
+    clocks: int
+
+    @property
+    def lost_fraction(self) -> float:
+        return self.lost / self.arrived if self.arrived else 0.0
+
+
+class TimedCore(Core):
+    """A core whose timestamps come at their times: `timed_frame`. All else is `Core`'s.
+
+    port   timestamps that wait at most; the assumed chip's port holds one
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        tables: Mapping[str, np.ndarray] | None = None,
+        *,
+        chip: ChipSpec | None = None,
+        port: int = 1,
+    ) -> None:
+        super().__init__(program, tables, chip=chip)
+        require(port >= 1, f"port of {port} timestamps, expected 1 or more")
+        self.port = port
+        self._frame_is_over, self._drains = False, True
+        self._steps: dict[int, tuple] = {}  # by word: what it does, how many instructions, and whether it asks the port
+
+    def timed_frame(
+        self, clocks: np.ndarray, timestamps: np.ndarray, frame_clocks: int, *, drain: bool = True
+    ) -> TimedFrame:
+        """One frame of `frame_clocks` clocks, to HALT; photons that come while it is drained belong to no frame.
+
+        clocks (N,) when each photon comes, rising, 0 to frame_clocks; timestamps (N,) as the port tells them. Without
+        `drain` it stops where the program would end the frame: there the cores of a block need each other.
+        Raises InputError for other clocks, and as `run` does.
+        """
+        times = np.asarray(clocks, np.float64)
+        good = times.shape == np.shape(timestamps) and times.ndim == 1 and bool((np.diff(times) >= 0).all())
+        good = good and (not times.size or (times[0] >= 0 and times[-1] < frame_clocks))
+        require(good, f"arrivals: expected rising clocks from 0 to below {frame_clocks}, one for each timestamp")
+        self.start([])
+        self._frame_is_over, self._drains = False, drain
+        waiting, stamps = times.tolist(), np.asarray(timestamps).tolist()
+        now = came = lost = steps = 0
+        idle: tuple | None = None
+        per, word = self.chip.clocks_per_instruction, self.word
+        while True:
+            does, length, asks = self._step_at(word)
+            if asks:
+                while came < len(waiting) and waiting[came] <= now:
+                    if len(self._port) - self._read < self.port:
+                        self._port.append(stamps[came])
+                    else:
+                        lost += 1
+                    came += 1
+                self._frame_is_over = now >= frame_clocks
+                if asks == "BNT" and self._read == len(self._port):
+                    now, idle = self._idle(word, now, waiting[came] if came < len(waiting) else frame_clocks, idle)
+                steps = 0 if asks == "RDT" else steps
+            now += per * length
+            word = does()
+            if word < 0:
+                return TimedFrame(len(waiting), self._read, lost, tuple(self.out), now)
+            steps += 1
+            if steps > PATIENCE:
+                raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} branches")
+
+    def _idle(self, word: int, now: int, until: float, before: tuple | None) -> tuple[int, tuple]:
+        """The time of the look at the port that comes next before `until`: turns of an idle loop that leave the core
+        as it was are counted, not run."""
+        state = (word, tuple(self.registers), bytes(self.ram))
+        if before is not None and before[0] == state and now > before[1]:
+            turn = now - before[1]
+            now += max(0, int((until - now) // turn)) * turn
+        return now, (state, now)
+
+    def _step_at(self, word: int) -> tuple:
+        """The instructions from a word to the next branch, without one that asks the port unless it is the first."""
+        if word not in self._steps:
+            code = self.program.instructions
+            asks = code[word].name if word < len(code) and code[word].name in _PORT_INSTRUCTIONS else ""
+            stretch = self._function(word)
+            inside = code[word + 1 : stretch.end + 1]
+            if asks or any(one.name in _PORT_INSTRUCTIONS for one in inside):
+                stretch = self._function(word, single=True)
+            self._steps[word] = (stretch.does, stretch.end - word + 1, asks)
+        return self._steps[word]
+
+    def _over(self, word: int, target: int) -> int:
+        if self._frame_is_over and not self._drains:
+            return self._not_yet(word)
+        return target if self._frame_is_over else word + 1
+
+
+def lost_fraction(
+    rate: float, service_clocks: np.ndarray | float, idle_clocks: float = 9, read_clocks: float = 3
+) -> float:
+    """Share of Poisson photons that a core with a port of one timestamp loses (module docstring).
+
+    rate            photons a clock
+    service_clocks  D, from look to look, of every timestamp alike likely, or of all
+    idle_clocks     L, of the idle loop: BNT, BFE, JMP
+    read_clocks     e, from BNT to RDT
+    """
+    if rate <= 0:
+        return 0.0
+    service = np.asarray(service_clocks, np.float64)
+    stays_empty = float(np.exp(-rate * (service - read_clocks)).mean())
+    comes = -np.expm1(-rate * idle_clocks)
+    full = comes / (comes + stays_empty)
+    return float(1 - full / (rate * (full * float(service.mean()) + (1 - full) * idle_clocks)))
+
+
+def md1_lost_fraction(rho: float) -> float:
+    """The same of the queue M/D/1 with one place to wait: a core that looks at its port all the time."""
+    return float(1 - 1 / (rho + np.exp(-rho)))
+
+
+def poisson_arrivals(rate: float, frame_clocks: int, seed: int) -> np.ndarray:
+    """Rising clocks of a Poisson process of `rate` photons a clock."""
+    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(10,)))
+    return np.sort(random.random(random.poisson(rate * frame_clocks))) * frame_clocks
+
+
+def periodic_arrivals(
+    timestamps: np.ndarray, frame_clocks: int, seed: int, *, period_s: float = 100e-9, chip: ChipSpec | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Clocks of photons that a pulsed laser brings: every timestamp in a cycle of its own, at its place in the period.
+
+    timestamps (N,) of 0 .. 1023 over the period -> clocks (N,) rising, and the timestamps in that order.
+    """
+    chip = chip or ChipSpec()
+    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(11,)))
+    period = period_s / chip.clock_s
+    cycles = random.integers(0, int(frame_clocks // period), len(timestamps))
+    clocks = (cycles + (np.asarray(timestamps) + random.random(len(timestamps))) / chip.timestamps) * period
+    order = np.argsort(clocks, kind="stable")
+    return clocks[order], np.asarray(timestamps)[order]
