@@ -190,10 +190,10 @@ _FIGURES = Section(
                 Picture("ultraphase-power.png", "4a: processing and readout power by program, printed and emulated"),
                 Picture("ultraphase-depth.png", "4b: depth images from the codes of emulated cores, by program"),
                 Picture("ultraphase-shared-core.png", "Beyond the paper: 4 x 4 SPADs that share a core"),
-                Picture("ultraphase-front.png", "Beyond the paper: depth error against power, bytes, clocks; lost photons"),
+                Picture("ultraphase-front.png", "Beyond the paper: depth error against power, bytes and clocks"),
             ),
             tables=(
-                Table("ultraphase-lost.csv", "Photons that a busy core loses: emulated with arrival times, closed form"),
+                Table("ultraphase-lost.csv", "Photons lost by busy cores: emulated with arrival times, closed form"),
             ),
             data=("ultraphase-front.csv",),
         ),

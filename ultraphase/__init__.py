@@ -7,7 +7,9 @@ from ultraphase.array import CoreArray
 from ultraphase.assembler import assemble, assemble_file
 from ultraphase.catalog import Method, method
 from ultraphase.chip import ChipSpec
+from ultraphase.compiler import compile_code
 from ultraphase.core import Core
+from ultraphase.integer_code import IntegerCode
 from ultraphase.program import Program, disassemble, listing
 from ultraphase.verify import Tabulated, verify
 
@@ -15,11 +17,13 @@ __all__ = [
     "ChipSpec",
     "Core",
     "CoreArray",
+    "IntegerCode",
     "Method",
     "Program",
     "Tabulated",
     "assemble",
     "assemble_file",
+    "compile_code",
     "disassemble",
     "listing",
     "method",

@@ -35,7 +35,7 @@ def source_of(code: IntegerCode, chip: ChipSpec, turns: int) -> str:
     blocks, many = chip.timestamps // code.bins, code.block != (1, 1)
     moving = blocks > 1 or turns > 1 or many
     lines = [
-        f"; {code.name}: {loop_order(code, turns)}",
+        f"; {' '.join(code.name.split())}: {loop_order(code, turns)}",
         "",
         f".equ K, {code.codes}",
         f".equ SUMS, {blocks * code.codes}",

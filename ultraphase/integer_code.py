@@ -31,6 +31,7 @@ class IntegerCode:
         good = len(shape) in (2, 4) and 0 not in shape and self.temporal.dtype.kind in "iu"
         good = good and (spatial is None or (len(shape) == 2 and len(spatial) == 3 and spatial[0] == shape[0]))
         require(good, f"code {self.name}: integers of shape {shape} and {spatial}, expected (K, Mt) and (K, Mr, Mc)")
+        require(spatial is None or self.block != (1, 1), f"code {self.name}: spatial weights of a block of one core")
         parts = [self.temporal] if self.spatial is None else [self.temporal, self.spatial]
         largest = max(int(np.abs(part).max()) for part in parts)
         require(largest <= 127, f"code {self.name}: value {largest} is outside -127 to 127")

@@ -102,6 +102,8 @@ def test_codes_that_hold_the_pulse_are_no_quarter_wave():
 def test_models_that_have_no_program_are_refused():
     with pytest.raises(InputError, match="no codes to compile"):
         compile_model(DepthModel(ModelConfig(front="counts")), "none")
+    with pytest.raises(InputError, match="has no codes to find depth from"):
+        DepthModel(ModelConfig(front="counts")).depth_of_codes(torch.zeros(1, 8, 1, 4, 4))
     other = replace(Sensor(), bins=512, period_s=512 * Sensor().bin_width_s)
     short = DepthModel(ModelConfig(design=Design("fourier", (512, 1, 1), 8), sensor=other))
     with pytest.raises(InputError, match="sensor of 512 bins, the chip's timestamps count 1024"):

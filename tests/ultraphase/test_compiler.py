@@ -154,6 +154,8 @@ def test_a_larger_chip_takes_more():
 def test_codes_of_other_shapes_are_refused():
     with pytest.raises(InputError, match="expected \\(K, Mt\\) and \\(K, Mr, Mc\\)"):
         IntegerCode("odd", np.zeros((2, 16), int), np.zeros((3, 2, 2), int))
+    with pytest.raises(InputError, match="a block of one core"):
+        IntegerCode("alone", np.zeros((2, 16), int), np.zeros((2, 1, 1), int))
     with pytest.raises(InputError, match="128 is outside"):
         IntegerCode("large", np.full((2, 16), 128))
     with pytest.raises(InputError, match="3 x 2 cores does not divide into blocks of 2 x 2"):
