@@ -33,6 +33,6 @@ class Calibrate(Common):
 
 def run(command: Calibrate, progress: Progress) -> dict:
     """Captures -> sensor file, its standard errors, and the likelihood of the captures that were held out."""
-    from studies import calibrating
+    from studies.cli import calibrating
 
     return calibrating.run(command, progress)
