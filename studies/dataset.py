@@ -152,10 +152,10 @@ def _lost(view: int, why: str) -> Done:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """The plan of each of thousands of views goes into the index, not to the screen."""
+    """Plan and missed target of each of thousands of views go into the index, and one warning tells of all."""
     logger = logging.getLogger("render")
     level = logger.level
-    logger.setLevel(logging.WARNING)
+    logger.setLevel(logging.ERROR)
     try:
         yield
     finally:

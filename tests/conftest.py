@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 # the tests' own helpers are imported by name; the packages are installed
-sys.path[:0] = [str(Path(__file__).parent / package) for package in ("spad", "scenes", "csph")]
+sys.path[:0] = [str(Path(__file__).parent / package) for package in ("spad", "scenes", "csph", "support")]
 
 
 @pytest.fixture(scope="session")
@@ -15,3 +15,13 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no data for checks (set SCENE2SPAD_DATA; looked in {folder})")
     return folder
+
+
+@pytest.fixture(scope="session")
+def warm():
+    """A process with everything imported, whose children are killed by tests."""
+    from killed import Warm
+
+    process = Warm()
+    yield process
+    process.close()

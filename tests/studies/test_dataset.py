@@ -209,6 +209,13 @@ def test_the_command_line_packs(whole, tmp_path, capsys):
     assert pack_set(out, tmp_path / "again.h5") == pack.stat().st_size
 
 
+def test_views_above_their_error_target_are_one_line_on_the_screen(tmp_path, capsys):
+    argv = ["dataset", "hard-cases", "--width", "12", "--height", "9", "--bounces", "1", "--grid", "2"]
+    assert main([*argv, "--error", "1e-4", "--count", "3", "--out", str(tmp_path / "set")]) == 0
+    told = capsys.readouterr().err
+    assert "views end above their error target" in told and told.count("\n") == 1
+
+
 def test_views_above_their_error_target_are_counted(tmp_path, caplog, monkeypatch):
     """Two rays a side do not meet 1e-4: every view says so in the index, the set in its result and in one warning."""
     job = replace(CLI_JOB, error=1e-4)

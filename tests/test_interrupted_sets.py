@@ -1,0 +1,181 @@
+"""`dataset` with worker processes and on a Dask cluster: Ctrl-C, dead workers and a dead scheduler.
+
+Every end is one line, nothing runs on, and the same command goes on to the same bytes.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from killed import Killed, Run, Warm, check_whole, command, is_alone, whole_run
+
+pytest.importorskip("distributed")
+
+SET = ("dataset", "rooms", "--width", "8", "--height", "8", "--bounces", "1", "--grid", "2", "--count", "24")
+STOPPED = "interrupted; finished files stay, nothing is half-written\n"
+PATIENCE_S = 60  # far above the few seconds that an end takes
+SCHEDULER = """
+import asyncio
+from distributed import Scheduler
+async def serve():
+    async with Scheduler(host="127.0.0.1", port={port}, dashboard=False) as scheduler:
+        await scheduler.finished()
+asyncio.run(serve())
+"""
+WORKER = """
+import asyncio
+from distributed import Worker
+async def work():
+    async with Worker("{address}", nthreads=1, local_directory="{folder}", dashboard=False) as worker:
+        await worker.finished()
+asyncio.run(work())
+"""
+
+
+class Cluster:
+    """A Dask scheduler at a port that was free, and workers without nannies."""
+
+    def __init__(self, warm: Warm, folder: Path) -> None:
+        self.warm, self.folder, self.workers = warm, folder, []
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.address = f"tcp://127.0.0.1:{self.port}"
+        self.start()
+
+    def start(self, workers: int = 2) -> None:
+        self.scheduler = self._run(SCHEDULER.format(port=self.port))
+        while not self._answers():
+            time.sleep(0.05)
+        for _ in range(workers):
+            self.add_worker()
+
+    def add_worker(self) -> None:
+        self.workers.append(self._run(WORKER.format(address=self.address, folder=self.folder)))
+
+    def kill_worker(self) -> None:
+        self.warm.kill(self.workers.pop(0))
+
+    def kill_scheduler(self) -> None:
+        self.warm.kill(self.scheduler)
+
+    def close(self) -> None:
+        for process in (*self.workers, self.scheduler):
+            if self.warm.status(process) is None:
+                self.warm.kill(process)
+        self.workers = []
+
+    def _run(self, code: str) -> int:
+        return self.warm.start(code, self.folder, self.folder / "cluster.txt")
+
+    def _answers(self) -> bool:
+        with socket.socket() as asking:
+            return asking.connect_ex(("127.0.0.1", self.port)) == 0
+
+
+@pytest.fixture(scope="module")
+def whole(warm, tmp_path_factory) -> tuple[Path, float]:
+    """The set made in one go, and its CPU-seconds."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, whole_run(warm, Run(command(*SET, "--out", "out")), folder)
+
+
+@pytest.fixture
+def cluster(warm, tmp_path) -> Iterator[Cluster]:
+    (tmp_path / "cluster").mkdir()
+    made = Cluster(warm, tmp_path / "cluster")
+    yield made
+    made.close()
+
+
+def set_of(warm: Warm, whole: tuple[Path, float], folder: Path, *more: str) -> Killed:
+    run = Run(command(*SET, "--out", "out", *more))
+    return Killed(warm, run, *whole, folder / "run", folder / "temporary")
+
+
+def wait_for_views(run: Killed, child: int, count: int, delay_s: float) -> int | None:
+    """Until so many views are there, and a moment longer; the exit status where the run has ended."""
+    status, end = None, time.monotonic() + 2 * PATIENCE_S
+    while len([*run.folder.glob("out/views/0*.exr")]) < count and status is None and time.monotonic() < end:
+        status = run.warm.wait(child, seconds=0.02)
+    return run.warm.wait(child, seconds=delay_s) if status is None else status
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["one process", "two processes", "cluster"])
+def test_ctrl_c_ends_in_one_line_and_the_run_goes_on(whole, warm, tmp_path, where, request):
+    """At five random moments, to the whole process group, as a terminal does."""
+    options = {"one process": (), "two processes": ("--workers", "2")}
+    more = options.get(where) or ()
+    if where == "cluster":
+        more = ("--scheduler", request.getfixturevalue("cluster").address)
+    run, moments = set_of(warm, whole, tmp_path, *more), random.Random(7)
+    for views in (0, 1, 4, 8, 12):
+        child = run.start()
+        while (status := wait_for_views(run, child, views, moments.uniform(0, 0.3))) is not None:
+            run.begin_anew(status)
+            child = run.start()
+        warm.kill(child, signal.SIGINT)
+        status = warm.wait(child, seconds=PATIENCE_S)
+        told = run.output.read_text()
+        run.output.write_text("")
+        assert (status, told) in ((130, STOPPED), (0, told)) and "Traceback" not in told, told[-3000:]
+        end = time.monotonic() + PATIENCE_S
+        while not is_alone(child) and time.monotonic() < end:
+            time.sleep(0.05)
+        assert is_alone(child)
+        check_whole(run.folder / "out")
+    run.finish()
+
+
+@pytest.mark.slow
+def test_ten_killed_workers_of_a_cluster_change_no_byte(whole, warm, tmp_path, cluster):
+    """SIGKILL to a worker at a random moment, and another in its place; the client runs on, or is run again."""
+    run, moments = set_of(warm, whole, tmp_path, "--scheduler", cluster.address), random.Random(3)
+    child = run.start()
+    for number in range(10):
+        if wait_for_views(run, child, 2 * number, moments.uniform(0, 0.3)) is not None:
+            child = run.start()
+        cluster.kill_worker()
+        cluster.add_worker()
+    assert warm.wait(child) == 0
+    run.finish()  # views whose workers died again and again are tried again
+
+
+@pytest.mark.slow
+def test_ten_killed_schedulers_are_one_line_each_and_the_run_goes_on(whole, warm, tmp_path, cluster):
+    run, moments = set_of(warm, whole, tmp_path, "--scheduler", cluster.address), random.Random(4)
+    for number in range(10):
+        child = run.start()
+        status = wait_for_views(run, child, 2 * number, moments.uniform(0, 0.3))
+        cluster.kill_scheduler()
+        status = warm.wait(child, seconds=PATIENCE_S) if status is None else status
+        told = run.output.read_text()
+        run.output.write_text("")
+        gone = re.fullmatch(r"scene2spad: scheduler tcp://\S+: (has gone away|cannot be reached)[^\n]*\n", told)
+        assert (status == 2 and gone) or status == 0, f"{status} {told[-3000:]}"
+        check_whole(run.folder / "out")
+        cluster.close()
+        cluster.start()
+    run.finish()
+
+
+def test_an_address_where_nobody_listens_is_one_line(tmp_path, capsys, monkeypatch):
+    from studies import workers
+    from studies.cli import main
+
+    monkeypatch.setattr(workers, "CONNECT_S", 1)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    assert main([*SET, "--out", str(tmp_path / "set"), "--scheduler", address]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"scene2spad: scheduler {address}: cannot be reached") and told.count("\n") == 1
+    assert main([*SET, "--out", str(tmp_path / "set"), "--count", "1"]) == 0

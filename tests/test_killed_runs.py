@@ -1,0 +1,70 @@
+"""SIGKILL at random moments of everything that takes long: the run that goes on ends with the same bytes.
+
+Every run is killed with TMPDIR on the file system of its results, and on another. Moments come from fixed seeds.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+from killed import Killed, Run, command, other_file_system, whole_run
+
+KILLS = 6  # of each run and file system
+UNLIKE = ("timings.jsonl", "resume.ckpt")  # Lightning counts in its state how often a run went on
+
+SET = ("--width", "12", "--height", "9", "--bounces", "1", "--grid", "2", "--count", "8", "--out", "out")
+SMOKE = ("--preset", "smoke", "--out", "out")
+SMALLER = """
+from dataclasses import replace
+from render.settings import RenderSettings
+from studies import render_error, transport_plan
+render_error.QUALITIES, render_error.FINE = ((1, 1), (2, 16)), (4, 64)
+render_error.BOUNCES, render_error.DRAWS, render_error.LEVELS = 2, 2, ((10.0, 10.0),)
+plan = transport_plan.PLANS["smoke"]
+places = (transport_plan.Places("tabletop", 1, sun=True),)
+transport_plan.PLANS["smoke"] = replace(plan, places=places, size=(12, 8), planned=RenderSettings(error=0.5))
+"""
+RENDER_ERROR = ("study", "render-error", "--width", "12", "--height", "8", "--views", "1")
+RUNS = {
+    "dataset": Run(command("dataset", "hard-cases", *SET)),
+    "dataset, 2 processes": Run(command("dataset", "hard-cases", *SET, "--workers", "2")),
+    "dataset, planned": Run(
+        command("dataset", "rooms", "--width", "8", "--height", "8", "--bounces", "1", "--count", "7", "--out", "out")
+    ),
+    "train": Run(command("train", "--preset", "smoke", "--threads", "1", "--steps", "24", "--out", "out"), UNLIKE),
+    "codes": Run(command("study", "codes", "--width", "12", "--height", "8", "--out", "out")),
+    "render-error": Run(command(*RENDER_ERROR, "--out", "out/study", "--cache", "out/cache", before=SMALLER)),
+    "transport": Run(command("study", "transport", *SMOKE, before=SMALLER)),
+}
+RUNS |= {
+    name: Run(command("study", name, *SMOKE), UNLIKE)
+    for name in ("depth-offset", "spatial-block", "tensor-size", "fourier", "real-data", "multipath")
+}
+
+
+@pytest.fixture(scope="module", params=RUNS)
+def whole(request, warm, tmp_path_factory) -> tuple[Run, Path, float]:
+    """A run, the folder where it ran in one go, and its seconds."""
+    run, folder = RUNS[request.param], tmp_path_factory.mktemp("whole")
+    return run, folder, whole_run(warm, run, folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("temporary", ["same", "other"])
+def test_killed_at_random_moments_a_run_ends_with_the_same_bytes(whole, warm, tmp_path, temporary):
+    """Six times, TMPDIR beside the results or on another file system."""
+    run, folder, seconds = whole
+    place = tmp_path if temporary == "same" else other_file_system(tmp_path)
+    if place is None:
+        pytest.skip("no second file system that can be written")
+    tmpdir = Path(tempfile.mkdtemp(prefix="killed-runs-", dir=place))
+    try:
+        killed = Killed(warm, run, folder, seconds, tmp_path / "run", tmpdir)
+        killed.kill(KILLS, random.Random(f"{run.code} {temporary}"))
+        killed.finish()
+    finally:
+        shutil.rmtree(tmpdir)
