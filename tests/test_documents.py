@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from spad.sensor_files import read_sensor
 from studies.cli.main import RUNNERS, main
 
 ROOT = Path(__file__).parents[1]
@@ -77,3 +78,10 @@ def test_the_python_example_of_the_front_page_runs(tmp_path):
     done = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "mae_mm" in done.stdout
+
+
+def test_the_sensor_file_of_the_guide_is_one(tmp_path):
+    (text,) = re.findall(r"```toml\n(.*?)```", (ROOT / "docs/sensors.md").read_text(encoding="utf-8"), re.S)
+    (tmp_path / "mine.toml").write_text(text)
+    found = read_sensor(tmp_path / "mine.toml")
+    assert (found.sensor.bins, found.sensor.dead_time_s, found.sensor.pde) == (1024, 30e-9, 0.25)
