@@ -14,7 +14,6 @@ from csph.torch_files import load_torch_file
 from scenes.errors import InputError
 from scenes.files import whole_file
 
-RESUME = "resume.ckpt"
 KEYS = ("state_dict", "optimizer_states", "lr_schedulers", "callbacks", "loops", "epoch", "global_step")
 CURE = "delete it to begin the run again"
 

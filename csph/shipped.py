@@ -19,6 +19,7 @@ from scenes.inputs import read_whole_lines
 
 WEIGHTS = Path(__file__).parent / "weights"
 RUN_WEIGHTS = ("model", "last")  # files of a run; shipped ones have the models' names
+RESUME = "resume.ckpt"  # of a run: what it goes on from
 TIMINGS = "timings.jsonl"  # of a run: seconds of each epoch, wall clock and CPU
 _BESIDE = {"log.csv": ".csv", "energy.csv": ".energy.csv"}
 

@@ -40,9 +40,9 @@ from csph.loss import kl_divergence, total_variation
 from csph.model import DepthModel, load_model, save_model
 from csph.posterior import DECODERS
 from csph.rank import coherence, participation_rank
-from csph.resume import RESUME, WholeFileCheckpoints, check_resume
+from csph.resume import WholeFileCheckpoints, check_resume
 from csph.schedule import rate_factor
-from csph.shipped import TIMINGS
+from csph.shipped import RESUME, TIMINGS
 from csph.snapshots import CodeEnergy
 from csph.views import Views, packed_sha256, packed_views
 from render.heap import keep_freed_memory

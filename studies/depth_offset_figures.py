@@ -185,17 +185,20 @@ def sweep(found: dict, path: Path) -> Path:
 
 
 def range_end(found: dict, path: Path) -> Path:
-    """Up to the end of the range: MAE of truncated Fourier by what is changed, and bias before a wall."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(14, 5.5), layout="constrained")
+    """Up to the end of the range: MAE of truncated Fourier by what is changed (where measured), and bias at a wall."""
+    count = 2 if found["arms"] else 1
+    figure, panels = plt.subplots(1, count, figsize=(7 * count, 5.5), layout="constrained", squeeze=False)
+    left, right = panels[0][0], panels[0][-1]
     for number, name in enumerate(dict.fromkeys(row["arm"] for row in found["arms"])):
         mine = [row for row in found["arms"] if row["arm"] == name]
         low, mean, high = ([row[key] for row in mine] for key in ("least_mm", "mae_mm", "largest_mm"))
         at = [row["offset_m"] for row in mine]
         left.plot(at, mean, marker="o", ms=4, color=f"C{number}", label=name)
         left.fill_between(at, low, high, color=f"C{number}", alpha=0.15)
-    plain_log(left)
-    left.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
-    left.set_title(f"truncated Fourier, 128x, photons {_levels([found])}: mean and span of seeds", fontsize=10)
+    if found["arms"]:
+        plain_log(left)
+        left.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
+        left.set_title(f"truncated Fourier, 128x, photons {_levels([found])}: mean and span of seeds", fontsize=10)
     for model in dict.fromkeys(row["model"] for row in found["walls"]):
         mine = [row for row in found["walls"] if row["model"] == model]
         name, _, changed = model.partition(", ")
@@ -205,7 +208,7 @@ def range_end(found: dict, path: Path) -> Path:
     right.set_yscale("symlog", linthresh=10)
     right.set(xlabel="depth of the wall [m]", ylabel="mean signed error [mm], linear within 10 mm")
     right.set_title("a wall, photons [{:g}, {:g}], seed 0".format(*found["wall_level"]), fontsize=10)
-    for panel in (left, right):
+    for panel in panels[0]:
         panel.grid(alpha=0.3)
         panel.legend(fontsize=8)
     return save(figure, path)

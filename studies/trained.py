@@ -18,7 +18,7 @@ from csph.config import ModelConfig, TrainConfig
 from csph.design import Design
 from csph.evaluation import FindsDepth
 from csph.model import DepthModel, load_model, weights_sha256
-from csph.shipped import RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
+from csph.shipped import RESUME, RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
 from render.tracing import Progress
 from scenes.errors import require
 from studies.commands import Train
@@ -218,8 +218,12 @@ def _loaded(wanted: Wanted, path: Path) -> Trained:
 
 
 def _finished(found: Trained) -> bool:
-    if (found.path.parent / "last.safetensors").is_file():
+    """Whether a run came to its end; one that was killed between its log and its last weights did not."""
+    folder = found.path.parent
+    if (folder / "last.safetensors").is_file():
         return True
+    if (folder / RESUME).is_file():
+        return False
     rows = found.table("log.csv")
     return bool(rows) and rows[-1]["step"] >= found.config.steps
 

@@ -46,6 +46,25 @@ def test_missing_explicit_library_is_refused():
     assert len(done.stdout.splitlines()) == 1
 
 
+def test_ctrl_c_while_dr_jit_is_imported_waits_for_its_end():
+    """Imported by half, Dr.Jit would abort the process (status -6)."""
+    interrupting = """
+import signal, sys
+class Interrupting:
+    def find_spec(self, name, path, target=None):
+        if name == "drjit.detail":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+from render.llvm import start_mitsuba
+try:
+    start_mitsuba()
+except KeyboardInterrupt:
+    print("interrupted", start_mitsuba().variant())
+"""
+    done = run(interrupting)
+    assert done.returncode == 0 and done.stdout.split()[0] == "interrupted" and "_ad_mono" in done.stdout, done.stderr
+
+
 @pytest.mark.parametrize("version", [14, 15, 16])
 def test_old_explicit_library_is_refused_before_it_can_abort(version):
     found = sorted(Path("/usr/lib").glob(f"*/libLLVM-{version}*.so*"))

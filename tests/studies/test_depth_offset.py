@@ -254,7 +254,7 @@ def test_interrupted_and_resumed_repeats_nothing(capfd, tmp_path, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     assert run(tmp_path / "whole") == 0
     told = json.loads(capfd.readouterr().out)
-    assert len(told["figures"]) == 7 and all(Path(name).is_file() for name in told["figures"])
+    assert len(told["figures"]) == 8 and all(Path(name).is_file() for name in told["figures"])
     assert told["absent"] == [] and told["published"] == [] and told["relief"] == []
     assert {row["mode"] for row in csv.DictReader((tmp_path / "whole/depth-offset.csv").open())} == {
         "time", "ray", "rigid",

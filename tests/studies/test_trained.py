@@ -3,6 +3,7 @@
 import csv
 import logging
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,6 +80,18 @@ def test_found_trained_shipped_or_absent(folder, tmp_path, caplog):
 def test_finished_runs_are_not_trained_again(folder, monkeypatch):
     monkeypatch.setattr("studies.trained.run_train", lambda *_: pytest.fail("trained again"))
     Library(folder).train([LEARNED], "smoke", Path("planes"), quietly)
+
+
+def test_a_run_killed_before_its_last_weights_goes_on(folder, tmp_path):
+    """Log and state are at the end, `last.safetensors` is not there yet: the run writes it, and ends the same."""
+    run = tmp_path / "models" / LEARNED.name
+    shutil.copytree(folder / LEARNED.name, run)
+    last = (run / "last.safetensors").read_bytes()
+    (run / "last.safetensors").unlink()
+    library = Library(tmp_path / "models", None)
+    assert library.find(LEARNED) is None
+    library.train([LEARNED], "smoke", Path("planes"), quietly)
+    assert (run / "last.safetensors").read_bytes() == last and library.find(LEARNED) is not None
 
 
 def test_unfinished_runs_are_left_out(folder, tmp_path, caplog):
