@@ -30,7 +30,7 @@ $(STAMP): pyproject.toml constraints.txt
 	    { echo "scene2spad needs Python 3.11 or newer; say which with: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
-	$(BIN)/python -c 'from render.llvm import start_mitsuba; start_mitsuba()'
+	$(BIN)/python -c 'from render.backend.llvm import start_mitsuba; start_mitsuba()'
 	touch $(STAMP)
 
 clean:

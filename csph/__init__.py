@@ -1,36 +1,21 @@
 """Single-photon compressive histograms: coding tensors, encoding, decoding.
 
-Names are imported when they are first used: modules without torch, `csph.waves`, can be imported alone.
+Names are imported when they are first used: modules without torch, `csph.codes.waves`, can be imported alone.
 """
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from scenes.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from csph.codes import temporal_code, truncated_fourier
-    from csph.coding import CodingTensor, encode, encode_timestamps
-    from csph.decode import decode_depth
-    from csph.design import Design
+    from csph.codes.decode import decode_depth
+    from csph.codes.design import Design
+    from csph.codes.quantise import Quantised, encode_int16, quantised
+    from csph.codes.temporal import temporal_code, truncated_fourier
+    from csph.codes.tensor import CodingTensor, encode, encode_timestamps
     from csph.layer import CompressiveLayer, LayerOptions, make_coding
-    from csph.quantise import Quantised, encode_int16, quantised
-
-_HOME = {
-    "CodingTensor": "coding",
-    "CompressiveLayer": "layer",
-    "Design": "design",
-    "LayerOptions": "layer",
-    "Quantised": "quantise",
-    "decode_depth": "decode",
-    "encode": "coding",
-    "encode_int16": "quantise",
-    "encode_timestamps": "coding",
-    "make_coding": "layer",
-    "quantised": "quantise",
-    "temporal_code": "codes",
-    "truncated_fourier": "codes",
-}
 
 __all__ = [
     "CodingTensor",
@@ -48,11 +33,14 @@ __all__ = [
     "truncated_fourier",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for (PEP 562)."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"csph.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "csph.codes.decode": ("decode_depth",),
+        "csph.codes.design": ("Design",),
+        "csph.codes.quantise": ("Quantised", "encode_int16", "quantised"),
+        "csph.codes.temporal": ("temporal_code", "truncated_fourier"),
+        "csph.codes.tensor": ("CodingTensor", "encode", "encode_timestamps"),
+        "csph.layer": ("CompressiveLayer", "LayerOptions", "make_coding"),
+    },
+)

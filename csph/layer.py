@@ -16,14 +16,14 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from csph import blocks, rank
-from csph.codes import circle_of, orthogonal_start, temporal_code, uniform_start
-from csph.coding import CodingTensor, full_tensor
-from csph.design import Design
-from csph.photons import encode_photons, photon_table
+from csph.codes import blocks, rank
+from csph.codes.design import Design
+from csph.codes.photons import encode_photons, photon_table
+from csph.codes.temporal import circle_of, orthogonal_start, temporal_code, uniform_start
+from csph.codes.tensor import CodingTensor, full_tensor
 from scenes.errors import require
-from spad.sensor import Sensor
-from spad.template import binned_pulse
+from spad.sensor.model import Sensor
+from spad.sensor.template import binned_pulse
 
 SpatialStart = Literal["uniform", "orthogonal"]
 STARTS: tuple[str, ...] = ("uniform", "orthogonal")
@@ -160,7 +160,7 @@ class CompressiveLayer(nn.Module):
         return CodingTensor(self.name, self._temporal_part(), self.spatial, computed=self.computed)
 
     def pixel_gram(self) -> Tensor:
-        """Inner products of the codes of each two pixels of a block, (Mr Mc, Mr Mc): see `csph.rank`."""
+        """Inner products of the codes of each two pixels of a block, (Mr Mc, Mr Mc): see `csph.codes.rank`."""
         temporal = self._temporal_part()
         return rank.pixel_gram(temporal) if self.spatial is None else rank.separable_gram(temporal, self.spatial)
 

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.direct import Layers
-from render.rays import MAX_LAYERS, camera_rays, shape_index, spawn
-from render.world import OPACITY, Bool, Float, UInt32, World, dr, mi, recorded, upload
+from render.direct.integrator import Layers
+from render.scene.rays import MAX_LAYERS, camera_rays, shape_index, spawn
+from render.scene.traced_scene import OPACITY, Bool, Float, UInt32, World, dr, mi, recorded, upload
 from scenes.model import Camera
 
 MOST_LANES = 1 << 18  # paths of one launch, where an image is not larger by itself
@@ -171,7 +171,7 @@ def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> t
     shift = sampler.next_2d()
     x, y = Float(pixel % world.width) + shift.x, Float(pixel // world.width) + shift.y
     found = _traced(world, sampler, camera_rays(world, x, y)[0], bounces)
-    # a path across a face without a normal says nothing, as in `render.sums`
+    # a path across a face without a normal says nothing, as in `render.indirect.accumulators`
     return tuple(dr.select(dr.isfinite(light), light, 0) for light in found)
 
 

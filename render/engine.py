@@ -11,8 +11,7 @@ from functools import cache
 import numpy as np
 
 from render.ambient import AmbientLight, ambient_light
-from render.cells import coarsened
-from render.direct import centre_layers
+from render.direct.integrator import centre_layers
 from render.error import (
     ErrorEstimate,
     estimate,
@@ -23,17 +22,18 @@ from render.error import (
     target_verdict,
     worst_share_of,
 )
-from render.indirect import (
+from render.indirect.integrator import (
     Schedule,
     Watched,
     image_cells,
 )
+from render.indirect.path_cells import coarsened
+from render.pipeline import Progress, Traced, derived_seed, most_spp, spans_of, trace, traced_on
 from render.planning import finer_pilot, make_plan, pilot_pixels
-from render.returns import concatenate, no_samples, of_pixels, to_returns
+from render.scene.traced_scene import World
 from render.settings import BATCHES, FILTERED_BATCHES, MIN_PIXEL_BYTES, MOST_AMBIENT_SPP, Plan, RenderSettings
-from render.tracing import Progress, Traced, derived_seed, most_spp, spans_of, trace, traced_on
 from render.transient import Transient
-from render.world import World
+from render.transient.samples import concatenate, no_samples, of_pixels, to_returns
 from scenes.limits import require_memory
 from scenes.model import Scene
 

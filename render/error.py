@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from render.returns import Samples
+from render.transient.samples import Samples
 from scenes.constants import (
     REFERENCE_BINS,
     REFERENCE_PERIOD_S,

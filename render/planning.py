@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from render.direct import direct_light, least_share_of
+from render.direct.integrator import direct_light, least_share_of
 from render.error import PULSE_POWER, error_for_budget, error_of_background, estimate, response
-from render.paths import energy_by_bounces
-from render.returns import of_pixels
+from render.indirect.camera_paths import energy_by_bounces
+from render.scene.traced_scene import World
 from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
-from render.world import World
+from render.transient.samples import of_pixels
 from scenes.errors import InputError
 from scenes.model import Material
 

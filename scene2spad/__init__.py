@@ -12,16 +12,17 @@ Arrays are NumPy's, lengths metres and times seconds. Names are imported when th
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from scenes.lazy import lazy_names
 
 if TYPE_CHECKING:
     from csph import CodingTensor, CompressiveLayer, Design, decode_depth, encode, encode_timestamps, make_coding
-    from csph.cards import Card
-    from csph.config import ModelConfig, TrainConfig
-    from csph.model import DepthModel
-    from csph.training import train
-    from csph.views import Views, read_views
+    from csph.networks.model import DepthModel
+    from csph.training.config import ModelConfig, TrainConfig
+    from csph.training.loop import train
+    from csph.training.views import Views, read_views
+    from csph.weights.cards import Card
     from render.settings import RenderSettings
     from render.transient import Transient, read_transient, write_transient
     from scene2spad.chain import (
@@ -34,13 +35,13 @@ if TYPE_CHECKING:
         sense,
     )
     from scenes import Ambient, Camera, InputError, Laser, Material, Scene, Surface, Texture
-    from scenes.catalog import load_scene
-    from spad.budget import Optics
-    from spad.histogram import Histogram, read_histogram, write_histogram
-    from spad.mat import read_mat, write_mat
-    from spad.pulse import Pulse, read_pulse
-    from spad.rgbd import transient_from_rgbd
-    from spad.sensor import PhotonBudget, Sensor, sensor_by_name
+    from scenes.library.catalog import load_scene
+    from spad.formats.histogram import Histogram, read_histogram, write_histogram
+    from spad.formats.mat import read_mat, write_mat
+    from spad.formats.rgbd import transient_from_rgbd
+    from spad.sensor.budget import Optics
+    from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+    from spad.sensor.pulse import Pulse, read_pulse
     from ultraphase import ChipSpec, Core, CoreArray, Program, assemble, verify
 
 _MODULE_OF: dict[str, tuple[str, ...]] = {
@@ -54,15 +55,15 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
         "sense",
     ),
     "scenes": ("Ambient", "Camera", "InputError", "Laser", "Material", "Scene", "Surface", "Texture"),
-    "scenes.catalog": ("load_scene",),
+    "scenes.library.catalog": ("load_scene",),
     "render.settings": ("RenderSettings",),
     "render.transient": ("Transient", "read_transient", "write_transient"),
-    "spad.sensor": ("PhotonBudget", "Sensor", "sensor_by_name"),
-    "spad.pulse": ("Pulse", "read_pulse"),
-    "spad.budget": ("Optics",),
-    "spad.histogram": ("Histogram", "read_histogram", "write_histogram"),
-    "spad.mat": ("read_mat", "write_mat"),
-    "spad.rgbd": ("transient_from_rgbd",),
+    "spad.sensor.model": ("PhotonBudget", "Sensor", "sensor_by_name"),
+    "spad.sensor.pulse": ("Pulse", "read_pulse"),
+    "spad.sensor.budget": ("Optics",),
+    "spad.formats.histogram": ("Histogram", "read_histogram", "write_histogram"),
+    "spad.formats.mat": ("read_mat", "write_mat"),
+    "spad.formats.rgbd": ("transient_from_rgbd",),
     "csph": (
         "CodingTensor",
         "CompressiveLayer",
@@ -72,15 +73,13 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
         "encode_timestamps",
         "make_coding",
     ),
-    "csph.cards": ("Card",),
-    "csph.config": ("ModelConfig", "TrainConfig"),
-    "csph.model": ("DepthModel",),
-    "csph.training": ("train",),
-    "csph.views": ("Views", "read_views"),
+    "csph.weights.cards": ("Card",),
+    "csph.training.config": ("ModelConfig", "TrainConfig"),
+    "csph.networks.model": ("DepthModel",),
+    "csph.training.loop": ("train",),
+    "csph.training.views": ("Views", "read_views"),
     "ultraphase": ("ChipSpec", "Core", "CoreArray", "Program", "assemble", "verify"),
 }
-_HOME = {name: module for module, names in _MODULE_OF.items() for name in names}
-
 __all__ = [  # noqa: RUF022 (in the order of the chain)
     "load_scene",
     "Scene",
@@ -137,17 +136,16 @@ __all__ = [  # noqa: RUF022 (in the order of the chain)
 ]
 
 
+_import_name, _names = lazy_names(__name__, _MODULE_OF)
+
+
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for (PEP 562)."""
     if name == "__version__":
         from importlib.metadata import version
 
         return version("scene2spad")
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
+    return _import_name(name)
 
 
 def __dir__() -> list[str]:

@@ -12,14 +12,14 @@ import numpy as np
 from scenes.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
-    from csph.cards import Card
-    from csph.coding import CodingTensor
-    from csph.model import DepthModel
+    from csph.codes.tensor import CodingTensor
+    from csph.networks.model import DepthModel
+    from csph.weights.cards import Card
     from render.transient import Transient
     from scenes.model import Scene
-    from spad.budget import Optics
-    from spad.histogram import Histogram
-    from spad.sensor import Sensor
+    from spad.formats.histogram import Histogram
+    from spad.sensor.budget import Optics
+    from spad.sensor.model import Sensor
 
 Progress = Callable[[str, float], None]
 Law = Literal["auto", "poisson", "first-photon", "free-running"]
@@ -73,7 +73,7 @@ def render(
     """
     from render.engine import render as render_scene
     from render.settings import RenderSettings
-    from scenes.catalog import load_scene
+    from scenes.library.catalog import load_scene
     from scenes.model import Scene
 
     known = [field.name for field in fields(RenderSettings)]
@@ -132,8 +132,8 @@ def sense(
     >>> s2s.sense(transient, signal=20, background=5).counts.shape
     (6, 8, 1024)
     """
-    from spad.detect import sense as sense_exposure
-    from spad.sensor import PhotonBudget, sensor_by_name
+    from spad.detection.detect import sense as sense_exposure
+    from spad.sensor.model import PhotonBudget, sensor_by_name
 
     chosen = sensor_by_name(sensor) if isinstance(sensor, str) else sensor
     budget = optics.budget(transient, chosen) if optics is not None else PhotonBudget(signal, background)
@@ -175,7 +175,7 @@ def estimate_depth(histogram: Histogram, method: str | CodingTensor | DepthModel
     >>> coded.shape
     (8, 8)
     """
-    from spad.depth import METHODS, histogram_depth_m
+    from spad.estimators.depth import METHODS, histogram_depth_m
 
     if isinstance(method, str) and method in METHODS:
         return histogram_depth_m(histogram, method)
@@ -226,7 +226,7 @@ def coding_tensor(code: str, codes: int, sensor: Sensor | str = "reference", *, 
     (16, 1024)
     """
     from csph import CodingTensor, temporal_code
-    from spad.sensor import sensor_by_name
+    from spad.sensor.model import sensor_by_name
 
     chosen = sensor_by_name(sensor) if isinstance(sensor, str) else sensor
     return CodingTensor(f"{code}-{codes}", temporal_code(code, codes, chosen.bins, chosen, seed))
@@ -262,7 +262,7 @@ def depth_errors(depth_m: np.ndarray, histogram: Histogram, *, unmixed: bool = F
     >>> s2s.depth_errors(histogram.depth_m, histogram)["mae_mm"]
     0.0
     """
-    from spad.depth import depth_errors as compared
+    from spad.estimators.depth import depth_errors as compared
 
     exclude = histogram.mixed if unmixed else None
     return compared(depth_m, histogram.depth_m, range_m=histogram.sensor.range_m, exclude=exclude)
@@ -282,7 +282,7 @@ def models() -> list[Card]:
     >>> "learned-256x4x4-128x-s0" in [card.name for card in s2s.models()]
     True
     """
-    from csph.cards import cards
+    from csph.weights.cards import cards
 
     return cards()
 
@@ -312,7 +312,7 @@ def load_model(name: str | Path) -> DepthModel:
     >>> s2s.load_model("learned-256x4x4-128x-s0").config.block
     (256, 4, 4)
     """
-    from csph.cards import checkpoint_of
-    from csph.model import load_model as load
+    from csph.networks.model import load_model as load
+    from csph.weights.cards import checkpoint_of
 
     return load(checkpoint_of(name))[0]

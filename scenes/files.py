@@ -20,7 +20,7 @@ from tokenize import TokenError
 import numpy as np
 
 from scenes.errors import InputError
-from scenes.inputs import parse_json
+from scenes.io.inputs import parse_json
 
 ATTRIBUTE = "scene2spad"
 SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 2, "network": 1}
@@ -90,7 +90,7 @@ def is_unclaimed(folder: Path) -> bool:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append one line to a journal, which `scenes.inputs.read_whole_lines` reads.
+    """Append one line to a journal, which `scenes.io.inputs.read_whole_lines` reads.
 
     A kill or a full disk costs no more than the line that it cuts: the next begins on a line of its own. Raises
     InputError naming the file where it cannot be written.

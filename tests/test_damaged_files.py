@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parent / "support"))
 from damage import MEMORY_BYTES, SECONDS, damaged, read_all
 from readers import READERS
 
-from scenes.hdf5 import USER_BLOCK, add_checksum
+from scenes.io.hdf5 import USER_BLOCK, add_checksum
 
 
 def check(reader: str, count: int, folder: Path, first: int = 0) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from spad.sensor_files import read_sensor
-from studies.cli.main import RUNNERS, main
+from scene2spad.cli.main import RUNNERS, main
+from spad.sensor.files import read_sensor
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -168,8 +168,8 @@ def test_ten_killed_schedulers_are_one_line_each_and_the_run_goes_on(whole, warm
 
 
 def test_an_address_where_nobody_listens_is_one_line(tmp_path, capsys, monkeypatch):
-    from studies import workers
-    from studies.cli import main
+    from scene2spad.cli import main
+    from scene2spad.datasets import workers
 
     monkeypatch.setattr(workers, "CONNECT_S", 1)
     with socket.socket() as free:

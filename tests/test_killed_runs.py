@@ -21,7 +21,8 @@ SMOKE = ("--preset", "smoke", "--out", "out")
 SMALLER = """
 from dataclasses import replace
 from render.settings import RenderSettings
-from studies import render_error, transport_plan
+from scene2spad.studies import render_error
+from scene2spad.studies.transport import plan as transport_plan
 render_error.QUALITIES, render_error.FINE = ((1, 1), (2, 16)), (4, 64)
 render_error.BOUNCES, render_error.DRAWS, render_error.LEVELS = 2, 2, ((10.0, 10.0),)
 plan = transport_plan.PLANS["smoke"]

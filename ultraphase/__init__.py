@@ -4,13 +4,13 @@ UltraPhase-constrained: the chip's published limits and costs, with an instructi
 """
 
 from ultraphase.array import CoreArray
-from ultraphase.assembler import assemble, assemble_file
+from ultraphase.assembly.assembler import assemble, assemble_file
+from ultraphase.assembly.program import Program, disassemble, listing
 from ultraphase.catalog import Method, method
 from ultraphase.chip import ChipSpec
 from ultraphase.compiler import compile_code
 from ultraphase.core import Core
 from ultraphase.integer_code import IntegerCode
-from ultraphase.program import Program, disassemble, listing
 from ultraphase.verify import Tabulated, verify
 
 __all__ = [

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.errors import InputError, require
+from ultraphase.assembly.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
+from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
 from ultraphase.core import PATIENCE, Core, Counters, region_contents
-from ultraphase.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
-from ultraphase.program import Program
 
 _RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
 # In step, a turn costs about as much for one core as for hundreds: so few finish their timestamps one after the other.

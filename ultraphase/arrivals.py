@@ -24,9 +24,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.errors import InputError, require
+from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
 from ultraphase.core import PATIENCE, Core
-from ultraphase.program import Program
 
 _PORT_INSTRUCTIONS = ("BNT", "RDT", "BFE")
 

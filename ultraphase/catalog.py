@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from scenes.errors import InputError, require
-from ultraphase.assembler import assemble_file
+from ultraphase.assembly.assembler import assemble_file
+from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
-from ultraphase.program import Program
 from ultraphase.tables import INT8_SCALE, block_matrix, coarse_matrix, fourier_matrix, quarter_wave
 
 FOLDER = Path(__file__).parent / "programs"

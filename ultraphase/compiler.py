@@ -14,13 +14,13 @@ from functools import cached_property
 import numpy as np
 
 from scenes.errors import InputError, require
-from scenes.inputs import read_text
-from ultraphase.assembler import assemble
+from scenes.io.inputs import read_text
+from ultraphase.assembly.assembler import assemble
+from ultraphase.assembly.codegen import loop_order, source_of, turns_of
+from ultraphase.assembly.program import Program
 from ultraphase.catalog import FOLDER, Method
 from ultraphase.chip import ChipSpec
-from ultraphase.codegen import loop_order, source_of, turns_of
 from ultraphase.integer_code import IntegerCode, folded_temporal
-from ultraphase.program import Program
 from ultraphase.tables import block_matrix, quarter_wave
 
 _EAST, _WEST, _SOUTH, _NORTH = 1, 2, 4, 8  # bits of a core's `ways`, as `sumblock.s` reads them

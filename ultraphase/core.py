@@ -10,10 +10,10 @@ from types import CodeType
 import numpy as np
 
 from scenes.errors import InputError, require
+from ultraphase.assembly.isa import REGISTERS, Instruction, spelled
+from ultraphase.assembly.program import KINDS, Program
+from ultraphase.assembly.translate import source
 from ultraphase.chip import ChipSpec
-from ultraphase.isa import REGISTERS, Instruction, spelled
-from ultraphase.program import KINDS, Program
-from ultraphase.translate import source
 
 PATIENCE = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
 _STOP = -1

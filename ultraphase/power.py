@@ -23,9 +23,9 @@ import numpy as np
 
 from scenes.errors import require
 from ultraphase.array import CoreArray
+from ultraphase.assembly.program import Program
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS, Method
 from ultraphase.chip import ChipSpec
-from ultraphase.program import Program
 
 MICRO, KILO = 1e6, 1e-3
 READINGS = {

@@ -9,8 +9,8 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from ultraphase.array import CoreArray, Frame
+from ultraphase.assembly.program import KINDS, Program
 from ultraphase.chip import ChipSpec
-from ultraphase.program import KINDS, Program
 
 _EXACT_IN_FLOAT32 = 1 << 24
 _CHUNK = 256  # pixels at a time: 1 MB of float32 histogram, which a cache holds

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from csph.backbone import DeepBoosting, doubled, parameters_of, soft_argmax
-from csph.compact import Compact, averages, enlarged, fold, read_out
+from csph.networks.compact import Compact, averages, enlarged, fold, read_out
+from csph.networks.published import DeepBoosting, doubled, parameters_of, soft_argmax
+from scene2spad.bench.network import PlainDeepBoosting, gmac
 from scenes import InputError
-from studies.bench.network import PlainDeepBoosting, gmac
 
 
 def formula_weights(network: nn.Module) -> None:

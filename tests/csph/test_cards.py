@@ -7,11 +7,11 @@ import sys
 import pytest
 from test_training import FEW, MODEL, near_planes
 
-from csph.cards import cards, checkpoint_of, read_card, shipped_model
-from csph.config import preset
-from csph.shipped import WEIGHTS, ship
-from csph.training import train
-from csph.views import split_views
+from csph.training.config import preset
+from csph.training.loop import train
+from csph.training.views import split_views
+from csph.weights.cards import cards, checkpoint_of, read_card, shipped_model
+from csph.weights.shipped import WEIGHTS, ship
 from scenes import InputError
 
 
@@ -53,10 +53,10 @@ def test_training_needs_no_renderer_and_no_command_line():
         "import sys\n"
         "for name in ('mitsuba', 'drjit', 'OpenEXR', 'tyro'):\n"
         "    sys.modules[name] = None\n"
-        "import csph.training, csph.cards, csph.evaluation\n"
-        "from csph.model import load_model\n"
-        "from csph.views import read_views\n"
-        "from csph.cards import shipped_model\n"
+        "import csph.training.loop, csph.weights.cards, csph.evaluation.methods\n"
+        "from csph.networks.model import load_model\n"
+        "from csph.training.views import read_views\n"
+        "from csph.weights.cards import shipped_model\n"
         "print(load_model(shipped_model('none-s0'))[0].parameters_count)\n"
     )
     said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from csph.codes import (
+from csph.codes.decode import decode_depth
+from csph.codes.design import Design
+from csph.codes.temporal import (
     FIXED_CODES,
     block_pulse,
     coarse_gates,
@@ -17,14 +19,12 @@ from csph.codes import (
     uniform_start,
     walsh_hadamard,
 )
-from csph.coding import CodingTensor, encode
-from csph.config import ModelConfig
-from csph.decode import decode_depth
-from csph.design import Design
+from csph.codes.tensor import CodingTensor, encode
 from csph.layer import CompressiveLayer
+from csph.training.config import ModelConfig
 from scenes.errors import InputError
-from spad.rgbd import published_taps
-from spad.sensor import Pulse, Sensor, sensor_by_name
+from spad.formats.rgbd import published_taps
+from spad.sensor.model import Pulse, Sensor, sensor_by_name
 
 REFERENCE = Sensor()
 # mean over image rows of the published training pulse, 16 taps of 80 ps (physics of the ICCV 2023 data set)

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from csph import CodingTensor, decode_depth, encode, encode_timestamps, truncated_fourier
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
-from spad.depth import cramer_rao_m, grid_peak
-from spad.sensor import Sensor
-from spad.template import binned_pulse
+from spad.estimators.depth import cramer_rao_m, grid_peak
+from spad.sensor.model import Sensor
+from spad.sensor.template import binned_pulse
 
 REFERENCE = Sensor()
 SMALL = Sensor(name="small", bins=64)
@@ -134,7 +134,7 @@ def test_a_decoder_that_answers_late_is_put_right(monkeypatch: pytest.MonkeyPatc
     counts = torch.from_numpy(np.random.default_rng(6).poisson(2.0, (20, 64)))
     codes = truncated_fourier(8, 64)
     right = decode_depth(encode(counts, CodingTensor("right", codes)), CodingTensor("right", codes), SMALL)
-    monkeypatch.setattr("csph.decode.grid_peak", lambda scores: grid_peak(scores) + 5)
+    monkeypatch.setattr("csph.codes.decode.grid_peak", lambda scores: grid_peak(scores) + 5)
     late = CodingTensor("late", codes)
     assert torch.allclose(decode_depth(encode(counts, late), late, SMALL), right, atol=1e-6)
 

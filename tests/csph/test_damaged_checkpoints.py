@@ -10,15 +10,15 @@ import pytest
 import torch
 from safetensors.torch import load_file, save
 
-from csph.config import ModelConfig, TrainConfig
-from csph.design import Design
-from csph.model import KIND, DepthModel, _weights_sha256, load_model, save_model
-from csph.torch_files import load_torch_file
-from csph.training import _claim
+from csph.codes.design import Design
+from csph.networks.model import KIND, DepthModel, _weights_sha256, load_model, save_model
+from csph.training.config import ModelConfig, TrainConfig
+from csph.training.loop import _claim
+from csph.weights.torch_files import load_torch_file
+from scene2spad.studies.tensors import coding_of
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, seal
-from spad.sensor import Sensor
-from studies.tensors import coding_of
+from spad.sensor.model import Sensor
 
 CONFIG = TrainConfig(
     model=ModelConfig(design=Design.named("learned", (16, 2, 2), codes=8), sensor=Sensor(bins=64)), crop=8

@@ -2,7 +2,7 @@
 
 import pytest
 
-from csph.design import Design, codes_for
+from csph.codes.design import Design, codes_for
 from csph.layer import CompressiveLayer, make_coding
 from scenes.errors import InputError
 

@@ -6,15 +6,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from csph.blocks import EPSILON, FORMED, back_project, encode_blocks, zero_normalised
-from csph.codes import truncated_fourier
-from csph.coding import CodingTensor
-from csph.design import Design
+from csph import reference
+from csph.codes.blocks import EPSILON, FORMED, back_project, encode_blocks, zero_normalised
+from csph.codes.design import Design
+from csph.codes.photons import encode_photons, photon_table
+from csph.codes.temporal import truncated_fourier
+from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer, LayerOptions, make_coding
-from csph.photons import encode_photons, photon_table
 from scenes.errors import InputError
-from spad.sensor import Sensor
-from spad.template import binned_pulse
+from spad.sensor.model import Sensor
+from spad.sensor.template import binned_pulse
 
 SIZE = (32, 8, 8)
 DESIGNS = {
@@ -69,21 +70,15 @@ def rounding(counts: torch.Tensor, layer: CompressiveLayer) -> float:
 
 
 def convolved(counts: torch.Tensor, weights: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Codes and back-projection by strided convolutions, normalisation written out."""
-
-    def zn(v: torch.Tensor, axis: int) -> torch.Tensor:
-        v = v - v.mean(axis, keepdim=True)
-        return v / (v.norm(dim=axis, keepdim=True) + EPSILON)
-
-    kernel, stride = weights.unsqueeze(1), weights.shape[1:]
-    codes = torch.nn.functional.conv3d(counts.to(weights.dtype), kernel, stride=stride)
-    return codes, torch.nn.functional.conv_transpose3d(zn(codes, 1), zn(kernel, 0), stride=stride)
+    """Codes and back-projection by the plain twin."""
+    codes = reference.encode(counts, weights)
+    return codes, reference.back_project(codes, weights, EPSILON)
 
 
 @pytest.fixture(params=[FORMED, 0], ids=["formed", "in two steps"])
 def both_routes(request, monkeypatch):
     """Separable tensors formed, as for this little counts, and not."""
-    monkeypatch.setattr("csph.blocks.FORMED", request.param)
+    monkeypatch.setattr("csph.codes.blocks.FORMED", request.param)
 
 
 @pytest.mark.usefixtures("both_routes")
@@ -134,8 +129,8 @@ def test_order_by_place_and_counts_of_many_time_blocks_change_nothing(layer, see
     counts = counts_from(seed)
     stamps, offsets = photons_of(counts, seed if shuffled else None)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("csph.photons.CACHE_BYTES", 0)
-        patch.setattr("csph.photons.MARKED_TIMES", 1)
+        patch.setattr("csph.codes.photons.CACHE_BYTES", 0)
+        patch.setattr("csph.codes.photons.MARKED_TIMES", 1)
         sparse = layer.encode_timestamps(stamps, offsets, SIZE)
     assert (sparse - layer.encode(counts)).abs().max() <= 2 * rounding(counts, layer)
 

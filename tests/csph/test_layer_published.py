@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from csph.coding import CodingTensor
+from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer
 
 FIXTURE = Path(os.environ.get("SCENE2SPAD_DATA", Path(__file__).parents[3] / "shared" / "data")).parent

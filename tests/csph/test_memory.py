@@ -5,8 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from csph.design import Design
-from csph.memory import best_blocks, data_compression, memory_compression, separable_factor, stored, transmitted
+from csph.codes.design import Design
+from csph.evaluation.memory import (
+    best_blocks,
+    data_compression,
+    memory_compression,
+    separable_factor,
+    stored,
+    transmitted,
+)
 from scenes.errors import InputError
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from csph.metrics import (
+from csph.evaluation.metrics import (
     PHOTON_LEVELS,
     TRAIN_LEVELS,
     bias_by_depth,

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from csph.codes import orthogonal_start, uniform_start
-from csph.config import ModelConfig
-from csph.design import Design
-from csph.images import mirrored, spans
+from csph.codes.design import Design
+from csph.codes.rank import coherence, participation_rank, pixel_gram, separable_gram
+from csph.codes.temporal import orthogonal_start, uniform_start
 from csph.layer import CompressiveLayer
-from csph.model import DepthModel
-from csph.posterior import confidence, decoded, posterior_median
-from csph.rank import coherence, participation_rank, pixel_gram, separable_gram
-from spad.detect import sense
-from spad.histogram import TRUTH
-from spad.pulse import Pulse
-from spad.sensor import PhotonBudget, Sensor
-from studies.planes import random_planes
+from csph.networks.images import mirrored, spans
+from csph.networks.model import DepthModel
+from csph.networks.posterior import confidence, decoded, posterior_median
+from csph.training.config import ModelConfig
+from scene2spad.datasets.planes import random_planes
+from spad.detection.detect import sense
+from spad.formats.histogram import TRUTH
+from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.pulse import Pulse
 
 SMALL = Sensor(name="small", bins=64, bin_width_s=1e-10, pulse=Pulse(1.4e-10))
 

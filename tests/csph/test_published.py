@@ -11,18 +11,18 @@ import torch
 from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.utilities.parsing import AttributeDict
 
-from csph.backbone import soft_argmax
-from csph.cards import limits
-from csph.config import ModelConfig
-from csph.design import Design
-from csph.grid import published_position
-from csph.model import DepthModel, load_model
-from csph.published import FULL, LEFT_OUT, SPATIAL, TEMPORAL, import_checkpoint
-from csph.torch_files import load_torch_file
+from csph.codes.design import Design
+from csph.networks.grid import published_position
+from csph.networks.model import DepthModel, load_model
+from csph.networks.published import soft_argmax
+from csph.training.config import ModelConfig
+from csph.weights.cards import limits
+from csph.weights.published import FULL, LEFT_OUT, SPATIAL, TEMPORAL, import_checkpoint
+from csph.weights.torch_files import load_torch_file
+from scene2spad.datasets.planes import random_planes
 from scenes.errors import InputError
-from spad.detect import sense
-from spad.sensor import PhotonBudget, Sensor, sensor_by_name
-from studies.planes import random_planes
+from spad.detection.detect import sense
+from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 
 TRAIN = sensor_by_name("iccv2023-train")
 DESIGNS = (

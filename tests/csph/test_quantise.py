@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from csph.blocks import encode_blocks
-from csph.coding import CodingTensor
-from csph.design import Design
+from csph.codes.blocks import encode_blocks
+from csph.codes.design import Design
+from csph.codes.quantise import PUBLISHED_STEP, encode_int16, published_int8, quantised
+from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer, make_coding
-from csph.quantise import PUBLISHED_STEP, encode_int16, published_int8, quantised
 
 DESIGNS = (
     Design("fourier", (32, 1, 1), 8),

@@ -10,19 +10,19 @@ import pytest
 import torch
 from test_training import FEW, MODEL, SMALL, Stopped, near_planes
 
-from csph.config import RECIPE, ModelConfig, TrainConfig, preset
-from csph.data import Samples, SetData, _sensed
-from csph.design import Design
-from csph.grid import on_published_grid, published_centroid_bins, published_position, published_target
-from csph.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
-from csph.metrics import PHOTON_LEVELS, TRAIN_LEVELS
-from csph.model import load_model, weights_sha256
-from csph.schedule import rate_factor
-from csph.training import DepthTraining, train
-from csph.views import packed_views, split_views
+from csph.codes.design import Design
+from csph.evaluation.metrics import PHOTON_LEVELS, TRAIN_LEVELS
+from csph.networks.grid import on_published_grid, published_centroid_bins, published_position, published_target
+from csph.networks.model import load_model, weights_sha256
+from csph.training.config import RECIPE, ModelConfig, TrainConfig, preset
+from csph.training.data import Samples, SetData, _sensed
+from csph.training.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
+from csph.training.loop import DepthTraining, train
+from csph.training.schedule import rate_factor
+from csph.training.views import packed_views, split_views
+from scene2spad.datasets.planes import random_planes
 from scenes import InputError
-from spad.sensor import Sensor
-from studies.planes import random_planes
+from spad.sensor.model import Sensor
 
 CODED = ModelConfig(design=Design("learned", (256, 2, 2), 8))
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from csph.resume import KEYS, WholeFileCheckpoints, check_resume
+from csph.training.resume import KEYS, WholeFileCheckpoints, check_resume
 from scenes import InputError
 
 MODULE = nn.Linear(3, 2)

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from csph.codes import bin_energy, grouped_energy, truncated_fourier
-from csph.config import ModelConfig, preset
-from csph.design import Design
+from csph.codes.design import Design
+from csph.codes.temporal import bin_energy, grouped_energy, truncated_fourier
 from csph.layer import make_coding
-from csph.model import load_model
-from csph.shipped import beside, ship, shipped_file
-from csph.training import train
-from csph.views import split_views
+from csph.networks.model import load_model
+from csph.training.config import ModelConfig, preset
+from csph.training.loop import train
+from csph.training.views import split_views
+from csph.weights.shipped import beside, ship, shipped_file
+from scene2spad.datasets.planes import random_planes
 from scenes import InputError
-from spad.detect import sense
-from spad.sensor import PhotonBudget, Sensor
-from studies.planes import random_planes
+from spad.detection.detect import sense
+from spad.sensor.model import PhotonBudget, Sensor
 
 DESIGN = Design("learned", (1024, 1, 1), 8)
 
@@ -72,7 +72,7 @@ def test_shipped_is_small_whole_and_tells_no_folder(trained, tmp_path):
 def test_shipping_forgets_where_the_set_lay(trained, tmp_path):
     from dataclasses import replace
 
-    from csph.model import save_model
+    from csph.networks.model import save_model
 
     model, config, state = load_model(trained)
     moved = replace(config, data={**config.data, "training": "/somewhere/else/rooms.h5", "validation": "b/v.h5"})

@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 import torch
 
-from csph.config import PUBLISHED_TV, ModelConfig, TrainConfig, preset
-from csph.data import Frames, Samples, SetData
-from csph.design import Design
-from csph.evaluation import evaluate
-from csph.loss import kl_divergence, pulse_target, total_variation
-from csph.model import DepthModel, load_model, save_model, weights_sha256
-from csph.training import train
-from csph.views import Views, packed_views, split_views
+from csph.codes.design import Design
+from csph.evaluation.methods import evaluate
+from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
+from csph.training.config import PUBLISHED_TV, ModelConfig, TrainConfig, preset
+from csph.training.data import Frames, Samples, SetData
+from csph.training.loop import train
+from csph.training.loss import kl_divergence, pulse_target, total_variation
+from csph.training.views import Views, packed_views, split_views
+from scene2spad.datasets.planes import random_planes
 from scenes import Camera, InputError
 from scenes.files import ATTRIBUTE
-from spad.detect import sense
-from spad.pulse import Pulse
-from spad.sensor import PhotonBudget, Sensor, sensor_by_name
-from spad.template import binned_pulse
-from studies.planes import random_planes
+from spad.detection.detect import sense
+from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.pulse import Pulse
+from spad.sensor.template import binned_pulse
 
 SPEED = 299_792_458.0
 # a small sensor: 64 bins over 6.4 ns, 0.96 m
@@ -317,7 +317,7 @@ def test_histograms_that_do_not_fit():
 def test_freed_memory_is_kept():
     script = (
         "import resource, numpy as np\n"
-        "from render.heap import keep_freed_memory\n"
+        "from render.backend.malloc import keep_freed_memory\n"
         "def faults():\n"
         "    start = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
         "    for _ in range(20):\n"
@@ -334,7 +334,7 @@ def test_freed_memory_is_kept():
 
 def test_a_networks_depth_knows_where_the_laser_is():
     """A half path beside a displaced laser becomes a distance, for networks as for the filters."""
-    from spad.depth import radial_depth_m
+    from spad.estimators.depth import radial_depth_m
 
     camera = {"pose": np.eye(4).tolist(), "fov_deg": 60.0, "width": 16, "height": 16}
     views, baseline = near_planes(1), (0.1, 0.0, 0.02)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from render.ambient import ambient_light, shared
-from render.direct import Layers, centre_layers
-from render.world import World, mi
+from render.direct.integrator import Layers, centre_layers
+from render.scene.traced_scene import World, mi
+from scene2spad.bench.hard import oracles
+from scenes.library.things.shapes import box, sphere
 from scenes.model import Ambient, Material, Scene, Surface
-from scenes.shapes import box, sphere
-from studies.bench import oracles
 
 GLASS = Material("thindielectric", ior=1.5)
 

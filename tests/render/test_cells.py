@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from render.cells import Rows, coarsened, make_cells
-from render.returns import Samples, packed
-from render.world import Bool, Float, UInt32, dr, upload
+from render.indirect.path_cells import Rows, coarsened, make_cells
+from render.scene.traced_scene import Bool, Float, UInt32, dr, upload
+from render.transient.samples import Samples, packed
 
 
 def samples_of(rows: Rows, pixels: int = 1) -> Samples:

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from render.direct import DirectLight, direct_light
-from render.world import World, dr
+from render.direct.integrator import DirectLight, direct_light
+from render.scene.traced_scene import World, dr
 from scenes import Camera, Laser, Material, Scene, Surface
-from scenes.shapes import sphere
+from scenes.library.things.shapes import sphere
 
 
 class Moments(NamedTuple):

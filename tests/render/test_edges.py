@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from render.edges import (
+from render.direct.edges import (
     CREASE_COSINE,
     CREASE_M,
     CUT,
@@ -23,8 +23,8 @@ from render.edges import (
     compared,
     first_edges,
 )
-from render.footprint import HIT, LARGE, LIT
-from render.world import Float, UInt32
+from render.direct.footprints import HIT, LARGE, LIT
+from render.scene.traced_scene import Float, UInt32
 
 HEIGHT, WIDTH, GRID, LEAST = 8, 9, 3, 0.02
 COUNT = HEIGHT * WIDTH * GRID**2
@@ -47,7 +47,7 @@ def cells_of(seed: int, count: int = COUNT, *, glossy: bool = False) -> Cells:
 
 
 def between(cells: Cells, a: int, b: int, way: tuple[float, float]) -> tuple[bool, bool, float, bool, float]:
-    """differ, apart, contrast, joined, glint: a sentence of `render.edges` a line."""
+    """differ, apart, contrast, joined, glint: a sentence of `render.direct.edges` a line."""
     hits = [bool(cells.flags[i] & HIT) for i in (a, b)]
     lits = [bool(cells.flags[i] & LIT) for i in (a, b)]
     step = float(cells.distance_m[b]) - float(cells.distance_m[a])

@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from render import engine, tracing
+from render import engine
+from render import pipeline as tracing
 from render.engine import render
 from render.error import BIN_M, PULSE_POWER, SIGMA_M, estimate, response, target_verdict, worst_share_of
 from render.planning import _bounces, make_plan, rays_for_all
-from render.returns import Samples
+from render.scene.traced_scene import World
 from render.settings import RenderSettings
-from render.world import World
+from render.transient.samples import Samples
+from scene2spad.bench.hard import oracles
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
-from scenes.hard_cases import hard_case
-from scenes.shapes import box, sphere
-from studies.bench import oracles
+from scenes.library.hard_cases import hard_case
+from scenes.library.things.shapes import box, sphere
 
 
 def room(mode: str = "flood", width: int = 24, height: int = 18) -> Scene:
@@ -29,7 +30,7 @@ def room(mode: str = "flood", width: int = 24, height: int = 18) -> Scene:
 
 
 def test_same_seed_same_bytes_with_one_and_two_threads():
-    from render.world import dr
+    from render.scene.traced_scene import dr
 
     threads = dr.thread_count()
     hashes = set()

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import render.caustics
-import render.glossy
-from render.caustics import thrown_light
-from render.glossy import ELSEWHERE, glossy_of
+import render.indirect.glossy
+import render.indirect.light_tracing
+from render.indirect.glossy import ELSEWHERE, glossy_of
+from render.indirect.light_tracing import thrown_light
+from render.pipeline import Traced, trace
+from render.scene.traced_scene import World
 from render.settings import Plan, RenderSettings
-from render.tracing import Traced, trace
-from render.world import World
 from scenes import Camera, Laser, Material, Scene, Surface
-from scenes.hard_cases import hard_case
-from scenes.shapes import sphere
+from scenes.library.hard_cases import hard_case
+from scenes.library.things.shapes import sphere
 
 WIDTH, HEIGHT, BATCHES = 16, 12, 16
 METAL = Material("roughconductor", roughness=0.1, eta=2.9, k=3.1)
@@ -66,7 +66,7 @@ def by_chance(monkeypatch):
     """Turns the paths that begin on polished surfaces off."""
 
     def off() -> None:
-        for module in (render.glossy, render.caustics):
+        for module in (render.indirect.glossy, render.indirect.light_tracing):
             monkeypatch.setattr(module, "glossy_of", lambda world: None)
 
     return off

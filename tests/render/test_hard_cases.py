@@ -8,11 +8,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from scene2spad.bench.hard.case import Case, Measured
+from scene2spad.bench.hard_cases import CASES, row, run
 from scenes import InputError
-from scenes.catalog import load_scene
-from scenes.hard_cases import SCENES
-from studies.bench.hard_case import Case, Measured
-from studies.bench.hard_cases import CASES, row, run
+from scenes.library.catalog import load_scene
+from scenes.library.hard_cases import SCENES
 
 PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] * case.slow) for case in CASES.values()]
 

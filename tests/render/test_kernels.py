@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from render.direct.footprints import trace
 from render.engine import render
-from render.footprint import trace
-from render.paths import trace_paths
+from render.indirect.camera_paths import trace_paths
+from render.indirect.launch_layout import BLOCK, block_order, turns_of
+from render.scene.traced_scene import World, dr
 from render.settings import RenderSettings
-from render.specular import specular_light
-from render.turns import BLOCK, block_order, turns_of
-from render.world import World, dr
+from render.specular.image_method import specular_light
 from scenes import Camera, Laser, Material, Scene, Surface
-from scenes.shapes import box, rectangle, sphere
+from scenes.library.things.shapes import box, rectangle, sphere
 
 SETTINGS = RenderSettings(bounces=3, spp=16, grid=2)
 

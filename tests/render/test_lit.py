@@ -5,14 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from render import lit, paths, sharing
-from render.paths import trace_paths
-from render.rays import laser_light
-from render.turns import BLOCK, block_order, turns_of
-from render.world import Float, UInt32, World, dr
+from render.indirect import camera_paths as paths
+from render.indirect import light_vertices as lit
+from render.indirect import reuse as sharing
+from render.indirect.camera_paths import trace_paths
+from render.indirect.launch_layout import BLOCK, block_order, turns_of
+from render.scene.rays import laser_light
+from render.scene.traced_scene import Float, UInt32, World, dr
+from scene2spad.bench.hard import oracles
 from scenes import Laser, Material, Scene, Surface
-from scenes.shapes import box, sphere
-from studies.bench import oracles
+from scenes.library.things.shapes import box, sphere
 
 LAMP = Laser("flood", cone_deg=360)
 KINDS = ("diffuse", "plastic", "roughplastic", "roughconductor", "dielectric")

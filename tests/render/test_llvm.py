@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from render import llvm
+from render.backend import llvm
 from scenes import InputError
 
 
@@ -21,7 +21,7 @@ def run(code: str, **environment: str) -> subprocess.CompletedProcess:
 
 START = """
 from scenes import InputError
-from render.llvm import start_mitsuba
+from render.backend.llvm import start_mitsuba
 try:
     mi = start_mitsuba()
 except InputError as error:
@@ -55,7 +55,7 @@ class Interrupting:
         if name == "drjit.detail":
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Interrupting())
-from render.llvm import start_mitsuba
+from render.backend.llvm import start_mitsuba
 try:
     start_mitsuba()
 except KeyboardInterrupt:
@@ -79,7 +79,7 @@ def test_old_explicit_library_is_refused_before_it_can_abort(version):
 def test_old_version_is_refused_also_when_drjit_was_imported_first(version):
     code = f"""
 import os
-from render.llvm import wheel_llvm
+from render.backend.llvm import wheel_llvm
 os.environ['DRJIT_LIBLLVM_PATH'] = str(wheel_llvm() or '')
 import drjit
 drjit.detail.llvm_version = lambda: {version}
@@ -111,7 +111,7 @@ drjit.detail.llvm_version = lambda: (15, 0, 6)
 
 def test_no_llvm_at_all_is_one_line():
     # a name that exists nowhere stands for a machine without any LLVM; the check of the variable is stepped over
-    code = START.replace("try:", "import render.llvm\nrender.llvm.choose_llvm = lambda: None\ntry:", 1)
+    code = START.replace("try:", "import render.backend.llvm\nrender.backend.llvm.choose_llvm = lambda: None\ntry:", 1)
     done = run(code, DRJIT_LIBLLVM_PATH="/nowhere/libLLVM.so")
     assert done.returncode == 0 and done.stdout.startswith("refused: "), done.stderr
     assert len(done.stdout.splitlines()) == 1 and done.stderr == ""

@@ -8,10 +8,10 @@ import pytest
 from scipy.special import erf
 
 from render.engine import render
+from render.scene.traced_scene import World, mi
 from render.settings import RenderSettings
-from render.world import World, mi
+from scene2spad.bench.hard import oracles
 from scenes import Material, Scene
-from studies.bench import oracles
 
 ROUGHNESS, PER_SIDE, DISTANCE_M = 0.4, 6, 2.0
 KINDS = {

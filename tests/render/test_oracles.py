@@ -8,9 +8,9 @@ import pytest
 from render.engine import render
 from render.settings import RenderSettings
 from render.transient import Transient
+from scene2spad.bench.hard import oracles
 from scenes import Ambient, Camera, Laser, Material, Scene, Surface, Texture
-from scenes.shapes import box, sphere
-from studies.bench import oracles
+from scenes.library.things.shapes import box, sphere
 
 DIRECT = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
 
@@ -121,7 +121,7 @@ def test_energy_equals_mitsuba_steady_render(bounces):
 
 
 def steady_by_mitsuba(scene: Scene, light: dict, *, max_depth: int, spp: int, seed: int) -> np.ndarray:
-    from render.world import World, mi
+    from render.scene.traced_scene import World, mi
 
     objects = {f"shape{i}": shape for i, shape in enumerate(World(scene).traced.shapes())}
     traced = mi.load_dict({"type": "scene", "light": light, **objects})

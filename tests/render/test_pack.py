@@ -8,7 +8,8 @@ import h5py
 import numpy as np
 import pytest
 
-from render.pack import (
+from render.transient import Transient
+from render.transient.packs import (
     AMBIENT_STEPS,
     DEPTH_STEP_M,
     FINER,
@@ -19,10 +20,9 @@ from render.pack import (
     rounded,
     write_pack,
 )
-from render.transient import Transient
 from scenes import InputError
 from scenes.files import ATTRIBUTE
-from scenes.hdf5 import add_checksum
+from scenes.io.hdf5 import add_checksum
 
 
 def transient(seed: int, height: int = 6, width: int = 5) -> Transient:
@@ -91,7 +91,7 @@ def test_rounding_changes_little_and_only_once():
 
 
 def test_a_pack_is_read_without_renderer_exr_or_command_line(packed):
-    program = f"import sys; from render.pack import read_pack; print(len(read_pack({str(packed)!r})),"
+    program = f"import sys; from render.transient.packs import read_pack; print(len(read_pack({str(packed)!r})),"
     program += " [m for m in ('mitsuba', 'drjit', 'OpenEXR', 'tyro', 'torch') if m in sys.modules])"
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert said.strip() == f"{len(VIEWS)} []"

@@ -8,11 +8,12 @@ import torch
 
 from render.engine import render
 from render.settings import RenderSettings
-from scenes import Ambient, Camera, InputError, Laser, Material, Scene, Surface, Texture, shapes
+from scenes import Ambient, Camera, InputError, Laser, Material, Scene, Surface, Texture
+from scenes.library.things import shapes
 from scenes.model import LASER_MODES, MATERIAL_KINDS
-from spad.depth import estimate_depth
-from spad.detect import sense
-from spad.sensor import PhotonBudget, Sensor
+from spad.detection.detect import sense
+from spad.estimators.depth import estimate_depth
+from spad.sensor.model import PhotonBudget, Sensor
 
 SEEDS = [*range(8), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 200))]
 

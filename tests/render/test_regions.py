@@ -8,19 +8,21 @@ import pytest
 
 from render.engine import render
 from render.error import response
+from render.indirect.path_space_filter import READERS, SHRINKING, octaves
+from render.pipeline import trace
 from render.planning import make_plan
-from render.regions import READERS, SHRINKING, octaves
-from render.returns import Samples, select
+from render.scene.traced_scene import World, dr
 from render.settings import RenderSettings
-from render.tracing import trace
-from render.world import World, dr
-from scenes import Camera, InputError, Laser, Material, Scene, Surface, hard_cases
-from scenes.hard_cases import hard_case
-from scenes.shapes import box, sphere
-from studies.bench import oracles, settings
-from studies.bench.binning import binned
-from studies.bench.hard_case import moments_of
-from studies.bench.oracles_optics import integrating_sphere
+from render.transient.samples import Samples, select
+from scene2spad.bench.hard import oracles
+from scene2spad.bench.hard.case import moments_of
+from scene2spad.bench.hard.oracles_optics import integrating_sphere
+from scene2spad.bench.rendering import settings
+from scene2spad.bench.rendering.binning import binned
+from scenes import Camera, InputError, Laser, Material, Scene, Surface
+from scenes.library import hard_cases
+from scenes.library.hard_cases import hard_case
+from scenes.library.things.shapes import box, sphere
 
 
 def room(width: int = 24, kind: str = "diffuse", **laser) -> Scene:
@@ -181,10 +183,10 @@ def test_bias_and_depth_under_a_flash():
     """Mean of 32 filtered runs of the flash scene: off by at most 0.5 % after the pulse, depth by 1 mm (median)."""
     import torch
 
-    from spad.depth import estimate_depth
-    from spad.sensor import Sensor
-    from studies.bench.errors import pulsed
-    from studies.bench.settings import BIN_M, BINS
+    from scene2spad.bench.rendering.errors import pulsed
+    from scene2spad.bench.rendering.settings import BIN_M, BINS
+    from spad.estimators.depth import estimate_depth
+    from spad.sensor.model import Sensor
 
     size, sensor = 64, Sensor()
     world = World(settings.bench_scene("flash", size))

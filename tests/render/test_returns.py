@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from render.returns import Samples, merge, packed, to_returns
+from render.transient.samples import Samples, merge, packed, to_returns
 
 
 def random_samples(seed: int, count: int, pixels: int = 5) -> Samples:

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from render.direct import centre_layers, direct_light
-from render.mirrors import check_slabs, find_mirrors, slab_error_m
-from render.specular import specular_light
-from render.world import World
+from render.direct.integrator import centre_layers, direct_light
+from render.scene.traced_scene import World
+from render.specular.image_method import specular_light
+from render.specular.mirrors import check_slabs, find_mirrors, slab_error_m
 from scenes import Camera, InputError, Laser, Material, Scene, Surface, Texture
-from scenes.shapes import axis_frame, box, sphere
+from scenes.library.things.shapes import axis_frame, box, sphere
 
 GOOD_MIRROR = Material("conductor", eta=0.0, k=1.0, specular=0.8, name="mirror")
 SILVER = Material("conductor", eta=0.2, k=3.0, name="silver")

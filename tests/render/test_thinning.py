@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from render.thinning import PULSE_M, thinned
 from render.transient import Transient
+from render.transient.thinning import PULSE_M, thinned
 
 
 def lone(seed: int) -> Transient:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from render.returns import Samples, merge, to_returns
 from render.transient import Transient, read_transient, write_transient
+from render.transient.samples import Samples, merge, to_returns
 from scenes import InputError
 from scenes.files import ATTRIBUTE
 

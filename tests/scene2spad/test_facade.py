@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import scene2spad as s2s
-from spad.depth import histogram_depth_m
+from spad.estimators.depth import histogram_depth_m
 
 HEAVY = ("mitsuba", "drjit", "torch", "matplotlib", "scipy", "h5py", "OpenEXR", "trimesh")
 
@@ -20,8 +20,8 @@ def test_importing_starts_nothing():
 
 
 def test_every_public_name_is_there_and_listed_once():
-    assert len(set(s2s.__all__)) == len(s2s.__all__) == len(s2s._HOME)
-    assert set(s2s.__all__) == set(s2s._HOME) <= set(dir(s2s))
+    assert len(set(s2s.__all__)) == len(s2s.__all__)
+    assert set(s2s.__all__) == {name for names in s2s._MODULE_OF.values() for name in names} <= set(dir(s2s))
     for name in s2s.__all__:
         assert getattr(s2s, name).__doc__, name
     assert s2s.__version__.count(".") == 2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scenes import InputError
-from scenes.catalog import SCENES, load_scene
+from scenes.library.catalog import SCENES, load_scene
 
 
 def size(scene):
@@ -111,7 +111,9 @@ def test_bad_sizes_are_one_line(width, height):
 
 
 def test_no_mesh_library_is_loaded_for_a_named_scene():
-    program = "import sys, scenes.catalog as c; c.load_scene('plane'); print([m for m in sys.modules if m in %r])"
+    program = (
+        "import sys, scenes.library.catalog as c; c.load_scene('plane'); print([m for m in %r if m in sys.modules])"
+    )
     heavy = ["trimesh", "mitsuba", "torch", "drjit", "PIL"]
     result = subprocess.run([sys.executable, "-c", program % heavy], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

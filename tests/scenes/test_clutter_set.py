@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from scenes import InputError, Scene, Texture
-from scenes.catalog import load_scene
-from scenes.clutter_set import NEAREST_M, clutter_view
-from scenes.edge_shapes import MAKERS, merged, random_rotation
-from scenes.sets import scene_set
+from scenes.library.catalog import load_scene
+from scenes.library.clutter_set import NEAREST_M, clutter_view
+from scenes.library.sets import scene_set
+from scenes.library.things.edge_shapes import MAKERS, merged, random_rotation
 
 VIEWS = range(8)
 
@@ -21,8 +21,8 @@ def view(index: int, split: str = "train") -> Scene:
 
 @cache
 def depth(index: int) -> np.ndarray:
-    from render.direct import centre_layers
-    from render.world import World
+    from render.direct.integrator import centre_layers
+    from render.scene.traced_scene import World
 
     return centre_layers(World(view(index))).depth_m
 
@@ -103,8 +103,8 @@ def test_materials_of_all_views_are_of_the_same_kinds():
 @pytest.mark.slow
 def test_depths_of_two_hundred_views():
     """From arm's length to the end of a hall: nothing under 0.3 m, most within rooms' depths, some beyond 8 m."""
-    from render.direct import centre_layers
-    from render.world import World
+    from render.direct.integrator import centre_layers
+    from render.scene.traced_scene import World
 
     seen = np.array([centre_layers(World(clutter_view(i, width=32, height=32))).depth_m for i in range(200)])
     assert np.isfinite(seen).all() and seen.min() >= NEAREST_M and seen.max() < 26

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from scene2spad.cli import main
 from scenes import InputError
-from scenes.catalog import load_scene
-from scenes.hard_cases import million_triangles
-from scenes.meshes import load_mesh
-from scenes.relief import RgbdFiles, middlebury, rgbd
-from studies.cli import main
+from scenes.io.meshes import load_mesh
+from scenes.io.relief import RgbdFiles, middlebury, rgbd
+from scenes.library.catalog import load_scene
+from scenes.library.hard_cases import million_triangles
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 PLY = "ply\nformat ascii 1.0\n{comment}element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"

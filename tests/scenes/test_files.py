@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from scenes import InputError
-from scenes import hdf5 as hdf5_module
 from scenes.files import open_seal, read_array, whole_file
-from scenes.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
+from scenes.io import hdf5 as hdf5_module
+from scenes.io.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
 
 
 def test_a_file_and_its_folder_are_flushed_before_and_after_the_rename(tmp_path, monkeypatch):
@@ -94,7 +94,7 @@ def test_a_damaged_mark_does_not_pass_for_a_file_of_an_earlier_version(tmp_path,
     for byte in (13, USER_BLOCK + 900):
         data[byte] ^= 4
     path.write_bytes(data)
-    monkeypatch.setattr("scenes.hdf5.in_child", lambda *_: pytest.fail("given to the library"))
+    monkeypatch.setattr("scenes.io.hdf5.in_child", lambda *_: pytest.fail("given to the library"))
     with pytest.raises(InputError, match="the mark of its checksum is damaged"), open_checked(path):
         pass
 
@@ -160,8 +160,8 @@ from pathlib import Path
 import h5py, json
 import readers
 from scenes import InputError
-from scenes.hdf5 import add_checksum
-from spad.histogram import read_histogram
+from scenes.io.hdf5 import add_checksum
+from spad.formats.histogram import read_histogram
 path = Path({str(tmp_path / "h.h5")!r})
 for extra in ("unknown", "counts"):
     readers.READERS["histogram"].make(path)

@@ -15,11 +15,11 @@ import trimesh
 from PIL import Image
 
 from scenes import InputError
-from scenes.catalog import load_scene
-from scenes.inputs import file_inside, parse_json, read_json_object, read_text, read_whole_lines, regular_file
-from scenes.relief import read_levels
-from scenes.set_index import read_set_index
-from scenes.textures import load_texture
+from scenes.io.inputs import file_inside, parse_json, read_json_object, read_text, read_whole_lines, regular_file
+from scenes.io.relief import read_levels
+from scenes.io.set_index import read_set_index
+from scenes.io.textures import load_texture
+from scenes.library.catalog import load_scene
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
 SIDE = 60_000  # of images that declare more pixels than any limit

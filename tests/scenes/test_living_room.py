@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scenes import InputError, Scene, Texture
-from scenes.living_room import HIGH, LOW, RUG_M, living_room
+from scenes.library.living_room import HIGH, LOW, RUG_M, living_room
 
 SEEDS = (0, 1, 2, 3)
 

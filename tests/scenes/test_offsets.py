@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from scenes import Camera, InputError, Material, Scene, Surface
+from scenes.library.things.shapes import box, rectangle, sphere
 from scenes.offsets import moved_away, pushed_along_rays
-from scenes.shapes import box, rectangle, sphere
 
 
 def camera(fov: float = 50.0) -> Camera:

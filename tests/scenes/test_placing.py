@@ -9,8 +9,8 @@ import xml_files
 
 from scenes import InputError
 from scenes.blackbody import planck_w_per_m2_nm, seen_radiance_w_per_m2_sr_nm, sunlit_sky_w_per_m2_sr_nm
-from scenes.catalog import load_scene
-from scenes.meshes import load_mesh
+from scenes.io.meshes import load_mesh
+from scenes.library.catalog import load_scene
 from scenes.placing import Placing, scaled
 
 # A tetrahedron whose tip lies along z, half a unit tall.
@@ -158,7 +158,7 @@ def test_refusals_name_the_way_round_before_meshes_are_read(tmp_path, body, said
 
 def test_render_takes_size_camera_laser_and_sunlight(tip, tmp_path, capfd):
     from render.transient import read_transient
-    from studies.cli import main
+    from scene2spad.cli import main
 
     out = tmp_path / "tip.exr"
     words = "--up z --scale 2 --from 1 1 4 --look-at 0 0.5 0 --fov 30 --baseline 0.05 0 0 --sunlight 5e4 --bare"
@@ -175,7 +175,7 @@ def test_render_takes_size_camera_laser_and_sunlight(tip, tmp_path, capfd):
 
 
 def test_a_scene_in_other_units_is_questioned(tmp_path, capfd):
-    from studies.cli import main
+    from scene2spad.cli import main
 
     command = ["render", "wall@2000", "--width", "8", "--bounces", "1", "--grid", "2", "--no-figure"]
     assert main([*command, "--out", str(tmp_path / "w.exr")]) == 0

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from scenes import Texture
-from scenes.relief import RgbdFiles, dequantised, filled, middlebury, middlebury_names, read_levels, relief, rgbd
+from scenes.io.relief import RgbdFiles, dequantised, filled, middlebury, middlebury_names, read_levels, relief, rgbd
 
 GREY = Texture(np.full((40, 60), 0.4, np.float32), "grey")
 
 
 def layers(scene):
-    from render.direct import centre_layers
-    from render.world import World
+    from render.direct.integrator import centre_layers
+    from render.scene.traced_scene import World
 
     found = centre_layers(World(scene))
     shape = scene.camera.height, scene.camera.width

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from scenes import InputError, Scene, Texture
-from scenes.catalog import load_scene
-from scenes.layout import Boxes, overlap, set_down
+from scenes.library.catalog import load_scene
+from scenes.library.layout import Boxes, overlap, set_down
+from scenes.library.rooms import VIEWS_PER_ROOM, _room, pieces, room_view
+from scenes.library.sets import scene_set
+from scenes.library.things.parts import Piece, box, joined, panel
+from scenes.library.things.patterns import on_one_sheet
 from scenes.model import Material
-from scenes.parts import Piece, box, joined, panel
-from scenes.patterns import on_one_sheet
-from scenes.rooms import VIEWS_PER_ROOM, _room, pieces, room_view
-from scenes.sets import scene_set
 
 VIEWS = (0, 5, 10, 15)  # of four rooms
 
@@ -25,8 +25,8 @@ def view(index: int, split: str = "train") -> Scene:
 
 @cache
 def depth(index: int) -> np.ndarray:
-    from render.direct import centre_layers
-    from render.world import World
+    from render.direct.integrator import centre_layers
+    from render.scene.traced_scene import World
 
     return centre_layers(World(view(index))).depth_m
 
@@ -156,9 +156,9 @@ def test_names_lead_to_views_and_wrong_ones_are_one_line():
 
 
 def test_tabletop_scenes_are_named_fixed_and_in_range():
-    from render.direct import centre_layers
-    from render.world import World
-    from scenes.tabletop import SCENES, tabletop
+    from render.direct.integrator import centre_layers
+    from render.scene.traced_scene import World
+    from scenes.library.tabletop import SCENES, tabletop
 
     assert len(SCENES) == 8
     for name in SCENES:
@@ -173,8 +173,8 @@ def test_tabletop_scenes_are_named_fixed_and_in_range():
 @pytest.mark.slow
 def test_depths_of_two_hundred_views():
     """Quantiles as NYUv2's: 0.5 to 7 m, median 2 to 3.5 m, under 1 % beyond 7 m; no view with over 2 % empty pixels."""
-    from render.direct import centre_layers
-    from render.world import World
+    from render.direct.integrator import centre_layers
+    from render.scene.traced_scene import World
 
     seen = np.array([centre_layers(World(room_view(i, width=32, height=32))).depth_m for i in range(200)])
     assert np.isnan(seen).mean(axis=1).max() <= 0.02

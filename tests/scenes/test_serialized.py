@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import xml_files
 
-from scenes import serialized
 from scenes.errors import InputError
+from scenes.io import serialized
 
 POINTS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0.5), (0, 1, 0)], float)
 FACES = np.array([(0, 1, 2), (0, 2, 3)])

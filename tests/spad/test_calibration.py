@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from scenes.errors import InputError
-from spad.calibration import (
+from spad.detection.saturation import draw_saturated
+from spad.sensor.model import Sensor
+from spad.sensor.pulse import Pulse
+from spad.zones.calibration import (
     PulseBasis,
     ZoneCapture,
     ZoneModel,
@@ -18,10 +21,7 @@ from spad.calibration import (
     poisson_deviance,
     standard_errors,
 )
-from spad.pulse import Pulse
-from spad.saturation import draw_saturated
-from spad.sensor import Sensor
-from spad.zones import ZoneArray, ZoneReturns, expected_zone_counts, zone_flux
+from spad.zones.sensor import ZoneArray, ZoneReturns, expected_zone_counts, zone_flux
 
 ZONES = ZoneArray((-0.2, 0.0, 0.2), (0.0, 0.0, 0.0), (0.1,) * 3, (0.1,) * 3)
 SENSOR = Sensor(name="s", bins=40, bin_width_s=1e-10, pulse=Pulse(1e-10))

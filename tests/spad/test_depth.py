@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scenes import Camera
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
-from spad.depth import (
+from spad.estimators.depth import (
     ESTIMATORS,
     METHODS,
     by_pixels,
@@ -22,10 +22,10 @@ from spad.depth import (
     histogram_depth_m,
     noise_free_bias_m,
 )
-from spad.histogram import Histogram
-from spad.matching import correlation, normalised_correlation
-from spad.sensor import PhotonBudget, Pulse, Sensor
-from spad.template import binned_pulse, pulse_taps
+from spad.estimators.matching import correlation, normalised_correlation
+from spad.formats.histogram import Histogram
+from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor.template import binned_pulse, pulse_taps
 
 REFERENCE = Sensor()
 WIDTH = REFERENCE.bin_width_s
@@ -84,7 +84,7 @@ def test_an_estimator_that_answers_late_is_put_right(monkeypatch: pytest.MonkeyP
     counts, _ = drawn(50, 5, 20, seed=2, sensor=SMALL)
     late = {name: lambda part, sensor, f=function: f(part, sensor) + 0.7 for name, function in ESTIMATORS.items()}
     other = Sensor(name="another", bins=64)  # its answer is not cached yet, and is not asked for again
-    monkeypatch.setattr("spad.depth.ESTIMATORS", late)
+    monkeypatch.setattr("spad.estimators.depth.ESTIMATORS", late)
     shifted = {method: estimate_depth(counts, other, method) for method in METHODS}
     monkeypatch.undo()
     for method in METHODS:
@@ -217,7 +217,7 @@ def test_chunks_shape_and_type_do_not_matter(method: str, monkeypatch: pytest.Mo
     assert torch.equal(estimate_depth(counts.to(torch.uint8), SMALL, method), depth)
     assert torch.equal(estimate_depth(counts[7], SMALL, method), depth[7])
     assert estimate_depth(counts[:0], SMALL, method).shape == (0,)
-    monkeypatch.setattr("spad.depth._CHUNK", {"cpu": 7 * 64, "cuda": 7 * 64})
+    monkeypatch.setattr("spad.estimators.depth._CHUNK", {"cpu": 7 * 64, "cuda": 7 * 64})
     assert [len(part) for part in _parts(counts)] == [7] * 8 + [4]
     assert torch.equal(estimate_depth(counts, SMALL, method), depth)
 

@@ -11,12 +11,12 @@ from scipy import stats
 from test_flux import transient_of
 
 from scenes import InputError
-from scenes.hdf5 import add_checksum
-from spad.detect import expected_in_pixel, sense
-from spad.flux import expected_counts, rates_for
-from spad.histogram import Histogram, read_histogram, write_histogram
-from spad.sensor import PhotonBudget, Sensor
-from spad.timestamps import counts_from_timestamps
+from scenes.io.hdf5 import add_checksum
+from spad.detection.detect import expected_in_pixel, sense
+from spad.detection.flux import expected_counts, rates_for
+from spad.formats.histogram import Histogram, read_histogram, write_histogram
+from spad.formats.timestamps import counts_from_timestamps
+from spad.sensor.model import PhotonBudget, Sensor
 
 REFERENCE = Sensor()
 

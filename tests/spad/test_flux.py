@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from render.transient import Transient
 from scenes import InputError
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
-from spad.flux import expected_counts, rates_for, signal_per_bin
-from spad.sensor import PhotonBudget, Pulse, Sensor
-from spad.template import binned_pulse, pulse_cdf
+from spad.detection.flux import expected_counts, rates_for, signal_per_bin
+from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor.template import binned_pulse, pulse_cdf
 
 REFERENCE = Sensor()
 

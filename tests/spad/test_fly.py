@@ -8,10 +8,10 @@ import torch
 from scipy import stats
 
 from scenes.errors import InputError
-from spad.flux import expected_counts, rates_for
-from spad.fly import Patch, packed_transients, sense_patches
-from spad.rgbd import transient_from_rgbd
-from spad.sensor import PhotonBudget, Sensor
+from spad.detection.flux import expected_counts, rates_for
+from spad.detection.training_patches import Patch, packed_transients, sense_patches
+from spad.formats.rgbd import transient_from_rgbd
+from spad.sensor.model import PhotonBudget, Sensor
 
 SENSOR = Sensor(bins=128, dark_count_rate_hz=(30.0, 0.0))
 

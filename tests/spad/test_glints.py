@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_flux import transient_of
 
-from spad.detect import sense
-from spad.glints import glint_warning, signal_shares
-from spad.sensor import PhotonBudget, Sensor
-from studies.cli.sensing import summary
+from scene2spad.cli.sensing import summary
+from spad.detection.detect import sense
+from spad.detection.glints import glint_warning, signal_shares
+from spad.sensor.model import PhotonBudget, Sensor
 
 SENSOR = Sensor()
 

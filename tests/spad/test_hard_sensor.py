@@ -10,10 +10,10 @@ from test_laws import same
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
-from spad.depth import METHODS, estimate_depth
-from spad.detect import sense, sense_timestamps
-from spad.histogram import read_histogram, write_histogram
-from spad.sensor import PhotonBudget, Pulse, Sensor
+from spad.detection.detect import sense, sense_timestamps
+from spad.estimators.depth import METHODS, estimate_depth
+from spad.formats.histogram import read_histogram, write_histogram
+from spad.sensor.model import PhotonBudget, Pulse, Sensor
 
 REFERENCE = Sensor()
 MODELS = ("poisson", "first-photon", "free-running")

@@ -9,8 +9,8 @@ from scipy import stats
 from test_flux import transient_of
 
 from scenes import InputError
-from spad.detect import expected_in_pixel, sense, sense_timestamps, stream_timestamps
-from spad.laws import (
+from spad.detection.detect import expected_in_pixel, sense, sense_timestamps, stream_timestamps
+from spad.detection.laws import (
     Detected,
     add_crosstalk,
     coates,
@@ -22,8 +22,8 @@ from spad.laws import (
     linearised,
     live_detections,
 )
-from spad.sensor import PhotonBudget, Pulse, Sensor
-from spad.timestamps import Timestamps
+from spad.formats.timestamps import Timestamps
+from spad.sensor.model import PhotonBudget, Pulse, Sensor
 
 REFERENCE = Sensor()
 SMALL = Sensor(name="small", bins=64)
@@ -47,7 +47,7 @@ def same(pixels: int, *returns: tuple[float, float, float]):
 @pytest.mark.parametrize("dense_from", [0.0, 4.0])
 def test_poisson_dispersion(rate: float, dense_from: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """`rate` detections a bin in 4000 pixels, photon by photon and bin by bin: mean and variance are the rate."""
-    monkeypatch.setattr("spad.exposure.DENSE_FROM", dense_from)
+    monkeypatch.setattr("spad.detection.exposure.DENSE_FROM", dense_from)
     bins, pixels = (4, 4000) if rate < 1e5 else (1, 400)
     sensor = Sensor(bins=bins, bin_width_s=1e-9)
     counts = sense(same(pixels, (1.0, 1.0, 1.0)), sensor, PhotonBudget(0, rate * bins), seed=3, model="poisson").counts
@@ -67,7 +67,7 @@ def test_photon_by_photon_and_bin_by_bin_are_one_law(monkeypatch: pytest.MonkeyP
     sensor = Sensor(bins=64, pulse=pulse, jitter=jitter)
     scene, budget = same(3000, (0.3, 0.5, 1.0), (1.85, 1.85, 0.5)), PhotonBudget(8, 4)
     by_photon = sense(scene, sensor, budget, seed=1, model="poisson").counts[0].sum(axis=0)
-    monkeypatch.setattr("spad.exposure.DENSE_FROM", 0.0)
+    monkeypatch.setattr("spad.detection.exposure.DENSE_FROM", 0.0)
     by_bin = sense(scene, sensor, budget, seed=2, model="poisson").counts[0].sum(axis=0)
     both = np.stack([by_photon, by_bin])
     assert stats.chi2_contingency(both[:, both.sum(axis=0) > 20]).pvalue > 1e-3
@@ -113,7 +113,7 @@ def test_first_photon_is_the_event_by_event_simulation(mean: float) -> None:
 
 @pytest.mark.parametrize("dense_from", [0.0, 1e9])
 def test_sense_draws_first_photons_by_either_route(dense_from: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spad.exposure.DENSE_FROM", dense_from)
+    monkeypatch.setattr("spad.detection.exposure.DENSE_FROM", dense_from)
     cycles = 500
     sensor = replace(SMALL, exposure_s=cycles * SMALL.period_s)
     scene, budget = same(600, (0.6, 0.7, 1.0)), PhotonBudget(600, 300)  # 1.8 detections a cycle

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from test_flux import transient_of
 
 from scenes.errors import InputError
-from spad.depth import estimate_depth
-from spad.detect import sense_timestamps
-from spad.linospad import (
+from spad.detection.detect import sense_timestamps
+from spad.estimators.depth import estimate_depth
+from spad.formats.linospad import (
     Capture,
     capture_of,
     pooling,
@@ -23,8 +23,8 @@ from spad.linospad import (
     resampled_sensor,
     write_linospad,
 )
-from spad.sensor import PhotonBudget, sensor_by_name
-from spad.timestamps import Timestamps
+from spad.formats.timestamps import Timestamps
+from spad.sensor.model import PhotonBudget, sensor_by_name
 
 LINOSPAD = sensor_by_name("linospad")
 LAWS = settings(deadline=None, derandomize=True, max_examples=30)

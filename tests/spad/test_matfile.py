@@ -13,15 +13,15 @@ import scipy.sparse
 from test_rgbd import made
 
 from scenes import InputError
-from spad.depth import histogram_depth_m
-from spad.detect import sense
-from spad.histogram import Histogram
-from spad.linospad import read_linospad
-from spad.mat import read_mat, write_mat
-from spad.matfile import checked_contents, load_mat, save_mat
-from spad.pulse import Pulse, SampledPulse
-from spad.rgbd import published_taps, transient_from_rgbd
-from spad.sensor import PhotonBudget, Sensor, sensor_by_name
+from spad.detection.detect import sense
+from spad.estimators.depth import histogram_depth_m
+from spad.formats.histogram import Histogram
+from spad.formats.linospad import read_linospad
+from spad.formats.mat import read_mat, write_mat
+from spad.formats.matfile import checked_contents, load_mat, save_mat
+from spad.formats.rgbd import published_taps, transient_from_rgbd
+from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.pulse import Pulse, SampledPulse
 
 
 def saved(path: Path, compressed: bool = False, **variables) -> Path:

@@ -13,12 +13,12 @@ from test_flux import transient_of
 from scenes.blackbody import sunlight_w_per_m2_nm
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
-from spad.budget import Optics
-from spad.detect import sense
-from spad.flux import rates_for
-from spad.mat import read_mat, write_mat
-from spad.rgbd import cosine_of_incidence, from_rgbd, published_taps, transient_from_rgbd
-from spad.sensor import PhotonBudget, Pulse, Sensor, sensor_by_name
+from spad.detection.detect import sense
+from spad.detection.flux import rates_for
+from spad.formats.mat import read_mat, write_mat
+from spad.formats.rgbd import cosine_of_incidence, from_rgbd, published_taps, transient_from_rgbd
+from spad.sensor.budget import Optics
+from spad.sensor.model import PhotonBudget, Pulse, Sensor, sensor_by_name
 
 TRAIN = sensor_by_name("iccv2023-train")
 LIGHT = 3e8

@@ -8,11 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scenes.errors import InputError
-from spad.budget import Optics
-from spad.pulse import Pulse, SampledPulse
-from spad.quantities import UNITS, format_quantity, parse_quantity
-from spad.sensor import PRESETS, Sensor
-from spad.sensor_files import (
+from spad.sensor.budget import Optics
+from spad.sensor.files import (
     DETECTOR,
     HISTOGRAM,
     OPTICS,
@@ -24,9 +21,12 @@ from spad.sensor_files import (
     sensor_names,
     write_sensor,
 )
-from spad.sensor_files import ZONES as ZONE_KEYS
-from spad.toml import read_toml
-from spad.zones import ZoneArray
+from spad.sensor.files import ZONES as ZONE_KEYS
+from spad.sensor.model import PRESETS, Sensor
+from spad.sensor.pulse import Pulse, SampledPulse
+from spad.sensor.quantities import UNITS, format_quantity, parse_quantity
+from spad.sensor.toml import read_toml
+from spad.zones.sensor import ZoneArray
 
 PLAIN = """name = "mine"
 [histogram]

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from spad.sensor import Pulse, Sensor
-from spad.template import (
+from spad.sensor.model import Pulse, Sensor
+from spad.sensor.template import (
     binned_pulse,
     binned_pulse_slope,
     pulse_cdf,

@@ -9,11 +9,11 @@ from scipy.stats import chi2
 
 from render.transient import Transient
 from scenes.errors import InputError
-from spad.pulse import Pulse
-from spad.saturation import draw_saturated, saturated, saturated_jacobian
-from spad.sensor import PhotonBudget, Sensor
-from spad.zone_histogram import sense_zones, with_budget, zone_grid
-from spad.zones import EFFECTS, ZoneArray, ZoneReturns, expected_zone_counts, zone_returns, zone_signal
+from spad.detection.saturation import draw_saturated, saturated, saturated_jacobian
+from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.pulse import Pulse
+from spad.zones.histogram import sense_zones, with_budget, zone_grid
+from spad.zones.sensor import EFFECTS, ZoneArray, ZoneReturns, expected_zone_counts, zone_returns, zone_signal
 
 SENSOR = Sensor(name="s", bins=64, bin_width_s=1e-10, pulse=Pulse(1e-10))
 TWO = ZoneArray((-0.2, 0.2), (0.0, 0.0), (0.3, 0.3), (0.5, 0.5))

@@ -23,12 +23,12 @@ from typing import Any
 
 from PIL import Image
 
-from csph.model import load_model
-from csph.torch_files import check_torch_file
-from render.pack import read_pack
+from csph.networks.model import load_model
+from csph.weights.torch_files import check_torch_file
 from render.transient import read_transient
+from render.transient.packs import read_pack
 from scenes.files import read_array
-from scenes.inputs import parse_json, read_whole_lines
+from scenes.io.inputs import parse_json, read_whole_lines
 
 SERVER = """
 import importlib, json, os, signal, sys, traceback
@@ -70,7 +70,7 @@ for line in sys.stdin:
 """
 # Not Mitsuba: Dr.Jit's threads would not live in a child.
 MODULES = ("torch", "pytorch_lightning", "matplotlib.pyplot", "OpenEXR", "skimage.metrics", "scipy.io", "h5py")
-MODULES += ("trimesh", "distributed", "csph.training", "spad.linospad", "studies.cli", "rich.progress")
+MODULES += ("trimesh", "distributed", "csph.training.loop", "spad.formats.linospad", "scene2spad.cli", "rich.progress")
 SECONDS = 300  # that no run may take
 
 
@@ -136,7 +136,7 @@ class Warm:
 
 def command(*argv: str, before: str = "") -> str:
     """Code that runs the command line."""
-    return f"{before}\nimport sys\nfrom studies.start import script\nsys.argv = {['scene2spad', *argv]!r}\nscript()"
+    return f"{before}\nimport sys\nfrom scene2spad.start import script\nsys.argv = {['scene2spad', *argv]!r}\nscript()"
 
 
 def _members(group: int) -> Iterator[list[str]]:

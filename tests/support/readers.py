@@ -22,7 +22,7 @@ class Reader:
 
 
 def _transient():
-    from spad.rgbd import transient_from_rgbd
+    from spad.formats.rgbd import transient_from_rgbd
 
     rng = np.random.default_rng(3)
     depth = rng.uniform(0.5, 6, (4, 6))
@@ -32,8 +32,8 @@ def _transient():
 
 
 def _histogram():
-    from spad.detect import sense
-    from spad.sensor import PhotonBudget, Sensor
+    from spad.detection.detect import sense
+    from spad.sensor.model import PhotonBudget, Sensor
 
     return sense(_transient(), Sensor(bins=64), PhotonBudget(20, 10), seed=1)
 
@@ -52,13 +52,13 @@ def _of_transient(transient) -> Numbers:
 
 
 def _write_histogram(path: Path) -> None:
-    from spad.histogram import write_histogram
+    from spad.formats.histogram import write_histogram
 
     write_histogram(_histogram(), path)
 
 
 def _read_histogram(path: Path) -> Numbers:
-    from spad.histogram import read_histogram
+    from spad.formats.histogram import read_histogram
 
     return _of_histogram(read_histogram(path))
 
@@ -76,26 +76,26 @@ def _read_transient(path: Path) -> Numbers:
 
 
 def _write_pack(path: Path) -> None:
-    from render.pack import rounded, write_pack
+    from render.transient.packs import rounded, write_pack
 
     write_pack([(rounded(_transient()), {"scene": "a"})] * 2, path)
 
 
 def _read_pack(path: Path) -> Numbers:
-    from render.pack import read_pack
+    from render.transient.packs import read_pack
 
     for transient in read_pack(path):
         yield from _of_transient(transient)
 
 
 def _write_frame(path: Path) -> None:
-    from spad.mat import write_mat
+    from spad.formats.mat import write_mat
 
     write_mat(_histogram(), path)
 
 
 def _read_frame(path: Path) -> Numbers:
-    from spad.mat import read_mat
+    from spad.formats.mat import read_mat
 
     return _of_histogram(read_mat(path))
 
@@ -103,7 +103,7 @@ def _read_frame(path: Path) -> Numbers:
 def _write_capture(path: Path) -> None:
     import scipy.sparse
 
-    from spad.linospad import Capture, write_linospad
+    from spad.formats.linospad import Capture, write_linospad
 
     counts = scipy.sparse.random(64, 16, 0.2, "csc", rng=np.random.default_rng(0))
     counts.data = np.ceil(9 * counts.data)
@@ -111,7 +111,7 @@ def _write_capture(path: Path) -> None:
 
 
 def _read_capture(path: Path) -> Numbers:
-    from spad.linospad import read_linospad, resampled
+    from spad.formats.linospad import read_linospad, resampled
 
     capture = read_linospad(path, bins=64)
     yield resampled(capture, 32, 2), False
@@ -120,10 +120,10 @@ def _read_capture(path: Path) -> Numbers:
 
 
 def _write_weights(path: Path) -> None:
-    from csph.config import ModelConfig, TrainConfig
-    from csph.design import Design
-    from csph.model import DepthModel, save_model
-    from spad.sensor import Sensor
+    from csph.codes.design import Design
+    from csph.networks.model import DepthModel, save_model
+    from csph.training.config import ModelConfig, TrainConfig
+    from spad.sensor.model import Sensor
 
     design = Design.named("learned", (16, 2, 2), codes=8)
     config = TrainConfig(model=ModelConfig(design=design, sensor=Sensor(bins=64)))
@@ -131,7 +131,7 @@ def _write_weights(path: Path) -> None:
 
 
 def _read_weights(path: Path) -> Numbers:
-    from csph.model import load_model
+    from csph.networks.model import load_model
 
     model, _, _ = load_model(path)
     return ((value.numpy(), False) for value in model.state_dict().values())
@@ -142,7 +142,7 @@ def _write_numbers(path: Path) -> None:
 
 
 def _read_pulse(path: Path) -> Numbers:
-    from spad.pulse import read_pulse
+    from spad.sensor.pulse import read_pulse
 
     yield np.array(read_pulse(path, 1e-11).samples), False
 
@@ -154,7 +154,7 @@ def _write_mesh(path: Path) -> None:
 
 
 def _read_scene(path: Path) -> Numbers:
-    from scenes.catalog import load_scene
+    from scenes.library.catalog import load_scene
 
     for surface in load_scene(str(path), width=16, height=12).surfaces:
         yield surface.vertices, False
@@ -182,7 +182,7 @@ def _write_image(path: Path) -> None:
 
 
 def _read_texture(path: Path) -> Numbers:
-    from scenes.textures import load_texture
+    from scenes.io.textures import load_texture
 
     yield load_texture(path).image, False
 
@@ -195,7 +195,7 @@ def _write_depth_image(path: Path) -> None:
 
 
 def _read_rgbd(path: Path) -> Numbers:
-    from scenes.relief import RgbdFiles, rgbd
+    from scenes.io.relief import RgbdFiles, rgbd
 
     photograph = path.parent / "photograph.bmp"
     if not photograph.is_file():
@@ -241,7 +241,7 @@ def _read_index(path: Path) -> Numbers:
     import tempfile
 
     from scenes.errors import InputError
-    from scenes.set_index import read_set_index
+    from scenes.io.set_index import read_set_index
 
     with tempfile.TemporaryDirectory() as folder:
         shutil.copy(path, Path(folder) / "index.jsonl")
@@ -259,7 +259,7 @@ def _write_state(path: Path) -> None:
     """The state of an interrupted run, small: what Lightning keeps, and two layers' weights."""
     import torch
 
-    from csph.resume import KEYS, WholeFileCheckpoints
+    from csph.training.resume import KEYS, WholeFileCheckpoints
 
     weights = torch.nn.Linear(7, 5, dtype=torch.float64).state_dict()
     weights = {name: torch.linspace(-1, 1, value.numel()).reshape(value.shape) for name, value in weights.items()}
@@ -270,8 +270,8 @@ def _write_state(path: Path) -> None:
 def _read_state(path: Path) -> Numbers:
     import torch
 
-    from csph.resume import check_resume
-    from csph.torch_files import load_torch_file
+    from csph.training.resume import check_resume
+    from csph.weights.torch_files import load_torch_file
 
     check_resume(path, torch.nn.Linear(7, 5))
     for value in load_torch_file(path)["state_dict"].values():
@@ -293,7 +293,7 @@ def _write_serialized(path: Path) -> None:
 
 
 def _read_serialized(path: Path) -> Numbers:
-    from scenes.serialized import read_serialized
+    from scenes.io.serialized import read_serialized
 
     found = read_serialized(path)
     yield found.vertices, True

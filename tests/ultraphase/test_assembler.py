@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from scenes.errors import InputError
 from ultraphase import ChipSpec, assemble, assemble_file, disassemble, listing, method
+from ultraphase.assembly.isa import DIRECTIONS, OPS, Instruction, decode, encode, spelled
 from ultraphase.catalog import FOLDER, PUBLISHED
-from ultraphase.isa import DIRECTIONS, OPS, Instruction, decode, encode, spelled
 
 DEFAULT = settings(deadline=None, derandomize=True, max_examples=80)
 

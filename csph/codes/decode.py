@@ -1,0 +1,90 @@
+"""Depth from codes by correlation over K, without a network: for codes of one pixel over all its time bins."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from csph.codes.tensor import CodingTensor, encode
+from scenes.errors import InputError
+from spad.estimators.depth import by_pixels, correlate, depth_in_range, grid_peak, noise_free_bias_m
+from spad.sensor.model import Sensor
+from spad.sensor.template import FINE_STEP, pulse_taps
+
+_TIE = 1e-6  # of the largest score: what float32 sums cannot tell apart
+
+
+@lru_cache(maxsize=8)
+def _templates(coding: CodingTensor, sensor: Sensor, device: str) -> Tensor:
+    """(T, G, K) float64: unit vectors P C h(tau) for arrivals at T bin centres and G steps of -1 to 1 bin around each.
+
+    P removes the direction C 1 that a uniform background takes: nothing where rows sum to zero (Fourier), the mean
+    over K for a coarse histogram. The mean over K is not removed where C 1 = 0: it would carry depth there, and of
+    K = 2 codes only a sign would be left.
+    """
+    taps = pulse_taps(sensor, device)
+    matrix = coding.tensor.flatten(1).double().to(device)
+    first = int(taps.shifts[0])
+    templates = torch.stack([correlate(matrix, step.unsqueeze(0), first, sensor).T for step in taps.fine], dim=1)
+    uniform = matrix.sum(-1)
+    uniform = torch.where(uniform.abs() > 1e-5 * matrix.abs().sum(-1), uniform, 0.0)
+    if uniform.any():
+        templates = templates - (templates @ uniform).unsqueeze(-1) * uniform / (uniform @ uniform)
+    return templates / templates.norm(dim=-1, keepdim=True).clamp(min=1e-30)
+
+
+def _first_peak(scores: Tensor) -> Tensor:
+    """Bin of the largest of (P, T) scores; the first of equals, not whichever rounding favours, and the middle of a
+    run of equals, as within the gates of a coarse histogram."""
+    top = scores >= scores.amax(-1, keepdim=True) - _TIE * scores.abs().amax(-1, keepdim=True)
+    first = top.byte().argmax(-1, keepdim=True)
+    beyond = ~top & (torch.arange(scores.shape[-1], device=scores.device) > first)
+    end = torch.where(beyond.any(-1), beyond.byte().argmax(-1), scores.shape[-1])
+    return (first.squeeze(-1) + end - 1) // 2
+
+
+def _raw_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
+    templates = _templates(coding, sensor, str(codes.device))
+    centre = templates.shape[1] // 2
+    coarse = templates[:, centre].float().T
+
+    def one(part: Tensor) -> Tensor:
+        peak = _first_peak(part.float() @ coarse)
+        # In float64: of K = 2 codes the score changes by 3e-7 over an eighth of one of 1024 bins.
+        scores = (templates[peak] @ part.double().unsqueeze(-1)).squeeze(-1)
+        bins = peak + 0.5 + (grid_peak(scores) - centre) * FINE_STEP
+        return torch.where(part.any(-1), bins, math.nan)
+
+    return by_pixels(one, codes, max(coding.bins, templates[0].numel())) * sensor.bin_depth_m
+
+
+@lru_cache(maxsize=32)
+def _bias_m(coding: CodingTensor, sensor: Sensor) -> float:
+    return noise_free_bias_m(lambda counts: _raw_depth(encode(counts, coding), coding, sensor), sensor)
+
+
+def decode_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
+    """Depth [m] at the highest score <y, C h(tau)> / |C h(tau)| over arrivals tau, (..., K) -> (...,) float32.
+
+    h(tau) is the binned pulse. Searched over the bin centres, then over a grid of eighths of a bin and a parabola; of
+    equal scores the first, of neighbours that score alike their middle; the noise-free answer is subtracted as in
+    `spad.estimators.depth`. NaN where all codes are zero. Raises InputError for another number of codes or bins, and
+    codes that are not finite.
+    """
+    if coding.bins != sensor.bins:
+        raise InputError(f"coding tensor {coding.name} has {coding.bins} bins, sensor {sensor.name} has {sensor.bins}")
+    if coding.codes < 2:
+        raise InputError(f"{coding.name}: 1 code tells nothing but a sign, correlation over K needs 2 or more")
+    if codes.ndim < 1 or codes.shape[-1] != coding.codes:
+        raise InputError(
+            f"codes of shape {tuple(codes.shape)}: the last axis must be the {coding.codes} of {coding.name}"
+        )
+    if not codes.numel():
+        return torch.empty(codes.shape[:-1], device=codes.device)
+    if not bool(codes.isfinite().all()):
+        raise InputError(f"codes of {coding.name} are not all finite")
+    depth = _raw_depth(codes.reshape(-1, coding.codes), coding, sensor) - _bias_m(coding, sensor)
+    return depth_in_range(depth, sensor).reshape(codes.shape[:-1])

@@ -1,0 +1,134 @@
+"""`Design`: which coding tensor, told in a few words, and what it costs. Needs no torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from scenes.errors import InputError, did_you_mean, require
+
+CODES = ("learned", "fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
+_QUARTER_WAVE = ("fourier", "gray", "fourier-published", "gray-published")
+_COUNTED = ("coarse", "hadamard")  # an entry follows from its place: nothing is stored
+
+
+@dataclass(frozen=True)
+class Design:
+    """K codes over blocks of Mt bins x Mr rows x Mc columns.
+
+    code             temporal part: learned, or fixed to one of the codes of `csph.codes.temporal`
+    block            (Mt, Mr, Mc)
+    codes            K
+    full             every entry a number of its own, instead of temporal x spatial (learned and random alone)
+    spatial_learned  the spatial part of a fixed temporal code is learned ("fourier+learned")
+    zero_mean        rows are held to sum to zero over Mt; None: all but coarse histograms, as published
+    """
+
+    code: str = "learned"
+    block: tuple[int, int, int] = (256, 4, 4)
+    codes: int = 32
+    full: bool = False
+    spatial_learned: bool = True
+    zero_mean: bool | None = None
+
+    def __post_init__(self) -> None:
+        meant = did_you_mean(self.code, CODES)
+        require(self.code in CODES, f"design {self.code!r} is unknown{meant}, expected one of {', '.join(CODES)}")
+        good = len(self.block) == 3 and all(isinstance(n, int) and n >= 1 for n in self.block)
+        require(good, f"block {self.block}: expected three positive numbers of bins, rows and columns")
+        most = self.size if self.code in ("learned", "random") else self.block[0]
+        said = f"{self.codes} codes over a block of {self.block_name}, expected 1 to {most} for {self.code} codes"
+        require(1 <= self.codes <= most, said)
+        free = self.code in ("learned", "random")
+        require(free or not self.full, f"design {self.code}: full coding tensors are learned or random")
+        if self.zero_mean is None:
+            object.__setattr__(self, "zero_mean", self.code != "coarse")
+
+    @classmethod
+    def named(
+        cls,
+        name: str,
+        block: tuple[int, int, int],
+        *,
+        codes: int | None = None,
+        compression: float | None = None,
+        full: bool = False,
+    ) -> Design:
+        """From a name as the command line has it: a code, or CODE+learned with a learned spatial part.
+
+        K is given, or follows from the compression ratio Mt Mr Mc / K, which must divide. A fixed code alone has no
+        spatial part: over several pixels it needs +learned. Raises InputError.
+        """
+        code, plus, second = name.partition("+")
+        require(not plus or second == "learned", f"design {name!r}: expected CODE or CODE+learned")
+        known = f"expected one of {', '.join(CODES)}, or CODE+learned"
+        require(code in CODES, f"design {name!r} is unknown{did_you_mean(code, CODES)}, {known}")
+        alone = code in ("learned", "random") or plus or math.prod(block[1:]) == 1
+        require(bool(alone), f"design {name!r} over {block[1]} x {block[2]} pixels has no spatial part: {code}+learned")
+        if (codes is None) == (compression is None):
+            raise InputError(f"design {name!r}: give the number of codes or the compression ratio, one of them")
+        if codes is None:
+            codes = codes_for(block, compression)
+        return cls(code, tuple(block), codes, full=full, spatial_learned=code == "learned" or bool(plus))
+
+    @property
+    def size(self) -> int:
+        """M = Mt Mr Mc, counts of one block."""
+        return math.prod(self.block)
+
+    @property
+    def block_name(self) -> str:
+        return " x ".join(map(str, self.block))
+
+    @property
+    def has_spatial(self) -> bool:
+        """Whether there is a spatial factor: a separable tensor over more than one pixel."""
+        return not self.full and math.prod(self.block[1:]) > 1
+
+    @property
+    def name(self) -> str:
+        """As in "fourier+learned 256x4x4 K32"."""
+        plus = "+learned" if self.has_spatial and self.spatial_learned and self.code != "learned" else ""
+        return f"{'full ' if self.full else ''}{self.code}{plus} {'x'.join(map(str, self.block))} K{self.codes}"
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """The parts that training changes: temporal, spatial."""
+        spatial = self.has_spatial and (self.code == "learned" or self.spatial_learned)
+        return (("temporal",) if self.code == "learned" else ()) + (("spatial",) if spatial else ())
+
+    @property
+    def compression_ratio(self) -> float:
+        """Mt Mr Mc / K"""
+        return self.size / self.codes
+
+    @property
+    def spatial_parameters(self) -> int:
+        return self.codes * math.prod(self.block[1:]) if self.has_spatial else 0
+
+    @property
+    def parameters(self) -> int:
+        """K Mt Mr Mc of a full tensor, K Mt + K Mr Mc of a separable one, K Mt over single pixels."""
+        return self.codes * (self.size if self.full else self.block[0]) + self.spatial_parameters
+
+    @property
+    def computed(self) -> int | None:
+        """Numbers from which the temporal part is computed on the fly: a quarter wave, Mt/4, for Fourier codes
+        whatever K (supplement S.2), none for gates and Walsh functions; None where every entry is stored."""
+        if self.code in _QUARTER_WAVE:
+            return math.ceil(self.block[0] / 4)
+        return 0 if self.code in _COUNTED else None
+
+    @property
+    def storage(self) -> int:
+        """Numbers that a sensor stores: `parameters`, with the temporal part computed on the fly where it can be."""
+        return self.parameters if self.computed is None else self.computed + self.spatial_parameters
+
+
+def codes_for(block: tuple[int, int, int], compression: float) -> int:
+    """K = Mt Mr Mc / CR. Raises InputError unless it is a whole number of at least 1."""
+    size = math.prod(block)
+    whole = math.isfinite(compression) and compression > 0 and size % compression == 0 and size >= compression
+    said = f"compression ratio {compression:g} does not divide the {size} counts of a block of"
+    require(whole, f"{said} {' x '.join(map(str, block))}")
+    return int(size / compression)

@@ -1,0 +1,107 @@
+"""Coding tensors in 8 bits and sums in 16: what an in-pixel core computes, and how often it overflows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from csph.codes.blocks import encode_blocks
+from csph.codes.tensor import CodingTensor
+
+Int8Rule = Literal["calibrated", "published"]
+INT8_RULES: tuple[str, ...] = get_args(Int8Rule)
+LEVELS = 127  # +-: symmetric, -128 is left out so that a sign can always be turned
+PRODUCT_SHIFT = 7  # bits that the product of two 8-bit factors is shifted by, back into 8 bits
+ACCUMULATOR_BITS = 16
+# 255 steps over [-1, 1] for every factor; in single precision as published, so that 1 is 127 steps and not 127.5
+PUBLISHED_STEP = float(np.float32(2 / 255))
+
+
+@dataclass(frozen=True, eq=False)
+class Quantised:
+    """An 8-bit coding tensor: C is about scale x tensor.
+
+    tensor             (K, Mt, Mr, Mc) int8. Of separable tensors the product of the factors as integers, rounded by a
+                       shift: (temporal x spatial + 64) >> 7
+    scale              value of one step of `tensor`
+    temporal, spatial  the int8 factors, (K, Mt) or (K, Mt, Mr, Mc), and (K, Mr, Mc) or None
+    temporal_scale, spatial_scale   value of one step of each
+    """
+
+    name: str
+    tensor: np.ndarray
+    scale: float
+    temporal: np.ndarray
+    temporal_scale: float
+    spatial: np.ndarray | None
+    spatial_scale: float
+
+    def coding(self) -> CodingTensor:
+        """The values that the 8-bit tensor stands for."""
+        return CodingTensor(
+            f"{self.name} int8", torch.from_numpy(self.tensor.astype(np.float32) * np.float32(self.scale))
+        )
+
+
+def _to_int8(values: Tensor, scale: float | None = None) -> tuple[np.ndarray, float]:
+    """Round to steps of `scale` (default: 1/127 of the largest magnitude), clamped to +-127; and the scale."""
+    array = values.double().cpu().numpy()
+    if scale is None:
+        scale = float(np.abs(array).max()) / LEVELS or 1.0
+    return np.clip(np.rint(array / scale), -LEVELS, LEVELS).astype(np.int8), scale
+
+
+def quantised(coding: CodingTensor) -> Quantised:
+    """Round every factor to the nearest of 255 steps between plus and minus its largest magnitude.
+
+    This is what an in-pixel core computes with: one 8-bit tensor, of separable factors their product in integers.
+    """
+    temporal, temporal_scale = _to_int8(coding.temporal)
+    if coding.spatial is None:
+        tensor = temporal.reshape(coding.codes, *coding.block)
+        return Quantised(coding.name, tensor, temporal_scale, temporal, temporal_scale, None, 1.0)
+    spatial, spatial_scale = _to_int8(coding.spatial)
+    product = temporal[:, :, None, None].astype(np.int16) * spatial[:, None].astype(np.int16)
+    tensor = ((product + (1 << PRODUCT_SHIFT - 1)) >> PRODUCT_SHIFT).astype(np.int8)
+    scale = temporal_scale * spatial_scale * (1 << PRODUCT_SHIFT)
+    return Quantised(coding.name, tensor, scale, temporal, temporal_scale, spatial, spatial_scale)
+
+
+def published_int8(coding: CodingTensor) -> CodingTensor:
+    """Round every factor to the published 8 bits, q = round(127.5 w), and return the values that they stand for.
+
+    Each factor (temporal, spatial, or the full tensor) has steps of 2/255 whatever its largest value, and factors are
+    multiplied in floating point: an emulation, not what one 8-bit tensor holds (`quantised`). Weights beyond +-1 are
+    clamped, where the published code wraps around. It also casts counts to 8 bits; here they stay as they are.
+    """
+
+    def rounded(part: Tensor) -> Tensor:
+        steps, scale = _to_int8(part, PUBLISHED_STEP)
+        return torch.from_numpy(steps.astype(np.float32) * np.float32(scale))
+
+    spatial = None if coding.spatial is None else rounded(coding.spatial)
+    return replace(coding, name=f"{coding.name} int8 as published", temporal=rounded(coding.temporal), spatial=spatial)
+
+
+class IntegerCodes(NamedTuple):
+    """codes (B, K, T/Mt, R/Mr, C/Mc) int16 as a 16-bit accumulator holds them at the end; `overflows`, how many of them
+    lie outside its range and so have wrapped around."""
+
+    codes: Tensor
+    overflows: int
+
+
+def encode_int16(counts: Tensor, tensor: Quantised) -> IntegerCodes:
+    """Sums of 8-bit weights in 16-bit accumulators that wrap around: (B, 1, T, R, C) -> int16 codes.
+
+    Wrapping is modular, so the result does not depend on the order of detections, and a sum that leaves the range and
+    comes back is right. Exact for up to 2^53 / 127 photons a block. Raises InputError as `encode_blocks` does.
+    """
+    exact = encode_blocks(counts, torch.from_numpy(tensor.tensor).double()).round().to(torch.int64)
+    half = 1 << ACCUMULATOR_BITS - 1
+    wrapped = torch.remainder(exact + half, 2 * half) - half
+    return IntegerCodes(wrapped.to(torch.int16), int((wrapped != exact).sum()))

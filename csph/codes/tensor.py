@@ -1,0 +1,169 @@
+"""`CodingTensor`: the K codes of a block of Mt bins x Mr rows x Mc columns, full or separable, and what it costs.
+
+A block keeps K codes y_k = sum over (t, r, c) of C[k, t, r, c] n[t, r, c] instead of Mt Mr Mc counts; a detection adds
+one column of C.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from csph.codes.photons import encode_photons, photon_table
+from scenes.errors import InputError, require
+from spad.estimators.depth import by_pixels
+
+
+@dataclass(frozen=True, eq=False)
+class CodingTensor:
+    """K codes over a block of Mt bins x Mr rows x Mc columns.
+
+    name      what it is called in results
+    temporal  (K, Mt) float32; of a full tensor (K, Mt, Mr, Mc)
+    spatial   (K, Mr, Mc) float32 of a separable tensor, C[k, t, r, c] = temporal[k, t] spatial[k, r, c]; else None
+    computed  how many numbers generate the temporal part on the fly, whatever K (Fourier: Mt/4, a quarter wave);
+              None where it is stored entry by entry
+    """
+
+    name: str
+    temporal: Tensor
+    spatial: Tensor | None = None
+    computed: int | None = None
+
+    def __post_init__(self) -> None:
+        for label, ranks, layout in (
+            ("temporal", (2, 4), "(K, Mt) or (K, Mt, Mr, Mc)"),
+            ("spatial", (3,), "(K, Mr, Mc)"),
+        ):
+            part = getattr(self, label)
+            if part is None and label == "spatial":
+                continue
+            part = as_tensor(part)
+            shape = tuple(part.shape)
+            if part.ndim not in ranks or 0 in shape or not bool(part.isfinite().all()):
+                raise InputError(
+                    f"coding tensor {self.name}: {label} part of shape {shape}, expected finite values {layout}"
+                )
+            object.__setattr__(self, label, part.detach().float())
+        if self.spatial is not None:
+            alike = self.temporal.ndim == 2 and len(self.spatial) == len(self.temporal)
+            shapes = f"temporal part {tuple(self.temporal.shape)} and spatial part {tuple(self.spatial.shape)}"
+            require(alike, f"coding tensor {self.name}: {shapes}, expected (K, Mt) and (K, Mr, Mc)")
+        size = self.bins * self.rows * self.columns
+        require(self.codes <= size, f"coding tensor {self.name}: {self.codes} codes of a block of {size} counts")
+
+    @property
+    def codes(self) -> int:
+        """K"""
+        return self.temporal.shape[0]
+
+    @property
+    def bins(self) -> int:
+        """Mt"""
+        return self.temporal.shape[1]
+
+    @property
+    def rows(self) -> int:
+        """Mr"""
+        return self.block[1]
+
+    @property
+    def columns(self) -> int:
+        """Mc"""
+        return self.block[2]
+
+    @property
+    def block(self) -> tuple[int, int, int]:
+        """(Mt, Mr, Mc)"""
+        spatial = self.temporal.shape[2:] if self.spatial is None else self.spatial.shape[1:]
+        return (self.bins, *(spatial or (1, 1)))
+
+    @property
+    def is_full(self) -> bool:
+        """Whether every entry of the tensor is a number of its own."""
+        return self.temporal.ndim == 4
+
+    @cached_property
+    def tensor(self) -> Tensor:
+        """(K, Mt, Mr, Mc) float32"""
+        return full_tensor(self.temporal, self.spatial)
+
+    @cached_property
+    def table(self) -> Tensor:
+        """The tensor as `encode_photons` wants it, one row of K a place in the block."""
+        return photon_table(self.tensor)
+
+    @property
+    def compression_ratio(self) -> float:
+        """Mt Mr Mc / K"""
+        return self.bins * self.rows * self.columns / self.codes
+
+    @property
+    def parameters(self) -> int:
+        """Numbers that make the tensor: K Mt Mr Mc if full, K Mt + K Mr Mc if separable."""
+        return self.temporal.numel() + (0 if self.spatial is None else self.spatial.numel())
+
+    @property
+    def storage(self) -> int:
+        """Numbers that a sensor stores where it computes the temporal part on the fly (supplement S.2): Mt/4 + K Mr Mc
+        for Fourier codes; else `parameters`."""
+        temporal = self.temporal.numel() if self.computed is None else self.computed
+        return temporal + self.parameters - self.temporal.numel()
+
+
+def full_tensor(temporal: Tensor, spatial: Tensor | None) -> Tensor:
+    """C[k, t, r, c] = temporal[k, t] spatial[k, r, c], or the full tensor that `temporal` is: (K, Mt, Mr, Mc)."""
+    if temporal.ndim == 4:
+        return temporal
+    wide = temporal[..., None, None]
+    return wide if spatial is None else wide * spatial.unsqueeze(1)
+
+
+def _per_pixel(coding: CodingTensor) -> None:
+    single = coding.rows == coding.columns == 1
+    require(single, f"coding tensor {coding.name} is over {coding.rows} x {coding.columns} pixels, expected 1 x 1")
+
+
+def as_tensor(values: Tensor | np.ndarray) -> Tensor:
+    """Return a tensor as it is, and a numpy array as one, copied where it is read-only, as arrays of files are.
+
+    Raises InputError for anything else.
+    """
+    if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
+        return torch.from_numpy(np.require(values, requirements=["C", "W"]))
+    require(isinstance(values, Tensor), f"expected a tensor or an array of numbers, got {type(values).__name__}")
+    return values
+
+
+def encode(counts: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
+    """y = C n of every pixel: counts (..., T) -> codes (..., K) float32, C over one pixel and all T bins.
+
+    `counts` may be a numpy array. Raises InputError for another number of bins.
+    Blocks of several pixels: `csph.codes.blocks.encode_blocks`.
+    """
+    _per_pixel(coding)
+    counts = as_tensor(counts)
+    if counts.ndim < 1 or counts.shape[-1] != coding.bins:
+        shape = tuple(counts.shape)
+        raise InputError(f"histogram of shape {shape}: the last axis must be the {coding.bins} bins of {coding.name}")
+    if not counts.numel():
+        return torch.empty((*counts.shape[:-1], coding.codes), device=counts.device)
+    columns = coding.tensor.flatten(1).to(counts.device).T
+    codes = by_pixels(lambda part: part.float() @ columns, counts.reshape(-1, coding.bins))
+    return codes.reshape(*counts.shape[:-1], coding.codes)
+
+
+def encode_timestamps(timestamps: Tensor, offsets: Tensor, coding: CodingTensor) -> Tensor:
+    """Sum of the columns of C that a pixel's detections name, without a histogram: (P, K) float32.
+
+    timestamps (N,) bin of each detection, any integer type, pixel after pixel; offsets (P + 1,) where each pixel's
+    begin, and the end: 0 .. N. A pixel without detections gives zeros. Raises InputError for bad offsets or bins.
+    """
+    _per_pixel(coding)
+    table = coding.table.to(timestamps.device)
+    codes = encode_photons(timestamps, offsets, table, coding.block, (coding.bins, 1, 1), name=coding.name)
+    return codes.flatten(1)

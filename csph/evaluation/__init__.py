@@ -1,0 +1,1 @@
+"""Compare depth methods on the same photons: the 16 levels, figures of merit, memory."""

@@ -1,0 +1,179 @@
+"""Depth methods on rendered views at the 16 photon levels: every method sees the same photons.
+
+A method is any function of a histogram. What it gives is compared with the truth image by image, and summed up over
+all, low and high signal-to-background levels, with intervals by bootstrap over scenes (`csph.evaluation.metrics`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from csph.evaluation.metrics import (
+    PHOTON_LEVELS,
+    TOLERANCES_MM,
+    Interval,
+    bias_by_depth,
+    bootstrap_mean,
+    grouped_errors,
+    is_low_sbr,
+    paired_difference,
+)
+from csph.networks.posterior import Decoder
+from csph.training.views import Views
+from render.backend.malloc import keep_freed_memory
+from scenes.errors import require
+from spad.detection.detect import sense
+from spad.formats.histogram import TRUTH, Histogram
+from spad.sensor.model import PhotonBudget, Sensor
+
+STAGE_EVALUATE = 34
+PIXELS = ("all", "unmixed", "mixed")
+FIGURES = ("mae_mm", "rmse_mm", *(f"within_{t}mm" for t in TOLERANCES_MM))
+LEVEL_GROUPS: dict[str, Callable[[float, float], bool]] = {
+    "all": lambda signal, background: True,
+    "low_sbr": is_low_sbr,
+    "high_sbr": lambda signal, background: not is_low_sbr(signal, background),
+}
+
+Method = Callable[[Histogram], np.ndarray]
+Progress = Callable[[str, float], None]
+
+
+class FindsDepth(Protocol):
+    """What evaluation asks of a model, or of what stands for one."""
+
+    def depth_of(self, histogram: Histogram, *, decoder: Decoder | None = None) -> tuple[np.ndarray, int]: ...
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one group of pixels of one image; `pixels` counted, `missing` had no estimate and were left out."""
+
+    method: str
+    scene: str
+    view: int
+    signal: float
+    background: float
+    group: str
+    mae_mm: float
+    rmse_mm: float
+    within_1mm: float
+    within_5mm: float
+    within_10mm: float
+    within_20mm: float
+    ssim: float
+    pixels: int
+    missing: int
+    beyond_range: int
+
+
+@dataclass
+class Evaluation:
+    """Rows of every method and image, and each method's estimates beside the truth, for what depends on depth."""
+
+    rows: list[Row] = field(default_factory=list)
+    depths: dict[str, list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
+
+    def values(
+        self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
+    ) -> dict[str, np.ndarray]:
+        """{scene: (methods, images)} of a figure; several methods are trainings of one design by different seeds."""
+        chosen, found = LEVEL_GROUPS[levels], {}
+        for row in self.rows:
+            if row.method in methods and row.group == group and chosen(row.signal, row.background):
+                by_method = found.setdefault(row.scene, {name: [] for name in methods})
+                by_method[row.method].append(getattr(row, figure))
+        return {scene: np.array([*by_method.values()]) for scene, by_method in found.items()}
+
+    def interval(
+        self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
+    ) -> Interval | None:
+        """Mean over scenes with its bootstrap interval; None where there is no finite value."""
+        found = self.values(methods, group, levels, figure)
+        return bootstrap_mean(found) if any(np.isfinite(v).any() for v in found.values()) else None
+
+    def difference(self, first: Sequence[str], second: Sequence[str], levels: str = "all") -> Interval:
+        """Paired difference of MAE [mm], first - second, over scenes and levels."""
+        return paired_difference(self.values(first, levels=levels), self.values(second, levels=levels))
+
+    def summary(self, methods: Sequence[str]) -> dict[str, Any]:
+        """Figures by level group and pixel group (means over scenes), intervals of the MAE, and the bias by depth."""
+        table: dict[str, Any] = {}
+        for levels in LEVEL_GROUPS:
+            table[levels] = {}
+            for group in PIXELS:
+                figures = (*FIGURES, "ssim") if group == "all" else FIGURES
+                found = {name: self.interval(methods, group, levels, name) for name in figures}
+                line: dict[str, Any] = {name: None if i is None else i.mean for name, i in found.items()}
+                mae = found["mae_mm"]
+                line["mae_interval_mm"] = None if mae is None else [mae.low, mae.high]
+                table[levels][group] = line
+        estimate, truth = (
+            np.concatenate(parts) for parts in zip(*(pair for m in methods for pair in self.depths[m]), strict=True)
+        )
+        far = math.ceil(float(np.nanmax(truth, initial=1.0)))
+        return {**table, "bias_by_depth": [b._asdict() for b in bias_by_depth(estimate, truth, range(far + 1))]}
+
+
+def evaluate(
+    methods: Mapping[str, Method],
+    views: Views,
+    sensor: Sensor,
+    *,
+    levels: Sequence[tuple[float, float]] = PHOTON_LEVELS,
+    tile: tuple[int, int] = (1, 1),
+    offset_m: float = 0.0,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Sense every view at every level and apply all methods to it.
+
+    After sensing, images are cut to what tiles of `tile` rows and columns cover. `offset_m` moves the scenes away in
+    time alone (`Transient.delayed`); sets rendered with other offsets are given as they are. Raises InputError for an
+    empty set or no method, an image smaller than a tile, and what the methods raise.
+    """
+    require(bool(views.transients) and bool(methods), "evaluation: no view or no method")
+    keep_freed_memory()
+    say, result = progress or (lambda what, share: None), Evaluation(depths={name: [] for name in methods})
+    total = len(views.transients) * len(levels)
+    for view, (transient, scene) in enumerate(zip(views.transients, views.scenes, strict=True)):
+        moved = transient.delayed(offset_m) if offset_m else transient
+        for number, (signal, background) in enumerate(levels):
+            say(f"{scene}, {signal:g} + {background:g} photons", (view * len(levels) + number) / total)
+            draw = np.random.SeedSequence(seed, spawn_key=(STAGE_EVALUATE, view, number)).generate_state(1)[0]
+            histogram = sense(moved, sensor, PhotonBudget(signal, background), seed=int(draw), model="poisson")
+            histogram = _tiled(histogram, tile)
+            for name, method in methods.items():
+                estimate = method(histogram)
+                result.rows += _rows(name, scene, view, (signal, background), estimate, histogram)
+                known = np.isfinite(histogram.depth_m) & (histogram.depth_m < sensor.range_m)
+                result.depths[name].append((estimate[known], histogram.depth_m[known]))
+    return result
+
+
+def _tiled(histogram: Histogram, tile: tuple[int, int]) -> Histogram:
+    """Its first rows and columns, as many as tiles cover; InputError where not one fits."""
+    size = histogram.depth_m.shape
+    rows, columns = (side // part * part for side, part in zip(size, tile, strict=True))
+    fits = rows > 0 and columns > 0
+    require(fits, f"image of {size[1]} x {size[0]} pixels is smaller than a block of {tile[1]} x {tile[0]}")
+    cut = {name: getattr(histogram, name)[:rows, :columns].copy() for name in ("counts", *TRUTH)}
+    return histogram if (rows, columns) == size else replace(histogram, **cut)
+
+
+def _rows(
+    method: str, scene: str, view: int, level: tuple[float, float], estimate: np.ndarray, histogram: Histogram
+) -> Iterable[Row]:
+    groups = grouped_errors(estimate, histogram.depth_m, histogram.mixed, histogram.sensor.range_m)
+    for group, errors in groups.items():
+        kept = {key: errors[key] for key in (*FIGURES, "pixels", "missing", "beyond_range")}
+        yield Row(method, scene, view, *level, group, ssim=errors.get("ssim", math.nan), **kept)
+
+
+def as_dicts(rows: Iterable[Row]) -> list[dict[str, Any]]:
+    return [asdict(row) for row in rows]

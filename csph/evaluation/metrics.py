@@ -1,0 +1,149 @@
+"""Figures of merit of depth maps, the paper's photon levels and groups, and intervals by bootstrap over scenes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scenes.errors import require
+from spad.estimators.depth import depth_errors
+
+# mean signal and background photons of the 16 test levels; training draws from the first nine
+PHOTON_LEVELS: tuple[tuple[float, float], ...] = (
+    *((signal, background) for signal in (10.0, 5.0, 2.0) for background in (2.0, 10.0, 50.0)),
+    *((10.0, background) for background in (200.0, 500.0, 1000.0)),
+    *((50.0, background) for background in (50.0, 200.0, 500.0, 1000.0)),
+)
+TRAIN_LEVELS = PHOTON_LEVELS[:9]
+LOW_SBR = 0.1  # the paper's two groups of levels: at most, and above
+TOLERANCES_MM = (1, 5, 10, 20)
+_SSIM_SIDE = 7  # pixels of scikit-image's window
+
+
+def is_low_sbr(signal: float, background: float) -> bool:
+    """Whether signal / background is at most 0.1, without dividing by zero."""
+    return signal <= LOW_SBR * background
+
+
+def image_errors(estimate: np.ndarray, truth: np.ndarray, range_m: float, exclude: np.ndarray | None = None) -> dict:
+    """`spad.estimators.depth.depth_errors` with the shares strictly within 1, 5, 10 and 20 mm; depths (H, W) [m]."""
+    errors = depth_errors(estimate, truth, range_m=range_m, exclude=exclude)
+    error = _error_mm(estimate, truth, range_m, exclude)
+    shares = {f"within_{t}mm": float((np.abs(error) < t).mean()) if error.size else math.nan for t in TOLERANCES_MM}
+    return {**errors, **shares}
+
+
+def _error_mm(estimate: np.ndarray, truth: np.ndarray, range_m: float, exclude: np.ndarray | None) -> np.ndarray:
+    keep = np.isfinite(truth) & (truth < range_m) & np.isfinite(estimate)
+    keep = keep if exclude is None else keep & ~exclude
+    return (estimate.astype(np.float64) - truth)[keep] * 1e3
+
+
+def grouped_errors(estimate: np.ndarray, truth: np.ndarray, mixed: np.ndarray, range_m: float) -> dict[str, dict]:
+    """`image_errors` of all pixels, of those with one surface, and of those where surfaces mix; SSIM of all."""
+    left_out = {"all": None, "unmixed": mixed, "mixed": ~mixed}
+    groups = {name: image_errors(estimate, truth, range_m, exclude) for name, exclude in left_out.items()}
+    groups["all"]["ssim"] = ssim(estimate, truth, range_m)
+    return groups
+
+
+def ssim(estimate: np.ndarray, truth: np.ndarray, range_m: float) -> float:
+    """Mean structural similarity (Wang et al. 2004, 7 x 7 windows) over the pixels that have a truth.
+
+    The data range is that of the truth, so that a wild estimate cannot raise its own score. Where there is no truth,
+    or no estimate, both are set to the truth's (mean) value. NaN for a truth that is flat, or under 7 pixels.
+    """
+    from skimage.metrics import structural_similarity
+
+    known = np.isfinite(truth) & (truth < range_m)
+    if min(truth.shape) < _SSIM_SIDE or not known.any():
+        return math.nan
+    span = float(truth[known].max() - truth[known].min())
+    if span <= 0:
+        return math.nan
+    filled = np.where(known, truth, truth[known].mean()).astype(np.float64)
+    shown = np.where(known & np.isfinite(estimate), estimate, filled).astype(np.float64)
+    _, local = structural_similarity(filled, shown, win_size=_SSIM_SIDE, data_range=span, full=True)
+    return float(local[known].mean())
+
+
+class Bias(NamedTuple):
+    """Signed error in one interval of depth [m]."""
+
+    near_m: float
+    far_m: float
+    pixels: int
+    mean_mm: float
+    median_mm: float
+
+
+def bias_by_depth(
+    estimate: np.ndarray, truth: np.ndarray, edges_m: Sequence[float], exclude: np.ndarray | None = None
+) -> list[Bias]:
+    """Mean and median of estimate - truth in intervals of true depth; those without a pixel are left out.
+
+    What soft-argmax draws towards mid-range shows as a mean that falls with depth while the median stays.
+    """
+    found = []
+    for near, far in pairwise(edges_m):
+        outside = ~((truth >= near) & (truth < far))
+        error = _error_mm(estimate, truth, math.inf, outside if exclude is None else outside | exclude)
+        if error.size:
+            found.append(Bias(near, far, error.size, float(error.mean()), float(np.median(error))))
+    return found
+
+
+class Interval(NamedTuple):
+    """A mean over scenes with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def bootstrap_mean(values: Mapping[str, ArrayLike], *, draws: int = 2000, seed: int = 0) -> Interval:
+    """Mean of the scenes' means, and its interval: seeds, scenes, and each scene's values are drawn with replacement.
+
+    values: scene -> (values,) or (seeds, values), the photon levels of that scene under one or several trainings.
+    Levels of one scene are not independent, and one training is the same in all scenes: scenes and seeds are what is
+    drawn first. NaN values are left out. One scene gives an interval of NaN.
+    """
+    kept = [np.atleast_2d(np.asarray(v, float)) for v in values.values()]
+    kept = [v for v in kept if np.isfinite(v).any()]
+    require(bool(kept), "bootstrap: no finite value")
+    require(len({len(v) for v in kept}) == 1, "bootstrap: scenes with different numbers of seeds")
+    mean = float(np.mean([np.nanmean(v) for v in kept]))
+    if len(kept) < 2:
+        return Interval(mean, math.nan, math.nan)
+    rng = np.random.default_rng(np.random.SeedSequence(seed))
+    seeds = rng.integers(0, len(kept[0]), (draws, len(kept[0]), 1))
+    means = np.empty((draws, len(kept)))
+    for column, v in enumerate(kept):
+        drawn = v[seeds, rng.integers(0, v.shape[1], (draws, 1, v.shape[1]))]
+        known = np.isfinite(drawn)
+        total = np.where(known, drawn, 0.0).sum((1, 2))
+        means[:, column] = total / np.maximum(known.sum((1, 2)), 1)
+        means[~known.any((1, 2)), column] = np.nanmean(v)
+    chosen = rng.integers(0, len(kept), (draws, len(kept)))
+    low, high = np.quantile(np.take_along_axis(means, chosen, axis=1).mean(1), (0.025, 0.975))
+    return Interval(mean, float(low), float(high))
+
+
+def paired_difference(first: Mapping[str, ArrayLike], second: Mapping[str, ArrayLike], **bootstrap: int) -> Interval:
+    """Mean of first - second, value by value, with its interval; both as in `bootstrap_mean`.
+
+    What makes a scene or a level hard is in both and cancels. Other numbers of seeds: of the means over seeds.
+    """
+    scenes = [scene for scene in first if scene in second]
+    require(bool(scenes), "paired difference: the two have no scene in common")
+    differences = {}
+    for scene in scenes:
+        a, b = (np.atleast_2d(np.asarray(v[scene], float)) for v in (first, second))
+        require(a.shape[1] == b.shape[1], f"paired difference: scene {scene} has other levels in the two")
+        differences[scene] = a - b if len(a) == len(b) else a.mean(0) - b.mean(0)
+    return bootstrap_mean(differences, **bootstrap)

@@ -1,0 +1,285 @@
+"""`DepthModel`: counts -> codes -> back-projection -> network -> depth; and its checkpoint, a safetensors file."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from csph.codes.blocks import encode_blocks
+from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8, quantised
+from csph.layer import CompressiveLayer
+from csph.networks.compact import Compact
+from csph.networks.grid import published_position
+from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
+from csph.networks.posterior import Decoder, confidence, decoded
+from csph.networks.published import DeepBoosting, parameters_of
+from csph.training.config import ModelConfig, TrainConfig
+from scenes.errors import InputError, require
+from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from scenes.io.inputs import regular_file
+from scenes.limits import require_memory
+from spad.estimators.depth import radial_depth_of
+from spad.estimators.matching import normalised_correlation
+from spad.formats.histogram import Histogram
+
+KIND = "network"
+
+
+class Estimate(NamedTuple):
+    """What a network says of an image.
+
+    depth_m      (H, W) float32 [m]
+    confidence   (H, W) float32: share of the posterior within 3 bins of the answer (`posterior.confidence`)
+    overflows    16-bit sums that wrapped
+    """
+
+    depth_m: np.ndarray
+    confidence: np.ndarray
+    overflows: int
+
+
+class DepthModel(nn.Module):
+    """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin."""
+
+    def __init__(self, config: ModelConfig, seed: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.layer = None
+        if config.design is not None:
+            start = {"seed": seed, "spatial_start": config.spatial_start}
+            self.layer = CompressiveLayer.of(config.design, sensor=config.sensor, **start, **config.layer)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            compact = config.network == "compact"
+            self.network = Compact() if compact else DeepBoosting(can_die=config.network == "published")
+
+    @property
+    def parameters_count(self) -> int:
+        return parameters_of(self)
+
+    def seen(self, counts: Tensor) -> Tensor:
+        """What the network sees, (B, 1, T, R, C): back-projection, counts, these matched, or 1 at the fullest bin."""
+        if self.layer is not None:
+            return self.layer(counts)
+        if self.config.front == "counts":
+            return counts.float()
+        if self.config.front == "matched":
+            return normalised_correlation(counts.float().flatten(3).squeeze(1), self.config.sensor).view(counts.shape)
+        return torch.zeros(counts.shape, device=counts.device).scatter_(2, counts.argmax(2, keepdim=True), 1.0)
+
+    def windowed(self, counts: Tensor, first_bin: Tensor, window: int) -> Tensor:
+        """Logits (B, window, R, C) of the bins from `first_bin` (B,) on, whose blocks alone are encoded."""
+        coded = self.layer is not None
+        whole = counts if coded else self.seen(counts)
+        firsts = first_bin.tolist()
+        cut = torch.stack([one[:, first : first + window] for one, first in zip(whole, firsts, strict=True)])
+        return self.network(self.layer(cut) if coded else cut)
+
+    def forward(self, counts: Tensor) -> Tensor:
+        return self.network(self.seen(counts))
+
+    def position(self, logits: Tensor, decoder: Decoder | None = None) -> Tensor:
+        """The answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C); decoder None: the configuration's."""
+        return self._on_grid(decoded(logits, decoder or self.config.decoder))
+
+    def _on_grid(self, bins: Tensor) -> Tensor:
+        return bins if self.config.grid == "continuous" else published_position(bins, self.config.sensor.bins)
+
+    def depth_m(self, counts: Tensor, decoder: Decoder | None = None) -> Tensor:
+        """Depth of counts (B, 1, T, R, C) that blocks tile, (B, R, C) [m]; decoder as in `position`."""
+        return self.position(self(counts), decoder) * self.config.sensor.bin_depth_m
+
+    def depth_of_codes(self, codes: Tensor, decoder: Decoder | None = None) -> Tensor:
+        """Depth (B, R, C) [m] from codes (B, K, T/Mt, R/Mr, C/Mc) that a sensor has made; decoder as in `position`.
+
+        Raises InputError for a model without codes, and codes of another shape.
+        """
+        require(self.layer is not None, f"{self.config.name}: has no codes to find depth from")
+        logits = self.network(self.layer.decode(codes))
+        return self.position(logits, decoder) * self.config.sensor.bin_depth_m
+
+    def check_histogram(self, histogram: Histogram) -> None:
+        """InputError unless the histogram is of the sensor that the model was trained for."""
+        mine, other = self.config.sensor, histogram.sensor
+        alike = (mine.bins, mine.bin_width_s, mine.response) == (other.bins, other.bin_width_s, other.response)
+        told = ", ".join(f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps)" for s in (mine, other))
+        require(alike, f"the network was trained for another sensor or pulse than the histogram's: {told}")
+
+    def _tiles(self, rows: int, columns: int, tile: int | None) -> Iterator[tuple[Span, Span]]:
+        _, height, width = self.config.block
+        units = (math.lcm(side, self.network.coarsest) for side in (height, width))
+        axes = zip((rows, columns), (height, width), units, strict=True)
+        return product(*(spans(*axis, self.network.reach, tile) for axis in axes))
+
+    @torch.no_grad()
+    def estimate(
+        self,
+        histogram: Histogram,
+        *,
+        int8: bool = False,
+        int8_rule: Int8Rule = "calibrated",
+        decoder: Decoder | None = None,
+        tile: int | None = None,
+    ) -> Estimate:
+        """Estimate radial depth and confidence of a histogram of any size; decoder as in `position`.
+
+        With a displaced laser the network's half path becomes a distance by the histogram's geometry.
+
+        What blocks do not tile is reflected at the end; images over `WHOLE_PIXELS` go through in tiles of `tile` pixels
+        (default: `TILE`; smaller images in tiles only if it is given) whose halo holds all that the network sees.
+        `int8`: codes of 8-bit weights summed in 16 bits (`csph.codes.quantise.quantised`), or with the rule
+        "published" of weights rounded to 8 bits and summed in float32 (`published_int8`); the decoder keeps float32.
+        Raises InputError for another sensor's histogram.
+        """
+        require(int8_rule in INT8_RULES, f"8-bit rule {int8_rule!r} is unknown, expected {' or '.join(INT8_RULES)}")
+        self.check_histogram(histogram)
+        device = next(self.parameters()).device
+        rows, columns, bins = histogram.counts.shape
+        tile = tile or (TILE if rows * columns > WHOLE_PIXELS else None)
+        depth, sure = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
+        overflows = 0
+        for down, across in self._tiles(rows, columns, tile):
+            part = histogram.counts
+            if len(down.read) != rows or len(across.read) != columns:
+                part = part[down.read[:, None], across.read]
+            # turned over as a matrix, which torch does in tiles: a third of the time
+            size = (1, 1, bins, len(down.read), len(across.read))
+            counts = torch.from_numpy(part).reshape(-1, bins).T.contiguous().view(size)
+            inside = tuple(slice(one.inner, one.inner + one.own.stop - one.own.start) for one in (down, across))
+            if int8:
+                logits, wrapped = self._logits_int8(counts, inside, int8_rule)
+            else:
+                logits, wrapped = self(counts.to(device).float()), 0
+            overflows += wrapped
+            logits = logits[..., inside[0], inside[1]]
+            place = decoded(logits, decoder or self.config.decoder)
+            sure[down.own, across.own] = confidence(logits, place)[0].cpu()
+            depth[down.own, across.own] = (self._on_grid(place) * self.config.sensor.bin_depth_m)[0].cpu()
+        return Estimate(radial_depth_of(histogram, depth), sure, overflows)
+
+    def _logits_int8(self, counts: Tensor, inside: tuple[slice, slice], rule: Int8Rule) -> tuple[Tensor, int]:
+        """Logits from codes of 8-bit weights, and how many sums wrapped of the blocks that reach `inside`."""
+        if self.layer is None:
+            raise InputError(f"{self.config.name}: has no codes to hold in 8 bits")
+        coding = self.layer.coding()
+        if rule == "published":
+            weights = published_int8(coding).tensor.to(self.layer.temporal.device)
+            return self.network(self.layer.decode(encode_blocks(counts.to(weights.device), weights))), 0
+        tensor = quantised(coding)
+        codes, _ = encode_int16(counts, tensor)
+        logits = self.network(self.layer.decode(codes.to(self.layer.temporal.device).float() * tensor.scale))
+        blocks = (
+            slice(one.start, -(-one.stop // side) * side)
+            for one, side in zip(inside, self.config.block[1:], strict=True)
+        )
+        return logits, encode_int16(counts[(..., *blocks)], tensor).overflows
+
+    def depth_of(
+        self,
+        histogram: Histogram,
+        *,
+        int8: bool = False,
+        int8_rule: Int8Rule = "calibrated",
+        decoder: Decoder | None = None,
+    ) -> tuple[np.ndarray, int]:
+        """Depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped (0 without int8)."""
+        found = self.estimate(histogram, int8=int8, int8_rule=int8_rule, decoder=decoder)
+        return found.depth_m, found.overflows
+
+
+def _weights_sha256(weights: dict[str, Tensor]) -> str:
+    sha = hashlib.sha256()
+    for name in sorted(weights):
+        array = weights[name].detach().cpu().contiguous()
+        sha.update(f"{name}{array.dtype}{tuple(array.shape)}".encode())
+        sha.update(array.view(-1).view(torch.uint8).numpy().tobytes())  # as bytes: numpy knows no bfloat16
+    return sha.hexdigest()
+
+
+def weights_sha256(model: nn.Module) -> str:
+    """SHA-256 over names, shapes and values of all weights."""
+    return _weights_sha256(model.state_dict())
+
+
+def save_model(model: DepthModel, config: TrainConfig, state: dict, path: Path, *, half: bool = False) -> None:
+    """Weights as safetensors, whole or not at all; configuration and `state` (step, validation) in its header.
+
+    `half` keeps them in float16, in half the space; `load_model` gives float32 again, 11 bits of each.
+    """
+    from safetensors.torch import save
+
+    weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
+    weights = {name: value.half() for name, value in weights.items()} if half else weights
+    header = seal({"config": config.to_dict(), "state": state}, KIND, _weights_sha256(weights))
+    with whole_file(path) as beside:
+        beside.write_bytes(save(weights, {ATTRIBUTE: header}))
+
+
+def checkpoint_file(path: Path) -> Path:
+    """The checkpoint that a path names: the file, or `model.safetensors` in the folder of a run."""
+    path = Path(path)
+    return regular_file(path / "model.safetensors" if path.is_dir() else path)
+
+
+def load_model(path: Path) -> tuple[DepthModel, TrainConfig, dict]:
+    """A model as it was saved, in evaluation mode, its configuration, and the state it was saved in.
+
+    Weights in float16 or bfloat16 become float32. Raises InputError in one line for a missing, foreign or altered
+    file, a newer schema, or weights of another design or that are not finite.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = checkpoint_file(path)
+    try:
+        with safe_open(path, "pt") as file:
+            header = (file.metadata() or {}).get(ATTRIBUTE)
+            require(header is not None, "is no checkpoint of scene2spad")
+            meta, sha256 = open_seal(header, KIND)
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+        meta = check_seal(meta, sha256, _weights_sha256(weights))
+        config, state = TrainConfig.from_dict(meta["config"]), meta["state"]
+        require(isinstance(state, dict), f"its state is a {type(state).__name__}, expected an object")
+        _check_design(config.model, sum(value.numel() for value in weights.values()))
+        model = DepthModel(config.model, config.seed)
+        _check_weights(weights, model)
+        model.load_state_dict(weights)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError, ArithmeticError) as error:
+        raise InputError(f"{path}: not a readable checkpoint ({' '.join(str(error).split())[:120]})") from None
+    return model.eval(), config, state
+
+
+def _check_design(config: ModelConfig, stored: int) -> None:
+    """InputError for a coding tensor of more numbers than the file holds, before it is made."""
+    design = config.design
+    if design is None:
+        return
+    depth, pixels = design.block[0], design.size // design.block[0]
+    numbers = design.codes * (design.size if design.full else depth + (pixels if pixels > 1 else 0))
+    if config.layer.get("pulse_in_codes") or config.layer.get("pulse_in_decoder"):
+        require_memory(24 * depth**2, f"the pulse at every one of {depth} bins")
+    require(numbers <= stored, f"its design has {numbers} code entries, the file holds {stored} numbers")
+
+
+def _check_weights(weights: dict[str, Tensor], model: DepthModel) -> None:
+    """InputError that names the first tensor that is missing, too many, of another shape or kind, or not finite."""
+    expected = model.state_dict()
+    of = f"of another design than {model.config.name}:"
+    for name in sorted({*expected, *weights}):
+        require(name in weights, f"its weights are {of} tensor {name} is missing")
+        require(name in expected, f"its weights are {of} tensor {name} is one too many")
+        has, should = weights[name], expected[name]
+        shapes = f"{tuple(has.shape)}, expected {tuple(should.shape)}"
+        require(has.shape == should.shape, f"its weights are {of} tensor {name} is {shapes}")
+        alike = has.is_floating_point() == should.is_floating_point()
+        require(alike, f"tensor {name} holds {has.dtype}, expected {should.dtype}")
+        require(bool(has.isfinite().all()), f"tensor {name} holds NaN or infinite weights")

@@ -1,0 +1,1 @@
+"""Train depth networks: configuration, patches sensed on the fly, loss, schedule, resume."""

@@ -1,0 +1,276 @@
+"""Everything that decides a trained network, in frozen dataclasses that JSON holds; the presets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal
+
+from csph.codes.design import Design
+from csph.evaluation.metrics import TRAIN_LEVELS
+from csph.layer import STARTS, SpatialStart
+from csph.networks.grid import GRIDS, Grid
+from csph.networks.posterior import Decoder
+from csph.training.levels import CONTINUOUS, Levels
+from scenes.errors import InputError, require
+from scenes.limits import require_memory
+from spad.sensor.model import Sensor
+
+Network = Literal["compact", "published", "published-signed"]
+Front = Literal["codes", "counts", "matched", "peak"]
+NETWORKS: tuple[str, ...] = ("compact", "published", "published-signed")
+FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
+Schedule = Literal["steps", "cosine"]
+SCHEDULES: tuple[str, ...] = ("steps", "cosine")
+PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+MAX_STEPS, MAX_THREADS = 10**8, 1024
+COUNT_BYTES = 4 * 4  # of a batch: counts, logits, their gradient and the target, in float32
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What stands between counts and depth.
+
+    front    what the network sees: the back-projection of codes; without compression the counts, or their correlation
+             with the pulse (`spad.estimators.matching.normalised_correlation`); or one-hot argmax
+    design   the codes, with `front` = "codes"
+    layer    switches of `csph.layer.LayerOptions` that differ from the published layer
+    network  compact; published; or published with logits of any sign, which cannot die
+    sensor   whose histograms it takes
+    grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with print
+    spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
+    """
+
+    front: Front = "codes"
+    design: Design | None = None
+    layer: dict[str, bool] = field(default_factory=dict)
+    network: Network = "compact"
+    sensor: Sensor = field(default_factory=Sensor)
+    grid: Grid = "continuous"
+    spatial_start: SpatialStart = "uniform"
+
+    def __post_init__(self) -> None:
+        require(self.front in FRONTS, f"front {self.front!r} is unknown, expected one of {', '.join(FRONTS)}")
+        require(self.network in NETWORKS, f"network {self.network!r} is unknown, expected {', '.join(NETWORKS)}")
+        switches = isinstance(self.layer, dict) and all(isinstance(value, bool) for value in self.layer.values())
+        require(switches, f"layer {self.layer!r}: expected switches by name")
+        require(self.grid in GRIDS, f"grid {self.grid!r} is unknown, expected one of {', '.join(GRIDS)}")
+        known = self.spatial_start in STARTS
+        require(known, f"spatial start {self.spatial_start!r} is unknown, expected one of {', '.join(STARTS)}")
+        coded = self.front == "codes"
+        require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
+        if self.design is not None:
+            bins, block = self.sensor.bins, self.design.block
+            require(bins % block[0] == 0, f"blocks of {block[0]} bins do not divide the sensor's {bins}")
+            said = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
+            require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{said}, or --layer keep_mean")
+
+    @property
+    def block(self) -> tuple[int, int, int]:
+        """(Mt, Mr, Mc); one pixel and bin without codes."""
+        return (1, 1, 1) if self.design is None else self.design.block
+
+    @property
+    def decoder(self) -> Decoder:
+        """How its answer is read unless one asks otherwise: the published way on the published grid."""
+        return "soft-argmax" if self.grid == "published" else "median"
+
+    @property
+    def name(self) -> str:
+        uncoded = {"counts": "no compression", "matched": "no compression", "peak": "peak"}
+        return f"{uncoded[self.front] if self.design is None else self.design.name}, {self.network}"
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Every number of a run.
+
+    model         the network and its codes
+    seed          of weights, crops, photon levels and noise
+    epochs, steps_per_epoch    an epoch ends in validation, and is what an interrupted run goes back to
+    batch, crop   patches a step, and their side in pixels
+    rate          Adam's learning rate at the start, or after the warm-up
+    schedule      steps: times `decay` every `decay_steps` steps; cosine: one cosine over the run down to `rate_end` of
+                  it; either after `warmup` steps of a linear rise
+    decay, decay_steps, warmup, rate_end   of the schedule
+    average       of the weights after every step, with this weight of the past: what is validated, kept and shipped;
+                  0: the weights themselves
+    window        train on so many bins around a label, in steps of 256, but for the last tenth of the run; 0: on all.
+                  Not for blocks of more bins, whose codes would then not see the whole range
+    weights       how often patches are drawn from each of several training sets (default: alike)
+    coherence     weight of the mean squared cosine between the codes of two pixels of a block (`csph.codes.rank`)
+    tv_weight, tv_start        weight of the mean total variation of depth / range, and the step it comes in at
+    levels        mean (signal, background) photons, one drawn for each patch; or "continuous" (`csph.training.levels`)
+    time_offset_m random delay, uniform from 0 to this, of every patch: 0 is off, as published
+    validation_views           frames of the validation scenes
+    precision     Lightning's name; bf16-mixed on GPUs that have it
+    threads       of a CPU (0: as many as there are); the same number gives the same bytes
+    data          what it was trained on: path and SHA-256, filled in by `csph.training.loop.train`
+    """
+
+    model: ModelConfig = field(default_factory=lambda: ModelConfig(design=Design()))
+    preset: str = "laptop"
+    seed: int = 0
+    epochs: int = 12
+    steps_per_epoch: int = 250
+    batch: int = 6
+    crop: int = 16
+    rate: float = 2e-3
+    decay: float = 0.75
+    decay_steps: int = 250
+    tv_weight: float = 0.0
+    tv_start: int = 500
+    levels: Levels = TRAIN_LEVELS
+    time_offset_m: float = 0.0
+    validation_views: int = 18
+    precision: str = "32-true"
+    threads: int = 0
+    data: dict[str, Any] = field(default_factory=dict)
+    schedule: Schedule = "steps"
+    warmup: int = 0
+    rate_end: float = 0.02
+    average: float = 0.0
+    window: int = 0
+    weights: tuple[float, ...] = ()
+    coherence: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "steps_per_epoch", "batch", "crop", "decay_steps", "validation_views"):
+            require(getattr(self, name) >= 1, f"training: {name} {getattr(self, name)} is below 1")
+        require(self.steps <= MAX_STEPS, f"training: {self.steps} steps are above {MAX_STEPS}")
+        require(0 <= self.threads <= MAX_THREADS, f"training: threads {self.threads} is outside 0 to {MAX_THREADS}")
+        require(0 < self.rate < 1, f"training: learning rate {self.rate:g} is outside 0 to 1")
+        require(0 < self.decay <= 1, f"training: decay {self.decay:g} is outside (0, 1]")
+        require(self.tv_weight >= 0, f"training: weight {self.tv_weight:g} of the total variation is negative")
+        require(0 <= self.time_offset_m < math.inf, f"training: time offset {self.time_offset_m:g} m is negative")
+        require(self.precision in PRECISIONS, f"precision {self.precision!r}: expected {', '.join(PRECISIONS)}")
+        rows, columns = self.model.block[1:]
+        fits = self.crop % rows == 0 and self.crop % columns == 0
+        require(fits, f"training: crops of {self.crop} pixels are not tiled by blocks of {rows} x {columns}")
+        require(bool(self.levels), "training: no photon level")
+        listed = not isinstance(self.levels, str)
+        require(listed or self.levels == CONTINUOUS, f"training: levels {self.levels!r}, expected a list or continuous")
+        self._check_recipe()
+
+    def _check_recipe(self) -> None:
+        known = self.schedule in SCHEDULES
+        require(known, f"training: schedule {self.schedule!r} is unknown, expected one of {', '.join(SCHEDULES)}")
+        require(self.warmup >= 0, f"training: warm-up of {self.warmup} steps is negative")
+        require(0 < self.rate_end <= 1, f"training: rate_end {self.rate_end:g} is outside (0, 1]")
+        require(0 <= self.average < 1, f"training: average {self.average:g} is outside [0, 1)")
+        require(self.coherence >= 0, f"training: weight {self.coherence:g} of the coherence is negative")
+        weighted = all(math.isfinite(weight) and weight > 0 for weight in self.weights)
+        require(weighted, f"training: set weights {', '.join(map(str, self.weights))} are not all positive")
+        if self.window:
+            said = window_refused(self.model, self.window)
+            require(not said, f"training: windows of {self.window} bins {said}")
+            require(not self.time_offset_m, "training: windows and random time offsets do not go together")
+        still = self.model.grid == "continuous" or not self.time_offset_m
+        require(still, "training: the published grid and random time offsets do not go together")
+
+    @property
+    def steps(self) -> int:
+        return self.epochs * self.steps_per_epoch
+
+    def check_memory(self) -> None:
+        """Raise InputError unless the least that one step holds fits in memory: ask before sets are read."""
+        counts = self.batch * self.crop**2 * self.model.sensor.bins
+        told = f"a step of {self.batch} patches of {self.crop} x {self.crop} pixels and {self.model.sensor.bins} bins"
+        require_memory(COUNT_BYTES * counts, told)
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict) -> TrainConfig:
+        """Raises InputError for an entry that is missing or unknown."""
+        try:
+            model = dict(values["model"])
+            design = model.pop("design")
+            sensor = Sensor.from_dict(model.pop("sensor"))
+            if design is not None:
+                design = Design(**{**design, "block": tuple(design["block"])})
+            levels = values["levels"]
+            levels = levels if isinstance(levels, str) else tuple(tuple(level) for level in levels)
+            made = {"model": ModelConfig(design=design, sensor=sensor, **model), "levels": levels}
+            return cls(**{**values, **made, "weights": tuple(values.get("weights", ()))})
+        except (KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"its configuration cannot be read ({' '.join(str(error).split())[:120]})") from None
+
+
+_STEPS_PER_PUBLISHED_EPOCH = 3463  # 13,851 frames in batches of 4
+# 1e-5 of a sum over 4 crops of 32 x 32, beside a KL divergence divided by 1024 bins
+PUBLISHED_TV = 1e-5 * 1024 * 4 * 32 * 32
+
+WINDOW_STEP = 256  # bins; windows begin at multiples of it
+
+
+def window_refused(model: ModelConfig, window: int) -> str:
+    """Why a model cannot be trained on windows of so many bins; empty where it can."""
+    if window % WINDOW_STEP or not 0 < window < model.sensor.bins:
+        return f"are no multiple of {WINDOW_STEP} below the sensor's {model.sensor.bins}"
+    if model.design is not None and WINDOW_STEP % model.block[0]:
+        return f"do not hold codes over blocks of {model.block[0]} bins"
+    if model.layer.get("per_pixel_norm"):
+        return "are another thing to a norm over all time blocks"
+    return ""
+
+
+UNWINDOWED_STEPS = 0.55  # of a preset's steps where windows are left out: a step takes 256 ms instead of 146
+# Adam with one warm-up and one cosine, weights averaged, levels over the whole range, windows where they can be
+RECIPE: dict[str, Any] = {
+    "schedule": "cosine",
+    "warmup": 100,
+    "average": 0.995,
+    "levels": CONTINUOUS,
+    "window": 512,
+    "validation_views": 24,
+}
+PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": {
+        **RECIPE,
+        "epochs": 2,
+        "steps_per_epoch": 4,
+        "batch": 2,
+        "crop": 8,
+        "validation_views": 1,
+        "warmup": 2,
+    },
+    "laptop": {**RECIPE, "epochs": 12, "steps_per_epoch": 650},
+    "workstation": {**RECIPE, "epochs": 24, "steps_per_epoch": 1500, "warmup": 400},
+    "laptop-v1": {},  # what the first models were shipped with
+    "paper": {
+        # half a published epoch: validated and kept twice in each
+        "epochs": 60,
+        "steps_per_epoch": math.ceil(_STEPS_PER_PUBLISHED_EPOCH / 2),
+        "batch": 4,
+        "crop": 32,
+        "rate": 1e-3,
+        "decay": 0.9,
+        "decay_steps": _STEPS_PER_PUBLISHED_EPOCH,
+        "validation_views": 2777,
+    },
+}
+
+
+def preset(name: str, model: ModelConfig, **changes: Any) -> TrainConfig:
+    """A preset's configuration with a model; `changes` that are None leave it as it is.
+
+    smoke (seconds), laptop (compact, one core, 25 minutes at the most), workstation (compact, two cores, 2 hours at the
+    most), paper (the published network, levels and schedule), laptop-v1 (the recipe of the first models). Windows are
+    left out where the model does not allow them, and with random time offsets. Without compression, and of one-hot
+    peaks, `paper` has the published total variation and a tenth of the learning rate. `levels` may be "paper".
+    """
+    require(name in PRESETS, f"preset {name!r} is unknown, expected one of {', '.join(PRESETS)}")
+    known = {item.name for item in fields(TrainConfig)}
+    given = {key: value for key, value in changes.items() if value is not None}
+    require(given.keys() <= known, f"unknown options {', '.join(sorted(given.keys() - known))}")
+    oracle = {"rate": 1e-4, "tv_weight": PUBLISHED_TV} if name == "paper" and model.front != "codes" else {}
+    if given.get("levels") == "paper":
+        given["levels"] = TRAIN_LEVELS
+    values = {"model": model, "preset": name, **PRESETS[name], **oracle, **given}
+    if "window" not in given and (window_refused(model, values.get("window", 0)) or values.get("time_offset_m")):
+        values["window"] = 0
+        if values["window"] != PRESETS[name].get("window", 0) and "steps_per_epoch" not in given:
+            values["steps_per_epoch"] = math.ceil(UNWINDOWED_STEPS * values["steps_per_epoch"])
+    return TrainConfig(**values)

@@ -1,0 +1,181 @@
+"""Training data: patches of rendered sets, sensed on the fly, photon level, crop and noise new for every sample.
+
+A sample is told apart by (seed, epoch, number), never by worker, so that the same run gives the same patches whatever
+the number of workers, and one that goes on after an interruption the patches that it would have seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import pytorch_lightning as pl
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.training.config import WINDOW_STEP, TrainConfig
+from csph.training.levels import CONTINUOUS, draw_level
+from scenes.errors import require
+from spad.detection.training_patches import Batch, PackedTransients, Patch, sense_patches
+from spad.sensor.model import Sensor
+
+STAGE_TRAIN, STAGE_VALIDATE, STAGE_WINDOW = 31, 32, 36
+FULL_LENGTH_FRACTION = 0.1  # of a run with windows, its last: on all bins
+
+
+class Request(NamedTuple):
+    """A patch of one of several sets."""
+
+    source: int
+    patch: Patch
+
+
+class TrainBatch(NamedTuple):
+    """Sensed patches, their labels, and the first bin of each one's window (-1: all bins)."""
+
+    counts: Tensor  # (B, 1, T, h, w) float32
+    depth_m: Tensor  # (B, h, w) float32, NaN where nothing is
+    valid: Tensor  # (B, h, w) bool
+    first_bin: Tensor  # (B,) int64
+
+
+class Samples(Dataset):
+    """Requests for the patches of one epoch; drawing one is cheap, `sense` of a batch is the work."""
+
+    def __init__(self, sets: Sequence[PackedTransients], config: TrainConfig, epoch: int) -> None:
+        self.shapes, self.config, self.epoch = [packed.depth_m.shape for packed in sets], config, epoch
+        for shape in self.shapes:
+            most = min(shape[1:])
+            require(config.crop <= most, f"crops of {config.crop} pixels do not fit views of {most}")
+        weights = config.weights or (1.0,) * len(sets)
+        said = f"training: {len(weights)} set weights for {len(sets)} training sets"
+        require(len(weights) == len(sets), said)
+        self.edges = np.cumsum(weights)[:-1] / np.sum(weights)
+
+    def __len__(self) -> int:
+        return self.config.steps_per_epoch * self.config.batch
+
+    def __getitem__(self, number: int) -> Request:
+        config = self.config
+        key = (config.seed, self.epoch, number)
+        rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(STAGE_TRAIN,)))
+        signal, background = draw_level(rng, config.levels)
+        # of one set nothing is drawn: the samples are those of a tree that knew only one
+        source = int(np.searchsorted(self.edges, rng.random(), side="right")) if len(self.shapes) > 1 else 0
+        scenes, rows, columns = self.shapes[source]
+        patch = Patch(
+            scene=int(rng.integers(scenes)),
+            row=int(rng.integers(rows - config.crop + 1)),
+            column=int(rng.integers(columns - config.crop + 1)),
+            signal=signal,
+            background=background,
+            seed=key,
+            time_offset_m=config.time_offset_m * float(rng.random()),
+        )
+        return Request(source, patch)
+
+
+class Frames(Dataset):
+    """Whole validation frames of one set, as far as blocks tile them: view after view, each at one level, levels in
+    turn; the 16 test levels where training draws from a continuous range."""
+
+    def __init__(
+        self, packed: PackedTransients, config: TrainConfig, views: int | None = None, source: int = 0
+    ) -> None:
+        scenes, rows, columns = packed.depth_m.shape
+        _, height, width = config.model.block
+        self.size = (rows // height * height, columns // width * width)
+        fits = min(self.size) > 0
+        require(fits, f"validation views of {columns} x {rows} pixels are smaller than a block of {width} x {height}")
+        self.levels = PHOTON_LEVELS if config.levels == CONTINUOUS else config.levels
+        # spread over the scenes, so that a few views are not all of the first
+        count = min(views or config.validation_views, scenes * len(self.levels))
+        self.chosen = [round(i * scenes * len(self.levels) / count) for i in range(count)]
+        self.config, self.scenes, self.source = config, scenes, source
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __getitem__(self, number: int) -> Request:
+        scene, turn = divmod(self.chosen[number], len(self.levels))
+        signal, background = self.levels[(number + turn) % len(self.levels)]
+        # sets after the first have noise of their own
+        key = (self.config.seed, STAGE_VALIDATE, number, *((self.source,) if self.source else ()))
+        return Request(self.source, Patch(scene, 0, 0, signal, background, key))
+
+
+def _sensed(
+    sets: Sequence[PackedTransients], sensor: Sensor, size: tuple[int, int], window: int, requests: Sequence[Request]
+) -> TrainBatch:
+    """A batch whose patches keep their order; patches of one set are sensed together."""
+    sources = [request.source for request in requests]
+    parts, order = [], []
+    for source in sorted(set(sources)):
+        mine = [i for i, one in enumerate(sources) if one == source]
+        parts.append(sense_patches(sets[source], sensor, [requests[i].patch for i in mine], size=size))
+        order += mine
+    batch = parts[0]
+    if len(parts) > 1:
+        back = torch.from_numpy(np.argsort(order))
+        batch = Batch(*(torch.cat(same)[back] for same in zip(*parts, strict=True)))
+    starts = [_window_start(batch, i, request.patch, sensor, window) for i, request in enumerate(requests)]
+    return TrainBatch(batch.counts, batch.depth_m, batch.valid, torch.tensor(starts))
+
+
+def _window_start(batch: Batch, number: int, patch: Patch, sensor: Sensor, window: int) -> int:
+    """First bin of a window that holds the label of one pixel, drawn with the patch's key; -1 without windows."""
+    if not window:
+        return -1
+    rng = np.random.default_rng(np.random.SeedSequence(patch.seed, spawn_key=(STAGE_WINDOW,)))
+    labels = batch.depth_m[number][batch.valid[number]]
+    label = float(labels[rng.integers(len(labels))]) if len(labels) else 0.0
+    block = int(label / sensor.bin_depth_m) // WINDOW_STEP - int(rng.integers(window // WINDOW_STEP))
+    return min(max(0, block * WINDOW_STEP), sensor.bins - window)
+
+
+class SetData(pl.LightningDataModule):
+    """Loaders over training and validation sets; `workers` processes sense ahead (0: in this one).
+
+    Validation frames are shared out evenly over the validation sets.
+    """
+
+    def __init__(
+        self,
+        training: Sequence[PackedTransients],
+        validation: Sequence[PackedTransients],
+        config: TrainConfig,
+        workers: int = 0,
+    ) -> None:
+        super().__init__()
+        self.training, self.validation, self.config, self.workers = training, validation, config, workers
+        Samples(training, config, 0)
+        views = -(-config.validation_views // len(validation))
+        self.frames = [Frames(packed, config, views, source) for source, packed in enumerate(validation)]
+
+    def train_dataloader(self) -> DataLoader:
+        # made anew each epoch (`reload_dataloaders_every_n_epochs`), which decides the samples
+        epoch = 0 if self.trainer is None else self.trainer.current_epoch
+        config = self.config
+        late = epoch >= round((1 - FULL_LENGTH_FRACTION) * config.epochs)
+        window = 0 if late else config.window
+        size = (config.crop, config.crop)
+        return self._loader(Samples(self.training, config, epoch), self.training, config.batch, size, window)
+
+    def val_dataloader(self) -> list[DataLoader]:
+        return [self._loader(frames, self.validation, 1, frames.size, 0) for frames in self.frames]
+
+    def _loader(
+        self, samples: Dataset, sets: Sequence[PackedTransients], batch: int, size: tuple[int, int], window: int
+    ) -> DataLoader:
+        collate = partial(_sensed, sets, self.config.model.sensor, size, window)
+        return DataLoader(
+            samples,
+            batch_size=batch,
+            num_workers=self.workers,
+            collate_fn=collate,
+            pin_memory=torch.cuda.is_available(),
+        )

@@ -1,0 +1,318 @@
+"""Training by Lightning: a run is a folder with one configuration, a log, the best weights, and what it resumes from.
+
+    config.json         every number of the run, written before its first step
+    log.csv             one row an epoch: step, learning rate, training loss, validation RMSE and MAE by both decoders,
+                        participation rank of spatial codes
+    model.safetensors   weights of the lowest validation RMSE, with the configuration in the header
+    timings.jsonl       seconds of each epoch
+    energy.csv          energy of a learned temporal code by groups of time bins, now and then from the start on
+    last.safetensors    weights after the last step
+    resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
+
+Devices, precision and several GPUs are Lightning's; nothing here knows how many there are.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor, nn
+from torchmetrics import MeanMetric
+
+from csph.codes.rank import coherence, participation_rank
+from csph.networks.grid import on_published_grid, published_target
+from csph.networks.model import DepthModel, load_model, save_model
+from csph.networks.posterior import DECODERS
+from csph.networks.published import soft_argmax
+from csph.training.config import TrainConfig
+from csph.training.data import SetData, TrainBatch
+from csph.training.loss import kl_divergence, total_variation
+from csph.training.resume import WholeFileCheckpoints, check_resume
+from csph.training.schedule import rate_factor
+from csph.training.snapshots import CodeEnergy
+from csph.training.views import Views, packed_sha256, packed_views
+from csph.weights.shipped import RESUME, TIMINGS
+from render.backend.malloc import keep_freed_memory
+from scenes.errors import InputError, require
+from scenes.files import append_line, is_unclaimed, whole_file, write_csv
+from scenes.io.inputs import read_json_object
+
+log = logging.getLogger("csph")
+
+Progress = Callable[[str, float], None]
+
+
+class DepthTraining(pl.LightningModule):
+    """KL divergence to the pulse at the label, plus total variation and coherence where asked; Adam, and an average of
+    the weights where asked."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.model = DepthModel(config.model, config.seed)
+        self.averaged: DepthModel | None = None
+        if config.average:  # a module of its own: Lightning's checkpoint then holds it
+            self.averaged = deepcopy(self.model).requires_grad_(False).eval()
+        self.train_loss = MeanMetric()
+        self.squared_m2 = nn.ModuleDict({name: MeanMetric() for name in DECODERS})
+        self.absolute_m = nn.ModuleDict({name: MeanMetric() for name in DECODERS})
+
+    @property
+    def kept(self) -> DepthModel:
+        """What is validated and kept: the averaged weights, or the weights themselves."""
+        return self.model if self.averaged is None else self.averaged
+
+    def loss(self, batch: TrainBatch) -> Tensor:
+        config, sensor, depth = self.config, self.config.model.sensor, batch.depth_m
+        if config.model.grid == "published":
+            depth = published_target(depth, sensor)
+        if config.window and bool((batch.first_bin >= 0).all()):
+            logits = self.model.windowed(batch.counts, batch.first_bin, config.window)
+            near = batch.first_bin.view(-1, 1, 1) * sensor.bin_depth_m
+            depth = depth - near
+            valid = batch.valid & (depth >= 0) & (depth < config.window * sensor.bin_depth_m)
+            # gated: what of the pulse falls outside the window is left out
+            sensor = replace(sensor, bins=config.window)
+        else:
+            logits, valid = self.model(batch.counts), batch.valid
+        loss = kl_divergence(logits, depth, valid, sensor)
+        if config.tv_weight and self.global_step >= config.tv_start:
+            loss = loss + config.tv_weight * total_variation(soft_argmax(logits) / config.model.sensor.bins)
+        if config.coherence and self.model.layer is not None:
+            loss = loss + config.coherence * coherence(self.model.layer.pixel_gram())
+        return loss
+
+    def training_step(self, batch: TrainBatch, _: int) -> Tensor:
+        loss = self.loss(batch)
+        self.train_loss.update(loss.detach())
+        return loss
+
+    def optimizer_step(self, *args: Any, **more: Any) -> None:
+        super().optimizer_step(*args, **more)
+        if self.averaged is not None:
+            # the first steps are forgotten sooner
+            past = min(self.config.average, (1 + self.global_step) / (10 + self.global_step))
+            with torch.no_grad():
+                torch._foreach_lerp_(list(self.averaged.parameters()), list(self.model.parameters()), 1 - past)
+
+    def validation_step(self, batch: TrainBatch, _: int, dataloader_idx: int = 0) -> None:
+        logits = self.kept(batch.counts)
+        # pixels without a truth have weight 0
+        weight = batch.valid.float()
+        for decoder in DECODERS:
+            depth = self.kept.position(logits, decoder) * self.config.model.sensor.bin_depth_m
+            error = torch.where(batch.valid, depth - batch.depth_m, 0.0)
+            self.squared_m2[decoder].update(error**2, weight)
+            self.absolute_m[decoder].update(error.abs(), weight)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        adam = torch.optim.Adam(self.model.parameters(), lr=self.config.rate, fused=True)
+        # a function of the step alone: nothing about it has to be restored
+        steps = torch.optim.lr_scheduler.LambdaLR(adam, partial(rate_factor, config=self.config))
+        return {"optimizer": adam, "lr_scheduler": {"scheduler": steps, "interval": "step"}}
+
+
+class Record(pl.Callback):
+    """At the end of each epoch: a row of the log, the weights if they are the best so far, and what to resume from."""
+
+    def __init__(self, folder: Path, progress: Progress) -> None:
+        self.folder, self.progress = folder, progress
+        self.rows: list[dict[str, float]] = []
+        self.noted = (time.perf_counter(), time.process_time())
+
+    def _note_time(self, epoch: int) -> None:
+        """Append an epoch's seconds, for whom results are not to depend on."""
+        now = (time.perf_counter(), time.process_time())
+        wall, cpu = (round(end - start, 3) for end, start in zip(now, self.noted, strict=True))
+        self.noted = now
+        append_line(self.folder / TIMINGS, json.dumps({"epoch": epoch, "wall_s": wall, "cpu_s": cpu}))
+
+    @property
+    def best_mm(self) -> float:
+        return min((row["val_rmse_mm"] for row in self.rows), default=float("inf"))
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.rows = state["rows"]
+
+    def on_train_batch_end(self, trainer: pl.Trainer, module: DepthTraining, *_: object) -> None:
+        step = trainer.global_step
+        self.progress(f"step {step} of {module.config.steps}", step / module.config.steps)
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, module: DepthTraining) -> None:
+        best = self.best_mm
+        row = {
+            "epoch": trainer.current_epoch + 1,
+            "step": trainer.global_step,
+            "rate": trainer.optimizers[0].param_groups[0]["lr"],
+            "train_loss": float(module.train_loss.compute()),
+            **_validation_mm(module),
+        }
+        layer = module.kept.layer
+        if layer is not None and math.prod(layer.block[1:]) > 1:
+            row["spatial_rank"] = participation_rank(layer.pixel_gram().detach())
+        for metric in (module.train_loss, *module.squared_m2.values(), *module.absolute_m.values()):
+            metric.reset()
+        self.rows = [*self.rows, row]
+        if trainer.is_global_zero:
+            if row["val_rmse_mm"] < best or not (self.folder / "model.safetensors").is_file():
+                save_model(module.kept, module.config, row, self.folder / "model.safetensors")
+            write_csv(self.rows, self.folder / "log.csv")
+            log.info(
+                "step %d of %d: loss %.4f, validation RMSE %.1f mm, MAE %.1f mm",
+                *(row["step"], module.config.steps, row["train_loss"], row["val_rmse_mm"], row["val_mae_mm"]),
+            )
+        if trainer.is_global_zero:
+            self._note_time(trainer.current_epoch + 1)
+        trainer.save_checkpoint(self.folder / RESUME)  # on all devices
+
+
+def _validation_mm(module: DepthTraining) -> dict[str, float]:
+    """Validation RMSE and MAE [mm] as the model is decoded, and by each decoder."""
+    squared, absolute = module.squared_m2, module.absolute_m
+    errors = {
+        name: (float(squared[name].compute()) ** 0.5 * 1e3, float(absolute[name].compute()) * 1e3) for name in DECODERS
+    }
+    own = errors[module.config.model.decoder]
+    return {
+        "val_rmse_mm": own[0],
+        "val_mae_mm": own[1],
+        **{f"val_mae_mm_{name}": absolute for name, (_, absolute) in errors.items()},
+    }
+
+
+def _claim(folder: Path, config: TrainConfig) -> None:
+    """Write the configuration, or see that the folder holds the same; InputError for another one's folder."""
+    text = json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n"
+    path = folder / "config.json"
+    if path.is_file():
+        known = read_json_object(path, "configuration")
+        try:  # by what it says: a file of before an option was there means its default
+            same = TrainConfig.from_dict(known) == TrainConfig.from_dict(json.loads(text))
+        except InputError:
+            same = False
+        require(same, f"{folder}: holds a run with other options or another set; choose another --out")
+        return
+    require(is_unclaimed(folder), f"{folder}: is not an empty folder and holds no run; choose another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as beside:
+        beside.write_text(text)
+
+
+def _listed(views: Views | Sequence[Views]) -> list[Views]:
+    return [views] if isinstance(views, Views) else list(views)
+
+
+@contextmanager
+def _quiet() -> Any:
+    """Lightning's advice on workers and devices is not the user's business: what is said here goes to the log."""
+    loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning.pytorch")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
+    """Lightning's Trainer without what `Record` does instead. InputError for mixed precision on a CPU."""
+    runner = pl.Trainer(
+        max_epochs=config.epochs,
+        precision=config.precision,
+        callbacks=[CodeEnergy(record.folder), record],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        plugins=[WholeFileCheckpoints()],
+        reload_dataloaders_every_n_epochs=1,
+        **more,
+    )
+    # there, weights' gradients in bf16 read memory that was never written (torch 2.13)
+    on_cpu = runner.strategy.root_device.type == "cpu"
+    require(config.precision == "32-true" or not on_cpu, f"precision {config.precision} needs a GPU")
+    return runner
+
+
+def train(
+    config: TrainConfig,
+    training: Views | Sequence[Views],
+    validation: Views | Sequence[Views],
+    folder: Path,
+    *,
+    workers: int = 0,
+    progress: Progress | None = None,
+    **trainer: Any,
+) -> dict[str, Any]:
+    """Run a configuration to its end in a folder, or go on where an interrupted run of the same configuration stopped.
+
+    Sets are one or several; patches are drawn from the training sets by `config.weights`. `trainer` holds further
+    arguments of Lightning's Trainer (accelerator, devices, strategy). Returns steps, seconds (of this call),
+    val_rmse_mm of the weights kept, their checkpoint, and the number of parameters. Raises InputError for sets that do
+    not fit, and a folder of another run.
+    """
+    config.check_memory()
+    sets = [[packed_views(one) for one in _listed(views)] for views in (training, validation)]
+    data = {}
+    for name, packs in zip(("training", "validation"), sets, strict=True):
+        hashes = [packed_sha256(packed) for packed in packs]
+        data[f"{name}_sha256"] = hashes[0] if len(hashes) == 1 else hashes
+    config = replace(config, data={**config.data, **data})
+    if config.model.grid == "published":
+        sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
+    module_data = SetData(*sets, config, workers)
+    record = Record(folder, progress or (lambda what, share: None))
+    with _quiet():
+        runner = _trainer(config, record, **trainer)
+    _claim(folder, config)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    keep_freed_memory()
+    start = time.perf_counter()
+    module = DepthTraining(config)
+    resume = folder / RESUME
+    if resume.is_file():
+        check_resume(resume, module)
+    if not (folder / "last.safetensors").is_file():
+        with _quiet():
+            try:
+                runner.fit(module, module_data, ckpt_path=str(resume) if resume.is_file() else None, weights_only=True)
+            except SystemExit:  # what Lightning makes of Ctrl-C
+                raise KeyboardInterrupt from None
+        if runner.is_global_zero:
+            save_model(module.kept, config, record.rows[-1], folder / "last.safetensors")
+        runner.strategy.barrier()
+    _, _, best = load_model(folder)
+    _, _, last = load_model(folder / "last.safetensors")
+    diverged = f"{folder}: the run diverged, its validation error is no number; use a lower --rate"
+    require(math.isfinite(best["val_rmse_mm"]), diverged)
+    return {
+        "steps": last["step"],
+        "seconds": time.perf_counter() - start,
+        "val_rmse_mm": best["val_rmse_mm"],
+        "val_mae_mm": best["val_mae_mm"],
+        "best_step": best["step"],
+        "checkpoint": str(folder / "model.safetensors"),
+        "parameters": module.model.parameters_count,
+    }

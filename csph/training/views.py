@@ -1,0 +1,78 @@
+"""Views of a rendered set, from its folder or its pack, and their split by scenes. Needs no renderer."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from render.transient import Transient, read_transient
+from render.transient.packs import read_pack
+from scenes.errors import require
+from scenes.io.set_index import read_set_index
+from spad.detection.training_patches import PackedTransients, packed_transients
+
+VALIDATION_SHARE = 0.1  # of a set's scenes, its last, where no validation set is given
+
+
+class Views(NamedTuple):
+    """Views of a rendered set and the names of the scenes that they show."""
+
+    transients: tuple[Transient, ...]
+    scenes: tuple[str, ...]
+
+
+def read_views(path: Path) -> Views:
+    """All views of a pack (.h5), or of the folder that `scene2spad dataset` filled.
+
+    Raises InputError in one line for anything else, an empty set, and a laser that is not at the camera.
+    """
+    path = Path(path)
+    if path.is_dir():
+        transients, scenes = _from_folder(path)
+    else:
+        packed = read_pack(path)
+        transients, scenes = list(packed), [_scene(meta, i) for i, meta in enumerate(packed.metas)]
+    require(bool(transients), f"{path}: the set is empty")
+    for transient, scene in zip(transients, scenes, strict=True):
+        displaced = any(transient.meta.get("laser", {}).get("baseline_m", (0, 0, 0)))
+        require(not displaced, f"{path}: the laser of {scene} is not at the camera, its path is not twice the depth")
+    return Views(tuple(transients), tuple(scenes))
+
+
+def _from_folder(path: Path) -> tuple[list[Transient], list[str]]:
+    records = read_set_index(path)
+    transients = [read_transient(path / record["file"]) for record in records]
+    return transients, [_scene(record, i) for i, record in enumerate(records)]
+
+
+def _scene(meta: dict, number: int) -> str:
+    """What a view shows: views of one place are not independent, whatever their numbers."""
+    return str(meta.get("place", meta.get("scene", number)))
+
+
+def split_views(views: Views, share: float = VALIDATION_SHARE) -> tuple[Views, Views]:
+    """Training and validation views of different scenes: the last scenes are validation's. InputError for one scene."""
+    names = list(dict.fromkeys(views.scenes))
+    require(len(names) >= 2, f"a set of one scene ({names[0]}) has none left to validate on; give a validation set")
+    held = set(names[-max(1, round(share * len(names))) :])
+    parts = []
+    for wanted in (False, True):
+        kept = [i for i, name in enumerate(views.scenes) if (name in held) == wanted]
+        parts.append(Views(tuple(views.transients[i] for i in kept), tuple(views.scenes[i] for i in kept)))
+    return parts[0], parts[1]
+
+
+def packed_sha256(packed: PackedTransients) -> str:
+    """SHA-256 over what is sensed: a run that goes on must go on with the same set."""
+    sha = hashlib.sha256(str(packed.depth_m.shape).encode())
+    for name in ("offsets", "path_near_m", "path_far_m", "radiance", "depth_m", "ambient", "mixed"):
+        sha.update(np.ascontiguousarray(getattr(packed, name)).tobytes())
+    return sha.hexdigest()
+
+
+def packed_views(views: Views) -> PackedTransients:
+    """One packed set; InputError where views are of different sizes."""
+    return packed_transients(views.transients)

@@ -1,0 +1,125 @@
+"""Cards of the models that come with the package: what each is, what made it, how far it errs, what it is not for.
+
+A card is read from the model's JSON: configuration and state are always there, CPU-minutes and errors where `ship` was
+told them.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from csph.training.config import TrainConfig
+from csph.training.levels import BACKGROUND, CONTINUOUS, SIGNAL
+from csph.weights.shipped import WEIGHTS
+from scenes.errors import InputError, require
+
+LONG_BLOCK = 256  # bins; learned codes over more of them know the depths of their training set
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a shipped model is.
+
+    training, training_sha256   its sets' files and their SHA-256
+    levels        photon levels of training, in words
+    cpu_minutes   of its training; None where they were not recorded
+    val_mae_mm    on its validation set, as the model was decoded then
+    errors        MAE [mm] by set and level, where `ship` was told
+    not_for       what it must not be used for
+    """
+
+    name: str
+    model: str
+    compression: float
+    training: tuple[str, ...]
+    training_sha256: tuple[str, ...]
+    levels: str
+    steps: int
+    cpu_minutes: float | None
+    val_mae_mm: float | None
+    errors: dict[str, dict[str, float]]
+    not_for: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def read_card(path: Path) -> Card:
+    """The card of a shipped model's JSON file; InputError in one line where it cannot be read."""
+    try:
+        told = json.loads(path.read_text())
+        config, state = TrainConfig.from_dict(told["config"]), told["state"]
+    except (OSError, ValueError, KeyError, TypeError, InputError) as error:
+        raise InputError(f"{path}: is no card of a model ({' '.join(str(error).split())[:80]})") from None
+    design = config.model.design
+    return Card(
+        name=path.stem,
+        model=config.model.name,
+        compression=1.0 if design is None else design.compression_ratio,
+        training=_several(config.data.get("training", ())),
+        training_sha256=_several(config.data.get("training_sha256", ())),
+        levels=levels_in_words(config),
+        steps=config.steps,
+        cpu_minutes=told.get("cpu_minutes"),
+        val_mae_mm=state.get("val_mae_mm"),
+        errors=told.get("errors", {}),
+        not_for=limits(config),
+    )
+
+
+def cards(folder: Path = WEIGHTS) -> list[Card]:
+    """Cards of all models of a folder, by name."""
+    return [read_card(path) for path in sorted(folder.glob("*.json")) if path.with_suffix(".safetensors").is_file()]
+
+
+def _several(value: str | list[str] | tuple[str, ...]) -> tuple[str, ...]:
+    return (value,) if isinstance(value, str) else tuple(value)
+
+
+def levels_in_words(config: TrainConfig) -> str:
+    """As in "signal 2 to 10, background 2 to 50"."""
+    listed = config.levels != CONTINUOUS
+    columns = zip(*config.levels, strict=True) if listed else (SIGNAL, BACKGROUND)
+    (low, high), (least, most) = ((min(column), max(column)) for column in columns)
+    return f"signal {low:g} to {high:g}, background {least:g} to {most:g}"
+
+
+def limits(config: TrainConfig) -> tuple[str, ...]:
+    """What a model trained so must not be used for."""
+    model, sensor = config.model, config.model.sensor
+    found = [f"histograms of other than {sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps, or another pulse"]
+    found.append(f"photon levels far from its training's ({levels_in_words(config)})")
+    reach, design = config.data.get("training_reach_m"), model.design
+    long = design is not None and "temporal" in design.learned and design.block[0] > LONG_BLOCK
+    if long and reach and not config.time_offset_m:
+        found.append(f"depths beyond those of its training set, {reach:g} m")
+    if model.grid == "published":
+        found.append("absolute depth: its labels are the published ones, for comparison with print")
+    return tuple(found)
+
+
+def shipped_model(name: str, folder: Path = WEIGHTS) -> Path:
+    """The file of a shipped model by its name; InputError that names the nearest ones for another."""
+    path = folder / f"{name}.safetensors"
+    if not path.is_file():
+        import difflib
+
+        names = sorted(one.stem for one in folder.glob("*.safetensors"))
+        near = difflib.get_close_matches(name, names, 3, 0.4)
+        require(False, f"model {name!r} is unknown{', like ' + ', '.join(near) if near else ''}; see scene2spad models")
+    return path
+
+
+def checkpoint_of(name_or_path: Path | str, folder: Path = WEIGHTS) -> Path:
+    """A checkpoint's path as it is if something lies there, else the shipped model of that name. InputError."""
+    path = Path(name_or_path)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        require(path.exists(), f"{path}: file not found")
+        return path
+    try:
+        return shipped_model(str(name_or_path), folder)
+    except InputError as error:
+        raise InputError(f"{path}: file not found, and {error}") from None

@@ -1,0 +1,70 @@
+"""Files of torch.save (.ckpt, .pt): checked against their own checksums, and read as tensors alone."""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+from scenes.errors import InputError, require
+from scenes.io.inputs import regular_file
+
+
+class _EmptyInstead:
+    """Stands for a class or function of another library: whatever is made with it is an empty dictionary."""
+
+    def __new__(cls, *_: object) -> OrderedDict:  # type: ignore[misc]
+        return OrderedDict()
+
+
+class _NothingInstead:
+    """Stands for a class or function of NumPy, whose state is no dictionary: made of anything, it keeps nothing."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def __setstate__(self, state: object) -> None:
+        pass
+
+
+def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
+    """Return what torch.save wrote, tensors and plain values alone, on the CPU.
+
+    `foreign`: objects of other libraries, such as the settings that a trainer keeps beside its weights, are replaced by
+    empty ones; none of those libraries is imported or called. Raises InputError in one line for a missing or foreign
+    file, one whose checksums do not fit (torch does not look at them), and one that holds other objects, which could
+    run code.
+    """
+    import torch
+    from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
+
+    path = regular_file(path, "checkpoint")
+    check_torch_file(path)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            names = get_unsafe_globals_in_checkpoint(path) if foreign else []
+            empty = [(_NothingInstead if name.startswith("numpy.") else _EmptyInstead, name) for name in names]
+            with safe_globals(empty):
+                return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # unpickling raises whatever the pickle asks for
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{path}: no checkpoint of tensors alone ({reason})") from None
+
+
+def check_torch_file(path: Path) -> None:
+    """InputError unless a file is a whole archive of torch.save: every entry stored as it is, its CRC-32 fitting."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = path.stat().st_size
+            for entry in archive.infolist():
+                stored = entry.compress_type == zipfile.ZIP_STORED and entry.file_size <= size
+                require(stored, f"{path}: entry {entry.filename!r} of {entry.file_size} bytes is not stored plainly")
+            damaged = archive.testzip()
+    except InputError:
+        raise
+    except Exception as error:  # what zipfile raises for damaged directories is of many types
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{path}: no checkpoint, or a damaged one ({reason})") from None
+    require(damaged is None, f"{path}: is damaged, entry {damaged!r} does not fit its checksum")

@@ -1,0 +1,1 @@
+"""Integrate direct light: footprints of rays, cells of pixels, edges between cells."""

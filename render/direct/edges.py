@@ -1,0 +1,350 @@
+"""What lies between neighbouring cells of pixels, compared all at once; and how cells follow their neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.direct.footprints import HIT, LARGE, LIT
+from render.scene.traced_scene import Bool, Float, UInt32, dr, mi, recorded, upload
+
+# Two neighbours lie on one surface if their planes explain the step between their distances up to this [m]: a sixth of
+# the reference sensor's bin. A crease lies between them if their planes differ by more than CREASE_M over the step, or
+# if the cosines toward the laser differ by more than CREASE_COSINE.
+STEP_M = 0.0025
+CREASE_M = 0.03
+CREASE_COSINE = 0.05
+# An edge of paint or of a glint lies between two neighbours on one surface whose radiances differ by more than this
+# share of the brighter one.
+TONE = 0.1
+MIXED_GAP_M = 0.05
+# A cell follows its neighbours if its tangent plane is off the mean step to them by no more than this share of its
+# distance, a bent surface apart.
+FOLLOWED = 3e-4
+GLINT_WIDTH = 2.0  # of a highlight, in units of the roughness
+
+CUT, MIXED, GLINT = 1, 2, 4
+ACROSS, PAIRS = 8, 12  # pairs of a cut cell's children: with what lies beyond its sides, and with siblings
+
+
+class Cells(NamedTuple):
+    """What is compared of cells, (N,) each: see `render.direct.footprints.Footprints`."""
+
+    distance_m: Any
+    slope_x_m: Any
+    slope_y_m: Any
+    facing: Any
+    radiance: Any
+    flags: Any
+    tilt_x: Any = None
+    tilt_y: Any = None
+    peak: Any = None
+
+
+class Place(NamedTuple):
+    """Where cells lie: level, column and row in cells of that level, and the rank of their pixel, (N,) each."""
+
+    level: Any
+    column: Any
+    row: Any
+    rank: Any
+
+
+class Tree(NamedTuple):
+    """How cells, `grid` a pixel side, are found in an image `width` wide: `rank_of` each pixel from the `first` one on
+    (-1: none), and the first `child` of each cell (-1: a leaf); both int32."""
+
+    grid: int
+    width: int
+    first: int
+    rank_of: np.ndarray
+    child: np.ndarray
+
+
+class _Between(NamedTuple):
+    """Of a pair of cells: whether an edge lies between them, whether it parts surfaces too far from each other (or one
+    from nothing), the share of the brighter one's radiance that misplacing it can change, whether both are hits on
+    one surface, bent or not, and the mean radiance that a highlight between them may add to a cell."""
+
+    differ: Any
+    apart: Any
+    contrast: Any
+    joined: Any
+    glint: Any
+
+
+def first_edges(
+    cells: Cells, spans: Sequence[np.ndarray], grid: int, width: int, least: float
+) -> tuple[np.ndarray, ...]:
+    """Compare all cells of whole pixels, grid x grid each, with their neighbours: CUT, MIXED, GLINT bits, and spans.
+
+    `width` is the image's where the pixels are its whole rows; 0: neighbours in other pixels are not met. CUT is set
+    where an edge could change radiance times a pixel's area by `least` or more, or where the cell is large; GLINT
+    where a highlight between two cells could.
+
+    `spans` are path centres, half widths and smaller half spans [m]; all columns are `aligned`. Small cells are spread
+    between their neighbours on the same surface instead of on the tangent plane. Along each axis
+    p = p_0 + s x + c x^2 / 2 and r = r_0 + g x, with s, g the mean of the steps to both neighbours (the one step where
+    the other neighbour lies across an edge) and c their difference. Then the half span is |s| / 2 (c adds c^2 / 720 to
+    the variance), and the mean path p_0 + c / 24 + g s / (12 r_0), summed over the axes: second order in the cell's
+    width where the tangent plane is first, and blind to facets of a curved surface. At a crease the tangent plane
+    agrees with one of the steps instead of their mean, and is kept.
+    """
+    if len(cells.flags) < 2:  # arrays of one entry are scalars to Dr.Jit: another kernel
+        return np.where(cells.flags & LARGE, np.uint32(CUT), np.uint32(0)), *spans
+    columns = tuple(Float(column) for column in spans)
+    lane = dr.arange(UInt32, len(cells.flags))
+    dr.eval(lane)
+    numbers = (dr.opaque(UInt32, value) for value in (grid, width, len(cells.flags) // grid**2))
+    least = dr.opaque(Float, float(least))
+    found = _first_edges(_seen(cells), *columns, lane, *numbers, least)
+    dr.eval(found)
+    return tuple(values.numpy() for values in found)
+
+
+def child_edges(
+    tree: Tree, places: Place, cells: Cells, parents: np.ndarray, start: int, least: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compare the children of cells that were just cut, numbered from `start`, with each other and with what lies
+    beyond the cut cells' sides: a child of a cell of the same size, or a leaf.
+
+    Returns the pairs (one, other) and their CUT, MIXED and GLINT bits, all (12 parents,) uint32. Where nothing lies
+    beside, and where both of two neighbours were cut and the other one meets the pair, bits are 0.
+    """
+    number = max(len(parents), 2)  # arrays of one entry are scalars to Dr.Jit: another kernel
+    lane = dr.arange(UInt32, PAIRS * number)
+    dr.eval(lane)
+    counts = (dr.opaque(UInt32, value) for value in (tree.grid, tree.width, tree.first, len(tree.rank_of), start))
+    found = _child_edges(
+        tuple(mi.Int32(column) for column in (tree.rank_of, tree.child)),
+        tuple(UInt32(column.view(np.uint32)) for column in places),
+        _seen(cells),
+        upload(UInt32, parents, number),
+        lane,
+        *counts,
+        dr.opaque(Float, float(least)),
+    )
+    dr.eval(found)
+    return tuple(values.numpy() for values in found)
+
+
+def _seen(cells: Cells) -> tuple[Any, ...]:
+    """The same memory, as Dr.Jit sees it."""
+    return tuple((UInt32 if column.dtype == np.uint32 else Float)(column) for column in cells if column is not None)
+
+
+@recorded
+def _first_edges(
+    cells: Any, path: Any, half: Any, minor: Any, lane: Any, grid: Any, width: Any, pixels: Any, least: Any
+) -> tuple[Any, ...]:
+    cells = Cells(*cells)
+    per_pixel = grid * grid
+    rank = lane // per_pixel
+    row = (lane - rank * per_pixel) // grid
+    column = lane - rank * per_pixel - row * grid
+    whole = width > 0
+    pixel_x = rank % dr.maximum(width, 1)
+    # after and before along x, then y: whether the neighbour is of the same pixel, whether of another, and which it is
+    sides = (
+        (column + 1 < grid, whole & (pixel_x + 1 < width), lane + 1, lane + per_pixel + 1 - grid),
+        (column > 0, whole & (pixel_x > 0), lane - 1, lane - per_pixel - 1 + grid),
+        (row + 1 < grid, whole & (rank + width < pixels), lane + grid, lane + per_pixel * width + grid - per_pixel),
+        (row > 0, whole & (rank >= width), lane - grid, lane - per_pixel * width - grid + per_pixel),
+    )
+    pitch = dr.rcp(Float(grid))
+    follows = ((cells.flags & (HIT | LARGE)) == HIT) & (cells.radiance > 0)
+    per_radiance = dr.select(follows, dr.rcp(cells.radiance), 0)
+    cut, mixed, glint = (cells.flags & LARGE) != 0, Bool(False), Bool(False)
+    mean, variance, halves = Float(path), Float(0), []  # a copy: += would change the path
+    for axis in range(2):
+        number, rise, rises, bend, run, bends = (Float(0) for _ in range(6))
+        gain = Float(0)
+        slope = cells[1 + axis] * pitch
+        for (inside, across, near, far), way in zip(sides[2 * axis : 2 * axis + 2], (1, -1), strict=True):
+            there = inside | across
+            index = dr.select(inside, near, far)
+            other = _at(cells, index, there)
+            step = way * (other.distance_m - cells.distance_m)
+            between = _between(cells, other, step, slope, other[1 + axis] * pitch)
+            brighter = dr.maximum(cells.radiance, other.radiance)
+            cut |= there & between.differ & (brighter * between.contrast * pitch * pitch >= least)
+            glint |= there & (between.glint > 0) & (between.glint * pitch * pitch >= least)
+            mixed |= inside & between.differ & between.apart
+            joined = there & between.joined
+            number += dr.select(joined, 1, 0)
+            rise += dr.select(joined, step, 0)
+            rises += dr.select(joined, way * step, 0)
+            step = dr.select(joined, way * (dr.gather(Float, path, index, there) - path), 0)
+            run, bends = run + step, bends + way * step
+            gain += dr.select(joined, way * (other.radiance - cells.radiance), 0)
+        share, two = dr.rcp(dr.maximum(number, 1)), dr.select(number == 2, Float(1), Float(0))
+        off = dr.abs(slope - rise * share)
+        follows &= (number > 0) & (off <= dr.maximum(dr.abs(rises) * two / 4, FOLLOWED * cells.distance_m))
+        run, bend = run * share, bends * two
+        gain = dr.clip(gain * share * per_radiance, -2, 2)
+        mean += bend / 24 + gain * run / 12
+        halves.append(dr.abs(run) / 2)
+        variance += dr.square(run) / 4 + dr.square(bend) / 240
+    return (
+        _bits(cut, mixed, glint),
+        dr.select(follows, mean, path),
+        dr.select(follows, dr.sqrt(variance), half),
+        dr.select(follows, dr.minimum(*halves), minor),
+    )
+
+
+@recorded
+def _child_edges(
+    tree: Any,
+    places: Any,
+    cells: Any,
+    parent: Any,
+    lane: Any,
+    grid: Any,
+    width: Any,
+    first: Any,
+    pixels: Any,
+    start: Any,
+    least: Any,
+) -> tuple[Any, Any, Any]:
+    rank_of, child = tree
+    places, cells = Place(*places), Cells(*cells)
+    number = lane // PAIRS
+    pair = lane - number * PAIRS
+    of = dr.gather(UInt32, parent, number)
+    mine = UInt32(dr.gather(mi.Int32, child, of))
+    # two pairs on each side, left, right, above and below, and four of siblings; children lie (0, 0), (1, 0), (0, 1),
+    # (1, 1) in columns and rows
+    across, side, second = pair < ACROSS, pair >> 1, pair & 1
+    beyond, upright = side & 1, side < 2  # whether the way leads to higher columns or rows; along the columns
+    among = pair - ACROSS
+    near = dr.select(upright, beyond + 2 * second, 2 * beyond + second)
+    near = dr.select(across, near, dr.select(among < 2, 2 * among, among - 2))
+    far = dr.select(upright, 1 - beyond + 2 * second, 2 * (1 - beyond) + second)
+    far = dr.select(across, far, dr.select(among < 2, 2 * among + 1, among))
+    way = 2 * mi.Int32(beyond) - 1
+    level = dr.gather(UInt32, places.level, of)
+    column, row = (mi.Int32(dr.gather(UInt32, numbers, of)) for numbers in (places.column, places.row))
+    column, row = column + dr.select(upright, way, 0), row + dr.select(upright, 0, way)
+    beside = _cell_at(rank_of, child, level, column, row, across, grid, width, first, pixels)
+    met = across & (beside >= 0)
+    its_child = dr.gather(mi.Int32, child, beside, met)
+    cut = met & (its_child >= 0)
+    # two cells cut in this pass, side by side, are met once
+    met &= (beyond == 1) | ~cut | (its_child < mi.Int32(start))
+    even = cut & (dr.gather(UInt32, places.level, beside, met) == level)
+    one, other = mine + near, dr.select(even, its_child + mi.Int32(far), beside)
+    other = dr.select(across, UInt32(other), mine + far)
+    compare = met | ~across
+    one, other = dr.select(compare, one, 0), dr.select(compare, other, 0)
+    return one, other, dr.select(compare, compared(places, cells, one, other, grid, least), 0)
+
+
+@dr.syntax
+def _cell_at(
+    rank_of: Any,
+    child: Any,
+    level: Any,
+    column: Any,
+    row: Any,
+    active: Any,
+    grid: Any,
+    width: Any,
+    first: Any,
+    pixels: Any,
+) -> Any:
+    """The deepest cell, no deeper than `level`, that holds the cell (column, row) of that level; -1 where none."""
+    depth = mi.Int32(level)
+    column_0, row_0 = column >> depth, row >> depth
+    active = active & (column_0 >= 0) & (row_0 >= 0)  # a copy: &= would change the caller's
+    x, y = UInt32(column_0), UInt32(row_0)
+    pixel_x, pixel_y = x // grid, y // grid
+    place = pixel_y * width + pixel_x - first  # wraps to a large number where it would be negative
+    active &= (pixel_x < width) & (place < pixels)
+    rank = dr.gather(mi.Int32, rank_of, place, active)
+    active &= rank >= 0
+    found = mi.Int32((UInt32(rank) * grid + y - pixel_y * grid) * grid + x - pixel_x * grid)
+    found = dr.select(active, found, -1)
+    depth = dr.select(active, depth, 0)
+    while depth > 0:
+        depth -= 1
+        below = dr.gather(mi.Int32, child, found)
+        down = below + 2 * ((row >> depth) & 1) + ((column >> depth) & 1)
+        found = dr.select(below >= 0, down, found)
+        depth = dr.select(below >= 0, depth, 0)
+    return found
+
+
+def compared(places: Place, cells: Cells, one: Any, other: Any, grid: Any, least: Any) -> Any:
+    """CUT, MIXED and GLINT bits of pairs of cells of any size, side by side, as `first_edges` sets them of a cell.
+
+    `one` and `other` number the pairs' cells in `places` and `cells`.
+    """
+    (begin, first), (end, second) = ((_at(places, index), _at(cells, index)) for index in (one, other))
+    # half a cell's width, in the unit of the finer cell of the pair's half width; columns and rows at that unit
+    finer = dr.maximum(begin.level, end.level)
+    unit = 0.5 / Float(grid << finer)
+    way_x, way_y = (
+        Float(mi.Int32(((2 * to + 1) << (finer - end.level)) - ((2 * of + 1) << (finer - begin.level)))) * unit
+        for of, to in ((begin.column, end.column), (begin.row, end.row))
+    )
+    rises = (cell.slope_x_m * way_x + cell.slope_y_m * way_y for cell in (first, second))
+    between = _between(first, second, second.distance_m - first.distance_m, *rises)
+    wider = 2 * unit * Float(UInt32(1) << (finer - dr.minimum(begin.level, end.level)))
+    brighter = dr.maximum(first.radiance, second.radiance)
+    cut = between.differ & (brighter * between.contrast * dr.square(wider) >= least)
+    glint = (between.glint > 0) & (between.glint * dr.square(wider) >= least)
+    mixed = between.differ & between.apart & (begin.rank == end.rank)
+    return _bits(cut, mixed, glint)
+
+
+def _bits(cut: Any, mixed: Any, glint: Any) -> Any:
+    bits = ((cut, CUT), (mixed, MIXED), (glint, GLINT))
+    return sum((dr.select(condition, bit, UInt32(0)) for condition, bit in bits), UInt32(0))
+
+
+def _at(columns: Any, index: Any, active: bool | Any = True) -> Any:
+    """Those of other cells; of nothing where not `active`."""
+    gathered = (dr.gather(type(column), column, index, active) for column in columns if column is not None)
+    return type(columns)(*gathered)
+
+
+def _between(one: Cells, other: Cells, step: Any, rise: Any, other_rise: Any) -> _Between:
+    """Compare cells with their neighbours.
+
+    `step` is the difference of two hits' distances [m], the rises what each one's tangent plane predicts for it. Across
+    a crease, or along a surface that bends one way, it lies between the two predictions; across a gap it does not.
+    """
+    least, most = dr.minimum(rise, other_rise), dr.maximum(rise, other_rise)
+    both = (one.flags & other.flags & HIT) != 0
+    unlike = one.flags ^ other.flags
+    gap = dr.select(both, dr.maximum(step - most, least - step), 0)
+    edge = (gap > STEP_M) | (both & (most - least > CREASE_M)) | ((unlike & (HIT | LIT)) != 0)
+    bend = dr.abs(one.facing - other.facing)
+    brighter = dr.maximum(one.radiance, other.radiance)
+    tone = dr.select(brighter > 0, dr.abs(one.radiance - other.radiance) / brighter, 0)
+    differ = edge | (both & ((bend > CREASE_COSINE) | (tone > TONE)))
+    apart = (gap > MIXED_GAP_M) | ((unlike & HIT) != 0)
+    joined = both & ~edge
+    glint = Float(0) if one.peak is None else dr.select(joined, _highlight(one, other) - brighter, 0)
+    return _Between(differ, apart, dr.select(edge, Float(1), dr.maximum(bend, tone)), joined, glint)
+
+
+def _highlight(one: Cells, other: Cells) -> Any:
+    """Mean radiance of a cell that holds the highlight between two neighbours on a surface that bends.
+
+    Between them the tilt off its middle, in units of the roughness, runs from one's to the other's, and in the
+    neighbouring rows as far to the side as half the step. GGX falls as 1 / (1 + t^2)^2 with the tilt t, Beckmann
+    faster: its edges are followed where they need not be, none is missed. A highlight narrower than the step fills a
+    part of the cell.
+    """
+    step_x, step_y = other.tilt_x - one.tilt_x, other.tilt_y - one.tilt_y
+    step2 = dr.square(step_x) + dr.square(step_y)
+    part = dr.clip(-(one.tilt_x * step_x + one.tilt_y * step_y) / dr.maximum(step2, 1e-12), 0, 1)
+    off = dr.norm(mi.Vector2f(one.tilt_x + part * step_x, one.tilt_y + part * step_y))
+    step = dr.sqrt(step2)
+    off = dr.maximum(off - step / 2, 0)
+    share = dr.minimum(GLINT_WIDTH / dr.maximum(step, GLINT_WIDTH), 1)
+    return dr.minimum(one.peak, other.peak) / dr.square(1 + dr.square(off)) * share

@@ -1,0 +1,217 @@
+"""One ray per cell of a pixel, and the footprint of the cell on the face that the ray hits.
+
+A cell is a square of a pixel, `pitch` pixels wide. Seen on the tangent plane of the point its ray hits, it spans
+path lengths p(x, y) = rho + |p - L|. To first order p is linear over the cell, so its distribution is a trapezoid of
+variance (a^2 + b^2) / 3 with half spans a = |dp/dx| pitch/2, b = |dp/dy| pitch/2; the cell's return is uniform over
+p +- sqrt(a^2 + b^2), which has the same mean and variance. Its radiance is f cos I / d^2 (`laser_leg`), that of the
+ray. Both hold while the cell is small: on a plane radiance goes with u^3 and distance with 1/u, u = n . l, so that a
+cell over which u changes by a share D makes an energy error of D^2 / 4 and shifts the mean path by a share D^2 / 6.
+SMALL bounds D: 1/32 means 2.5e-4 of energy, and a shift of 1 % of the standard deviation of a pixel of 2 x 2 cells.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.scene.rays import camera_rays, first_opaque, laser_leg, shape_index, to_camera
+from render.scene.traced_scene import Bool, Float, UInt32, World, dr, mi, upload
+
+SMALL = 1 / 32
+# beside a displaced laser: a cell's extent over its distance to the laser, second order in the laser leg
+SMALL_FROM_LASER = 1 / 8
+HIT, LIT, LARGE, CLIPPED = 1, 2, 4, 8
+LEVEL_BIT = 24  # rows of cells stay below 2^24
+
+
+class Footprints(NamedTuple):
+    """Per cell, float32 (N,): path centre, half width, smaller half span b [m] (0: unknown), radiance, radial
+    distance of the centre [m], its change per pixel along x and y [m], |cosine| of the shading normal and the way to
+    the laser, and flags HIT, LIT, LARGE, CLIPPED (uint32).
+
+    Of worlds with glints also how far the shading normal is from the middle of the highlight, n - h with h halfway
+    between the ways to camera and laser, in camera-frame x and y over the surface's roughness; and the radiance in
+    the middle (0: no glint)."""
+
+    path_m: np.ndarray
+    half_width_m: np.ndarray
+    minor_m: np.ndarray
+    radiance: np.ndarray
+    distance_m: np.ndarray
+    slope_x_m: np.ndarray
+    slope_y_m: np.ndarray
+    facing: np.ndarray
+    flags: np.ndarray
+    tilt_x: np.ndarray | None = None
+    tilt_y: np.ndarray | None = None
+    peak: np.ndarray | None = None
+
+
+def trace(world: World, column: np.ndarray, row: np.ndarray, level: np.ndarray, grid: int, *, clip: bool = False):
+    """Footprints of the cells in these columns and rows (N,) of an image of cells 1/(grid 2^level) pixels wide.
+
+    With `clip` a footprint that is not small is cut to the path lengths that its face spans.
+    """
+    if len(column) == 0:
+        nothing = np.empty(0, np.float32)
+        return Footprints(*(nothing,) * 8, np.empty(0, np.uint32), *(nothing,) * (3 if world.has_glints else 0))
+    packed = row.astype(np.uint32) | level.astype(np.uint32) << LEVEL_BIT
+    count, lanes = len(column), _lanes(len(column))
+    columns = [upload(UInt32, values, lanes) for values in (column, packed)]
+    work = partial(_footprints, clip=clip)
+    found = world.recordings.call(world, ("footprints", clip), work, *columns, dr.opaque(UInt32, grid))
+    dr.eval(found)
+    return Footprints(*(values.numpy()[:count] for values in found))
+
+
+def _lanes(count: int) -> int:
+    """The next number that neither 2 nor 3 divides, from 5 on.
+
+    Dr.Jit records anew where two inputs have one size that had not before. Coordinates of meshes and their textures
+    come in twos and threes; and arrays of one entry are scalars to it.
+    """
+    lanes = max(count, 5)
+    return next(more for more in range(lanes, lanes + 4) if more % 2 and more % 3)
+
+
+def _footprints(world: World, column: Any, packed: Any, grid: Any, *, clip: bool) -> tuple:
+    level = packed >> LEVEL_BIT
+    side = grid << level
+    row = packed & ((1 << LEVEL_BIT) - 1)
+    pitch = dr.rcp(Float(side))
+    x, y = (Float(column) + 0.5) * pitch, (Float(row) + 0.5) * pitch
+    # not by integer division: lanes that pad the last packet hold anything, and a division by their 0 is fatal
+    pixel = UInt32(y) * world.width + UInt32(x)
+    step = pitch / world.focal_px
+    aside, down = _off_centre(column, row, level)
+    ray, aim = camera_rays(world, x + aside * pitch, y + down * pitch)
+    if world.sees_through:
+        si, transmission, optical, distance = first_opaque(world, ray, Bool(True))
+    else:
+        # neighbouring lanes are neighbouring rays: told so, Embree is three times as fast
+        si = world.traced.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=Bool(True))
+        transmission, optical, distance = Float(1), si.t, si.t
+    hit = si.is_valid()
+    value, to_laser, irradiance, leg = laser_leg(world, si, pixel, hit, seen_by_camera=(transmission, optical))
+    normal, point = to_camera(world, si.n), to_camera(world, si.p - world.eye)
+    # what the ray through the centre sees on the tangent plane, where it sees any of it near by
+    local = aim - mi.Vector3f(aside, down, 0) * step
+    depth = dr.dot(normal, aim) / dr.dot(normal, local)
+    local, depth = dr.select((depth > 0.5) & (depth < 2), local, aim), dr.select((depth > 0.5) & (depth < 2), depth, 1)
+    centre = local * (point.z * depth)
+    nearer = dr.norm(centre) - dr.norm(point)
+    laser = to_camera(world, world.laser - world.eye)
+    from_laser = dr.norm(point - laser), dr.norm(centre - laser)
+    path = optical + leg + nearer + (from_laser[1] - from_laser[0])
+    distance = distance + nearer
+    # paint's f cos / d^2 goes with 1 / d^3 on a plane
+    radiance = dr.select(hit, value * transmission * (from_laser[0] / from_laser[1]) ** 3, 0)
+    slope, path_slope, extent = _slopes(local, normal, centre - laser, distance, world.scene.laser.is_colocated)
+    half_x, half_y = dr.abs(path_slope.x) * step / 2, dr.abs(path_slope.y) * step / 2
+    half = dr.sqrt(dr.square(half_x) + dr.square(half_y))
+    # edge on, or on a face without a normal, there is no first order: the cell is large
+    half = dr.select(dr.isfinite(half), half, path)
+    slope = dr.select(dr.isfinite(slope.x) & dr.isfinite(slope.y), slope, 0)
+    small = (half <= 0.5 * SMALL * path) & (dr.maximum(dr.abs(slope.x), dr.abs(slope.y)) * step <= SMALL * distance)
+    lit = hit
+    small &= hit
+    if not world.scene.laser.is_colocated:
+        small &= dr.square(extent * step) <= dr.square(SMALL_FROM_LASER) * dr.squared_norm(si.p - world.laser)
+        # black paint is no shadow: where nothing could come back nothing is missing
+        lit = hit & ((radiance > 0) | (albedo(world, si, hit) == 0))
+    flags = dr.select(hit, HIT, UInt32(0)) | dr.select(lit, LIT, UInt32(0)) | dr.select(hit & ~small, LARGE, UInt32(0))
+    if clip:
+        near, far = _face_span(world, si, path, hit & ~small)
+        low, high = dr.maximum(path - half, near), dr.minimum(path + half, far)
+        cut = hit & ~small & ~((near <= path - half) & (far >= path + half))
+        path, half = dr.select(cut, 0.5 * (low + high), path), dr.select(cut, 0.5 * (high - low), half)
+        flags |= dr.select(cut, CLIPPED, UInt32(0))
+    facing = dr.abs(dr.dot(si.sh_frame.n, to_laser))
+    zero = Float(0)
+    per_pixel = dr.rcp(world.focal_px)
+    return (
+        dr.select(hit, path, zero),
+        dr.select(hit, half, zero),
+        dr.select(small, dr.minimum(half_x, half_y), zero),
+        radiance,
+        dr.select(hit, distance, zero),
+        dr.select(hit, slope.x * per_pixel, zero),
+        dr.select(hit, slope.y * per_pixel, zero),
+        dr.select(hit, facing, zero),
+        flags,
+        *(_glint(world, si, ray, to_laser, hit, irradiance * transmission) if world.has_glints else ()),
+    )
+
+
+def _off_centre(column: Any, row: Any, level: Any) -> tuple[Any, Any]:
+    """Where in its cell a ray goes, off the centre along x and y in cells' widths: 0 in cells of level 0.
+
+    Cells that were cut lie along edges, and edges of rooms run along rows or columns: with rays in the middle all cells
+    of a row would round to the same side. So a row's rays are moved along it, and a column's along the column, by
+    multiples of the golden ratio modulo 1, which cut any stretch of neighbours evenly. Three quarters of the cell's
+    width do best over straight and round edges (measured).
+    """
+    cut = dr.select(level > 0, Float(0.75 * 2.0**-24), 0)
+    golden = UInt32(2654435769)  # 2^32 (sqrt(5) - 1) / 2
+    return tuple((Float(number * golden >> 8) - 2.0**23) * cut for number in (row, column))
+
+
+def _glint(world: World, si: Any, ray: Any, to_laser: Any, hit: Any, irradiance: Any) -> tuple[Any, Any, Any]:
+    """Tilt off the highlight's middle, and its radiance there: see `Footprints`."""
+    index = shape_index(si)
+    peak = dr.gather(Float, world.peak, index, hit) * irradiance
+    glossy = hit & (peak > 0)
+    middle = dr.normalize(to_laser - ray.d)
+    normal = dr.mulsign(mi.Vector3f(si.sh_frame.n), dr.dot(si.sh_frame.n, middle))
+    tilt = to_camera(world, normal - middle) / dr.gather(Float, world.roughness, index, glossy)
+    return dr.select(glossy, tilt.x, 0), dr.select(glossy, tilt.y, 0), dr.select(glossy, peak, 0)
+
+
+def _slopes(local: Any, normal: Any, from_laser: Any, distance: Any, colocated: bool) -> tuple[Any, Any, Any]:
+    """Change of distance and of path length per unit of camera-frame x and y (z = 1), (2,) each, and of the point [m].
+
+    On the tangent plane n . (p - C) = const the distance along l = (x, y, 1) is rho = const |l| / (n . l), so
+    drho/dx = rho (x / |l|^2 - n_x / (n . l)), and dp/dx = (drho/dx) r + rho (e_x / |l| - l x / |l|^3).
+    """
+    inverse = dr.rcp(dr.dot(normal, local))
+    length2 = dr.squared_norm(local)
+    along = dr.normalize(local)
+    to_point = along if colocated else dr.normalize(from_laser)
+    slopes, path_slopes, extent2 = [], [], Float(0)
+    for axis in range(2):
+        slope = distance * (local[axis] / length2 - normal[axis] * inverse)
+        unit = mi.Vector3f(1, 0, 0) if axis == 0 else mi.Vector3f(0, 1, 0)
+        sideways = distance * (unit - along * (local[axis] * dr.rsqrt(length2))) * dr.rsqrt(length2)
+        moved = along * slope + sideways
+        slopes.append(slope)
+        path_slopes.append(slope + dr.dot(to_point, moved))
+        extent2 += dr.squared_norm(moved)
+    return mi.Vector2f(*slopes), mi.Vector2f(*path_slopes), dr.sqrt(extent2)
+
+
+def _face_span(world: World, si: Any, path: Any, active: Any) -> tuple[Any, Any]:
+    """Bounds [m] of the path length over the hit triangle.
+
+    p(x) = |x - C| + |x - L| is convex: it is largest at a vertex, and nowhere on the face below its linearisation at
+    the hit point, p + g . (x - x_0) with g the sum of the two unit vectors, whose least value is at a vertex too.
+    """
+    mesh = mi.MeshPtr(si.shape)
+    face = mesh.face_indices(si.prim_index, active)
+    gradient = dr.normalize(si.p - world.eye) + dr.normalize(si.p - world.laser)
+    near, far = Float(path), Float(path)
+    for corner in range(3):
+        vertex = mesh.vertex_position(face[corner], active)
+        near = dr.minimum(near, path + dr.dot(gradient, vertex - si.p))
+        straight = dr.norm(vertex - world.eye) + dr.norm(vertex - world.laser)
+        # glass on the way adds the same delay everywhere, as far as a bound needs to know
+        far = dr.maximum(far, path + straight - dr.norm(si.p - world.eye) - dr.norm(si.p - world.laser))
+    return near, far
+
+
+def albedo(world: World, si: Any, hit: Any) -> Any:
+    """Diffuse reflectance, or a conductor's at normal incidence; 0 where nothing is hit."""
+    diffuse = si.bsdf().eval_diffuse_reflectance(si, hit)[0]
+    specular = dr.gather(Float, world.albedo, shape_index(si), hit)
+    return dr.select(hit, dr.select(specular >= 0, specular, diffuse), 0)

@@ -1,0 +1,193 @@
+"""Direct light, integrated: every cell's footprint spreads its energy over path lengths."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.direct.cell_tree import MOST_CELLS, CellTree
+from render.direct.footprints import albedo
+from render.scene.rays import camera_rays, first_opaque
+from render.scene.traced_scene import Bool, Float, UInt32, World, dr
+from render.transient.samples import Samples, concatenate, merge, no_samples, packed
+
+LANES, LEAST_ROWS = 1 << 19, 16
+REFINE = 6
+# A footprint whose smaller half span is below this is as good as uniform: a thirtieth of the reference sensor's bin.
+NARROW_M = 1e-3
+
+
+class DirectLight(NamedTuple):
+    """Samples of direct light; per pixel the `mixed` flag; how many footprints were clipped; rays cast."""
+
+    samples: Samples
+    mixed: np.ndarray
+    clipped: int
+    rays: int
+
+
+class Layers(NamedTuple):
+    """What the pixel-centre ray meets: radial depth [m] (NaN: nothing), world normal toward the camera, albedo."""
+
+    depth_m: np.ndarray
+    normal: np.ndarray
+    albedo: np.ndarray
+
+
+def least_share_of(grid: int) -> float:
+    """Share of a first cell of a typical pixel below which an edge is not worth its rays.
+
+    Falls with the grid, as the error of all other cells does: what both leave costs least in sum (measured).
+    """
+    return min(1.0, 2 / grid)
+
+
+def direct_light(
+    world: World,
+    pixels: np.ndarray,
+    grid: int,
+    tolerance_m: float = 1e-4,
+    refine: int = REFINE,
+    least_share: float | None = None,
+) -> DirectLight:
+    """Direct returns of the given flat pixel indices (sorted, each once), merged within `tolerance_m`.
+
+    Every pixel starts as grid x grid cells, one ray and footprint each (`render.direct.footprints`). A cell is cut in
+    four, at most `refine` times and down to 1/MOST_CELLS of a pixel, where
+    - its footprint is not small, so that first order no longer describes it; or
+    - it and a neighbouring cell lie on different surfaces, or one is in shadow, or one is painted darker: an edge runs
+      through one of them.
+      An edge that could change less than `least_share` of a first cell's energy, in a pixel of the root mean square of
+      all pixels' radiance, is left alone; by default `least_share_of` the grid.
+    New cells are compared with their neighbours too, of whatever size and pixel, and those are cut in turn: a wire
+    thinner than a cell is followed from wherever a ray hit it. All cuts of a pass are traced in one launch. Footprints
+    not small at the end are clipped to the face they lie on, and counted if that changes them.
+
+    Small cells that are not cut, and whose neighbours lie on the same surface, take their spread of path lengths from
+    them instead of from the tangent plane (`render.direct.edges.first_edges`).
+
+    Pixels are treated in groups of whole rows, at least LEAST_ROWS and about LANES rays each. Neither across edges of
+    groups nor, where not all pixels are asked for, across edges of pixels are cells compared.
+    """
+    least_share = least_share_of(grid) if least_share is None else least_share
+    width = world.scene.camera.width
+    per_chunk = max(LEAST_ROWS, LANES // (grid * grid * width)) * width
+    parts = [
+        _chunk(world, pixels[i : i + per_chunk], grid, tolerance_m, refine, least_share)
+        for i in range(0, max(len(pixels), 1), per_chunk)
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    mixed = np.concatenate([part.mixed for part in parts])
+    samples = concatenate([part.samples for part in parts])
+    return DirectLight(samples, mixed, sum(p.clipped for p in parts), sum(p.rays for p in parts))
+
+
+def _chunk(
+    world: World, pixels: np.ndarray, grid: int, tolerance_m: float, refine: int, least_share: float
+) -> DirectLight:
+    tree = CellTree(world, pixels, grid)
+    touched = tree.refine(max(0, min(refine, int(math.log2(MOST_CELLS / grid)))), least_share / grid**2)
+    clipped = tree.clip()
+    # pixels that were left alone are a table of equal cells; what was cut is a list
+    plain = _merge_plain(tree, np.flatnonzero(~touched), tolerance_m)
+    leaves = tree.child[: tree.used] < 0
+    leaves[: len(pixels) * grid * grid] &= np.repeat(touched, grid * grid)
+    cells = np.flatnonzero(leaves)
+    cut = merge(_samples(tree, cells, tree.pitch(cells), tolerance_m), tolerance_m)
+    return DirectLight(concatenate([plain, cut]), tree.mixed, clipped, tree.rays)
+
+
+def _samples(tree: CellTree, cells: np.ndarray, pitch: np.ndarray | float, tolerance_m: float) -> Samples:
+    """What cells of that width, in pixels, return.
+
+    A cell with half spans a > b is a trapezoid of path lengths, which one uniform return describes badly at the edges
+    of bins. Where b is above the tolerance two returns do it better, without another ray: its halves along the smaller
+    span, at p +- b/2 with half width sqrt(a^2 + b^2 / 4).
+    """
+    count = len(cells)
+    wide = np.flatnonzero(tree.minor_m[cells] > max(tolerance_m, NARROW_M))
+    found = no_samples(count + len(wide))
+    pixel, path, half_width, radiance, _ = found
+    pixel[:count] = tree.pixels[tree.rank[cells]]
+    for column, values in ((path, tree.path_m), (half_width, tree.half_width_m), (radiance, tree.radiance)):
+        np.take(values, cells, out=column[:count], mode="clip")  # other modes copy once more
+    radiance[:count] *= np.square(pitch, dtype=np.float32)
+    found.bounces[:] = 1
+    minor = tree.minor_m[cells[wide]]
+    pixel[count:] = pixel[wide]
+    radiance[wide] = radiance[count:] = radiance[wide] / 2
+    half_width[wide] = half_width[count:] = np.sqrt(half_width[wide] ** 2 - 0.75 * minor**2)
+    path[count:] = path[wide] + minor / 2
+    path[wide] -= minor / 2
+    return found
+
+
+def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Samples:
+    """Merged returns of pixels whose cells are all of level 0.
+
+    Most pixels need no sort: all their cells merge, or no two do.
+    """
+    cells = tree.grid**2
+    index = ranks[:, None] * cells + np.arange(cells)
+    share = 1 / cells
+    if cells > 64 or tolerance_m == 0:
+        return merge(_samples(tree, index.ravel(), 1 / tree.grid, tolerance_m), tolerance_m)
+    radiance = tree.radiance[index]
+    lit = radiance > 0
+    key = np.floor(tree.path_m[index] / tolerance_m)
+    columns = [key[:, k] for k in range(cells)]
+    same = _all([columns[0] == column for column in columns[1:]], len(ranks)) & _all(list(lit.T), len(ranks))
+    parts = [_merge_rows(tree, index[same], radiance[same], share)]
+    rest = index[~same]
+    if cells == 1:
+        return parts[0]
+    if cells <= 4:
+        pairs = [columns[i] != columns[j] for i in range(cells) for j in range(i)]
+        apart = _all(pairs, len(ranks)) & _all(list(lit.T), len(ranks))
+        parts.append(_samples(tree, index[apart].ravel(), 1 / tree.grid, tolerance_m))
+        rest = index[~(same | apart)]
+    parts.append(merge(_samples(tree, rest.ravel(), 1 / tree.grid, tolerance_m), tolerance_m))
+    return concatenate(parts)
+
+
+def _all(conditions: list[np.ndarray], length: int) -> np.ndarray:
+    """Elementwise and."""
+    every = np.ones(length, bool)
+    for condition in conditions:
+        every &= condition
+    return every
+
+
+def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, share: float) -> Samples:
+    """One return for each row of cells, with the sum of energy, the centroid and the variance of its cells."""
+    weight = radiance.astype(np.float64).T * share
+    path = tree.path_m[index].astype(np.float64).T
+    half_width = tree.half_width_m[index].astype(np.float64).T
+    total = sum(weight)
+    centroid = sum(weight * path) / total if len(total) else total
+    variance = sum(weight * ((path - centroid) ** 2 + half_width**2 / 3)) / total if len(total) else total
+    pixel = tree.pixels[tree.rank[index[:, 0]]]
+    return packed(pixel, centroid, np.sqrt(3 * variance), total, np.ones(len(index), np.uint8))
+
+
+def centre_layers(world: World) -> Layers:
+    """Depth, normal and albedo at every pixel centre, (H, W)."""
+    shape = (world.scene.camera.height, world.scene.camera.width)
+    pixel = dr.arange(UInt32, shape[0] * shape[1])
+    dr.eval(pixel)
+    found = world.recordings.call(world, "centre layers", _centres, pixel)
+    dr.eval(found)
+    depth, x, y, z, reflectance = (values.numpy().reshape(shape) for values in found)
+    normal = np.stack((x, y, z), axis=-1)
+    return Layers(depth.copy(), normal.astype(np.float16), reflectance.astype(np.float16))
+
+
+def _centres(world: World, pixel: Any) -> tuple[Any, ...]:
+    ray, _ = camera_rays(world, Float(pixel % world.width) + 0.5, Float(pixel // world.width) + 0.5)
+    si, _, _, distance = first_opaque(world, ray, Bool(True))
+    hit = si.is_valid()
+    normal = si.n * dr.select(hit, dr.select(dr.dot(si.n, ray.d) > 0, Float(-1), Float(1)), 0)
+    return dr.select(hit, distance, dr.nan), *normal, albedo(world, si, hit)

@@ -1,0 +1,1 @@
+"""Estimate indirect light: camera paths, reuse between pixels, light vertices, light tracing, path-space filter."""

@@ -1,0 +1,137 @@
+"""Paths that begin at the laser, on polished surfaces: light that these throw on what the camera sees.
+
+A path L, x1, x2, ..., xk, x1 polished, is light of the pixel that shows xk. Paths are spread evenly, n a pixel, over an
+image that the laser would take (`render.indirect.glossy`). With W the weight of the path up to xk (reflectance over
+density) and f the reflectance there, one of them adds to the pixel
+
+    X = c W f cos I / (n d^2) (cos a_1 / cos a_k)^3 prod_m [cos_s / cos_g](in) [cos_g / cos_s](out),
+
+where d is the way from xk to the camera, cos the cosine of that way, I the laser's intensity, and a are angles to the
+optical axis, as a pixel of the image plane sees (cos a)^3 of solid angle. Shading normals s instead of true ones g make
+reflection unsymmetrical (Veach 1997, section 5.3): the product runs over x1 (in from the laser) to xk (out to the
+camera). c is the share that other paths leave to these (`render.indirect.glossy`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.indirect.glossy import RATIO, begun_on_highlight, glossy_of, is_glossy, laser_rays
+from render.scene.rays import first_opaque, in_beam, pixel_of, segment, spawn, to_camera
+from render.scene.traced_scene import Bool, Float, UInt32, World, dr, mi, upload
+
+PATHS = 1 << 17  # of one launch
+LEAST_COSINE = 1e-4
+
+
+class Thrown(NamedTuple):
+    """Light that some paths throw on other pixels: flat pixel, path [m], radiance over the number of paths, batch."""
+
+    pixel: np.ndarray
+    path_m: np.ndarray
+    radiance: np.ndarray
+    batch: np.ndarray
+
+
+def thrown_light(world: World, paths: float, batches: int, bounces: int, seed: int) -> Iterator[Thrown]:
+    """Trace RATIO times `paths` paths for every polished pixel, fewer for others, launch by launch.
+
+    A flood's intensity is the same everywhere.
+    """
+    glossy = glossy_of(world)
+    if glossy is None:
+        return
+    rounds = np.ceil(RATIO * paths * np.array(glossy.shares, np.float64)).astype(np.int64)
+    ends = np.cumsum(rounds)
+    parts = np.linspace(0, ends[-1], math.ceil(ends[-1] / PATHS) + 1).astype(np.int64)
+    keys = [dr.opaque(UInt32, int(number)) for number in np.random.SeedSequence(seed).generate_state(2)]
+    for begin, end in pairwise(parts):
+        lane = np.arange(begin, end)
+        pixel = np.searchsorted(ends, lane, side="right")
+        number = lane - (ends - rounds)[pixel]
+        batch = (number + pixel) % batches
+        columns = (upload(UInt32, column) for column in (pixel, lane, number // batches, batch))
+        found = _thrown(world, *columns, keys, bounces)
+        dr.eval(found)
+        target, path, radiance = (values.numpy() for values in found)
+        kept = np.flatnonzero(radiance)
+        radiance = radiance[kept].astype(np.float64) / rounds[pixel[kept % len(lane)]]
+        yield Thrown(target[kept].astype(np.int64), path[kept], radiance, batch[kept % len(lane)])
+
+
+@dr.syntax
+def _thrown(
+    world: World, pixel: Any, lane: Any, number: Any, batch: Any, keys: list[Any], bounces: int
+) -> tuple[Any, Any, Any]:
+    """Target pixels, paths and radiances, (bounces - 1) x lanes flat."""
+    lanes = dr.width(lane)
+    targets = dr.zeros(UInt32, lanes * (bounces - 1))
+    paths, values = dr.zeros(Float, lanes * (bounces - 1)), dr.zeros(Float, lanes * (bounces - 1))
+    place, stride, last = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes), dr.opaque(UInt32, bounces - 1)
+    key = mi.sample_tea_32(lane ^ keys[0], keys[1])
+    random = mi.PCG32(initstate=mi.UInt64(key[0]), initseq=mi.UInt64(key[1]))
+    si, path, sample, value, active = _begun(world, pixel, number, batch, keys, random)
+    begun, start = Bool(True), mi.SurfaceInteraction3f(si)
+    slot = dr.zeros(UInt32, lanes)
+    while active:
+        towards, before = spawn(si, si.to_world(sample.wo)), mi.Point3f(si.p)
+        si, _, leg, _ = first_opaque(world, towards, active, before)
+        active &= si.is_valid()
+        path += leg
+        if begun:
+            value *= begun_on_highlight(world, pixel, si.p, -towards.d, start, active)
+            begun = Bool(False)
+        target, seen = pixel_of(world, si.p)
+        # the camera has to see it; the laser need not shine on it
+        passed, back = segment(world, si, world.eye, active & seen)
+        local = to_camera(world, si.p - world.eye)
+        out = si.to_local((world.eye - si.p) / back)
+        light = si.bsdf().eval(mi.BSDFContext(), si, out, active)[0] * value
+        light *= passed / dr.square(back)
+        light *= _ratio(si, si.wi) / _ratio(si, out) * (back / local.z) ** 3
+        light = dr.select(active & seen & dr.isfinite(light), dr.maximum(light, 0), 0)
+        dr.scatter(targets, target, slot * stride + place, active)
+        dr.scatter(paths, path + back, slot * stride + place, active)
+        dr.scatter(values, light, slot * stride + place, active)
+        slot += 1
+        active &= slot < last
+        sample, again = si.bsdf().sample(
+            mi.BSDFContext(),
+            si,
+            random.next_float32(),
+            mi.Point2f(random.next_float32(), random.next_float32()),
+            active,
+        )
+        through = again[0]
+        survive = dr.clip(through, 0.05, 0.95)
+        active &= (through > 0) & (random.next_float32() < survive)
+        value *= through / survive * _ratio(si, si.wi) / _ratio(si, sample.wo)
+        active &= dr.isfinite(value)
+    return targets, paths, values
+
+
+def _begun(world: World, pixel: Any, number: Any, batch: Any, keys: list[Any], random: Any) -> tuple[Any, ...]:
+    """x1, the path to it, a sample of where light goes from there, its value, and whether there is any."""
+    glossy, intensity = glossy_of(world), dr.gather(Float, world.intensity, UInt32(0))
+    jitter = mi.Point2f(random.next_float32(), random.next_float32())
+    ray, aim = laser_rays(world, pixel, jitter.x, jitter.y, glossy.left, glossy.up, glossy.width)
+    si, _, path, _ = first_opaque(world, ray, dr.full(Bool, True, dr.width(pixel)))
+    active = is_glossy(world, si, si.is_valid()) & in_beam(world, si.p, pixel)
+    # one randomised (0, 2)-sequence a pixel and batch
+    shift = mi.sample_tea_32(pixel ^ keys[1], batch ^ keys[0])
+    first = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
+    sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*first), active)
+    # |aim| = 1 / cos a
+    value = intensity * weight[0] * dr.rcp(dr.norm(aim)) ** 3 * _ratio(si, si.wi) / _ratio(si, sample.wo)
+    return si, path, sample, value, active & (value > 0)
+
+
+def _ratio(si: Any, local: Any) -> Any:
+    """Cosine to the shading normal over that to the surface, of a direction in the shading frame."""
+    shading, true = dr.abs(local.z), dr.abs(dr.dot(si.n, si.to_world(local)))
+    return dr.maximum(shading, LEAST_COSINE) / dr.maximum(true, LEAST_COSINE)

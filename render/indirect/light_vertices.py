@@ -1,0 +1,194 @@
+"""Points that the laser lights, to which paths of indirect light are joined.
+
+A path that goes on by chance seldom meets what the laser lights most: what is near it, or the few places in its cone.
+So every vertex is also joined to a point that was found from the laser's side (bidirectional path tracing with one
+vertex of the laser's: Lafortune, Willems 1993; Veach 1997, chapter 10). Both ways sample the same light. Going on by
+chance keeps the share
+
+    w = B q / (B q + p d^2 / cos),
+
+where q = cos / pi is the density, per solid angle, of a diffuse lobe (taken for every diffuse reflectance, coated or
+not, so that w does not depend on how the path came), p the density of lit points per area, d the distance and cos the
+cosine at the far end: the balance heuristic (Veach, eq. 9.8). Joining has the rest, of diffuse lobes alone: mirror-like
+ones go on by chance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from render.indirect.glossy import left_to_paths
+from render.scene.rays import first_opaque, laser_light, segment, to_world
+from render.scene.traced_scene import Bool, Float, UInt32, World, dr, mi
+
+MOST_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
+LEAST_COSINE = 1e-9
+# Lit points that x1 is joined to, of a path alone and of one that is shared: as many as lowered the noise of a second
+# most. Under a lamp, whose paths seldom meet what is close to it, later vertices are joined to one, too. A flash lights
+# what its pixels see, which paths meet often: there joining hardly pays.
+WIDE_JOINS, NARROW_JOINS = (4, 8), (1, 0)
+
+
+def joins_of(world: World, *, shared: bool) -> int:
+    """Lit points that every x1 is joined to; none where the laser is no flood, and lights another place every time."""
+    if world.scene.laser.mode != "flood":
+        return 0
+    return (WIDE_JOINS if is_wide(world) else NARROW_JOINS)[shared]
+
+
+def is_wide(world: World) -> bool:
+    """Whether the laser lights half the sphere or more."""
+    return world.scene.laser.cos_half_angle(world.scene.camera) <= 0
+
+
+class Lit(NamedTuple):
+    """Points of a launch, `each` for every batch: direction and optical path to the laser, irradiance, and density.
+
+    `density` is that of one point per area [1/m^2]. At the end are a few that belong to no batch.
+    """
+
+    si: Any
+    to_laser: Any
+    path: Any
+    irradiance: Any
+    density: Any
+    each: Any
+
+
+def lit_points(world: World, lanes: int, batches: int, key: tuple[Any, Any]) -> Lit:
+    """Points where uniform directions of the laser's cone meet a surface, for a launch of so many paths."""
+    wanted = min(MOST_POINTS, max(int(lanes * POINTS_PER_PATH), 1))
+    parts = 1 << (batches - 1).bit_length()
+    each = max(1, (1 << (wanted - 1).bit_length()) // parts)
+    count = each * parts
+    opaque = dr.opaque(UInt32, each)
+    index = dr.arange(UInt32, count + 3)  # of no other input's length (`render.indirect.camera_paths`)
+    dr.eval(index)
+    parts, *columns = world.recordings.call(world, "lit points", _lit_points, index, opaque, *key)
+    return Lit(of_parts(parts), *columns, opaque)
+
+
+def _lit_points(world: World, index: Any, each: Any, *key: Any) -> tuple[Any, ...]:
+    """The parts of `Lit`, in plain tuples."""
+    # each batch has a randomised (0, 2)-sequence of its own
+    shift = mi.sample_tea_32(index // each + key[0], index * 0 + key[1])
+    number = index % each
+    u, v = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
+    height = u * _cap(world)
+    ring = dr.sqrt(dr.maximum(height * (2 - height), 0))
+    sine, cosine = dr.sincos(2 * math.pi * v)
+    towards = to_world(world, mi.Vector3f(ring * cosine, ring * sine, 1 - height))
+    ray = mi.Ray3f(mi.Point3f(world.laser) + 0 * towards, towards)
+    si, _, _, _ = first_opaque(world, ray, Bool(True))
+    found = si.is_valid()
+    to_laser, irradiance, path = laser_light(world, si, 0 * index, found, seen_by_camera=None)
+    return parts_of(si), to_laser, path, irradiance, density_of(world, si, to_laser)
+
+
+_KEPT = ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index")
+
+
+def parts_of(si: Any) -> tuple[Any, ...]:
+    """What reflectance and rays need of an interaction."""
+    return tuple(getattr(si, name) for name in _KEPT)
+
+
+def of_parts(parts: tuple[Any, ...]) -> Any:
+    """The interaction with these parts alone."""
+    few = dr.zeros(mi.SurfaceInteraction3f, dr.width(parts[0]))
+    for name, part in zip(_KEPT, parts, strict=True):
+        setattr(few, name, part)
+    return few
+
+
+def kept(si: Any) -> Any:
+    """The interaction with what is needed of it alone: most of a launch's memory is interactions."""
+    return of_parts(parts_of(si))
+
+
+def density_of(world: World, si: Any, to_laser: Any) -> Any:
+    """Density per area [1/m^2] of a lit point at an interaction, if the laser lights it."""
+    distance2 = dr.squared_norm(world.laser - si.p)
+    return dr.abs(dr.dot(si.n, to_laser)) / (distance2 * 2 * math.pi * _cap(world))
+
+
+def _cap(world: World) -> Any:
+    """Solid angle of the laser's cone over 2 pi: 1 - cos, without cancellation."""
+    return 2 * dr.square(dr.sin(0.5 * world.half_angle))
+
+
+def densities(cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> tuple[Any, Any]:
+    """Per solid angle: density of `copies` diffuse lobes at that cosine, and of these and lit points together."""
+    lobes = copies / math.pi * dr.abs(cosine)
+    return lobes, lobes + density * distance2 / dr.maximum(dr.abs(far_cosine), LEAST_COSINE)
+
+
+def share_by_chance(diffuse: Any, cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> Any:
+    """Share of a lit point's light that paths keep which go there by chance, from a surface that reflects the share
+    `diffuse` of it diffusely."""
+    lobes, both = densities(cosine, distance2, far_cosine, density, copies)
+    return 1 - diffuse * dr.select(both > 0, 1 - lobes / both, 0)
+
+
+def diffuse_share(world: World, si: Any, direction: Any, value: Any, active: Any) -> Any:
+    """Share of a surface's reflectance `value`, cosine included, that is diffuse; of what is not mirror-like."""
+    if not world.has_mixed_lobes:
+        return 1
+    diffuse = si.bsdf().eval(_diffuse(), si, si.to_local(direction), active)[0]
+    return dr.select(value > 0, dr.clip(diffuse / value, 0, 1), 0)
+
+
+def by_chance(world: World, si: Any, sample: Any, weight: Any, end: Any, density: Any, copies: Any, active: Any) -> Any:
+    """`share_by_chance` of a lit point `end` that was met in the direction of a sample, with its weight, of `si`."""
+    direction = si.to_world(sample.wo)
+    diffuse = diffuse_share(world, si, direction, weight * sample.pdf, active)
+    diffuse = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, diffuse)
+    offset = end.p - si.p
+    far_cosine = dr.dot(end.n, direction)
+    return share_by_chance(diffuse, sample.wo.z, dr.squared_norm(offset), far_cosine, density, copies)
+
+
+def _diffuse() -> Any:
+    context = mi.BSDFContext()
+    context.type_mask = mi.BSDFFlags.DiffuseReflection
+    return context
+
+
+def joined(
+    world: World,
+    si: Any,
+    lit: Lit,
+    batch: Any,
+    number: Any,
+    active: Any,
+    copies: Callable[[Any], Any] = lambda path: 1,
+    joins: int = 1,
+) -> tuple[Any, Any, Any]:
+    """Light that a surface reflects diffusely from one lit point, towards `si.wi`; the path from the laser;
+    the direction of the point.
+
+    `number` chooses among the batch's points. The light is divided by the density of all `joins` such points together
+    with as many lobes as `copies` says of the path.
+    """
+    point = batch * lit.each + number % lit.each
+    end = dr.gather(mi.SurfaceInteraction3f, lit.si, point, active)
+    irradiance = dr.gather(Float, lit.irradiance, point, active)
+    offset = end.p - si.p
+    distance2 = dr.squared_norm(offset)
+    direction = offset * dr.rsqrt(distance2)
+    local = si.to_local(direction)
+    active = active & (irradiance > 0) & (distance2 > 0)
+    value = si.bsdf().eval(_diffuse(), si, local, active)[0]
+    active &= value > 0
+    end.wi = end.to_local(-direction)
+    to_laser = mi.Vector3f(*(dr.gather(Float, part, point, active) for part in lit.to_laser))
+    value *= end.bsdf().eval(mi.BSDFContext(), end, end.to_local(to_laser), active)[0] * irradiance
+    active &= value > 0
+    passed, leg = segment(world, si, end.p, active)
+    path = leg + dr.gather(Float, lit.path, point, active)
+    density = dr.gather(Float, lit.density, point, active) * joins
+    _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))
+    light = dr.select(active, value * passed / both * left_to_paths(world, si.p, direction, end, active), 0)
+    return dr.select(dr.isfinite(light), light, 0), path, direction

@@ -1,0 +1,368 @@
+"""Late indirect light shared by the paths that meet one small region of a surface: a filter, fast and biased.
+
+Light that arrives an excess path x after the direct light from x1, the first surface, met a second one at least x / 2
+away from there. Seen from there, points of the first surface much closer together than that are one. So
+light is averaged over regions of a width that is a share of x, in octaves of x; what comes before the first octave
+stays with its own pixel. This is path-space filtering (Keller, Dahm, Binder 2014; Binder, Fricke, Keller 2018), with
+regions that widen with delay as irradiance samples are spaced by the distance of what they see (Ward, Rubinstein, Clear
+1988).
+
+A region is a cube of the world, in one of GRIDS grids, and a class of normals. It keeps what comes to its points over
+the path from the laser to x1, without the way to the camera ("unwarped") and divided by the reflectance
+("demodulated"), and the mean direction in which that path grows along the surface: light from one side reaches points
+farther away later, to first order. Light of diffuse lobes goes into one region of one octave in each grid, and pixels
+read the regions of some points of theirs: energy is kept. The bias is what differs within a region, shadows above all.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.indirect.accumulators import Sums
+from render.indirect.path_cells import add_quanta
+from render.scene.rays import camera_rays, first_opaque
+from render.scene.traced_scene import Float, UInt32, World, dr, mi, upload
+
+UInt64, Int32 = mi.UInt64, mi.Int32
+# Width of a region in its octave's excess path, and of the widest in the mean distance, at PATHS paths a pixel. They
+# shrink with paths^-SHRINKING, so that the bias goes where the noise does.
+KAPPA, WIDEST, PATHS, SHRINKING = 0.2, 0.15, 16, 0.3
+READERS = 8  # points of a pixel that read
+# Every region is one of a grid, and there are so many grids, shifted against one another: their mean is smooth where
+# one grid has steps, and has less noise. Two were best for their time (measured).
+GRIDS = 2
+MOST_OCTAVES = 16
+FULL = 1 << 24  # weight of all paths of a pixel: divided by their number, it stays a whole one
+FINENESS = 0.8  # of cells, in those of the pixels that read them: wider ones are faster and have less noise, more bias
+GROWTH = 0.03  # of a region's cells along the path
+KEY_BITS, NORMAL_BITS = 15, 2  # of a cube's number along an axis (they wrap around), and of a class of normals
+
+
+class Octaves(NamedTuple):
+    """Per octave: where its excess path begins, the width of its regions and of the first of their cells [m]; how many
+    cells a region has."""
+
+    from_m: np.ndarray
+    size_m: np.ndarray
+    width_m: np.ndarray
+    cells: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return len(self.from_m)
+
+
+class Point(NamedTuple):
+    """Points on surfaces: position, normal toward the camera, optical path to the camera, and diffuse reflectance."""
+
+    p: Any
+    n: Any
+    path: Any
+    reflectance: Any
+
+
+def octaves(
+    paths: float, footprint_m: float, distance_m: float, longest_m: float, width_m: float, growth: float
+) -> Octaves:
+    """Octaves for so many paths a pixel, from regions of a pixel's footprint to the widest; the last one is open."""
+    shrunk = (PATHS / paths) ** SHRINKING
+    count = 1 + max(0, round(math.log2(shrunk * WIDEST * distance_m / footprint_m)))
+    count = min(count, MOST_OCTAVES)
+    size = footprint_m * 2.0 ** np.arange(count)
+    start = size / (shrunk * KAPPA)
+    width = FINENESS * (width_m + growth * start)
+    # an octave's excess paths, what the camera's way differs by across a region, and that along it to its middle
+    length = np.append(np.diff(start), longest_m) + 2 * math.sqrt(3) * size
+    cells = np.ceil(np.log1p(GROWTH * length / width) / GROWTH).astype(np.int64) + 1
+    return Octaves(start, size, width, cells)
+
+
+def point_of(si: Any, ray: Any, path_m: Any, transmission: Any, hit: Any) -> Point:
+    """The point that a camera's ray met.
+
+    What it reflects diffusely depends on where the light comes from, on coated surfaces; that of one direction stands
+    for all: regions are divided by it and multiplied with it again.
+    """
+    normal = mi.Vector3f(dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n))
+    context = mi.BSDFContext()
+    context.type_mask = mi.BSDFFlags.DiffuseReflection
+    _, weight = si.bsdf().sample(context, si, Float(0.5), mi.Point2f(0.25, 0.5), hit)
+    reflectance = dr.select(hit & (weight[0] > 0), weight[0] * transmission, 0)
+    return Point(mi.Point3f(si.p), normal, Float(path_m), reflectance)
+
+
+def late_from(world: World, point: Point, from_m: Any) -> Any:
+    """The path from the laser to points [m] from which on light there is late: so much behind direct light."""
+    return point.path + dr.norm(point.p - world.laser) - dr.norm(point.p - world.eye) + from_m
+
+
+class Regions:
+    """The regions that some pixels of the image see, and the light in them, by batches.
+
+    `pixels` are flat (-1: none); what is read is added to `Sums` by their places in that list.
+    Not a dataclass: Dr.Jit would take its fields for variables of a loop.
+    """
+
+    def __init__(
+        self, world: World, pixels: np.ndarray, spans: Octaves, batches: int, quantum: float, seed: int
+    ) -> None:
+        self.spans, self.batches = spans, batches
+        numbers = np.random.SeedSequence(seed).generate_state(4)
+        shift = numbers[:3] * 2.0**-32 + np.arange(GRIDS)[:, None] / GRIDS
+        self._shift = mi.Vector3f(*(upload(Float, np.tile(part, spans.count)) for part in shift.T))
+        self._quantum, self._per_quantum = dr.opaque(Float, quantum), dr.opaque(Float, 1 / quantum)
+        self.from_m, self._size = dr.opaque(Float, float(spans.from_m[0])), _by_level(spans.size_m)
+        self._width, self._last = _by_level(spans.width_m), dr.opaque(UInt32, spans.count - 1)
+        self.place, self.points = _points(world, pixels, dr.opaque(UInt32, int(numbers[3])))
+        reader, level = _each(dr.width(self.place), spans.count * GRIDS)
+        point = _gathered(self.points, reader)
+        key = self._key(point, level)
+        dr.eval(key, point.path)
+        found, row = _numbered(key.numpy())
+        self._row_of = upload(UInt32, row)
+        nearest = np.full(len(found), np.inf, np.float32)  # of the paths' type: ten times as fast
+        np.minimum.at(nearest, row, point.path.numpy())
+        # the length of the search is part of its kernel: one for all views of a size, but where there are very many
+        self._searched = 1 << max(len(pixels) * MOST_OCTAVES * GRIDS, len(found)).bit_length()
+        self._keys = upload(UInt64, np.append(found, np.uint64(2**64 - 1)), self._searched)
+        self._nowhere = len(found)
+        self._lay_out(found, nearest)
+
+    def _lay_out(self, found: np.ndarray, nearest_m: np.ndarray) -> None:
+        """Cells for the regions with these keys, whose points are at least so far from the camera."""
+        octave = (found >> np.uint64(3 * (KEY_BITS + NORMAL_BITS))).astype(np.int64) // GRIDS
+        cells = self.spans.cells[octave]
+        reach = 0.5 * math.sqrt(3) * self.spans.size_m[octave]
+        self._base = upload(Float, np.append(nearest_m + self.spans.from_m[octave] - 3 * reach, 0))
+        self._first, self._cells = (upload(UInt32, np.append(part, 0)) for part in (np.cumsum(cells) - cells, cells))
+        size = max(int(cells.sum()), 1)
+        self.energy = dr.zeros(UInt64, size * self.batches)
+        self.growing = dr.zeros(UInt64, size * 3)
+        self.paths, self.filled = dr.zeros(UInt64, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
+
+    def _key(self, point: Point, level: Any) -> Any:
+        """Level, class of normals and cube of a point in one number. A level is a grid of an octave."""
+        size, key = dr.gather(Float, self._size, level), UInt64(level)
+        for part in point.n:
+            key = (key << NORMAL_BITS) | UInt64(UInt32(Int32(dr.round(part)) + 1))
+        for part, shift in zip(point.p, self._shift, strict=True):
+            number = UInt32(Int32(dr.floor(part / size + dr.gather(Float, shift, level)))) & ((1 << KEY_BITS) - 1)
+            key = (key << KEY_BITS) | UInt64(number)
+        return key
+
+    def _from_middle(self, point: Point, level: Any) -> Any:
+        """The way along the surface to a point from the middle of its cube."""
+        size = dr.gather(Float, self._size, level)
+        parts = [part / size + dr.gather(Float, shift, level) for part, shift in zip(point.p, self._shift, strict=True)]
+        off = mi.Vector3f(*(part - dr.floor(part) - 0.5 for part in parts)) * size
+        return off - point.n * dr.dot(point.n, off)
+
+    def _row(self, key: Any, active: Any) -> tuple[Any, Any]:
+        """Number of a region, and whether there is one."""
+        found = dr.binary_search(0, self._searched - 1, lambda i: dr.gather(UInt64, self._keys, i, active) < key)
+        return found, active & (dr.gather(UInt64, self._keys, found, active) == key)
+
+    def count_paths(self, points: Point, weight: Any) -> Any:
+        """One more path for the regions of each point that reflects; returns their numbers, levels x points.
+
+        A pixel's paths count FULL together, however many they are: a region's light is the mean over its pixels.
+        """
+        number, level = _each(dr.width(points.path), self.spans.count * GRIDS)
+        point = _gathered(points, number)
+        row, known = self._row(self._key(point, level), point.reflectance > 0)
+        row = dr.select(known, row, dr.opaque(UInt32, self._nowhere))
+        dr.scatter_add(self.paths, UInt64(dr.gather(UInt32, weight, number)), row, known, mode=dr.ReduceMode.Direct)
+        return row
+
+    def add(
+        self,
+        point: Point,
+        rows: Any,
+        late_m: Any,
+        towards: Any,
+        diffuse: Any,
+        batch: Any,
+        path_m: Any,
+        radiance: Any,
+        weight: Any,
+        active: Any,
+    ) -> Any:
+        """Add light that comes to points from x2, which lies `towards`, after `path_m` from the laser.
+
+        It is late from `late_m` on. `radiance` is what the pixel sees of it by one path, which counts with `weight`
+        quanta of FULL (see `count_paths`) in a region of each grid. Returns where it is still to add: where it came too
+        early for any region, or left by no `diffuse` lobe. Late light in a region that no pixel reads is dropped.
+        """
+        excess_m = path_m - late_m + self.from_m
+        late = active & diffuse & (path_m >= late_m) & (point.reflectance > 0)
+        number = Int32(dr.floor(dr.log2(dr.maximum(excess_m, self.from_m) / self.from_m)))
+        octave = UInt32(dr.clip(number, 0, Int32(self._last)))
+        lit = late & (radiance > 0) & dr.isfinite(radiance)
+        value = radiance / point.reflectance * self._per_quantum * (Float(weight) / FULL)
+        lanes = dr.width(point.path)
+        lane = dr.arange(UInt32, lanes)
+        for grid in range(GRIDS):
+            level = octave * GRIDS + grid
+            row = dr.gather(UInt32, rows, level * dr.opaque(UInt32, lanes) + lane, lit)
+            known = lit & (row != dr.opaque(UInt32, self._nowhere))
+            # the path grows away from x2
+            grown_m = path_m + dr.dot(towards, self._from_middle(point, level))
+            x = dr.maximum(grown_m - dr.gather(Float, self._base, row, known), 0) / dr.gather(Float, self._width, level)
+            last = dr.gather(UInt32, self._cells, row, known) - 1
+            cell = dr.minimum(UInt32(dr.log(1 + GROWTH * x) / GROWTH), last)
+            index = dr.gather(UInt32, self._first, row, known) + cell
+            add_quanta(self.energy, value, index * self.batches + batch, known)
+            dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, known, mode=dr.ReduceMode.Direct)
+            for axis, part in enumerate(-towards):
+                add_quanta(self.growing, value * dr.clip(0.5 + 0.5 * part, 0, 1), 3 * index + axis, known)
+        return active & ~late
+
+    def evaluate(self) -> None:
+        """Run what was added so far."""
+        dr.eval(self.energy, self.growing, self.paths, self.filled)
+
+    def read(self, sums: Sums) -> None:
+        """Add every region's light to the pixels that have points there."""
+        if dr.width(self.place) == 0:
+            return
+        place, level, row, weight, point = self._readings()
+        weight = weight * self._quantum / (READERS * GRIDS / FULL * Float(dr.gather(UInt64, self.paths, row)))
+        base = dr.gather(Float, self._base, row) + point.path
+        reading = _Reading(place, level, row, weight, base, self._from_middle(point, level))
+        dr.eval(*reading)
+        for batch, total in enumerate(self._read(sums, reading, None)):
+            sums.add_total(place, dr.opaque(UInt32, batch), total)
+        if sums.watched is not None:
+            watched = dr.compress(dr.gather(Int32, sums.watch, place) >= 0)
+            number, batch = _each(dr.width(watched), self.batches)
+            if dr.width(number):
+                self._read(sums, _gathered(reading, dr.gather(UInt32, watched, number)), batch)
+        sums.evaluate()
+
+    def _readings(self) -> tuple[Any, Any, Any, Any, Point]:
+        """Which place reads which region, once, with its points' summed reflectance and their mean.
+
+        Points of one place lie next to each other.
+        """
+        reader, level = _each(dr.width(self.place), self.spans.count * GRIDS)
+        place, row = dr.gather(UInt32, self.place, reader), self._row_of
+        first = dr.gather(UInt64, self.paths, row) > 0
+        for step in range(1, READERS):
+            first &= ~self._reads(Int32(reader) - step, level, place, row)
+        chosen = dr.compress(first)
+        reader, level, place, row = (dr.gather(UInt32, column, chosen) for column in (reader, level, place, row))
+        sums = [Float(0)] * 8
+        for step in range(READERS):
+            reads = self._reads(Int32(reader) + step, level, place, row)
+            point = _gathered(self.points, dr.select(reads, reader + step, 0))
+            share = dr.select(reads, point.reflectance, 0)
+            sums = [a + share * b for a, b in zip(sums, (1, *point.p, *point.n, point.path), strict=True)]
+        weight, x, y, z, right, up, back, path = sums
+        normal = dr.normalize(mi.Vector3f(right, up, back))
+        return place, level, row, weight, Point(mi.Point3f(x, y, z) / weight, normal, path / weight, weight)
+
+    def _reads(self, reader: Any, level: Any, place: Any, row: Any) -> Any:
+        """Whether there is such a point of this place, and it reads this region."""
+        readers = dr.opaque(UInt32, dr.width(self.place))
+        there = (reader >= 0) & (reader < Int32(readers))
+        number = UInt32(dr.select(there, reader, 0))
+        there &= dr.gather(UInt32, self.place, number, there) == place
+        return there & (dr.gather(UInt32, self._row_of, level * readers + number, there) == row)
+
+    def _energies(self, index: Any) -> list:
+        """Every batch's energy in a cell."""
+        return [Float(dr.gather(UInt64, self.energy, index * self.batches + b)) for b in range(self.batches)]
+
+    def _growing(self, index: Any, energies: list) -> Any:
+        """Mean direction in which the path of a cell's light grows; of all batches, whose energies these are."""
+        energy = sum(energies[1:], energies[0])
+        parts = (2 * Float(dr.gather(UInt64, self.growing, 3 * index + axis)) - energy for axis in range(3))
+        return dr.select(energy > 0, mi.Vector3f(*parts) / energy, 0)
+
+    @dr.syntax
+    def _read(self, sums: Sums, reading: Any, batch: Any) -> Any:
+        """Read cell by cell; returns each batch's total. Of one `batch` a lane for the watched rows, or of all."""
+        place, row, weight, off = reading.place, reading.row, reading.weight, reading.off
+        width = dr.gather(Float, self._width, reading.level)
+        index, cells = dr.gather(UInt32, self._first, row), dr.gather(UInt32, self.filled, row)
+        cell = dr.zeros(UInt32, dr.width(place))
+        totals = [dr.zeros(Float, dr.width(place)) for _ in range(self.batches)]
+        while cell < cells:
+            low, high = reading.base + _edge(cell) * width, reading.base + _edge(cell + 1) * width
+            energies = self._energies(index)
+            later = dr.dot(self._growing(index, energies), off)
+            if dr.hint(batch is None, mode="scalar"):
+                totals = _plus(totals, energies, weight)
+                energy = sum(energies[1:], energies[0]) * weight
+                sums.spread(place, low + later, high + later, energy, energy > 0)
+            else:
+                energy = Float(dr.gather(UInt64, self.energy, index * self.batches + batch)) * weight
+                sums.spread_watched(place, batch, low + later, high + later, energy, energy > 0)
+            cell += 1
+            index += 1
+        return totals
+
+
+class _Reading(NamedTuple):
+    """A place that reads a region: factor of its quanta, path at which the region's cells begin, and how far along the
+    surface the place's points are from the middle."""
+
+    place: Any
+    level: Any
+    row: Any
+    weight: Any
+    base: Any
+    off: Any
+
+
+def _numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct keys, sorted, and the number of each one's. Neighbours mostly have the same: runs of them are sorted."""
+    begins = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
+    found, number = np.unique(keys[begins], return_inverse=True)
+    return found, np.repeat(number, np.diff(np.append(begins, len(keys))))
+
+
+def _by_level(of_octaves: np.ndarray) -> Any:
+    """Values of octaves for their levels: one a grid."""
+    return upload(Float, np.repeat(of_octaves, GRIDS))
+
+
+def _plus(totals: list, energies: list, weight: Any) -> list:
+    return [total + energy * weight for total, energy in zip(totals, energies, strict=True)]
+
+
+def _edge(cell: Any) -> Any:
+    """Where a cell begins, in widths of the first."""
+    return (dr.exp(GROWTH * Float(cell)) - 1) / GROWTH
+
+
+def _each(count: int, times: int) -> tuple[Any, Any]:
+    """All pairs of 0 .. `count` and 0 .. `times`, the first running faster. Opaque: counts differ from run to run."""
+    lane, number = dr.arange(UInt32, count * times), dr.opaque(UInt32, max(count, 1))
+    return lane % number, lane // number
+
+
+def _gathered(columns: NamedTuple, index: Any) -> Any:
+    return type(columns)(*(dr.gather(type(column), column, index) for column in columns))
+
+
+def _points(world: World, pixels: np.ndarray, key: Any) -> tuple[Any, Point]:
+    """READERS points of every pixel, spread evenly, where they reflect diffusely, and their places in `pixels`."""
+    lane = dr.arange(UInt32, len(pixels) * READERS)
+    place, number = lane // READERS, lane % READERS
+    pixel = dr.gather(UInt32, upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF), place)
+    valid = pixel != 0xFFFFFFFF
+    pixel = dr.select(valid, pixel, 0)
+    first, second = mi.sample_tea_32(pixel, key)
+    x, y = mi.radical_inverse_2(number, first), mi.sobol_2(number, second)
+    ray, _ = camera_rays(world, Float(pixel % world.width) + x, Float(pixel // world.width) + y)
+    si, transmission, path, _ = first_opaque(world, ray, valid)
+    hit = valid & si.is_valid()
+    point = point_of(si, ray, path, transmission, hit)
+    lit = hit & (point.reflectance > 0)
+    dr.eval(lit, place, *point)
+    chosen = dr.compress(lit)
+    return dr.gather(UInt32, place, chosen), _gathered(point, chosen)

@@ -1,0 +1,240 @@
+"""A plan -> traced light: direct, specular and indirect, and further paths on top of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from render.backend.malloc import release
+from render.direct.integrator import direct_light
+from render.error import power_of
+from render.indirect.integrator import (
+    IndirectLight,
+    Schedule,
+    allocate,
+    combined,
+    combined_samples,
+    image_cells,
+    indirect_light,
+    pilot_noise,
+    uniform,
+)
+from render.indirect.launch_layout import BLOCK, block_order
+from render.indirect.light_vertices import is_wide
+from render.indirect.path_space_filter import Octaves, octaves
+from render.scene.traced_scene import World
+from render.settings import BATCHES, FILTERED_BATCHES, Plan, RenderSettings
+from render.specular.image_method import specular_light
+from render.transient.samples import Growing, Samples, concatenate, no_samples, select
+
+STAGE_INDIRECT, STAGE_PILOT = 11, 13
+# Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
+MOST_SPP, MOST_SPP_BY_DEFAULT = 16384, 1024
+FIRST_FILTERED_SPP = 16  # filtered light has no pilot: it starts with few paths
+
+Progress = Callable[[str, float], None]
+
+
+class Traced(NamedTuple):
+    """Light of a planned render before it is packed: its samples, what is known of indirect light or None, counts.
+
+    Samples of direct light come first, then those of specular light, up to `ends`, then those of indirect light.
+    """
+
+    samples: Samples
+    ends: tuple[int, int]
+    indirect: IndirectLight | None
+    origin_m: np.ndarray
+    mixed: np.ndarray
+    clipped: int
+    rays: int
+    schedule: Schedule | None
+    reasons: tuple[str, ...]
+
+    @property
+    def spp(self) -> int:
+        """Work on indirect light in paths a pixel."""
+        return 0 if self.schedule is None else round(self.schedule.cost)
+
+    @property
+    def direct(self) -> Samples:
+        return select(self.samples, slice(self.ends[0]))
+
+    @property
+    def specular(self) -> Samples:
+        return select(self.samples, slice(*self.ends))
+
+    @property
+    def indirect_samples(self) -> Samples:
+        return select(self.samples, slice(self.ends[1], None))
+
+
+def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
+    """A 32-bit seed for one pass of one stage of one scene: independent streams from one number."""
+    return int(np.random.SeedSequence(seed, spawn_key=(stage, scene, number)).generate_state(1)[0])
+
+
+def most_spp(settings: RenderSettings) -> tuple[int, bool]:
+    """Paths a pixel that a plan may spend, and whether a target was asked for."""
+    asked = settings.error is not None or settings.budget is not None
+    return MOST_SPP if asked else MOST_SPP_BY_DEFAULT, asked
+
+
+def trace(
+    world: World,
+    plan: Plan,
+    settings: RenderSettings,
+    *,
+    seed: int = 0,
+    checked: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> Traced:
+    """Trace what the plan says: the light alone, without layers, ambient light or an error estimate.
+
+    `checked` are sorted flat pixels whose indirect light is kept by batches, for the error estimate.
+    """
+    say = progress or (lambda what, share: None)
+    camera = world.scene.camera
+    pixels = np.arange(camera.height * camera.width)
+    say("direct light", 0.05)
+    direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, least_share=plan.least_share)
+    release(len(pixels))
+    # only indirect light is counted from where direct light is
+    origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
+    specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
+    release(len(pixels))
+    rays, indirect, schedule, reasons = direct.rays, None, None, ()
+    if plan.bounces > 1 and brightest > 0:
+        schedule, reasons = _schedule(world, plan, settings, direct.samples, origin_m, seed)
+    light = Growing()
+    light.add(direct.samples)
+    direct = direct._replace(samples=no_samples())  # they are in the list now
+    ends = len(light), len(light) + len(specular.samples.pixel)
+    light.add(specular.samples)
+    if schedule is not None:
+        its_seed = derived_seed(seed, STAGE_INDIRECT)
+        indirect = _indirect(world, plan, settings, schedule, its_seed, origin_m, brightest, checked, light, say)
+        rays += schedule.rays(plan.bounces)
+    reasons = (*specular.notes, *reasons)
+    samples = light.finished(lambda: release(len(pixels)))
+    return Traced(samples, ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
+
+
+def _indirect(
+    world: World,
+    plan: Plan,
+    settings: RenderSettings,
+    schedule: Schedule,
+    seed: int,
+    origin_m: np.ndarray,
+    brightest: float,
+    checked: np.ndarray | None,
+    light: Growing,
+    say: Progress,
+) -> IndirectLight:
+    return indirect_light(
+        world,
+        schedule,
+        plan.bounces,
+        seed,
+        origin_m,
+        brightest,
+        np.empty(0, np.int64) if checked is None else checked,
+        light.add,
+        width_m=settings.indirect_tolerance_m,
+        growth=settings.indirect_growth,
+        say=lambda share: say("indirect light", 0.1 + 0.8 * share),
+    )
+
+
+def traced_on(
+    world: World,
+    plan: Plan,
+    settings: RenderSettings,
+    traced: Traced,
+    more: Schedule,
+    seed: int,
+    checked: np.ndarray,
+    say: Progress,
+) -> Traced:
+    """A trace with further paths, weighted by their numbers.
+
+    These follow the first paths' noise; the bias of such a stop is of second order in it.
+    """
+    _, brightest = mean_path(traced.direct, len(traced.origin_m))
+    light = Growing()
+    added = _indirect(world, plan, settings, more, seed, traced.origin_m, brightest, checked, light, say)
+    before = traced.schedule
+    share = np.ones(len(traced.origin_m))
+    pixels, real = before.pixels, before.pixels >= 0
+    share[pixels[real]] = np.repeat(before.rounds / (before.rounds + more.rounds), BLOCK)[real]
+    cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
+    merged = combined_samples(traced.indirect_samples, light.finished(), share, cells, traced.origin_m)
+    reason = f"indirect light: the work of {more.cost:.0f} paths a pixel on top, as the target was missed"
+    return traced._replace(
+        samples=concatenate([traced.direct, traced.specular, merged]),
+        indirect=combined(traced.indirect, added, share),
+        rays=traced.rays + more.rays(plan.bounces),
+        schedule=before._replace(rounds=before.rounds + more.rounds),
+        reasons=(*traced.reasons, reason),
+    )
+
+
+def _schedule(
+    world: World, plan: Plan, settings: RenderSettings, direct: Samples, origin_m: np.ndarray, seed: int
+) -> tuple[Schedule, tuple[str, ...]]:
+    """How many paths each pixel traces, and why: from the noise of a pilot of a few paths, which is not used again."""
+    camera = world.scene.camera
+    blocks = block_order(np.arange(camera.height * camera.width), camera.width)
+    if plan.filter:
+        spp = FIRST_FILTERED_SPP if plan.spp is None else plan.spp
+        spans = spans_of(world, plan, settings, origin_m, spp)
+        rounds = spp if spp < FILTERED_BATCHES else -(-spp // FILTERED_BATCHES) * FILTERED_BATCHES
+        schedule = uniform(blocks, rounds, shared=False)
+        # under a lamp the noise that the filter leaves is even, and a pilot costs more than it saves
+        if plan.adaptive and spp >= FIRST_FILTERED_SPP and not is_wide(world):
+            from_m = float(spans.from_m[0])
+            noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT), from_m)
+            schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES)
+        least, most = schedule.rounds.min(), schedule.rounds.max()
+        told = f"indirect light: filtered, later than {spans.from_m[0]:.2g} m behind direct light, over regions of "
+        told += f"surfaces {spans.size_m[0]:.2g} to {spans.size_m[-1]:.2g} m wide; {least} to {most} paths a pixel"
+        return schedule._replace(spans=spans), (told,)
+    if plan.spp is not None and (not plan.adaptive or plan.spp < BATCHES):
+        rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
+        return uniform(blocks, rounds, shared=False), ()
+    own, shared = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT))
+    if not plan.adaptive:
+        own, shared = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
+    if plan.spp is not None:
+        return allocate(blocks, own, shared, cost=plan.spp), ()
+    power, per_sample = power_of(direct)
+    allowed = plan.noise**2 * power / per_sample
+    schedule = allocate(blocks, own, shared, squared_error=allowed)
+    limit, asked = most_spp(settings)
+    wanted, reasons = schedule.cost, []
+    if wanted > limit:
+        schedule = allocate(blocks, own, shared, cost=limit)
+        remedy = "force more with spp" if asked else "ask for more with an error target"
+        reasons.append(f"indirect light: the work of {wanted:.0f} paths a pixel would meet the target; {remedy}")
+    spread = f"{schedule.rounds.min()} to {schedule.rounds.max()} paths a pixel, {schedule.shared.mean():.0%} shared"
+    reasons.append(f"indirect light: {spread}; the work of {schedule.cost:.0f} paths a pixel")
+    return schedule, tuple(reasons)
+
+
+def spans_of(world: World, plan: Plan, settings: RenderSettings, origin_m: np.ndarray, spp: float) -> Octaves:
+    """Octaves of filtered light for so many paths a pixel in all."""
+    distance_m = float(origin_m[origin_m > 0].mean()) / 2
+    width_m, growth = settings.indirect_tolerance_m, settings.indirect_growth
+    longest_m = float(image_cells(world, width_m, growth, origin_m, plan.bounces).edges_m[-1])
+    footprint_m = distance_m / world.scene.camera.focal_px
+    return octaves(spp, footprint_m, distance_m, longest_m, width_m, growth)
+
+
+def mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:
+    """Radiance-weighted mean path of each pixel [m], 0 where there is none; and the brightest pixel's radiance."""
+    total = np.bincount(samples.pixel, weights=samples.radiance, minlength=pixels)
+    moment = np.bincount(samples.pixel, weights=samples.radiance * samples.path_m, minlength=pixels)
+    return np.divide(moment, total, out=np.zeros(pixels), where=total > 0), float(total.max(initial=0))

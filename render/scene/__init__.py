@@ -1,0 +1,1 @@
+"""Hold a `Scene` as the ray tracer sees it: Mitsuba scene, camera, laser, rays."""

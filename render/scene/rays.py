@@ -1,0 +1,227 @@
+"""Rays in a `World`: from the camera, past glass and cut-outs, to the laser, and what its light does at a surface."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from render.scene.traced_scene import OPACITY, Bool, Float, UInt32, World, dr, mi
+
+MAX_LAYERS = 64  # of glass and cut-outs that one ray passes
+
+
+def camera_rays(world: World, x: Any, y: Any, eye: Any = None) -> tuple[Any, Any]:
+    """Rays from the camera's centre through raster positions, and their camera-frame directions with z = 1; from
+    another `eye` that looks as the camera does, if there is one."""
+    local = mi.Vector3f(
+        (x - Float(world.width) / 2) / world.focal_px, (y - Float(world.height) / 2) / world.focal_px, 1
+    )
+    return mi.Ray3f(mi.Point3f(world.eye if eye is None else eye), dr.normalize(to_world(world, local))), local
+
+
+def to_world(world: World, local: Any) -> Any:
+    """A camera-frame vector in the world."""
+    right, down, forward = world.axes
+    return right * local.x + down * local.y + forward * local.z
+
+
+def to_camera(world: World, vector: Any) -> Any:
+    """A world vector in the camera's frame."""
+    return mi.Vector3f(*(dr.dot(axis, vector) for axis in world.axes))
+
+
+def shape_index(si: Any) -> Any:
+    return dr.reinterpret_array(UInt32, si.shape)
+
+
+def spawn(si: Any, direction: Any) -> Any:
+    """A ray that leaves a surface from a little off it: a share of its distance to the origin, as float32 rounds.
+
+    Mitsuba's `spawn_ray` keeps off 90 um more, whatever the scene's size: in one of millimetres that is a gap.
+    """
+    off = dr.mulsign(mi.math.RayEpsilon * dr.max(dr.abs(si.p)), dr.dot(si.n, direction))
+    return mi.Ray3f(dr.fma(off, si.n, si.p), direction)
+
+
+def first_opaque(world: World, ray: Any, active: Any, origin: Any = None) -> tuple[Any, Any, Any, Any]:
+    """The first surface that stops light, past glass and the holes of cut-outs, in a straight line.
+
+    `origin` is the surface point that the ray was spawned from, a little off its own start; None is the camera.
+    Returns the interaction, the transmission of the glass on the way, the optical path (the index of refraction counted
+    inside solid glass, as its group index) and the geometric distance [m]. A cut-out stops light where its opacity is
+    1/2 or more. Refraction's change of direction is left out: exact for a co-located laser at normal incidence, a plan
+    says so otherwise.
+    """
+    if not world.sees_through:
+        si = world.traced.ray_intersect(ray, active)
+        distance = si.t if origin is None else dr.norm(si.p - origin)
+        return si, Float(1), distance, distance
+    start = ray.o if origin is None else origin
+    return _pass_layers(world, ray, start, active, Float(dr.inf), origin is None)[:4]
+
+
+@dr.syntax
+def _pass_layers(world: World, ray: Any, origin: Any, active: Any, limit: Any, in_air: bool) -> tuple[Any, ...]:
+    """`first_opaque` with layers, no farther than `limit`; where nothing stops the ray the paths run to the limit.
+
+    A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
+    ray that starts at a surface may start inside glass: the side of its first interface tells. A ray that meets more
+    than MAX_LAYERS is lost. The fifth result is the distance by which glass shortens the geometric spreading, the sum
+    of t (1 - 1/n) (see `spreading`).
+    """
+    lanes = dr.width(ray.d)
+    transmission, optical, distance = dr.full(Float, 1, lanes), dr.zeros(Float, lanes), dr.zeros(Float, lanes)
+    shortening = dr.zeros(Float, lanes)
+    medium = dr.full(Float, 1 if in_air else 0, lanes)  # index of refraction on the way, 0 = not known yet
+    layer = dr.zeros(UInt32, lanes)
+    ray, start = mi.Ray3f(ray), mi.Point3f(origin)
+    found = dr.zeros(mi.PreliminaryIntersection3f, lanes)
+    found.t = dr.full(Float, dr.inf, lanes)
+    searching = Bool(active)
+    while searching:
+        ray.maxt = limit - dr.dot(ray.o - start, ray.d)
+        # rays from the camera are neighbours of each other: told so, Embree is faster
+        found = world.traced.ray_intersect_preliminary(ray, coherent=in_air, active=searching)
+        hit = searching & found.is_valid()
+        solid = dr.gather(Float, world.solid_ior, shape_index(found), hit)
+        thin = dr.gather(Float, world.thin_ior, shape_index(found), hit)
+        glass = hit & ((solid > 0) | (thin > 0))
+        # all about a point is worked out where light may pass, and in the end where it does not
+        si = found.compute_surface_interaction(ray, mi.RayFlags.All, hit if world.has_cutouts else glass)
+        cosine = dr.dot(ray.d, si.n)
+        fresnel = mi.fresnel(dr.abs(cosine), dr.maximum(dr.maximum(solid, thin), 1.0001))[0]
+        # one interface lets 1 - F through; a thin pane, with all its inner reflections, (1 - F) / (1 + F)
+        crossing = dr.select(thin > 0, (1 - fresnel) / (1 + fresnel), 1 - fresnel)
+        transmission = dr.select(glass, transmission * crossing, transmission)
+        interface = glass & (solid > 0)
+        medium = dr.select(interface & (medium == 0), dr.select(cosine > 0, solid, 1), medium)
+        passing = Bool(glass)
+        if dr.hint(world.has_cutouts, mode="scalar"):
+            passing |= hit & ~glass & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
+        # measured from the start: every new ray begins a little off the surface
+        reached = dr.select(passing, dr.dot(si.p - start, ray.d), distance)
+        optical += (reached - distance) * dr.maximum(medium, 1)
+        shortening += dr.select(medium > 1, (reached - distance) * (1 - dr.rcp(medium)), 0)
+        distance = reached
+        medium = dr.select(interface, dr.select(medium == 1, solid, 1), medium)
+        ray.o = dr.select(passing, spawn(si, ray.d).o, ray.o)
+        layer += 1
+        searching = passing & (layer < MAX_LAYERS)
+        lost = passing & ~searching
+        found.t = dr.select(lost, dr.inf, found.t)
+        transmission = dr.select(lost, 0, transmission)
+    si = found.compute_surface_interaction(ray, mi.RayFlags.All, active & found.is_valid())
+    reached = dr.select(si.is_valid(), dr.dot(si.p - start, ray.d), limit)
+    optical += (reached - distance) * dr.maximum(medium, 1)
+    shortening += dr.select(medium > 1, (reached - distance) * (1 - dr.rcp(medium)), 0)
+    return si, transmission, optical, reached, shortening
+
+
+def laser_leg(
+    world: World, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
+) -> tuple[Any, Any, Any, Any]:
+    """What the laser does at a surface: radiance scattered towards `si.wi` [1/(m^2 sr)], and the laser leg's path [m].
+
+    L = f(wi, wo) cos I(w) T / d^2. Between them the direction to the laser and the irradiance I(w) T / d^2 across it.
+    """
+    direction, irradiance, path = laser_light(world, si, pixel, active, seen_by_camera=seen_by_camera)
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)
+    radiance = value[0] * irradiance
+    return dr.select(active & dr.isfinite(radiance), radiance, 0), direction, irradiance, path
+
+
+def laser_light(
+    world: World, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
+) -> tuple[Any, Any, Any]:
+    """Direction to the laser, irradiance I(w) T / d^2 [1/m^2] across it, and the laser leg's path [m] at a surface.
+
+    With `seen_by_camera` = (transmission, optical path) the point was reached by a straight camera ray, along which a
+    co-located laser sees it too: no shadow ray is needed. Solid glass on the way shortens d (`spreading`).
+    """
+    laser = world.scene.laser
+    to_laser = world.laser - si.p
+    distance2 = dr.squared_norm(to_laser)
+    direction = to_laser * dr.rsqrt(distance2)
+    lit = active & (distance2 > 0)
+    if laser.mode == "flood" or seen_by_camera is None:
+        lit &= in_beam(world, si.p, pixel)
+    # with glasses of several indices the optical path does not tell how much of each was crossed: trace it
+    if laser.is_colocated and seen_by_camera is not None and len(world.solid_indices) < 2:
+        transmission, path = seen_by_camera
+        if world.solid_indices:
+            distance = dr.sqrt(distance2)
+            # t = (optical - d) / (n - 1), so t (1 - 1/n) = (optical - d) / n
+            transmission = transmission * spreading(distance, (path - distance) / world.solid_index)
+    else:
+        transmission, path = segment(world, si, world.laser, lit)
+    intensity = dr.gather(Float, world.intensity, pixel, lit)
+    return direction, dr.select(lit, intensity * transmission / distance2, 0), path
+
+
+def spreading(distance: Any, shortening: Any) -> Any:
+    """Factor on 1 / distance^2 where solid glass on the way changes how a point's light spreads.
+
+    A thin cone of half angle a around the normal of a slab (thickness t, index n) runs inside it at a/n, and leaves it
+    with a radius t a (1 - 1/n) smaller than without: it spreads as if the distance d were d - t (1 - 1/n), whatever the
+    order of air and glass. The irradiance is I T / (d - sum t (1 - 1/n))^2, exact at normal incidence. The radiance
+    that a camera sees through a flat slab does not change.
+    """
+    return dr.square(distance / dr.maximum(distance - shortening, 1e-3 * distance))
+
+
+def in_beam(world: World, point: Any, pixel: Any) -> Any:
+    """Whether the laser shines on a point: in its cone (flood), or in the row (line) or pixel (scan) being measured."""
+    laser = world.scene.laser
+    if laser.mode == "flood":
+        aim = to_camera(world, mi.Vector3f(point) - world.laser)
+        return dr.atan2(dr.norm(mi.Vector2f(aim.x, aim.y)), aim.z) <= world.half_angle
+    seen_in, same = pixel_of(world, point, columns=laser.mode == "scan")
+    return same & (seen_in == pixel if laser.mode == "scan" else seen_in // world.width == pixel // world.width)
+
+
+def pixel_of(world: World, point: Any, *, columns: bool = True) -> tuple[Any, Any]:
+    """The flat pixel in whose pyramid a point lies, and whether there is one; not in which of its row's `columns` if
+    these do not matter."""
+    column, row, seen = raster_of(world, world.eye, point)
+    column, row = dr.floor(column) if columns else Float(0), dr.floor(row)
+    inside = seen & (row >= 0) & (row < Float(world.height)) & (column >= 0) & (column < Float(world.width))
+    return UInt32(dr.select(inside, row, 0)) * world.width + UInt32(dr.select(inside, column, 0)), inside
+
+
+def raster_of(world: World, eye: Any, point: Any) -> tuple[Any, Any, Any]:
+    """Where an eye that looks as the camera does sees a point: in pixels from the image's corner; and whether it lies
+    before it."""
+    local = to_camera(world, mi.Vector3f(point) - eye)
+    x, y = (local[axis] / local.z * world.focal_px for axis in range(2))
+    return x + Float(world.width) / 2, y + Float(world.height) / 2, local.z > 0
+
+
+def segment(world: World, si: Any, point: Any, active: Any) -> tuple[Any, Any]:
+    """Transmission of the straight way from a surface to a point, 0 where it is blocked, and its optical path [m].
+
+    The transmission includes the glass's `spreading`: it is what f cos I / distance^2 is to be multiplied by.
+    """
+    distance = dr.norm(point - si.p)
+    if not world.sees_through:
+        ray = spawn(si, point - si.p)
+        way = point - ray.o
+        length = dr.norm(way)
+        ray = mi.Ray3f(ray.o, way / length, length * (1 - mi.math.ShadowEpsilon), 0, mi.Color0f())
+        return dr.select(world.traced.ray_test(ray, active), Float(0), Float(1)), distance
+    short = distance * (1 - 1e-4)  # not as far as a surface that the point may lie on
+    ray = spawn(si, (point - si.p) / distance)
+    transmission, optical, shortening = passage(world, ray, si.p, short, active, in_air=False)
+    return transmission * spreading(distance, shortening), optical + (distance - short)
+
+
+def passage(world: World, ray: Any, origin: Any, limit: Any, active: Any, *, in_air: bool) -> tuple[Any, Any, Any]:
+    """Transmission (0: blocked), optical path and shortening (`spreading`) [m] from `origin` along `ray` to `limit`.
+
+    `ray` starts at or a little off `origin`; `in_air` says that it starts outside of all glass, else its first
+    interface tells.
+    """
+    if not world.sees_through:
+        ray = mi.Ray3f(ray)
+        ray.maxt = limit
+        return dr.select(world.traced.ray_test(ray, active), Float(0), Float(1)), limit, Float(0)
+    end, transmission, optical, _, shortening = _pass_layers(world, ray, origin, active, limit, in_air)
+    return dr.select(end.is_valid(), 0, transmission), optical, shortening

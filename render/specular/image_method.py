@@ -1,0 +1,355 @@
+"""Light that smooth surfaces send back in one exact direction: neither direct light nor path tracing can find it.
+
+The image method gives it all. Light that reaches a point by way of plane mirrors 1 ... k (1 nearest the point) runs
+along the unfolded straight line to the laser's image L' = S_1 S_2 ... S_k L, where S_i reflects in plane i.
+
+Glints: the laser seen in mirrors, in the smooth coat of plastic and in the faces of glass.
+Mirrored light: what the camera sees, directly or by way of mirrors, lit by way of mirrors.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from render.scene.rays import camera_rays, first_opaque, in_beam, passage, shape_index, spawn, spreading
+from render.scene.traced_scene import OPACITY, Bool, Float, UInt32, World, dr, mi, upload
+from render.specular.mirrors import (
+    COATED,
+    MAX_ORDER,
+    Mirrors,
+    check_slabs,
+    find_mirrors,
+    glint_sequences,
+    image_of,
+    image_sequences,
+    planes_of,
+    specular_points,
+)
+from render.transient.samples import Samples, concatenate, merge, no_samples
+
+LANES = 1 << 20
+# A glint is a thin cone of rays: on an edge or in the apex of a corner cube, the share of them that comes back counts.
+LOBE_RAYS, LOBE_RAD = 32, 5e-4
+WIDEST_SPREAD = 0.25  # of the path: a footprint that spans more describes no mesh
+
+
+class SpecularLight(NamedTuple):
+    """Samples of specular light, and what was left out or is inexact, one line each."""
+
+    samples: Samples
+    notes: tuple[str, ...]
+
+
+def specular_light(world: World, grid: int = 4, tolerance_m: float = 1e-4) -> SpecularLight:
+    """Deterministic returns by way of smooth plane surfaces, as `Samples` merged within `tolerance_m`.
+
+    Glints: pixel-mean radiance T R_1 ... R_k I(w) / (D^2 Omega), with D the unfolded one-way length laser -> mirrors ->
+    camera, Omega the pixel's solid angle, T the transmission of glass on the way; path length D plus glass delay,
+    `bounces` = k. Mirrored light is integrated over grid x grid cells of each pixel: f cos R_1 ... I(w) / D^2 with D
+    the unfolded length from the laser to the surface, times the reflectances between surface and camera; `bounces`
+    counts every surface met. Paths without a mirror on the laser's side are not here: direct light and path tracing
+    find them.
+
+    Raises InputError where a displaced laser's straight path through a glass slab is off by more than 10 mm.
+    """
+    notes = check_slabs(world)
+    if not any(surface.material.kind in COATED for surface in world.scene.surfaces):
+        return SpecularLight(no_samples(), tuple(notes))
+    mirrors, more = find_mirrors(world)
+    notes += more
+    tables = _Tables(world, mirrors)
+    parts = [no_samples()]
+    for sequence in glint_sequences(mirrors, notes):
+        parts.append(_glints(world, tables, mirrors, sequence))
+    for sequence in image_sequences(mirrors, notes):
+        parts += _mirrored(world, tables, mirrors, sequence, grid)
+    return SpecularLight(merge(concatenate(parts), tolerance_m), tuple(notes))
+
+
+# ---- tracing ----
+
+
+class _Tables:
+    """Planes and, per registered shape, what decides a smooth reflectance, as Dr.Jit arrays."""
+
+    def __init__(self, world: World, mirrors: Mirrors) -> None:
+        # one row more: an array of a single value would compile other kernels
+        columns = np.vstack((np.column_stack((mirrors.normal, mirrors.offset)), np.zeros(4)))
+        self.normal = mi.Vector3f(*(upload(Float, column) for column in columns[:, :3].T))
+        self.offset = upload(Float, columns[:, 3] + columns[:, :3] @ world.eye_m)
+        self.shape = upload(UInt32, np.append(mirrors.shape, 0))
+        materials = [group[0].material for group in world.groups]
+        self.scale = world.table([m.specular if m.kind in ("conductor", "plastic") else 1 for m in materials])
+        self.ior = world.table([m.ior for m in materials])
+        self.eta, self.k = world.table([m.eta for m in materials]), world.table([m.k for m in materials])
+        self.kind = world.table([COATED.index(m.kind) if m.kind in COATED else -1 for m in materials])
+        # a metal mesh with a curved surface shows no flat image: what is seen in it is left out
+        metal = [
+            m.kind == "conductor" and all(s.normals is None or planes_of(s, s.vertices[0]) is not None for s in group)
+            for m, group in zip(materials, world.groups, strict=True)
+        ]
+        self.mirrors = world.table([float(flag) for flag in metal])
+
+
+def _reflectance(tables: _Tables, shape: Any, cosine: Any, active: Any) -> Any:
+    """Unpolarised Fresnel reflectance: a metal's, one interface's, or 2F / (1 + F) of a thin pane."""
+    kind = dr.gather(Float, tables.kind, shape, active)
+    cosine = dr.minimum(dr.abs(cosine), 1)
+    index = mi.Complex2f(dr.gather(Float, tables.eta, shape, active), dr.gather(Float, tables.k, shape, active))
+    metal = mi.fresnel_conductor(cosine, index)
+    glass = mi.fresnel(cosine, dr.maximum(dr.gather(Float, tables.ior, shape, active), 1.0001))[0]
+    glass = dr.select(kind == COATED.index("thindielectric"), 2 * glass / (1 + glass), glass)
+    scale = dr.gather(Float, tables.scale, shape, active)
+    return scale * dr.select(kind == COATED.index("conductor"), metal, glass)
+
+
+def _connect(
+    world: World, tables: _Tables, start: Any, lift: Any, target: Any, sequence: list[Any], active: Any, in_air: bool
+) -> tuple[Any, Any, Any, Any]:
+    """The way from `start` toward the laser's image `target`, folded by the planes of `sequence`.
+
+    Returns the product of reflectances and transmissions (0: the way does not exist or is blocked), the delay and the
+    shortening of the spreading by glass [m], and the last mirror point, which the laser shines on. Rays start at
+    `start` + `lift`, off the surface.
+    """
+    along = target - start
+    left = dr.norm(along)
+    direction = along / left
+    scale = left + dr.norm(start - world.eye)
+    position, lit = mi.Point3f(start), Bool(active)
+    weight, delay, shortening = Float(1), Float(0), Float(0)
+    for number, plane in enumerate((*sequence, None)):
+        step = left
+        if plane is not None:
+            normal = dr.gather(mi.Vector3f, tables.normal, plane, lit)
+            cosine = dr.dot(normal, direction)
+            step = (dr.gather(Float, tables.offset, plane, lit) - dr.dot(normal, mi.Vector3f(position))) / cosine
+            lit &= (step > 0) & (step < left)
+        gap = dr.minimum(1e-5 * scale, 0.1 * step)
+        # from a little off this surface to a little before the next one
+        begin = position + lift + gap * direction
+        way = position + (step - gap) * direction - begin
+        limit = dr.norm(way)
+        ray = mi.Ray3f(begin, way / limit)
+        passed, optical, short = passage(world, ray, begin, limit, lit, in_air=in_air and number == 0)
+        weight *= passed
+        delay += optical - limit
+        shortening += short
+        if plane is None:
+            break
+        position = position + step * direction
+        # is there a face at that point of its plane?
+        probe = dr.minimum(1e-4 * scale, 0.3 * step)
+        ray = mi.Ray3f(position - probe * direction, direction)
+        ray.maxt = 2 * probe
+        si = world.traced.ray_intersect(ray, lit)
+        shape = dr.gather(UInt32, tables.shape, plane, lit)
+        lit &= si.is_valid() & (shape_index(si) == shape)
+        if world.has_cutouts:
+            lit &= si.shape.eval_attribute_1(OPACITY, si, lit) >= 0.5
+        weight *= _reflectance(tables, shape, cosine, lit)
+        lift = normal * dr.select(cosine > 0, -4e-6, 4e-6) * scale
+        direction = direction - 2 * cosine * normal
+        left -= step
+    lit &= weight > 0
+    return dr.select(lit, weight, 0), dr.select(lit, delay, 0), dr.select(lit, shortening, 0), position
+
+
+# ---- glints ----
+
+
+def _glints(world: World, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray) -> Samples:
+    """The laser itself in rows of (m, k) planes, from the camera on."""
+    camera, laser = world.scene.camera, world.scene.laser
+    laser_point = laser.position(camera) - camera.origin
+    image = image_of(mirrors, sequence, laser_point)
+    last, possible = specular_points(mirrors, sequence, image, 5 * LOBE_RAD)
+    column, row = _raster(world, image)
+    possible &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    possible &= _shines_on(world, last, laser_point, column, row)
+    kept = np.flatnonzero(possible)
+    if len(kept) == 0:
+        return no_samples()
+    sequence, image = sequence[kept], image[kept]
+    row, column = row[kept].astype(np.int64), column[kept].astype(np.int64)
+    distance = np.linalg.norm(image, axis=1)
+    lanes = _lobe(image).reshape(-1, 3)
+    planes = [upload(UInt32, np.repeat(plane, LOBE_RAYS)) for plane in sequence.T]
+    target = mi.Point3f(*(upload(Float, axis) for axis in (lanes + world.eye_m).T))
+    start = mi.Point3f(world.eye) + dr.zeros(mi.Vector3f, len(lanes))
+    active = dr.full(Bool, True, len(lanes))
+    weight, delay, shortening, _ = _connect(world, tables, start, mi.Vector3f(0), target, planes, active, True)
+    dr.eval(weight, delay, shortening)
+    weight, delay, shortening = (
+        np.array(value, dtype=np.float64).reshape(-1, LOBE_RAYS) for value in (weight, delay, shortening)
+    )
+    spread = (distance[:, None] / np.maximum(distance[:, None] - shortening, 1e-3 * distance[:, None])) ** 2
+    energy = (weight * spread).mean(axis=1) * _made_up(image, weight > 0)
+    lit = energy > 0
+    late = (weight * delay).sum(axis=1)[lit] / weight.sum(axis=1)[lit]
+    row, column, distance, energy = row[lit], column[lit], distance[lit], energy[lit]
+    per_pixel = laser.intensity(camera)[row, column] / camera.pixel_solid_angle()[row, column]
+    return Samples(
+        row * camera.width + column,
+        np.round(distance + late, 9),  # the ways through a corner cube have one length, whatever rounding says
+        np.zeros(len(row)),
+        energy * per_pixel / distance**2,
+        np.full(len(row), sequence.shape[1], np.uint8),
+    )
+
+
+def _made_up(image: np.ndarray, came_back: np.ndarray) -> np.ndarray:
+    """Factor (m,) that makes up for the one or two rays of a lobe (m, LOBE_RAYS) lost to rounding on a border of faces.
+
+    In a corner cube the ways in different order share one image and divide its lobe among them.
+    """
+    _, group = np.unique(np.round(image, 6), axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    covered = np.zeros((group.max() + 1, LOBE_RAYS))
+    np.add.at(covered, group, came_back)
+    count = (covered > 0).sum(axis=1)[group]
+    return np.where(count >= LOBE_RAYS - 2, LOBE_RAYS / np.maximum(count, 1), 1.0)
+
+
+def _raster(world: World, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row (floored, -1: behind the camera) of the pixels that look in the given directions (m, 3)."""
+    camera = world.scene.camera
+    x, y, z = (direction @ camera.rotation).T
+    ahead = z > 0
+    z = np.where(ahead, z, 1)
+    column, row = camera.focal_px * x / z + camera.width / 2, camera.focal_px * y / z + camera.height / 2
+    # a direction along the border of two pixels belongs to the later one, whatever rounding says
+    return tuple(np.where(ahead, np.floor(value + 1e-9), -1) for value in (column, row))
+
+
+def _shines_on(
+    world: World, point: np.ndarray, laser_point: np.ndarray, column: np.ndarray, row: np.ndarray
+) -> np.ndarray:
+    """Whether the laser shines on points (m, 3) while the pixel (column, row) is measured: `in_beam` in float64."""
+    camera, laser = world.scene.camera, world.scene.laser
+    if laser.mode == "flood":
+        x, y, z = ((point - laser_point) @ camera.rotation).T
+        return np.arctan2(np.hypot(x, y), z) <= math.acos(laser.cos_half_angle(camera)) * (1 + 1e-5)
+    lit_column, lit_row = _raster(world, point)
+    return (lit_row == row) & ((lit_column == column) | (laser.mode == "line"))
+
+
+def _lobe(image: np.ndarray) -> np.ndarray:
+    """Points in a small disk around each image as seen from the camera, (m, LOBE_RAYS, 3): a sunflower's spiral."""
+    number = np.arange(LOBE_RAYS)
+    radius = LOBE_RAD * np.sqrt((number + 0.5) / LOBE_RAYS)
+    angle = number * math.pi * (3 - math.sqrt(5)) + 0.5
+    axis = np.eye(3)[np.abs(image).argmin(axis=1)]
+    first = np.cross(image, axis)
+    first *= (np.linalg.norm(image, axis=1) / np.linalg.norm(first, axis=1))[:, None]
+    second = np.cross(image, first) / np.linalg.norm(image, axis=1, keepdims=True)
+    around = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
+    return image[:, None] + radius[:, None] * around
+
+
+# ---- mirrored light ----
+
+
+def _mirrored(world: World, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray, grid: int) -> list[Samples]:
+    """What the camera sees, directly or by way of up to MAX_ORDER mirrors, lit by the planes of `sequence` (k,)."""
+    camera, laser = world.scene.camera, world.scene.laser
+    image = image_of(mirrors, sequence[None], laser.position(camera) - camera.origin)[0]
+    target = mi.Point3f(*(dr.opaque(Float, float(v)) for v in image + world.eye_m))
+    planes = [dr.opaque(UInt32, int(plane)) for plane in sequence]
+    pixels, cells = np.arange(camera.height * camera.width), grid * grid
+    per_chunk = max(1, LANES // cells)
+    parts = []
+    for first in range(0, len(pixels), per_chunk):
+        chunk = pixels[first : first + per_chunk]
+        path, half_width, radiance, met = _cells(world, tables, int(chunk[0]), len(chunk) * cells, grid, target, planes)
+        dr.eval(path, half_width, radiance, met)
+        radiance = np.array(radiance, dtype=np.float64)
+        lit = radiance > 0
+        path, half_width = (np.array(value, dtype=np.float64)[lit] for value in (path, half_width))
+        bounces = (np.array(met)[lit] + 1 + len(sequence)).astype(np.uint8)
+        parts.append(Samples(np.repeat(chunk, cells)[lit], path, half_width, radiance[lit], bounces))
+    return parts
+
+
+def _cells(
+    world: World, tables: _Tables, first: int, lanes: int, grid: int, target: Any, planes: list[Any]
+) -> tuple[Any, Any, Any, Any]:
+    """Per cell of the pixels from `first` on: path and its half width [m], radiance / cells, mirrors met on the way."""
+    side = dr.opaque(UInt32, grid)
+    lane = dr.arange(UInt32, lanes)
+    cells = side * side
+    pixel, cell = lane // cells + dr.opaque(UInt32, first), lane % cells
+    pitch = 1 / Float(side)
+    x = Float(pixel % world.width) + (Float(cell % side) + 0.5) * pitch
+    y = Float(pixel // world.width) + (Float(cell // side) + 0.5) * pitch
+    ray, local = camera_rays(world, x, y)
+    si, weight, optical, distance, axes, met = _seen(world, tables, ray, lanes)
+    active = si.is_valid() & (weight > 0)
+    active &= dr.gather(Float, tables.mirrors, shape_index(si), active) == 0
+
+    along = target - si.p
+    length = dr.norm(along)
+    direction = along / length
+    lift = si.n * dr.select(dr.dot(si.n, direction) > 0, 1e-5, -1e-5) * (length + dr.norm(si.p - world.eye))
+    passed, delay, shortening, last = _connect(world, tables, si.p, lift, target, planes, active, False)
+    active &= in_beam(world, last, pixel)
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)[0]
+    intensity = dr.gather(Float, world.intensity, pixel, active)
+    radiance = weight * value * passed * intensity * spreading(length, shortening) / dr.square(length) / Float(cells)
+    path = optical + length + delay
+    half_width = _half_width(local, axes, si.n, -direction, distance, pitch / world.focal_px)
+    half_width = dr.minimum(half_width, WIDEST_SPREAD * path)
+    return path, half_width, dr.select(active & dr.isfinite(radiance), radiance, 0), met
+
+
+@dr.syntax
+def _seen(world: World, tables: _Tables, ray: Any, lanes: int) -> tuple[Any, ...]:
+    """The first surface that is no plane mirror: interaction, weight of the way, optical and geometric length [m].
+
+    Also the camera's axes as the mirrors show them (the unfolded camera's frame) and the number of mirrors met.
+    """
+    si, weight, optical, distance = first_opaque(world, ray, Bool(True))
+    weight = weight + dr.zeros(Float, lanes)
+    right, down, forward = (axis + dr.zeros(mi.Vector3f, lanes) for axis in world.axes)
+    direction = mi.Vector3f(ray.d)
+    met = dr.zeros(UInt32, lanes)
+    mirror = si.is_valid()
+    mirror &= dr.gather(Float, tables.mirrors, shape_index(si), mirror) > 0
+    while mirror & (met < MAX_ORDER):
+        normal = mi.Vector3f(si.n)
+        weight *= _reflectance(tables, shape_index(si), dr.dot(normal, direction), mirror)
+        direction = direction - 2 * dr.dot(normal, direction) * normal
+        right = right - 2 * dr.dot(normal, right) * normal
+        down = down - 2 * dr.dot(normal, down) * normal
+        forward = forward - 2 * dr.dot(normal, forward) * normal
+        onward, origin = spawn(si, direction), mi.Point3f(si.p)
+        si, transmission, more, step = first_opaque(world, onward, mirror, origin)
+        weight *= transmission
+        optical += more
+        distance += step
+        met += 1
+        mirror = mirror & si.is_valid()
+        mirror &= dr.gather(Float, tables.mirrors, shape_index(si), mirror) > 0
+    return si, weight, optical, distance, (right, down, forward), met
+
+
+def _half_width(local: Any, axes: tuple, normal: Any, from_laser: Any, distance: Any, pitch: Any) -> Any:
+    """Half width [m] of the path lengths over a cell of angular size `pitch`, sqrt(a^2 + b^2), by the tangent plane.
+
+    In the unfolded camera's frame the point seen along l = (x, y, 1) lies at rho = const |l| / (n . l), so
+    drho/dx = rho (x / |l|^2 - n_x / (n . l)) and dp/dx = (drho/dx) r + rho (e_x / |l| - l x / |l|^3); the path's half
+    span is a = |drho/dx + dp/dx . w| dx/2, with w the unit vector from the laser's image.
+    """
+    normal, from_laser = (mi.Vector3f(*(dr.dot(axis, v) for axis in axes)) for v in (normal, from_laser))
+    inverse, length2 = dr.rcp(dr.dot(normal, local)), dr.squared_norm(local)
+    along = dr.normalize(local)
+    total = Float(0)
+    for axis in range(2):
+        slope = distance * (local[axis] / length2 - normal[axis] * inverse)
+        unit = mi.Vector3f(1, 0, 0) if axis == 0 else mi.Vector3f(0, 1, 0)
+        sideways = distance * (unit - along * (local[axis] * dr.rsqrt(length2))) * dr.rsqrt(length2)
+        total += dr.square((slope + dr.dot(from_laser, along * slope + sideways)) * pitch / 2)
+    return dr.sqrt(total)

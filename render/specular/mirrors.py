@@ -1,0 +1,259 @@
+"""Plane smooth faces of a scene and their images: the geometry of specular light. Plain numpy, float64.
+
+Everything has the scene's axes, and the camera at the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from render.scene.traced_scene import World
+from scenes.errors import listed, require
+from scenes.model import Surface
+
+MAX_ORDER = 3  # mirrors in a row
+MOST_PLANES = 64  # a smooth mesh of more planes is a curved surface
+MOST_SEQUENCES = 1 << 18
+MOST_IMAGES = 64
+MOST_SLAB_ERROR_M = 0.010
+COATED = ("conductor", "plastic", "dielectric", "thindielectric")
+
+
+class Mirrors(NamedTuple):
+    """Plane smooth faces n . x = c, the camera at the origin, (n,) or (n, 3) each.
+
+    `low` and `high` bound the face; `shape` is its mesh's registered index; `is_metal` and `is_solid` its material.
+    """
+
+    normal: np.ndarray
+    offset: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    shape: np.ndarray
+    is_metal: np.ndarray
+    is_solid: np.ndarray
+
+
+class SlabError(NamedTuple):
+    """Bounds over the view on what a straight line through a glass solid does wrong [m]; `flat`: it is a slab."""
+
+    name: str
+    thickness_m: float
+    shift_m: float
+    path_m: float
+    flat: bool
+
+
+def find_mirrors(world: World) -> tuple[Mirrors, list[str]]:
+    """All plane smooth faces of a scene, and notes that name the smooth surfaces that are curved."""
+    rows, notes, curved = [], [], {}
+    for shape, group in zip(world.shape_ids, world.groups, strict=True):
+        kind = group[0].material.kind
+        if kind not in COATED:
+            continue
+        planes: list[tuple] = []
+        for surface in group:
+            found = planes_of(surface, world.scene.camera.origin)
+            if found is None:
+                curved.setdefault(surface.name, None)
+            for plane in found or ():
+                _add_plane(planes, plane)
+        rows += [(*plane, shape, kind == "conductor", kind == "dielectric") for plane in planes]
+    if curved:
+        notes.append(
+            f"specular light: curved smooth surfaces ({listed(curved)}): glints and what they mirror are left out"
+        )
+    kinds = {surface.material.kind for surface in world.scene.surfaces}
+    if kinds & {"dielectric", "thindielectric"}:
+        notes.append("glass: its own return is rendered; other light that it reflects is left out")
+    if "plastic" in kinds:
+        notes.append("smooth plastic: the laser's glint in its coat is rendered, not what is lit by way of the coat")
+    if any(row[5] for row in rows):
+        notes.append("mirrors: light by way of them that meets two or more other surfaces first is left out")
+    columns = list(zip(*rows, strict=True)) if rows else [np.empty((0, 3)), [], np.empty((0, 3)), np.empty((0, 3))]
+    columns += [[]] * (7 - len(columns))
+    types = (float, float, float, float, np.int64, bool, bool)
+    return Mirrors(*(np.array(c, dtype=t) for c, t in zip(columns, types, strict=True))), notes
+
+
+def planes_of(surface: Surface, origin: np.ndarray) -> list[tuple] | None:
+    """Planes (normal, offset, low, high) of a mesh relative to `origin`; None for a curved one.
+
+    Triangles without area do not count.
+    """
+    corners = (surface.vertices - origin)[surface.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    kept = area > 1e-12 * max(area.max(), 1e-300)
+    if surface.normals is not None:
+        shading = surface.normals[surface.faces]
+        shading = shading / np.maximum(np.linalg.norm(shading, axis=-1, keepdims=True), 1e-300)
+        flat = np.abs(np.einsum("fcj,fj->fc", shading, normal)) > (1 - 1e-5) * area[:, None]
+        if not flat[kept].all():
+            return None
+    order = np.argsort(-area[kept], kind="stable")
+    corners, normal = corners[kept][order], (normal[kept] / area[kept, None])[order]
+    # a curved mesh shows in its largest faces already: no need to look for planes among a million
+    if len(corners) > 256 and _cluster(corners[:256], normal[:256]) is None:
+        return None
+    return _cluster(corners, normal)
+
+
+def _cluster(corners: np.ndarray, normal: np.ndarray) -> list[tuple] | None:
+    planes: list[tuple] = []
+    while len(corners):
+        if len(planes) == MOST_PLANES:
+            return None
+        n, c = normal[0], float(normal[0] @ corners[0, 0])
+        size = np.abs(corners).max()
+        close = np.abs(corners @ n - c).max(axis=1) < 2e-6 * size
+        same = close & (np.abs(normal @ n) > 1 - 1e-6)
+        same[0] = True
+        points = corners[same].reshape(-1, 3)
+        planes.append((n, c, points.min(axis=0), points.max(axis=0)))
+        corners, normal = corners[~same], normal[~same]
+    return planes
+
+
+def _add_plane(planes: list[tuple], plane: tuple) -> None:
+    """Append a plane, or widen an equal one: two surfaces of one material in one plane give one glint."""
+    normal, offset, low, high = plane
+    for i, (n, c, a, b) in enumerate(planes):
+        sign = np.sign(n @ normal)
+        if abs(n @ normal) > 1 - 1e-9 and abs(sign * offset - c) < 2e-6 * max(np.abs(b).max(), np.abs(a).max()):
+            planes[i] = (n, c, np.minimum(a, low), np.maximum(b, high))
+            return
+    planes.append(plane)
+
+
+def glint_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
+    """Mirrors in a row, (m, k) plane indices for k = 1, 2, 3. Solid glass, which refracts, stands alone."""
+    found = [np.arange(len(mirrors.offset))[:, None]] if len(mirrors.offset) else []
+    return found + _longer(np.flatnonzero(~mirrors.is_solid), MOST_SEQUENCES, notes, "glints")
+
+
+def image_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
+    """Sequences (k,) of metal mirrors that light the scene, the shorter ones first."""
+    metal = np.flatnonzero(mirrors.is_metal)
+    if len(metal) > MOST_IMAGES:
+        notes.append(f"mirrors: {len(metal) - MOST_IMAGES} of {len(metal)} planes light no other surface")
+        metal = metal[:MOST_IMAGES]
+    longer = _longer(metal, MOST_IMAGES - len(metal), notes, "mirrored light")
+    return [row for rows in ([metal[:, None]] if len(metal) else []) + longer for row in rows]
+
+
+def _longer(planes: np.ndarray, most: int, notes: list[str], what: str) -> list[np.ndarray]:
+    """Sequences of 2 and of 3 planes, no plane twice in a row; a length that has more than `most` left is noted."""
+    found, count = [], len(planes)
+    for order in range(2, MAX_ORDER + 1):
+        number = count * (count - 1) ** (order - 1)
+        if number > most:
+            notes.append(f"{what} by {order} or more mirrors left out: {number} ways among {count} planes")
+            break
+        most -= number
+        if number:
+            rows = planes[np.indices((count,) * order).reshape(order, -1).T]
+            found.append(rows[(rows[:, 1:] != rows[:, :-1]).all(axis=1)])
+    return found
+
+
+def image_of(mirrors: Mirrors, sequence: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """S_1 ... S_k x of a point for each row of (m, k) planes, (m, 3)."""
+    image = np.tile(point, (len(sequence), 1))
+    for plane in sequence.T[::-1]:
+        normal = mirrors.normal[plane]
+        image -= 2 * ((normal * image).sum(axis=1) - mirrors.offset[plane])[:, None] * normal
+    return image
+
+
+def specular_points(
+    mirrors: Mirrors, sequence: np.ndarray, image: np.ndarray, slack_rad: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the way from the camera to an image last leaves a mirror, (m, 3), and whether it may exist at all, (m,)."""
+    total = np.linalg.norm(image, axis=1)
+    direction = image / np.maximum(total, 1e-300)[:, None]
+    position, left = np.zeros_like(image), total
+    slack = slack_rad * total
+    possible = total > 0
+    for plane in sequence.T:
+        normal = mirrors.normal[plane]
+        cosine = (normal * direction).sum(axis=1)
+        possible &= np.abs(cosine) > 1e-9
+        gap = mirrors.offset[plane] - (normal * position).sum(axis=1)
+        step = gap / np.where(np.abs(cosine) > 1e-9, cosine, 1)
+        position = position + step[:, None] * direction
+        left = left - step
+        possible &= (step > -slack) & (left > -slack)
+        inside = (position > mirrors.low[plane] - slack[:, None]) & (position < mirrors.high[plane] + slack[:, None])
+        possible &= inside.all(axis=1)
+        direction = direction - 2 * cosine[:, None] * normal
+    return position, possible
+
+
+def check_slabs(world: World) -> list[str]:
+    """Notes on light that a straight line through solid glass puts in a wrong place.
+
+    Raises InputError where that is more than 10 mm of path beside a displaced laser.
+    """
+    errors = slab_error_m(world)
+    lenses, slabs = [e.name for e in errors if not e.flat], [e for e in errors if e.flat]
+    notes = []
+    if lenses:
+        notes.append(f"glass {_gathered(lenses)}: bends light as a lens does, crossed here in a straight line")
+    if not slabs:
+        return notes
+    worst = max(slabs, key=lambda error: error.path_m)
+    off = f"{1e3 * max(e.shift_m for e in slabs):.1f} mm beside it, {1e3 * worst.path_m:.1f} mm of path"
+    allowed = world.scene.laser.is_colocated or worst.path_m <= MOST_SLAB_ERROR_M
+    limit = f"the limit with a displaced laser is {1e3 * MOST_SLAB_ERROR_M:.0f} mm"
+    require(allowed, f"glass {worst.name}: a straight line through it is up to {off} off the refracted one; {limit}")
+    names = _gathered([error.name for error in slabs])
+    return [*notes, f"glass {names}: crossed in a straight line, up to {off} off the refracted one"]
+
+
+def _gathered(names: list[str]) -> str:
+    """The name of one, the number and the first names of several."""
+    return names[0] if len(names) == 1 else f"({len(names)} solids: {listed(names)})"
+
+
+def slab_error_m(world: World) -> list[SlabError]:
+    """Bounds over the view on the error of a straight line through each solid of glass that the camera faces.
+
+    At incidence a (b inside, sin a = n sin b) a slab of thickness t shifts a ray sideways by
+    t sin a (1 - cos a / sqrt(n^2 - sin^2 a)), and a straight line is longer in path by at most
+    n t (1/cos a - 1/cos b); the camera's leg and the laser's add up. a is the largest that the view and the solid
+    allow, on the laser's leg larger by the parallax of the baseline at the slab.
+    """
+    camera = world.scene.camera
+    baseline = np.linalg.norm(world.scene.laser.baseline_m)
+    rays = camera.rays(np.array([0, 0, 1, 1]) * camera.width, np.array([0, 1, 0, 1]) * camera.height)
+    errors = []
+    for surface in world.scene.surfaces:
+        if surface.material.kind != "dielectric":
+            continue
+        points = surface.vertices - camera.origin
+        if (points @ camera.rotation[:, 2]).max() <= 0:
+            continue
+        planes = planes_of(surface, camera.origin)
+        if planes is None:
+            errors.append(SlabError(surface.name, math.nan, math.inf, math.inf, False))
+            continue
+        normal = min((plane[0] for plane in planes), key=lambda n: np.ptp(points @ n))
+        height = points @ normal
+        thickness, extent = float(np.ptp(height)), float(np.linalg.norm(np.ptp(points, axis=0)))
+        cosine = max(
+            (np.abs(height) / np.maximum(np.linalg.norm(points, axis=1), 1e-300)).min(), np.abs(rays @ normal).min()
+        )
+        angle = math.acos(min(cosine, 1.0))
+        before = np.abs(height).min() if height.min() * height.max() > 0 else 0.0
+        shift = path = 0.0
+        for a in (angle, min(angle + math.atan2(baseline, before), math.pi / 2)):
+            inside = math.sqrt(1 - (math.sin(a) / surface.material.ior) ** 2)
+            straight = min(thickness / max(math.cos(a), 1e-12), extent)
+            shift = max(shift, thickness * math.sin(a) * (1 - math.cos(a) / (surface.material.ior * inside)))
+            path += max(surface.material.ior * (straight - thickness / inside), 0.0)
+        errors.append(SlabError(surface.name, thickness, shift, path, True))
+    return errors

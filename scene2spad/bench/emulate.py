@@ -1,0 +1,135 @@
+"""`bench emulate`: seconds of the emulator's two routes, which must agree bit for bit, and a megapixel frame."""
+
+from __future__ import annotations
+
+import csv
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from render.pipeline import Progress
+from scene2spad.studies.power.emulated_chain import timestamps_of
+from scene2spad.studies.power.program_tables import int8_temporal
+from scenes.errors import require
+from scenes.files import whole_file
+from ultraphase import Core, CoreArray, Method, method, verify
+from ultraphase.catalog import PUBLISHED, TIMESTAMPS
+from ultraphase.tables import INT8_SCALE, spatial_sum
+from ultraphase.verify import Tabulated
+
+COLUMNS = ("name", "seconds", "error", "pixels", "photons", "instructions_per_second", "photons_per_second")
+MEGAPIXEL = 1 << 20
+PHOTONS = 550
+_BLOCK = 1 << 15  # pixels of fresh counts; a megapixel holds them 32 times, each time shifted in time
+
+
+def run(command: Any, progress: Progress) -> dict:
+    """Rows of `name`, `seconds`, `error` (numbers that differ from the interpreted program's) and rates; CSV in
+    `command.out`. `command.quick` leaves out the megapixel frames; `command.only` names programs."""
+    names = list(command.only) or list(PUBLISHED)
+    out = command.out
+    require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
+    rows = []
+    for number, name in enumerate(names):
+        progress(name, number / len(names))
+        rows += _one(method(name), command.seed)
+    if not command.quick:
+        chosen = method("fourier-16")
+        progress("megapixel", 0.9)
+        rows.append(_megapixel(chosen, _proof(chosen), command.seed, command.repeats))
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "bench-emulate.csv"
+    with whole_file(path) as beside, beside.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    return {"rows": rows, "out": str(path)}
+
+
+def _proof(chosen: Method) -> Tabulated:
+    temporal = int8_temporal(chosen)
+    return verify(chosen.program(), chosen.matrix(temporal), chosen.tables(temporal))
+
+
+def _counts(pixels: int, seed: int) -> np.ndarray:
+    """Poisson counts with a mean of 500 uniform and 50 in three bins, (pixels, 1024) uint8."""
+    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(8, pixels)))
+    counts = random.poisson((PHOTONS - 50) / TIMESTAMPS, (pixels, TIMESTAMPS)).astype(np.uint8)
+    peak = random.integers(1, TIMESTAMPS - 1, pixels)
+    for step, share in ((-1, 0.25), (0, 0.5), (1, 0.25)):
+        counts[np.arange(pixels), peak + step] += random.poisson(50 * share, pixels).astype(np.uint8)
+    return counts
+
+
+def _one(chosen: Method, seed: int) -> list[dict]:
+    """One program: a core alone, an array of cores, and its tabulated form, on the same photons."""
+    program, tables = chosen.program(), chosen.tables(int8_temporal(chosen))
+    rows_columns = (16, 32)
+    counts = _counts(rows_columns[0] * rows_columns[1], seed)
+    stamps, offsets = timestamps_of(counts.reshape(*rows_columns, -1))
+    start = time.perf_counter()
+    array = CoreArray(program, rows_columns, tables)
+    frame = array.frame(stamps, offsets)
+    arrays = time.perf_counter() - start
+    start = time.perf_counter()
+    proof = _proof(chosen)
+    proven = time.perf_counter() - start
+    start = time.perf_counter()
+    sums = proof.frame(counts)
+    tabulated = time.perf_counter() - start
+    for _ in range(2):  # the first compiles the program
+        core = Core(program, tables)
+        core.start(stamps[: offsets[1]], park=True)
+        start = time.perf_counter()
+        core.run()
+        alone = time.perf_counter() - start
+    held = np.concatenate([core.contents(region.name) for region in program.state])
+    pixels, work = len(counts), frame.counters
+    return [
+        _row(f"{chosen.name}: core alone", alone, held != sums[0], 1, core.counters.instructions, offsets[1]),
+        _row(f"{chosen.name}: array", arrays, _left(chosen, sums) != frame.out, pixels, work.instructions, len(stamps)),
+        _row(f"{chosen.name}: proof", proven, np.zeros(1, bool), TIMESTAMPS, 0, proof.states * TIMESTAMPS),
+        _row(f"{chosen.name}: tabulated", tabulated, np.zeros(1, bool), pixels, 0, len(stamps)),
+    ]
+
+
+def _left(chosen: Method, sums: np.ndarray, shape: tuple[int, int] = (16, 32)) -> np.ndarray:
+    """What leaves the sensor of numbers that the cores hold, as the array orders it."""
+    if chosen.block == (1, 1):
+        return sums
+    (down, right), (height, width) = chosen.block, shape
+    cores = sums.reshape(height // down, down, width // right, right, -1, chosen.codes).swapaxes(1, 2)
+    cores = cores.reshape(height // down * width // right, down * right, -1, chosen.codes)
+    return spatial_sum(cores, np.full((down * right, chosen.codes), INT8_SCALE)).reshape(len(cores), -1)
+
+
+def _row(name: str, seconds: float, differs: np.ndarray, pixels: int, instructions: int, photons: int) -> dict:
+    return {
+        "name": name,
+        "seconds": seconds,
+        "error": int(np.count_nonzero(differs)),
+        "pixels": pixels,
+        "photons": int(photons),
+        "instructions_per_second": instructions / seconds,
+        "photons_per_second": photons / seconds,
+    }
+
+
+def _megapixel(chosen: Method, proof: Tabulated, seed: int, repeats: int) -> dict:
+    """A frame of 2^20 pixels from uint8 histograms by the tabulated form, two threads, best of `repeats`; a block of it
+    is compared with the integer product."""
+    block = _counts(_BLOCK, seed)
+    histograms = np.concatenate([np.roll(block, shift, axis=1) for shift in range(MEGAPIXEL // _BLOCK)])
+    halves = np.array_split(histograms, 2)
+    best, sums = np.inf, np.empty(0)
+    with ThreadPoolExecutor(2) as threads:
+        for _ in range(max(repeats, 1)):
+            start = time.perf_counter()
+            parts = list(threads.map(proof.frame, halves))
+            best = min(best, time.perf_counter() - start)
+            sums = parts[-1]
+    last = halves[-1][-2048:].astype(np.int64) @ proof.table
+    photons = int(block.sum(dtype=np.int64)) * (MEGAPIXEL // _BLOCK)
+    return _row(f"{chosen.name}: megapixel", best, proof.limited(last) != sums[-2048:], MEGAPIXEL, 0, photons)

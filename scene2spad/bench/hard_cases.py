@@ -1,0 +1,96 @@
+"""`bench hard-cases`: scenes that break renderers, each against a closed form or a quadrature. One table for all users.
+
+The tests run the same table, one test a case.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from scene2spad.bench.hard import direct as hard_cases_direct
+from scene2spad.bench.hard import indirect as hard_cases_indirect
+from scene2spad.bench.hard import optics as hard_cases_optics
+from scene2spad.bench.hard.case import Case, Measured
+from scenes.errors import InputError, require
+from scenes.files import whole_file
+
+CASES: dict[str, Case] = {
+    case.name: case for case in (*hard_cases_direct.CASES, *hard_cases_indirect.CASES, *hard_cases_optics.CASES)
+}
+COLUMNS = ("name", "passed", "quantity", "error", "limit", "seconds", "clipped", "oracle")
+
+Progress = Callable[[str, float], None]
+
+
+def run(command: Any, progress: Progress) -> dict:
+    """Measure every case, or those that `command.only` names, and write the table as CSV where `command.out` is set.
+
+    `command` has `seed` and may have `out` (a folder), `only` (names) and `quick` (leave out slow ones).
+    A row is one case: its quantity nearest to the limit, all of them under `quantities`, and what was clipped. Its
+    seconds, oracle included, leave out renders and quadratures that an earlier row has paid for.
+    """
+    cases = chosen(getattr(command, "only", ()) or (), quick=getattr(command, "quick", False))
+    out = getattr(command, "out", None)
+    if out is not None:
+        require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
+    rows = []
+    for number, case in enumerate(cases):
+        progress(case.name, number / len(cases))
+        rows.append(row(case, command.seed))
+    progress("done", 1.0)
+    result = {"rows": rows, "passed": sum(r["passed"] for r in rows), "cases": len(rows)}
+    if out is not None:
+        result["out"] = str(_write(out, rows))
+    return result
+
+
+def chosen(only: Iterable[str], *, quick: bool = False) -> list[Case]:
+    """The cases of those names, all where none is named; InputError for a name that is not there."""
+    names = [only] if isinstance(only, str) else list(only)
+    for name in names:
+        require(name in CASES, f"hard case {name!r}: expected one of {', '.join(CASES)}")
+    return [CASES[name] for name in names] or [case for case in CASES.values() if not (quick and case.slow)]
+
+
+def row(case: Case, seed: int) -> dict:
+    """One line of the table. A case that a renderer refuses or breaks on has failed; the others go on."""
+    start = time.perf_counter()
+    reason = ""
+    try:
+        errors, clipped = case.measure(seed)
+    except (InputError, ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+        errors, clipped = {"refused": Measured(math.inf, 0)}, 0
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+    quantity, worst = max(errors.items(), key=lambda item: item[1].share)
+    return {
+        "name": case.name,
+        "passed": bool(worst.share <= 1),
+        "quantity": quantity,
+        "error": float(worst.error),
+        "limit": float(worst.limit),
+        "seconds": time.perf_counter() - start,
+        "clipped": int(clipped),
+        "oracle": case.oracle,
+        "quantities": {name: [float(m.error), float(m.limit)] for name, m in errors.items()},
+        **({"reason": reason} if reason else {}),
+    }
+
+
+def _write(out: Path, rows: list[dict]) -> Path:
+    """The table as CSV, one line a quantity; whole or not at all."""
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "bench-hard-cases.csv"
+    with whole_file(path) as beside, beside.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for one in rows:
+            for quantity, (error, limit) in one["quantities"].items():
+                passed = Measured(error, limit).share <= 1
+                shown = [f"{value:.4g}" for value in (error, limit, one["seconds"])]
+                writer.writerow((one["name"], passed, quantity, *shown, one["clipped"], one["oracle"]))
+    return path

@@ -1,0 +1,1 @@
+"""Measure seconds against error of the renderer beside its peers."""

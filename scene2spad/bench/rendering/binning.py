@@ -1,0 +1,43 @@
+"""Samples of light -> a dense histogram: what the renderer is timed to, since its peer can make nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from render.scene.traced_scene import Float, UInt32, dr, mi, upload
+from render.transient.samples import Samples
+
+
+def binned(samples: Samples, pixels: int, bins: int, bin_m: float) -> np.ndarray:
+    """Radiance per pixel and bin, (pixels, bins) float32; bin i covers path lengths [i, i + 1) * bin_m.
+
+    A sample is uniform over path +- half width (a point where that is 0) and gives each bin its share of the interval;
+    what lies outside [0, bins * bin_m) is dropped. Scattered by as many threads as the peer scatters with.
+    """
+    if len(samples.pixel) == 0:
+        return np.zeros((pixels, bins), np.float32)
+    # a point on an edge belongs to the bin above it: the division must not round it down
+    near = ((samples.path_m - samples.half_width_m) / bin_m).astype(np.float32)
+    far = ((samples.path_m + samples.half_width_m) / bin_m).astype(np.float32)
+    columns = upload(UInt32, samples.pixel), upload(Float, near), upload(Float, far), upload(Float, samples.radiance)
+    out = _scattered(*columns, dr.opaque(UInt32, bins), pixels * bins)
+    dr.eval(out)
+    return out.numpy().reshape(pixels, bins)
+
+
+@dr.freeze
+@dr.syntax
+def _scattered(pixel: Any, near: Any, far: Any, radiance: Any, bins: Any, size: int) -> Any:
+    out = dr.zeros(Float, size)
+    place = dr.maximum(mi.Int32(dr.floor(near)), 0)
+    last = dr.minimum(mi.Int32(dr.floor(far)), mi.Int32(bins) - 1)
+    point = far == near
+    density = dr.select(point, radiance, radiance / (far - near))
+    while place <= last:
+        overlap = dr.minimum(far, Float(place) + 1) - dr.maximum(near, Float(place))
+        share = dr.select(point, 1, overlap)
+        dr.scatter_reduce(dr.ReduceOp.Add, out, density * share, pixel * bins + UInt32(place))
+        place += 1
+    return out

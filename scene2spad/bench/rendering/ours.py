@@ -1,0 +1,22 @@
+"""The renderer under test, behind one function: the only place that changes with its interface."""
+
+from __future__ import annotations
+
+from render.direct.integrator import least_share_of
+from render.pipeline import trace as trace_light
+from render.scene.traced_scene import World
+from render.settings import Plan, RenderSettings
+from render.transient.samples import Samples
+from scene2spad.bench.rendering.settings import Method, grid_beside
+
+MERGED_M = 0.0  # nothing is merged: a histogram follows at once
+
+
+def trace(world: World, method: Method, bounces: int, quality: int, seed: int) -> Samples:
+    """Merged samples of all pixels, nothing planned or estimated: every setting is forced."""
+    grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality), quality)
+    forced = {"bounces": bounces, "spp": spp, "grid": grid, "filter": method.filter}
+    exact = {"least_share": least_share_of(grid), "direct_tolerance_m": MERGED_M}
+    settings = RenderSettings(**forced, **exact)
+    plan = Plan(**forced, **exact, ambient=False, reasons=())
+    return trace_light(world, plan, settings, seed=seed).samples

@@ -1,0 +1,79 @@
+"""References in two halves, made in passes, kept in a folder under the hash of all that decides them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from scene2spad.bench.rendering.errors import Reference
+from scenes.files import whole_file
+
+log = logging.getLogger("scene2spad")
+FORMAT = 1
+FIRST_SEED = 1_000_000  # far from the seeds of what is judged
+
+
+def default_folder() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scene2spad"
+
+
+def key_of(parts: dict) -> str:
+    """A hash of everything that decides a reference (plain JSON values)."""
+    return hashlib.sha256(json.dumps({**parts, "format": FORMAT}, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def reference(
+    folder: Path,
+    name: str,
+    parts: dict,
+    passes: int,
+    make: Callable[[int], np.ndarray],
+    maker: str,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Reference:
+    """Both halves, from the folder or made now: `make(seed)` is one pass, (pixels, bins) float32.
+
+    After every pass the half is saved, so that a stopped run goes on where it was.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    halves = []
+    for half in range(2):
+        path = folder / f"{name}-{key_of({**parts, 'passes': passes})}-{'AB'[half]}.npz"
+        first = FIRST_SEED * (half + 1)
+        halves.append(_half(path, passes, first, make, lambda done, h=half: progress((h + done / passes) / 2)))
+    return Reference(*halves, maker)
+
+
+def _half(
+    path: Path, passes: int, first: int, make: Callable[[int], np.ndarray], progress: Callable[[int], None]
+) -> np.ndarray:
+    mean, done = _load(path)
+    if done >= passes:
+        return mean
+    total = None if mean is None else mean.astype(np.float64) * done
+    for number in range(done, passes):
+        progress(number)
+        part = make(first + number)
+        total = part.astype(np.float64) if total is None else np.add(total, part, out=total)
+        mean = (total / (number + 1)).astype(np.float32)
+        with whole_file(path) as beside:
+            np.savez_compressed(beside, mean=mean, passes=number + 1)
+    return mean
+
+
+def _load(path: Path) -> tuple[np.ndarray | None, int]:
+    try:
+        with np.load(path) as file:
+            return file["mean"], int(file["passes"])
+    except FileNotFoundError:
+        return None, 0
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        log.warning("%s: unreadable, made again", path)
+        return None, 0

@@ -1,0 +1,171 @@
+"""`bench sense`: seconds to timestamps and histograms beside dense Poisson draws of the same rates, and who errs how.
+
+Times are medians of runs that alternate with their peer's, so that what else the machine does meets both. Beside each
+stands the p-value of a chi-square test that both drew from one law: totals over the image of every bin.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from render.transient import Transient
+from scene2spad.bench import estimators
+from scenes.errors import require
+from scenes.files import whole_file, write_csv
+from spad.detection.detect import sense, sense_timestamps
+from spad.detection.flux import expected_counts, rates_for
+from spad.detection.laws import first_photon_counts
+from spad.detection.training_patches import Patch, packed_transients, sense_patches
+from spad.formats.rgbd import transient_from_rgbd
+from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+
+SIZE = (72, 88)
+BUDGETS = ((10.0, 50.0), (10.0, 1000.0))
+CYCLES = (1_000, 1_000_000)
+FLUX_PER_CYCLE = 0.05
+PATCHES = ((10.0, 50.0), (50.0, 50.0))
+
+Progress = Callable[[str, float], None]
+
+
+def relief(height: int, width: int) -> Transient:
+    """A smooth procedural relief at 1.4 to 2.6 m with steps, four returns a pixel."""
+    y, x = np.mgrid[0 : 2 * height, 0 : 2 * width] / 20.0
+    depth = 2 + 0.4 * np.sin(x) * np.cos(y / 1.3) + 0.2 * (np.floor(x / 2) % 2)
+    albedo = 0.5 + 0.3 * np.cos(x + y)
+    return transient_from_rgbd(depth, albedo, albedo, fov_deg=21.0, block=2)
+
+
+def run(command: Any, progress: Progress) -> dict:
+    """Rows of `name`, `seconds`, `error` and what they are compared with; tables and picture in `command.out`.
+
+    `command` has `seed`, `repeats`, `quick` (two levels and one image in the table of estimators), `set`, `data` and
+    `out`.
+    """
+    out: Path = command.out
+    require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
+    repeats, scenes = max(3, command.repeats), estimators.scenes_of(command)
+    progress("seconds", 0.0)
+    rows = [
+        *against_dense(command.seed, repeats),
+        *first_photons(command.seed, repeats),
+        training(command.seed, repeats),
+    ]
+    result: dict = {"rows": rows}
+    out.mkdir(parents=True, exist_ok=True)
+    result["out"] = str(write_csv(rows, out / "bench-sense.csv"))
+    if scenes:
+        table = estimators.table(
+            scenes,
+            sensor_by_name("reference"),
+            estimators.QUICK_LEVELS if command.quick else estimators.LEVELS,
+            seed=command.seed,
+            progress=lambda what, share: progress(what, 0.3 + 0.7 * share),
+        )
+        said = estimators.markdown(table)
+        result["estimators"] = estimators.summary(table) if command.json else said
+        with whole_file(out / "bench-estimators.md") as beside:
+            beside.write_text("\n".join(said) + "\n", encoding="utf-8")
+        result["table"] = str(write_csv(table, out / "bench-estimators.csv"))
+        result["figure"] = str(estimators.draw(table, out / "bench-estimators.png"))
+    return result
+
+
+def alternating(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Median seconds of each way, warmed up once, run in turn."""
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for way in ways.values():
+        way()
+    for _ in range(repeats):
+        for name, way in ways.items():
+            start = time.perf_counter()
+            way()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: statistics.median(times) for name, times in seconds.items()}
+
+
+def one_law(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """p-value of the chi-square test that two sets of counts (..., T) have the same distribution over bins."""
+    both = np.stack([counts.reshape(-1, counts.shape[-1]).sum(axis=0) for counts in (ours, theirs)])
+    return float(stats.chi2_contingency(both[:, both.sum(axis=0) > 10]).pvalue)
+
+
+def against_dense(seed: int, repeats: int) -> list[dict]:
+    """numpy's Poisson draw of every bin from rates that it is given, beside our draws from the returns."""
+    transient, sensor, rows = relief(*SIZE), sensor_by_name("reference"), []
+    for signal, background in BUDGETS:
+        budget = PhotonBudget(signal, background)
+        everything = slice(0, transient.height * transient.width)
+        rates = expected_counts(transient, sensor, rates_for(transient, sensor, budget), everything)[0].numpy()
+        rng = np.random.default_rng(seed)
+        seconds = alternating(
+            {
+                "numpy": lambda rng=rng, rates=rates: rng.poisson(rates),
+                "timestamps": lambda budget=budget: sense_timestamps(transient, sensor, budget, seed=seed),
+                "histogram": lambda budget=budget: sense(transient, sensor, budget, seed=seed),
+            },
+            repeats,
+        )
+        peer = rng.poisson(rates)
+        ours = sense(transient, sensor, budget, seed=seed).counts
+        p_value, error = one_law(ours, peer), abs(float(ours.sum(dtype=np.int64) / rates.sum()) - 1)
+        level = f"{signal:g} + {background:g} photons"
+        rows.append(_row(f"dense numpy Poisson, {level}", seconds["numpy"]))
+        for what in ("timestamps", "histogram"):
+            rows.append(_row(f"{what}, {level}", seconds[what], seconds["numpy"] / seconds[what], p_value, error))
+    return rows
+
+
+def first_photons(seed: int, repeats: int) -> list[dict]:
+    """The first-photon law at few and many cycles: at one budget an exposure, and at one flux a cycle (dense)."""
+    transient, budget = relief(*SIZE), PhotonBudget(10.0, 50.0)
+    sensors = {cycles: _with_cycles(cycles) for cycles in CYCLES}
+    ways = {
+        cycles: lambda sensor=sensor: sense(transient, sensor, budget, seed=seed, model="first-photon")
+        for cycles, sensor in sensors.items()
+    }
+    seconds = alternating(ways, repeats)
+    rows = []
+    for cycles in CYCLES:
+        speed = seconds[CYCLES[0]] / seconds[cycles]
+        rows.append(
+            _row(f"first photon, {cycles:,} cycles, the same 10 + 50 photons an exposure", seconds[cycles], speed)
+        )
+    flux = expected_counts(transient, sensors[CYCLES[0]], rates_for(transient, Sensor(), budget), slice(0, 1024))[0]
+    flux = flux.numpy() * (FLUX_PER_CYCLE / flux.sum(dim=1).mean().item())
+    rng = np.random.default_rng(seed)
+    dense = alternating({n: lambda n=n: first_photon_counts(flux, n, rng) for n in CYCLES}, repeats)
+    for cycles in CYCLES:
+        name = f"first photon, {cycles:,} cycles, the same {FLUX_PER_CYCLE:g} photons a cycle, every bin"
+        rows.append(_row(name, dense[cycles], dense[CYCLES[0]] / dense[cycles]))
+    return rows
+
+
+def _with_cycles(cycles: int) -> Sensor:
+    reference = sensor_by_name("reference")
+    return replace(reference, exposure_s=cycles * reference.period_s)
+
+
+def training(seed: int, repeats: int) -> dict:
+    """One batch: 4 patches of 32 x 32 x 1024 at two photon levels, from 64 x 64 transients in memory."""
+    packed = packed_transients([relief(64, 64)] * 4)
+    sensor = sensor_by_name("reference")
+    patches = [Patch(i, 8 * i, 30 - 8 * i, *PATCHES[i % 2], seed=(seed, i)) for i in range(4)]
+    seconds = alternating({"batch": lambda: sense_patches(packed, sensor, patches, size=(32, 32))}, 3 * repeats)
+    return _row("training batch, 4 x 32 x 32 x 1024, 10 + 50 and 50 + 50 photons", seconds["batch"])
+
+
+def _row(
+    name: str, seconds: float, speed: float | None = None, p_value: float | None = None, error: float | None = None
+) -> dict:
+    """`times_faster` than the row's peer; `error` of the total counts against the expected ones, where it is measured:
+    shot noise, as the law is exact."""
+    return {"name": name, "seconds": seconds, "error": error, "times_faster": speed, "same_law_p": p_value}

@@ -1,0 +1,17 @@
+"""Run one stage of the bench. Its options: `scene2spad.options.experiments`."""
+
+from __future__ import annotations
+
+import importlib
+
+from scene2spad.options.common import Progress
+from scene2spad.options.experiments import Bench
+from scenes.errors import InputError
+
+
+def run(command: Bench, progress: Progress) -> dict:
+    """One stage of the bench: the module of its name, imported only when it is asked for."""
+    for name, value in (("seeds", command.seeds), ("repeats", command.repeats)):
+        if not 1 <= value <= 1000:
+            raise InputError(f"bench: {name} {value} is outside 1 to 1000")
+    return importlib.import_module(f"scene2spad.bench.{command.stage.replace('-', '_')}").run(command, progress)

@@ -1,0 +1,38 @@
+"""Calibrate a multi-zone sensor from captures at known distances. No torch, no Mitsuba: --help must be quick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from scene2spad.options.common import Common, Positional, Progress
+
+FITTED = ("delay", "clock", "bin_width", "background", "trials", "recovery", "compression")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrate(Common):
+    """Calibrate a multi-zone sensor from captures of a plane at known distances, and write its sensor file."""
+
+    captures: Positional[Path] = Path("shipped")
+    """Captures (.npz: distance_m, counts by zone and bin, and reference_counts if any); shipped: a TMF8820's that come
+    with the package."""
+    sensor: str = "tmf8820"
+    """Preset or sensor file (.toml) that zones, and what is not fitted, are taken from."""
+    out: Path = Path("sensor.toml")
+    """The sensor file to write."""
+    every: int = 2
+    """Fit every N-th capture; the others are held out."""
+    nearest: float = 0.1
+    """Nearest distance that is used [m]."""
+    effects: tuple[str, ...] = FITTED
+    """What is fitted beside pulse and gains; crosstalk too, if named. What is left out is off."""
+    model_error: float = 0.005
+    """Relative error of the model that every bin's variance is widened by; 0 is the Poisson likelihood alone."""
+
+
+def run(command: Calibrate, progress: Progress) -> dict:
+    """Captures -> sensor file, its standard errors, and the likelihood of the captures that were held out."""
+    from scene2spad.cli import calibrating
+
+    return calibrating.run(command, progress)

@@ -1,0 +1,80 @@
+"""The command `calibrate`: captures before a plane -> the sensor file that predicts them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scene2spad.datasets.zone_captures import read_plane_captures, shipped_captures, within, zone_captures
+from scene2spad.options.common import Progress
+from scenes.errors import require
+from spad.sensor.files import SensorFile, load_sensor, write_sensor
+from spad.zones.calibration import Calibration, ZoneCapture, calibrate, check_effects, poisson_deviance
+from spad.zones.sensor import expected_zone_counts
+
+if TYPE_CHECKING:
+    from scene2spad.cli.calibrate import Calibrate
+
+LEAST_CAPTURES = 16
+CALIBRATED = ("gain", "delay", "clock", "background", "trials", "recovery", "compression", "crosstalk")
+
+
+def run(command: Calibrate, progress: Progress) -> dict:
+    """Render the plane at each distance, fit every N-th capture, score the others, write the file."""
+    require(command.out.suffix == ".toml", f"{command.out}: the output must end in .toml")
+    require(command.out.parent.is_dir(), f"{command.out}: folder {command.out.parent} does not exist")
+    require(command.every >= 2, f"--every {command.every} leaves no capture to be held out, expected 2 or more")
+    require(0 <= command.model_error < 1, f"--model-error {command.model_error:g} is outside 0 to 1")
+    check_effects(command.effects)
+    start = load_sensor(command.sensor)
+    require(start.zones is not None, f"sensor {start.sensor.name} has no zones: its file needs a table [zones]")
+    path = shipped_captures() if str(command.captures) == "shipped" else command.captures
+    chosen = within(read_plane_captures(path), command.nearest)
+    number = len(chosen.distance_m)
+    enough = number >= LEAST_CAPTURES
+    require(enough, f"{path}: {number} captures from {command.nearest:g} m on, expected {LEAST_CAPTURES} or more")
+    began = time.perf_counter()
+    progress("render the plane", 0.0)
+    captures = zone_captures(chosen, start.sensor, start.zones)
+    progress("fit", 0.3)
+    used = captures[:: command.every]
+    held = [one for at, one in enumerate(captures) if at % command.every]
+    fitted = calibrate(used, start.sensor, start.zones, free=command.effects, model_error=command.model_error)
+    span = f"{chosen.distance_m[0]:g} to {chosen.distance_m[-1]:g} m"
+    how = f"calibrated from {len(used)} captures of {path.name}, {span}"
+    write_sensor(calibrated_file(start, fitted, command.out.stem, how), command.out)
+    zones = fitted.zones
+    return {
+        "seconds": time.perf_counter() - began,
+        "captures": len(used),
+        "held_out": len(held),
+        "deviance": fitted.deviance,
+        "held_out_deviance": mean_deviance(held, fitted),
+        "bin_width_ps": fitted.sensor.bin_width_s * 1e12,
+        "trials": zones.trials[0],
+        "recovery": zones.recovery,
+        "compression": zones.compression,
+        "crosstalk": zones.crosstalk,
+        "standard_errors": {name: float(np.max(error)) for name, error in fitted.errors.items()},
+        "out": str(command.out),
+    }
+
+
+def calibrated_file(start: SensorFile, fitted: Calibration, name: str, how: str) -> SensorFile:
+    """Return the sensor file of a calibration; the sources of what was not fitted are kept."""
+    sources = {key: said for key, said in start.sources.items() if not key.startswith(("pulse.", "jitter."))}
+    keys = ("histogram.bin_width", "pulse.samples", "pulse.step", *(f"zones.{key}" for key in CALIBRATED))
+    sources.update(dict.fromkeys(keys, how))
+    sensor = replace(fitted.sensor, name=name)
+    return SensorFile(sensor, start.optics, fitted.zones, f"{start.sensor.name}, {how}", sources)
+
+
+def mean_deviance(captures: Sequence[ZoneCapture], fitted: Calibration) -> float:
+    """Poisson deviance a bin of captures: about 1 for a true model."""
+    expected = [expected_zone_counts(c.returns, fitted.sensor, fitted.zones, c.drift_s) for c in captures]
+    total = sum(poisson_deviance(c.counts, one) for c, one in zip(captures, expected, strict=True))
+    return total / sum(c.counts.size for c in captures)

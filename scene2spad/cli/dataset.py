@@ -1,0 +1,73 @@
+"""Render a scene set to a folder, and pack it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from render.settings import SHARED_AMBIENT_SPP
+from scene2spad.cli.paths import output_file
+from scene2spad.options.common import Common, Count, File, Number, Offset, Pixels, Positional, Progress, may_stay_open
+from scenes.library.sets import scene_set
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset(Common):
+    """Render a scene set to a folder of EXR files with an index; stopped at any moment, it goes on where it was."""
+
+    set: Positional[str] = "rooms"
+    """rooms, rooms/val, rooms/test, tabletop, middlebury or hard-cases."""
+    count: Count = None
+    """Views (default: all of a finite set, 100 of rooms)."""
+    out: Annotated[Path | None, may_stay_open("FOLDER")] = None
+    """Folder of the set (default: out/ and the set's name)."""
+    workers: int = 1
+    """Processes on this machine."""
+    scheduler: Annotated[str | None, may_stay_open("ADDRESS")] = None
+    """Address of a running Dask scheduler, tcp://HOST:PORT, instead of processes here."""
+    pack: File = None
+    """Make one .h5 file of the finished set, which training reads without a renderer."""
+    width: Pixels = None
+    """Image width, pixels (default: 64 of rooms, the scenes' own of others)."""
+    height: Pixels = None
+    """Image height, pixels."""
+    bounces: Count = None
+    """Surfaces light may meet, 1 = direct only (default: planned for each view)."""
+    spp: Count = None
+    """Indirect light paths per pixel (default: planned for each view)."""
+    filter: bool = False
+    """Average late indirect light over small regions of surfaces, as `render` does: faster, and biased."""
+    grid: Count = None
+    """Direct rays per pixel side (default: planned, one for all views of an endless set)."""
+    error: Number = None
+    """Target of the relative error (default: 0.01 with 1 bounce, 0.03 with more)."""
+    ambient: bool = True
+    """Render ambient light."""
+    ambient_spp: int = SHARED_AMBIENT_SPP
+    """Paths per pixel of ambient light, which neighbouring pixels share."""
+    offset: float = 0.0
+    """Move every scene this many metres away."""
+    offset_mode: Offset = "time"
+    """As of `render`."""
+
+
+def run(command: Dataset, progress: Progress) -> dict:
+    """A scene set -> a folder of .exr files, and one .h5 of them all."""
+    from scene2spad.datasets.rendering import Job, make_set, pack_set
+
+    of = scene_set(command.set)
+    error = command.error or (0.01 if command.bounces == 1 else 0.03)
+    job = Job(
+        of.name, command.seed, command.width, command.height, command.bounces, command.spp, command.grid, error,
+        command.offset, command.offset_mode, command.ambient, command.ambient_spp, filter=command.filter,
+    )  # fmt: skip
+    if command.pack is not None:
+        output_file(command.pack, ".h5", "pack")
+    out = command.out or Path("out") / of.name.replace("/", "-")
+    count = command.count if command.count is not None else of.size or 100
+    options = {"workers": command.workers, "scheduler": command.scheduler, "progress": progress}
+    result = make_set(job, count, out, **options)
+    if command.pack is not None:
+        result |= {"pack_bytes": pack_set(out, command.pack, progress), "pack": str(command.pack)}
+    return result

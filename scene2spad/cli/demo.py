@@ -1,0 +1,76 @@
+"""From a scene to depth, with one figure."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from scene2spad.cli.depth import depth_map
+from scene2spad.cli.paths import output_file
+from scene2spad.cli.render import in_view
+from scene2spad.options.common import Common, Progress
+from scenes.errors import InputError
+from scenes.library.catalog import load_scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Common):
+    """From the default scene to depth, with a figure: render, sense, classical and compressive depth."""
+
+    scene: str = "living-room"
+    """A scene as `render` takes it."""
+    width: int = 128
+    """Image width, pixels."""
+    height: int = 96
+    """Image height, pixels."""
+    signal: float = 50.0
+    """Mean signal photons per pixel."""
+    background: float = 50.0
+    """Mean background photons per pixel."""
+    out: Path = Path("out/demo")
+    """Folder for the transient (.exr), the histogram (.h5) and the figure (.png)."""
+
+
+def run(command: Demo, progress: Progress) -> dict:
+    """Scene -> transient -> histogram -> four depth maps -> one figure."""
+    from render.engine import render
+    from render.transient import write_transient
+    from scene2spad.plots import figures
+    from spad.detection.detect import sense
+    from spad.estimators.depth import depth_errors
+    from spad.formats.histogram import write_histogram
+    from spad.sensor.model import PhotonBudget, sensor_by_name
+
+    budget = PhotonBudget(command.signal, command.background)
+    folder = command.out
+    if not (folder.is_dir() or not folder.exists()):
+        raise InputError(f"{folder}: is a file, expected a folder for the demo's results")
+    scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
+    folder.mkdir(parents=True, exist_ok=True)
+    output_file(folder / f"{scene.name}.exr", ".exr", "transient")
+    output_file(folder / f"{scene.name}.h5", ".h5", "histogram")
+    start = time.perf_counter()
+    transient = in_view(render(scene, seed=command.seed, progress=progress))
+    rendered = time.perf_counter()
+    sensor = sensor_by_name("reference")
+    histogram = sense(transient, sensor, budget, seed=command.seed, progress=progress)
+    sensed = time.perf_counter()
+    names = {"argmax": "argmax", "matched": "matched", "log-matched": "log-matched", "compressive": "Fourier K = 16"}
+    depths = {name: depth_map(histogram, method) for method, name in names.items()}
+    errors = {n: depth_errors(d, histogram.depth_m, range_m=sensor.range_m) for n, d in depths.items()}
+    estimated = time.perf_counter()
+    write_transient(transient, folder / f"{scene.name}.exr")
+    write_histogram(histogram, folder / f"{scene.name}.h5")
+    figure = figures.draw_demo(transient, histogram, depths, errors, folder / "demo.png")
+    return {
+        "seconds": time.perf_counter() - start,
+        "seconds_render": rendered - start,
+        "seconds_sense": sensed - rendered,
+        "seconds_depth": estimated - sensed,
+        "relative_error": transient.meta["relative_error"]["total"],
+        "target_met": transient.meta["target_met"],
+        "mae_mm": {name: e["mae_mm"] for name, e in errors.items()},
+        "within_10mm": {name: e["within_10mm"] for name, e in errors.items()},
+        "figure": str(figure),
+    }

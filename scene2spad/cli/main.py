@@ -1,0 +1,211 @@
+"""`scene2spad COMMAND`: parse, run, report. Bad input ends with exit status 2 and one line on stderr."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from importlib.metadata import version
+from typing import Annotated, Any, get_args
+
+import tyro
+
+from scene2spad.cli import (
+    bench,
+    calibrate,
+    dataset,
+    demo,
+    depth,
+    evaluate,
+    models,
+    render,
+    report,
+    scenes,
+    sense,
+    study,
+    train,
+    ultraphase,
+)
+from scene2spad.options.common import Common, Progress
+from scenes.errors import InputError, did_you_mean, require
+from scenes.files import finite
+
+log = logging.getLogger("scene2spad")
+DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."
+Command = (
+    Annotated[demo.Demo, tyro.conf.subcommand("demo")]
+    | Annotated[scenes.Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[render.Render, tyro.conf.subcommand("render")]
+    | Annotated[dataset.Dataset, tyro.conf.subcommand("dataset")]
+    | Annotated[sense.Sense, tyro.conf.subcommand("sense")]
+    | Annotated[depth.Depth, tyro.conf.subcommand("depth")]
+    | Annotated[calibrate.Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[train.Train, tyro.conf.subcommand("train")]
+    | Annotated[models.Models, tyro.conf.subcommand("models")]
+    | Annotated[evaluate.Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[ultraphase.Ultraphase, tyro.conf.subcommand("ultraphase")]
+    | Annotated[study.Study, tyro.conf.subcommand("study")]
+    | Annotated[bench.Bench, tyro.conf.subcommand("bench")]
+    | Annotated[report.Report, tyro.conf.subcommand("report")]
+)
+RUNNERS: dict[type, Callable[[Any, Progress], dict]] = {
+    demo.Demo: demo.run,
+    scenes.Scenes: scenes.run,
+    render.Render: render.run,
+    dataset.Dataset: dataset.run,
+    sense.Sense: sense.run,
+    depth.Depth: depth.run,
+    calibrate.Calibrate: calibrate.run,
+    train.Train: train.run,
+    models.Models: models.run,
+    evaluate.Evaluate: evaluate.run,
+    ultraphase.Ultraphase: ultraphase.run,
+    study.Study: study.run,
+    bench.Bench: bench.run,
+    report.Report: report.run,
+}
+
+
+def main(argv: list[str]) -> int:
+    """Run one command and return the exit status: 0 done, 2 bad input, 130 interrupted. Bad input never raises."""
+    try:
+        if argv == ["--version"]:
+            print(f"scene2spad {version('scene2spad')}")
+            return 0
+        command = _parse(argv or ["--help"])
+    except InputError as error:
+        return _refuse(str(error))
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except BrokenPipeError:  # --help into a reader that has gone
+        sys.stdout = None
+        return 0
+    _log_to_stderr()
+    if command.seed < 0:
+        return _refuse(f"seed {command.seed} is negative, expected 0 or more")
+    try:
+        with _progress() as progress:
+            result = RUNNERS[type(command)](command, progress)
+    except InputError as error:
+        return _refuse(str(error))
+    except OSError as error:
+        return _refuse(f"{error.filename or 'file system'}: {error.strerror or error}")
+    except MemoryError:
+        return _refuse("out of memory: use a smaller image or fewer samples")
+    except KeyboardInterrupt:
+        print("interrupted; finished files stay, nothing is half-written", file=sys.stderr)
+        return 130
+    try:
+        print(json.dumps(finite(result), allow_nan=False) if command.json else _prose(result), flush=True)
+    except BrokenPipeError:
+        sys.stdout = None  # the reader has gone: Python must not try to flush again
+    except OSError as error:
+        sys.stdout = None
+        return _refuse(f"standard output: {error.strerror or error}")
+    return 0
+
+
+def _commands() -> dict[str, type[Common]]:
+    """Return each command's options by its name, from the union that tyro parses."""
+    found = {}
+    for one in get_args(Command):
+        options, *notes = get_args(one)
+        found[next(note.name for note in notes if hasattr(note, "name"))] = options
+    return found
+
+
+def _check_words(argv: list[str]) -> None:
+    """Raise InputError for a command or an option that does not exist, with the one that was probably meant."""
+    known = _commands()
+    name = argv[0]
+    if name.startswith("-"):
+        require(name in ("-h", "--help"), f"no option {name}{did_you_mean(name, ('--help', '--version'))}")
+        return
+    require(name in known, f"no command {name!r}{did_you_mean(name, known)} (there are {', '.join(known)})")
+    options = {f"--{field.name.rstrip('_').replace('_', '-')}" for field in fields(known[name])}
+    switches = {f"--no-{field.name.replace('_', '-')}" for field in fields(known[name]) if field.type in ("bool", bool)}
+    options |= switches | {"--help"}
+    for word in argv[1:]:
+        option = word.partition("=")[0].replace("_", "-")
+        if option.startswith("--") and option not in options:
+            raise InputError(
+                f"{name}: no option {option}{did_you_mean(option, options)} (see scene2spad {name} --help)"
+            )
+
+
+def _parse(argv: list[str]) -> Common:
+    _check_words(argv)
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(Command, prog="scene2spad", description=DESCRIPTION, args=argv)
+    except SystemExit as stop:
+        if stop.code:
+            print(f"scene2spad: {_one_line(said.getvalue())}", file=sys.stderr)
+            raise SystemExit(2) from None
+        sys.stderr.write(said.getvalue())
+        raise
+
+
+def _one_line(box: str) -> str:
+    """tyro explains errors in a box of several lines: its sentences in one line."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    lines = [re.sub(r"[│╭╮╰╯─|]+", " ", line).strip() for line in plain.splitlines()]
+    text = " ".join(line for line in lines if line and not set(line) <= set("-=_ "))
+    text = re.sub(r"\s+", " ", text).removeprefix("Parsing error ").removeprefix("Invalid choice ").strip()
+    choice = re.search(r"invalid choice '(.*?)' for argument '.*?'\. Expected one of \((.*?)\)", text)
+    if choice is not None:
+        meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2]))
+        text = text.replace(choice[0], f"{choice[0]}{meant}", 1)
+    text = re.sub(r" no type matching .*?could be instantiated from (\[.*?\])\. Got errors.*", r" cannot be \1", text)
+    return re.sub(r"For full helptext, run (.*)$", r"(see \1)", text) or "bad command line; see scene2spad --help"
+
+
+def _refuse(reason: str) -> int:
+    print(f"scene2spad: {' '.join(reason.split())}", file=sys.stderr)
+    return 2
+
+
+def _prose(result: dict) -> str:
+    return "\n".join(f"{key}: {_spelled(value)}" for key, value in result.items())
+
+
+def _spelled(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        flat = all(isinstance(item, (int, float)) for item in value.values())
+        spelled = [f"{key}: {_spelled(item)}" for key, item in value.items()]
+        return ", ".join(spelled) if flat else "".join(f"\n  {item}".replace("\n", "\n  ") for item in spelled)
+    if isinstance(value, (list, tuple)) and all(isinstance(item, (int, float)) for item in value):
+        return " ".join(map(_spelled, value))
+    if isinstance(value, (list, tuple)):
+        return "".join(f"\n  {_spelled(item)}" for item in value)
+    return str(value)
+
+
+def _log_to_stderr() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    for name in ("scene2spad", "render", "spad", "csph"):
+        logger = logging.getLogger(name)
+        logger.handlers[:] = [handler]
+        logger.setLevel(logging.INFO)
+        logger.propagate = False
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Progress]:
+    """A progress bar on stderr, and the function that moves it; silent where nobody looks."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("start", total=1.0)
+        yield lambda what, share: bar.update(task, description=what, completed=share)

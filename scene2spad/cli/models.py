@@ -1,0 +1,72 @@
+"""List the networks that come with the package, from their cards, and import published ones."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from scene2spad.options.common import Common, Positional, Progress, may_stay_open
+from scenes.errors import InputError
+
+log = logging.getLogger("scene2spad")
+IMPORT = "import"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Models(Common):
+    """List the models that come with the package: design, compression, training set, photon levels, error, limits; or
+    make a model of a checkpoint of the published code: `import FILE.ckpt --out FOLDER`."""
+
+    name: Positional[str] = ""
+    """Show this one's whole card; or `import`."""
+    file: Positional[str] = ""
+    """Checkpoint of the published code to import (.ckpt, written by Lightning)."""
+    sensor: Annotated[str | None, may_stay_open("NAME")] = None
+    """Sensor whose histograms an imported model is to take, a preset or a file (default: iccv2023-train, that of the
+    published training set; print tests on reference)."""
+    out: Annotated[Path | None, may_stay_open("FOLDER")] = None
+    """Folder for an imported model (default: out/models and the checkpoint's name)."""
+
+
+def run(command: Models, progress: Progress) -> dict:
+    """Cards of the shipped models, a line each, or one's whole; or a published checkpoint as a model."""
+    if command.name == IMPORT:
+        return _import(command)
+    if command.file or command.sensor or command.out:
+        raise InputError("models: FILE, --sensor and --out go with import, as in `models import FILE.ckpt`")
+    from csph.weights.cards import cards, read_card, shipped_model
+
+    if command.name:
+        return read_card(shipped_model(command.name).with_suffix(".json")).to_dict()
+    found = cards()
+    if command.json:
+        return {"models": [card.to_dict() for card in found]}
+    lines = []
+    for card in found:
+        error = "no error recorded" if card.val_mae_mm is None else f"validation MAE {card.val_mae_mm:.1f} mm"
+        said = f"{card.name}: {card.model}, {card.compression:g}x; {', '.join(card.training)}; {card.levels}; {error}"
+        lines.append(f"{said}; not for {'; '.join(card.not_for)}")
+    return {"models": lines}
+
+
+def _import(command: Models) -> dict:
+    if not command.file:
+        raise InputError("models: import without a checkpoint, expected `models import FILE.ckpt`")
+    from csph.weights.published import TRAINED_ON, import_checkpoint
+    from spad.sensor.files import load_sensor
+
+    source = Path(command.file)
+    folder = command.out or Path("out/models") / source.stem
+    made = import_checkpoint(source, folder, load_sensor(command.sensor or TRAINED_ON).sensor)
+    model, design = made.config.model, made.config.model.design
+    log.info("depths of this model are on the published grid: bin i of T is i/(T - 1) of the range, labels whole bins")
+    return {
+        "model": model.name,
+        "compression": design.compression_ratio,
+        "parameters": made.parameters,
+        "sensor": model.sensor.name,
+        "decoder": f"{model.decoder}, {model.grid} grid",
+        "checkpoint": str(made.path),
+    }

@@ -1,0 +1,13 @@
+"""Write one page of all results. Its options: `scene2spad.options.experiments`."""
+
+from __future__ import annotations
+
+from scene2spad.options.common import Progress
+from scene2spad.options.experiments import Report
+
+
+def run(command: Report, progress: Progress) -> dict:
+    """Results -> one page."""
+    from scene2spad.report import page as report
+
+    return report.run(command, progress)

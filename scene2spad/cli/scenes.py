@@ -1,0 +1,68 @@
+"""List the built-in scenes and sets, or describe one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scene2spad.options.common import Common, File, Pixels, Positional, Progress
+from scenes.errors import InputError
+from scenes.library.catalog import SCENES, load_scene
+from scenes.library.sets import SETS, scene_set
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenes(Common):
+    """List the built-in scenes and sets, or describe one: size, triangles, camera, lights, what a loader changed."""
+
+    scene: Positional[str] = ""
+    """A scene as `render` takes it, or with --sheet a set; none lists the names."""
+    sheet: File = None
+    """Draw a contact sheet of the set's first views to this .png."""
+    count: int = 48
+    """Views on the sheet, or all of a smaller set."""
+    width: Pixels = None
+    """Width of the sheet's views, pixels (default: 128 in 4:3 of rooms, the scene's own of others)."""
+
+
+def run(command: Scenes, progress: Progress) -> dict:
+    """List or describe."""
+    if command.sheet is not None:
+        return _sheet(command, progress)
+    if not command.scene:
+        return {"scenes": dict(SCENES), "sets": dict(SETS)}
+    scene = load_scene(command.scene, seed=command.seed)
+    low, high = scene.bounds()
+    camera, laser = scene.camera, scene.laser
+    described = {
+        "size_m": (high - low).tolist(),
+        "surfaces": len(scene.surfaces),
+        "materials": sorted({f"{s.material.name} ({s.material.kind})" for s in scene.surfaces}),
+        "triangles": scene.triangles,
+        "camera": {
+            "position_m": camera.origin.tolist(),
+            "fov_deg": camera.fov_deg,
+            "pixels": [camera.width, camera.height],
+        },
+        "laser": {"mode": laser.mode, "baseline_m": list(laser.baseline_m)},
+        "ambient_light": scene.has_ambient,
+        "notes": list(scene.notes),
+    }
+    return {"scenes": {scene.name: described}}
+
+
+def _sheet(command: Scenes, progress: Progress) -> dict:
+    """A contact sheet of a set."""
+    from scene2spad.datasets.contact_sheets import draw_sheet
+
+    path = command.sheet
+    if path.suffix.lower() != ".png" or not path.parent.is_dir():
+        raise InputError(f"{path}: expected a .png in a folder that exists")
+    of = scene_set(command.scene or "rooms")
+    if command.count < 1:
+        raise InputError(f"count {command.count} is less than 1")
+    count = command.count if of.size is None else min(of.size, command.count)
+    width, height = (command.width or 128, None) if of.size is None else (command.width, None)
+    height = round(0.75 * width) if of.size is None else None
+    scenes = [of.view(i, seed=command.seed, width=width, height=height) for i in range(count)]
+    draw_sheet(scenes, path, progress=progress)
+    return {"scenes": [scene.name for scene in scenes], "figure": str(path)}

@@ -1,0 +1,213 @@
+"""The command `sense`: the sensor and the budget that its options ask for, the draw, and the files."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from render.transient import Transient, read_transient
+from scene2spad.cli.paths import input_file, output_file, picture
+from scene2spad.options.common import Progress
+from scenes.errors import require
+from scenes.files import read_array
+from spad.detection.detect import expected_in_pixel, sense
+from spad.estimators.depth import confidence, laser_baseline_m
+from spad.formats.histogram import Histogram, write_histogram
+from spad.formats.mat import write_mat
+from spad.sensor.budget import Optics
+from spad.sensor.files import FWHM_PER_SIGMA, load_sensor
+from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.pulse import AnyPulse, Pulse, read_pulse
+from spad.zones.histogram import sense_zones, with_budget
+from spad.zones.sensor import ZoneArray
+
+if TYPE_CHECKING:
+    from scene2spad.cli.sense import Sense
+
+log = logging.getLogger("scene2spad")
+
+DEFAULT_PHOTONS = 50.0
+HOT_RATE_HZ = 1e4
+DEFAULT_OPTICS = Optics(10e-9, 10e-3, 2.0, 20e-6, 0.8, 10.0, 850e-9)
+
+
+def sensor_of(command: Sense) -> Sensor:
+    """Return the preset, or the sensor of a file, with what the options change."""
+    return changed_sensor(load_sensor(command.sensor).sensor, command)
+
+
+def changed_sensor(sensor: Sensor, command: Sense) -> Sensor:
+    """Return the sensor with the fields that the options set."""
+    asked = {
+        "bins": command.bins,
+        "bin_width_s": command.bin_width,
+        "period_s": command.period,
+        "dark_count_rate_hz": command.dark_count_rate,
+        "reset": command.reset,
+        "dead_time_s": command.dead_time,
+        "exposure_s": command.exposure,
+        "pde": command.pde,
+        "crosstalk": command.crosstalk,
+        "hot_share": command.hot_pixels,
+        "hot_rate_hz": command.hot_rate,
+        "dead_share": command.dead_pixels,
+    }
+    changes = {name: value for name, value in asked.items() if value is not None}
+    if ("bins" in changes or "bin_width_s" in changes) and command.period is None:
+        changes["period_s"] = None
+    if command.hot_pixels and command.hot_rate is None and not sensor.hot_rate_hz:
+        changes["hot_rate_hz"] = HOT_RATE_HZ
+    if command.jitter is not None:
+        changes["jitter"] = Pulse(command.jitter, command.jitter_tail)
+    require(command.jitter is not None or not command.jitter_tail, "--jitter-tail needs --jitter")
+    pulse = _asked_pulse(command)
+    return replace(sensor, **changes, **({} if pulse is None else {"pulse": pulse}))
+
+
+def _asked_pulse(command: Sense) -> AnyPulse | None:
+    """Return the pulse that the options ask for, None where they leave the preset's."""
+    require((command.pulse is None) == (command.pulse_step is None), "--pulse and --pulse-step go together")
+    require(command.pulse is None or command.pulse_fwhm is None, "give --pulse or --pulse-fwhm, not both")
+    require(command.pulse_fwhm is not None or not command.pulse_tail, "--pulse-tail needs --pulse-fwhm")
+    if command.pulse is not None:
+        return read_pulse(command.pulse, command.pulse_step)
+    return None if command.pulse_fwhm is None else Pulse(command.pulse_fwhm / FWHM_PER_SIGMA, command.pulse_tail)
+
+
+def optics_of(command: Sense) -> Optics | None:
+    """Return the optics of a radiometric budget, None without one: the sensor file's with what the options change."""
+    if not command.radiometric:
+        return None
+    given = command.signal is not None or command.background is not None
+    require(not given, "--radiometric computes the photon budget: leave out --signal and --background")
+    asked = {
+        "pulse_energy_j": command.pulse_energy,
+        "focal_length_m": command.focal_length,
+        "f_number": command.f_number,
+        "pixel_pitch_m": command.pixel_pitch,
+        "transmission": command.transmission,
+        "filter_nm": command.filter_width,
+        "wavelength_m": command.wavelength,
+    }
+    optics = load_sensor(command.sensor).optics or DEFAULT_OPTICS
+    return replace(optics, **{name: value for name, value in asked.items() if value is not None})
+
+
+def budget_of(command: Sense) -> PhotonBudget:
+    """The budget by means that the options ask for."""
+    asked = (DEFAULT_PHOTONS if value is None else value for value in (command.signal, command.background))
+    return PhotonBudget(*asked)
+
+
+def run(command: Sense, progress: Progress) -> dict:
+    """Transient -> histogram, its picture, and the .mat layout where asked."""
+    zones = load_sensor(command.sensor).zones
+    if zones is not None:
+        return _run_zones(command, zones)
+    sensor, optics = sensor_of(command), optics_of(command)
+    budget = budget_of(command) if optics is None else None
+    source, out = _files(command)
+    transient = read_transient(source)
+    dark_map = _dark_map(command.dark_map, transient)
+    if optics is not None:
+        budget = optics.budget(transient, sensor, seed=command.seed, dark_map_hz=dark_map)
+    start = time.perf_counter()
+    histogram = sense(
+        transient, sensor, budget, seed=command.seed, model=command.model, dark_map_hz=dark_map, progress=progress
+    )
+    seconds = time.perf_counter() - start
+    for reason in histogram.meta["plan"]:
+        log.log(logging.WARNING if reason.startswith("warning:") else logging.INFO, "%s", reason)
+    write_histogram(histogram, out)
+    result = {"seconds": seconds, **summary(histogram), "out": str(out)}
+    if command.export == "mat":
+        mat = out.with_suffix(".mat")
+        result.update({"pulse_file": str(write_mat(histogram, mat)), "export": str(mat)})
+    if command.figure:
+        from scene2spad.plots import figures
+
+        # a map of dark counts is not part of the rates that the figure could draw
+        rate = partial(expected_in_pixel, transient, sensor, budget, seed=command.seed) if dark_map is None else None
+        result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram"), expected=rate))
+    return result
+
+
+def _files(command: Sense) -> tuple[Path, Path]:
+    """Return the transient's file and the histogram's, checked."""
+    source = input_file(command.file)
+    histogram_given = source.suffix.lower() in (".h5", ".hdf5")
+    require(not histogram_given, f"{source}: is an HDF5 file, expected a transient (.exr) that `render` wrote")
+    return source, output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
+
+
+def _run_zones(command: Sense, zones: ZoneArray) -> dict:
+    """Transient -> histogram of a multi-zone sensor, whose gains are its own unless a budget is asked for."""
+    pixels_alone = ("radiometric", "dark_map", "export", "dark_count_rate", "dead_time", "crosstalk", "hot_pixels")
+    for option in (*pixels_alone, "dead_pixels", "reset"):
+        given = getattr(command, option) not in (None, False)
+        require(not given, f"--{option.replace('_', '-')} does not go with a sensor of zones")
+    require(command.model == "auto", f"--model {command.model} does not go with a sensor of zones")
+    sensor = sensor_of(command)
+    source, out = _files(command)
+    transient = read_transient(source)
+    start = time.perf_counter()
+    asked = command.signal is not None or command.background is not None
+    if asked or set(zones.gain) == {1.0}:  # not calibrated
+        zones = with_budget(zones, transient, sensor, budget_of(command))
+    histogram = sense_zones(transient, sensor, zones, seed=command.seed)
+    seconds = time.perf_counter() - start
+    for reason in histogram.meta["plan"]:
+        log.info("%s", reason)
+    write_histogram(histogram, out)
+    result = {"seconds": seconds, **summary(histogram), "out": str(out)}
+    if command.figure:
+        from scene2spad.plots import figures
+
+        result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram"), expected=None))
+    return result
+
+
+def summary(histogram: Histogram) -> dict:
+    """Summarise a histogram for the command's result.
+
+    `pile_up` is of primary detections, before dead time; `detections_per_cycle` what the brightest pixel counted.
+    """
+    meta = histogram.meta
+    fullest = histogram.counts.sum(axis=2, dtype=np.int64).max(initial=0)
+    return {
+        "mean_signal": float(histogram.expected_signal.mean(dtype=np.float64)),
+        "mean_background": float(histogram.expected_background.mean(dtype=np.float64)),
+        "mean_counts": float(histogram.counts.sum(dtype=np.int64) / histogram.depth_m.size),
+        "detections_per_cycle": float(fullest / histogram.sensor.cycles),
+        **{name: meta[name] for name in ("pile_up", "model", "wrapped", "dark_share")},
+        **{name: meta[name] for name in ("brightest_pixel", "brightest_thousandth", "median_signal")},
+    }
+
+
+def _dark_map(path: Path | None, transient: Transient) -> np.ndarray | None:
+    if path is None:
+        return None
+    rates = read_array(path)
+    shape = (transient.height, transient.width)
+    good = rates.dtype.kind in "fiu" and rates.shape == shape
+    require(good, f"{path}: {rates.dtype}{rates.shape}, expected numbers {shape}")
+    return rates
+
+
+def mean_confidence(histogram: Histogram, depth_m: np.ndarray) -> float:
+    """Mean probability that an estimate is no chance peak, over the pixels that have one; NaN with a baseline.
+
+    There the distance is not the arrival time that the probability is of.
+    """
+    if any(laser_baseline_m(histogram)) or np.isnan(depth_m).all():
+        return math.nan
+    share = confidence(torch.from_numpy(histogram.counts), torch.from_numpy(depth_m), histogram.sensor)
+    return float(share.nanmean())

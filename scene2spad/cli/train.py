@@ -1,0 +1,13 @@
+"""Train a depth network. Its options: `scene2spad.options.networks`."""
+
+from __future__ import annotations
+
+from scene2spad.options.common import Progress
+from scene2spad.options.networks import Train
+
+
+def run(command: Train, progress: Progress) -> dict:
+    """Set -> checkpoint; Lightning is imported only when it is asked for."""
+    from scene2spad.networks import training
+
+    return training.run_train(command, progress)

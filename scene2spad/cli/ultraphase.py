@@ -1,0 +1,47 @@
+"""Compressive histograms as programs on the emulated in-pixel processor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from scene2spad.options.common import Common, File, Positional, Progress
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ultraphase(Common):
+    """Compressive histograms as programs on the emulated UltraPhase processor: `table` (Supplementary Figure 5 beside
+    the emulation), `compile MODEL` (a trained model's codes), `run PROGRAM`, `asm FILE`, `list FILE`, `verify PROGRAM`,
+    `sweep`."""
+
+    action: Positional[Literal["table", "compile", "run", "asm", "list", "verify", "sweep"]] = "table"
+    """What is done."""
+    program: Positional[str] = ""
+    """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s); of compile, a
+    shipped model's name or a checkpoint."""
+    define: tuple[str, ...] = ()
+    """Constants of a source file, as NAME=VALUE."""
+    out: File = None
+    """File for the words (asm: one hexadecimal word a line), the listing (list; compile: with the tables) or the rows
+    (table, sweep: .csv)."""
+    photons: tuple[float, ...] = (550.0,)
+    """Photons a pixel and frame, background included; `run` takes one number, `sweep` several."""
+    signal: float = 50.0
+    """Of these, photons of one laser return (run)."""
+    fps: tuple[float, ...] = (30.0,)
+    """Frames a second (sweep)."""
+    codes: tuple[int, ...] = ()
+    """K of the Fourier and separable programs (sweep; default: the seven of the paper)."""
+    pixels: tuple[int, ...] = (4, 1048576)
+    """Pixels of the sensor (sweep)."""
+    trace: int = 0
+    """Show this many instructions of one core (run)."""
+    watch: str = ""
+    """Show every change of this region of one core's RAM, 100 at the most (run)."""
+
+
+def run(command: Ultraphase, progress: Progress) -> dict:
+    """The emulated in-pixel processor."""
+    from scene2spad.cli import ultraphase_actions
+
+    return ultraphase_actions.run(command, progress)

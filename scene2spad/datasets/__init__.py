@@ -1,0 +1,1 @@
+"""Render scene sets, in processes or on a cluster; test sets, planes, captures."""

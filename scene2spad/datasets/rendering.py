@@ -1,0 +1,367 @@
+"""Render a scene set to a folder: one EXR a view, one index, on one process, several, or a Dask cluster.
+
+Every view is a function of the set, the seed and its number: who renders it, when, and after what, changes no byte.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from render.settings import MIN_PIXEL_BYTES, SHARED_AMBIENT_SPP, Plan, RenderSettings
+from scene2spad.datasets.set_folder import Done, Folder, file_name
+from scene2spad.datasets.workers import Run, check_workers, executor
+from scenes.errors import InputError, require
+from scenes.files import whole_file
+from scenes.io.inputs import read_json_object
+from scenes.io.set_index import read_set_index
+from scenes.library.sets import LARGEST, scene_set
+from scenes.limits import require_memory
+from scenes.model import MAX_IMAGE_SIDE, Scene
+from scenes.offsets import OffsetMode, check_offset
+
+if TYPE_CHECKING:
+    from render.scene.traced_scene import World
+
+log = logging.getLogger("scene2spad")
+
+Progress = Callable[[str, float], None]
+STAGE_VIEW = 20
+# Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
+DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
+# Of the squared error target: a set's views are to meet it together, not each by itself. With indirect light plans do
+# better than they promise: they take too little power for mixed pixels, and round paths up (measured).
+AIM, INDIRECT_AIM = 0.95, 1.4
+PLANNED_PLACES, OF_A_PLACE = 8, 3  # views that tell how many rays an endless set takes
+THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
+# of the last place
+_WORLDS: dict[tuple, World] = {}
+_PLANS: dict[tuple[Job, str], Plan] = {}
+_ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that decides the bytes of a set's views, but for their number.
+
+    merging     how much of a set's merging of returns is done: 1 as sets are written, 0.1 for references
+    least_share as of `RenderSettings`; what `grid.json` says, where a set plans its rays
+    """
+
+    set: str
+    seed: int = 0
+    width: int | None = None
+    height: int | None = None
+    bounces: int | None = None
+    spp: int | None = None
+    grid: int | None = None
+    error: float | None = None
+    offset_m: float = 0.0
+    offset_mode: OffsetMode = "time"
+    ambient: bool = True
+    ambient_spp: int = SHARED_AMBIENT_SPP
+    merging: float = 1.0
+    least_share: float | None = None
+    filter: bool = False
+
+    def __post_init__(self) -> None:
+        scene_set(self.set)
+        check_offset(self.offset_m)
+        self.settings()
+
+    def settings(self) -> RenderSettings:
+        return RenderSettings(
+            bounces=self.bounces,
+            spp=self.spp,
+            filter=self.filter,
+            grid=self.grid,
+            least_share=self.least_share,
+            error=self.error,
+            aim=AIM if self.bounces == 1 else INDIRECT_AIM,
+            ambient_spp=self.ambient_spp,
+            ambient_shared=True,
+            direct_tolerance_m=self.merging * DIRECT_TOLERANCE_M,
+            indirect_tolerance_m=self.merging * INDIRECT_TOLERANCE_M,
+            indirect_growth=self.merging * INDIRECT_GROWTH,
+        )
+
+    def made(self) -> dict:
+        """All that decides the bytes of its views, this version's choices included."""
+        tolerances = [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, self.settings().aim]
+        return asdict(self) | {"schema": 7, "tolerances": tolerances}
+
+
+def render_view(job: Job, view: int, again: int = 0) -> Done:
+    """Render one view to EXR bytes. A view that cannot be rendered is a record with `failed`, not an exception.
+
+    `again` from 1 on renders the same scene with other noise than the set's.
+    """
+    start = time.perf_counter()
+    where = f"{os.uname().nodename}/{os.getpid()}"
+    with _ONE_AT_A_TIME, quiet():
+        try:
+            record, exr = _rendered(job, view, again)
+        except Exception as error:  # one odd scene of thousands must not end the run
+            told = " ".join(str(error).split()) or type(error).__name__
+            name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            record, exr = {"view": view, "failed": f"{name}{told}"[:500]}, None
+            _forget()  # what was recorded may be half done
+    return Done(record, exr, time.perf_counter() - start, where)
+
+
+def render_views(job: Job, views: Sequence[int]) -> list[Done]:
+    """Views that one process renders in a row, since they show one place."""
+    return [render_view(job, view) for view in views]
+
+
+def _direct_errors(job: Job, views: Sequence[int]) -> list[float]:
+    """`render.planning.direct_error` of some views; NaN of one that cannot be rendered, which its record will say."""
+    from render.planning import direct_error
+    from render.scene.traced_scene import World
+
+    found = []
+    for view in views:
+        with _ONE_AT_A_TIME:
+            try:
+                scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
+                world = _world(job, view, scene) or World(scene)
+                found.append(direct_error(world, job.settings(), _seed(job, view)))
+            except Exception:  # as in `render_view`
+                log.debug("view %d cannot be planned", view, exc_info=True)
+                found.append(math.nan)
+                _forget()
+    return found
+
+
+def _lost(view: int, why: str) -> Done:
+    return Done({"view": view, "failed": why}, None, 0.0, "")
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Plan and missed target of each of thousands of views go into the index, and one warning tells of all."""
+    logger = logging.getLogger("render")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
+    # heavy imports only where a view is really rendered: the process that collects needs none of them
+    from render.engine import render
+    from render.transient.data import exr_bytes
+    from render.transient.packs import rounded
+    from render.transient.thinning import thinned
+    from scene2spad.datasets.moving import moved
+
+    scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
+    if not job.ambient:
+        scene = scene.without_lights()
+    if job.offset_m and job.offset_mode != "time":
+        scene = moved(scene, job.offset_m, job.offset_mode)
+    seed = _seed(job, view, again)
+    world = _world(job, view, scene)
+    transient = render(scene, job.settings(), seed=seed, world=world, plan=_plan(job, view, world))
+    if job.offset_m and job.offset_mode == "time":
+        transient = transient.delayed(job.offset_m)
+    require(transient.returns > 0, f"{scene.name}: nothing in view of the camera returns light")
+    transient = rounded(thinned(transient, job.merging * THINNED))
+    exr = exr_bytes(transient)
+    depth = transient.depth_m[np.isfinite(transient.depth_m)]
+    quantiles = np.quantile(depth, (0, 0.01, 0.5, 0.99, 1)) if depth.size else np.full(5, np.nan)
+    plan = transient.meta["plan"]
+    record = {
+        "view": view,
+        "scene": scene.name,
+        "place": scene_set(job.set).place(view),
+        "file": file_name(view),
+        "bytes": len(exr),
+        "seed": seed,
+        "plan": {key: plan[key] for key in ("bounces", "spp", "grid", "least_share", "ambient")},
+        "error": transient.meta["relative_error"]["total"],
+        "target": plan["target"],
+        "target_met": transient.meta["target_met"],
+        "depth_m": dict(zip(("min", "q01", "median", "q99", "max"), np.round(quantiles, 4).tolist(), strict=True)),
+        "empty": round(1 - depth.size / transient.depth_m.size, 6),
+        "returns": transient.returns,
+        "indirect_fraction": round(transient.indirect_fraction, 6),
+        "triangles": scene.triangles,
+    }
+    return record, exr
+
+
+def _seed(job: Job, view: int, again: int = 0) -> int:
+    key = (STAGE_VIEW, view, *((again,) if again else ()))
+    return int(np.random.SeedSequence(job.seed, spawn_key=key).generate_state(1)[0])
+
+
+def _world(job: Job, view: int, scene: Scene) -> World | None:
+    """The world of a place that several cameras look at, built once for all of them; None: the scene's own.
+
+    Its origin is the place's, not a camera's, so a view's bytes are the same whether others were rendered before.
+    """
+    from render.scene.traced_scene import World
+
+    chosen = scene_set(job.set)
+    if chosen.views_per_place == 1 or (job.offset_m and job.offset_mode != "time"):
+        return None
+    place = job.set, job.seed, job.ambient, chosen.place(view)
+    if place not in _WORLDS:
+        plastics = {key: made for world in _WORLDS.values() for key, made in world.plastics.items()}
+        _forget()  # before the next is built: calls are compiled for all materials that are there
+        _WORLDS[place] = World(scene, of_place=True, plastics=plastics)
+    return _WORLDS[place].seen_from(scene.camera)
+
+
+def _plan(job: Job, view: int, world: World | None) -> Plan | None:
+    """The plan for the first camera of a place, which holds for the others too; None: the view's own."""
+    from render.engine import planned
+
+    if world is None:
+        return None
+    chosen = scene_set(job.set)
+    first = view - view % chosen.views_per_place
+    key = job, chosen.place(view)
+    if key not in _PLANS:
+        camera = chosen.view(first, seed=job.seed, width=job.width, height=job.height).camera
+        _PLANS[key] = planned(world.seen_from(camera), job.settings(), _seed(job, first))
+    return _PLANS[key]
+
+
+def _forget() -> None:
+    _WORLDS.clear()
+    _PLANS.clear()
+
+
+# --- Running ---------------------------------------------------------------------------------------------------------
+
+
+def _runs(job: Job, views: Iterable[int]) -> Iterator[tuple[int, ...]]:
+    """Views of one place together, in order."""
+    chosen = scene_set(job.set)
+    return (tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place))
+
+
+def _check_asked(job: Job, count: int, workers: int) -> None:
+    """Raise InputError for a set that is too large, or views that do not fit in memory, before anything is made."""
+    size = scene_set(job.set).size
+    most = LARGEST if size is None else size
+    require(1 <= count <= most, f"set {job.set}: count {count} is outside 1 to {most}")
+    check_workers(workers)
+    sides = [side for side in (job.width, job.height) if side is not None]
+    for side in sides:
+        require(1 <= side <= MAX_IMAGE_SIDE, f"image side {side} is outside 1 to {MAX_IMAGE_SIDE} pixels")
+    if sides:
+        width, height = sides[0], sides[-1]
+        told = f"views of {width} x {height} pixels on {workers} process{'es' * (workers > 1)}"
+        require_memory(workers * MIN_PIXEL_BYTES * width * height, told)
+
+
+def _with_grid(job: Job, folder: Folder, run: Run, say: Progress) -> Job:
+    """The job with as many rays for all views, by the errors of some of the first places', however many are asked."""
+    from render.planning import rays_for_all
+
+    path = folder.path / "grid.json"
+    if not path.is_file():
+        say("plan", 0.0)
+        each = scene_set(job.set).views_per_place
+        some = range(0, each, -(-each // OF_A_PLACE))
+        places = [tuple(place * each + view for view in some) for place in range(PLANNED_PLACES)]
+        found = run(partial(_direct_errors, job), places, lambda view, why: math.nan)
+        errors = sorted(error for error in found if math.isfinite(error))
+        # None: each place by itself
+        grid, least_share = rays_for_all(errors, job.settings()) if errors else (None, None)
+        with whole_file(path) as beside:
+            beside.write_text(json.dumps({"grid": grid, "least_share": least_share, "errors": errors}) + "\n")
+    try:
+        planned = read_json_object(path)
+        return replace(job, grid=planned["grid"], least_share=planned["least_share"])
+    except (InputError, KeyError, TypeError):
+        raise InputError(f"{path}: is damaged; delete it, and it is made again") from None
+
+
+def make_set(
+    job: Job, count: int, out: Path, *, workers: int = 1, scheduler: str | None = None, progress: Progress | None = None
+) -> dict:
+    """Render views 0 to count - 1 of a set into a folder; what is there already stays.
+
+    workers: processes on this machine; scheduler: address of a running Dask scheduler instead, whose workers send the
+    files back, so that no file system need be shared. Returns numbers for the command line.
+    """
+    _check_asked(job, count, workers)
+    folder = Folder(out, job.made())
+    missing = count - sum(view < count for view in folder.records)
+    todo = (view for view in range(count) if view not in folder.records)
+    say = progress or (lambda what, share: None)
+    start = time.perf_counter()
+    with executor(workers if missing else 1, scheduler if missing else None) as run:
+        endless = scene_set(job.set).size is None
+        job = _with_grid(job, folder, run, say) if missing and endless and job.grid is None else job
+        for number, done in enumerate(run(partial(render_views, job), _runs(job, todo), _lost), 1):
+            folder.add(done)
+            if "failed" in done.record:
+                log.warning("view %d failed: %s", done.record["view"], done.record["failed"])
+            say(f"view {count - missing + number} of {count}", (count - missing + number) / count)
+    folder.close()
+    seconds = time.perf_counter() - start
+    records = [folder.records[view] for view in range(count)]
+    good = [record for record in records if "failed" not in record]
+    missed = [record for record in good if not record["target_met"]]
+    together = math.sqrt(np.mean([record["error"] ** 2 for record in good])) if good else math.nan
+    if missed:
+        worst = max(missed, key=lambda record: record["error"] / record["target"])
+        log.warning(
+            "warning: %d of %d views end above their error target of %.2g, the worst, view %d, at %.2g; all together "
+            "(root mean square) are at %.2g, which is what a set is planned for",
+            *(len(missed), len(good), worst["target"], worst["view"], worst["error"], together),
+        )
+    return {
+        "scenes": len(good),
+        "failed": [record["view"] for record in records if "failed" in record],
+        "rendered_now": missing,
+        "seconds": seconds,
+        "scenes_per_second": missing / seconds if missing else 0.0,
+        "bytes_per_scene": sum(record["bytes"] for record in good) / max(len(good), 1),
+        "target_missed": len(missed),
+        "error_together": together,
+        "error_median": float(np.median([record["error"] for record in good])) if good else float("nan"),
+        "out": str(out),
+    }
+
+
+# --- Packing ---------------------------------------------------------------------------------------------------------
+
+
+def pack_set(folder: Path, path: Path, progress: Progress | None = None) -> int:
+    """All finished views of a set's folder as one file (`render.transient.packs`); returns its size in bytes."""
+    from render.transient import read_transient
+    from render.transient.packs import write_pack
+
+    records = read_set_index(folder)
+    say = progress or (lambda what, share: None)
+
+    def views() -> Iterator[tuple]:
+        for i, record in enumerate(records):
+            say("pack", i / len(records))
+            transient = read_transient(folder / record["file"])
+            kept = {key: transient.meta[key] for key in ("camera", "laser", "scene_sha256")}
+            yield transient, record | kept | {"time_offset_m": transient.meta.get("time_offset_m", 0.0)}
+
+    write_pack(views(), path)
+    return path.stat().st_size

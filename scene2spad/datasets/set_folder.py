@@ -1,0 +1,89 @@
+"""The folder of a rendered scene set: what it holds, what may be added, and its index.
+
+set.json      what was asked for; a folder is continued only with the same
+grid.json     how many rays all views of an endless set take, and the errors of some that say so
+views/*.exr   one transient a view, written beside and renamed, so that a file is whole or not there
+journal.jsonl one line a view as it ends, in whatever order; gone once the index is written
+index.jsonl   one line a view in the order of the views: scene, plan, error, depth statistics, or why it failed
+timings.jsonl seconds and places, kept out of the index so that two runs are the same byte for byte
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from scenes.errors import InputError, require
+from scenes.files import abandoned_files, append_line, is_unclaimed, whole_file
+from scenes.io.inputs import read_text, read_whole_lines
+
+
+class Done(NamedTuple):
+    """A finished view: its record for the index, the bytes of its EXR (None: it failed), seconds, and by whom."""
+
+    record: dict
+    exr: bytes | None
+    seconds: float
+    where: str
+
+
+def file_name(view: int) -> str:
+    return f"views/{view:06d}.exr"
+
+
+class Folder:
+    """A set's folder: what is there already, and where finished views go. `made` is all that decides their bytes."""
+
+    def __init__(self, path: Path, made: dict) -> None:
+        self.path = path
+        asked = json.dumps(made, sort_keys=True, indent=1) + "\n"
+        config = path / "set.json"
+        if config.is_file():
+            if read_text(config) != asked:
+                raise InputError(
+                    f"{path}: holds a set that was made with other options or another version; choose another --out"
+                )
+        else:
+            require(is_unclaimed(path), f"{path}: is not empty and holds no set; choose another --out")
+            path.mkdir(parents=True, exist_ok=True)
+            with whole_file(config) as beside:
+                beside.write_text(asked)
+        (path / "views").mkdir(exist_ok=True)
+        for left in (*abandoned_files(path), *abandoned_files(path / "views")):
+            left.unlink(missing_ok=True)
+        self.records = {r["view"]: r for r in self._known() if self._stands(r)}
+
+    def _known(self) -> Iterator[dict]:
+        for name in ("index.jsonl", "journal.jsonl"):
+            for record in read_whole_lines(self.path / name):
+                if isinstance(record, dict) and isinstance(record.get("view"), int):
+                    yield record
+
+    def _stands(self, record: dict) -> bool:
+        """Whether the view of a record is there in full; failed ones are tried again."""
+        if "failed" in record or record.get("file") != file_name(record["view"]):
+            return False
+        path = self.path / record["file"]
+        if not isinstance(record.get("error"), (int, float)):
+            return False
+        return path.is_file() and path.stat().st_size == record.get("bytes")
+
+    def add(self, done: Done) -> None:
+        """The file first, then the line that vouches for it."""
+        view = done.record["view"]
+        if done.exr is not None:
+            with whole_file(self.path / file_name(view)) as beside:
+                beside.write_bytes(done.exr)
+        self.records[view] = done.record
+        timing = {"view": view, "seconds": round(done.seconds, 4), "where": done.where}
+        append_line(self.path / "journal.jsonl", json.dumps(done.record, sort_keys=True))
+        append_line(self.path / "timings.jsonl", json.dumps(timing, sort_keys=True))
+
+    def close(self) -> None:
+        """The index in the order of the views, then no journal."""
+        with whole_file(self.path / "index.jsonl") as beside:
+            lines = (json.dumps(self.records[view], sort_keys=True) + "\n" for view in sorted(self.records))
+            beside.write_text("".join(lines))
+        (self.path / "journal.jsonl").unlink(missing_ok=True)

@@ -1,0 +1,185 @@
+"""What trained models are tested on, and trained on where no set is given: rendered once into a study's folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from csph.evaluation.methods import Method, Row, as_dicts, evaluate
+from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.training.views import Views, read_views
+from render.pipeline import Progress
+from scene2spad.datasets.rendering import Job, make_set, pack_set
+from scene2spad.networks.registry import Subject
+from scene2spad.networks.training import network_method
+from scene2spad.studies.results import Store
+from scenes.errors import require
+from scenes.library.sets import scene_set
+from scenes.offsets import OffsetMode
+from spad.formats.histogram import Histogram
+from spad.sensor.model import Sensor
+
+TILE = (4, 4)  # pixels that images are cut to whole numbers of, for every model alike
+ROOMS = 2000  # views that `laptop` models are trained on
+
+
+@dataclass(frozen=True, eq=False)
+class TestSet:
+    """Views under a name; `offset_m` and `mode` say how they were moved before they were rendered."""
+
+    __test__ = False  # no test of pytest's
+
+    name: str
+    views: Views
+    offset_m: float = 0.0
+    mode: OffsetMode = "time"
+
+    @cached_property
+    def digests(self) -> tuple[str, ...]:
+        """SHA-256 of each view: results are kept by it, so that parts of a set share what was computed."""
+        return tuple(transient.sha256()[:32] for transient in self.views.transients)
+
+    def first(self, count: int | None) -> TestSet:
+        """Its first views."""
+        return TestSet(self.name, Views(*(part[:count] for part in self.views)), self.offset_m, self.mode)
+
+    def truth_m(self, view: int, delay_m: float) -> np.ndarray:
+        """Depth of a view as it is evaluated, cut to TILE."""
+        depth = self.views.transients[view].depth_m
+        rows, columns = (side // part * part for side, part in zip(depth.shape, TILE, strict=True))
+        return depth[:rows, :columns] + np.float32(delay_m)
+
+
+def rendered(
+    name: str,
+    folder: Path,
+    *,
+    offset_m: float = 0.0,
+    mode: OffsetMode = "time",
+    count: int | None = None,
+    size: tuple[int, int] | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> TestSet:
+    """A finite set with direct light alone, rendered into `folder` where it is not there; `size` is (width, height).
+
+    Raises InputError where a view cannot be rendered.
+    """
+    width, height = size or (None, None)
+    job = Job(name, seed, width, height, bounces=1, grid=4, error=0.01, offset_m=offset_m, offset_mode=mode)
+    of = scene_set(name)
+    moved = f"-{mode}-{offset_m:g}m" if offset_m else ""
+    path = folder / f"{name.replace('/', '-')}{moved}"
+    folder.mkdir(parents=True, exist_ok=True)
+    said = make_set(job, of.size if count is None else count, path, progress=progress)
+    require(not said["failed"], f"{path}: views {said['failed']} could not be rendered")
+    return TestSet(name, read_views(path), offset_m, mode).first(count)
+
+
+def rooms(folder: Path, progress: Progress) -> Path:
+    """The pack of ROOMS views of rooms, direct light alone, made where it is not there."""
+    pack = folder / "rooms.h5"
+    if not pack.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        job = Job("rooms/train", width=64, height=64, bounces=1, grid=4, error=0.01)
+        make_set(job, ROOMS, folder / "rooms", workers=2, progress=progress)
+        pack_set(folder / "rooms", pack, progress)
+    return pack
+
+
+def evaluated(
+    store: Store,
+    subjects: Sequence[Subject],
+    test: TestSet,
+    levels: Sequence[tuple[float, float]],
+    *,
+    delay_m: float = 0.0,
+    maps: Sequence[int] = (),
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[Row]:
+    """Rows of every model, view and level; what the store has is not computed again, the rest sees the same photons.
+
+    `delay_m` moves the views in time alone, with the counts of every pixel as they were. Of the views in `maps` the
+    depth maps are kept as well (`depth_map`).
+    """
+    say, rows = progress or (lambda what, share: None), []
+    total = len(test.views.transients) * len(levels)
+    for view, scene in enumerate(test.views.scenes):
+        for number, level in enumerate(levels):
+            say(f"{scene}, {level[0]:g} + {level[1]:g}, {delay_m:g} m", (view * len(levels) + number) / total)
+            key = _key(test, view, level, delay_m, seed)
+            missing = [one for one in subjects if not _has(store, one, key, view in maps)]
+            if missing:
+                _evaluate(store, missing, test, view, level, delay_m, seed, view in maps)
+            for one in subjects:
+                kept = store.get(one.digest, **key)
+                rows += [Row(**{**row, "method": one.name, "view": view}) for row in kept]
+    return rows
+
+
+def depth_map(
+    store: Store, subject: Subject, test: TestSet, view: int, level: tuple[float, float], delay_m: float, seed: int
+) -> np.ndarray:
+    """(H, W) depth [m] that `evaluated` kept."""
+    return np.load(store.map_file(subject.digest, **_key(test, view, level, delay_m, seed)))
+
+
+def _key(test: TestSet, view: int, level: tuple[float, float], delay_m: float, seed: int) -> dict[str, object]:
+    return {
+        "view": f"{view}-{test.digests[view]}",
+        "signal": float(level[0]),
+        "background": float(level[1]),
+        "delay_m": float(delay_m),
+        "seed": seed,
+    }
+
+
+def _has(store: Store, one: Subject, key: dict[str, object], with_map: bool) -> bool:
+    there = store.get(one.digest, **key) is not None
+    return there and (not with_map or store.map_file(one.digest, **key).is_file())
+
+
+def _evaluate(
+    store: Store,
+    subjects: Sequence[Subject],
+    test: TestSet,
+    view: int,
+    level: tuple[float, float],
+    delay_m: float,
+    seed: int,
+    with_map: bool,
+) -> None:
+    key = _key(test, view, level, delay_m, seed)
+    one_view = Views(test.views.transients[view : view + 1], test.views.scenes[view : view + 1])
+    estimates: dict[str, np.ndarray] = {}
+
+    def method(subject: Subject) -> Method:
+        depth_of = network_method(subject.model)
+
+        def kept(histogram: Histogram) -> np.ndarray:
+            estimates[subject.digest] = depth_of(histogram)
+            return estimates[subject.digest]
+
+        return kept
+
+    draw = _draw(seed, view, level)
+    methods = {subject.digest: method(subject) for subject in subjects}
+    found = evaluate(methods, one_view, Sensor(), levels=(level,), tile=TILE, offset_m=delay_m, seed=draw)
+    for subject in subjects:
+        if with_map:
+            store.put_map(estimates[subject.digest], subject.digest, **key)
+        rows = [row for row in as_dicts(found.rows) if row["method"] == subject.digest]
+        store.put(subject.digest, rows, **key)
+
+
+def _draw(seed: int, view: int, level: tuple[float, float]) -> int:
+    """Seed of the photons of a view at a level: numbered where it is one of the paper's, by its photons elsewhere."""
+    if level in PHOTON_LEVELS:
+        return (seed * 1000 + view) * len(PHOTON_LEVELS) + PHOTON_LEVELS.index(level)
+    milli = [round(1000 * photons) for photons in level]
+    return int(np.random.SeedSequence((seed, view, *milli)).generate_state(1)[0])

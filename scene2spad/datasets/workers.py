@@ -1,0 +1,208 @@
+"""Who does the work on numbered things: this process, several processes, or the workers of a Dask cluster.
+
+Work comes in runs, numbers that one process does in a row. A run whose worker dies is tried again number by number.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import chain, islice
+from multiprocessing import active_children, get_context
+from threading import Thread
+from typing import Any
+
+from scenes.errors import InputError, require
+
+log = logging.getLogger("scene2spad")
+
+MAX_WORKERS = 256
+TRIES = 3  # of a number whose worker process died
+CONNECT_S, CLOSE_S = 10, 2  # until a scheduler that does not answer is given up, and one is left
+Numbers = tuple[int, ...]
+Work = Callable[[Numbers], list]  # one result a number; pickled to other processes
+Lost = Callable[[int, str], Any]  # the result of a number that nobody could do, and why
+Run = Callable[[Work, Iterable[Numbers], Lost], Iterator[Any]]
+
+
+def check_workers(number: int, least: int = 1) -> None:
+    """Raise InputError for a number of processes that nobody means."""
+    require(least <= number <= MAX_WORKERS, f"workers {number} is outside {least} to {MAX_WORKERS}")
+
+
+@contextmanager
+def executor(workers: int, scheduler: str | None) -> Iterator[Run]:
+    """Something that does runs and gives their results, in whatever order; InputError if a scheduler is not there.
+
+    Runs are taken one by one, as they can be done. At the end what is still under way is given up, not waited for.
+    """
+    with ExitStack() as stack:
+        client = None if scheduler is None else stack.enter_context(_dask_client(scheduler))
+
+        def run(work: Work, runs: Iterable[Numbers], lost: Lost) -> Iterator[Any]:
+            if client is not None:
+                results = _on_dask(client, work, runs, lost)
+            elif workers == 1:
+                results = (result for some in runs for number in some for result in work((number,)))
+            else:
+                results = _on_processes(workers, work, runs, lost)
+            stack.callback(results.close)
+            return results
+
+        yield run
+
+
+def _on_processes(workers: int, work: Work, runs: Iterable[Numbers], lost: Lost) -> Iterator[Any]:
+    """Several processes of ours. One that dies takes the pool with it: a new one goes on, and retries what was lost."""
+    runs = iter(runs)
+    first = list(islice(runs, workers))
+    waiting: Iterator[Numbers] = chain(first, runs)
+    tries: Counter[int] = Counter()
+    workers = max(1, min(workers, len(first)))
+    threads, others = max(1, (os.cpu_count() or 1) // workers), {*active_children()}
+    while True:
+        running: dict[Future, Numbers] = {}
+        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads, os.getpid())) as pool:
+            try:
+                while True:
+                    for run in islice(waiting, 2 * workers - len(running)):
+                        with _interrupts_blocked():
+                            running[pool.submit(work, run)] = run
+                    if not running:
+                        return
+                    for future in wait(running, return_when=FIRST_COMPLETED).done:
+                        done = future.result()
+                        del running[future]
+                        yield from done
+            except BrokenProcessPool:
+                log.warning("a worker process died; starting others")
+            except BaseException:  # Ctrl-C, a full disk
+                for child in {*active_children()} - others:
+                    child.kill()
+                raise
+        numbers = sorted(number for run in running.values() for number in run)
+        tries.update(numbers)
+        for number in numbers:
+            if tries[number] >= TRIES:
+                yield lost(number, f"its process died {TRIES} times")
+        waiting = chain([(number,) for number in numbers if tries[number] < TRIES], waiting)
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Keep Ctrl-C from the processes that are started meanwhile, for good: who started them is interrupted, and ends
+    them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker(threads: int, parent: int) -> None:
+    """In a new process: as many threads as its share of the cores; it ends when the one that started it does."""
+    Thread(target=_end_with, args=(parent,), daemon=True).start()
+    from render.backend.llvm import start_mitsuba
+
+    start_mitsuba()
+    import drjit
+
+    drjit.set_thread_count(threads)
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+@contextmanager
+def _dask_client(address: str) -> Iterator[Any]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--scheduler needs the package `distributed`: pip install 'scene2spad[cluster]'") from None
+    with _cluster_logs_off():
+        try:
+            client = Client(address, timeout=CONNECT_S)
+        except (OSError, ValueError, TypeError) as error:
+            told = " ".join(str(error).split())[:120]
+            raise InputError(f"scheduler {address}: cannot be reached ({told or type(error).__name__})") from None
+        try:
+            yield client
+        finally:
+            with suppress(TimeoutError):
+                client.close(timeout=CLOSE_S)
+
+
+@contextmanager
+def _cluster_logs_off() -> Iterator[None]:
+    """Dask and its event loop tell of a lost connection in tracebacks: what it means to the user is said in a line."""
+    names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
+    loggers = [logging.getLogger(name) for name in (*names, "asyncio")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def _on_dask(client: Any, work: Work, runs: Iterable[Numbers], lost: Lost) -> Iterator[Any]:
+    """A cluster's workers, a few tasks each in flight, so that results do not heap up; a dead worker's move on.
+
+    Raises InputError where the scheduler goes away.
+    """
+    from distributed import as_completed
+
+    waiting = iter(runs)
+    with _told_if_gone(client):
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+    if not workers:
+        log.warning("scheduler %s has no workers yet: waiting for some", client.scheduler.address)
+    lanes = max(1, len(workers))
+    submitted: dict[Any, Numbers] = {}
+    pending = as_completed()
+    while True:
+        for run in islice(waiting, 3 * lanes - len(submitted)):
+            with _told_if_gone(client):
+                future = client.submit(work, run, pure=False, retries=TRIES)
+            submitted[future] = run
+            pending.add(future)
+        if not submitted:
+            return
+        future = next(pending)
+        run = submitted.pop(future)
+        failed = future.status == "error"
+        with _told_if_gone(client):
+            found = future.exception() if failed else future.result()
+        future.release()
+        if not failed:
+            yield from found
+        elif len(run) > 1:  # one of them may be to blame: each by itself
+            waiting = chain([(number,) for number in run], waiting)
+        else:
+            yield lost(run[0], f"its workers died: {' '.join(str(found).split())[:300]}")
+
+
+@contextmanager
+def _told_if_gone(client: Any) -> Iterator[None]:
+    """InputError in one line where the scheduler does not answer any more; it is told by errors of several types."""
+    try:
+        yield
+    except (Exception, asyncio.CancelledError) as error:
+        cancelled = isinstance(error, (CancelledError, asyncio.CancelledError))
+        if client.status == "running" and not cancelled:
+            raise
+        told = f"scheduler {client.scheduler.address}: has gone away; what is finished stays"
+        raise InputError(f"{told}, and the same command goes on from it") from None

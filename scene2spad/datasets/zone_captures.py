@@ -1,0 +1,139 @@
+"""Captures of a multi-zone sensor before a plane: the file, and the plane rendered as the sensor saw it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from render.engine import render
+from render.settings import RenderSettings
+from render.transient import Transient
+from scene2spad.datasets.rendering import quiet
+from scenes.errors import InputError, require
+from scenes.io.inputs import regular_file
+from scenes.model import Camera, Laser, Material, Scene, Surface
+from spad.sensor.model import Sensor
+from spad.zones.calibration import ZoneCapture
+from spad.zones.sensor import ZoneArray, zone_returns
+
+PIXELS = 28  # side of the image that the zones' fields of view are cut from
+CONE_DEG = 80.0
+PLANE_M = 2.0  # half its side
+DIRECT = RenderSettings(bounces=1, grid=2)
+# Bins of the reference channel around its pulse, whose centroid follows the laser as it warms up.
+REFERENCE_REACH = (-4, 16)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneCaptures:
+    """Captures in order of distance: distance_m (N,), counts (N, Z, T), drift_bins (N,) of the reference channel, and
+    what the chip itself says, chip_m (N, Z), NaN where the file has none."""
+
+    distance_m: np.ndarray
+    counts: np.ndarray
+    drift_bins: np.ndarray
+    chip_m: np.ndarray
+
+    def chosen(self, which: np.ndarray) -> PlaneCaptures:
+        """Return some of the captures, by a mask or indices."""
+        return PlaneCaptures(*(getattr(self, name)[which] for name in ("distance_m", "counts", "drift_bins", "chip_m")))
+
+
+def shipped_captures() -> Path:
+    """Return the captures of a TMF8820 that come with the package."""
+    return Path(str(files("scene2spad.datasets") / "captures" / "tmf8820-plane.npz"))
+
+
+def read_plane_captures(path: Path) -> PlaneCaptures:
+    """Read captures (.npz): `distance_m` (N,), `counts` (N, Z, T), and if any `reference_counts` (N, T) of the channel
+    that sees the laser itself, and `chip_depth_1_mm` (N, Z).
+
+    Raises InputError in one line that names the file and what is missing, of another shape, negative or not finite.
+    """
+    path = regular_file(Path(path), "capture file")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            held = {name: file[name] for name in file.files}
+    except Exception as error:  # zip files and numpy raise many kinds
+        raise InputError(f"{path}: not a readable .npz file ({' '.join(str(error).split())[:80]})") from None
+    for name, dims in (("distance_m", 1), ("counts", 3)):
+        require(name in held, f"{path}: holds no {name}, there are {', '.join(held) or 'none'}")
+        good = held[name].ndim == dims and held[name].dtype.kind in "iuf"
+        require(good, f"{path}: {name} is {held[name].dtype}{held[name].shape}, expected {dims} dimensions of numbers")
+        good = bool(np.isfinite(held[name]).all() and (held[name] >= 0).all())
+        require(good, f"{path}: {name} holds values that are negative or not finite")
+    distance, counts = held["distance_m"].astype(np.float64), held["counts"].astype(np.int64)
+    require(len(distance) == len(counts) > 0, f"{path}: {len(distance)} distances for {len(counts)} captures")
+    require(bool((distance > 0).all()), f"{path}: a distance is 0")
+    number, zones, bins = counts.shape
+    reference = held.get("reference_counts", np.zeros((number, bins)))
+    good = reference.shape == (number, bins)
+    require(good, f"{path}: reference_counts is {reference.shape}, expected {(number, bins)}")
+    chip = held.get("chip_depth_1_mm", np.full((number, zones), np.nan)).astype(np.float64)
+    require(chip.shape == (number, zones), f"{path}: chip_depth_1_mm is {chip.shape}, expected {(number, zones)}")
+    order = np.argsort(distance, kind="stable")
+    found = PlaneCaptures(
+        distance, counts, _drift_bins(reference.astype(np.float64)), np.where(chip > 0, chip, np.nan) / 1e3
+    )
+    return found.chosen(order)
+
+
+def _drift_bins(reference: np.ndarray) -> np.ndarray:
+    """How late the reference channel's pulse is in each capture, bins after its mean; 0 without such a channel."""
+    if not reference.any():
+        return np.zeros(len(reference))
+    peak = int(reference.sum(axis=0).argmax())
+    first, last = max(0, peak + REFERENCE_REACH[0]), min(reference.shape[1], peak + REFERENCE_REACH[1])
+    window = reference[:, first:last]
+    centroid = window @ np.arange(first, last) / np.maximum(window.sum(axis=1), 1)
+    return centroid - centroid.mean()
+
+
+def plane_scene(
+    distance_m: float, zones: ZoneArray, tilt_rad: tuple[float, float] = (0.0, 0.0), pixels: int = PIXELS
+) -> Scene:
+    """A white plane that a sensor at the origin, looking along z, sees; `distance_m` along its axis.
+
+    tilt_rad: the plane turned about the sensor's y axis (its right side farther), then about its x axis (lower side
+    farther). The image holds all zones.
+    """
+    reach = max(
+        np.abs(np.asarray(centre)).max() + np.asarray(size).max() / 2
+        for centre, size in ((zones.centre_x, zones.width), (zones.centre_y, zones.height))
+    )
+    camera = Camera(np.eye(4), 2 * math.degrees(math.atan(1.05 * reach)), pixels, pixels)
+    side = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], dtype=np.float64) * PLANE_M
+    depth = distance_m + side @ np.tan(tilt_rad)
+    require(bool((depth > 0).all()), f"plane at {distance_m:g} m: its tilt brings it behind the sensor")
+    wall = Surface(np.column_stack((side, depth)), np.array([[0, 1, 2], [0, 2, 3]]), Material(albedo=0.5))
+    return Scene("plane", (wall,), camera, Laser("flood", tuple(zones.baseline_m), cone_deg=CONE_DEG))
+
+
+def render_plane(
+    distance_m: float, zones: ZoneArray, tilt_rad: tuple[float, float] = (0.0, 0.0), pixels: int = PIXELS
+) -> Transient:
+    """Render the plane's direct light, deterministic."""
+    with quiet():
+        return render(plane_scene(distance_m, zones, tilt_rad, pixels), DIRECT)
+
+
+def zone_captures(captures: PlaneCaptures, sensor: Sensor, zones: ZoneArray) -> list[ZoneCapture]:
+    """Render the plane at each capture's distance, and return its light beside the counts."""
+    _, count, bins = captures.counts.shape
+    fits = count == zones.count and bins == sensor.bins
+    expected = f"sensor {sensor.name} has {zones.count} zones of {sensor.bins} bins"
+    require(fits, f"captures of {count} zones and {bins} bins: {expected}")
+    found = []
+    for distance, counts, drift in zip(captures.distance_m, captures.counts, captures.drift_bins, strict=True):
+        returns = zone_returns(render_plane(float(distance), zones), zones)
+        found.append(ZoneCapture(returns, counts, float(drift) * sensor.bin_width_s))
+    return found
+
+
+def within(captures: PlaneCaptures, nearest_m: float, farthest_m: float = math.inf) -> PlaneCaptures:
+    """Return the captures of a span of distances."""
+    return captures.chosen((captures.distance_m >= nearest_m) & (captures.distance_m <= farthest_m))

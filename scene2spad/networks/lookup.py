@@ -1,0 +1,78 @@
+"""The trained models of one study: found where its command says, or trained; the absent ones are told."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from csph.weights.shipped import WEIGHTS
+from render.pipeline import Progress
+from scene2spad.datasets.test_sets import rooms
+from scene2spad.networks.registry import Library, Trained, Wanted
+from scene2spad.networks.training import PLANES
+from scene2spad.options.experiments import Study
+from scenes.errors import InputError
+
+OTHER_SEEDS = (1, 2)
+log = logging.getLogger("scene2spad")
+
+
+class Obtained(NamedTuple):
+    """Models that are there, in the order asked for, and those that are not."""
+
+    found: dict[Wanted, Trained]
+    absent: list[Wanted]
+
+    def described(self) -> dict[str, list]:
+        return {
+            "models": [one.described() for one in self.found.values()],
+            "absent": [one.name for one in self.absent],
+        }
+
+
+def obtain(wanted: Sequence[Wanted], command: Study, progress: Progress) -> Obtained:
+    """Models of --models (else of --out), then of the package; with --retrain, and in `smoke`, all trained there.
+
+    Absent ones are named, with the command that makes each. Raises InputError where none is found, and for a model of
+    another configuration under a wanted name.
+    """
+    folder, library = command.out / command.preset, _library(command)
+    training = command.set or (Path(PLANES) if command.preset == "smoke" else None)
+    if library.shipped is None:
+        training = training or rooms(folder / "sets", progress)
+        library.train(wanted, command.preset, training, progress)
+    found = library.gather(wanted)
+    if not found:
+        said = f"holds none of the {len(wanted)} models, nor does the package; give --models FOLDER or --retrain"
+        raise InputError(f"{library.folder}: {said}")
+    absent = [one for one in wanted if one not in found]
+    if absent and training is None:
+        training = Path("rooms.h5")
+        log.warning("%s below: scene2spad dataset rooms --count 2000 --bounces 1 --pack %s", training, training)
+    for one in absent:
+        log.warning("absent: %s; made by: %s", one.name, one.spelled(command.preset, training, library.folder))
+    _say_if_unlike(found.values())
+    return Obtained(found, absent)
+
+
+def other_seeds(wanted: Iterable[Wanted], command: Study) -> dict[Wanted, Trained]:
+    """Trainings of the same models by OTHER_SEEDS, where there are any: none is missed, and none is trained for it."""
+    return _library(command).gather([replace(one, seed=seed) for one in wanted for seed in OTHER_SEEDS])
+
+
+def _library(command: Study) -> Library:
+    retrain = command.retrain or command.preset == "smoke"
+    return Library(command.models or command.out / command.preset / "models", None if retrain else WEIGHTS)
+
+
+def _say_if_unlike(found: Iterable[Trained]) -> None:
+    """Say so where models are compared that were not trained alike."""
+    kinds = set()
+    for one in found:
+        config, on = one.config, str(one.config.data.get("training_sha256", "unknown"))[:8]
+        kinds.add(f"{config.preset}, {config.steps} steps, {config.model.network} network, set {on}")
+    if len(kinds) > 1:
+        log.warning("models of different trainings are compared: %s", "; ".join(sorted(kinds)))

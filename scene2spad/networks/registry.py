@@ -1,0 +1,233 @@
+"""Trained models as studies ask for them: found in a folder of runs or in the package, or trained; checked, loaded."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from csph.codes.design import Design
+from csph.evaluation.methods import FindsDepth
+from csph.networks.model import DepthModel, load_model, weights_sha256
+from csph.training.config import ModelConfig, TrainConfig
+from csph.weights.shipped import RESUME, RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
+from render.pipeline import Progress
+from scene2spad.networks.training import config_of, run_train
+from scene2spad.options.networks import Train
+from scenes.errors import require
+
+log = logging.getLogger("scene2spad")
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A model that a study needs: everything that its conclusions hang on, as `train` takes it.
+
+    design         as of `train`, none and peak among them (block and compression then mean nothing)
+    time_offset_m  random delays in training, 0 as published
+    """
+
+    design: str = "learned"
+    block: tuple[int, int, int] = (256, 4, 4)
+    compression: int = 128
+    seed: int = 0
+    time_offset_m: float = 0.0
+    full: bool = False
+
+    @property
+    def coded(self) -> bool:
+        return self.design not in ("none", "peak")
+
+    @property
+    def label(self) -> str:
+        """Without compression and seed: what a line in a figure is called."""
+        if not self.coded:
+            return {"none": "no compression", "peak": "peak"}[self.design]
+        sort = f"{'full ' if self.full else ''}{self.design}"
+        moved = f", trained with offsets to {self.time_offset_m:g} m" if self.time_offset_m else ""
+        return f"{sort} {'x'.join(map(str, self.block))}{moved}"
+
+    @property
+    def name(self) -> str:
+        """Of its run's folder and of the shipped file: learned-1024x4x4-128x-s0, none-s0, ...-t8-s0."""
+        parts = [f"{'full-' if self.full else ''}{self.design.replace('+', '-')}"]
+        if self.coded:
+            parts += ["x".join(map(str, self.block)), f"{self.compression}x"]
+        if self.time_offset_m:
+            parts.append(f"t{self.time_offset_m:g}")
+        return "-".join([*parts, f"s{self.seed}"])
+
+    def command(self, preset: str, training: Path, folder: Path) -> Train:
+        """The `train` command that makes it in `folder/name`."""
+        return Train(
+            design=self.design,
+            block=self.block,
+            compression=self.compression,
+            full=self.full,
+            preset=preset,
+            seed=self.seed,
+            time_offset=self.time_offset_m or None,
+            set=(training,),
+            out=folder / self.name,
+        )
+
+    def spelled(self, preset: str, training: Path, folder: Path) -> str:
+        """The same as one types it."""
+        coded = f" --block {' '.join(map(str, self.block))} --compression {self.compression}" if self.coded else ""
+        more = f"{' --full' if self.full else ''}"
+        more += f" --time-offset {self.time_offset_m:g}" if self.time_offset_m else ""
+        made = f"--preset {preset} --seed {self.seed} --set {training} --out {folder / self.name}"
+        return f"scene2spad train --design {self.design}{coded}{more} {made}"
+
+
+class Subject(NamedTuple):
+    """A model to be evaluated, or what stands for one, under a name of its own."""
+
+    name: str
+    model: FindsDepth
+    digest: str
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A model that was found or made, and where."""
+
+    wanted: Wanted
+    model: DepthModel
+    config: TrainConfig
+    state: dict
+    path: Path
+
+    @cached_property
+    def digest(self) -> str:
+        return weights_sha256(self.model)
+
+    @property
+    def subject(self) -> Subject:
+        # results of the same weights read by another decoder are other results
+        read = hashlib.sha256(f"{self.digest} {self.config.model.decoder}".encode()).hexdigest()
+        return Subject(self.wanted.name, self.model, read)
+
+    @property
+    def shipped(self) -> bool:
+        return self.path.stem not in RUN_WEIGHTS
+
+    def table(self, kind: str) -> list[dict[str, float]]:
+        """`log.csv` or `energy.csv` of its training; empty where there is none."""
+        path = beside(self.path, kind)
+        if not path.is_file():
+            return []
+        with path.open(newline="") as lines:
+            return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(lines)]
+
+    def described(self) -> dict[str, object]:
+        return {
+            "name": self.wanted.name,
+            "model": self.config.model.name,
+            "preset": self.config.preset,
+            "steps": self.config.steps,
+            "best_step": self.state.get("step"),
+            "val_rmse_mm": self.state.get("val_rmse_mm"),
+            "trained_on": file_names(self.config.data.get("training", "")),
+            "shipped": self.shipped,
+            "sha256": self.digest,
+        }
+
+
+def check(config: TrainConfig, wanted: Wanted, path: Path) -> None:
+    """InputError in one line for a checkpoint that is not what is wanted: other design, seed, sensor, time offsets."""
+    expected = config_of(wanted.command("laptop", Path("planes"), Path()))
+    pairs = {
+        "random time offsets [m]": (config.time_offset_m, wanted.time_offset_m),
+        "seed": (config.seed, wanted.seed),
+        "front": (config.model.front, expected.model.front),
+        "design": (_told(config.model.design), _told(expected.model.design)),
+        "layer": (config.model.layer, expected.model.layer),
+        "sensor": (_sensor(config.model), _sensor(expected.model)),
+    }
+    wrong = [f"{what} {has}, expected {should}" for what, (has, should) in pairs.items() if has != should]
+    require(not wrong, f"{path}: is not the model {wanted.name}: {'; '.join(wrong)}")
+
+
+def _told(design: Design | None) -> str:
+    return "none" if design is None else f"{design.name}{'' if design.zero_mean else ' without zero mean'}"
+
+
+def _sensor(model: ModelConfig) -> str:
+    sensor = model.sensor
+    return f"{sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps, {sensor.response}"
+
+
+@dataclass(frozen=True)
+class Library:
+    """Where models are looked for: `folder/NAME` as `train --out` fills it, then among those that come with the package
+    (`shipped`; None: not there)."""
+
+    folder: Path
+    shipped: Path | None = WEIGHTS
+
+    def find(self, wanted: Wanted) -> Trained | None:
+        """The model if it is there and its training came to its end. Raises InputError for another under its name."""
+        run = self.folder / wanted.name / "model.safetensors"
+        if run.is_file():
+            found = _loaded(wanted, run)
+            if _finished(found):
+                return found
+            log.warning("%s: its training has not come to its end; left out", run.parent)
+            return None
+        packaged = None if self.shipped is None else shipped_file(wanted.name, self.shipped)
+        return _loaded(wanted, packaged) if packaged is not None and packaged.is_file() else None
+
+    def gather(self, wanted: Sequence[Wanted]) -> dict[Wanted, Trained]:
+        """Those that are there, in the order asked for."""
+        found = {one: self.find(one) for one in wanted}
+        return {one: model for one, model in found.items() if model is not None}
+
+    def train(self, wanted: Sequence[Wanted], preset: str, training: Path, progress: Progress) -> None:
+        """Train what is not finished in the folder; interrupted runs go on. Says how long it takes."""
+        todo = [one for one in wanted if self.find(one) is None]
+        start = time.perf_counter()
+        for number, one in enumerate(todo):
+            command = one.command(preset, training, self.folder)
+            steps = config_of(command).steps
+            log.info("model %d of %d: %s, %d steps", number + 1, len(todo), one.name, steps)
+            result = run_train(command, _share(progress, one.name, number, len(todo)))
+            taken = time.perf_counter() - start
+            rest = taken / (number + 1) * (len(todo) - number - 1)
+            said = "%s: validation RMSE %.1f mm; %.0f s so far, about %.0f s to go"
+            log.info(said, one.name, result["val_rmse_mm"], taken, rest)
+
+
+def _share(progress: Progress, name: str, number: int, of: int) -> Progress:
+    return lambda what, share: progress(f"{name}: {what}", (number + share) / of)
+
+
+def _loaded(wanted: Wanted, path: Path) -> Trained:
+    model, config, state = load_model(path)
+    check(config, wanted, path)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    return Trained(wanted, model.to(device), config, state, path)
+
+
+def _finished(found: Trained) -> bool:
+    """Whether a run came to its end; one that was killed between its log and its last weights did not."""
+    folder = found.path.parent
+    if (folder / "last.safetensors").is_file():
+        return True
+    if (folder / RESUME).is_file():
+        return False
+    rows = found.table("log.csv")
+    return bool(rows) and rows[-1]["step"] >= found.config.steps
+
+
+def ship_all(models: Sequence[Trained], folder: Path = WEIGHTS) -> list[str]:
+    """Put models into the package in half precision; those that came from there stay. Returns the files."""
+    return [str(ship(one.path.parent, one.wanted.name, folder)) for one in models if not one.shipped]

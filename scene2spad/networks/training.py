@@ -1,0 +1,274 @@
+"""`train` and `evaluate`: from the command line's words to csph's configuration, and results to files."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from csph import CodingTensor, decode_depth, encode, temporal_code
+from csph.codes.design import Design
+from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, FindsDepth, Method, as_dicts, evaluate
+from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.networks.model import DepthModel, load_model
+from csph.training.config import ModelConfig, TrainConfig, preset
+from csph.training.views import Views, read_views, split_views
+from csph.weights.cards import checkpoint_of
+from render.pipeline import Progress
+from scene2spad.datasets.planes import random_planes
+from scene2spad.datasets.workers import check_workers
+from scene2spad.options.networks import Evaluate, Train
+from scenes.errors import InputError, require
+from scenes.files import write_csv
+from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
+from spad.formats.histogram import Histogram
+from spad.sensor.model import Sensor, sensor_by_name
+
+log = logging.getLogger("scene2spad")
+
+PLANES = "planes"  # the set that needs no renderer
+PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "paper": 13851}
+SMOKE_PIXELS = 32
+
+
+def config_of(command: Train) -> TrainConfig:
+    """The preset with what the command line changes. Raises InputError for options that do not fit together."""
+    sensor = sensor_by_name(command.sensor)
+    network = command.network or ("published" if command.preset == "paper" else "compact")
+    # the published network finds the pulse in the counts by itself; ours, of few layers, is given them matched
+    front = {"none": "matched" if network == "compact" else "counts", "peak": "peak"}.get(command.design, "codes")
+    design = None
+    if front == "codes":
+        compression = command.compression if command.codes is None else None
+        design = Design.named(
+            command.design, command.block, codes=command.codes, compression=compression, full=command.full
+        )
+    layer = dict.fromkeys(command.layer, True)
+    # the first models' and the published start, which their recipes reproduce
+    start = command.spatial_start or ("uniform" if command.preset in ("paper", "laptop-v1") else "orthogonal")
+    start = start if design is not None and "spatial" in design.learned else "uniform"
+    made = {"network": network, "sensor": sensor, "grid": command.grid, "spatial_start": start}
+    model = ModelConfig(front=front, design=design, layer=layer, **made)
+    config = preset(
+        command.preset,
+        model,
+        seed=command.seed,
+        batch=command.batch,
+        crop=command.crop,
+        rate=command.rate,
+        tv_weight=command.tv,
+        tv_start=command.tv_start,
+        precision=command.precision,
+        threads=command.threads,
+        time_offset_m=command.time_offset,
+        levels=command.levels,
+        window=command.window,
+        weights=command.set_weights or None,
+        coherence=command.coherence,
+    )
+    if command.steps is None:
+        return config
+    # as many epochs, each shorter, and the rate steps down at the same shares of the run
+    require(command.steps >= 1, f"steps {command.steps} is below 1")
+    epochs = min(config.epochs, command.steps)
+    each = -(-command.steps // epochs)
+    decay_steps = max(1, round(config.decay_steps * each / config.steps_per_epoch))
+    warmup = min(config.warmup, command.steps // 10)
+    return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps, warmup=warmup)
+
+
+def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, Any]]:
+    """Training and validation views of every set, and the words that say which they are."""
+    sets = [_views_of_set(path, command) for path in command.set]
+    said = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
+    if command.validation:
+        training, validation = sets, [read_views(path) for path in command.validation]
+    else:
+        parts = [split_views(views) for views in sets]
+        training, validation = [first for first, _ in parts], [second for _, second in parts]
+    return training, validation, {**said, "training_reach_m": max(map(training_reach_m, training))}
+
+
+def _views_of_set(path: Path, command: Train) -> Views:
+    if str(path) != PLANES:
+        return read_views(path)
+    pixels = SMOKE_PIXELS if command.preset == "smoke" else 64
+    return random_planes(PLANE_SCENES[command.preset], size=pixels, seed=command.seed)
+
+
+def _paths(paths: Sequence[Path]) -> str | list[str]:
+    """A set's path as it was given; a list of several."""
+    said = [str(path) for path in paths]
+    return said if len(said) > 1 else "".join(said)
+
+
+def training_reach_m(views: Views) -> float:
+    """The depth that 99.9 % of the views' pixels do not pass [m]."""
+    depth = np.concatenate([t.depth_m[np.isfinite(t.depth_m)] for t in views.transients] or [np.zeros(0)])
+    return round(float(np.quantile(depth, 0.999)), 3) if depth.size else 0.0
+
+
+def run_train(command: Train, progress: Progress) -> dict:
+    """Train one model, or go on with an interrupted run in the same folder."""
+    config = config_of(command)
+    config.check_memory()
+    require(bool(command.set), "train: --set without a set")
+    check_workers(command.workers, least=0)
+    from csph.training.loop import train  # and Lightning, which takes seconds to import
+
+    training, validation, said = views_of(command)
+    name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
+    folder = command.out or Path("out/train") / name
+    result = train(
+        replace(config, data=said),
+        training,
+        validation,
+        folder,
+        workers=command.workers,
+        progress=progress,
+        devices=command.devices or "auto",
+    )
+    return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
+
+
+def network_method(model: FindsDepth, *, overflows: list[int] | None = None, **reading: Any) -> Method:
+    """Depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`.
+
+    `reading` is passed on to `DepthModel.depth_of`: int8, int8_rule, decoder.
+    """
+
+    def method(histogram: Histogram) -> np.ndarray:
+        depth, wrapped = model.depth_of(histogram, **reading)
+        if overflows is not None:
+            overflows.append(wrapped)
+        return depth
+
+    return method
+
+
+def classical(name: str) -> Callable[[Tensor, Sensor], Tensor]:
+    """Depth [m] from counts (..., T) of a sensor without a network: by one of `METHODS`, or by CODE-K
+    decoded by correlation, as in "fourier-8"."""
+    if name in METHODS:
+        return lambda counts, sensor: estimate_depth(counts, sensor, name)
+    code, _, number = name.rpartition("-")
+    require(code != "" and number.isdigit(), f"baseline {name!r}: expected {', '.join(METHODS)}, or CODE-K")
+
+    def compressive(counts: Tensor, sensor: Sensor) -> Tensor:
+        coding = _coding(code, int(number), sensor)
+        return decode_depth(encode(counts, coding), coding, sensor)
+
+    return compressive
+
+
+@lru_cache(maxsize=16)
+def _coding(code: str, number: int, sensor: Sensor) -> CodingTensor:
+    """One object for all images: the decoder keeps what it works out for a coding tensor."""
+    return CodingTensor(f"{code}-{number}", temporal_code(code, number, sensor.bins, sensor))
+
+
+def common_tile(models: Sequence[DepthModel]) -> tuple[int, int]:
+    """Rows and columns of the smallest tile that the blocks of all networks tile; 1 x 1 of none."""
+    blocks = [(1, 1), *(model.config.block[1:] for model in models)]
+    rows, columns = (math.lcm(*sides) for sides in zip(*blocks, strict=True))
+    return rows, columns
+
+
+def baseline(name: str) -> Method:
+    """A method without a network, by the names of `classical`."""
+    depth_of = classical(name)
+    return lambda histogram: histogram_depth_m(histogram, depth_of)
+
+
+def run_evaluate(command: Evaluate, progress: Progress) -> dict:
+    """Networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
+    models = [load_model(checkpoint_of(path))[0] for path in command.checkpoints]
+    require(bool(models), "evaluate: give at least one checkpoint")
+    require(command.int8 or command.int8_rule is None, "evaluate: --int8-rule goes with --int8")
+    rule = command.int8_rule or "calibrated"
+    in_8_bits = " int8" if rule == "calibrated" else f" int8 {rule}"
+    sensor = models[0].config.sensor
+    others = [model.config.sensor.name for model in models if model.config.sensor != sensor]
+    require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
+    if not 0 <= command.offset < sensor.range_m:
+        raise InputError(f"offset {command.offset:g} m is outside 0 to the sensor's range {sensor.range_m:.4f} m")
+    views = read_views(command.set)
+    if command.views is not None:
+        require(command.views >= 1, f"views {command.views} is below 1")
+        views = Views(views.transients[: command.views], views.scenes[: command.views])
+    overflows: list[int] = []
+    methods: dict[str, Method] = {}
+    groups: dict[str, list[str]] = {}  # trainings of one design by different seeds are one group
+    for path, model in zip(command.checkpoints, models, strict=True):
+        for suffix, int8 in (("", False), (in_8_bits, True))[: 1 + command.int8]:
+            read = {"int8": int8, "int8_rule": rule, "decoder": command.decoder}
+            methods[f"{path}{suffix}"] = network_method(model, **read, overflows=overflows)
+            groups.setdefault(f"{model.config.name}{suffix}", []).append(f"{path}{suffix}")
+    methods |= {name: baseline(name) for name in command.baselines}
+    groups |= {name: [name] for name in command.baselines}
+    found = evaluate(
+        methods,
+        views,
+        sensor,
+        levels=PHOTON_LEVELS,
+        tile=common_tile(models) if command.tiled else (1, 1),
+        offset_m=command.offset,
+        seed=command.seed,
+        progress=progress,
+    )
+    command.out.mkdir(parents=True, exist_ok=True)
+    table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
+    first = f"{models[0].config.name}{in_8_bits if command.int8 else ''}"
+    return {**results(found, groups, first, command.json), "overflows": sum(overflows), "csv": str(table)}
+
+
+def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> dict[str, Any]:
+    """Headline figures of the `first` group, every group by levels, paired differences of MAE from the first."""
+    summaries = {name: found.summary(members) for name, members in groups.items()}
+    everything = summaries[first]["all"]["all"]
+    head = {key: everything[key] for key in ("mae_mm", "rmse_mm", "within_10mm", "ssim", "mae_interval_mm")}
+    differences = {
+        levels: {
+            name: found.difference(groups[first], groups[name], levels)._asdict() for name in groups if name != first
+        }
+        for levels in LEVEL_GROUPS
+    }
+    head = {"method": first, "trainings": len(groups[first]), **head}
+    if not full:
+        return {**head, "table": _lines(summaries), "bias_by_depth": _bias(summaries[first])}
+    by_sbr = {
+        name: {group: summary[group]["all"] for group in ("low_sbr", "high_sbr")} for name, summary in summaries.items()
+    }
+    return {**head, "by_sbr": by_sbr, "methods": summaries, "mae_difference_mm": differences}
+
+
+def _lines(summaries: dict[str, dict]) -> list[str]:
+    said = [
+        f"{'method':<40} {'MAE mm':>8} {'SBR > 0.1':>10} {'SBR <= 0.1':>11} {'mixed':>8} {'< 10 mm':>8} {'SSIM':>6}"
+    ]
+    for name, s in summaries.items():
+        every = s["all"]["all"]
+        mae = (every, s["high_sbr"]["all"], s["low_sbr"]["all"], s["all"]["mixed"])
+        cells = [_cell(line["mae_mm"], f"{width}.1f") for line, width in zip(mae, (8, 10, 11, 8), strict=True)]
+        cells += [_cell(every["within_10mm"], "8.1%"), _cell(every["ssim"], "6.3f")]
+        said.append(f"{name[-40:]:<40} {' '.join(cells)}")
+    return said
+
+
+def _cell(value: float | None, form: str) -> str:
+    return f"{math.nan if value is None else value:>{form}}"
+
+
+def _bias(summary: dict) -> list[str]:
+    return [
+        f"{b['near_m']:g} to {b['far_m']:g} m: mean {b['mean_mm']:+.1f}, median {b['median_mm']:+.1f} mm, "
+        f"{b['pixels']} pixels"
+        for b in summary["bias_by_depth"]
+    ]

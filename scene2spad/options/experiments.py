@@ -1,0 +1,134 @@
+"""The command line's configuration of what compares and draws: `bench`, `study`, `report`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from scene2spad.options.common import Common, Positional, may_stay_open
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench(Common):
+    """Speed against error: `render` beside mitransient, `sense` beside dense Poisson draws, `encode` of compressive
+    layers, `network` of depth networks, `emulate` of the in-pixel processor and its two routes to the same bits; the
+    table of `hard-cases`."""
+
+    stage: Positional[Literal["render", "sense", "encode", "network", "emulate", "hard-cases"]] = "render"
+    """What is measured."""
+    scenes: tuple[Literal["flash", "lamp", "artist", "gallery", "groove"], ...] = ()
+    """Scenes of `bench render` (default: all)."""
+    sizes: tuple[int, ...] = ()
+    """Image sides, pixels (default: 64 128 256 of flash and lamp, and gallery, 64 128 of artist and groove)."""
+    only: tuple[str, ...] = ()
+    """Cases of `bench hard-cases` (default: all)."""
+    quick: bool = False
+    """No 256 pixels, and artist and groove at 64 alone; no slow hard cases."""
+    peer: Literal["mitransient", "none"] = "mitransient"
+    """The renderer beside ours; none measures ours alone, against its own finer results."""
+    repeats: int = 3
+    """Warm runs of each quality; their median is reported."""
+    seeds: int = 3
+    """Runs of different seeds that the error is averaged over."""
+    memory: bool = False
+    """Compare peak memory in fresh processes instead."""
+    data: Annotated[Path | None, may_stay_open("FOLDER")] = None
+    """Folder with the artist's scene and the Middlebury images (default: SCENE2SPAD_DATA, else ../shared/data)."""
+    set: Annotated[Path | None, may_stay_open("SET")] = None
+    """Rendered set whose views the estimators of `bench sense` are compared on (default: the Middlebury images)."""
+    cache: Annotated[Path | None, may_stay_open("FOLDER")] = None
+    """Folder that keeps references from run to run (default: ~/.cache/scene2spad)."""
+    out: Path = Path("out/bench")
+    """Folder for the table (.csv) and the pictures (.png)."""
+
+
+ABLATIONS = ("spatial-block", "tensor-size", "fourier")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study(Common):
+    """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
+    decoded from codes without a network, and the in-pixel processor's power (4, 5); trained codes on that processor,
+    beside the same models in floating point; of trained models: scenes moved out
+    of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
+    captures (13, 14); how much the error of a rendered set itself matters to depth; what a renderer adds to RGB-D
+    simulation, step by step; and networks beside the filter where light takes several paths."""
+
+    name: Positional[
+        Literal[
+            "tensors",
+            "memory",
+            "codes",
+            "power",
+            "chip",
+            "depth-offset",
+            "spatial-block",
+            "tensor-size",
+            "fourier",
+            "real-data",
+            "render-error",
+            "transport",
+            "multipath",
+        ]
+    ]
+    """Which study."""
+    checkpoints: tuple[Path, ...] = ()
+    """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc); trained
+    networks of `study render-error` and `study real-data`."""
+    design: str = ""
+    """A design that `study tensors` draws instead of the paper's: learned, fourier, gray, coarse, hadamard or random,
+    with +learned for a fixed temporal code and a learned spatial part."""
+    block: tuple[int, int, int] = (256, 4, 4)
+    """Block of --design: time bins, rows, columns."""
+    codes: int = 32
+    """Number K of codes of --design."""
+    full: bool = False
+    """--design is a full coding tensor instead of a separable one; of studies of trained models, every compression of
+    the paper instead of 128x (depth-offset: 64x and 128x), of depth-offset all 16 photon levels too."""
+    preset: Literal["smoke", "laptop", "paper"] = "laptop"
+    """Of studies of trained models: smoke trains two for seconds and tests them on two small views; laptop and paper
+    say how models are trained with --retrain. Of `study real-data`, how captures are rendered: 32 x 32 pixels of direct
+    light, 256 x 256 to 5 %, to 2 %. Of `study transport`, 2, 12 or 24 scenes, 24, 88 or 176 pixels wide."""
+    models: Annotated[Path | None, may_stay_open("FOLDER")] = None
+    """Folder of runs of `train`, each under its model's name, looked in before the models that come with the package
+    (default: models in --out)."""
+    retrain: bool = False
+    """Train what is not finished in --models, and use no model that came with the package."""
+    set: Annotated[Path | None, may_stay_open("SET")] = None
+    """What --retrain trains on, as of `train` (default: 2,000 rooms, rendered into --out)."""
+    ship: bool = False
+    """Put the models found into the package in half precision, with configuration and training log."""
+    scene: str = "tabletop/kitchen"
+    """Scene of `study codes` (direct light alone, under a scanning laser) and `study power`, as `render` takes it."""
+    width: int = 64
+    """Image width of these, pixels."""
+    height: int = 48
+    """Image height of these, pixels."""
+    signal: float = 50.0
+    """Mean signal photons per pixel of `study power`."""
+    background: float = 500.0
+    """Mean background photons per pixel of `study power`."""
+    scene_set: str = "tabletop"
+    """Scene set of `study render-error`, as `dataset` takes it."""
+    views: int = 3
+    """Its first N views, at --width x --height."""
+    cache: Annotated[Path | None, may_stay_open("FOLDER")] = None
+    """Folder that keeps its renders from run to run (default: ~/.cache/scene2spad)."""
+    capture: tuple[Path, ...] = ()
+    """Captures (.mat) of the LinoSPAD prototype for `study real-data`, instead of rendered ones in their layout."""
+    frame: int = 0
+    """Frame of these files, from 0."""
+    out: Path = Path("out/study")
+    """Folder for the figures (.png) and tables (.csv)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Common):
+    """One self-contained HTML page of every figure, table, configuration and version made so far: speed against error
+    first, published numbers beside ours, and what was not measured. Nothing is loaded, and it prints well."""
+
+    results: Path = Path("out")
+    """Folder that `bench`, `study`, `evaluate` and `demo` have filled, with all its subfolders."""
+    out: Path = Path("out/report.html")
+    """The page to write."""

@@ -1,0 +1,111 @@
+"""Options of `train` and `evaluate`, which studies read too. No torch, no Mitsuba: --help must be quick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from scene2spad.options.common import Common, Count, Number, Pixels, Positional, may_stay_open
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Common):
+    """Train a depth network, with or without compressive codes, on a rendered set; a run that was killed goes on."""
+
+    design: str = "learned"
+    """learned, fourier, gray, coarse, hadamard or random; with +learned for a fixed temporal code and a learned spatial
+    part; fourier-published and gray-published have the published rows (cos and -sin at whole bins); none for the counts
+    themselves, peak for their fullest bins."""
+    block: tuple[int, int, int] = (256, 4, 4)
+    """Block of the codes: time bins, rows, columns."""
+    compression: float = 128.0
+    """Counts of a block for one code that is kept."""
+    codes: Count = None
+    """Number K of codes, instead of --compression."""
+    full: bool = False
+    """A full coding tensor instead of a separable one."""
+    layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes"], ...] = ()
+    """Switches of the layer that differ from the published one."""
+    set: tuple[Path, ...] = (Path("planes"),)
+    """Folders of sets that `dataset` rendered, or their packs (.h5); planes: random planes, no renderer needed."""
+    set_weights: tuple[float, ...] = ()
+    """How often patches are drawn from each set (default: alike)."""
+    validation: tuple[Path, ...] = ()
+    """Sets to validate on (default: the last tenth of the scenes)."""
+    preset: Literal["smoke", "laptop", "workstation", "laptop-v1", "paper"] = "laptop"
+    """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; paper: the
+    published network and schedule (GPU); laptop-v1: the recipe of the first models."""
+    network: Annotated[
+        Literal["compact", "published", "published-signed"] | None,
+        may_stay_open("{compact,published,published-signed}"),
+    ] = None
+    """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
+    sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
+    """Sensor preset."""
+    steps: Count = None
+    """Steps of the whole run (default: the preset's)."""
+    batch: Count = None
+    """Patches a step (default: the preset's)."""
+    crop: Pixels = None
+    """Side of a patch (default: the preset's)."""
+    rate: Number = None
+    """Learning rate at the start, or after the warm-up (default: the preset's)."""
+    levels: Annotated[Literal["continuous", "paper"] | None, may_stay_open("{continuous,paper}")] = None
+    """Photon levels: signal from 1 to 100 over every background of the tests, or the paper's nine (default: the
+    preset's)."""
+    window: Count = None
+    """Train on so many bins around a label but for the last tenth of the run; 0: all (default: the preset's, where the
+    codes allow it)."""
+    grid: Literal["continuous", "published"] = "continuous"
+    """Labels: continuous, or on whole bins and decoded as published, for comparison with print."""
+    spatial_start: Annotated[Literal["uniform", "orthogonal"] | None, may_stay_open("{uniform,orthogonal}")] = None
+    """Start of learned spatial codes (default: orthogonal; uniform with paper and laptop-v1)."""
+    coherence: Number = None
+    """Weight of the penalty on codes that are alike for two pixels of a block (default: 0)."""
+    tv: Number = None
+    """Weight of the mean total variation of depth / range; 41.9 is the published 1e-5 (default: 0, or the preset's)."""
+    tv_start: Count = None
+    """Step at which the total variation comes in (default: 500)."""
+    time_offset: Number = None
+    """Delay every patch at random by up to this many metres of depth (default: 0, as published)."""
+    precision: Annotated[Literal["32-true", "bf16-mixed", "16-mixed"] | None, may_stay_open("{32-true,bf16-mixed}")] = (
+        None
+    )
+    """Lightning's name of the arithmetic (default: 32-true)."""
+    threads: Count = None
+    """CPU threads; the same number gives the same bytes (default: all)."""
+    workers: int = 0
+    """Processes that sense ahead; the same patches, whatever their number."""
+    devices: Count = None
+    """GPUs (default: all there are)."""
+    out: Annotated[Path | None, may_stay_open("FOLDER")] = None
+    """Folder of the run (default: out/train and a name from the options)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Common):
+    """Trained networks beside classical estimators on a rendered set, at the paper's 16 photon levels."""
+
+    checkpoints: Positional[tuple[Path, ...]]
+    """Checkpoints of `train`, their folders, or names of models (see `models`); the first is the one that the others
+    are compared with."""
+    decoder: Annotated[Literal["soft-argmax", "median"] | None, may_stay_open("{soft-argmax,median}")] = None
+    """How posteriors are read: their mean, or their median (default: each model's)."""
+    tiled: bool = False
+    """Cut images to what the blocks of all networks tile, instead of reflecting what is missing."""
+    set: Path
+    """Folder of a set that `dataset` rendered, or its pack (.h5); published: the paper's pairs that lie beside the
+    project, in its own simulation, read by both decoders."""
+    baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
+    """Estimators of `depth`, and CODE-K decoded without a network."""
+    views: Count = None
+    """Only the first N views (default: all)."""
+    offset: float = 0.0
+    """Move every scene this many metres away in time alone; other offsets are rendered: `dataset --offset-mode`."""
+    int8: bool = False
+    """Codes in 8 bits as well, summed in 16."""
+    int8_rule: Annotated[Literal["calibrated", "published"] | None, may_stay_open("{calibrated,published}")] = None
+    """How --int8 rounds weights: 255 steps over each factor's own range (default), or over -1 to 1 as published."""
+    out: Path = Path("out/evaluate")
+    """Folder for the table (.csv)."""

@@ -1,0 +1,1 @@
+"""Draw what the chain makes, with units on every axis."""

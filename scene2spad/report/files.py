@@ -1,0 +1,150 @@
+"""The files that `report` shows: found by name, read, and those of smoke runs set apart."""
+
+from __future__ import annotations
+
+import csv
+import io
+import struct
+import time
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from scenes.errors import printable, require
+from scenes.io.inputs import read_json_object
+
+# What studies keep for themselves: renders, sets, captures, kept results, trained models.
+INSIDE = ("sets", "renders", "captures", "results", "maps", "models", "emulated")
+ENDINGS = (".png", ".csv", ".json")
+# Titles, and the columns that are shown, all where none is named.
+CONFIGURATIONS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "config.json": (
+        "Trainings",
+        ("preset", "seed", "epochs", "steps_per_epoch", "batch", "crop", "rate", "tv_weight", "time_offset_m",
+         "precision", "model network", "data training", "data training_reach_m"),
+    ),
+    "set.json": ("Rendered sets", ()),
+}  # fmt: skip
+# what readers of tables, JSON and pictures raise for damaged files
+UNREADABLE = (
+    OSError, ValueError, TypeError, KeyError, SyntaxError, RecursionError, csv.Error, struct.error, zlib.error,
+    Image.DecompressionBombError,
+)  # fmt: skip
+
+
+@dataclass
+class Found:
+    """The results' files by name, the newest of each first, and what went wrong with them on the way."""
+
+    root: Path
+    files: dict[str, list[Path]]
+    smoke: list[Path]
+    configurations: dict[str, list[Path]]
+    problems: list[str] = field(default_factory=list)
+    missing: dict[str, list[str]] = field(default_factory=dict)  # by command
+    used: set[Path] = field(default_factory=set)
+    shown: set[str] = field(default_factory=set)  # anchors of pictures, by their contents
+    tables: int = 0
+
+    def newest(self, name: str) -> Path | None:
+        """The file of that name; all of them count as used."""
+        paths = self.files.get(name, [])
+        self.used.update(paths)
+        return paths[0] if paths else None
+
+    def told(self, path: Path) -> str:
+        """Its place in the folder and its day, and how many older ones of its name were passed over."""
+        day = time.strftime("%Y-%m-%d", time.gmtime(path.stat().st_mtime))
+        older = len(self.files.get(path.name, [])) - 1
+        return f"{path.relative_to(self.root)}, {day}{f'; {older} older of that name not shown' if older > 0 else ''}"
+
+    def read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
+        """What a reader makes of a file; None, and a problem, where it cannot."""
+        try:
+            return reader(path)
+        except UNREADABLE as error:
+            said = " ".join(str(error).split())[:120]
+            self.problem(f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {said})")
+            return None
+
+    def problem(self, line: str) -> None:
+        line = printable(line)
+        if line not in self.problems:
+            self.problems.append(line)
+
+
+def gather(root: Path) -> Found:
+    """All pictures, tables and configurations in a folder. Raises InputError where there is none."""
+    require(root.is_dir(), f"{root}: no folder of results; benches and studies fill one")
+    files: dict[str, list[Path]] = {}
+    configurations: dict[str, list[Path]] = {name: [] for name in CONFIGURATIONS}
+    for path in sorted(path for path in root.rglob("*") if path.is_file()):
+        inside = path.relative_to(root).parts[:-1]
+        if path.name in configurations:
+            configurations[path.name].append(path)
+        elif path.suffix in ENDINGS and not path.name.startswith(".") and not {*inside} & {*INSIDE}:
+            files.setdefault(path.name, []).append(path)
+    smoke = smoke_results(files)
+    kept = {name: [path for path in paths if path not in smoke] for name, paths in files.items()}
+    for paths in kept.values():
+        paths.sort(key=lambda path: (-path.stat().st_mtime, path))
+    return Found(root, {name: paths for name, paths in kept.items() if paths}, sorted(smoke), configurations)
+
+
+def smoke_results(files: Mapping[str, Sequence[Path]]) -> set[Path]:
+    """Return the files of every study that ran at toy size: its JSON says so, its files bear its name beside it."""
+    every = [path for paths in files.values() for path in paths]
+    found = set()
+    for numbers in (path for path in every if path.suffix == ".json"):
+        if _is_smoke(numbers):
+            beside = (path for path in every if path.parent == numbers.parent)
+            found |= {path for path in beside if f"{path.stem}-".startswith(f"{numbers.stem}-")}
+    return found
+
+
+def _is_smoke(path: Path) -> bool:
+    """Whether a study's numbers are of the preset `smoke`, or stand on models of it."""
+    try:
+        numbers = read_json_object(path)
+    except UNREADABLE:
+        return False  # told where it is shown
+    return "smoke" in (numbers.get("preset"), *(model.get("preset") for model in rows_in(numbers.get("models"))))
+
+
+def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
+    """A PNG's bytes and size; ValueError or OSError where it is none or cut."""
+    data = path.read_bytes()
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        image.verify()
+    if not data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
+        raise ValueError("its end is missing")
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        return data, image.size
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of a table; ValueError where lines are cut."""
+    with path.open(newline="", encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines, strict=True))
+    if any(None in row or None in row.values() for row in rows):
+        raise ValueError("rows of other lengths than its head")
+    return [{key: _number(text) for key, text in row.items()} for row in rows]
+
+
+def _number(text: str) -> int | float | str:
+    """A table's cell as the number that it spells, if it does."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def rows_in(value: Any) -> Sequence[Mapping[str, Any]]:
+    """Return the rows of a table in a JSON object; none where there is no table."""
+    return [row for row in value if isinstance(row, Mapping)] if isinstance(value, list) else []

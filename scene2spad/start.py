@@ -1,0 +1,37 @@
+"""Entry point of the console script: it imports next to nothing, so that Ctrl-C is answered from the first moment."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+
+def script() -> None:
+    """Run the command line and exit with its status; 130 for Ctrl-C, also while libraries are being imported."""
+    _open_standard_streams()
+    try:
+        from scene2spad.cli import main
+
+        status = main(sys.argv[1:])
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("interrupted; finished files stay, nothing is half-written", file=sys.stderr)
+        status = 130
+    except OSError as error:  # of --help: commands report their own files
+        sys.stdout = None
+        status = 0 if isinstance(error, BrokenPipeError) else 2
+        if status:
+            print(f"scene2spad: standard output: {error.strerror or error}", file=sys.stderr)
+    sys.exit(status)
+
+
+def _open_standard_streams() -> None:
+    """Give closed streams (>&-) somewhere to write to, or the next file opened would take their number."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number: this one
+    sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
+    sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)

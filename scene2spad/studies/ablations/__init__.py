@@ -1,0 +1,1 @@
+"""Compare designs of coding tensors (supplement S.3)."""

@@ -1,0 +1,1 @@
+"""Run trained codes on emulated cores, and decode depth by their networks."""

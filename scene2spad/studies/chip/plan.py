@@ -1,0 +1,56 @@
+"""What `study chip` runs: models, sets, photon levels. Plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from csph.evaluation.metrics import PHOTON_LEVELS
+from scene2spad.networks.registry import Wanted
+
+Level = tuple[float, float]
+TEST_SET = "tabletop"
+WITHIN = 0.02  # of the float model's MAE: what the chip may lose
+PAIR_LEVELS: tuple[Level, ...] = ((10.0, 10.0), (10.0, 200.0), (50.0, 50.0), (50.0, 500.0))
+ROOM_VIEWS, ROOM_SIZE = 8, (64, 64)
+MAIN = (
+    Wanted("fourier+learned", (256, 2, 2), 128),
+    Wanted("fourier+learned", (256, 2, 2), 64),
+    Wanted("fourier", (1024, 1, 1), 128),
+    Wanted("fourier", (1024, 1, 1), 64),
+)
+OTHERS = (
+    Wanted("gray", (1024, 1, 1), 128),
+    Wanted("fourier+learned", (256, 4, 4), 128),
+    Wanted("fourier", (256, 1, 1), 128),
+)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is run; `models` at every level of `levels` on the still lifes, at PAIR_LEVELS on rooms and pairs.
+
+    views, size   of each set; None: all, as they come
+    """
+
+    models: tuple[Wanted, ...] = (*MAIN, *OTHERS)
+    levels: tuple[Level, ...] = PHOTON_LEVELS
+    other_levels: tuple[Level, ...] = PAIR_LEVELS
+    views: int | None = None
+    size: tuple[int, int] | None = None
+    rooms: int = ROOM_VIEWS
+    pairs: int | None = None
+
+
+SMOKE = Plan(
+    models=(MAIN[0], MAIN[2]),
+    levels=PAIR_LEVELS[:2],
+    other_levels=PAIR_LEVELS[:1],
+    views=2,
+    size=(24, 16),
+    rooms=1,
+    pairs=1,
+)
+
+
+def plan_of(preset: str) -> Plan:
+    return SMOKE if preset == "smoke" else Plan()

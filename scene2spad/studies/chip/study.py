@@ -1,0 +1,161 @@
+"""`study chip`: trained codes through emulated cores to depth, beside the same models in floating point.
+
+Every view is sensed once a photon level; the float model sees its counts, the chip its photons: int8 tables, 16-bit
+sums that wrap, and the model's own network behind what leaves the sensor. The two are compared in pairs, by scene and
+level. One view a model is interpreted photon by photon, and its integers compared with the fast array's and torch's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from csph.evaluation.methods import Evaluation, Row, as_dicts
+from csph.evaluation.metrics import paired_difference
+from render.pipeline import Progress
+from scene2spad.datasets import published
+from scene2spad.datasets.test_sets import TestSet, evaluated, rendered
+from scene2spad.networks.lookup import obtain
+from scene2spad.networks.registry import Subject, Trained, Wanted
+from scene2spad.options.experiments import Study
+from scene2spad.studies.chip.chain import ChipDepth, interpret
+from scene2spad.studies.chip.code import codes_by_torch, compile_model
+from scene2spad.studies.chip.plan import ROOM_SIZE, TEST_SET, WITHIN, Plan, plan_of
+from scene2spad.studies.results import Store
+from scenes.errors import InputError
+from scenes.files import finite, whole_file, write_csv
+from spad.detection.detect import sense
+from spad.sensor.model import PhotonBudget, Sensor
+
+_CHIP = " on the chip"
+_INTERPRETED = (50.0, 500.0)  # photons a pixel of the view that is interpreted
+
+
+def run(command: Study, progress: Progress) -> dict:
+    """Measure every model on every set; a table of all rows, one of the pairs, and JSON in `command.out`."""
+    plan, folder = plan_of(command.preset), command.out / command.preset
+    models = obtain(plan.models, command, progress)
+    chips = {one: ChipDepth.of(compile_model(found.model, one.name)) for one, found in models.found.items()}
+    subjects = [pair for one, found in models.found.items() for pair in _pair(found, chips[one])]
+    store, options = Store(folder / "results"), {"seed": command.seed, "progress": progress}
+    still = rendered(TEST_SET, folder / "sets", count=plan.views, size=plan.size, progress=progress)
+    rooms = rendered("rooms/test", folder / "sets", count=plan.rooms, size=plan.size or ROOM_SIZE, progress=progress)
+    sets = {
+        TEST_SET: evaluated(store, subjects, still, plan.levels, **options),
+        "rooms": evaluated(store, subjects, rooms, plan.other_levels, **options),
+    }
+    pair_rows = _pairs(store, subjects, plan, options)
+    names = [one.name for one in models.found]
+    compared = [line for name, rows in sets.items() for line in compared_rows(name, names, _by_scene(rows))]
+    compared += compared_rows("published pairs", names, _by_pair(pair_rows)) if pair_rows else []
+    numbers: dict[str, Any] = {
+        **models.described(),
+        "compared": compared,
+        "interpreted": [_interpreted(one, chips[one], still, command.seed) for one in models.found],
+        "pairs": "measured" if pair_rows else "left out: no photographs beside the project",
+    }
+    tables = {"": [{"set": name, **row} for name, rows in sets.items() for row in as_dicts(rows)]}
+    tables |= {"-compared": compared, "-pairs": pair_rows}
+    made = [write_csv(table, command.out / f"chip{name}.csv") for name, table in tables.items() if table]
+    path = command.out / "chip.json"
+    with whole_file(path) as beside:
+        beside.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
+    shown = numbers if command.json else _in_words(numbers)
+    return {**shown, "csv": [str(each) for each in made], "numbers": str(path)}
+
+
+def _pair(found: Trained, chip: ChipDepth) -> tuple[Subject, Subject]:
+    """The float model, and the same on the chip: what its program and tables are is part of the digest."""
+    compiled = chip.chip.compiled
+    sha = hashlib.sha256(f"{found.subject.digest} {compiled.source}".encode())
+    for values in compiled.tables(compiled.block).values():
+        sha.update(np.ascontiguousarray(values).tobytes())
+    return found.subject, Subject(f"{found.wanted.name}{_CHIP}", chip, sha.hexdigest())
+
+
+def _pairs(store: Store, subjects: Sequence[Subject], plan: Plan, options: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows on the published pairs; none where the photographs are not at hand."""
+    try:
+        photographs = published.pairs(plan.pairs)
+    except InputError:
+        return []
+    return published.errors_of(store, subjects, photographs, plan.other_levels, 0.0, **options)
+
+
+def _by_scene(rows: Sequence[Row]) -> dict[str, dict[str, np.ndarray]]:
+    """{model: {scene: MAE [mm] of its views and levels}}"""
+    evaluation = Evaluation(list(rows))
+    return {name: evaluation.values([name]) for name in dict.fromkeys(row.method for row in rows)}
+
+
+def _by_pair(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, np.ndarray]]:
+    found: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        found.setdefault(row["model"], {}).setdefault(row["pair"], []).append(row["mae_mm_arrival"])
+    return {name: {pair: np.array([values]) for pair, values in of.items()} for name, of in found.items()}
+
+
+def compared_rows(
+    name: str, models: Sequence[str], values: Mapping[str, Mapping[str, np.ndarray]]
+) -> list[dict[str, Any]]:
+    """A row a model: MAE of both, and the paired difference as a share of the float model's with its 95 % interval
+    (bootstrap over scenes and levels). `holds` where the whole interval is within WITHIN."""
+    rows = []
+    for model in models:
+        plain, chip = values[model], values[f"{model}{_CHIP}"]
+        mae, mae_chip = (float(np.mean([np.nanmean(v) for v in of.values()])) for of in (plain, chip))
+        apart = paired_difference(chip, plain)
+        share, low, high = (part / mae for part in apart)
+        rows.append(
+            {
+                "set": name,
+                "model": model,
+                "scenes": len(plain),
+                "levels": int(next(iter(plain.values())).size),
+                "float_mae_mm": mae,
+                "chip_mae_mm": mae_chip,
+                "difference": share,
+                "low": low,
+                "high": high,
+                "holds": bool(-WITHIN <= share <= WITHIN and high <= WITHIN) if np.isfinite(high) else None,
+            }
+        )
+    return rows
+
+
+def _interpreted(one: Wanted, chip: ChipDepth, test: TestSet, seed: int) -> dict[str, Any]:
+    """A view, interpreted to its last photon: what the cores counted, and how its integers differ from two others."""
+    compiled = chip.chip.compiled
+    histogram = sense(test.views.transients[0], Sensor(), PhotonBudget(*_INTERPRETED), seed=seed)
+    (down, right), (height, width) = compiled.block, histogram.depth_m.shape
+    counts = histogram.counts[: height // down * down, : width // right * right]
+    found = interpret(counts, compiled)
+    fast, _ = chip.fast.frame(counts)
+    counted = found.counters
+    return {
+        "model": one.name,
+        "pixels": int(counts.shape[0] * counts.shape[1]),
+        "photons": counted.photons,
+        "cycles": counted.cycles,
+        "wraps": counted.wraps,
+        "differs_from_torch": int(np.count_nonzero(found.codes != codes_by_torch(counts, compiled))),
+        "differs_from_fast": int(np.count_nonzero(found.codes != fast)),
+    }
+
+
+def _in_words(numbers: dict[str, Any]) -> dict[str, Any]:
+    lines = []
+    for row in numbers["compared"]:
+        said = f"{row['float_mae_mm']:.1f} mm in float, {row['chip_mae_mm']:.1f} on the chip"
+        apart = f"{row['difference']:+.2%} ({row['low']:+.2%} to {row['high']:+.2%})"
+        lines.append(f"{row['set']}, {row['model']}: {said}, {apart}")
+    emulated = [
+        f"{row['model']}: {row['photons']:,} photons interpreted, {row['wraps']} wraps, {row['differs_from_torch']} "
+        f"integers differ from torch, {row['differs_from_fast']} from the fast array"
+        for row in numbers["interpreted"]
+    ]
+    return {"compared": lines, "interpreted": emulated, "absent": numbers["absent"] or ["none"]}

@@ -1,0 +1,1 @@
+"""Compare networks with the filter where light takes several paths."""

@@ -1,0 +1,48 @@
+"""What `study multipath` runs: scenes, photon levels, methods. Plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from render.settings import RenderSettings
+from scene2spad.networks.registry import Wanted
+
+BACKGROUNDS = (50.0, 20.0, 5.0, 1.0)
+LEVELS = tuple((signal, background) for signal in (50.0, 10.0) for background in BACKGROUNDS)
+HEADLINE = (50.0, 50.0)
+FILTER, PEAK = "log-matched", "argmax"
+MODELS = (
+    Wanted("learned", (256, 4, 4)),
+    Wanted("learned", (1024, 4, 4)),
+    Wanted("fourier", (1024, 1, 1)),
+    Wanted("none"),
+)
+# What of a render is sensed: the same surfaces, truth and mean counts.
+LIGHTS: dict[str, str] = {"flood": "direct and indirect light", "direct": "direct light alone"}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """scenes  by name and seed, as `render` takes them
+    size       (width, height), multiples of the blocks of all models
+    """
+
+    scenes: tuple[tuple[str, int], ...]
+    size: tuple[int, int]
+    settings: RenderSettings
+    levels: tuple[tuple[float, float], ...] = LEVELS
+
+
+SCENES = (
+    ("rooms/test/0", 0),
+    ("rooms/test/6", 0),
+    ("rooms/test/12", 0),
+    ("living-room", 0),
+    ("gallery", 0),
+    ("clutter/test/0", 0),
+)
+PLANS = {
+    "smoke": Plan(SCENES[:1], (24, 20), RenderSettings(bounces=2, spp=16, ambient=True), LEVELS[:1]),
+    "laptop": Plan(SCENES, (88, 72), RenderSettings(error=0.02, ambient=True)),
+    "paper": Plan(SCENES, (176, 144), RenderSettings(error=0.01, ambient=True)),
+}

@@ -1,0 +1,1 @@
+"""Measure time, data rate and power of emulated programs (supplement S.2)."""

@@ -1,0 +1,155 @@
+"""From a recorded histogram through emulated cores to depth, and the same integers by the torch path.
+
+One core is one pixel, as in S.2; `shared_core_depths` is the exception, 4 x 4 SPADs on one core.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from csph import CodingTensor, decode_depth, encode
+from scene2spad.studies.power.program_tables import fixed_spatial, int8_temporal
+from scenes.errors import require
+from spad.formats.histogram import Histogram
+from spad.sensor.model import Sensor
+from ultraphase import CoreArray, Method
+from ultraphase.catalog import TIMESTAMPS
+from ultraphase.core import Counters
+from ultraphase.tables import spatial_sum
+
+_CORES = 1 << 16  # emulated at a time
+INT16 = 1 << 15
+
+
+@dataclass(frozen=True, eq=False)
+class Emulated:
+    """What the cores of an image put out, and what that cost.
+
+    codes      (H / block rows, W / block columns, numbers) int64
+    counters   sums over all cores
+    bits       that left the sensor
+    """
+
+    codes: np.ndarray
+    counters: Counters
+    bits: int
+
+
+def emulate(counts: np.ndarray, method: Method, spatial: np.ndarray | None = None) -> Emulated:
+    """One frame of an image, every photon a timestamp that a core's program works on.
+
+    counts   (H, W, 1024) integers; H and W are multiples of the method's block
+    spatial  (rows, columns, K) int8 weights of one block of cores, else `fixed_spatial`
+    """
+    height, width = _blocks_fit(counts, method)
+    spatial = fixed_spatial(method) if spatial is None else spatial
+    program, tables = method.program(), method.tables(int8_temporal(method))
+    rows = max(_CORES // width // method.block[0], 1) * method.block[0]
+    codes, total, bits = [], None, 0
+    for top in range(0, height, rows):
+        part = counts[top : top + rows]
+        shape = part.shape[:2]
+        if spatial is not None:
+            tables["weight"] = np.tile(spatial, (shape[0] // method.block[0], shape[1] // method.block[1], 1))
+        stamps, offsets = timestamps_of(part)
+        frame = CoreArray(program, shape, tables).frame(stamps, offsets)
+        codes.append(frame.out.reshape(shape[0] // method.block[0], shape[1] // method.block[1], -1))
+        total = frame.counters if total is None else total + frame.counters
+        bits += int(frame.out_bits.sum())
+    return Emulated(np.concatenate(codes), total, bits)
+
+
+def timestamps_of(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Timestamps of every core, core after core, and where each core's begin: counts (H, W, T) -> (N,), (H W + 1,)."""
+    flat = counts.reshape(-1, counts.shape[-1])
+    core, time_bin = np.nonzero(flat)
+    number = flat[core, time_bin]
+    return np.repeat(time_bin, number), np.concatenate(([0], np.cumsum(flat.sum(axis=1, dtype=np.int64))))
+
+
+def _blocks_fit(counts: np.ndarray, method: Method) -> tuple[int, int]:
+    require(counts.shape[-1] == TIMESTAMPS, f"histogram of {counts.shape[-1]} bins, the chip's have {TIMESTAMPS}")
+    height, width = counts.shape[:2]
+    down, right = method.block
+    fits = height % down == 0 and width % right == 0
+    require(fits, f"image of {width} x {height} pixels does not divide into the blocks of {right} x {down} cores")
+    return height, width
+
+
+def by_torch(counts: np.ndarray, method: Method, spatial: np.ndarray | None = None) -> np.ndarray:
+    """The same numbers without a program: csph's `encode` with the int8 tensor, and the limits of the number format.
+
+    Raises InputError where a sum is so large that float32 does not hold it exactly.
+    """
+    height, width = _blocks_fit(counts, method)
+    spatial = fixed_spatial(method) if spatial is None else spatial
+    matrix = torch.from_numpy(method.matrix(int8_temporal(method))).float()
+    largest = int(counts.sum(axis=-1, dtype=np.int64).max(initial=0)) * int(matrix.abs().max())
+    require(largest < 1 << 24, f"sums up to {largest} are not exact in float32")
+    sums = encode(torch.from_numpy(counts), CodingTensor(method.name, matrix)).numpy().astype(np.int64)
+    if method.family == "coarse":
+        return np.minimum(sums, 255)
+    sums = (sums + INT16) % (2 * INT16) - INT16
+    if method.block == (1, 1):
+        return sums
+    down, right = method.block
+    cores = sums.reshape(height // down, down, width // right, right, -1, method.codes).swapaxes(1, 2)
+    cores = cores.reshape(height // down, width // right, down * right, -1, method.codes)
+    summed = spatial_sum(cores, spatial.reshape(down * right, method.codes))
+    return summed.reshape(height // down, width // right, -1)
+
+
+def decode(codes: np.ndarray, method: Method, sensor: Sensor, spatial: np.ndarray | None = None) -> np.ndarray:
+    """Depth [m] of every pixel from what the cores put out, (H, W) float32, by csph's correlation decoder.
+
+    The codes of a block answer to a pulse in its pixel p with w[p, k] C[k, t]: that matrix is pixel p's coding tensor.
+    """
+    matrix = method.matrix(int8_temporal(method))
+    spatial = fixed_spatial(method) if spatial is None else spatial
+    found = torch.from_numpy(codes).float()
+    down, right = method.block
+    depth = np.empty((codes.shape[0] * down, codes.shape[1] * right), np.float32)
+    answers: dict[bytes, np.ndarray] = {}
+    for row in range(down):
+        for column in range(right):
+            seen = matrix
+            if method.block != (1, 1):
+                seen = (matrix.reshape(-1, method.codes, matrix.shape[1]) * spatial[row, column][:, None]) / 128
+            seen = seen.reshape(matrix.shape)
+            if seen.tobytes() not in answers:
+                coding = CodingTensor(method.name, torch.from_numpy(seen).float())
+                answers[seen.tobytes()] = decode_depth(found, coding, sensor).numpy()
+            depth[row::down, column::right] = answers[seen.tobytes()]
+    return depth
+
+
+def shared_core_depths(histogram: Histogram, codes: int = 8) -> dict[str, np.ndarray]:
+    """Depth (H, W) of 4 x 4 SPADs that share a core, whose timestamps have lost their address (S.2) or kept it.
+
+    Without addresses one set of codes describes the whole group, and all its pixels get one depth; with them the core
+    keeps a set for every SPAD. Raises InputError for an image that does not divide into groups.
+    """
+    side, counts = 4, histogram.counts
+    height, width = counts.shape[:2]
+    require(
+        height % side == 0 and width % side == 0, f"image of {width} x {height} pixels, expected multiples of {side}"
+    )
+    groups = counts.reshape(height // side, side, width // side, side, TIMESTAMPS).swapaxes(1, 2)
+    plain, kept = Method("fourier", codes), Method("addressed", codes)
+    pooled = emulate(groups.sum(axis=(2, 3)), plain).codes
+    depth_pooled = decode(pooled, plain, histogram.sensor)
+    # a timestamp's upper bits are its SPAD: a histogram of 16 x 1024 words
+    words = groups.reshape(-1, side * side * TIMESTAMPS)
+    program, tables = kept.program(), kept.tables(int8_temporal(kept))
+    stamps, offsets = timestamps_of(words[None])
+    frame = CoreArray(program, (1, len(words)), tables).frame(stamps, offsets)
+    own = frame.out.reshape(height // side, width // side, side, side, codes).swapaxes(1, 2)
+    own = own.reshape(height, width, codes)
+    depth_own = decode(own, plain, histogram.sensor)
+    return {
+        "addresses lost": np.repeat(np.repeat(depth_pooled, side, axis=0), side, axis=1),
+        "addresses kept": depth_own,
+    }

@@ -1,0 +1,1 @@
+"""Find depth in captures of the LinoSPAD prototype (supplement S.4)."""

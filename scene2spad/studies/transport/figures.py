@@ -1,0 +1,134 @@
+"""Figures of `study transport`: errors step by step, the gaps between codes, planned beside full renders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import PercentFormatter
+
+from csph.evaluation.methods import Evaluation, Row
+from scene2spad.plots.figures import plain_log, plt, save
+from scene2spad.studies.transport.plan import KEPT, LASERS, LATER, LEVELS, LIMIT, OPEN, REVERSED, STEPS
+
+LABELS = [label.replace(", ", ",\n") for label in STEPS.values()]
+VERDICTS = {KEPT: "tab:blue", REVERSED: "tab:red", OPEN: "0.6"}
+MARKS = "os^DvP*X<>hd"
+MOST_PAIRS = 24  # of a panel
+
+
+def draw_steps(summary: Sequence[Mapping[str, Any]], rows: Mapping[tuple[str, str], Sequence[Row]], path: Path) -> Path:
+    """MAE of every design at each step, a row a laser and a column a photon level; bars: 95 % over scenes."""
+    designs = list(dict.fromkeys(line["design"] for line in summary))
+    figure, panels = plt.subplots(
+        len(LASERS), len(LEVELS), figsize=(5.2 * len(LEVELS), 4.2 * len(LASERS)), layout="constrained", squeeze=False,
+        sharex=True, sharey="col",
+    )  # fmt: skip
+    for line, laser in zip(panels, LASERS, strict=True):
+        for axes, (signal, background) in zip(line, LEVELS, strict=True):
+            for number, design in enumerate(designs):
+                mine = [_at_level(rows[laser, step], design, signal, background) for step in STEPS]
+                _curve(axes, [m for m in mine if m], number, design, len(designs))
+            axes.set_title(f"{laser} laser, {signal:g} signal + {background:g} background photons", fontsize=10)
+            plain_log(axes)
+            axes.grid(alpha=0.3, which="both")
+        line[0].set_ylabel("mean absolute depth error [mm]")
+    for axes in panels[-1]:
+        axes.set_xticks(range(len(STEPS)), LABELS, fontsize=8, rotation=25)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(labels)), fontsize=8)
+    scenes = len({row.scene for row in rows[LASERS[0], next(iter(STEPS))]})
+    figure.suptitle(f"What each step of the simulation adds: the same {scenes} scenes and the same mean counts")
+    return save(figure, path)
+
+
+def _at_level(rows: Sequence[Row], design: str, signal: float, background: float) -> tuple[float, float, float] | None:
+    chosen = [row for row in rows if (row.signal, row.background) == (signal, background)]
+    return Evaluation(chosen).interval([design])
+
+
+def _curve(axes: Axes, intervals: Sequence[tuple[float, float, float]], number: int, label: str, of: int) -> None:
+    mean, low, high = np.array(intervals).T
+    place = np.arange(len(mean)) + 0.3 * ((number + 0.5) / of - 0.5)  # side by side, so that bars do not hide bars
+    reach = np.nan_to_num([mean - low, high - mean]).clip(0)
+    look = {"marker": MARKS[number % len(MARKS)], "color": f"C{number % 10}", "ls": "-" if number < 10 else "--"}
+    axes.errorbar(place, mean, reach, ms=4.5, lw=1, capsize=2, elinewidth=0.8, label=label, **look)
+
+
+def draw_ranking(ranked: Sequence[Mapping[str, Any]], path: Path) -> Path:
+    """Gap of each pair of codes with RGB-D rates (hollow) and at each later step (filled), all levels together."""
+    mine = [r for r in ranked if r["levels"] == "all"]
+    pairs = list(dict.fromkeys((r["first"], r["second"]) for r in mine))[:MOST_PAIRS]
+    size = (3.4 * len(LATER) + 1.5, len(LASERS) * (1.6 + 0.34 * len(pairs)))
+    figure, panels = plt.subplots(
+        len(LASERS), len(LATER), figsize=size, layout="constrained", squeeze=False, sharey=True, sharex=True
+    )
+    for line, laser in zip(panels, LASERS, strict=True):
+        for axes, step in zip(line, LATER, strict=True):
+            for r in mine:
+                if (r["laser"], r["step"]) == (laser, step) and (r["first"], r["second"]) in pairs:
+                    _gap(axes, r, pairs.index((r["first"], r["second"])))
+            axes.axvline(0, color="k", lw=0.8)
+            axes.set_xscale("symlog", linthresh=10)
+            axes.grid(alpha=0.3, axis="x")
+            axes.set_title(f"{laser}: {STEPS[step]}", fontsize=9)
+        line[0].set_yticks(range(len(pairs)), [f"{a} - {b}" for a, b in pairs], fontsize=8)
+    panels[0, 0].invert_yaxis()
+    for axes in panels[-1]:
+        axes.set_xlabel("difference of MAE [mm]", fontsize=9)
+        axes.tick_params(axis="x", labelsize=8)
+    handles = [plt.Line2D([], [], color=colour, marker="o", label=f"order {what}") for what, colour in VERDICTS.items()]
+    handles.append(plt.Line2D([], [], color="k", marker="o", mfc="white", lw=0.8, label="with RGB-D rates"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
+    asked = "Does the ranking of codes change? Paired differences, 95 % intervals over scenes"
+    figure.suptitle(f"{asked}; below 0 the first is better", fontsize=10)
+    return save(figure, path)
+
+
+def _gap(axes: Axes, r: Mapping[str, Any], place: int) -> None:
+    for name, shift, look in (
+        ("rgbd", -0.16, {"color": "k", "mfc": "white", "lw": 0.8}),
+        ("here", 0.16, {"color": VERDICTS[r["verdict"]], "lw": 1.4}),
+    ):
+        axes.plot([r[f"{name}_low"], r[f"{name}_high"]], [place + shift] * 2, color=look["color"], lw=look["lw"])
+        axes.plot(r[f"{name}_mm"], place + shift, "o", ms=4, color=look["color"], mfc=look.get("mfc", look["color"]))
+
+
+def draw_planned(planned: Sequence[Mapping[str, Any]], scenes: Sequence[Mapping[str, Any]], path: Path) -> Path:
+    """Relative difference of the MAE on planned renders from that on full ones, and the rays that plans saved."""
+    names = [(one["scene"], one["laser"]) for one in scenes]
+    designs = list(dict.fromkeys(row["design"] for row in planned))
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(12, 1.8 + 0.3 * len(names)), layout="constrained", sharey=True, width_ratios=(1.6, 1)
+    )
+    left.axvspan(-LIMIT, LIMIT, color="tab:green", alpha=0.12, label=f"under {LIMIT:.0%}")
+    left.axvline(0, color="k", lw=0.6)
+    for number, design in enumerate(designs):
+        mine = [row for row in planned if row["design"] == design]
+        place = np.array([names.index((row["scene"], row["laser"])) for row in mine])
+        off = place + 0.5 * ((number + 0.5) / len(designs) - 0.5)
+        reach = np.nan_to_num([row["uncertain"] for row in mine])
+        share = [row["difference"] for row in mine]
+        left.errorbar(share, off, xerr=reach, fmt=MARKS[number], ms=4, lw=1, capsize=2, label=design)
+    left.set_yticks(range(len(names)), [f"{scene}, {laser}" for scene, laser in names], fontsize=8)
+    left.invert_yaxis()
+    left.set_xlabel("MAE on the planned render over that on the full one, - 1")
+    left.set_title("error: bars are 95 % over draws of photons, most of which both renders share", fontsize=9)
+    left.legend(fontsize=8)
+    place = np.arange(len(names))
+    right.barh(place - 0.18, [one["full_rays"] for one in scenes], 0.34, color="0.7", label="full")
+    bars = right.barh(place + 0.18, [one["planned_rays"] for one in scenes], 0.34, color="tab:blue", label="planned")
+    right.bar_label(bars, [f"{one['rays_saved']:.0%} saved" for one in scenes], fontsize=7, padding=2)
+    right.set_xscale("log")
+    right.set_xlim(0.3 * min(one["planned_rays"] for one in scenes), 4 * max(one["full_rays"] for one in scenes))
+    right.set_xlabel("rays of laser light (ambient light apart)")
+    right.set_title("work", fontsize=9)
+    right.legend(fontsize=8, loc="lower right")
+    left.xaxis.set_major_formatter(PercentFormatter(1.0))
+    for axes in (left, right):
+        axes.grid(alpha=0.3, axis="x")
+    figure.suptitle("What the planner left out: a planned render beside one with everything forced")
+    return save(figure, path)

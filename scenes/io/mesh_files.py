@@ -1,0 +1,102 @@
+"""Mesh files by way of trimesh: what they declare is checked first, what they name lies in their folder."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes.errors import InputError, require
+from scenes.io.inputs import file_inside, read_bytes
+from scenes.io.mesh_declarations import check_glb, check_ply, check_stl
+
+MAX_COORDINATE = 1e12  # in the file's unit: squares and cross products of such stay finite in double precision
+MAX_TRIANGLES = 1 << 25  # with all instances: a scene's arrays take some 200 bytes a triangle
+MAGIC = {b"ply": ".ply", b"glTF": ".glb", b"solid": ".stl"}
+
+
+class _Beside:
+    """Files beside a mesh, for trimesh: regular ones inside the mesh's folder alone."""
+
+    def __init__(self, path: Path) -> None:
+        self.folder, self.file_name = path.parent, path.name  # trimesh names geometry by the file
+
+    def get(self, name: str) -> bytes:
+        return read_bytes(file_inside(self.folder, name.strip()))
+
+    def __getitem__(self, name: str) -> bytes:
+        return self.get(name)
+
+
+def load_trimesh(path: Path, kind: str, **options: Any) -> Any:
+    """Return the trimesh.Scene of a file as it is: nothing merged, removed or reordered.
+
+    kind     ".obj", ".ply", ".stl" or ".glb"
+    options  handed to trimesh
+
+    Raises InputError in one line that begins with the file where it is missing, cut short, not consistent with what it
+    declares, or refers to what is not there.
+    """
+    import trimesh
+
+    content = read_bytes(path, "mesh file")
+    beside = _Beside(path)
+    try:
+        content, triangles = _checked(content, kind, beside)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            loaded = trimesh.load_scene(
+                io.BytesIO(content), file_type=kind[1:], resolver=beside, process=False, **options
+            )
+        if triangles is not None:
+            found = sum(len(getattr(mesh, "faces", ())) for mesh in loaded.geometry.values())
+            require(found == triangles, f"cut short or damaged: {found} of its {triangles} triangles can be read")
+        _check_size(loaded)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:  # every format of trimesh has its own exceptions
+        reason = (str(error).splitlines() or [""])[0]
+        # a missing import is how trimesh says that it cannot even guess the text encoding
+        told = reason[:200] if reason and not isinstance(error, ImportError) else "content not understood"
+        raise InputError(f"{path}: broken {kind} file ({told})") from None
+    return loaded
+
+
+def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | None]:
+    """What trimesh is to read, and how many triangles it must find, where the file says so."""
+    require(bool(content.strip()), "the file is empty")
+    actual = next((ext for magic, ext in MAGIC.items() if content.startswith(magic)), kind)
+    require(actual == kind, f"holds {actual} data, its extension says {kind}; rename it")
+    try:
+        match kind:
+            case ".ply":
+                check_ply(content)
+            case ".stl":
+                return content, check_stl(content)
+            case ".glb":
+                check_glb(content, beside.get)
+            case ".obj":
+                # Comments and names in an old encoding must not stop the geometry from being read.
+                content = content.decode("utf-8", errors="replace").encode()
+    except InputError as error:
+        raise InputError(f"broken {kind} file ({error})") from None
+    return content, None
+
+
+def _check_size(loaded: Any) -> None:
+    """InputError where all instances together are too many triangles."""
+    sizes = {name: len(getattr(mesh, "faces", ())) for name, mesh in loaded.geometry.items()}
+    triangles = sum(sizes[loaded.graph[node][1]] for node in loaded.graph.nodes_geometry)
+    require(triangles <= MAX_TRIANGLES, f"{triangles} triangles with all instances, expected {MAX_TRIANGLES} at most")
+
+
+def check_vertices(vertices: np.ndarray, name: str) -> None:
+    """InputError unless all coordinates are finite and of a size that can be computed with."""
+    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+    require(not bad, f"{bad} of {len(vertices)} vertices of {name} are NaN or infinite")
+    largest = float(np.abs(vertices).max(initial=0.0))
+    said = f"a coordinate of {name} is {largest:g}, expected {MAX_COORDINATE:g} at the most"
+    require(largest <= MAX_COORDINATE, said)

@@ -1,0 +1,398 @@
+"""Mesh files (.obj .ply .stl .glb) as scenes: the model stands on a floor before a wall, seen from its front.
+
+A mesh file knows neither its unit nor, for STL, its upward axis; what is assumed here is said in `Scene.notes`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes.arrays import check_faces
+from scenes.errors import InputError
+from scenes.io.inputs import file_inside, read_bytes
+from scenes.io.mesh_files import MAX_COORDINATE, check_vertices, load_trimesh
+from scenes.io.textures import load_texture, luminance, srgb_to_linear
+from scenes.library.things import shapes
+from scenes.model import Camera, Material, Scene, Surface, Texture
+from scenes.placing import AS_IT_IS, Placing
+
+EXTENSIONS = (".obj", ".ply", ".stl", ".glb")
+DEFAULT_ALBEDO = 0.6
+BACKDROP_ALBEDO = 0.55
+SENSIBLE_EXTENT_M = (0.2, 2.5)  # a model whose largest extent lies in here is taken to be in metres already
+UNITS_M = {"mm": 1e-3, "millimet": 1e-3, "cm": 1e-2, "centimet": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
+UNITS_M |= {"in": 0.0254, "ft": 0.3048, "met": 1.0, "m": 1.0}
+HEADER_BYTES = 4096  # where a comment may name the unit
+WALL_GAP_M = 1.0
+FOV_DEG = 40.0
+ELEVATION_DEG, AZIMUTH_DEG = 15.0, 30.0  # a little from above, and from the side: what faces away shows its flank
+FILL = 0.7  # share of the smaller image dimension that the model's bounding sphere takes
+# Rotations that bring an axis of the file upwards (to +y).
+TURNS = {
+    "x": np.array(((0.0, -1, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))),
+    "y": np.eye(4),
+    "z": np.array(((1.0, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))),
+}
+ZERO_AREA = 1e-12  # a face with a smaller area than this, for a model of unit extent, is degenerate
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One geometry of the file in the world of the file: triangles still as the loader left them."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray | None
+    normals: np.ndarray | None
+    visual: Any
+
+
+def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placing = AS_IT_IS) -> Scene:
+    """The scene of one mesh file, metres, y up: floor at y = 0, wall behind, camera before the model's +z side.
+
+    The model keeps its size if its largest extent is 0.2 to 2.5 m. Otherwise the unit that the file names is taken (a
+    comment or header such as "units: mm"), else millimetres or inches where these make 0.2 to 2.5 m of it, else it is
+    scaled to 1 m; each with a warning in the notes. Every surface is
+    diffuse with the file's colour as albedo (luminance of linear colour), 0.6 where the file has none. `placing` states
+    size, upward axis and camera instead. Raises InputError in one line for a file that is missing, of another kind,
+    broken, empty, without faces or with NaNs, and for a camera that floor and wall cannot be put around.
+    """
+    path = Path(path)
+    parts = _read(path)
+    notes: list[str] = []
+    parts = _stand(path, parts, notes, placing)
+    low = np.min([part.vertices.min(axis=0) for part in parts], axis=0)
+    high = np.max([part.vertices.max(axis=0) for part in parts], axis=0)
+    centre = (low + high) / 2
+    radius = max(float(np.linalg.norm(part.vertices - centre, axis=1).max()) for part in parts)
+    camera = placing.camera(_camera(centre, radius, width, height), centre)
+    wall_z = low[2] - WALL_GAP_M
+    around = [] if placing.bare else _around(path, camera, wall_z)
+    paint = _Paint(path, notes)
+    surfaces = [_surface(part, paint) for part in parts]
+    return Scene(path.stem, (*surfaces, *around), camera, notes=tuple(notes))
+
+
+def _around(path: Path, camera: Camera, wall_z: float) -> list[Surface]:
+    """Floor and wall, which a camera that was placed must stand before."""
+    top = camera.rays(np.array([0.0, camera.width]), np.zeros(2))
+    good = camera.origin[1] > 0 and camera.origin[2] > wall_z and bool((top[:, 2] < 0).all())
+    if not good:
+        raise InputError(f"{path}: the camera does not stand above the floor and look at the wall behind; use --bare")
+    return backdrop(camera, wall_z)
+
+
+def _camera(centre: np.ndarray, radius: float, width: int, height: int) -> Camera:
+    """A camera before and a little above a sphere that is to fill 70 % of the smaller image dimension."""
+    focal = Camera(np.eye(4), FOV_DEG, width, height).focal_px
+    edge = FILL * min(width, height) / 2 / focal
+    distance = radius * math.hypot(1, edge) / edge
+    up, aside = math.radians(ELEVATION_DEG), math.radians(AZIMUTH_DEG)
+    toward = (math.cos(up) * math.sin(aside), math.sin(up), math.cos(up) * math.cos(aside))
+    origin = centre + distance * np.array(toward)
+    return Camera.look_at(origin, centre, fov_deg=FOV_DEG, width=width, height=height)
+
+
+def backdrop(camera: Camera, wall_z: float, least_m: float = 4.0) -> list[Surface]:
+    """A floor at y = 0 and a wall at z = `wall_z`, both as large as the whole image needs and `least_m` at least.
+
+    The camera is above the floor, before the wall, and its top row looks towards the wall (not steeper than upright).
+    """
+    # Floor and wall are one folded sheet, so the image's border maps to the border of what is seen of them.
+    x, y = np.linspace(0, camera.width, 65), np.linspace(0, camera.height, 65)
+    border_x = np.concatenate((x, x, np.zeros(65), np.full(65, camera.width)))
+    border_y = np.concatenate((np.zeros(65), np.full(65, camera.height), y, y))
+    rays = camera.rays(border_x, border_y)
+    with np.errstate(divide="ignore"):
+        to_floor = np.where(rays[:, 1] < 0, -camera.origin[1] / rays[:, 1], np.inf)
+        to_wall = np.where(rays[:, 2] < 0, (wall_z - camera.origin[2]) / rays[:, 2], np.inf)
+    seen = camera.origin + np.minimum(to_floor, to_wall)[:, None] * rays
+    margin = 0.1 + 0.05 * np.ptp(seen, axis=0)
+    low = np.minimum(seen.min(axis=0) - margin, (-least_m / 2, 0, wall_z))
+    high = np.maximum(seen.max(axis=0) + margin, (least_m / 2, least_m / 2, wall_z + least_m))
+    width, tall, deep = high[0] - low[0], high[1], high[2] - wall_z
+    middle = (low[0] + high[0]) / 2
+    square, faces, _ = shapes.rectangle()
+    unit = (square[:, :2] + (0, 1)) / 2  # x from -1/2 to 1/2, upwards from 0 to 1
+    material = Material(albedo=BACKDROP_ALBEDO, name="backdrop")
+    across, zero = middle + width * unit[:, 0], np.zeros(4)
+    floor = np.column_stack((across, zero, high[2] - deep * unit[:, 1]))
+    wall = np.column_stack((across, tall * unit[:, 1], zero + wall_z))
+    return [Surface(floor, faces, material, name="floor"), Surface(wall, faces, material, name="wall")]
+
+
+# --- Reading -----------------------------------------------------------------------------------------------------
+
+
+def _read(path: Path) -> list[_Part]:
+    """The file's triangle meshes, each moved by its node's transform, or an InputError in one line."""
+    kind = path.suffix.lower()
+    if kind not in EXTENSIONS:
+        raise InputError(f"{path}: extension {kind or '(none)'}, expected one of {' '.join(EXTENSIONS)}")
+    loaded = load_trimesh(path, kind)
+    try:
+        meshes = [(*loaded.graph[node], node) for node in loaded.graph.nodes_geometry]
+        found = [_part(loaded.geometry[name], np.asarray(pose), node) for pose, name, node in meshes]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:  # what trimesh works out only when it is asked for
+        raise InputError(f"{path}: broken {kind} file ({(str(error).splitlines() or [''])[0][:200]})") from None
+    parts = [part for part in found if part is not None]
+    if not found:
+        raise InputError(f"{path}: empty, no mesh in it")
+    if not parts:
+        raise InputError(f"{path}: has no faces (a point cloud or lines only)")
+    return [replace(parts[0], name=path.stem)] if len(parts) == 1 else parts
+
+
+def _part(mesh: Any, pose: np.ndarray, name: str) -> _Part | None:
+    """One mesh in world coordinates; None for points, lines and meshes without faces."""
+    faces = np.asarray(getattr(mesh, "faces", ()))
+    if faces.size == 0:
+        return None
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise InputError(f"vertices of {name} are not x y z")
+    check_faces(faces, len(vertices), name)
+    check_vertices(vertices, name)
+    _check_pose(pose, name)
+    uv = getattr(mesh.visual, "uv", None)
+    uv = None if uv is None or np.shape(uv) != (len(vertices), 2) or not np.isfinite(uv).all() else np.asarray(uv)
+    # trimesh computes normals on demand; only those that it read from the file are in its cache before that.
+    normals = np.asarray(mesh.vertex_normals) if "vertex_normals" in mesh._cache else None
+    if normals is not None:
+        usable = np.isfinite(normals).all() and (np.linalg.norm(normals, axis=1) > 0).all()
+        normals = shapes.transform_normals(normals, pose) if usable else None
+    if np.linalg.det(pose[:3, :3]) < 0:
+        faces = faces[:, ::-1]  # a mirrored mesh would have its faces inside out
+    return _Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual)
+
+
+def _check_pose(pose: np.ndarray, name: str) -> None:
+    """InputError unless a node's transform is affine, can be inverted, and keeps coordinates of a sensible size."""
+    largest = float(np.abs(pose).max()) if np.isfinite(pose).all() else math.inf
+    if largest > MAX_COORDINATE:
+        raise InputError(f"the transform of {name} holds {largest:g}, expected {MAX_COORDINATE:g} at the most")
+    if abs(np.linalg.det(pose[:3, :3])) < 1e-30:
+        raise InputError(f"the transform of {name} is not invertible")
+
+
+# --- Standing upright, at a sensible size, with sound faces ----------------------------------------------------------
+
+
+def _stand(path: Path, parts: list[_Part], notes: list[str], placing: Placing) -> list[_Part]:
+    """The parts y up, in metres, without useless faces, resting on y = 0 with their middle at x = z = 0."""
+    up = placing.up or ("z" if path.suffix.lower() == ".stl" else "y")
+    turn = TURNS[up]
+    if placing.up is None and up == "z":
+        notes.append("z taken as up, as is usual for .stl; --up says otherwise")
+    points = np.concatenate([part.vertices[np.unique(part.faces)] for part in parts]) @ turn[:3, :3].T
+    low, high = points.min(axis=0), points.max(axis=0)
+    with np.errstate(over="ignore"):
+        extent = float((high - low).max())
+    if not 0 < extent < math.inf:
+        raise InputError(f"{path}: its largest extent is {extent:g}, expected a solid body of finite size")
+    scale, warning = _scale(path, extent) if placing.scale is None else (placing.scale, [])
+    size = (
+        f"{extent:.4g} m kept" if scale == 1 else f"scaled by {scale:.3g}: {extent:.4g} to {round(scale * extent, 4)} m"
+    )
+    notes += [f"largest extent {size}", *warning]
+    pose = scale * turn
+    pose[:, 3] = -scale * (low[0] + high[0]) / 2, -scale * low[1], -scale * (low[2] + high[2]) / 2, 1
+    if scale * (high[1] - low[1]) < 1e-6:
+        pose[1, 3] += 1e-3
+        notes.append("flat and level: lifted by 1 mm off the floor")
+    moved = [_moved(part, pose) for part in parts]
+    sound = [part for part in (_sound(part, notes) for part in moved) if part is not None]
+    if not sound:
+        raise InputError(f"{path}: all of its faces are degenerate")
+    return sound
+
+
+def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
+    """Metres per unit of the file, and what to warn of."""
+    low, high = SENSIBLE_EXTENT_M
+    with path.open("rb") as file:
+        header = file.read(HEADER_BYTES).decode("latin-1")
+    names = "|".join(sorted(UNITS_M, key=len, reverse=True))
+    told = re.search(rf"\bunits?\b[^a-z0-9\n]{{0,9}}(?:are |in )?({names})", header, re.IGNORECASE)
+    if told is not None and path.suffix.lower() != ".glb":
+        unit = told[1].lower()
+        return UNITS_M[unit], [f"warning: unit {unit!r} taken from the file's own words"]
+    if low <= extent <= high:
+        return 1.0, []
+    for name, metres in (("millimetres", 1e-3), ("inches (or centimetres)", 0.0254)):
+        if low <= metres * extent <= high and path.suffix.lower() != ".glb":
+            return metres, [f"warning: no unit in the file, {extent:.4g} looks like {name}"]
+    return 1.0 / extent, ["warning: no unit makes a sensible size of it, so its size is made up"]
+
+
+def _moved(part: _Part, pose: np.ndarray) -> _Part:
+    normals = None if part.normals is None else shapes.transform_normals(part.normals, pose)
+    return replace(part, vertices=shapes.transform(part.vertices, pose), normals=normals)
+
+
+def _sound(part: _Part, notes: list[str]) -> _Part | None:
+    """The part without faces of no area, doubled faces and vertices that no face uses; None when nothing is left."""
+    a, b, c = part.vertices[part.faces].transpose(1, 0, 2)
+    flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 <= ZERO_AREA
+    # The same three points in any order are one face: its two sides reflect alike.
+    _, point = np.unique(part.vertices, axis=0, return_inverse=True)
+    corners = np.sort(point.ravel()[part.faces], axis=1)
+    first = np.zeros(len(corners), dtype=bool)
+    first[np.unique(corners, axis=0, return_index=True)[1]] = True
+    keep = ~flat & first
+    used, faces = np.unique(part.faces[keep], return_inverse=True)
+    counts = (
+        (int(flat.sum()), "degenerate faces"),
+        (int((~first & ~flat).sum()), "duplicate faces"),
+        (len(part.vertices) - len(np.unique(part.faces)), "unreferenced vertices"),
+    )
+    notes += [f"{part.name}: {what} dropped: {count}" for count, what in counts if count]
+    if not keep.any():
+        return None
+    uv, normals = (None if value is None else value[used] for value in (part.uv, part.normals))
+    return replace(part, vertices=part.vertices[used], faces=faces.reshape(-1, 3), uv=uv, normals=normals)
+
+
+def _surface(part: _Part, paint: _Paint) -> Surface:
+    return Surface(part.vertices, part.faces, paint.material(part), uv=part.uv, normals=part.normals, name=part.name)
+
+
+# --- Colours ---------------------------------------------------------------------------------------------------------
+
+
+class _Paint:
+    """The materials of a file: equal colours share one Material, equal images one Texture."""
+
+    def __init__(self, path: Path, notes: list[str]) -> None:
+        self.path, self.notes = path, notes
+        self.library = _read_mtl(path, notes) if path.suffix.lower() == ".obj" else {}
+        self.made: dict[object, Material] = {}
+
+    def material(self, part: _Part) -> Material:
+        """Diffuse, with the part's texture or colour as albedo, 0.6 where the file says nothing."""
+        try:
+            key, make = self._albedo(part)
+            if key not in self.made:
+                self.made[key] = Material(albedo=make(), name=f"{part.name} paint")
+        except InputError:
+            raise
+        except Exception as error:  # an image that decodes only now may be broken in many ways
+            reason = (str(error).splitlines() or ["no reason given"])[0]
+            raise InputError(f"{self.path}: broken colours of {part.name} ({reason})") from None
+        return self.made[key]
+
+    def _albedo(self, part: _Part) -> tuple[object, Callable[[], float | Texture]]:
+        """What tells the part's albedo from others, and a function that makes it."""
+        source = getattr(part.visual, "material", None)
+        if source is None:
+            value = self._vertex_colour(part)
+        elif self.path.suffix.lower() == ".obj":
+            entry = self.library.get(str(source.name), _Entry())
+            if entry.image is not None and part.uv is not None:
+                return entry.image, lambda: load_texture(entry.image)
+            value = entry.colour
+        else:
+            image = getattr(source, "baseColorTexture", None) or getattr(source, "image", None)
+            factor = getattr(source, "baseColorFactor", None)
+            tint = np.ones(4) if factor is None else np.asarray(factor) / 255
+            if image is not None and part.uv is not None:
+                return (id(image), tint.tobytes()), lambda: _image_albedo(image, tint)
+            value = None if factor is None else luminance(tint)  # glTF's factor is linear already
+        if value is None:
+            value = DEFAULT_ALBEDO
+            self.notes.append(f"{part.name}: no colour in the file, albedo {value:g}")
+        value = round(min(max(float(value), 0.0), 1.0), 9)
+        return value, lambda: value
+
+    def _vertex_colour(self, part: _Part) -> float | None:
+        """The mean of colours stored per vertex or face (linear in glTF, sRGB elsewhere), None where there are none."""
+        kind = getattr(part.visual, "kind", None)
+        if kind not in ("vertex", "face"):
+            return None
+        colours = np.asarray(part.visual.vertex_colors if kind == "vertex" else part.visual.face_colors)[:, :3] / 255
+        self.notes.append(f"{part.name}: one mean albedo in place of its colours per {kind}")
+        return float(luminance(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours)).mean())
+
+
+def _image_albedo(image: Any, tint: np.ndarray) -> Texture:
+    """The texture of an sRGB image held in memory, times a linear colour."""
+    pixels = srgb_to_linear(np.asarray(image.convert("RGB")) / 255)
+    return Texture(np.minimum(luminance(pixels * tint[:3]), 1.0), "base colour")
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """What an .mtl says of one material: linear luminance of Kd, file of map_Kd."""
+
+    colour: float | None = None
+    image: Path | None = None
+
+
+def _read_mtl(path: Path, notes: list[str]) -> dict[str, _Entry]:
+    """The material library of an OBJ; a texture that it names and that is not there is an InputError.
+
+    trimesh reads the library too, but silently drops such textures and rounds Kd to 8 bits.
+    """
+    text = _lenient_text(path)
+    lines = [line.split(maxsplit=1) for line in text.splitlines() if line.startswith("mtllib")]
+    named = [words[1].strip() for words in lines if len(words) == 2 and words[0] == "mtllib"]
+    if not named:
+        return {}
+    if len(named) > 1:
+        notes.append(f"of {len(named)} material files only {named[0]} is read")
+    if not (path.parent / named[0].replace("\\", "/")).exists():
+        notes.append(f"material file {named[0]} not found")
+        return {}
+    try:
+        library = file_inside(path.parent, named[0], "material file")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return _read_library(library)
+
+
+def _lenient_text(path: Path) -> str:
+    """Names and comments in any encoding, numbers never."""
+    return read_bytes(path).decode("utf-8", errors="replace")
+
+
+def _read_library(library: Path) -> dict[str, _Entry]:
+    entries: dict[str, _Entry] = {}
+    name = ""
+    for line in _lenient_text(library).splitlines():
+        key, rest = (*line.split(maxsplit=1), "", "")[:2]
+        if key.lower() == "newmtl":
+            name = " ".join(rest.split())
+            entries[name] = _Entry()
+        elif key.lower() == "kd" and name:
+            entries[name] = replace(entries[name], colour=_kd(library, rest))
+        elif key.lower() == "map_kd" and name:
+            entries[name] = replace(entries[name], image=_map_kd(library, name, rest))
+    return entries
+
+
+def _kd(library: Path, text: str) -> float:
+    try:
+        colour = [float(word) for word in text.split()[:3]]
+        return float(luminance(srgb_to_linear(np.clip(colour * 3 if len(colour) == 1 else colour, 0, 1))))
+    except ValueError:
+        raise InputError(f"{library}: Kd {text.strip()!r}, expected three numbers") from None
+
+
+def _map_kd(library: Path, name: str, text: str) -> Path:
+    """The texture file of a map_Kd line, whose options (-s 1 1 1 ...) are left out."""
+    file = text.strip()
+    file = file.split()[-1] if file.startswith("-") else file
+    try:
+        return file_inside(library.parent, file, f"texture of material {name}")
+    except InputError as error:
+        raise InputError(f"{library}: {error}") from None

@@ -1,0 +1,262 @@
+"""Mitsuba's shape plugins as surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from scenes.arrays import check_faces
+from scenes.errors import InputError
+from scenes.io.inputs import read_bytes
+from scenes.io.mesh_files import check_vertices, load_trimesh
+from scenes.io.mitsuba_bsdf import Look, Materials
+from scenes.io.mitsuba_nodes import Document
+from scenes.io.mitsuba_plugin import Plugin
+from scenes.io.serialized import read_serialized
+from scenes.library.things import shapes
+from scenes.model import Surface
+
+# At 128 segments a disk's area is 4e-4 too small, at 5 subdivisions a sphere's 3e-4: under the 1e-3 that is promised.
+SEGMENTS = 128
+SUBDIVISIONS = 5
+
+# Side of Mitsuba's cube -> the directions in which its u and v grow, in the order of shapes.box: z, -z, x, -x, y, -y.
+_CUBE_UV = (
+    ((0, 1, 0), (1, 0, 0)),
+    ((0, -1, 0), (1, 0, 0)),
+    ((0, 1, 0), (0, 0, -1)),
+    ((0, 1, 0), (0, 0, 1)),
+    ((-1, 0, 0), (0, 0, -1)),
+    ((0, 0, 1), (1, 0, 0)),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles before to_world; uv with Mitsuba's v, which is 0 at the top row of an image.
+
+    `keeps_side` says that the outside stays outside under a mirroring to_world, as Mitsuba has it where normals are
+    known beside the faces.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    keeps_side: bool = True
+    smooth: bool = False
+
+
+class Shapes:
+    """Builds surfaces; every mesh file is read once."""
+
+    def __init__(self, document: Document, materials: Materials) -> None:
+        self._document = document
+        self._materials = materials
+        self._files: dict[tuple[Path, int], Mesh] = {}
+
+    def check(self, plugin: Plugin) -> None:
+        """Refuse a <shape> that has no counterpart here, in one line, before any file is read."""
+        if plugin.type in ("shapegroup", "instance"):
+            raise plugin.fail(f"shape {plugin.type!r} is not supported, write every copy out as .obj or .ply")
+        if plugin.type not in _BUILDERS:
+            raise plugin.fail(f"shape {plugin.type!r} is not supported, expected one of {', '.join(_BUILDERS)}")
+        plugin.refuse("medium", "volume", "phase", "subsurface", "sensor", "shape")
+        self._materials.check(plugin)
+
+    def surface(self, plugin: Plugin) -> Surface:
+        """The surface of a <shape>, in the world, with its material and its light."""
+        name = plugin.id or Path(plugin.string("filename", plugin.type).replace("\\", "/")).stem
+        mesh = _placed(_BUILDERS[plugin.type](self, plugin), plugin)
+        look = self._materials.of_shape(plugin)
+        emission = self._emission(plugin)
+        plugin.note_unused()
+        values = {"uv": _project_uv(mesh.uv, look), "normals": mesh.normals, "emission": emission, "name": name}
+        try:
+            return Surface(mesh.vertices, mesh.faces, look.material, **values)
+        except InputError as error:
+            raise plugin.fail(f"{plugin.string('filename', '')}: {error}".removeprefix(": ")) from None
+
+    def _emission(self, plugin: Plugin) -> float:
+        """Radiance of an area light on the shape."""
+        emitters = plugin.nested("emitter")
+        if len(emitters) > 1:
+            raise plugin.fail(f"has {len(emitters)} emitters, expected one")
+        if not emitters:
+            return 0.0
+        emitter = emitters[0]
+        if emitter.type != "area":
+            raise emitter.fail(f"emitter {emitter.type!r} on a shape is not supported, expected area")
+        radiance = self._materials.mean(emitter, "radiance", 1.0)
+        emitter.ignore(("sampling_weight",))
+        emitter.note_unused()
+        return radiance
+
+    def file(self, plugin: Plugin, kind: str) -> Mesh:
+        """A mesh file with the uv and vertex normals that it carries, v as the file has it."""
+        filename = plugin.string("filename")
+        path = self._document.file(plugin.element, filename, "mesh")
+        index = plugin.integer("shape_index", 0) if kind == "serialized" else 0
+        key = path.resolve(), index
+        if key not in self._files:
+            try:
+                self._files[key] = _read(path, kind) if kind != "serialized" else _read_serialized(path, index)
+            except InputError as error:
+                raise plugin.fail(f"{filename}: {str(error).removeprefix(f'{path}: ')}") from None
+            except Exception as error:  # what trimesh works out only when it is asked for
+                reason = (str(error).splitlines() or [type(error).__name__])[0]
+                raise plugin.fail(f"{filename}: broken .{kind} file ({reason})") from None
+        mesh = self._files[key]
+        if len(mesh.faces) == 0:
+            raise plugin.fail(f"{filename}: holds no triangles")
+        check_faces(mesh.faces, len(mesh.vertices), str(path))
+        return mesh
+
+
+def _read(path: Path, kind: str) -> Mesh:
+    """All parts of an .obj or .ply file as one mesh; materials in the file are not looked at."""
+    import trimesh
+
+    options = {}
+    if kind == "ply":
+        # Only uv per face corner need vertices to be split; splitting loses the normals of the file.
+        options["fix_texture"] = b"texcoord" in read_bytes(path).partition(b"end_header")[0]
+    loaded = load_trimesh(path, f".{kind}", skip_materials=True, **options)
+    parts = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if not parts:
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    check_vertices(vertices, path.name)
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, first, strict=False)])
+    uvs = [getattr(part.visual, "uv", None) for part in parts]
+    # trimesh keeps the normals of a file in the cache, where its own exporters look for them too; None if absent.
+    normals = [part._cache["vertex_normals"] for part in parts]
+    return Mesh(vertices, faces, _joined(uvs), _joined(normals))
+
+
+def _read_serialized(path: Path, index: int) -> Mesh:
+    """One mesh of a .serialized file."""
+    found = read_serialized(path, index)
+    check_vertices(found.vertices, path.name)
+    return Mesh(found.vertices, found.faces, found.uv, found.normals)
+
+
+def _joined(arrays: list[np.ndarray | None]) -> np.ndarray | None:
+    return None if any(array is None for array in arrays) else np.concatenate(arrays)
+
+
+def _obj(builder: Shapes, plugin: Plugin) -> Mesh:
+    return _from_file(builder.file(plugin, "obj"), plugin, flip_v=True)
+
+
+def _ply(builder: Shapes, plugin: Plugin) -> Mesh:
+    return _from_file(builder.file(plugin, "ply"), plugin, flip_v=False)
+
+
+def _serialized(builder: Shapes, plugin: Plugin) -> Mesh:
+    plugin.ignore(("max_smooth_angle",))
+    return _from_file(builder.file(plugin, "serialized"), plugin, flip_v=False)
+
+
+def _from_file(mesh: Mesh, plugin: Plugin, *, flip_v: bool) -> Mesh:
+    """face_normals drops vertex normals; a file without any gets smooth ones, as in Mitsuba."""
+    if mesh.uv is not None and plugin.boolean("flip_tex_coords", flip_v):
+        mesh = replace(mesh, uv=_flipped_v(mesh.uv))
+    plugin.ignore(("flip_tex_coords",))
+    if plugin.boolean("face_normals", False):
+        return replace(mesh, normals=None, keeps_side=False)
+    return replace(mesh, keeps_side=mesh.normals is not None, smooth=mesh.normals is None)
+
+
+def _rectangle(builder: Shapes, plugin: Plugin) -> Mesh:
+    return Mesh(*shapes.rectangle())
+
+
+def _cube(builder: Shapes, plugin: Plugin) -> Mesh:
+    vertices, faces, _ = shapes.box()
+    directions = np.repeat(np.array(_CUBE_UV, dtype=float), 4, axis=0)
+    return Mesh(vertices, faces, (1 + np.einsum("nij,nj->ni", directions, vertices)) / 2)
+
+
+def _sphere(builder: Shapes, plugin: Plugin) -> Mesh:
+    centre, radius = plugin.point("center", (0, 0, 0)), _positive(plugin, "radius")
+    vertices, faces, uv = shapes.sphere(1.0, SUBDIVISIONS)
+    # Mitsuba turns a mirrored sphere inside out, alone among its shapes.
+    return Mesh(centre + radius * vertices, faces, _flipped_v(uv), vertices, keeps_side=False)
+
+
+def _disk(builder: Shapes, plugin: Plugin) -> Mesh:
+    vertices, faces, uv = shapes.disk(1.0, SEGMENTS)
+    return Mesh(vertices, faces, _flipped_v(uv))
+
+
+def _cylinder(builder: Shapes, plugin: Plugin) -> Mesh:
+    p0, p1, radius = plugin.point("p0", (0, 0, 0)), plugin.point("p1", (0, 0, 1)), _positive(plugin, "radius")
+    length = np.linalg.norm(p1 - p0)
+    if length == 0:
+        raise plugin.fail("p0 and p1 are the same point")
+    vertices, faces, uv = shapes.cylinder(p0, p1, radius, segments=SEGMENTS)
+    axis = (p1 - p0) / length
+    spokes = (vertices - p0) - np.outer((vertices - p0) @ axis, axis)
+    return Mesh(vertices, faces, _flipped_v(uv), spokes / radius)
+
+
+_BUILDERS: dict[str, Callable[[Shapes, Plugin], Mesh]] = {
+    "obj": _obj,
+    "ply": _ply,
+    "serialized": _serialized,
+    "rectangle": _rectangle,
+    "cube": _cube,
+    "sphere": _sphere,
+    "disk": _disk,
+    "cylinder": _cylinder,
+}
+
+
+def _positive(plugin: Plugin, name: str) -> float:
+    value = plugin.number(name, 1.0)
+    if value <= 0:
+        raise plugin.fail(f"{name} {value:g} is not above 0")
+    return value
+
+
+def _placed(mesh: Mesh, plugin: Plugin) -> Mesh:
+    """The mesh moved by to_world, its faces counterclockwise seen from the side that Mitsuba calls outside."""
+    matrix = plugin.transform("to_world")
+    mirrored = np.linalg.det(matrix[:3, :3]) < 0
+    vertices, faces, normals = shapes.transform(mesh.vertices, matrix), mesh.faces, mesh.normals
+    if normals is not None:
+        normals = shapes.transform_normals(normals, matrix)
+        if mirrored and not mesh.keeps_side:
+            normals = -normals
+    if mirrored and mesh.keeps_side:
+        faces = faces[:, ::-1]
+    if mesh.smooth and np.isfinite(vertices).all():
+        normals = _smooth_normals(vertices, faces)
+    if plugin.boolean("flip_normals", False):
+        faces, normals = faces[:, ::-1], None if normals is None else -normals
+    return replace(mesh, vertices=vertices, faces=faces, normals=normals)
+
+
+def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vertex normals as the mean of the faces around, weighted by the angle each spans."""
+    import trimesh
+
+    return trimesh.Trimesh(vertices, faces, process=False).vertex_normals
+
+
+def _project_uv(uv: np.ndarray | None, look: Look) -> np.ndarray | None:
+    """Mitsuba's uv, moved as the textures ask, with v upwards as this project has it."""
+    if uv is None:
+        return None
+    if look.to_uv is not None:
+        uv = uv @ look.to_uv[:2, :2].T + look.to_uv[:2, 2]
+    return _flipped_v(uv)
+
+
+def _flipped_v(uv: np.ndarray) -> np.ndarray:
+    return np.column_stack((uv[:, 0], 1 - uv[:, 1]))

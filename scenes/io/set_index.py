@@ -1,0 +1,43 @@
+"""The index of a rendered set's folder, `index.jsonl`: one JSON object a line, in the order of the views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scenes.errors import InputError, require
+from scenes.io.inputs import file_inside, parse_json, read_text
+
+
+def read_set_index(folder: Path) -> list[dict]:
+    """Return the records of a set's finished views in order; those of failed views are left out.
+
+    Every `file` of a record is a regular file inside the folder. Raises InputError in one line where there is no
+    index, and where a line of it is damaged.
+    """
+    folder = Path(folder)
+    index = folder / "index.jsonl"
+    require(index.exists(), f"{folder}: no set of scene2spad (no index.jsonl); make one with scene2spad dataset")
+    text = read_text(index, "index")
+    require(not text or text.endswith("\n"), f"{index}: is damaged, its end is missing; run scene2spad dataset again")
+    records, last = [], -1
+    for number, line in enumerate(text.split("\n")[:-1], start=1):
+        try:
+            last, record = _checked(folder, line, last)
+        except InputError as error:
+            raise InputError(f"{index}: is damaged, line {number} {error}; run scene2spad dataset again") from None
+        if "failed" not in record:
+            records.append(record)
+    return records
+
+
+def _checked(folder: Path, line: str, last: int) -> tuple[int, dict]:
+    """Return a line's view and record; InputError where it is none, or not of a later view than `last`."""
+    record = parse_json(line)
+    require(isinstance(record, dict), "holds no JSON object")
+    view, file = record.get("view"), record.get("file")
+    numbered = isinstance(view, int) and not isinstance(view, bool)
+    require(numbered and view > last, f"is of view {view!r}, expected a whole number above {last}")
+    if "failed" not in record:
+        require(isinstance(file, str), f"names the file {file!r}, expected a path in the folder")
+        file_inside(folder, file, "view", "the set's folder")
+    return view, record

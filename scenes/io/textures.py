@@ -1,0 +1,126 @@
+"""Images from files, as the single-channel linear textures of a scene."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scenes.errors import InputError, require
+from scenes.files import silenced
+from scenes.io.inputs import regular_file
+from scenes.model import Texture
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+MAX_PIXELS = 1 << 26
+MAX_EXR_VALUES = 1 << 27  # of all channels: 8192 x 4096 RGBA, 1 GiB as float64
+
+
+def luminance(rgb: np.ndarray) -> np.ndarray:
+    """Rec. 709 luminance of linear RGB (..., 3): the one number this project keeps of a colour."""
+    rgb = np.asarray(rgb)[..., :3]
+    return rgb @ np.array([0.2126, 0.7152, 0.0722], dtype=np.result_type(rgb, np.float32))
+
+
+def srgb_to_linear(value: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB-encoded values in [0, 1] (IEC 61966-2-1)."""
+    value = np.asarray(value, dtype=np.float64)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def load_texture(path: Path, *, linear: bool = False, channel: str = "luminance") -> Texture:
+    """Read an image file (.png .jpg .bmp .tga .tif through Pillow, .exr through OpenEXR) as a linear texture.
+
+    `linear` says that the numbers of an 8- or 16-bit file are linear already, else they are taken as sRGB (.exr is
+    always linear). `channel` is "luminance", or "alpha" for the alpha channel (luminance where there is none).
+    Raises InputError naming the file when it is missing, broken or of another type.
+    """
+    path = regular_file(path, "texture file")
+    if path.suffix.lower() == ".exr":
+        return Texture(_exr_pixels(path, channel), path.name)
+    return Texture(_image_pixels(path, linear, channel), path.name)
+
+
+def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
+    with opened_image(path) as image:
+        if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV", "1"):
+            image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
+        bands = image.getbands()
+        values = np.asarray(image)
+    values = values.reshape(*values.shape[:2], -1)
+    alpha = channel == "alpha" and bands[-1] == "A"
+    values = values[..., -1:] if alpha else values[..., :3]
+    if values.dtype in (np.uint8, np.uint16):
+        # by table, in float32: a large image must not become many times its size
+        levels = np.arange(np.iinfo(values.dtype).max + 1) / np.iinfo(values.dtype).max
+        table = (levels if linear or alpha else srgb_to_linear(levels)).astype(np.float32)
+        values = table[values]
+    else:
+        values = values / (65535 if bands == ("I",) else 1)
+        values = values if linear or alpha else srgb_to_linear(values)
+    if alpha:
+        return values[..., 0]
+    return luminance(values) if len(bands) >= 3 else values[..., 0]
+
+
+@contextmanager
+def opened_image(path: Path, what: str = "image file") -> Iterator[Image.Image]:
+    """An image through Pillow, its declared size checked before any pixel is decoded.
+
+    What goes wrong while its pixels are taken is an InputError too, in one line that names the file.
+    """
+    from PIL import Image
+
+    path = regular_file(path, what)
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
+            size = image.width, image.height
+            require(size[0] * size[1] <= MAX_PIXELS, f"{size[0]} x {size[1]} pixels is over the limit of {MAX_PIXELS}")
+            yield image
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Image.UnidentifiedImageError:
+        raise InputError(f"{path}: not an image this reader knows (.png .jpg .bmp .tga .tif .exr)") from None
+    except Exception as error:  # each of Pillow's formats has its own
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: broken image file ({reason[:160]})") from None
+
+
+def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:
+    """The channels of a flat EXR, float64, by name, its declared size checked before any pixel is decoded."""
+    import OpenEXR
+
+    path = regular_file(path, what)
+    try:
+        with silenced():
+            with OpenEXR.File(str(path), header_only=True) as file:
+                low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
+                channels = len(file.header()["channels"])
+            wide, tall = (high - low + 1).tolist()
+            require(wide > 0 and tall > 0, f"data window of {wide} x {tall} pixels")
+            values = wide * tall * channels
+            said = f"{wide} x {tall} pixels of {channels} channels are over the limit of {MAX_EXR_VALUES} values"
+            require(values <= MAX_EXR_VALUES, said)
+            with OpenEXR.File(str(path), separate_channels=True) as file:
+                return {name: np.asarray(part.pixels, np.float64) for name, part in file.channels().items()}
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:  # OpenEXR raises bare exceptions of its own
+        raise InputError(f"{path}: broken EXR file ({(str(error).splitlines() or ['no reason given'])[0]})") from None
+
+
+def _exr_pixels(path: Path, channel: str) -> np.ndarray:
+    pixels = exr_channels(path, "texture file")
+    if channel == "alpha" and "A" in pixels:
+        return pixels["A"]
+    if {"R", "G", "B"} <= pixels.keys():
+        return luminance(np.stack([pixels[name] for name in "RGB"], axis=-1))
+    if "Y" in pixels:
+        return pixels["Y"]
+    raise InputError(f"{path}: channels {', '.join(sorted(pixels))}, expected R G B or Y")

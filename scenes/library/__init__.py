@@ -1,0 +1,1 @@
+"""Make procedural scenes and scene sets by name."""

@@ -1,0 +1,1 @@
+"""Make the things that procedural scenes are furnished with."""

@@ -1,0 +1,194 @@
+"""Building blocks of procedural scenes: boxes, turned and swept shapes, sheets, and pieces that are set down.
+
+A piece of furniture is built around its own origin, standing on y = 0 with its front towards +z. Lengths are metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from scenes.library.things import shapes
+from scenes.model import Material, Surface
+
+Random = np.random.Generator
+Vector = Sequence[float]
+Palette = dict[str, Material]  # one object per paint, cloth or wood, shared by all that is made of it
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Something that can be set down as a whole, and the level places on it that smaller things may stand on.
+
+    tops: rows of x, z, half width, half depth and height y of each such place.
+    """
+
+    surfaces: tuple[Surface, ...]
+    tops: tuple[tuple[float, float, float, float, float], ...] = ()
+
+    @cached_property
+    def low(self) -> np.ndarray:
+        return np.min([s.vertices.min(axis=0) for s in self.surfaces], axis=0)
+
+    @cached_property
+    def high(self) -> np.ndarray:
+        return np.max([s.vertices.max(axis=0) for s in self.surfaces], axis=0)
+
+
+def box(low: Vector, high: Vector) -> shapes.Shape:
+    """An axis-aligned box between two corners."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    vertices, faces, uv = shapes.box(high - low)
+    return vertices + (low + high) / 2, faces, uv
+
+
+def post(x: float, z: float, half: float, bottom: float, top: float) -> shapes.Shape:
+    """An upright square post around (x, z)."""
+    return box((x - half, bottom, z - half), (x + half, top, z + half))
+
+
+def panel(centre: Vector, half_right: Vector, half_up: Vector, tile_m: float | None = None) -> shapes.Shape:
+    """A rectangle seen from the side where its first half edge points right and its second up.
+
+    Its texture fills it once, or repeats every `tile_m` metres.
+    """
+    right, up = np.asarray(half_right, float), np.asarray(half_up, float)
+    square, faces, uv = shapes.rectangle()
+    if tile_m is not None:
+        uv = uv * (2 * np.linalg.norm(right) / tile_m, 2 * np.linalg.norm(up) / tile_m)
+    return np.asarray(centre, float) + square[:, :1] * right + square[:, 1:2] * up, faces, uv
+
+
+def joined(name: str, material: Material, *parts: shapes.Shape, emission: float = 0.0) -> Surface:
+    """Several shapes as one surface."""
+    starts = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts[:-1]])
+    return Surface(
+        np.concatenate([vertices for vertices, _, _ in parts]),
+        np.concatenate([faces + start for start, (_, faces, _) in zip(starts, parts, strict=True)]),
+        material,
+        uv=np.concatenate([uv for _, _, uv in parts]),
+        emission=emission,
+        name=name,
+    )
+
+
+def placed(surfaces: list[Surface], x: float, z: float, *, y: float = 0.0, turn_deg: float = 0.0) -> list[Surface]:
+    """A piece of furniture turned about the vertical (positive: its front from +z towards +x) and set down."""
+    c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    pose = np.array(((c, 0, s, x), (0, 1, 0, y), (-s, 0, c, z), (0, 0, 0, 1)))
+    moved = []
+    for surface in surfaces:
+        normals = None if surface.normals is None else shapes.transform_normals(surface.normals, pose)
+        moved.append(replace(surface, vertices=shapes.transform(surface.vertices, pose), normals=normals))
+    return moved
+
+
+def smooth_normals(points: np.ndarray, key: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted normals per vertex; vertices of equal `key` (the doubled seam of a sphere) share one normal."""
+    _, same = np.unique(np.round(key, 9) + 0.0, axis=0, return_inverse=True)
+    a, b, c = points[faces].transpose(1, 0, 2)
+    across = np.cross(b - a, c - a)
+    total = np.zeros((same.max() + 1, 3))
+    for corner in faces.T:
+        np.add.at(total, same.ravel()[corner], across)
+    normals = total[same.ravel()]
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def lathe(profile: Sequence[Vector], segments: int = 24) -> shapes.Shape:
+    """The surface that a profile of (radius, height) points sweeps around the y axis; u around, v along the profile.
+
+    A profile that rises has its outside outside. Points lie on the true surface of revolution.
+    """
+    points = np.asarray(profile, float)
+    turn = np.linspace(0, 2 * np.pi, segments + 1)
+    turn[-1] = 0.0
+    ring = np.column_stack((np.cos(turn), np.sin(turn)))
+    radius, height = np.repeat(points[:, 0], segments + 1), np.repeat(points[:, 1], segments + 1)
+    around = np.tile(ring, (len(points), 1))
+    vertices = np.column_stack((radius * around[:, 0], height, -radius * around[:, 1]))
+    v, u = np.meshgrid(np.linspace(0, 1, len(points)), np.linspace(0, 1, segments + 1), indexing="ij")
+    return vertices, grid_faces(len(points), segments + 1), np.column_stack((u.ravel(), v.ravel()))
+
+
+def tube(points: np.ndarray, radius: float, segments: int = 8) -> shapes.Shape:
+    """A round wire of that radius along a polyline (n, 3), without caps; its frame is carried along without twist."""
+    points = np.asarray(points, float)
+    along = np.gradient(points, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    frame = shapes.axis_frame(along[0])
+    across = [frame[:, 0]]
+    for direction in along[1:]:
+        side = across[-1] - direction * (direction @ across[-1])
+        across.append(side / np.linalg.norm(side))
+    first = np.array(across)
+    second = np.cross(along, first)
+    turn = np.linspace(0, 2 * np.pi, segments + 1)
+    turn[-1] = 0.0
+    rings = points[:, None] + radius * (
+        np.cos(turn)[:, None] * first[:, None] + np.sin(turn)[:, None] * second[:, None]
+    )
+    v, u = np.meshgrid(np.linspace(0, 1, len(points)), np.linspace(0, 1, segments + 1), indexing="ij")
+    return rings.reshape(-1, 3), grid_faces(len(points), segments + 1), np.column_stack((u.ravel(), v.ravel()))
+
+
+def sheet(points: np.ndarray) -> shapes.Shape:
+    """A grid of points (rows, columns, 3) as triangles, seen from where columns run right and rows run up."""
+    rows, columns = points.shape[:2]
+    v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
+    return points.reshape(-1, 3).astype(float), grid_faces(rows, columns), np.column_stack((u.ravel(), v.ravel()))
+
+
+def grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Two triangles a cell of a grid of rows x columns vertices, counterclockwise with columns right and rows up."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, up = corner + 1, corner + columns
+    return np.stack((corner, right, up + 1, corner, up + 1, up), axis=-1).reshape(-1, 3)
+
+
+def turned(shape: shapes.Shape, axis: str, degrees: float, by: Vector = (0.0, 0.0, 0.0)) -> shapes.Shape:
+    """A shape turned about an axis through the origin (right-handed), then moved."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    rotation = np.eye(3)
+    rotation[i, i], rotation[i, j], rotation[j, i], rotation[j, j] = c, -s, s, c
+    vertices, faces, uv = shape
+    return vertices @ rotation.T + np.asarray(by, float), faces, uv
+
+
+def moved(shape: shapes.Shape, by: Vector) -> shapes.Shape:
+    return shape[0] + np.asarray(by, float), shape[1], shape[2]
+
+
+def with_normals(surfaces: Sequence[Surface], brightness: float = 1.0) -> list[Surface]:
+    """The surfaces with shading normals, area-weighted means over the faces that share a vertex; their emission scaled.
+
+    Where corners have vertices of their own, as on a box, that is the face's own normal. Surfaces that have normals
+    keep them. All are worked on at once: a room has a hundred small ones.
+    """
+    bare = [surface for surface in surfaces if surface.normals is None]
+    found = iter(_mean_normals(bare) if bare else ())
+    shaded = []
+    for surface in surfaces:
+        normals = next(found) if surface.normals is None else surface.normals
+        shaded.append(replace(surface, normals=normals, emission=brightness * surface.emission))
+    return shaded
+
+
+def _mean_normals(surfaces: Sequence[Surface]) -> list[np.ndarray]:
+    starts = np.cumsum([0] + [len(surface.vertices) for surface in surfaces])
+    points = np.concatenate([surface.vertices for surface in surfaces])
+    faces = np.concatenate([surface.faces + start for surface, start in zip(surfaces, starts[:-1], strict=True)])
+    a = points[faces[:, 0]]
+    (ux, uy, uz), (vx, vy, vz) = (points[faces[:, 1]] - a).T, (points[faces[:, 2]] - a).T
+    across = (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
+    total = np.column_stack(
+        [sum(np.bincount(corner, part, len(points)) for corner in faces.T) for part in across],
+    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    normals = np.where(length > 0, total / np.where(length > 0, length, 1), (0.0, 1.0, 0.0))
+    return np.split(normals, starts[1:-1])

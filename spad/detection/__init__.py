@@ -1,0 +1,1 @@
+"""Turn a transient's flux into detections: laws, draws, training patches."""

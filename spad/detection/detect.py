@@ -1,0 +1,204 @@
+"""Transient -> Histogram: draw what the sensor detects, by the law that its flux and its detector ask for."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+from typing import Literal
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from render.transient import Transient
+from scenes.errors import InputError
+from spad.detection.exposure import Exposure, Progress, counts_of, timestamps_of
+from spad.detection.flux import expected_counts, rates_for
+from spad.detection.glints import glint_warning, signal_shares
+from spad.detection.laws import LOW_FLUX
+from spad.detection.photons import expected_signal, light_of
+from spad.formats.histogram import Histogram
+from spad.formats.timestamps import Timestamps
+from spad.sensor.model import PhotonBudget, Sensor
+
+Model = Literal["auto", "poisson", "first-photon", "free-running"]
+MODELS: tuple[str, ...] = ("auto", "poisson", "first-photon", "free-running")
+_HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
+
+
+def sense(
+    transient: Transient,
+    sensor: Sensor,
+    budget: PhotonBudget,
+    *,
+    seed: int = 0,
+    model: Model = "auto",
+    dark_map_hz: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> Histogram:
+    """Record one exposure as a histogram.
+
+    poisson        n_i ~ Poisson(lambda_i) in every pixel and bin, independently: exact at low flux
+    first-photon   a synchronous detector counts the first photon of each cycle: one multinomial over all cycles
+    free-running   event by event, blind for the sensor's dead time after each detection
+    auto           poisson up to 1 % primary detections per cycle (or dead time, if longer) in the brightest pixel;
+                   above it first-photon where the detector is armed at every cycle, else free-running
+
+    Crosstalk is added where the sensor has it. `dark_map_hz` (H, W) takes the place of the sensor's dark count rate,
+    NaN in dead pixels. Every 1024 pixels have a stream of their own, SeedSequence(seed, spawn_key=(stage, 0, block)).
+    `meta` holds the plan, `pile_up`: the expected primary detections per cycle of the brightest pixel, before dead time
+    and pile-up take theirs (what is counted after them is in `counts`); the share of signal detections that wrapped
+    around the period, the share of the background that is dark counts, the shares of the signal in the brightest pixel
+    and in the brightest thousandth of pixels, and the median pixel's signal (`spad.detection.glints`). Raises
+    InputError for an unknown law, one that the detector cannot follow, and more than 2^31 - 1 counts in a bin.
+    """
+    exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
+    return Histogram(counts=counts_of(exposure, progress), sensor=sensor, budget=budget, **truth)
+
+
+def sense_timestamps(
+    transient: Transient,
+    sensor: Sensor,
+    budget: PhotonBudget,
+    *,
+    seed: int = 0,
+    model: Model = "auto",
+    dark_map_hz: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> Timestamps:
+    """The same exposure as `sense`, detection for detection, as timestamps: no histogram where photons are few."""
+    exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
+    return timestamps_of(exposure, truth["meta"], progress)
+
+
+def stream_timestamps(
+    transient: Transient,
+    sensor: Sensor,
+    budget: PhotonBudget,
+    *,
+    parts: int,
+    seed: int = 0,
+    model: Model = "auto",
+    dark_map_hz: np.ndarray | None = None,
+) -> Iterator[Timestamps]:
+    """One exposure in `parts` equal parts, one after the other, for exposures larger than memory.
+
+    `Timestamps.merged` of all is one draw of `sense_timestamps` (another one for each number of parts). A dead time
+    that lasts from one part into the next is carried over. Raises InputError for fewer cycles than parts.
+    """
+    if not 1 <= parts <= sensor.cycles:
+        raise InputError(f"{parts} parts of an exposure of {sensor.cycles:g} cycles, expected 1 to that many")
+    exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
+    ready = np.zeros(transient.height * transient.width)
+    for part in range(parts):
+        yield timestamps_of(replace(exposure, part=part, parts=parts), truth["meta"], None, ready)
+
+
+def expected_in_pixel(
+    transient: Transient, sensor: Sensor, budget: PhotonBudget, row: int, column: int, *, seed: int = 0
+) -> np.ndarray:
+    """Expected primary detections per bin of one pixel, (T,) float64: the rates that `sense` draws from."""
+    pixel = row * transient.width + column
+    rates = rates_for(transient, sensor, budget, seed=seed)
+    rate, _ = expected_counts(transient, sensor, rates, slice(pixel, pixel + 1))
+    return rate[0].numpy()
+
+
+# The plan
+
+
+def _planned(
+    transient: Transient,
+    sensor: Sensor,
+    budget: PhotonBudget,
+    seed: int,
+    model: str,
+    dark_map_hz: np.ndarray | None,
+) -> tuple[Exposure, dict]:
+    """The exposure, and what its histogram holds beside the counts."""
+    if model not in MODELS:
+        raise InputError(f"detection model {model!r} is unknown, expected one of {', '.join(MODELS)}")
+    rates = rates_for(transient, sensor, budget, dark_map_hz=dark_map_hz, seed=seed)
+    light = light_of(transient, sensor, rates, slice(0, transient.height * transient.width))
+    exposure = Exposure(transient, sensor, rates, light, model, seed)
+    signal, wrapped = expected_signal(transient, sensor, rates, light)
+    # background falls on the whole period, also where it has no bins
+    background = rates.background * (sensor.bins / sensor.bins_per_period)
+    pile_up = float((signal + background).max(initial=0) / sensor.cycles)
+    chosen, reason = choose_model(model, pile_up, sensor)
+    reasons = [*rates.reasons, reason]
+    if sensor.crosstalk:
+        reasons.append(f"crosstalk: a detection fires each of its neighbours with probability {sensor.crosstalk:.3%}")
+    share = wrapped / (budget.signal * signal.size) if wrapped > 0 else 0.0
+    if wrapped > 0:
+        reasons.append(f"wrap: {share:.3%} of the signal arrives after the period of {sensor.range_m:.3f} m and wraps")
+    shares = signal_shares(signal)
+    warning = glint_warning(shares)
+    if warning is not None:
+        reasons.append(warning)
+    meta = {
+        "seed": seed,
+        "model": chosen,
+        "plan": reasons,
+        "pile_up": pile_up,
+        "wrapped": share,
+        "dark_share": rates.dark_share,
+        "brightest_pixel": shares.brightest_pixel,
+        "brightest_thousandth": shares.brightest_thousandth,
+        "median_signal": shares.median,
+        "transient": {**transient.meta, "sha256": _sha256(transient)},
+        "versions": _versions(),
+    }
+    truth = {
+        "depth_m": transient.depth_m,
+        "mixed": transient.mixed,
+        "albedo": transient.albedo,
+        "expected_signal": signal.astype(np.float32),
+        "expected_background": background.astype(np.float32),
+        "meta": meta,
+    }
+    return replace(exposure, model=chosen), truth
+
+
+def _sha256(transient: Transient) -> str:
+    """Its hash, computed once: one render is sensed many times, and cannot be written to."""
+    if transient not in _HASHES:
+        _HASHES[transient] = transient.sha256()
+    return _HASHES[transient]
+
+
+@lru_cache(maxsize=1)
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("scene2spad", "numpy", "torch")}
+
+
+def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
+    """Choose the detection law for `pile_up` primary detections per cycle in the brightest pixel, and say why.
+
+    Raises InputError for the first-photon law where the dead time outlasts the period.
+    """
+    outlasts = sensor.dead_time_s > sensor.period_s
+    if asked == "first-photon" and outlasts:
+        raise InputError(
+            f"model first-photon: the dead time of {sensor.dead_time_s:g} s is longer than the period of "
+            f"{sensor.period_s:g} s, the detector is not armed at every cycle; use free-running"
+        )
+    said = f"{pile_up:.2%} primary detections a cycle in the brightest pixel ({sensor.cycles:,.0f} cycles)"
+    blind = pile_up * max(1.0, sensor.dead_time_s / sensor.period_s)
+    if outlasts:
+        said += f", {blind:.2%} a dead time"
+    if asked != "auto":
+        left_out = ": pile-up and dead time, which matter from 1 %, are left out"
+        return asked, f"model: {asked} as asked, at {said}{left_out if asked == 'poisson' and blind > LOW_FLUX else ''}"
+    if blind <= LOW_FLUX:
+        return "poisson", f"model: independent Poisson, {said}"
+    if sensor.reset == "synchronous" and not outlasts:
+        return "first-photon", f"model: first photon of each cycle (pile-up), {said}, armed at every cycle"
+    if sensor.dead_time_s == 0:
+        return (
+            "poisson",
+            f"model: independent Poisson, {said}, but a free-running detector without dead time loses none",
+        )
+    why = "which outlasts the period" if outlasts else "free-running"
+    return "free-running", f"model: event by event (pile-up), {said}, dead time {sensor.dead_time_s:g} s, {why}"

@@ -1,0 +1,229 @@
+"""One exposure of the sensor drawn, block of pixels after block, by the law that was chosen: counts or timestamps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+
+from render.transient import Transient
+from scenes.errors import InputError
+from scenes.limits import require_memory
+from spad.detection.flux import Rates, expected_counts
+from spad.detection.laws import (
+    Detected,
+    add_crosstalk,
+    crosstalk_events,
+    first_of_each_cycle,
+    first_photon_counts,
+    live_detections,
+)
+from spad.detection.photons import Events, Light, draw_primaries
+from spad.formats.timestamps import Timestamps
+from spad.sensor.model import Sensor
+
+STAGE_SENSE = 20
+STAGE_CROSSTALK = 22
+# One random stream for this many pixels: the counts do not depend on threads, nor on how the work is cut.
+STREAM_PIXELS = 1024
+# From this many primary detections a bin on, drawing every bin is cheaper than drawing every photon (measured).
+DENSE_FROM = 4.0
+MOST_EVENTS = 1 << 22  # held at once by the event-by-event laws, about 200 MB
+MOST_CROSSTALK_EVENTS = 1 << 26
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """One exposure, or part `part` of `parts` equal ones in cycles, under one law."""
+
+    transient: Transient
+    sensor: Sensor
+    rates: Rates
+    whole: Light
+    model: str
+    seed: int
+    part: int = 0
+    parts: int = 1
+
+    @property
+    def cycles(self) -> tuple[int, int]:
+        """First and last + 1 laser cycle of this part; an exposure has a whole number."""
+        total = round(self.sensor.cycles)
+        return total * self.part // self.parts, total * (self.part + 1) // self.parts
+
+    @property
+    def share(self) -> float:
+        first, last = self.cycles
+        return (last - first) / round(self.sensor.cycles)
+
+    @property
+    def blocks(self) -> list[slice]:
+        pixels = self.transient.height * self.transient.width
+        return [slice(first, min(first + STREAM_PIXELS, pixels)) for first in range(0, pixels, STREAM_PIXELS)]
+
+    def rng(self, stage: int, block: slice) -> np.random.Generator:
+        seeds = np.random.SeedSequence(self.seed, spawn_key=(stage, self.part, block.start // STREAM_PIXELS))
+        return np.random.Generator(np.random.SFC64(seeds))
+
+    def light(self, block: slice) -> Light:
+        first, last = self.transient.offsets[block.start], self.transient.offsets[block.stop]
+        owner, *returns, background = self.whole
+        return Light(owner[first:last] - block.start, *(r[first:last] for r in returns), background[block])
+
+
+def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
+    """(H, W, T) int32."""
+    height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
+    require_memory(4 * height * width * bins, f"a histogram of {width} x {height} pixels and {bins} bins")
+    counts = np.zeros((height * width, bins), dtype=np.int32)
+
+    def fill(block: slice, drawn: np.ndarray) -> None:
+        if drawn.ndim == 2:
+            _fill(counts[block], drawn)
+        else:
+            flat = torch.from_numpy(counts[block].reshape(-1))
+            one = torch.from_numpy(np.ones(len(drawn), np.int32))  # torch.ones would wait for its own threads
+            flat.scatter_add_(0, torch.from_numpy(drawn.astype(np.int64)), one)
+
+    _draw(exposure, fill, progress, np.zeros(height * width))
+    counts = counts.reshape(height, width, bins)
+    if exposure.sensor.crosstalk and exposure.model == "poisson":
+        add_crosstalk(counts, exposure.sensor.crosstalk, exposure.rng(STAGE_CROSSTALK, slice(0, 0)))
+    return counts
+
+
+def _fill(counts: np.ndarray, drawn: np.ndarray) -> None:
+    most = drawn.max(initial=0)
+    if most > np.iinfo(np.int32).max:
+        raise InputError(f"a bin holds {most} counts, the limit is {np.iinfo(np.int32).max}")
+    counts[:] = drawn
+
+
+def timestamps_of(
+    exposure: Exposure, meta: dict, progress: Progress | None, ready: np.ndarray | None = None
+) -> Timestamps:
+    height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
+    if exposure.sensor.crosstalk and exposure.model == "poisson":
+        return Timestamps.of_counts(counts_of(exposure, progress), meta)
+    ready = np.zeros(height * width) if ready is None else ready
+
+    def sorted_stamps(block: slice, drawn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        places = np.repeat(np.arange(drawn.size, dtype=np.int32), drawn.ravel()) if drawn.ndim == 2 else np.sort(drawn)
+        starts = np.arange(block.stop - block.start + 1, dtype=np.int32) * np.int32(bins)
+        number = np.diff(np.searchsorted(places, starts))
+        return (places - np.repeat(starts[:-1], number)).astype(np.uint16), number
+
+    stamps, numbers = zip(*_draw(exposure, sorted_stamps, progress, ready), strict=True)
+    offsets = np.cumsum(np.concatenate(([0], *numbers)), dtype=np.int64)
+    return Timestamps(height, width, bins, np.concatenate(stamps), offsets, meta)
+
+
+def _draw(exposure: Exposure, finish: Callable, progress: Progress | None, ready: np.ndarray) -> list:
+    """finish(block, detected) of every block, on as many threads as torch has.
+
+    What was detected: counts (P, T), or places pixel x T + bin (N,) int32 in no order, pixels counted from the block's.
+    """
+    if exposure.sensor.crosstalk and exposure.model != "poisson":
+        return [finish(block, places) for block, places in _with_crosstalk(exposure, ready)]
+    blocks, workers, finished = exposure.blocks, torch.get_num_threads(), []
+    with ThreadPoolExecutor(workers) as pool:
+        for start in range(0, len(blocks), 4 * workers):  # no more at once than a few
+            if progress is not None:
+                progress("sense", start / len(blocks))
+            group = blocks[start : start + 4 * workers]
+            finished += pool.map(lambda block: finish(block, _block(exposure, block, ready[block])), group)
+    return finished
+
+
+def _block(exposure: Exposure, block: slice, ready: np.ndarray) -> np.ndarray:
+    sensor, rng, light = exposure.sensor, exposure.rng(STAGE_SENSE, block), exposure.light(block)
+    if exposure.model == "free-running":
+        places = [_places(part, sensor) for part in _free_running(exposure, light, rng, ready)]
+        return np.concatenate(places)
+    primaries = float(light.signal.sum() + light.background.sum()) * exposure.share
+    if primaries > DENSE_FROM * sensor.bins * light.pixels:
+        return _dense(exposure, block, rng)
+    if exposure.model == "poisson":
+        return _places(draw_primaries(light, sensor, rng, share=exposure.share), sensor)
+    return _places(_first_photons(exposure, light, rng), sensor)
+
+
+def _dense(exposure: Exposure, block: slice, rng: np.random.Generator) -> np.ndarray:
+    """Every bin drawn from its rate, (P, T)."""
+    rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()
+    if exposure.model == "poisson":
+        return rng.poisson(rate * exposure.share)
+    first, last = exposure.cycles
+    return first_photon_counts(rate / round(exposure.sensor.cycles), last - first, rng)
+
+
+def _places(detected: Detected | Events, sensor: Sensor) -> np.ndarray:
+    return detected.pixel.astype(np.int32) * np.int32(sensor.bins) + detected.position.astype(np.int32)
+
+
+def _first_photons(exposure: Exposure, light: Light, rng: np.random.Generator, events: tuple | None = None) -> Detected:
+    events = events or draw_primaries(light, exposure.sensor, rng, share=exposure.share)
+    cycle = rng.integers(*exposure.cycles, len(events.pixel))
+    return first_of_each_cycle(Detected(events.pixel, cycle, events.position), exposure.sensor)
+
+
+def _free_running(exposure: Exposure, light: Light, rng: np.random.Generator, ready: np.ndarray) -> Iterator[Detected]:
+    """Detections in turn of as many cycles as memory allows; `ready` (P,) in bins is carried on."""
+    sensor, (first, last) = exposure.sensor, exposure.cycles
+    primaries = float(light.signal.sum() + light.background.sum()) * exposure.share
+    pieces = min(max(1, math.ceil(primaries / MOST_EVENTS)), last - first)
+    edges = [first + (last - first) * piece // pieces for piece in range(pieces + 1)]
+    for start, stop in pairwise(edges):
+        share = (stop - start) / round(sensor.cycles)
+        events = draw_primaries(light, sensor, rng, share=share, fractional=True)
+        primary = Detected(events.pixel, rng.integers(start, stop, len(events.pixel)), events.position)
+        yield _alive(primary, sensor, ready)
+
+
+def _alive(events: Detected, sensor: Sensor, ready: np.ndarray) -> Detected:
+    time = events.cycle * float(sensor.bins_per_period) + events.position
+    kept = live_detections(events.pixel, time, sensor.dead_time_s / sensor.bin_width_s, ready)
+    return Detected(*(column[kept] for column in events))
+
+
+def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+    """Event by event over the whole image: detections fire neighbours, whose detector then decides between both.
+
+    A detection that a neighbour's crosstalk makes impossible keeps what it fired itself, and crosstalk fires no
+    further crosstalk: both are of second order in its probability. Raises InputError for more than 2^26 detections.
+    """
+    sensor, transient = exposure.sensor, exposure.transient
+    everything, before = [], ready.copy()
+    total = 0
+    for block in exposure.blocks:
+        rng, light = exposure.rng(STAGE_SENSE, block), exposure.light(block)
+        if exposure.model == "first-photon":
+            parts = [_first_photons(exposure, light, rng)]
+        else:
+            parts = list(_free_running(exposure, light, rng, before[block]))
+        everything += [part._replace(pixel=part.pixel + block.start) for part in parts]
+        total += sum(len(part.pixel) for part in parts)
+        if total > MOST_CROSSTALK_EVENTS:
+            raise InputError(
+                f"crosstalk event by event: over {MOST_CROSSTALK_EVENTS} detections; "
+                "lower the photon budget or the exposure, or take model poisson"
+            )
+    events = Detected(*(np.concatenate(columns) for columns in zip(*everything, strict=True)))
+    rng = exposure.rng(STAGE_CROSSTALK, slice(0, 0))
+    cause, pixel = crosstalk_events(events.pixel, sensor.crosstalk, transient.height, transient.width, rng)
+    fired = Detected(pixel, events.cycle[cause], events.position[cause])
+    both = Detected(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
+    detected = first_of_each_cycle(both, sensor) if exposure.model == "first-photon" else _alive(both, sensor, ready)
+    places = np.sort(detected.pixel * np.int64(sensor.bins) + detected.position.astype(np.int64))
+    edges = [block.start * sensor.bins for block in exposure.blocks]
+    edges.append(exposure.rates.alive.size * sensor.bins)
+    cuts = np.searchsorted(places, edges)
+    for number, block in enumerate(exposure.blocks):
+        yield block, (places[cuts[number] : cuts[number + 1]] - edges[number]).astype(np.int32)

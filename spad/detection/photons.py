@@ -1,0 +1,146 @@
+"""Photon by photon: primary detections drawn from the returns themselves, so that cost follows photons and not bins.
+
+A return of expected S detections, uniform over arrivals in [start, start + length] and blurred by the pulse, is a
+marked Poisson process: N ~ Poisson(S), each at start + U length + pulse, folded into the period. Binned, that is the
+independent Poisson law of `flux.expected_counts` exactly, without its rates. Positions are in bins.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from render.transient import Transient
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from spad.detection.flux import Rates, expected_counts, interval_cdf
+from spad.sensor.model import Sensor
+
+GATED_PIXELS = 1024  # whose rates are held at once
+
+
+class Light(NamedTuple):
+    """What falls on some pixels in one exposure: N returns grouped by pixel, and a flat background in each of P."""
+
+    owner: np.ndarray  # (N,) int32 pixel
+    start: np.ndarray  # (N,) float64 first arrival, bins after the laser's emission
+    length: np.ndarray  # (N,) float64 bins
+    signal: np.ndarray  # (N,) float64 expected primary detections
+    background: np.ndarray  # (P,) float64 expected primary detections over the whole period
+
+    @property
+    def pixels(self) -> int:
+        return len(self.background)
+
+    def signal_per_pixel(self) -> np.ndarray:
+        """(P,) float64, what wraps included."""
+        return np.bincount(self.owner, self.signal, minlength=self.pixels)
+
+
+class Events(NamedTuple):
+    """Detections in no order: pixel (M,) int32 and position (M,) in bins within the period, int32 or float64."""
+
+    pixel: np.ndarray
+    position: np.ndarray
+
+
+def paths_in_bins(near_m: np.ndarray, far_m: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """First arrival and length of returns, float64 in bins, of their nearest and farthest path [m]."""
+    near = near_m.astype(np.float64)
+    per_bin = SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s
+    return near / per_bin, (far_m - near) / per_bin
+
+
+def light_of(transient: Transient, sensor: Sensor, rates: Rates, pixels: slice) -> Light:
+    """The returns of some pixels at a budget's rates; pixels are counted from the slice's first."""
+    first, last = int(transient.offsets[pixels.start]), int(transient.offsets[pixels.stop])
+    sizes = np.diff(transient.offsets[pixels.start : pixels.stop + 1])
+    owner = np.repeat(np.arange(pixels.stop - pixels.start, dtype=np.int32), sizes)
+    start, length = paths_in_bins(transient.path_near_m[first:last], transient.path_far_m[first:last], sensor)
+    alive = rates.alive.reshape(-1)[pixels]
+    return Light(
+        owner=owner,
+        start=start,
+        length=length,
+        signal=transient.radiance[first:last] * (rates.signal_scale * alive[owner]),
+        background=rates.background.reshape(-1)[pixels],
+    )
+
+
+def draw_primaries(
+    light: Light, sensor: Sensor, rng: np.random.Generator, *, share: float = 1.0, fractional: bool = False
+) -> Events:
+    """Primary detections within the sensor's bins in a share of the exposure.
+
+    Whole bins (int64), or positions within them (float64) where a dead time needs to know.
+    """
+    period = sensor.bins_per_period
+    number = rng.poisson(light.signal * share)
+    position = np.repeat(light.start, number)  # which is grouped, and then costs less than a look-up per detection
+    total = len(position)
+    if light.length.any():
+        spread = np.repeat(light.length, number)
+        spread *= rng.random(total, dtype=np.float32)
+        position += spread
+    for kernel in (sensor.pulse, sensor.jitter):
+        if kernel is not None:
+            delay = kernel.draw(rng, total)
+            delay *= np.float32(1 / sensor.bin_width_s)
+            position += delay
+    steady = rng.poisson(light.background * share)
+    owner = np.concatenate((light.owner, np.arange(light.pixels, dtype=np.int32)))
+    pixel = np.repeat(owner, np.concatenate((number, steady)))
+    rest = len(pixel) - total
+    if fractional:
+        at = np.concatenate((np.mod(position, period), rng.random(rest) * period))
+        at[at >= period] = 0  # a tiny negative position rounds up to the period itself
+    else:
+        at = np.empty(len(pixel), np.int32)
+        _fold(position, period, at[:total])
+        at[total:] = _uniform_bins(rng, period, rest)
+    if sensor.bins == period:
+        return Events(pixel, at)
+    seen = at < sensor.bins  # the rest of the period has no bins: nothing is detected there
+    return Events(pixel[seen], at[seen])
+
+
+def _fold(position: np.ndarray, period: int, out: np.ndarray) -> None:
+    """The bin within the period of positions in bins, (N,), into `out`; positions are overwritten."""
+    whole = np.floor(position, out=position).astype(np.int64)
+    if period & (period - 1):
+        np.mod(whole, period, out=out, casting="same_kind")
+    else:  # the same of a power of two, also below 0, and much faster
+        np.bitwise_and(whole, period - 1, out=out, casting="same_kind")
+
+
+def _uniform_bins(rng: np.random.Generator, period: int, size: int) -> np.ndarray:
+    """Uniform integers from 0 to period - 1, (size,); powers of two to 2^16 from a quarter of a random word."""
+    if period & (period - 1) or period > 1 << 16:
+        return rng.integers(0, period, size, dtype=np.int32)
+    words = rng.integers(0, 1 << 64, -(-size // 4), dtype=np.uint64)
+    return words.view(np.uint16)[:size] & np.uint16(period - 1)
+
+
+def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: Light) -> tuple[np.ndarray, float]:
+    """Expected primary signal detections within the bins of every pixel, (H, W), and how much of the light wrapped."""
+    shape = (transient.height, transient.width)
+    if sensor.bins == sensor.bins_per_period:
+        return light.signal_per_pixel().reshape(shape), _wrapped(light, sensor)
+    inside = np.empty(light.pixels)
+    for first in range(0, light.pixels, GATED_PIXELS):
+        pixels = slice(first, min(first + GATED_PIXELS, light.pixels))
+        steady = light.background[pixels] * (sensor.bins / sensor.bins_per_period)
+        inside[pixels] = expected_counts(transient, sensor, rates, pixels)[0].sum(dim=1).numpy() - steady
+    return np.clip(inside, 0, None).reshape(shape), _wrapped(light, sensor)
+
+
+def _wrapped(light: Light, sensor: Sensor) -> float:
+    """Expected signal that arrives later than one period after the laser's emission."""
+    period, width = sensor.bins_per_period, sensor.bin_width_s
+    late = light.start + light.length + sensor.response.window_s(8.5)[1] / width > period
+    if not late.any():
+        return 0.0
+    start, length = (torch.from_numpy(column[late] * width) for column in (light.start, light.length))
+    arrived = interval_cdf(sensor.response, sensor.period_s - start, length).numpy()
+    return float(light.signal[late] @ (1 - arrived))

@@ -1,0 +1,1 @@
+"""Estimate depth from counts without a network."""

@@ -1,0 +1,285 @@
+"""Classical depth estimators: from a histogram of counts to depth, with the bound they are judged against.
+
+Conventions: bin i covers [i, i + 1) bin widths, its centre is i + 1/2; the pulse is centred, so its centroid is the
+arrival time t and depth = c t / 2; time wraps at the period. Every estimator subtracts its own mean answer to the
+noise-free pulse, `noise_free_bias_m`.
+
+    argmax       centre of the fullest bin, first of equals
+    matched      peak of the zero-normalised circular correlation with the binned pulse
+    log-matched  Poisson maximum likelihood: argmax over tau of sum_i n_i log(S h_i(tau) + B) - S sum_i h_i(tau)
+    correlation  the same as matched over whole bins, with a parabola: zero-normalised cross-correlation
+    lmf-published   argmax over whole bins of the correlation with log(1 + h), the filter of the ICCV 2023 code
+    coates       log-matched, after the pile-up of the sensor's detector is undone: Coates' correction of first
+                 photons, or the dead-time correction of a free-running detector
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.errors import InputError, did_you_mean
+from scenes.model import Camera
+from spad.detection.laws import linearised
+from spad.estimators.matching import (
+    argmax_bins,
+    correlate,
+    correlation_bins,
+    grid_peak,
+    is_circular,
+    likelihood,
+    log_matched_bins,
+    matched_bins,
+    published_log_matched_bins,
+)
+from spad.formats.histogram import Histogram
+from spad.sensor.model import Sensor
+from spad.sensor.template import binned_pulse, binned_pulse_slope, pulse_taps
+
+__all__ = [
+    "ESTIMATORS",
+    "METHODS",
+    "by_pixels",
+    "checked_histogram",
+    "confidence",
+    "correlate",
+    "cramer_rao_m",
+    "depth_errors",
+    "depth_in_range",
+    "estimate_depth",
+    "grid_peak",
+    "histogram_depth_m",
+    "laser_baseline_m",
+    "noise_free_bias_m",
+    "radial_depth_m",
+    "radial_depth_of",
+]
+
+_BIAS_PHASES = 16
+_BIAS_SIGNAL = 1e4
+_CHUNK = {"cpu": 1 << 20, "cuda": 1 << 24}  # counts per chunk: a few MB a tensor on a CPU, which its cache holds
+
+ESTIMATORS: dict[str, Callable[[Tensor, Sensor], Tensor]] = {
+    "argmax": argmax_bins,
+    "matched": matched_bins,
+    "log-matched": log_matched_bins,
+    "correlation": correlation_bins,
+    "lmf-published": published_log_matched_bins,
+    "coates": log_matched_bins,  # of counts without pile-up
+}
+METHODS: tuple[str, ...] = tuple(ESTIMATORS)
+
+
+def checked_histogram(counts: Tensor, bins: int) -> Tensor:
+    """The counts as (P, T) rows, or an InputError: last axis, negative or non-finite counts."""
+    if counts.ndim < 1 or counts.shape[-1] != bins:
+        raise InputError(f"histogram of shape {tuple(counts.shape)}: the last axis must be the sensor's {bins} bins")
+    if counts.numel():
+        low, high = (float(value) for value in torch.aminmax(counts))
+        if not (low >= 0 and math.isfinite(high)):
+            raise InputError(f"histogram counts range from {low:g} to {high:g}, expected finite counts of 0 or more")
+    return counts.reshape(-1, bins)
+
+
+def by_pixels(function: Callable[[Tensor], Tensor], rows: Tensor, per_pixel: int = 0) -> Tensor:
+    """`function` (P, T) -> (P, ...) over chunks of pixels, so that memory does not grow with the image.
+
+    `per_pixel` is the size of its largest intermediate tensor for one pixel, where that exceeds T."""
+    size = max(1, _CHUNK.get(rows.device.type, _CHUNK["cuda"]) // max(1, rows.shape[-1], per_pixel))
+    return torch.cat([function(part) for part in rows.split(size)])
+
+
+def depth_in_range(depth_m: Tensor, sensor: Sensor) -> Tensor:
+    """Float32 depth in [0, range): wrapped where the bins cover the period, else clamped to the bins."""
+    if is_circular(sensor):
+        depth_m = torch.remainder(depth_m, sensor.range_m)
+    else:
+        depth_m = depth_m.clamp(0, sensor.bins * sensor.bin_depth_m)
+    single = depth_m.float()  # may round up to the range itself, which is depth 0
+    return torch.where(single.double() >= sensor.range_m, 0.0, single)
+
+
+def _raw_depth(rows: Tensor, sensor: Sensor, method: str) -> Tensor:
+    def one(part: Tensor) -> Tensor:
+        part = part if part.dtype == torch.float64 else part.float()
+        bins = ESTIMATORS[method](part, sensor)
+        return torch.where(part.sum(-1) > 0, bins, math.nan)
+
+    return by_pixels(one, rows, pulse_taps(sensor, str(rows.device)).fine.numel()) * sensor.bin_depth_m
+
+
+def noise_free_bias_m(estimator: str | Callable[[Tensor], Tensor], sensor: Sensor) -> float:
+    """Mean over sub-bin phases of estimate - truth [m] for the expected counts of a lone pulse without background.
+
+    `estimator` is one of METHODS, before the subtraction (computed once a sensor), or any function of counts (P, T)
+    that gives depth (P,) in metres.
+    """
+    if isinstance(estimator, str):
+        _require_method(estimator)
+        return _method_bias_m(estimator, sensor)
+    phases = (torch.arange(_BIAS_PHASES, dtype=torch.float64) + 0.5) / _BIAS_PHASES
+    arrival = (sensor.bins // 2 + phases) * sensor.bin_width_s
+    error = estimator(_BIAS_SIGNAL * binned_pulse(arrival, sensor)).double() - arrival * SPEED_OF_LIGHT_M_PER_S / 2
+    half = sensor.range_m / 2
+    return float((torch.remainder(error + half, sensor.range_m) - half).mean())
+
+
+@lru_cache(maxsize=64)
+def _method_bias_m(method: str, sensor: Sensor) -> float:
+    return noise_free_bias_m(lambda counts: _raw_depth(counts, sensor, method), sensor)
+
+
+def _require_method(method: str) -> None:
+    if method not in METHODS:
+        meant = did_you_mean(method, METHODS)
+        raise InputError(f"depth method {method!r} is unknown{meant}, expected one of {', '.join(METHODS)}")
+
+
+def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched") -> Tensor:
+    """Estimate half the optical path [m] from counts, (..., T) -> (...,) float32 in [0, range); NaN without counts.
+
+    It is the depth where the laser is co-located with the camera. Counts know no laser: `histogram_depth_m` takes a
+    `Histogram`, which does, and gives the depth beside a displaced one too. Raises InputError for an unknown method, a
+    wrong number of bins, negative or non-finite counts, and with `coates` for counts that the sensor's detector cannot
+    have made.
+    """
+    _require_method(method)
+    rows = checked_histogram(counts, sensor.bins)
+    if not len(rows):
+        return torch.empty(counts.shape[:-1], dtype=torch.float32, device=counts.device)
+    if method == "coates":
+        rows = by_pixels(lambda part: linearised(part, sensor), rows)
+    depth = _raw_depth(rows, sensor, method) - noise_free_bias_m(method, sensor)
+    return depth_in_range(depth, sensor).reshape(counts.shape[:-1])
+
+
+def confidence(counts: Tensor, depth_m: Tensor, sensor: Sensor) -> Tensor:
+    """Probability that an estimated depth is the pulse's and not a chance peak, (..., T), (...,) -> (...,) float32.
+
+    The posterior share of arrivals within two pulse widths (the window that holds 95 % of a Gaussian) of the estimate,
+    with every bin as likely before as any other: softmax of the log-likelihood over bins, S and B as `log-matched`
+    estimates them. NaN where the depth is. Of any method's depth; raises InputError as `estimate_depth` does.
+    """
+    rows = checked_histogram(counts, sensor.bins)
+    if depth_m.shape != counts.shape[:-1]:
+        raise InputError(f"depth of shape {tuple(depth_m.shape)} for counts of shape {tuple(counts.shape)}")
+    taps = pulse_taps(sensor, str(rows.device))
+    reach = taps.shifts[taps.window]
+    estimate = (depth_m.reshape(-1, 1).double() / sensor.bin_depth_m).floor().nan_to_num(0).clamp(0, sensor.bins - 1)
+
+    def one(part: Tensor) -> Tensor:
+        part = part if part.dtype == torch.float64 else part.float()
+        return likelihood(part, sensor).double().softmax(-1)
+
+    def near(part: Tensor) -> Tensor:
+        posterior, index = one(part[:, :-1]), part[:, -1:].long() + reach
+        inside = (
+            torch.ones_like(index, dtype=torch.bool) if is_circular(sensor) else (index >= 0) & (index < sensor.bins)
+        )
+        # no bin twice, where the window is as wide as the period
+        return (posterior.gather(-1, index.remainder(sensor.bins)) * inside).sum(-1).clamp(max=1)
+
+    share = by_pixels(near, torch.cat([rows.double(), estimate], dim=-1)).float()
+    return torch.where(depth_m.isnan(), math.nan, share.reshape(depth_m.shape))
+
+
+def cramer_rao_m(arrival_s: Tensor, signal: Tensor, background_per_bin: Tensor, sensor: Sensor) -> Tensor:
+    """Lowest standard deviation of an unbiased depth estimate [m], (...,) float64, S and B known:
+
+    c/2 [sum_i (S dh_i/dtau)^2 / (S h_i + B)]^(-1/2), with the exact derivative of the binned pulse. All three inputs
+    broadcast: arrival [s], signal detections S, background detections B per bin. Infinite where S = 0.
+    """
+    signal, background = (torch.as_tensor(value).double().unsqueeze(-1) for value in (signal, background_per_bin))
+    rate = signal * binned_pulse(arrival_s, sensor) + background
+    slope = signal * binned_pulse_slope(arrival_s, sensor)
+    information = torch.where(rate > 0, slope**2 / rate, 0.0).sum(-1)
+    return SPEED_OF_LIGHT_M_PER_S / 2 * information**-0.5
+
+
+def radial_depth_m(half_path_m: np.ndarray, directions: np.ndarray, baseline_m: Iterable[float]) -> np.ndarray:
+    """Distance from the camera, given half the optical path from a displaced laser to the surface to the camera [m].
+
+    With p the path, b the laser's place relative to the camera and r the unit ray: the ellipsoid
+    d = (p^2 - |b|^2) / (2 (p - r.b)). half_path_m (...,), directions (..., 3) and b in one frame -> (...,) float32.
+    """
+    path, baseline = 2.0 * np.asarray(half_path_m, dtype=np.float64), np.asarray(tuple(baseline_m), dtype=np.float64)
+    distance = (path**2 - baseline @ baseline) / (2 * (path - directions @ baseline))
+    return distance.astype(np.float32)
+
+
+def laser_baseline_m(histogram: Histogram) -> tuple[float, ...]:
+    """Return the laser's place relative to the camera, in the camera's frame [m]; 0 0 0 if not told."""
+    return tuple(histogram.meta.get("transient", {}).get("laser", {}).get("baseline_m", (0.0, 0.0, 0.0)))
+
+
+def radial_depth_of(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
+    """Convert half the optical path (H, W) [m] into distance from the camera by the histogram's own camera and laser.
+
+    With a co-located laser, or where the histogram does not know of any, it is the same array.
+    """
+    baseline = laser_baseline_m(histogram)
+    if not any(baseline):
+        return half_path_m
+    camera = Camera(**histogram.meta["transient"]["camera"])
+    return radial_depth_m(half_path_m, camera.rays() @ camera.rotation, baseline)
+
+
+def histogram_depth_m(
+    histogram: Histogram, estimator: str | Callable[[Tensor, Sensor], Tensor] = "log-matched"
+) -> np.ndarray:
+    """Estimate the radial depth [m] of every pixel, (H, W) float32; NaN where a pixel has no count.
+
+    `estimator` is one of METHODS, or any function (counts (H, W, T), sensor) -> half the optical path (H, W) [m].
+    With a displaced laser that half path becomes a distance by the scene's geometry (`radial_depth_of`). Raises
+    InputError as `estimate_depth` does.
+    """
+    counts = torch.from_numpy(histogram.counts)
+    if isinstance(estimator, str):
+        half_path = estimate_depth(counts, histogram.sensor, estimator)
+    else:
+        half_path = estimator(counts, histogram.sensor)
+    return radial_depth_of(histogram, half_path.numpy())
+
+
+def depth_errors(
+    estimate: Tensor | np.ndarray,
+    truth: Tensor | np.ndarray,
+    *,
+    range_m: float,
+    exclude: Tensor | np.ndarray | None = None,
+) -> dict[str, float | int]:
+    """Error figures of a depth map against the truth [m], both of one shape, over the pixels not in `exclude`.
+
+    mae_mm, rmse_mm, median_mm (signed) and within_10mm (share strictly under 10 mm) over `pixels` pixels; left out and
+    counted: empty (truth NaN), beyond_range (truth at the range or beyond), missing (estimate NaN).
+    """
+    estimate, truth = (
+        np.asarray(value.cpu() if isinstance(value, Tensor) else value, dtype=np.float64) for value in (estimate, truth)
+    )
+    keep = (
+        np.ones(truth.shape, bool)
+        if exclude is None
+        else ~np.array(exclude.cpu() if isinstance(exclude, Tensor) else exclude, dtype=bool)
+    )
+    if not estimate.shape == truth.shape == keep.shape:
+        raise InputError(f"depth of shape {estimate.shape}, truth {truth.shape} and mask {keep.shape} must be alike")
+    empty = keep & np.isnan(truth)
+    beyond = keep & (truth >= range_m)
+    missing = keep & ~empty & ~beyond & np.isnan(estimate)
+    error = (estimate - truth)[keep & ~empty & ~beyond & ~missing] * 1e3
+    figures = {"mae_mm": math.nan, "rmse_mm": math.nan, "median_mm": math.nan, "within_10mm": math.nan}
+    if error.size:
+        figures = {
+            "mae_mm": float(np.abs(error).mean()),
+            "rmse_mm": float(np.sqrt((error**2).mean())),
+            "median_mm": float(np.median(error)),
+            "within_10mm": float((np.abs(error) < 10).mean()),
+        }
+    counted = {"empty": int(empty.sum()), "beyond_range": int(beyond.sum()), "missing": int(missing.sum())}
+    return {**figures, "pixels": int(error.size), **counted}

@@ -1,0 +1,1 @@
+"""Hold and read histograms, timestamps, `.mat` files, captures and RGB-D simulations."""

@@ -1,0 +1,136 @@
+"""`Histogram`: the photon counts of an image with the sensor and the truth that made it, and its HDF5 file."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from scenes.errors import InputError
+from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from scenes.io.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
+from scenes.limits import require_memory
+from spad.formats.timestamps import counts_from_timestamps, timestamps_from_counts
+from spad.sensor.model import PhotonBudget, Sensor
+
+TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Histogram:
+    """Photon counts of every pixel and time bin.
+
+    counts               (H, W, T) int32
+    sensor, budget       what recorded it
+    depth_m              (H, W) float32 truth: radial depth at the pixel centre, NaN where nothing is
+    mixed                (H, W) bool: surfaces more than 50 mm apart in the pixel
+    albedo               (H, W) float16 truth at the pixel centre
+    expected_signal, expected_background   (H, W) float32, detections per pixel and exposure
+    meta                 seed, plan, what made the transient: anything JSON holds
+    """
+
+    counts: np.ndarray
+    sensor: Sensor
+    budget: PhotonBudget
+    depth_m: np.ndarray
+    mixed: np.ndarray
+    albedo: np.ndarray
+    expected_signal: np.ndarray
+    expected_background: np.ndarray
+    meta: dict = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.counts.ndim != 3 or self.counts.dtype != np.int32 or self.counts.shape[2] != self.sensor.bins:
+            shape = f"{self.counts.dtype}{self.counts.shape}"
+            raise InputError(f"histogram: counts are {shape}, expected int32 (H, W, {self.sensor.bins})")
+        if self.counts.size and self.counts.min() < 0:
+            raise InputError(f"histogram: a bin holds {self.counts.min()} counts")
+        for name in TRUTH:
+            array = getattr(self, name)
+            if array.shape != self.counts.shape[:2]:
+                raise InputError(f"histogram: {name} is {array.shape}, expected {self.counts.shape[:2]}")
+            array.setflags(write=False)
+
+    def __repr__(self) -> str:
+        (height, width, bins), sensor = self.counts.shape, self.sensor
+        return (
+            f"Histogram({height} x {width} pixels (rows x columns) x {bins} bins of "
+            f"{sensor.bin_width_s * 1e12:.4g} ps, "
+            f"{int(self.counts.sum(dtype=np.int64))} detections, signal {self.budget.signal:g} + background "
+            f"{self.budget.background:g} a pixel, sensor {sensor.name!r})"
+        )
+
+    def timestamps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Sparse form: time bin of every detection (uint16, ascending in a pixel), and (H*W + 1,) int64 offsets."""
+        return timestamps_from_counts(self.counts)
+
+    def sha256(self) -> str:
+        """SHA-256 over counts and truth."""
+        sha = hashlib.sha256(str(self.counts.shape).encode())
+        for array in (self.counts, *(getattr(self, name) for name in TRUTH)):
+            sha.update(np.ascontiguousarray(array).tobytes())
+        return sha.hexdigest()
+
+
+def write_histogram(histogram: Histogram, path: Path) -> None:
+    """Write HDF5, whole or not at all: timestamps where they are the smaller form, else dense counts."""
+    import h5py
+
+    meta = {**histogram.meta, "sensor": histogram.sensor.to_dict(), "budget": histogram.budget.to_dict()}
+    packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    buffer = io.BytesIO()  # HDF5 itself does not survive a full disk
+    with h5py.File(
+        buffer, "w", libver="latest", userblock_size=USER_BLOCK
+    ) as file:  # older layouts hold no metadata over 64 kB
+        file.attrs[ATTRIBUTE] = seal(meta, "histogram", histogram.sha256())
+        if int(histogram.counts.sum(dtype=np.int64)) * 2 < histogram.counts.nbytes:
+            stamps, offsets = histogram.timestamps()
+            file.create_dataset("timestamps", data=stamps, **(packed if len(stamps) else {}))
+            file.create_dataset("offsets", data=offsets, **packed)
+        else:
+            file.create_dataset("counts", data=histogram.counts, **packed)
+        for name in TRUTH:
+            file.create_dataset(name, data=getattr(histogram, name), **packed)
+    with whole_file(path) as beside:
+        beside.write_bytes(buffer.getbuffer())
+        add_checksum(beside)
+
+
+def read_histogram(path: Path) -> Histogram:
+    """Read a histogram and check its hash.
+
+    Raises InputError in one line for a missing, foreign, truncated or altered file, or one of a newer schema.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: file not found")
+    try:
+        with open_checked(path) as file:
+            if ATTRIBUTE not in file.attrs:
+                raise InputError("not a file of scene2spad")
+            meta, sha256 = open_seal(file.attrs[ATTRIBUTE], "histogram")
+            unknown = sorted(set(file) - {*TRUTH, "counts", "timestamps", "offsets"})
+            if unknown:
+                raise InputError(f"holds {', '.join(unknown)[:80]}, which no histogram has")
+            histogram = _assemble(meta, {name: read_dataset(file, name) for name in file})
+        meta = check_seal(meta, sha256, histogram.sha256())
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, IndexError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable HDF5 file ({' '.join(str(error).split())[:120]})") from None
+    return replace(histogram, meta={key: value for key, value in meta.items() if key not in ("sensor", "budget")})
+
+
+def _assemble(meta: dict, data: dict[str, np.ndarray]) -> Histogram:
+    if not ({*TRUTH} <= {*data} and ("counts" in data or {"timestamps", "offsets"} <= {*data})):
+        raise InputError(f"datasets are missing, there are {', '.join(sorted(data)) or 'none'}")
+    sensor, budget = Sensor.from_dict(meta["sensor"]), PhotonBudget(**meta["budget"])
+    counts = data.get("counts")
+    require_memory(5 * data["depth_m"].size * sensor.bins, f"a histogram of {data['depth_m'].size} pixels")
+    if counts is None:
+        flat = counts_from_timestamps(data["timestamps"], data["offsets"], sensor.bins)
+        counts = flat.reshape(*data["depth_m"].shape, sensor.bins)
+    return Histogram(counts, sensor, budget, **{name: data[name] for name in TRUTH})

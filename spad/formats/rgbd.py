@@ -1,0 +1,244 @@
+"""RGB-D images -> expected counts: the simulation of the ICCV 2023 paper's supplement S.5.1, in two conventions.
+
+`ours` goes through a transient, one return a depth sample: the pulse's centroid at 2 d / c, radiance
+albedo cos(theta) / (pi d^2), everything else as for a rendered scene. `published` follows the paper's code: one return
+a pixel at the rounded bin, albedo / d^2 without a cosine, c = 3e8 m/s.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from render.transient import Transient
+from scenes.errors import InputError, require
+from spad.detection.flux import expected_counts, rates_for
+from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.pulse import Pulse, SampledPulse
+
+Convention = Literal["ours", "published"]
+PUBLISHED_SPEED_OF_LIGHT_M_PER_S = 3e8
+MIXED_M = 0.05
+
+
+class Expected(NamedTuple):
+    """Expected primary detections of an RGB-D image.
+
+    rates        (H, W, T) float64 per exposure
+    depth_m      (H, W) float64: the label that the convention trains and tests on, NaN for none
+    range_bin    (H, W) int64: bin of the pulse's peak, from 1 as in the published files; 0 for none
+    signal, background   (H, W) float64 per exposure
+    dark_share   share of the mean background that is dark counts
+    """
+
+    rates: np.ndarray
+    depth_m: np.ndarray
+    range_bin: np.ndarray
+    signal: np.ndarray
+    background: np.ndarray
+    dark_share: float
+
+
+def from_rgbd(
+    depth_m: np.ndarray,
+    albedo: np.ndarray,
+    ambient: np.ndarray,
+    sensor: Sensor,
+    budget: PhotonBudget,
+    *,
+    convention: Convention = "ours",
+    fov_deg: float | None = None,
+    block: int = 1,
+) -> Expected:
+    """Expected counts of an RGB-D image: radial depth [m], albedo and ambient light of any scale, (H, W) each.
+
+    ours        as `transient_from_rgbd` says (which takes `fov_deg` and `block`), signal and background by means
+    published   beta = round(2 d / (c Delta)) modulo T, 1 or more; S = signal a / d^2 over its mean; A = dark counts +
+                background b over its mean, rescaled to the asked mean; rate = S h + A / T with the largest sample of
+                the published taps h at bin beta, from 1; the label is beta - 1 bins
+
+    Raises InputError for arrays of different shapes, and where the published convention does not apply: depth that is
+    not finite, bins that do not cover the period, a pulse of other taps.
+    """
+    if convention == "ours":
+        return _ours(depth_m, albedo, ambient, sensor, budget, fov_deg, block)
+    require(convention == "published", f"convention {convention!r} is unknown, expected ours or published")
+    require(block == 1, "the published convention takes one depth a pixel, block must be 1")
+    return _published(*_alike(depth_m, albedo, ambient), sensor, budget)
+
+
+def _alike(*images: np.ndarray) -> list[np.ndarray]:
+    arrays = [np.asarray(image, dtype=np.float64) for image in images]
+    shapes = {array.shape for array in arrays}
+    if len(shapes) != 1 or arrays[0].ndim != 2 or not arrays[0].size:
+        raise InputError(f"RGB-D images of shapes {sorted(shapes)}, expected one of (H, W) for all")
+    return arrays
+
+
+# Ours
+
+
+def _ours(
+    depth_m: np.ndarray,
+    albedo: np.ndarray,
+    ambient: np.ndarray,
+    sensor: Sensor,
+    budget: PhotonBudget,
+    fov_deg: float | None,
+    block: int,
+) -> Expected:
+    transient = transient_from_rgbd(depth_m, albedo, ambient, fov_deg=fov_deg, block=block)
+    shape = (transient.height, transient.width)
+    rates = rates_for(transient, sensor, budget)
+    counts = expected_counts(transient, sensor, rates, slice(0, transient.height * transient.width))[0].numpy()
+    background = rates.background * (sensor.bins / sensor.bins_per_period)
+    depth = transient.depth_m.astype(np.float64)
+    known = np.isfinite(depth)
+    position = np.where(known, depth, 0) / sensor.bin_depth_m
+    return Expected(
+        rates=counts.reshape(*shape, sensor.bins),
+        depth_m=depth,
+        range_bin=np.where(known, np.floor(position).astype(np.int64) % sensor.bins_per_period + 1, 0),
+        signal=np.clip(counts.sum(axis=1).reshape(shape) - background, 0, None),
+        background=background,
+        dark_share=rates.dark_share,
+    )
+
+
+def transient_from_rgbd(
+    depth_m: np.ndarray,
+    albedo: np.ndarray,
+    ambient: np.ndarray,
+    *,
+    fov_deg: float | None = None,
+    block: int = 1,
+    meta: dict | None = None,
+) -> Transient:
+    """RGB-D images as a transient of point returns at path 2 d, lit by a radiant intensity of 1 W/sr at the camera.
+
+    With `block` b the images are b times finer than the sensor: a pixel sees the returns of its b x b samples, each
+    1 / b^2 of its footprint, so that an edge gives two returns and no depth in between; labels are those of the sample
+    at the pixel's centre, ambient light is the mean. `fov_deg` is the full horizontal angle that the cosine of
+    incidence is taken with, from the depth image itself; None for surfaces that face the camera. Samples without
+    depth (NaN or 0) return nothing; a pixel whose samples lie more than 50 mm apart, or partly nowhere, is mixed.
+    """
+    depth, albedo, ambient = _alike(depth_m, albedo, ambient)
+    require(
+        block >= 1 and all(side % block == 0 for side in depth.shape),
+        f"RGB-D images of {depth.shape[0]} x {depth.shape[1]} are no whole number of blocks of {block}",
+    )
+    good = np.isfinite(albedo) & np.isfinite(ambient) & (albedo >= 0) & (ambient >= 0)
+    require(bool(good.all()), "RGB-D images: albedo and ambient light must be finite and 0 or more")
+    seen = np.isfinite(depth) & (depth > 0)
+    depth = np.where(seen, depth, np.nan)
+    cosine = np.ones_like(depth) if fov_deg is None else cosine_of_incidence(depth, fov_deg)
+    radiance = np.where(seen, albedo * cosine / (np.pi * np.where(seen, depth, 1) ** 2), 0) / block**2
+    height, width = depth.shape[0] // block, depth.shape[1] // block
+
+    def blocks(image: np.ndarray) -> np.ndarray:
+        """(H b, W b) -> (H W, b b)"""
+        return image.reshape(height, block, width, block).swapaxes(1, 2).reshape(height * width, block * block)
+
+    order = np.argsort(blocks(depth), axis=1)  # NaN last
+    samples, energy = (np.take_along_axis(blocks(image), order, axis=1) for image in (depth, radiance))
+    kept = np.isfinite(samples)
+    number = kept.sum(axis=1)
+    extent = np.where(number > 0, np.nan_to_num(samples).max(axis=1) - np.nan_to_num(samples[:, 0]), 0)
+    path = (2 * samples[kept]).astype(np.float32)
+    shape, centre = (height, width), (slice(block // 2, None, block),) * 2
+    return Transient(
+        height,
+        width,
+        np.concatenate(([0], np.cumsum(number))).astype(np.int64),
+        path,
+        path,
+        energy[kept].astype(np.float32),
+        np.ones(len(path), np.uint8),
+        depth_m=depth[centre].astype(np.float32),
+        normal=np.zeros((*shape, 3), np.float16),
+        albedo=albedo[centre].astype(np.float16),
+        ambient=blocks(ambient).mean(axis=1).reshape(shape).astype(np.float32),
+        mixed=((extent > MIXED_M) | (number % block**2 > 0)).reshape(shape),
+        error=np.zeros(shape, np.float32),
+        meta={"scene": "RGB-D", **(meta or {})},
+    )
+
+
+def cosine_of_incidence(depth_m: np.ndarray, fov_deg: float) -> np.ndarray:
+    """|normal . ray| of the surface through the points depth x ray of a pinhole camera, (H, W); 1 where unknown.
+
+    Tangents are the shorter of the differences to both neighbours, so that an edge does not count as a slope.
+    """
+    require(0 < fov_deg < 180, f"field of view {fov_deg:g} degrees is outside 0 to 180")
+    height, width = depth_m.shape
+    focal = width / 2 / math.tan(math.radians(fov_deg) / 2)
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    rays = np.stack([x, y, np.full_like(x, focal)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    points = depth_m[..., None] * rays
+    normal = np.cross(_tangent(points, 1), _tangent(points, 0))
+    length = np.linalg.norm(normal, axis=-1)
+    cosine = np.abs((normal * rays).sum(axis=-1)) / np.where(length > 0, length, 1)
+    return np.where((length > 0) & np.isfinite(cosine), cosine, 1.0)
+
+
+def _tangent(points: np.ndarray, axis: int) -> np.ndarray:
+    step = np.diff(points, axis=axis)
+    nothing = np.full_like(np.take(points, [0], axis=axis), np.nan)
+    before, after = np.concatenate([nothing, step], axis=axis), np.concatenate([step, nothing], axis=axis)
+    length = [np.nan_to_num(np.linalg.norm(part, axis=-1), nan=np.inf) for part in (before, after)]
+    return np.where((length[0] < length[1])[..., None], before, after)
+
+
+# Published
+
+
+def _published(
+    depth: np.ndarray, albedo: np.ndarray, ambient: np.ndarray, sensor: Sensor, budget: PhotonBudget
+) -> Expected:
+    require(bool(np.isfinite(depth).all() and (depth > 0).all()), "published convention: every pixel needs a depth")
+    require(sensor.bins == sensor.bins_per_period, "published convention: the bins must cover the period")
+    require(float(albedo.mean()) > 0, "published convention: the albedo is 0 everywhere")
+    bins, speed = sensor.bins, PUBLISHED_SPEED_OF_LIGHT_M_PER_S
+    beta = np.floor(2 * depth / (speed * sensor.bin_width_s) + 0.5).astype(np.int64) % bins
+    beta = np.maximum(beta, 1)
+    amplitude = albedo / depth**2
+    signal = budget.signal * amplitude / amplitude.mean()
+    dark = sensor.dark_rate_map_hz(*depth.shape) * sensor.exposure_s
+    light = budget.background * (ambient / ambient.mean() if ambient.any() else np.ones_like(ambient))
+    both = dark + light
+    scale = budget.background / both.mean() if both.any() else 0.0
+    taps = published_taps(sensor)
+    rates = np.repeat((both * scale / bins)[..., None], bins, axis=2)
+    rows, columns = np.indices(depth.shape)
+    peak = int(taps.argmax())
+    for tap, share in enumerate(taps):  # no two taps in one bin, as there are fewer than bins
+        rates[rows, columns, (beta - 1 + tap - peak) % bins] += signal * share
+    label = (beta - 1) * (speed * sensor.bin_width_s / 2)
+    dark_share = float(dark.mean() / both.mean()) if both.any() else 0.0
+    return Expected(rates, label, beta, signal, both * scale, dark_share)
+
+
+def published_taps(sensor: Sensor) -> np.ndarray:
+    """The pulse as the published code has it, one sample a bin and unit sum: (L,) float64.
+
+    Measured samples in steps of a bin are taken as they are. A Gaussian of L = 2 sigma bins is sampled at
+    i = 1 .. floor(8 L) around (8 L - 1) / 2 with sigma = L / 2: at 270 ps and 97.66 ps bins its centroid is 0.44 bins
+    before its largest sample. Raises InputError for other pulses, and more taps than bins.
+    """
+    pulse, width = sensor.pulse, sensor.bin_width_s
+    if isinstance(pulse, SampledPulse) and math.isclose(pulse.sample_s, width, rel_tol=1e-9):
+        taps = np.asarray(pulse.samples)
+    else:
+        require(
+            isinstance(pulse, Pulse) and pulse.tail_s == 0 and sensor.jitter is None,
+            "published convention: the pulse must be Gaussian, or measured in steps of a bin",
+        )
+        length = 2 * pulse.sigma_s / width
+        sample = np.arange(1, math.floor(8 * length) + 1)
+        require(len(sample) > 0, f"published convention: a pulse of {length / 2:g} bins has no sample")
+        taps = np.exp(-0.5 * ((sample - (8 * length - 1) / 2) / (length / 2)) ** 2)
+    require(len(taps) <= sensor.bins, f"published convention: {len(taps)} taps for {sensor.bins} bins")
+    return taps / taps.sum()

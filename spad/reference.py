@@ -1,0 +1,51 @@
+"""Detection event by event, one photon after the other: read this first, then `spad.detection.laws`.
+
+Slow and plain on purpose. Only tests and benches import this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def arrivals(flux: Sequence[float], cycles: int, rng: np.random.Generator) -> list[float]:
+    """Draw the primary detections of one pixel, sorted in time.
+
+    Parameters
+    ----------
+    flux : expected primary detections per laser cycle in each of T bins that cover the period
+    cycles : laser cycles
+    rng : source of randomness
+
+    Returns
+    -------
+    times in bins since the first laser pulse; a photon is uniform within its bin
+    """
+    bins, times = len(flux), []
+    for cycle in range(cycles):
+        for place, mean in enumerate(flux):
+            times += [cycle * bins + place + rng.random() for _ in range(rng.poisson(mean))]
+    return sorted(times)
+
+
+def detect_synchronous(times: Sequence[float], bins: int) -> np.ndarray:
+    """Count the first photon of each laser cycle; all later ones of the cycle are lost: (T,) int64."""
+    counts, last = np.zeros(bins, np.int64), -1
+    for time in times:
+        cycle = int(time // bins)
+        if cycle != last:
+            counts[int(time % bins)] += 1
+            last = cycle
+    return counts
+
+
+def detect_free_running(times: Sequence[float], bins: int, dead_bins: float) -> np.ndarray:
+    """Count photons of a detector that is blind for `dead_bins` after each detection, not prolonged: (T,) int64."""
+    counts, ready = np.zeros(bins, np.int64), 0.0
+    for time in times:
+        if time >= ready:
+            counts[int(time % bins)] += 1
+            ready = time + dead_bins
+    return counts

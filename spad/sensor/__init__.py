@@ -1,0 +1,1 @@
+"""Describe the camera: bins, pulse, presets, sensor files, photon budget."""

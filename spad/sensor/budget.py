@@ -1,0 +1,99 @@
+"""Radiometric photon budget: from joules and lenses to detections.
+
+Expected signal detections of a pixel = pulse energy x sum(radiance) x aperture area x pixel solid angle x transmission
+x PDE x wavelength / (h c) x cycles; background = ambient spectral radiance x filter width x the same x exposure.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from render.transient import Transient
+from scenes.blackbody import PLANCK_J_S
+from scenes.constants import DEFAULT_WAVELENGTH_M, SPEED_OF_LIGHT_M_PER_S
+from scenes.errors import require
+from spad.detection.flux import detector_maps
+from spad.sensor.model import PhotonBudget, Sensor
+
+# Mean ambient radiance [W/(m^2 sr nm)] above which it is no radiance of daylight. White paper facing the sun: 100 klux
+# are 0.82 W/(m^2 nm) at 850 nm as a black body (`sunlight_w_per_m2_nm`), the direct sun of the reference spectrum ASTM
+# G-173 about 0.9, and / pi is 0.26 to 0.29; bright haze and sunlit clouds are about as bright. Silicon SPADs see most
+# of the sun, 1.6 W/(m^2 nm) outside the atmosphere, near 500 nm: 0.5.
+BRIGHT_SKY_W_PER_M2_SR_NM = 0.5
+
+
+@dataclass(frozen=True)
+class Optics:
+    """The lens, the filter and the laser's pulses.
+
+    pulse_energy_j    energy of one laser pulse, over the whole cone
+    focal_length_m, f_number    aperture diameter = focal length / f-number
+    pixel_pitch_m     side of a pixel's active square (fill factor included)
+    transmission      of lens and filter at the laser's wavelength
+    filter_nm         width of the band that the filter lets through
+    wavelength_m      of the laser
+    """
+
+    pulse_energy_j: float
+    focal_length_m: float
+    f_number: float
+    pixel_pitch_m: float
+    transmission: float = 1.0
+    filter_nm: float = 10.0
+    wavelength_m: float = DEFAULT_WAVELENGTH_M
+
+    def __post_init__(self) -> None:
+        for name in ("pulse_energy_j", "focal_length_m", "f_number", "pixel_pitch_m", "filter_nm", "wavelength_m"):
+            value = getattr(self, name)
+            good = math.isfinite(value) and (value > 0 or (name == "pulse_energy_j" and value == 0))
+            require(good, f"optics: {name} {value:g} must be finite and above 0")
+        require(0 < self.transmission <= 1, f"optics: transmission {self.transmission:g} is outside (0, 1]")
+
+    @property
+    def aperture_m2(self) -> float:
+        """Area of the lens opening."""
+        return math.pi / 4 * (self.focal_length_m / self.f_number) ** 2
+
+    @property
+    def pixel_sr(self) -> float:
+        """Solid angle that a pixel on the axis sees, (pitch / focal length)^2."""
+        return (self.pixel_pitch_m / self.focal_length_m) ** 2
+
+    @property
+    def photons_per_joule(self) -> float:
+        """wavelength / (h c)."""
+        return self.wavelength_m / (PLANCK_J_S * SPEED_OF_LIGHT_M_PER_S)
+
+    def detections_per_radiance(self, sensor: Sensor) -> float:
+        """Primary detections of a pixel per J/(m^2 sr) that comes to it: A Omega transmission PDE lambda / (h c)."""
+        return self.aperture_m2 * self.pixel_sr * self.transmission * sensor.pde * self.photons_per_joule
+
+    def signal_scale(self, sensor: Sensor) -> float:
+        """Expected signal detections per exposure and unit of a transient's radiance (which is per joule emitted)."""
+        return self.pulse_energy_j * self.detections_per_radiance(sensor) * sensor.cycles
+
+    def budget(
+        self, transient: Transient, sensor: Sensor, *, seed: int = 0, dark_map_hz: np.ndarray | None = None
+    ) -> PhotonBudget:
+        """Mean signal and mean background of a scene: the budget by means that gives these very expected counts.
+
+        Background is ambient light through the filter and dark counts, the sensor's or a measured map's. Raises
+        InputError where the mean ambient radiance is above a bright sky's: then a scene file's lights are in units of
+        their own, as those made for pictures are.
+        """
+        pixels = transient.height * transient.width
+        radiance = float(transient.ambient.mean(dtype=np.float64))
+        require(
+            radiance <= BRIGHT_SKY_W_PER_M2_SR_NM,
+            f"ambient radiance of {radiance:.3g} W/(m2 sr nm) on average is above {BRIGHT_SKY_W_PER_M2_SR_NM:g}, a "
+            "bright sky's: the scene's lights are in other units; scale them in the scene, or state the photons by "
+            "--signal and --background instead of --radiometric",
+        )
+        signal = self.signal_scale(sensor) * float(transient.radiance.sum(dtype=np.float64)) / pixels
+        ambient = radiance * self.filter_nm * sensor.exposure_s
+        dark_hz, _ = detector_maps(sensor, (transient.height, transient.width), dark_map_hz, seed)
+        dark = float(dark_hz.mean()) * sensor.exposure_s
+        return PhotonBudget(signal, ambient * self.detections_per_radiance(sensor) + dark)

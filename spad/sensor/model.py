@@ -1,0 +1,198 @@
+"""What the single-photon camera is: `Sensor`, and the `PhotonBudget` it is used at. Needs no torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
+from scenes.errors import did_you_mean, require
+from spad.sensor.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
+from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_from_dict
+
+STAGE_PIXELS = 21
+Reset = Literal["synchronous", "free-running"]
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A SPAD pixel array with one time-to-digital converter a pixel. With its defaults a perfect photon counter.
+
+    bins, bin_width_s     the histogram: bin i covers [i, i+1) bin widths after the laser's emission
+    pulse, jitter         the laser's pulse and the detector's timing jitter, a second kernel; `response` is both
+    period_s              laser period, a whole number of bin widths (None: the histogram covers it); time wraps at it
+    exposure_s            exposure of one frame; cycles = exposure / period
+    pde                   photon detection efficiency at the laser's wavelength: radiometric budgets count with it
+    dark_count_rate_hz    dark counts per second and pixel, uniform in time: a number, or one for each image row, used
+                          again from the first where the image has more rows
+    hot_share, hot_rate_hz   share of pixels, drawn at random, that have this dark count rate instead
+    dead_share            share of pixels, drawn at random, that never detect anything
+    reset                 what the detector does after a detection. `synchronous`: it is armed at the start of every
+                          laser cycle and detects the first photon; `free-running`: it is armed again after dead_time_s
+    dead_time_s           dead time after a detection, not prolonged by photons that arrive in it
+    crosstalk             probability that a detection fires a given one of the four neighbours, at the same time
+    """
+
+    name: str = "reference"
+    bins: int = REFERENCE_BINS
+    bin_width_s: float = REFERENCE_PERIOD_S / REFERENCE_BINS
+    pulse: AnyPulse = field(default_factory=Pulse)
+    period_s: float | None = None
+    exposure_s: float = 1 / 30
+    dark_count_rate_hz: float | tuple[float, ...] = 0.0
+    jitter: AnyPulse | None = None
+    pde: float = 1.0
+    hot_share: float = 0.0
+    hot_rate_hz: float = 0.0
+    dead_share: float = 0.0
+    reset: Reset = "synchronous"
+    dead_time_s: float = 0.0
+    crosstalk: float = 0.0
+
+    def __post_init__(self) -> None:
+        where = f"sensor {self.name}"
+        in_range = int(self.bins) == self.bins and 1 <= self.bins <= 65536
+        require(in_range, f"{where}: {self.bins} bins is outside 1 to 65536")
+        width = self.bin_width_s
+        require(
+            math.isfinite(width) and 1e-15 <= width <= 1e-3, f"{where}: bin width {width:g} s is outside 1e-15 to 1e-3"
+        )
+        if self.period_s is None:
+            object.__setattr__(self, "period_s", self.bins * width)
+        ratio = self.period_s / width
+        whole = math.isfinite(ratio) and abs(ratio - round(ratio)) < 1e-6 * ratio and round(ratio) >= self.bins
+        require(whole, f"{where}: period {self.period_s:g} s is not a whole number of bin widths, {self.bins} or more")
+        require(
+            math.isfinite(self.exposure_s) and self.exposure_s >= self.period_s,
+            f"{where}: exposure {self.exposure_s:g} s is shorter than the period {self.period_s:g} s",
+        )
+        self._check_detector(where)
+
+    def _check_detector(self, where: str) -> None:
+        if isinstance(self.dark_count_rate_hz, Iterable):
+            object.__setattr__(self, "dark_count_rate_hz", tuple(map(float, self.dark_count_rate_hz)))
+            require(len(self.dark_count_rate_hz) > 0, f"{where}: dark count rates of no row")
+        for rate in (*self._dark_rows, self.hot_rate_hz):
+            require(
+                math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite"
+            )
+        for label in ("hot_share", "dead_share"):
+            share = getattr(self, label)
+            require(0 <= share <= 1, f"{where}: {label} {share:g} is outside 0 to 1")
+        require(0 < self.pde <= 1, f"{where}: PDE {self.pde:g} is outside (0, 1]")
+        require(0 <= self.crosstalk < 0.25, f"{where}: crosstalk {self.crosstalk:g} is outside [0, 0.25)")
+        require(self.reset in ("synchronous", "free-running"), f"{where}: reset {self.reset!r} is unknown")
+        dead = self.dead_time_s
+        require(math.isfinite(dead) and 0 <= dead <= 1, f"{where}: dead time {dead:g} s is outside 0 to 1")
+
+    @property
+    def _dark_rows(self) -> tuple[float, ...]:
+        rate = self.dark_count_rate_hz
+        return rate if isinstance(rate, tuple) else (rate,)
+
+    @property
+    def response(self) -> AnyPulse:
+        """The pulse with the jitter: what one detection looks like in time."""
+        return convolved(self.pulse, self.jitter)
+
+    @property
+    def bins_per_period(self) -> int:
+        return round(self.period_s / self.bin_width_s)
+
+    @property
+    def cycles(self) -> float:
+        """Laser cycles in one exposure."""
+        return self.exposure_s / self.period_s
+
+    @property
+    def range_m(self) -> float:
+        """Unambiguous depth range c period / 2."""
+        return SPEED_OF_LIGHT_M_PER_S * self.period_s / 2
+
+    @property
+    def bin_depth_m(self) -> float:
+        """Depth that one bin spans, c bin_width / 2."""
+        return SPEED_OF_LIGHT_M_PER_S * self.bin_width_s / 2
+
+    @property
+    def timestamp_bits(self) -> int:
+        """Bits of one timestamp: 10 for 1024 bins."""
+        return max(1, (self.bins - 1).bit_length())
+
+    def dark_rate_map_hz(self, height: int, width: int, seed: int = 0) -> np.ndarray:
+        """Dark counts per second of every pixel, (H, W) float64: rows, then hot pixels at random by the seed."""
+        rows = np.resize(np.asarray(self._dark_rows, dtype=np.float64), height)
+        rate = np.repeat(rows[:, None], width, axis=1)
+        rate[self._chosen(self.hot_share, height, width, seed, 0)] = self.hot_rate_hz
+        return rate
+
+    def dead_pixels(self, height: int, width: int, seed: int = 0) -> np.ndarray:
+        """Pixels that detect nothing, (H, W) bool, at random by the seed."""
+        return self._chosen(self.dead_share, height, width, seed, 1)
+
+    @staticmethod
+    def _chosen(share: float, height: int, width: int, seed: int, what: int) -> np.ndarray:
+        chosen = np.zeros(height * width, dtype=bool)
+        if share > 0:
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_PIXELS, what, 0)))
+            chosen[rng.choice(chosen.size, round(share * chosen.size), replace=False)] = True
+        return chosen.reshape(height, width)
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict) -> Sensor:
+        pulses = {"pulse": pulse_from_dict(values["pulse"]), "jitter": pulse_from_dict(values.get("jitter"))}
+        return cls(**{**values, **pulses})
+
+
+PRESETS: dict[str, Sensor] = {
+    "reference": Sensor(),
+    "iccv2023-train": Sensor(
+        name="iccv2023-train",
+        bin_width_s=TRAIN_BIN_WIDTH_S,
+        pulse=SampledPulse(TRAIN_PULSE, TRAIN_BIN_WIDTH_S),
+        dark_count_rate_hz=tuple(30 * counts for counts in TRAIN_DARK_COUNTS),
+    ),
+    "linospad": Sensor(
+        name="linospad", bins=1536, bin_width_s=26e-12, pulse=Pulse(LINOSPAD_FWHM_S / (2 * math.sqrt(2 * math.log(2))))
+    ),
+}
+
+
+def sensor_by_name(name: str) -> Sensor:
+    """The preset of that name, or an InputError that lists the names."""
+    require(
+        name in PRESETS,
+        f"sensor {name!r} is unknown{did_you_mean(name, PRESETS)}, expected one of {', '.join(PRESETS)}",
+    )
+    return PRESETS[name]
+
+
+@dataclass(frozen=True)
+class PhotonBudget:
+    """Mean signal and mean background primary detections per pixel per exposure, averaged over all pixels.
+
+    Primary: PDE included, dead time, pile-up and crosstalk not. Signal sums direct and indirect light, what wraps
+    included. Background is dark counts, as the sensor has them, and ambient light scaled to fill the asked mean.
+    """
+
+    signal: float = 50.0
+    background: float = 50.0
+
+    def __post_init__(self) -> None:
+        for label, value in (("signal", self.signal), ("background", self.background)):
+            good = math.isfinite(value) and 0 <= value <= 1e9
+            require(good, f"photon budget: {label} {value:g} photons per pixel is outside 0 to 1e9")
+
+    @property
+    def sbr(self) -> float:
+        return self.signal / self.background if self.background > 0 else math.inf
+
+    def to_dict(self) -> dict:
+        return asdict(self)

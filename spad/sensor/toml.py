@@ -1,0 +1,65 @@
+"""TOML as sensor files need it: tables of texts, numbers, booleans and flat lists. Read by the standard library."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+
+from scenes.errors import InputError
+from scenes.io.inputs import read_text
+
+MAX_BYTES = 1 << 24
+_LINE = 110
+
+
+def read_toml(path: Path, what: str = "sensor file") -> dict:
+    """Return the tables of a TOML file. Raises InputError naming the file, and the line where it is no TOML."""
+    text = read_text(path, what, most_bytes=MAX_BYTES)
+    try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: is no TOML ({error})") from None
+
+
+def format_toml(tables: Mapping[str, object], comment: str = "") -> str:
+    """Write values, then tables of values (one level), as TOML text. Lists are broken at about 110 characters."""
+    lines = [f"# {line}" for line in comment.splitlines()]
+    lines += [f"{_key(key)} = {_value(value)}" for key, value in tables.items() if not isinstance(value, Mapping)]
+    for name, table in tables.items():
+        if isinstance(table, Mapping):
+            lines += ["", f"[{_key(name)}]", *(f"{_key(key)} = {_value(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _key(key: str) -> str:
+    plain = key and all(letter.isascii() and (letter.isalnum() or letter in "_-") for letter in key)
+    return key if plain else json.dumps(key)
+
+
+def _value(value: object) -> str:
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case int():
+            return str(value)
+        case float():
+            return repr(value) if math.isfinite(value) else ("nan" if math.isnan(value) else f"{'-' * (value < 0)}inf")
+        case str():
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        case list() | tuple():
+            return _list([_value(item) for item in value])
+    raise TypeError(f"TOML: {type(value).__name__} cannot be written")
+
+
+def _list(items: list[str]) -> str:
+    lines, line = [], ""
+    for item in items:
+        if line and len(line) + len(item) > _LINE:
+            lines.append(line)
+            line = ""
+        line += f" {item}," if line else f"{item},"
+    lines.append(line)
+    return f"[{line.rstrip(',')}]" if len(lines) == 1 else "[\n" + "".join(f"  {line}\n" for line in lines) + "]"

@@ -1,0 +1,1 @@
+"""Model a multi-zone sensor and calibrate it from captures."""

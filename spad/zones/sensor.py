@@ -1,0 +1,235 @@
+"""A multi-zone sensor: a few histograms, each of a field of view of several physical pixels, at close range.
+
+Every effect is one switch with a unit; with all off it is the identity sensor, which only sums each zone's light.
+Tangents are camera coordinates over depth: x right, y down. A histogram's time t is measured as t / clock + delay.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from render.transient import Transient
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.errors import require
+from spad.detection.flux import interval_cdf
+from spad.detection.saturation import draw_saturated, saturated
+from spad.sensor.model import Sensor
+
+STAGE_ZONES = 23
+# Switches that an ablation turns off one by one: name and what `without` puts in their place.
+EFFECTS = (
+    "parallax",
+    "aperture",
+    "illumination",
+    "clock",
+    "delay",
+    "crosstalk",
+    "saturation",
+    "recovery",
+    "compression",
+    "background",
+)
+
+
+@dataclass(frozen=True)
+class ZoneArray:
+    """Zones and the switches of what happens to their light.
+
+    centre_x, centre_y, width, height   fields of view [tangents], one number a zone
+    gain          primary detections an exposure per unit of a zone's light, 1 / (m^2 J); one number a zone
+    delay_s       electronic delay of each zone's converter [s]; off 0
+    clock         real seconds per second of each zone's converter; off 1
+    background    primary detections an exposure and bin of each zone, dark counts and ambient light; off 0
+    crosstalk     share of the sum of all zones' signal that every zone sees besides, light scattered in the lens; off 0
+    trials        detectors times laser cycles of each zone, which saturate (`spad.detection.saturation`); off infinite
+    recovery      further cycles that a detection costs its detector; off 0
+    compression   of full bins, n / (1 + compression n / trials), no law but a description; off 0
+    illumination_x, illumination_y   direction in which the emitter is brightest [tangent]
+    curvature_x, curvature_y         of the emitter's intensity exp(-(k_x u^2 + k_y v^2) / 2); off 0, uniform
+    baseline_m    emitter minus receiver (x right, y down, z forward): parallax in the near field; off 0
+    aperture_m    diameter of the receiver's lens, which blurs the zones' edges by aperture / depth; off 0
+    """
+
+    centre_x: tuple[float, ...]
+    centre_y: tuple[float, ...]
+    width: tuple[float, ...]
+    height: tuple[float, ...]
+    gain: tuple[float, ...] = ()
+    delay_s: tuple[float, ...] = ()
+    clock: tuple[float, ...] = ()
+    background: tuple[float, ...] = ()
+    crosstalk: float = 0.0
+    trials: tuple[float, ...] = ()
+    recovery: float = 0.0
+    compression: float = 0.0
+    illumination_x: float = 0.0
+    illumination_y: float = 0.0
+    curvature_x: float = 0.0
+    curvature_y: float = 0.0
+    baseline_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    aperture_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        count = len(self.centre_x)
+        require(1 <= count <= 4096, f"zones: {count} of them, expected 1 to 4096")
+        defaults = {"gain": 1.0, "delay_s": 0.0, "clock": 1.0, "background": 0.0, "trials": math.inf}
+        for name in ("centre_y", "width", "height", *defaults):
+            values = getattr(self, name)
+            if not values and name in defaults:
+                values = (defaults[name],) * count
+            require(len(values) == count, f"zones: {len(values)} numbers of {name} for {count} zones")
+            object.__setattr__(self, name, tuple(float(value) for value in values))
+        require(len(self.baseline_m) == 3, f"zones: baseline of {len(self.baseline_m)} numbers, expected 3")
+        for spec in fields(self):
+            values = getattr(self, spec.name)
+            values = values if isinstance(values, tuple) else (values,)
+            good = all(math.isfinite(value) or spec.name == "trials" for value in values)
+            require(good, f"zones: {spec.name} is not finite")
+            positive = spec.name in ("width", "height", "clock", "trials")
+            free = spec.name in ("centre_x", "centre_y", "delay_s", "baseline_m", "illumination_x", "illumination_y")
+            low = min(values)
+            good = free or (low > 0 if positive else low >= 0)
+            require(good, f"zones: {spec.name} {low:g} is below 0" + (" or 0" if positive else ""))
+        require(self.crosstalk < 1, f"zones: crosstalk {self.crosstalk:g} is outside [0, 1)")
+
+    @property
+    def count(self) -> int:
+        return len(self.centre_x)
+
+    def without(self, effect: str) -> ZoneArray:
+        """Return the array with one of EFFECTS off; delays and clocks become their mean over the zones."""
+        even = self.count
+        off = {
+            "parallax": {"baseline_m": (0.0, 0.0, 0.0)},
+            "aperture": {"aperture_m": 0.0},
+            "illumination": {"curvature_x": 0.0, "curvature_y": 0.0},
+            "clock": {"clock": (float(np.mean(self.clock)),) * even},
+            "delay": {"delay_s": (float(np.mean(self.delay_s)),) * even},
+            "crosstalk": {"crosstalk": 0.0},
+            "saturation": {"trials": (math.inf,) * even},
+            "recovery": {"recovery": 0.0},
+            "compression": {"compression": 0.0},
+            "background": {"background": (0.0,) * even},
+        }
+        require(effect in off, f"effect {effect!r} is unknown, expected one of {', '.join(EFFECTS)}")
+        return replace(self, **off[effect])
+
+
+class ZoneReturns(NamedTuple):
+    """What reaches one zone: path intervals [m] and light [1 / (m^2 J)], (N,) float64 each."""
+
+    near_m: np.ndarray
+    far_m: np.ndarray
+    light: np.ndarray
+
+
+def zone_returns(transient: Transient, zones: ZoneArray) -> list[ZoneReturns]:
+    """Gather the returns that each zone sees: radiance x share of the pixel in the zone x cos^4 of its direction.
+
+    The emitter's intensity is taken at the first surface of each pixel, exact for direct light. Raises InputError for a
+    transient without a camera in its `meta`, or whose laser is not where the zones' emitter is.
+    """
+    _check_laser(transient, zones)
+    x, y, depth = _pixel_tangents(transient)
+    pitch = x[0, 1] - x[0, 0] if x.shape[1] > 1 else 2 * x[0, 0]
+    flat = np.where(np.isfinite(depth), depth, 1e9)
+    light = _intensity(zones, x, y, flat) / (1 + x * x + y * y) ** 2
+    blur = zones.aperture_m / flat
+    owner = transient.return_pixel
+    near, far = (path.astype(np.float64) for path in (transient.path_near_m, transient.path_far_m))
+    found = []
+    for zone in range(zones.count):
+        across = _overlap(x - zones.centre_x[zone], zones.width[zone], pitch, blur)
+        along = _overlap(y - zones.centre_y[zone], zones.height[zone], pitch, blur)
+        energy = (across * along * light).ravel()[owner] * transient.radiance
+        seen = energy > 0
+        found.append(ZoneReturns(near[seen], far[seen], energy[seen]))
+    return found
+
+
+def _check_laser(transient: Transient, zones: ZoneArray) -> None:
+    laser = transient.meta.get("laser", {})
+    require("camera" in transient.meta, "zones need a transient that states its camera: render it")
+    rendered = np.asarray(laser.get("baseline_m", (0.0, 0.0, 0.0)))
+    there = bool(np.allclose(rendered, zones.baseline_m, atol=1e-9))
+    stated, asked = ((" ".join(f"{1e3 * v:g}" for v in b)) for b in (rendered, zones.baseline_m))
+    require(there, f"rendered with an emitter at {stated} mm, the zones' is at {asked} mm: render --baseline")
+
+
+def _pixel_tangents(transient: Transient) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tangents x, y (H, W) of the pixels' centres, and their depth along the axis [m], NaN where nothing is."""
+    height, width = transient.height, transient.width
+    focal = 0.5 * width / math.tan(math.radians(transient.meta["camera"]["fov_deg"]) / 2)
+    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal)
+    return x, y, transient.depth_m.astype(np.float64) / np.sqrt(1 + x * x + y * y)
+
+
+def _intensity(zones: ZoneArray, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Return the emitter's relative intensity towards the points that pixels see."""
+    right, down, forward = zones.baseline_m
+    away = np.maximum(depth - forward, 1e-6)
+    u = (x * depth - right) / away - zones.illumination_x
+    v = (y * depth - down) / away - zones.illumination_y
+    return np.exp(-(zones.curvature_x * u * u + zones.curvature_y * v * v) / 2)
+
+
+def _overlap(offset: np.ndarray, width: float, pitch: float, blur: np.ndarray) -> np.ndarray:
+    """Length of pixels of `pitch` at `offset` from a zone's centre that lies in it, its edges blurred by a box."""
+
+    def inside(at: np.ndarray) -> np.ndarray:
+        return _ramp(at + width / 2, blur) - _ramp(at - width / 2, blur)
+
+    return inside(offset + pitch / 2) - inside(offset - pitch / 2)
+
+
+def _ramp(at: np.ndarray, blur: np.ndarray) -> np.ndarray:
+    """Integral of a step at 0 that is blurred by a box of width `blur`."""
+    half = np.maximum(blur, 1e-12) / 2
+    return np.where(np.abs(at) < half, (at + half) ** 2 / (4 * half), np.maximum(at, 0.0))
+
+
+def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0) -> np.ndarray:
+    """Expected primary signal detections (Z, T) float64: pulses integrated over each zone's own bins, crosstalk added.
+
+    What arrives outside of the bins is not counted: the period of such a sensor is longer than its histogram.
+    `drift_s` delays all zones, as a laser that warms up does.
+    """
+    own = np.zeros((zones.count, sensor.bins))
+    edges = torch.arange(sensor.bins + 1, dtype=torch.float64) * sensor.bin_width_s
+    for zone, (near_m, far_m, light) in enumerate(returns):
+        if not len(light):
+            continue
+        scale = 1 / (SPEED_OF_LIGHT_M_PER_S * zones.clock[zone])
+        start = torch.from_numpy(near_m * scale + zones.delay_s[zone] + drift_s)[:, None]
+        length = torch.from_numpy((far_m - near_m) * scale)[:, None]
+        arrived = interval_cdf(sensor.response, edges - start, length.expand(-1, len(edges)))
+        own[zone] = np.diff(torch.from_numpy(light) @ arrived) * zones.gain[zone]
+    own = np.maximum(own, 0.0)
+    return own + zones.crosstalk * own.sum(axis=0)
+
+
+def zone_flux(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0) -> np.ndarray:
+    """Expected primary detections (Z, T) float64: signal and background."""
+    return zone_signal(returns, sensor, zones, drift_s) + np.asarray(zones.background)[:, None]
+
+
+def expected_zone_counts(
+    returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0
+) -> np.ndarray:
+    """Expected counts (Z, T) float64 of one exposure, after saturation."""
+    flux = zone_flux(returns, sensor, zones, drift_s)
+    return saturated(flux, np.asarray(zones.trials), zones.recovery, zones.compression)
+
+
+def draw_zone_counts(
+    returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, *, seed: int = 0, drift_s: float = 0.0
+) -> np.ndarray:
+    """Counts (Z, T) int64 of one exposure; the same seed gives the same counts."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_ZONES, 0, 0)))
+    flux = zone_flux(returns, sensor, zones, drift_s)
+    return draw_saturated(flux, np.asarray(zones.trials), zones.recovery, rng, zones.compression)

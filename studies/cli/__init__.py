@@ -1,5 +1,0 @@
-"""The command line: one file a command, its options above what it does. Heavy imports wait inside `run`."""
-
-from studies.cli.main import main
-
-__all__ = ["main"]

@@ -1,5 +1,0 @@
-"""`python -m studies.cli COMMAND`."""
-
-from studies.start import script
-
-script()

@@ -1,0 +1,84 @@
+"""The command `calibrate`: a sensor file from captures, which `sense` takes; mistakes in one line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from render.transient import write_transient
+from scene2spad.cli import main
+from scene2spad.datasets.zone_captures import read_plane_captures, render_plane, shipped_captures, zone_captures
+from spad.formats.histogram import read_histogram
+from spad.sensor.files import load_sensor, read_sensor, write_sensor
+from spad.zones.sensor import draw_zone_counts, zone_returns
+
+
+def test_shipped_captures_are_a_tmf8820s():
+    captures = read_plane_captures(shipped_captures())
+    assert captures.counts.shape == (119, 9, 128) and (np.diff(captures.distance_m) > 0).all()
+    assert captures.chip_m.shape == (119, 9) and np.abs(captures.drift_bins).max() < 0.5
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A calibration of every fifth capture beyond 0.25 m, enough for a test."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    assert main(["calibrate", "--every", "5", "--nearest", "0.25", "--out", str(folder / "mine.toml")]) == 0
+    return folder / "mine.toml"
+
+
+def test_a_calibrated_sensor_predicts_a_held_out_capture(calibrated):
+    """Shape and amplitude of all zones at 0.3 m, with room over what the full calibration reaches."""
+    found = read_sensor(calibrated)
+    captures = read_plane_captures(shipped_captures())
+    at = int(np.abs(captures.distance_m - 0.3025).argmin())
+    (capture,) = zone_captures(captures.chosen(slice(at, at + 1)), found.sensor, found.zones)
+    counts = draw_zone_counts(capture.returns, found.sensor, found.zones, seed=1, drift_s=capture.drift_s)
+    assert np.linalg.norm(counts - capture.counts) < 0.1 * np.linalg.norm(capture.counts)
+    assert np.abs(counts.sum(axis=1) / capture.counts.sum(axis=1) - 1).max() < 0.06
+    assert 90e-12 < found.sensor.bin_width_s < 97e-12 and found.sources["zones.gain"].startswith("calibrated from")
+    again = calibrated.with_name("again.toml")
+    assert read_sensor(write_sensor(found, again)) == found
+
+
+def test_sense_takes_the_calibrated_sensor(calibrated, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    zones = load_sensor(str(calibrated)).zones
+    write_transient(render_plane(0.25, zones), tmp_path / "plane.exr")
+    options = ["sense", "plane.exr", "--sensor", str(calibrated), "--json"]
+    assert main(options) == 0
+    said = json.loads(capfd.readouterr().out.splitlines()[-1])
+    histogram = read_histogram(tmp_path / "plane.h5")
+    assert histogram.counts.shape == (3, 3, 128) and said["model"] == "zones" and said["mean_signal"] > 1e5
+    light = zone_returns(render_plane(0.25, zones), zones)
+    assert len(light) == 9
+    assert main([*options, "--signal", "500", "--background", "100"]) == 0
+    assert json.loads(capfd.readouterr().out.splitlines()[-1])["mean_signal"] == pytest.approx(500, rel=1e-4)
+    assert main([*options, "--radiometric"]) == 2
+    assert "--radiometric does not go with a sensor of zones" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["none.npz"], "capture file not found"),
+        (["bad.npz"], "not a readable .npz file"),
+        (["thin.npz"], "holds no counts"),
+        (["small.npz"], "captures of 2 zones and 5 bins"),
+        (["--sensor", "reference"], "has no zones"),
+        (["--every", "1"], "leaves no capture"),
+        (["--nearest", "0.39"], "expected 16 or more"),
+        (["--effects", "gravity"], "gravity cannot be fitted"),
+        (["--out", "x.txt"], "must end in .toml"),
+        (["--model-error", "-1"], "is outside 0 to 1"),
+    ],
+)
+def test_mistakes_end_in_one_line(arguments, words, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.npz").write_text("no")
+    np.savez(tmp_path / "thin.npz", distance_m=np.ones(3))
+    np.savez(tmp_path / "small.npz", distance_m=np.linspace(0.1, 0.4, 20), counts=np.ones((20, 2, 5)))
+    status = main(["calibrate", *arguments])
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("scene2spad: ")]
+    assert status == 2 and len(lines) == 1 and words in lines[0]
+    assert not [*tmp_path.glob("*.toml")]

@@ -1,0 +1,127 @@
+"""What the command line says to somebody who mistyped, or gave a file of another kind."""
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from readers import READERS
+
+from csph import CodingTensor, encode, temporal_code
+from scene2spad.cli import main
+from scenes.library.catalog import load_scene
+from spad.formats.histogram import read_histogram
+from spad.sensor.model import Sensor
+
+
+def run(capsys: pytest.CaptureFixture, *words: str) -> tuple[int, str, str]:
+    status = main(list(words))
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["rendr", "plane"], "no command 'rendr'; did you mean 'render'?"),
+        (["--versio"], "did you mean '--version'?"),
+        (["render", "plane", "--widht", "3"], "no option --widht; did you mean '--width'?"),
+        (["render", "plane", "--widht=3"], "did you mean '--width'?"),
+        (["depth", "x.h5", "--metod", "argmax"], "did you mean '--method'?"),
+        (["demo", "--no-seed"], "no option --no-seed"),
+        (["study", "depth-ofset"], "did you mean 'depth-offset'?"),
+        (["scenes", "galery"], "did you mean 'gallery'?"),
+        (["dataset", "tabeltop"], "did you mean 'tabletop'?"),
+    ],
+)
+def test_a_mistyped_word_is_answered_with_the_one_that_was_meant(words, meant, capsys):
+    status, out, err = run(capsys, *words)
+    assert status == 2 and not out
+    assert err.startswith("scene2spad: ") and err.count("\n") == 1 and meant in err
+    assert "Unrecognized options Unrecognized" not in err and "invalid choice invalid" not in err.lower()
+
+
+def test_alone_it_prints_its_help_and_version_its_version(capsys):
+    status, out, _ = run(capsys)
+    assert status == 0 and "render" in out and "usage" in out.lower()
+    status, out, _ = run(capsys, "--version")
+    assert status == 0 and out.startswith("scene2spad 0.")
+
+
+def test_a_file_of_another_kind_is_named_with_the_command_that_takes_it(tmp_path, capsys):
+    for kind in ("transient", "histogram", "weights"):
+        READERS[kind].make(tmp_path / f"a{READERS[kind].suffix}")
+    status, _, err = run(capsys, "depth", str(tmp_path / "a.exr"))
+    assert status == 2 and "is a transient" in err and "scene2spad sense" in err
+    status, _, err = run(capsys, "depth", str(tmp_path / "a.safetensors"))
+    assert status == 2 and "is a checkpoint" in err
+    status, _, err = run(capsys, "sense", str(tmp_path / "a.h5"))
+    assert status == 2 and "expected a transient" in err
+
+
+def test_depth_maps_of_two_checkpoints_have_two_names():
+    from scene2spad.cli.depth import Depth, depth_label
+
+    def label(checkpoint: str) -> str:
+        return depth_label(Depth(file=Path("a.h5"), method="network", checkpoint=Path(checkpoint)))
+
+    labels = [label(name) for name in ("runs/a/model.safetensors", "runs/b/model.safetensors", "w/c.safetensors")]
+    assert labels == ["network-a-model", "network-b-model", "network-c"]
+    assert label("runs/a/last.safetensors") == "network-a-last"
+
+
+def test_reprs_are_one_line_with_shapes_and_units(tmp_path):
+    """A Scene's was 40 kB of arrays."""
+    READERS["histogram"].make(tmp_path / "h.h5")
+    READERS["transient"].make(tmp_path / "t.exr")
+    from render.transient import read_transient
+
+    for thing, words in (
+        (load_scene("living-room"), ("triangles", "pixels", "deg")),
+        (read_transient(tmp_path / "t.exr"), ("4 x 6 pixels", "returns", " m")),
+        (read_histogram(tmp_path / "h.h5"), ("4 x 6 pixels", "64 bins", "ps", "detections")),
+    ):
+        told = repr(thing)
+        assert len(told) < 250 and "\n" not in told and all(word in told for word in words), told
+
+
+def test_codes_take_numpy_arrays():
+    sensor = Sensor(bins=64)
+    matrix = temporal_code("fourier", 8, 64, sensor)
+    counts = np.random.default_rng(0).poisson(1.0, (3, 5, 64)).astype(np.int32)
+    ours = encode(counts, CodingTensor("numpy", matrix.numpy()))
+    assert torch.equal(ours, encode(torch.from_numpy(counts), CodingTensor("torch", matrix)))
+
+
+def test_results_to_a_full_device_end_in_one_line(monkeypatch, capsys):
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(sys, "stdout", Full())
+    assert main(["scenes", "plane"]) == 2
+    assert "No space left" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_libraries_are_imported_is_one_line():
+    """The signal comes with the first import of the command line, half a second before it used to be answered."""
+    program = """
+import builtins, os, signal, sys
+from scene2spad.start import script
+wrapped = builtins.__import__
+def importing(name, *more):
+    if name.startswith("scene2spad.cli"):
+        os.kill(os.getpid(), signal.SIGINT)
+    return wrapped(name, *more)
+builtins.__import__ = importing
+sys.argv = ["scene2spad", "scenes"]
+script()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 130 and done.stderr.count("\n") == 1 and "interrupted" in done.stderr, done.stderr

@@ -1,0 +1,64 @@
+"""Sizes that nobody means are refused in one line before a set is listed, read, rendered or allocated."""
+
+from __future__ import annotations
+
+import itertools
+from contextlib import contextmanager
+
+import pytest
+
+from scene2spad.cli import main
+from scene2spad.datasets import rendering as dataset
+from scene2spad.datasets.rendering import Job, make_set
+from scenes import InputError
+from scenes.limits import VARIABLE
+
+TRAIN = ["train", "--preset", "smoke"]
+DATASET = ["dataset", "rooms"]
+
+
+@pytest.mark.parametrize(
+    ("argv", "why"),
+    [
+        ([*DATASET, "--count", "1000000000000"], "count 1000000000000 is outside 1 to 1000000"),
+        ([*DATASET, "--width", "16384", "--height", "16384"], "views of 16384 x 16384 pixels on 1 process: needs 1"),
+        ([*DATASET, "--width", "16384", "--workers", "4"], "on 4 processes: needs 6"),
+        ([*DATASET, "--height", "20000"], "image side 20000 is outside 1 to 16384"),
+        ([*DATASET, "--workers", "1000"], "workers 1000 is outside 1 to 256"),
+        ([*TRAIN, "--batch", "100000000"], "a step of 100000000 patches of 8 x 8 pixels and 1024 bins: needs"),
+        ([*TRAIN, "--crop", "1000000000"], "patches of 1000000000 x 1000000000 pixels"),
+        ([*TRAIN, "--steps", "1000000000000"], "1000000000000 steps are above 100000000"),
+        ([*TRAIN, "--threads", "1000000"], "threads 1000000 is outside 0 to 1024"),
+        ([*TRAIN, "--workers", "1000000"], "workers 1000000 is outside 0 to 256"),
+    ],
+)
+def test_absurd_sizes_are_refused_before_any_work(tmp_path, capsys, monkeypatch, argv, why):
+    def work(*_, **__):
+        raise AssertionError("work was begun")
+
+    monkeypatch.setenv(VARIABLE, "8")
+    monkeypatch.setattr("scene2spad.networks.training.views_of", work)
+    monkeypatch.setattr("scene2spad.datasets.rendering.Folder", work)
+    assert main([*argv, "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert why in told and told.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_a_set_of_a_million_views_is_listed_as_it_is_rendered(tmp_path, monkeypatch):
+    """The first run is taken before the second is known; so are the views of an endless list."""
+    first = next(dataset._runs(Job("rooms"), itertools.count()))
+    assert first == tuple(range(6))
+    taken = []
+
+    @contextmanager
+    def executor(*_):
+        def run(work, runs, lost):
+            taken.append(next(runs))
+            raise InputError("enough")
+
+        yield run
+
+    monkeypatch.setattr(dataset, "executor", executor)
+    with pytest.raises(InputError, match="enough"):
+        make_set(Job("rooms", width=8, height=8, bounces=1, grid=2), 1_000_000, tmp_path / "set")
+    assert taken == [first]

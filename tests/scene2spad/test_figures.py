@@ -1,0 +1,43 @@
+"""Colour scales serve what is shown, not its one odd pixel."""
+
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+
+from scene2spad.plots.figures import DEPTH_COLOURS, _image, depth_limits
+
+
+def room(pixels: int = 64) -> np.ndarray:
+    return np.linspace(2.0, 6.0, pixels * pixels).reshape(pixels, pixels)
+
+
+def test_one_pixel_far_away_does_not_ruin_the_scale():
+    depth = room()
+    plain = depth_limits(depth)
+    depth[3, 5], depth[7, 7] = 120.0, np.nan
+    limits = depth_limits(depth)
+    assert limits["vmin"] == pytest.approx(plain["vmin"], rel=0.02)
+    assert limits["vmax"] == pytest.approx(plain["vmax"], rel=0.02)
+    depth[3, 5] = np.inf
+    assert depth_limits(depth)["vmax"] == pytest.approx(plain["vmax"], rel=1e-2)
+
+
+def test_without_odd_pixels_nothing_is_cut_off():
+    limits = depth_limits(room())
+    assert limits["vmin"] < 2 and limits["vmax"] > 6
+    two_walls = np.where(np.arange(4096) < 100, 12.0, 3.0)  # 2.4 % of the pixels are no oddity
+    assert depth_limits(two_walls)["vmax"] > 12
+    assert depth_limits(np.full((2, 2), 3.0)) == pytest.approx({"vmin": 2.99, "vmax": 3.01})
+    assert depth_limits(np.full((2, 2), np.nan)) == pytest.approx({"vmin": 0.0, "vmax": 1.02})
+
+
+@pytest.mark.parametrize(("odd", "extend"), [(3.0, "neither"), (120.0, "max"), (0.05, "min")])
+def test_the_colour_bar_points_to_what_lies_beyond_it(odd, extend):
+    depth = room() + 10 * (odd < 1)
+    depth[3, 5] = odd
+    figure, axes = plt.subplots()
+    try:
+        _image(axes, depth, "depth", "m", cmap=DEPTH_COLOURS, **depth_limits(depth))
+        assert axes.images[0].colorbar.extend == extend
+    finally:
+        plt.close(figure)

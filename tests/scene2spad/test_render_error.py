@@ -1,0 +1,88 @@
+"""How much a set's own error matters: the measured error against its definition, the cache, and the table."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from render.transient import read_transient
+from scene2spad.cli import main
+from scene2spad.datasets.planes import random_planes
+from scene2spad.datasets.rendering import Job, render_view
+from scene2spad.studies import render_error
+from spad.detection.flux import signal_per_bin
+from spad.sensor.model import Sensor
+
+SMALL = {"QUALITIES": ((1, 1), (2, 16)), "FINE": (4, 64), "BOUNCES": 2, "DRAWS": 2, "LEVELS": ((10.0, 10.0),)}
+
+
+def run(capfd, *argv: str) -> tuple[int, dict, str]:
+    status = main(["study", "render-error", *argv, "--json"])
+    out, err = capfd.readouterr()
+    return status, json.loads(out.splitlines()[-1]) if status == 0 else {}, err
+
+
+def test_the_measured_error_is_its_definition():
+    """Returns with independent noise in three copies: the first's 5 % alone is seen, the references' cancels."""
+    clean = random_planes(1, size=48, seed=1).transients[0]
+    rng = np.random.default_rng(0)
+    noisy = [replace(clean, radiance=clean.radiance * (1 + s * rng.normal(size=clean.returns)).astype(np.float32))
+             for s in (0.05, 0.02, 0.02)]  # fmt: skip
+    found = render_error.measured_error(noisy[:1], noisy[1:2], noisy[2:])
+    energy = signal_per_bin(clean, Sensor(), slice(0, 48 * 48))[0].square().sum(1).numpy()
+    # sum (x - A)(x - B): the noise of x squared, and cross terms of mean 0
+    weight = energy / energy.sum()
+    effective = 1 / (weight**2).sum()  # pixels
+    assert found == pytest.approx(0.05, rel=4 * math.sqrt(2 / effective))
+    assert render_error.measured_error([clean], [clean], [clean]) == 0
+
+
+def test_other_noise_of_the_same_scene(tmp_path):
+    """`again` = 0 is the set's own render, byte for byte; 1 has other light and the same surfaces."""
+    job = Job("rooms", 3, 8, 8, bounces=2, spp=8, grid=1)
+    transients = []
+    for name, again in (("own", ()), ("zero", (0,)), ("other", (1,))):
+        (tmp_path / name).write_bytes(render_view(job, 0, *again).exr)
+        transients.append(read_transient(tmp_path / name))
+    own, zero, other = transients
+    assert np.array_equal(own.radiance, zero.radiance) and np.array_equal(own.offsets, zero.offsets)
+    np.testing.assert_array_equal(own.depth_m, other.depth_m)
+    assert not np.array_equal(own.radiance, other.radiance)
+
+
+def test_table(capfd, tmp_path, monkeypatch):
+    for name, value in SMALL.items():
+        monkeypatch.setattr(render_error, name, value)
+    trained = tmp_path / "run"
+    arguments = ["--preset", "smoke", "--compression", "64", "--threads", "1", "--out", str(trained)]
+    assert main(["train", *arguments]) == 0
+    given = ["--width", "16", "--height", "12", "--views", "1", "--cache", str(tmp_path / "cache")]
+    given += ["--out", str(tmp_path / "out"), "--checkpoints", str(trained)]
+    status, found, said = run(capfd, *given)
+    assert status == 0, said
+    rows = found["rows"]
+    assert len(rows) == 5 * 2 and {row["method"] for row in rows} == {"log-matched", str(trained)}
+    assert rows[-1]["measured"] is None and all(row["mae_mm"] > 0 for row in rows)
+    coarse, finer = (np.mean([r["measured"] for r in rows if r["grid"] == grid]) for grid in (1, 2))
+    assert coarse > finer > 0
+    assert rows[0]["mae_mm"] != rows[2]["mae_mm"]  # other noise
+    # everything comes from the cache, but what is damaged is rendered again, to the same
+    kept = sorted((tmp_path / "cache").glob("*.exr"))
+    assert len(kept) == 6
+    times = {path: path.stat().st_mtime_ns for path in kept}
+    kept[0].write_bytes(kept[0].read_bytes()[:100])
+    assert run(capfd, *given)[1]["rows"] == rows
+    assert [path for path in kept if path.stat().st_mtime_ns != times[path]] == kept[:1]
+
+
+def test_mistakes_end_in_one_line(capfd, tmp_path):
+    out = ["--out", str(tmp_path)]
+    for given, told in (
+        (("--views", "9"), "views 9 is outside 1 to 8 of set tabletop"),
+        (("--scene-set", "nowhere"), "scene set 'nowhere'"),
+        (("--checkpoints", str(tmp_path / "none")), "file not found"),
+    ):
+        status, _, said = run(capfd, *given, *out)
+        assert status == 2 and told in said and len(said.strip().splitlines()) == 1

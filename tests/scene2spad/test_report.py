@@ -1,0 +1,319 @@
+"""`report` on a made-up tree of results: what is there is shown once, what is not is named, and the page is valid HTML
+that loads nothing."""
+
+import base64
+import io
+import json
+import os
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scene2spad.cli import main
+from scene2spad.networks.registry import Wanted
+from scene2spad.options.experiments import ABLATIONS
+from scene2spad.report import html as report_html
+from scene2spad.report import page as report
+from scene2spad.report import published as report_published
+from scene2spad.report.plan import SECTIONS
+from scene2spad.studies.ablations.plan import CLAIMS, sheets_of
+from scene2spad.studies.depth_offset.plan import plan_of
+from scenes import InputError
+
+VOID = {"meta", "link", "img", "br", "hr", "input"}
+LOADING = {"src", "href", "srcset", "data", "poster", "action", "background", "xlink:href"}
+
+
+class Page(HTMLParser):
+    """Elements of a page, and everything that is wrong with them."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.seen: list[tuple[str, dict[str, str]]] = []
+        self.wrong: list[str] = []
+        self.text: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "p" and "p" in self.open:
+            self.wrong.append("p within p")
+        self.seen.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(f"</{tag}> closes something else")
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+    def of(self, tag: str) -> list[dict[str, str]]:
+        return [attrs for name, attrs in self.seen if name == tag]
+
+    @property
+    def words(self) -> str:
+        return " ".join(" ".join(self.text).split())
+
+
+def png(seed: int, size: tuple[int, int] = (9, 7)) -> bytes:
+    pixels = np.random.default_rng(seed).integers(0, 255, (size[1], size[0], 3), np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+def put(path: Path, contents: bytes | str | dict, age: int = 0) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(contents) if isinstance(contents, dict) else contents
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    os.utime(path, (1_700_000_000 - age,) * 2)
+
+
+@pytest.fixture
+def tree(tmp_path) -> Path:
+    """A bench, an ablation with markup in its names, a broken figure, a cut table, inner files of studies."""
+    root = tmp_path / "results"
+    put(root / "bench/bench-render-raw.png", png(1))
+    put(root / "bench/bench-render-pulse.png", png(2))
+    ratio = {"scene": "flash", "size": 64, "ratio": 12.3456, "error": 0.01, "chief": True}
+    numbers = {"ratios": [ratio, {**ratio, "scene": "not chief", "chief": False}], "checks": []}
+    put(root / "bench/bench-render.json", {**numbers, "machine": {"cpus": 2, "versions": {"mitsuba": "3.9"}}})
+    put(root / "bench/bench-hard-cases.csv", "name,passed,error\n<b>glass</b> & co,True,1e-4\n")
+    put(root / "bench/bench-sense.csv", 'name,seconds\n"cut')
+    model = {
+        "name": "fourier-1024x1x1-128x-s0",
+        "preset": "laptop",
+        "steps": 8,
+        "trained_on": "planes",
+        "sha256": "ab" * 32,
+    }
+    fourier = {
+        "models": [model],
+        "absent": ["gray-1024x1x1-128x-s0"],
+        "conclusions": [{"claim": "4 x 4 is <best>", "verdict": "not decided", "why": "absent: <x>"}],
+        "summary": [{"design": "fourier", "mae_mm": None}],
+    }
+    put(root / "study/fourier.json", fourier)
+    put(root / "study/fourier-12-128x.png", png(3))
+    put(root / "older/fourier-12-128x.png", png(4), age=1000)
+    published = "model,of,near_mae_mm_label\nfourier-1024x1x1-128x-s0,5 of 8 scenes,80.68\n"
+    put(root / "study/fourier-published.csv", published)
+    put(root / "study/codes.png", png(5)[:-30])
+    put(root / "study/copy.png", png(3))
+    put(root / "study/power.json", "{")
+    put(root / "study/depth-offset.json", {"models": [1, "x"], "absent": 3, "bars": [1], "conclusions": "none"})
+    put(root / "study/smoke/sets/tabletop/set.json", {"set": "tabletop", "grid": 4, "deep": {"a": 1, "b": {}}})
+    put(root / "study/smoke/models/m/config.json", {"preset": "smoke", "rate": 0.001})
+    put(root / "study/smoke/renders/inner.png", png(6))
+    return root
+
+
+def made(tree: Path, capfd) -> tuple[dict, str]:
+    out = tree / "report.html"
+    assert main(["report", "--results", str(tree), "--out", str(out), "--json"]) == 0
+    told = json.loads(capfd.readouterr().out)
+    assert told["out"] == str(out) and told["bytes"] == out.stat().st_size
+    return told, out.read_text(encoding="utf-8")
+
+
+def test_every_section_is_there_and_every_link_leads_somewhere(tree, capfd):
+    _, text = made(tree, capfd)
+    page = Page(text)
+    assert not page.wrong and not page.open
+    ids = [attrs["id"] for _, attrs in page.seen if "id" in attrs]
+    assert len(ids) == len(set(ids))
+    expected = [one.anchor for part in SECTIONS for one in (part, *part.items)]
+    shown = [one for one in ids if one in expected]
+    # what was measured, in order, speed against error first; what was not makes no heading
+    assert shown == [one for one in expected if one in shown]
+    assert {"speed", "bench-render", "bench-hard-cases", "figure-12"} <= set(shown) and "bench-encode" not in shown
+    assert ids[-1] == "not-measured" and {"configurations", "others"} <= set(ids)
+    links = [attrs["href"] for attrs in page.of("a")]
+    assert set(links) == {href for href in links if href[1:] in ids} and len(links) >= len(shown)
+    assert text.startswith("<!DOCTYPE html>") and page.of("html")[0]["lang"] == "en"
+    assert [tag for tag, _ in page.seen].count("h1") == 1 and len(page.of("title")) == 1
+
+
+def test_the_page_loads_nothing(tree, capfd):
+    _, text = made(tree, capfd)
+    page = Page(text)
+    for tag, attrs in page.seen:
+        assert tag not in ("script", "iframe", "object", "embed", "form")
+        for name in LOADING & set(attrs):
+            assert attrs[name].startswith(("#", "data:")), f"{tag} {name}={attrs[name][:40]}"
+    assert not re.search(r"https?://|url\(|@import", text)
+    assert "default-src 'none'" in text
+
+
+def test_pictures_are_whole_in_it_once_and_told(tree, capfd):
+    told, text = made(tree, capfd)
+    images = Page(text).of("img")
+    embedded = [base64.b64decode(one["src"].removeprefix("data:image/png;base64,")) for one in images]
+    assert embedded == [png(1), png(2), png(3)] and told["figures"] == 3  # no older, inner, broken or second one
+    assert all(one["alt"] and (one["width"], one["height"]) == ("9", "7") for one in images)
+    words = Page(text).words
+    assert "1 older of that name not shown" in words and "shown above" in words
+
+
+def test_text_of_results_is_text(tree, capfd):
+    _, text = made(tree, capfd)
+    page = Page(text)
+    assert "<b>" not in text and "<x>" not in text and "<best>" not in text
+    assert "<b>glass</b> & co" in page.words and "4 x 4 is <best>" in page.words
+
+
+def test_what_is_missing_or_broken_is_named_with_its_command(tree, capfd):
+    told, text = made(tree, capfd)
+    missing = {one["command"]: one["files"] for one in told["missing"]}
+    assert missing["scene2spad bench encode"] == ["bench-encode.png", "bench-encode.csv"]
+    assert "scene2spad bench render" not in missing or missing["scene2spad bench render"] == ["bench-render.csv"]
+    assert missing["scene2spad study fourier --full"] == ["fourier-11-64x.png"]
+    assert "codes.png" not in missing.get("scene2spad study codes", [])  # there, but broken
+    broken = {line.split(":")[0] for line in told["problems"]}
+    assert broken == {"study/codes.png", "bench/bench-sense.csv", "study/power.json", "study/depth-offset.json"}
+    end = text[text.index('id="not-measured"') :]
+    for command, files in missing.items():
+        assert command in end and all(name in end for name in files)
+    assert all(name in end for name in broken)
+    assert "fourier: 4 x 4 is &lt;best&gt;" in end and "captures" in end
+
+
+def test_configurations_and_versions(tree, capfd):
+    _, text = made(tree, capfd)
+    words = Page(text[text.index('id="configurations"') :]).words
+    for told in ("scene2spad", "torch", "study/smoke/sets/tabletop", "study/smoke/models/m", "mitsuba: 3.9", "planes"):
+        assert told in words
+    assert "abababababab" in words and "ab" * 7 not in words
+
+
+def test_sets_with_views_above_their_error_target_are_marked(tree, capfd):
+    folder = tree / "study/smoke/sets/tabletop"
+    lines = [json.dumps({"view": i, "file": "view.exr", "target_met": i > 1}) for i in range(5)]
+    put(folder / "index.jsonl", "\n".join(lines) + "\n")
+    put(folder / "view.exr", b"")
+    put(tree / "study/smoke/sets/rooms/set.json", {"set": "rooms"})
+    put(tree / "study/smoke/sets/rooms/index.jsonl", "{cut")
+    told, text = made(tree, capfd)
+    words = Page(text[text.index('id="configurations"') :]).words
+    assert "above the error target" in words and "2 (!)" in words
+    assert any("rooms/index.jsonl: cannot be read" in line for line in told["problems"])
+
+
+def test_only_the_chief_ratios_are_shown(tree, capfd):
+    words = Page(made(tree, capfd)[1]).words
+    assert "12.35" in words and "not chief" not in words
+
+
+def test_measured_things_come_first_and_missing_ones_in_one_list_at_the_end(tree, capfd):
+    _, text = made(tree, capfd)
+    before, _, end = text.partition('<section id="not-measured"')
+    assert 'class="missing"' not in text and "not measured" not in before.partition("<main>")[2].lower()
+    assert "bench-encode.png" not in before and "bench-encode.png" in end
+    first = re.search(r"<h3>(.*?)</h3>", before)
+    assert first is not None and first[1] == "Rendering"
+
+
+def test_smoke_results_stand_apart_and_never_beside_print(tree, capfd):
+    numbers = json.loads((tree / "study/fourier.json").read_text())
+    for told in ({"preset": "smoke"}, {"models": [{**numbers["models"][0], "preset": "smoke"}]}):
+        put(tree / "study/fourier.json", {**numbers, **told})
+        _, text = made(tree, capfd)
+        page = Page(text)
+        ids = [attrs["id"] for _, attrs in page.seen if "id" in attrs]
+        assert "smoke" in ids and "80.68" not in text and "40.34" not in text
+        smoke = text[text.index('<section id="smoke"') : text.index('<section id="configurations"')]
+        assert base64.b64encode(png(3)).decode() in smoke + text and "smoke: study/fourier-12-128x.png" in smoke
+        assert "study/fourier-published.csv" in smoke and not page.wrong and not page.open
+
+
+def test_an_empty_folder_makes_a_page_of_what_is_missing(tmp_path, capfd):
+    (tmp_path / "results").mkdir()
+    told, text = made(tmp_path / "results", capfd)
+    page = Page(text)
+    assert not page.wrong and not page.open and told["figures"] == 0
+    expected = {name.file for part in SECTIONS for item in part.items for name in (*item.pictures, *item.tables)}
+    assert expected <= {name for one in told["missing"] for name in one["files"]}
+    assert not page.of("img") and page.words.count("Not found, and the command that makes it") == 1
+
+
+def test_the_same_results_give_the_same_page(tree, capfd):
+    assert made(tree, capfd)[1] == made(tree, capfd)[1]
+
+
+def test_mistakes_end_in_one_line(tree, tmp_path, capfd):
+    put(tmp_path / "mine.html", "<p>my own page</p>")
+    for given, told in (
+        (("--results", str(tmp_path / "none")), "no folder of results"),
+        (("--results", str(tree), "--out", str(tmp_path / "page.txt")), "must end in .html"),
+        (("--results", str(tree), "--out", str(tmp_path / "mine.html")), "choose another --out"),
+        (("--results", str(tree), "--out", str(tmp_path / "no/page.html")), "does not exist"),
+    ):
+        assert main(["report", *given]) == 2
+        said = capfd.readouterr().err
+        assert told in said and len(said.strip().splitlines()) == 1
+    assert (tmp_path / "mine.html").read_text() == "<p>my own page</p>"
+
+
+# What is expected, against what studies write
+
+
+def test_figures_of_the_ablations_are_those_that_their_studies_draw():
+    pictures = {one.file for part in SECTIONS for item in part.items for one in item.pictures}
+    for study in ABLATIONS:
+        for sheet in sheets_of(study, "paper", True):
+            assert f"{study}-{sheet.figure}-{sheet.compression}x.png" in pictures
+        assert study in CLAIMS
+    for ratio in plan_of("laptop", False).compressions:
+        assert f"depth-offset-3-{ratio}x.png" in pictures
+
+
+def test_every_file_expected_is_written_somewhere_in_the_package():
+    """Names that no module spells, whole or in its parts, are names that nothing writes."""
+    folder = Path(report.__file__).parents[1]
+    source = "\n".join(p.read_text() for p in folder.rglob("*.py") if p.parent.name != "report")
+    for part in SECTIONS:
+        for item in part.items:
+            for file in (*(one.file for one in item.pictures), *(one.file for one in item.tables), *item.data):
+                stem, _, ending = file.rpartition(".")
+                if re.search(r"\d+x$", stem) or stem.split("-summary")[0] in ABLATIONS:
+                    continue  # composed: the test above
+                tail = stem.rpartition("-")[2]
+                assert stem in source or f"-{tail}.{ending}" in source or f'"{tail}"' in source, file
+
+
+# Published numbers
+
+
+def test_published_numbers_stand_beside_ours():
+    one, other = Wanted("fourier", (1024, 1, 1)), Wanted("gray", (1024, 1, 1))
+    rows = report_published.error_rows([one, other], [{"model": one.name, "near_mae_mm_label": 80.68}], far=False)
+    assert rows[0]["near published"] == 40.34 and rows[0]["near ours / published"] == "2.00 worse"
+    assert len(rows) == 1  # print stands beside what was measured, alone beside nothing
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.00012346, "0.0001235"),
+        (True, "yes"),
+        (None, "–"),
+        (float("nan"), "–"),
+        ([1, 2.5], "1, 2.5"),
+        ({"a": 1}, "a: 1"),
+        (1234567, "1234567"),
+    ],
+)
+def test_cells(value, text):
+    assert report_html.spelled(value) == text
+
+
+def test_gathering_wants_a_folder(tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        report.gather(tmp_path / "none")

@@ -1,0 +1,190 @@
+"""The commands `sense`, `depth` and `bench sense` with the sensor's wider options."""
+
+import csv
+import json
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import scipy.io
+
+from render.transient import write_transient
+from scene2spad.bench import estimators
+from scene2spad.bench.sense import alternating, one_law, relief
+from scene2spad.cli import main
+from scene2spad.plots import figures
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from spad.detection.detect import expected_in_pixel, sense
+from spad.formats.histogram import read_histogram
+from spad.formats.mat import read_mat
+from spad.formats.rgbd import transient_from_rgbd
+from spad.sensor.budget import Optics
+from spad.sensor.files import SensorFile, write_sensor
+from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    depth = np.linspace(2, 6, 8 * 10).reshape(8, 10)
+    transient = transient_from_rgbd(depth, np.full_like(depth, 0.5), np.full_like(depth, 0.02))
+    write_transient(transient, tmp_path / "s.exr")
+    return transient
+
+
+def run(capfd, *argv: str) -> tuple[int, dict, str]:
+    status = main([*argv, "--json", "--no-figure"] if argv[0] in ("sense", "depth") else [*argv, "--json"])
+    out, err = capfd.readouterr()
+    return status, json.loads(out.splitlines()[-1]) if out.strip() else {}, err
+
+
+def test_laws_and_inverses_by_command(scene, capfd):
+    status, said, err = run(capfd, "sense", "s.exr", "--signal", "4e5", "--background", "4e5")
+    assert status == 0 and said["model"] == "first-photon" and said["pile_up"] > 0.5 and "pile-up" in err
+    assert said["mean_counts"] < 0.95 * 8e5
+    errors = {}
+    for method in ("log-matched", "coates", "lmf-published", "correlation"):
+        status, depth, _ = run(capfd, "depth", "s.h5", "--method", method)
+        assert status == 0 and 0 <= depth["confidence"] <= 1
+        errors[method] = depth["mae_mm"]
+    assert errors["coates"] < 0.5 < errors["log-matched"]
+    options = ("--model", "free-running", "--dead-time", "3e-7", "--exposure", "1e-3")
+    status, said, _ = run(capfd, "sense", "s.exr", "--signal", "1e3", "--background", "1e3", *options)
+    assert status == 0 and said["model"] == "free-running" and said["mean_counts"] < 1e-3 / 3e-7 + 1
+
+
+def test_detector_options_reach_the_sensor(scene, capfd, tmp_path):
+    np.save(tmp_path / "p.npy", np.exp(-np.arange(40) / 8))
+    np.save(tmp_path / "d.npy", np.full((8, 10), 90.0))
+    options = "--jitter 5e-11 --jitter-tail 1e-10 --pde 0.3 --crosstalk 0.002 --dead-pixels 0.1 --hot-pixels 0.05"
+    status, said, err = run(
+        capfd, "sense", "s.exr", *options.split(), "--pulse", "p.npy", "--pulse-step", "2e-11", "--sensor", "linospad"
+    )
+    sensor = read_histogram(tmp_path / "s.h5").sensor
+    assert status == 0 and said["mean_signal"] == pytest.approx(45, rel=0.05) and "crosstalk" in err
+    assert (sensor.name, sensor.bins, sensor.pde, sensor.crosstalk) == ("linospad", 1536, 0.3, 0.002)
+    assert sensor.jitter.tail_s == 1e-10 and len(sensor.pulse.samples) == 40 and sensor.hot_rate_hz == 1e4
+    status, said, _ = run(capfd, "sense", "s.exr", "--dark-map", "d.npy")
+    assert status == 0 and said["dark_share"] == pytest.approx(3 / 50)
+
+
+def test_a_sensor_file_is_the_sensor_and_options_change_it(scene, capfd, tmp_path):
+    """Every field of the sensor has an option; one that the file sets and no option names stays as it is."""
+    sensor = Sensor(name="mine", bins=512, bin_width_s=2e-10, crosstalk=0.01, hot_share=0.1, hot_rate_hz=3e3)
+    write_sensor(SensorFile(sensor, Optics(1e-9, 5e-3, 1.4, 1e-5)), tmp_path / "mine.toml")
+    status, _, _ = run(capfd, "sense", "s.exr", "--sensor", "mine.toml")
+    assert status == 0 and read_histogram(tmp_path / "s.h5").sensor == sensor
+    options = "--bins 256 --bin-width 4e-10 --pulse-fwhm 1e-9 --pulse-tail 2e-10 --crosstalk 0 --hot-pixels 0"
+    assert run(capfd, "sense", "s.exr", "--sensor", "mine.toml", *options.split())[0] == 0
+    changed = read_histogram(tmp_path / "s.h5").sensor
+    assert (changed.bins, changed.bin_width_s, changed.period_s) == (256, 4e-10, 256 * 4e-10)
+    assert changed.pulse.fwhm_s == pytest.approx(1e-9) and changed.pulse.tail_s == 2e-10
+    assert changed.crosstalk == changed.hot_share == 0
+    _, ours, _ = run(capfd, "sense", "s.exr", "--sensor", "mine.toml", "--radiometric")
+    _, lens, _ = run(capfd, "sense", "s.exr", "--sensor", "mine.toml", "--radiometric", "--f-number", "2.8")
+    assert ours["mean_signal"] == pytest.approx(4 * lens["mean_signal"], rel=1e-4)
+
+
+def test_radiometric_budget_by_command(scene, capfd):
+    status, said, _ = run(capfd, "sense", "s.exr", "--radiometric", "--pde", "0.2", "--pulse-energy", "1e-9")
+    assert status == 0 and said["mean_signal"] > 0 and said["mean_background"] > 0
+    _, twice, _ = run(capfd, "sense", "s.exr", "--radiometric", "--pde", "0.4", "--pulse-energy", "1e-9")
+    assert twice["mean_signal"] == pytest.approx(2 * said["mean_signal"], rel=1e-5)
+
+
+def test_export_by_command(scene, capfd, tmp_path):
+    status, said, _ = run(capfd, "sense", "s.exr", "--export", "mat")
+    assert status == 0 and (tmp_path / "s.mat").is_file() and said["export"] == "s.mat"
+    assert (read_mat(tmp_path / "s.mat").counts == read_histogram(tmp_path / "s.h5").counts).all()
+    assert scipy.io.loadmat(said["pulse_file"])["PSF_img"].shape[:2] == (8, 10)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--jitter-tail", "1e-10"], "needs --jitter"),
+        (["--pulse", "p.npy"], "go together"),
+        (["--pulse", "none.npy", "--pulse-step", "1e-11"], "none.npy"),
+        (["--dark-map", "none.npy"], "none.npy"),
+        (["--radiometric", "--signal", "3"], "leave out --signal"),
+        (["--pde", "2"], "PDE 2"),
+        (["--dead-time", "1e-6", "--model", "first-photon"], "use free-running"),
+        (["--exposure", "1e-12"], "shorter than the period"),
+        (["--sensor", "retina"], "retina"),
+        (["--sensor", "mine.toml"], "mine.toml: sensor file not found"),
+        (["--pulse-tail", "1e-10"], "needs --pulse-fwhm"),
+        (["--pulse", "p.npy", "--pulse-step", "1e-11", "--pulse-fwhm", "1e-10"], "not both"),
+        (["--bins", "100", "--period", "1e-12"], "is not a whole number of bin widths"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(scene, capfd, tmp_path, options, words):
+    status, _, err = run(capfd, "sense", "s.exr", *options)
+    lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
+    assert status == 2 and len(lines) == 1 and words in lines[0] and not (tmp_path / "s.h5").exists()
+
+
+def test_table_of_estimators():
+    rows = estimators.table([("a", relief(6, 7))], sensor_by_name("reference"), [(30, 300)], seed=1)
+    assert len(rows) == 6 * 3 and {row["group"] for row in rows} == {"all", "unmixed", "mixed"}
+    summary = estimators.summary(rows)
+    assert summary["log-matched"]["all"]["rmse_mm"] < summary["argmax"]["all"]["rmse_mm"]
+    for group in ("unmixed", "mixed"):
+        assert sum(row["pixels"] for row in rows if row["group"] == group) <= 6 * 42
+    assert len(set(estimators.LEVELS)) == 16
+    said = estimators.markdown(rows)
+    assert said[2].startswith("| 30 / 300 | ") and said[-1].startswith("| coates | ") and len(said) == 3 + 1 + 2 + 6
+
+
+def test_middlebury_pairs_become_transients(shared_data):
+    transient = estimators.middlebury(shared_data / "middlebury" / "Art")
+    assert (transient.height, transient.width) == (69, 86) and 0 < transient.mixed.mean() < 0.5
+    assert 1.3 < np.nanmin(transient.depth_m) < np.nanmax(transient.depth_m) < 2.3
+
+
+def test_measuring_tools():
+    calls = []
+    seconds = alternating({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 3)
+    assert calls == ["a", "b"] * 4 and set(seconds) == {"a", "b"}
+    rng = np.random.default_rng(0)
+    counts = [rng.poisson(rate, (500, 8)) for rate in (3.0, 3.0)]
+    assert one_law(*counts) > 1e-3
+    assert one_law(counts[0], rng.poisson(np.linspace(2, 4, 8), (500, 8))) < 1e-6
+
+
+@pytest.mark.slow
+def test_bench_sense(tmp_path, capfd):
+    status, said, _ = run(capfd, "bench", "sense", "--quick", "--out", str(tmp_path / "b"), "--data", str(tmp_path))
+    assert status == 0 and "estimators" not in said
+    names = [row["name"] for row in said["rows"]]
+    assert sum("numpy" in name for name in names) == 2 and any("training batch" in name for name in names)
+    assert all(row["same_law_p"] is None or row["same_law_p"] > 1e-4 for row in said["rows"])
+    with (tmp_path / "b" / "bench-sense.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(said["rows"])
+
+
+def test_the_figure_shows_pixels_by_a_stated_rule_with_their_rates_over_the_counts(scene, tmp_path, monkeypatch):
+    """At 10 + 200 photons the rate still peaks at the true depth, where counts alone would not."""
+    budget = PhotonBudget(10, 200)
+    histogram = sense(scene, sensor_by_name("reference"), budget, seed=1)
+    shown = figures.shown_pixels(histogram)
+    signal = histogram.expected_signal
+    for name, rank in (("dark", 0.1), ("median", 0.5), ("bright", 0.9)):
+        below = (signal < signal[shown[name]]).mean()
+        assert abs(below - rank) < 0.02  # 80 pixels
+    mixed = replace(histogram, mixed=signal > np.median(signal))
+    assert all(not mixed.mixed[place] for place in figures.shown_pixels(mixed).values())
+    kept = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: kept.append(figure) or path)
+    rate = partial(expected_in_pixel, scene, histogram.sensor, budget)
+    figures.draw_histogram(histogram, tmp_path / "h.png", expected=rate)
+    panels = {axes.get_title().split(" pixel")[0]: axes for axes in kept[0].axes if " pixel (" in axes.get_title()}
+    assert [*panels] == ["dark", "median", "bright"]
+    for name, axes in panels.items():
+        counts, expected = axes.patches
+        depth_ns = 2e9 * float(histogram.depth_m[shown[name]]) / SPEED_OF_LIGHT_M_PER_S
+        values, edges, _ = expected.get_data()
+        centre = 0.5 * (edges[values.argmax()] + edges[values.argmax() + 1])
+        assert abs(centre - depth_ns) < 0.1  # one bin
+        assert counts.get_data()[0].sum() == histogram.counts[shown[name]].sum()
+        assert axes.get_xlim()[0] < depth_ns < axes.get_xlim()[1]

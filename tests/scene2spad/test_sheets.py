@@ -1,0 +1,44 @@
+"""Contact sheets, and RGB-D pairs and offsets from the command line."""
+
+import json
+
+import numpy as np
+from PIL import Image
+
+from render.transient import read_transient
+from scene2spad.cli import main
+
+
+def test_a_sheet_of_rooms_is_drawn(tmp_path, capsys):
+    sheet = tmp_path / "sheet.png"
+    assert main(["scenes", "rooms/val", "--sheet", str(sheet), "--count", "2", "--width", "20", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert said["scenes"] == ["rooms/val/0", "rooms/val/1"]
+    assert Image.open(sheet).width > 100
+
+
+def test_sets_are_listed_and_bad_sheets_refused(tmp_path, capsys):
+    assert main(["scenes", "--json"]) == 0
+    assert {"rooms/train", "tabletop", "middlebury"} <= set(json.loads(capsys.readouterr().out)["sets"])
+    for arguments in (["kitchens", "--sheet", str(tmp_path / "s.png")], ["rooms", "--sheet", str(tmp_path / "s.jpg")]):
+        assert main(["scenes", *arguments]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_rgbd_pair_is_rendered_and_moved(tmp_path, capsys):
+    Image.fromarray(np.full((12, 16), 188, np.uint8)).save(tmp_path / "photo.png")
+    Image.fromarray(np.full((12, 16), 2000, np.uint16)).save(tmp_path / "depth.png")
+    pair = ["render", str(tmp_path / "photo.png"), "--depth", str(tmp_path / "depth.png"), "--no-figure"]
+    pair += ["--width", "16", "--bounces", "1", "--grid", "2"]
+    known = ["--focal", "20", "--depth-scale", "0.001"]
+    for name, more, extra_m in (("here", [], 0.0), ("far", ["--offset", "3", "--offset-mode", "ray"], 3.0)):
+        assert main([*pair, *known, *more, "--out", str(tmp_path / f"{name}.exr")]) == 0
+        transient = read_transient(tmp_path / f"{name}.exr")
+        x, y = (np.arange(16) - 7.5) / 20, (np.arange(12)[:, None] - 5.5) / 20
+        assert np.abs(transient.depth_m - 2 * np.sqrt(1 + x**2 + y**2) - extra_m).max() < 2e-3
+    capsys.readouterr()
+    for missing in (known[:2], known[2:]):
+        assert main([*pair, *missing, "--out", str(tmp_path / "no.exr")]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and "scale" in said + "scale" * ("--focal" in said)
+    assert not (tmp_path / "no.exr").exists()

@@ -1,0 +1,207 @@
+"""Training and evaluation as a user meets them: a set, a checkpoint, depth; killed and resumed; one line a mistake."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from csph.evaluation.metrics import PHOTON_LEVELS
+from render.transient import write_transient
+from render.transient.packs import write_pack
+from scene2spad.bench import network as bench
+from scene2spad.cli import main
+from scene2spad.datasets.planes import FAR_M, Plane, random_planes
+from spad.detection.detect import sense
+from spad.formats.histogram import write_histogram
+from spad.sensor.model import PhotonBudget, Sensor
+
+QUICK = ["--preset", "smoke", "--threads", "1"]
+
+
+def run(capfd, *argv: str) -> dict:
+    status = main([*argv, "--json"])
+    out, err = capfd.readouterr()
+    assert status == 0, err
+    assert len(out.splitlines()) == 1
+    return json.loads(out)
+
+
+def refused(capfd, *argv: str) -> str:
+    status = main(list(argv))
+    out, err = capfd.readouterr()
+    lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
+    assert status == 2 and out == "" and len(lines) == 1 and "Traceback" not in err
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory) -> Path:
+    """Six scenes of planes as a pack."""
+    path = tmp_path_factory.mktemp("set") / "planes.h5"
+    views = random_planes(6, size=16, seed=4)
+    write_pack(((t, {"scene": s}) for t, s in zip(views.transients, views.scenes, strict=True)), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(packed, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "learned"
+    assert main(["train", *QUICK, "--set", str(packed), "--out", str(folder)]) == 0
+    return folder
+
+
+def test_planes_are_planes():
+    plane = Plane(np.array([0.0, 0.0, -1.0]), 2.0, 0.5)
+    rays = np.array([[0.0, 0, 1], [0.6, 0, 0.8], [0, 0, -1]])
+    assert plane.distance_m(rays).tolist() == [2.0, 2.5, np.inf]
+    views = random_planes(12, size=24, seed=3)
+    for transient in views.transients:
+        met = np.isfinite(transient.depth_m)
+        assert met.any() and transient.returns == met.sum()
+        np.testing.assert_allclose(transient.mean_path_m()[met] / 2, transient.depth_m[met], rtol=1e-6)
+        assert transient.depth_m[met].min() > 0.1 and transient.depth_m[met].min() < 2 * FAR_M
+    again = random_planes(12, size=24, seed=3)
+    assert [t.sha256() for t in views.transients] == [t.sha256() for t in again.transients]
+    assert views.transients[0].sha256() != random_planes(1, size=24, seed=4).transients[0].sha256()
+
+
+def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run(capfd, "train", *QUICK, "--set", str(packed), "--out", "run")
+    assert {"steps", "seconds", "val_rmse_mm", "checkpoint", "parameters"} <= result.keys()
+    assert result["steps"] == 8 and result["model"] == "learned 256x4x4 K32, compact"
+    config = json.loads(Path("run/config.json").read_text())
+    assert config["data"]["training"] == str(packed) and len(config["data"]["training_sha256"]) == 64
+    assert config["model"]["sensor"]["bins"] == 1024
+
+    found = run(capfd, "evaluate", "run", "--set", str(packed), "--views", "2", "--int8", "--out", "table")
+    assert {"mae_mm", "rmse_mm", "within_10mm", "by_sbr", "methods", "overflows"} <= found.keys()
+    name = "learned 256x4x4 K32, compact"
+    assert set(found["methods"]) == {name, f"{name} int8", "argmax", "log-matched", "fourier-8"}
+    assert found["method"] == f"{name} int8" and found["trainings"] == 1
+    rows = Path("table/evaluation.csv").read_text().splitlines()
+    assert len(rows) == 1 + 2 * len(PHOTON_LEVELS) * 5 * 3
+    by_sbr = found["by_sbr"]["log-matched"]
+    assert by_sbr["high_sbr"]["mae_mm"] < by_sbr["low_sbr"]["mae_mm"]
+    every = found["methods"]["log-matched"]["all"]["all"]
+    assert every["mae_interval_mm"][0] < every["mae_mm"] < every["mae_interval_mm"][1]
+    moved = run(capfd, "evaluate", "run", "--set", str(packed), "--views", "1", "--offset", "2", "--out", "table")
+    assert min(b["near_m"] for b in moved["methods"]["argmax"]["bias_by_depth"]) >= 2
+
+    histogram = sense(random_planes(1, size=16, seed=4).transients[0], Sensor(), PhotonBudget(50, 50))
+    write_histogram(histogram, Path("planes.h5"))
+    depth = run(capfd, "depth", "planes.h5", "--method", "network", "--checkpoint", "run", "--no-figure")
+    assert depth["pixels"] == np.isfinite(histogram.depth_m).sum() and depth["method"] == "network-run"
+    assert Path("planes-network-run.exr").is_file()
+    assert 0 < depth["posterior_within_3_bins"] <= 1
+    mean = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--decoder", "soft-argmax")
+    median = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--no-figure")
+    assert median["mae_mm"] < mean["mae_mm"]
+    layers = OpenEXR.File("planes-network-none-s0.exr", separate_channels=True).channels()
+    assert set(layers) == {"Z", "confidence"}
+    sure = layers["confidence"].pixels
+    assert sure.shape == (16, 16) and sure.mean() == pytest.approx(median["posterior_within_3_bins"], abs=1e-6)
+
+
+def test_models_are_listed_with_their_limits(capfd):
+    found = {card["name"]: card for card in run(capfd, "models")["models"]}
+    assert found["none-s0"]["compression"] == 1 and found["none-s0"]["training"] == ["rooms2.h5"]
+    assert run(capfd, "models", "none-s0") == found["none-s0"]
+    assert "model 'nonne-s0' is unknown, like none-s0" in refused(capfd, "models", "nonne-s0")
+
+
+def test_folder_of_a_set(capfd, tmp_path):
+    views = random_planes(3, size=8, seed=1)
+    (tmp_path / "views").mkdir()
+    records = []
+    for i, (transient, scene) in enumerate(zip(views.transients, views.scenes, strict=True)):
+        write_transient(transient, tmp_path / f"views/{i}.exr")
+        records.append({"view": i, "scene": scene, "file": f"views/{i}.exr"})
+    records.append({"view": 3, "failed": "no light"})
+    (tmp_path / "index.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    result = run(capfd, "train", *QUICK, "--steps", "2", "--set", str(tmp_path), "--out", str(tmp_path / "run"))
+    assert result["views"] == 2 and result["steps"] == 2
+
+
+def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    train = ["train", *QUICK, "--out", "x", "--set"]
+    assert "nowhere.h5: file not found" in refused(capfd, *train, "nowhere.h5")
+    Path("empty").mkdir()
+    assert "no index.jsonl" in refused(capfd, *train, "empty")
+    Path("empty/index.jsonl").write_text("")
+    assert "empty: the set is empty" in refused(capfd, *train, "empty")
+    Path("empty/index.jsonl").write_text("{cut")
+    assert "is damaged" in refused(capfd, *train, "empty")
+    lasers = random_planes(2, size=8).transients
+    displaced = [(t, {"scene": "a", "laser": {"baseline_m": [0.1, 0, 0]}}) for t in lasers]
+    write_pack(displaced, Path("displaced.h5"))
+    assert "the laser of a is not at the camera" in refused(capfd, *train, "displaced.h5")
+    write_pack([(t, {"scene": "a"}) for t in lasers], Path("one.h5"))
+    assert "a set of one scene (a)" in refused(capfd, *train, "one.h5")
+    assert "crops of 8 pixels are not tiled by blocks of 3 x 3" in refused(
+        capfd, *train, str(packed), "--block", "256", "3", "3", "--compression", "1", "--codes", "8"
+    )
+    assert "does not divide" in refused(capfd, *train, str(packed), "--compression", "100")
+    assert "holds a run with other options" in refused(
+        capfd, "train", *QUICK, "--seed", "1", "--set", str(packed), "--out", str(trained)
+    )
+    assert not Path("x").exists()
+
+    planes = random_planes(1, size=16).transients[0]
+    write_histogram(sense(planes, replace(Sensor(), bins=512), PhotonBudget(5, 5)), Path("other.h5"))
+    depth = ["depth", "other.h5", "--method", "network"]
+    assert "--method network and --checkpoint or --model go together" in refused(capfd, *depth)
+    assert "trained for another sensor" in refused(capfd, *depth, "--checkpoint", str(trained))
+    evaluate = ["evaluate", str(trained), "--set", str(packed)]
+    assert "expected argmax" in refused(capfd, *evaluate, "--baselines", "guess")
+    assert "outside 0 to the sensor's range" in refused(capfd, *evaluate, "--offset", "20")
+    assert "file not found" in refused(capfd, "evaluate", "nowhere", "--set", str(packed))
+
+
+def test_bench_network(capfd, tmp_path, monkeypatch):
+    """At a small size: the plain layers give what ours give, and training takes a step even when its time is up."""
+    small = {"PRESET": "smoke", "FRAME": (1, 1, 1024, 8, 8), "SCENES": 10, "VIEW_PIXELS": 16, "QUICK_SECONDS": 0.0}
+    for name, value in small.items():
+        monkeypatch.setattr(bench, name, value)
+    found = run(capfd, "bench", "network", "--quick", "--repeats", "1", "--out", str(tmp_path))
+    compact, published, plain = found["rows"]
+    assert compact["gmac"] <= 1.5 and published["parameters"] == plain["parameters"] == 568_278
+    assert compact["trained_steps"] == published["trained_steps"] == 1 and compact["error"] > 0
+    assert plain["error"] < 1e-4 and plain["gmac"] > published["gmac"]
+    assert len((tmp_path / "network.csv").read_text().splitlines()) == 4
+
+
+@pytest.mark.slow
+def test_killed_and_resumed(packed, tmp_path):
+    """SIGKILL in the middle of an epoch, twice: the last weights are those of a run that was left alone."""
+    arguments = ["--steps", "40", "--set", str(packed)]
+
+    def start(folder: Path) -> subprocess.Popen:
+        code = "import sys; from scene2spad.cli import main; sys.exit(main(sys.argv[1:]))"
+        command = [sys.executable, "-c", code, "train", *QUICK, *arguments, "--out", str(folder)]
+        return subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=subprocess.DEVNULL)
+
+    assert start(tmp_path / "whole").wait(300) == 0
+    folder = tmp_path / "killed"
+    process = start(folder)
+    for wait in (lambda: (folder / "config.json").is_file(), lambda: (folder / "resume.ckpt").is_file()):
+        end = time.monotonic() + 120
+        while not wait() and time.monotonic() < end and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(0.3)
+        assert process.poll() is None, "the run ended before it could be killed"
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        process = start(folder)
+    assert process.wait(300) == 0
+    for name in ("last.safetensors", "model.safetensors", "log.csv", "energy.csv"):
+        assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name

@@ -1,0 +1,146 @@
+"""Models as studies ask for them: names, the commands that make them, what is found, and what is refused."""
+
+import csv
+import logging
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tyro
+
+from csph.networks.model import load_model, save_model
+from scene2spad.cli.main import Command
+from scene2spad.datasets.planes import random_planes
+from scene2spad.networks.registry import Library, Wanted, check, ship_all
+from scene2spad.networks.training import config_of, training_reach_m
+from scene2spad.studies.results import Store
+from scenes import InputError
+
+LEARNED = Wanted("learned", (256, 4, 4), 128, 1)
+
+
+def quietly(what: str, share: float) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder of runs that holds one."""
+    path = tmp_path_factory.mktemp("models")
+    Library(path, None).train([LEARNED], "smoke", Path("planes"), quietly)
+    return path
+
+
+def test_names_and_labels():
+    wanted = [Wanted(), Wanted("fourier+learned", full=True), Wanted("none", seed=2), Wanted(time_offset_m=7.5)]
+    assert [one.name for one in wanted] == [
+        "learned-256x4x4-128x-s0",
+        "full-fourier-learned-256x4x4-128x-s0",
+        "none-s2",
+        "learned-256x4x4-128x-t7.5-s0",
+    ]
+    assert [one.label for one in wanted[2:]] == ["no compression", "learned 256x4x4, trained with offsets to 7.5 m"]
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        LEARNED,
+        Wanted("none"),
+        Wanted("peak"),
+        Wanted("fourier", (1024, 1, 1), 64, 2),
+        Wanted(time_offset_m=8, full=True),
+    ],
+    ids=lambda one: one.name,
+)
+def test_spelled_command_is_the_command(wanted):
+    spelled = shlex.split(wanted.spelled("laptop", Path("rooms.h5"), Path("runs")))
+    parsed = tyro.cli(Command, args=spelled[1:])
+    assert parsed.out == Path("runs") / wanted.name
+    assert config_of(parsed) == config_of(wanted.command("laptop", Path("rooms.h5"), Path("runs")))
+    check(config_of(parsed), wanted, Path("model"))
+
+
+def test_found_trained_shipped_or_absent(folder, tmp_path, caplog):
+    found = Library(folder, None).find(LEARNED)
+    assert found.described()["trained_on"] == "planes" and not found.shipped and found.table("energy.csv")
+    assert Library(tmp_path, None).find(LEARNED) is None
+    names = ship_all([found], tmp_path / "weights")
+    assert names == [str(tmp_path / "weights" / f"{LEARNED.name}.safetensors")]
+    shipped = Library(tmp_path, tmp_path / "weights").find(LEARNED)
+    assert shipped.shipped and shipped.digest != found.digest and len(shipped.table("log.csv")) == 2
+    assert shipped.config.data["training_reach_m"] == found.config.data["training_reach_m"]
+    assert ship_all([shipped], tmp_path / "none") == []
+    other = Wanted("fourier", (1024, 1, 1), seed=99)  # of a seed that nobody ships
+    assert [*Library(folder).gather([other, LEARNED])] == [LEARNED]
+
+
+def test_finished_runs_are_not_trained_again(folder, monkeypatch):
+    monkeypatch.setattr("scene2spad.networks.registry.run_train", lambda *_: pytest.fail("trained again"))
+    Library(folder).train([LEARNED], "smoke", Path("planes"), quietly)
+
+
+def test_a_run_killed_before_its_last_weights_goes_on(folder, tmp_path):
+    """Log and state are at the end, `last.safetensors` is not there yet: the run writes it, and ends the same."""
+    run = tmp_path / "models" / LEARNED.name
+    shutil.copytree(folder / LEARNED.name, run)
+    last = (run / "last.safetensors").read_bytes()
+    (run / "last.safetensors").unlink()
+    library = Library(tmp_path / "models", None)
+    assert library.find(LEARNED) is None
+    library.train([LEARNED], "smoke", Path("planes"), quietly)
+    assert (run / "last.safetensors").read_bytes() == last and library.find(LEARNED) is not None
+
+
+def test_unfinished_runs_are_left_out(folder, tmp_path, caplog):
+    run = tmp_path / LEARNED.name
+    run.mkdir()
+    for name in ("model.safetensors", "config.json", "log.csv"):
+        (run / name).write_bytes((folder / LEARNED.name / name).read_bytes())
+    assert Library(tmp_path).find(LEARNED) is not None  # its log reaches the last step
+    rows = list(csv.reader((run / "log.csv").open()))
+    (run / "log.csv").write_text("\n".join(",".join(row) for row in rows[:-1]) + "\n")
+    with caplog.at_level(logging.WARNING, "scene2spad"):
+        assert Library(tmp_path).find(LEARNED) is None
+    assert "not come to its end" in caplog.text
+
+
+def test_other_models_under_its_name_are_refused_in_one_line(folder, tmp_path):
+    model, config, state = load_model(folder / LEARNED.name)
+    for changes, said in (
+        ({"time_offset_m": 8.0, "window": 0}, r"random time offsets \[m\] 8.0, expected 0.0"),
+        ({"seed": 5}, "seed 5, expected 1"),
+        ({"model": replace(config.model, layer={"keep_mean": True})}, "layer"),
+    ):
+        run = tmp_path / LEARNED.name
+        run.mkdir(exist_ok=True)
+        save_model(model, replace(config, **changes), state, run / "model.safetensors")
+        with pytest.raises(InputError, match=said):
+            Library(tmp_path).find(LEARNED)
+    with pytest.raises(InputError, match="design learned 256x4x4 K32, expected learned 1024x4x4 K128"):
+        check(config, Wanted("learned", (1024, 4, 4), 128, 1), Path("x"))
+
+
+def test_reach_is_the_depth_that_one_pixel_in_a_thousand_passes():
+    views = random_planes(3, size=24, seed=1)
+    depth = sorted(float(d) for t in views.transients for d in t.depth_m.ravel() if d == d)
+    reach = training_reach_m(views)
+    assert sum(d > reach + 1e-3 for d in depth) <= 0.001 * len(depth) + 1
+
+
+def test_store_keeps_what_was_put_and_survives_a_cut_line(tmp_path):
+    store = Store(tmp_path / "results")
+    store.put("a" * 64, {"mae": float("nan")}, view=1, level=[10.0, 2.0])
+    store.put("a" * 64, 3, view=2)
+    store.put("b" * 64, 4, view=2)
+    again = Store(tmp_path / "results")
+    assert again.get("a" * 64, view=2) == 3 and again.get("b" * 64, view=2) == 4 and again.get("a" * 64, view=3) is None
+    assert again.get("a" * 64, level=[10.0, 2.0], view=1)["mae"] != 0
+    path = tmp_path / "results" / f"{'a' * 32}.jsonl"
+    path.write_bytes(path.read_bytes()[:-3])  # killed while it wrote the second line
+    cut = Store(tmp_path / "results")
+    assert cut.get("a" * 64, view=2) is None and cut.get("a" * 64, level=[10.0, 2.0], view=1) is not None
+    cut.put("a" * 64, 5, view=2)
+    assert Store(tmp_path / "results").get("a" * 64, view=2) == 5

@@ -1,0 +1,195 @@
+"""The emulated processor from the command line, in the chain, in the bench and in the study."""
+
+import json
+
+import numpy as np
+import pytest
+
+from scene2spad.bench import emulate as bench
+from scene2spad.cli import main
+from scene2spad.studies.power.emulated_chain import by_torch, decode, emulate
+from scene2spad.studies.power.program_tables import int8_temporal
+from scenes.errors import InputError
+from spad.sensor.model import sensor_by_name
+from ultraphase import method
+from ultraphase.catalog import FOLDER, PUBLISHED
+
+
+def run(capfd, *argv: str) -> dict:
+    status = main([*argv, "--json"])
+    out, err = capfd.readouterr()
+    assert status == 0 and len(out.splitlines()) == 1, err
+    return json.loads(out)
+
+
+def refused(capfd, *argv: str) -> str:
+    status = main(list(argv))
+    out, err = capfd.readouterr()
+    assert status == 2 and out == "" and len(err.splitlines()) == 1, err
+    return err
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def counts(height: int, width: int, seed: int = 0, signal: float = 50, background: float = 500) -> np.ndarray:
+    """A plane seen by a pixel array: the same arrival, bin 400 to 401, in every pixel."""
+    random = np.random.default_rng(seed)
+    found = random.poisson(background / 1024, (height, width, 1024)).astype(np.int32)
+    stamps = random.normal(400.5, 1.4, (height, width, round(signal))).astype(int)
+    for row, column in np.ndindex(height, width):
+        np.add.at(found[row, column], stamps[row, column], 1)
+    return found
+
+
+def test_table(capfd, folder):
+    rows = run(capfd, "ultraphase", "table", "--out", "table.csv")["rows"]
+    assert [row["name"] for row in rows] == [*PUBLISHED]
+    for row in rows:
+        for column in ("frame_time_s", "rate_kb_per_s", "processing_uw", "readout_uw"):
+            assert row["recomputed"][column] == pytest.approx(row["published"][column], rel=6e-3)
+        assert row["emulated"]["processing_uw_energy"] > 1000 * row["emulated"]["processing_uw"]
+    assert len((folder / "table.csv").read_text().splitlines()) == 8
+
+
+def test_run_shows_what_it_cost_and_how(capfd, folder):
+    result = run(capfd, "ultraphase", "run", "fourier-8", "--photons", "100", "--signal", "40", "--trace", "9")
+    assert result["counters"]["photons"] == 400 and result["out_bits"] == 4 * 8 * 16
+    assert len(result["trace"]) == 9 and "RDT" in result["trace"][1]
+    again = run(capfd, "ultraphase", "run", "fourier-8", "--photons", "100", "--signal", "40", "--watch", "codes")
+    assert again["out"] == result["out"] and len(again["watch"]) == 100  # the first hundred changes
+    other = run(capfd, "ultraphase", "run", "fourier-8", "--photons", "100", "--signal", "40", "--seed", "1")
+    assert other["out"] != result["out"]
+    summed = run(capfd, "ultraphase", "run", "separable-8")
+    assert np.array(summed["out"]).shape == (1, 32) and summed["stall_clocks"] > 0
+
+
+def test_asm_list_and_verify(capfd, folder):
+    source = folder / "mine.s"
+    source.write_text((FOLDER / "coarse.s").read_text())
+    assembled = run(capfd, "ultraphase", "asm", "mine.s", "--define", "K=8", "SHIFT=7", "--out", "mine.hex")
+    assert (folder / "mine.hex").read_text().split() == assembled["words"] and assembled["ram_bits"] == 64
+    assert "SHR r1, r1, #4" in run(capfd, "ultraphase", "list", "mine.s")["listing"]
+    proof = run(capfd, "ultraphase", "verify", "mine.s")
+    assert proof["verified"] and proof["overflow"] == "saturates" and proof["adds"] == {"least": 0, "most": 1}
+    assert run(capfd, "ultraphase", "verify", "separable-8")["clocks_mean"] == 147
+
+
+def test_sweep_refuses_what_does_not_fit_and_goes_on(capfd, folder):
+    result = run(capfd, "ultraphase", "sweep", "--codes", "4", "26", "--photons", "55", "550", "--pixels", "1048576")
+    assert {row["name"] for row in result["rows"]} >= {"fourier-4", "separable-4", "coarse-16", "raw timestamps"}
+    assert (
+        set(result["refused"]) == {"fourier-26", "separable-26"} and "over the 256" in result["refused"]["fourier-26"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["run"], "which program"),
+        (["table", "fourier-8"], "takes no program"),
+        (["run", "walsh-8"], "walsh-8"),
+        (["run", "fourier-26"], "over the 256"),
+        (["verify", "learned-2"], "144 bits over"),
+        (["verify", "learned-1"], "learned"),
+        (["run", "addressed-8"], "no frame of 2 x 2"),
+        (["asm", "missing.s"], "missing.s"),
+        (["asm", "bad.s"], "bad.s:2:7"),
+        (["asm", "bad.s", "--define", "K"], "NAME=VALUE"),
+        (["run", "fourier-8", "--define", "K=3"], "--define"),
+        (["run", "fourier-8", "--photons", "10"], "50 signal of 10"),
+        (["run", "fourier-8", "--photons", "1", "2"], "2 photon counts"),
+        (["run", "fourier-8", "--photons", "1e9"], "20000"),
+        (["run", "fourier-8", "--trace", "-1"], "--trace -1"),
+        (["run", "fourier-8", "--watch", "nothing"], "nothing"),
+        (["sweep", "--fps", "0"], "0 frames"),
+        (["sweep", "--pixels", "0"], "0 pixels"),
+        (["sweep", "--codes", "7"], "7 codes"),
+        (["table", "--out", "nowhere/t.csv"], "nowhere"),
+    ],
+)
+def test_mistakes_end_in_one_line(capfd, folder, argv, said):
+    (folder / "bad.s").write_text("HALT\n  ADD r1\n".replace("ADD r1", "JMP 3"))
+    assert said in refused(capfd, "ultraphase", *argv)
+    assert [path.name for path in folder.iterdir()] == ["bad.s"]
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_emulated_codes_are_the_torch_paths_and_give_depth(name):
+    chosen, found = method(name), counts(4, 6)
+    spatial = None
+    if chosen.block != (1, 1):
+        spatial = np.random.default_rng(1).integers(-127, 128, (2, 2, chosen.codes))
+    emulated = emulate(found, chosen, spatial)
+    assert np.array_equal(emulated.codes, by_torch(found, chosen, spatial))
+    assert emulated.counters.photons == found.sum()
+    assert emulated.bits == emulated.codes.size * (8 if chosen.family == "coarse" else 16)
+    sensor = sensor_by_name("reference")
+    bright = counts(4, 6, signal=150, background=50)
+    depth = decode(emulate(bright, chosen).codes, chosen, sensor)
+    # a coarse bin without its neighbours only says which bin: half a bin; codes of a few harmonics: some bins of 1024
+    most_bins = {"coarse-16": 64, "coarse-64": 16, "coarse-256": 4}.get(name, 5)
+    assert np.abs(depth / sensor.bin_depth_m - 401).max() < most_bins
+
+
+def test_torch_and_cores_agree_where_numbers_overflow():
+    found = np.zeros((2, 2, 1024), np.int32)
+    found[..., 0] = 300
+    for name in PUBLISHED:
+        chosen = method(name)
+        emulated = emulate(found, chosen)
+        assert np.array_equal(emulated.codes, by_torch(found, chosen))
+        assert (emulated.counters.wraps > 0) == (chosen.family != "coarse")
+        assert emulated.counters.saturations > 0 or chosen.family == "fourier"
+
+
+def test_images_that_do_not_fit_are_refused():
+    with pytest.raises(InputError, match="512 bins"):
+        emulate(np.zeros((2, 2, 512), np.int32), method("coarse-16"))
+    with pytest.raises(InputError, match="3 x 2 pixels does not divide"):
+        emulate(np.zeros((2, 3, 1024), np.int32), method("separable-8"))
+
+
+def test_the_tables_come_from_csph():
+    assert int8_temporal(method("coarse-16")) is None
+    assert int8_temporal(method("fourier-8")).shape == (8, 1024)
+    assert int8_temporal(method("separable-16")).shape == (16, 256)
+
+
+def test_bench_rows_agree_bit_for_bit(capfd, folder):
+    result = run(capfd, "bench", "emulate", "--quick", "--only", "coarse-64", "separable-8", "--out", "bench")
+    assert len(result["rows"]) == 8 and all(row["error"] == 0 and row["seconds"] > 0 for row in result["rows"])
+    assert (folder / "bench" / "bench-emulate.csv").is_file()
+
+
+@pytest.mark.slow
+def test_a_megapixel_frame_equals_the_integer_product():
+    row = bench._megapixel(method("fourier-16"), bench._proof(method("fourier-16")), seed=0, repeats=1)
+    assert row["error"] == 0 and row["pixels"] == 1 << 20 and row["photons"] == pytest.approx(550 << 20, rel=1e-2)
+
+
+@pytest.mark.slow
+def test_study_power(capfd, folder):
+    argv = ("study", "power", "--scene", "plane", "--width", "8", "--height", "8", "--out", "study")
+    result = run(capfd, *argv)
+    assert [row["name"] for row in result["depth"]] == [*PUBLISHED] == [row["name"] for row in result["rows"]]
+    assert all(row["differs_from_torch"] == 0 for row in result["depth"])
+    assert set(result["shared_core"]) == {"addresses lost", "addresses kept"}
+    for figure in result["figures"]:
+        assert (folder / figure).read_bytes()[:4] == b"\x89PNG"
+    for table in ("ultraphase", "ultraphase-front", "ultraphase-lost"):
+        assert (folder / "study" / f"{table}.csv").is_file()
+    names = {row["name"] for row in result["front"]}
+    assert {"coarse histogram, K = 64", "fourier 1024x1x1, K = 8"} <= names
+    assert len(result["front"]) == 5 * 4 * len(names) and len(result["lost_photons"]) == len(names)
+    assert all(row["lost"] < row["lost_16_spads"] < 1 for row in result["front"])
+    kept = {path: path.stat().st_mtime_ns for path in (folder / "study" / "emulated").iterdir()}
+    broken = sorted(kept)[0]
+    broken.write_bytes(b"no archive")
+    again = run(capfd, *argv)  # finished programs are not run again
+    assert again == result and len(kept) == len(PUBLISHED)
+    assert all(path.stat().st_mtime_ns == time for path, time in kept.items() if path != broken)
+    assert "multiple of 4" in refused(capfd, "study", "power", "--width", "9")

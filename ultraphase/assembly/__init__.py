@@ -1,0 +1,1 @@
+"""Assemble, encode, list and translate programs of the core."""

@@ -1,0 +1,96 @@
+"""One core's instructions executed one after the other: read this first, then `ultraphase.core` and `ultraphase.array`.
+
+Fixed-width NumPy scalars and a structured view of RAM, nothing shared with the package's engines. No links between
+cores. Only tests and benches import this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ultraphase.assembly.isa import Instruction
+
+
+def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ram_bytes: int) -> dict[str, Any]:
+    """Run a program until it halts.
+
+    Parameters
+    ----------
+    instructions : in the order of the program store
+    timestamps : what the port delivers, photon by photon
+    ram_bytes : size of RAM, which starts at zero
+
+    Returns
+    -------
+    registers `r`, bytes of `ram`, words sent `out`, instructions done `n`, 16-bit and 8-bit wraps `w`, saturations `s`
+    """
+    r, ram, out = np.zeros(16, np.int32), np.zeros(ram_bytes, np.uint8), []
+    halves, port, at, done = ram.view(np.int16), list(timestamps), 0, 0
+    wraps = saturations = 0
+    with np.errstate(over="ignore"):
+        while True:
+            one = instructions[at]
+            done, at = done + 1, at + 1
+            other = np.int32(one.value) if one.constant else r[one.value & 15]
+            cell = (one.value if one.constant else int(r[one.rs]) + one.value) if "m" in one.op.takes else 0
+            match one.name:
+                case "HALT":
+                    return {"r": r.tolist(), "ram": ram.tolist(), "out": out, "n": done, "w": wraps, "s": saturations}
+                case "ADD" | "SUB" | "MUL":
+                    ufunc = {"ADD": np.add, "SUB": np.subtract, "MUL": np.multiply}[one.name]
+                    r[one.rd] = ufunc(r[one.rs], other, dtype=np.int32)
+                case "AND" | "OR" | "XOR":
+                    ufunc = {"AND": np.bitwise_and, "OR": np.bitwise_or, "XOR": np.bitwise_xor}[one.name]
+                    r[one.rd] = ufunc(r[one.rs], other)
+                case "MIN" | "MAX":
+                    r[one.rd] = {"MIN": np.minimum, "MAX": np.maximum}[one.name](r[one.rs], other)
+                case "MOV":
+                    r[one.rd] = other
+                case "SHL":
+                    r[one.rd] = np.left_shift(r[one.rs], np.int32(one.value))
+                case "SHR":
+                    r[one.rd] = (r[one.rs : one.rs + 1].view(np.uint32) >> np.uint32(one.value)).view(np.int32)[0]
+                case "SAR":
+                    r[one.rd] = np.right_shift(r[one.rs], np.int32(one.value))
+                case "SATB" | "SATH":
+                    info = np.iinfo(np.uint8 if one.name == "SATB" else np.int16)
+                    held = np.clip(r[one.rs], info.min, info.max)
+                    saturations += int(held != r[one.rs])
+                    r[one.rd] = held
+                case "LDB":
+                    r[one.rd] = ram[cell]
+                case "LDBS":
+                    r[one.rd] = ram.view(np.int8)[cell]
+                case "LDH":
+                    r[one.rd] = halves[cell // 2]
+                case "STB":
+                    value = int(r[one.rd])
+                    ram[cell] = value & 255
+                    wraps += value not in (int(ram[cell]), int(ram.view(np.int8)[cell]))
+                case "STH":
+                    value = int(r[one.rd])
+                    halves[cell // 2] = np.int32(value).astype(np.int16)
+                    wraps += value not in (int(halves[cell // 2]), int(halves[cell // 2]) & 0xFFFF)
+                case "ADDM" | "SUBM":
+                    exact = int(halves[cell // 2]) + (1 if one.name == "ADDM" else -1) * int(r[one.rd])
+                    halves[cell // 2] = np.int64(exact).astype(np.int16)
+                    wraps += exact != int(halves[cell // 2])
+                case "OUTB" | "OUTH":
+                    kind = np.uint8 if one.name == "OUTB" else np.int16
+                    out.append(int(r[one.rs].astype(kind)))
+                    wraps += out[-1] != int(r[one.rs])
+                case "RDT":
+                    r[one.rd] = port.pop(0)
+                case "ID":
+                    r[one.rd] = 0
+                case _:
+                    a, b = int(r[one.rs]), int(r[one.rd])
+                    bit = a >> one.bit & 1
+                    taken = {
+                        "BNT": not port, "BFE": not port, "JMP": True, "BZ": a == 0, "BNZ": a != 0, "BLT": a < b,
+                        "BBS": bit == 1, "BBC": bit == 0,
+                    }[one.name]  # fmt: skip
+                    at = one.target if taken else at
