@@ -13,14 +13,14 @@ import numpy as np
 
 from render.direct.integrator import Layers
 from render.scene.rays import MAX_LAYERS, camera_rays, shape_index, spawn
-from render.scene.traced_scene import OPACITY, Bool, Float, UInt32, World, dr, mi, recorded, upload
+from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, recorded, upload
 from scenes.model import Camera
 
-MOST_LANES = 1 << 18  # paths of one launch, where an image is not larger by itself
-# Surfaces that every path may meet; from then on it goes on by chance where its weight has fallen below LEAST_WEIGHT
+MAX_LANES = 1 << 18  # paths of one launch, where an image is not larger by itself
+# Surfaces that every path may meet; from then on it goes on by chance where its weight has fallen below MIN_WEIGHT
 # (in rooms a tenth to a quarter of the noise's square, at 1.4 times the cost, of going on with the weight itself).
-CERTAIN, LEAST_WEIGHT, MOST_LIKELY = 3, 1 / 6, 0.95
-FIRST_SPP, LEAST_MORE, MOST_MORE = 64, 1.25, 8  # paths a pixel whose noise tells how many times as many are needed
+CERTAIN, MIN_WEIGHT, MAX_LIKELY = 3, 1 / 6, 0.95
+FIRST_SPP, MIN_MORE, MAX_MORE = 64, 1.25, 8  # paths a pixel whose noise tells how many times as many are needed
 # Pixels share reflected light: a Gaussian of so many pixels, ended at that radius, of points that lie within a share of
 # the distance of the tangent plane, weighted by the cosine between normals to this power of 2.
 SHARED_SIGMA, SHARED_RADIUS, SHARED_PLANE, SHARED_NORMAL_DOUBLED = 2.0, 4, 0.02, 4
@@ -38,7 +38,7 @@ class AmbientLight(NamedTuple):
 
 
 def ambient_light(
-    world: World, spp: int, bounces: int, seed: int, shared_by: Layers | None = None, *, noise: float = 0.0
+    world: TracedScene, spp: int, bounces: int, seed: int, shared_by: Layers | None = None, *, noise: float = 0.0
 ) -> AmbientLight:
     """Steady spectral radiance of environment and area lights at each pixel, after up to `bounces - 1` surfaces.
 
@@ -54,14 +54,14 @@ def ambient_light(
         if light.error <= noise or wanted == spp:
             return light
         # the first paths underrate what is rare: by steps
-        more = min(max((light.error / noise) ** 2, LEAST_MORE), MOST_MORE)
+        more = min(max((light.error / noise) ** 2, MIN_MORE), MAX_MORE)
         wanted = min(spp, math.ceil(more * wanted))
 
 
 class _Sums:
     """Light of the paths traced so far, `spp` of each pixel, and what its noise is told by."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: TracedScene) -> None:
         self.world, self.camera, self.spp = world, world.scene.camera, 0
         pixels = self.camera.height * self.camera.width
         self.emitted = np.zeros(pixels)
@@ -71,7 +71,7 @@ class _Sums:
     def trace(self, spp: int, bounces: int, seed: int) -> None:
         """Go on until there are `spp` paths of each pixel."""
         pixels = self.emitted.size
-        per_pass = max(1, MOST_LANES // pixels)
+        per_pass = max(1, MAX_LANES // pixels)
         while self.spp < spp:
             now = min(per_pass, spp - self.spp)
             lane = dr.arange(UInt32, pixels * now)
@@ -163,7 +163,7 @@ def _with_neighbour(sums: list, pixel: Any, columns: list, lights: list, way: tu
     return [total + weight * more for total, more in zip(sums, (its_albedo, *its_lights), strict=True)]
 
 
-def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> tuple[Any, Any]:
+def _of_paths(world: TracedScene, lane: Any, seed: Any, paths: Any, bounces: Any) -> tuple[Any, Any]:
     """Light of camera rays, `paths` in a row through random positions of each pixel: seen where emitted; reflected."""
     pixel = lane // paths
     sampler = mi.load_dict({"type": "independent"})
@@ -176,7 +176,7 @@ def _of_paths(world: World, lane: Any, seed: Any, paths: Any, bounces: Any) -> t
 
 
 @dr.syntax
-def _traced(world: World, sampler: Any, ray: Any, most: Any) -> tuple[Any, Any]:
+def _traced(world: TracedScene, sampler: Any, ray: Any, most: Any) -> tuple[Any, Any]:
     """Light that comes back along each ray: what the ray itself meets, and what surfaces reflect."""
     scene, context = world.traced, mi.BSDFContext()
     lanes = dr.width(ray.d)
@@ -220,7 +220,7 @@ def _traced(world: World, sampler: Any, ray: Any, most: Any) -> tuple[Any, Any]:
         before.p = dr.select(passing, before.p, si.p)
         met += dr.select(passing, UInt32(0), UInt32(1))
         layer += dr.select(passing, UInt32(1), UInt32(0))
-        likely = dr.select((met >= CERTAIN) & ~passing, dr.minimum(weight / LEAST_WEIGHT, MOST_LIKELY), 1)
+        likely = dr.select((met >= CERTAIN) & ~passing, dr.minimum(weight / MIN_WEIGHT, MAX_LIKELY), 1)
         active = hit & going_on & (layer < MAX_LAYERS) & (sampler.next_1d(active) < likely)
         weight /= dr.maximum(likely, 1e-9)
         active &= weight > 0
@@ -228,7 +228,7 @@ def _traced(world: World, sampler: Any, ray: Any, most: Any) -> tuple[Any, Any]:
     return seen, light
 
 
-def _pane(world: World, si: Any, ray: Any, sample: Any, hit: Any) -> tuple[Any, Any]:
+def _pane(world: TracedScene, si: Any, ray: Any, sample: Any, hit: Any) -> tuple[Any, Any]:
     """Whether a ray passes straight through what it meets, thin glass or the hole of a cut-out, or glass mirrors it."""
     passing, mirrored = Bool(False), Bool(False)
     if world.has_glass:
@@ -248,7 +248,7 @@ def _transmission(ior: Any, ray: Any, si: Any) -> Any:
 
 
 @dr.syntax
-def _open(world: World, si: Any, to_light: Any, active: Any) -> Any:
+def _open(world: TracedScene, si: Any, to_light: Any, active: Any) -> Any:
     """Transmission of the straight way from a surface to a sampled light; solid glass blocks it, as it bends light."""
     ray = si.spawn_ray_to(to_light.p)
     transmission = dr.full(Float, 1, dr.width(ray.d))

@@ -23,17 +23,17 @@ from render.error import (
     worst_share_of,
 )
 from render.indirect.integrator import (
+    ProbePixels,
     Schedule,
-    Watched,
     image_cells,
 )
 from render.indirect.path_cells import coarsened
-from render.pipeline import Progress, Traced, derived_seed, most_spp, spans_of, trace, traced_on
+from render.pipeline import LightSamples, Progress, add_samples, derived_seed, most_spp, spans_of, trace
 from render.planning import finer_pilot, make_plan, pilot_pixels
-from render.scene.traced_scene import World
-from render.settings import BATCHES, FILTERED_BATCHES, MIN_PIXEL_BYTES, MOST_AMBIENT_SPP, Plan, RenderSettings
+from render.scene.traced_scene import TracedScene
+from render.settings import BATCHES, FILTERED_BATCHES, MAX_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
 from render.transient import Transient
-from render.transient.samples import concatenate, no_samples, of_pixels, to_returns
+from render.transient.samples import concatenate, no_samples, select_pixels, to_returns
 from scenes.limits import require_memory
 from scenes.model import Scene
 
@@ -42,9 +42,9 @@ log = logging.getLogger(__name__)
 STAGE_PLAN, STAGE_AMBIENT, STAGE_MORE = 10, 12, 14
 AMBIENT_BOUNCES = 16  # most paths end long before, by chance
 # paths traced on top are at most this many times those traced before; filtered light has no pilot
-MOST_MORE, MOST_MORE_FILTERED = 3.0, 15.0
+MAX_MORE, MAX_MORE_FILTERED = 3.0, 15.0
 CLEAR = 3  # standard deviations above which a bias is believed
-MOST_FILTERED_PASSES, LEAST_ALLOWED = 3, 0.25
+MAX_FILTERED_PASSES, MIN_ALLOWED = 3, 0.25
 
 
 def render(
@@ -53,7 +53,7 @@ def render(
     *,
     seed: int = 0,
     progress: Progress | None = None,
-    world: World | None = None,
+    world: TracedScene | None = None,
     plan: Plan | None = None,
 ) -> Transient:
     """Render the time-resolved radiance that the camera's pixels receive from the laser.
@@ -67,7 +67,7 @@ def render(
     say = progress or (lambda what, share: None)
     camera = scene.camera
     require_memory(MIN_PIXEL_BYTES * camera.width * camera.height, f"a render of {camera.width} x {camera.height}")
-    world = World(scene) if world is None else world
+    world = TracedScene(scene) if world is None else world
     say("plan", 0.0)
     plan = planned(world, settings, seed) if plan is None else plan
     checked = pilot_pixels(world, derived_seed(seed, STAGE_PLAN))
@@ -76,11 +76,13 @@ def render(
     # where nothing is in view there is nothing to explain
     plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, *traced.reasons))
     error = _estimated(world, plan, settings, traced, checked)
-    for number in range(MOST_FILTERED_PASSES if plan.filter else 1):
-        more = _missing(world, plan, settings, traced, error)
+    for number in range(MAX_FILTERED_PASSES if plan.filter else 1):
+        more = _additional_schedule(world, plan, settings, traced, error)
         if more is None:
             break
-        traced = traced_on(world, plan, settings, traced, more, derived_seed(seed, STAGE_MORE, 0, number), checked, say)
+        traced = add_samples(
+            world, plan, settings, traced, more, derived_seed(seed, STAGE_MORE, 0, number), checked, say
+        )
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
         error = _estimated(world, plan, settings, traced, checked)
     plan = replace(plan, reasons=(*plan.reasons, *_said_of_bias(plan, traced, error)))
@@ -91,9 +93,9 @@ def render(
     ambient = AmbientLight(np.zeros((camera.height, camera.width), np.float32), 0.0, 0)
     if plan.ambient:
         say("ambient light", 0.9)
-        by, spp = layers if settings.ambient_shared else None, settings.ambient_spp or MOST_AMBIENT_SPP
-        its_seed = derived_seed(seed, STAGE_AMBIENT)
-        ambient = ambient_light(world, spp, AMBIENT_BOUNCES, its_seed, by, noise=plan.ambient_noise)
+        by, spp = layers if settings.ambient_shared else None, settings.ambient_spp or MAX_AMBIENT_SPP
+        ambient_seed = derived_seed(seed, STAGE_AMBIENT)
+        ambient = ambient_light(world, spp, AMBIENT_BOUNCES, ambient_seed, by, noise=plan.ambient_noise)
         told = f"ambient light: {ambient.spp} paths a pixel, noise {ambient.error:.2g} of its mean"
         plan = replace(plan, reasons=(*plan.reasons, told))
         log.info("%s", told)
@@ -116,13 +118,13 @@ def render(
     )
 
 
-def planned(world: World, settings: RenderSettings, seed: int = 0) -> Plan:
+def planned(world: TracedScene, settings: RenderSettings, seed: int = 0) -> Plan:
     """The plan that `render` makes with these settings and this seed."""
     return make_plan(world, settings, derived_seed(seed, STAGE_PLAN))
 
 
-def _missing(
-    world: World, plan: Plan, settings: RenderSettings, traced: Traced, error: ErrorEstimate
+def _additional_schedule(
+    world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate
 ) -> Schedule | None:
     """What to trace on top where a planned render misses its target: pilots see few of the rare bright paths."""
     if settings.spp is not None or traced.schedule is None or traced.indirect is None or plan.target <= 0:
@@ -131,12 +133,12 @@ def _missing(
     allowed = settings.aim * plan.target**2 - error.direct**2 - error.merging**2 - error.bias**2
     if plan.filter and error.bias < plan.target:
         # what merging and the filter seem to cost after few paths falls with more
-        allowed = max(allowed, LEAST_ALLOWED * settings.aim * plan.target**2)
+        allowed = max(allowed, MIN_ALLOWED * settings.aim * plan.target**2)
     enough = error.total**2 <= settings.aim * plan.target**2
     if enough or allowed <= 0 or batches < (FILTERED_BATCHES if plan.filter else BATCHES):
         return None
     left = most_spp(settings)[0] / traced.schedule.cost - 1
-    factor = min(error.monte_carlo**2 / allowed - 1, MOST_MORE_FILTERED if plan.filter else MOST_MORE, left)
+    factor = min(error.monte_carlo**2 / allowed - 1, MAX_MORE_FILTERED if plan.filter else MAX_MORE, left)
     if factor <= 0:
         return None
     rounds = np.ceil(traced.schedule.rounds * factor / batches).astype(np.int64) * batches
@@ -147,7 +149,7 @@ def _missing(
     return more
 
 
-def _said_of_bias(plan: Plan, traced: Traced, error: ErrorEstimate) -> tuple[str, ...]:
+def _said_of_bias(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
     """What to know of a filter's bias, measured against the same paths without it."""
     if not plan.filter or traced.schedule is None:
         return ()
@@ -162,11 +164,11 @@ def _said_of_bias(plan: Plan, traced: Traced, error: ErrorEstimate) -> tuple[str
 
 
 def _estimated(
-    world: World, plan: Plan, settings: RenderSettings, traced: Traced, checked: np.ndarray
+    world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, checked: np.ndarray
 ) -> ErrorEstimate:
     """The error of a trace, from the checked pixels' batches and from finer direct light there."""
-    coarse = response(of_pixels(traced.direct, checked), checked)
-    glints = response(of_pixels(traced.specular, checked), checked)
+    coarse = response(select_pixels(traced.direct, checked), checked)
+    glints = response(select_pixels(traced.specular, checked), checked)
     fine = finer_pilot(world, checked, plan.grid, plan.least_share) + glints
     coarse += glints
     if traced.indirect is None:
@@ -197,7 +199,7 @@ def _estimated(
     return replace(error, worst_share=worst_share_of(traced.indirect.noise, error))
 
 
-def _filter_bias(filtered: list[np.ndarray], plain: Watched, place: np.ndarray) -> np.ndarray | float:
+def _filter_bias(filtered: list[np.ndarray], plain: ProbePixels, place: np.ndarray) -> np.ndarray | float:
     """Squared difference that the filter makes, per pixel, from two independent halves of the batches.
 
     What noise adds to it has mean 0; 0 where the sum is not CLEAR standard deviations above that.
@@ -219,7 +221,9 @@ def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> 
     return paths | {"ambient_error": round(ambient.error, 6)}
 
 
-def _meta(scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: ErrorEstimate, traced: Traced) -> dict:
+def _meta(
+    scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: ErrorEstimate, traced: LightSamples
+) -> dict:
     camera, laser = scene.camera, scene.laser
     return {
         "scene": scene.name,

@@ -19,10 +19,10 @@ BIN_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PERIOD_S / REFERENCE_BINS
 SIGMA_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PULSE_SIGMA_S
 PULSE_POWER = BIN_M / (2 * math.sqrt(math.pi) * SIGMA_M)  # sum over bins of the square of one return of energy 1
 WIDEST_STENCIL = 256
-WIDEST_PIECE, MOST_PIECES = 1.0, 64  # sigma: side by side these are even to 0.3 %
+WIDEST_PIECE, MAX_PIECES = 1.0, 64  # sigma: side by side these are even to 0.3 %
 BLOCK_ENTRIES = 1 << 16
 # Pixels that a few rare bright paths can spoil: a thousandth of the image, and at least a block that shares its paths.
-WORST_FRACTION, LEAST_WORST = 1e-3, 16
+WORST_FRACTION, MIN_WORST = 1e-3, 16
 RULED = 0.5  # share of the squared error in these pixels above which they rule it
 
 
@@ -85,8 +85,8 @@ def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
 
 
 def _in_pieces(samples: Samples) -> Samples:
-    """Samples of half widths up to WIDEST_PIECE sigma, of MOST_PIECES pieces at most."""
-    pieces = np.ceil(samples.half_width_m / (WIDEST_PIECE * SIGMA_M)).clip(1, MOST_PIECES).astype(np.int64)
+    """Samples of half widths up to WIDEST_PIECE sigma, of MAX_PIECES pieces at most."""
+    pieces = np.ceil(samples.half_width_m / (WIDEST_PIECE * SIGMA_M)).clip(1, MAX_PIECES).astype(np.int64)
     if len(pieces) == 0 or pieces.max() == 1:
         return samples
     pixel, path, half, radiance, bounces = (np.repeat(column, pieces) for column in samples)
@@ -127,7 +127,7 @@ def estimate(
 
 def worst_pixels(pixels: int) -> int:
     """Return the number of pixels that count as the worst: a thousandth, at least 16, at most all."""
-    return min(max(round(WORST_FRACTION * pixels), LEAST_WORST), pixels)
+    return min(max(round(WORST_FRACTION * pixels), MIN_WORST), pixels)
 
 
 def worst_share_of(standard_error: np.ndarray, error: ErrorEstimate) -> float:

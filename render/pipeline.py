@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.backend.malloc import release
+from render.backend.malloc import trim_memory
 from render.direct.integrator import direct_light
 from render.error import power_of
 from render.indirect.integrator import (
@@ -24,20 +24,20 @@ from render.indirect.integrator import (
 from render.indirect.launch_layout import BLOCK, block_order
 from render.indirect.light_vertices import is_wide
 from render.indirect.path_space_filter import Octaves, octaves
-from render.scene.traced_scene import World
+from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, Plan, RenderSettings
 from render.specular.image_method import specular_light
 from render.transient.samples import Growing, Samples, concatenate, no_samples, select
 
 STAGE_INDIRECT, STAGE_PILOT = 11, 13
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
-MOST_SPP, MOST_SPP_BY_DEFAULT = 16384, 1024
+MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
 FIRST_FILTERED_SPP = 16  # filtered light has no pilot: it starts with few paths
 
 Progress = Callable[[str, float], None]
 
 
-class Traced(NamedTuple):
+class LightSamples(NamedTuple):
     """Light of a planned render before it is packed: its samples, what is known of indirect light or None, counts.
 
     Samples of direct light come first, then those of specular light, up to `ends`, then those of indirect light.
@@ -79,18 +79,18 @@ def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
 def most_spp(settings: RenderSettings) -> tuple[int, bool]:
     """Paths a pixel that a plan may spend, and whether a target was asked for."""
     asked = settings.error is not None or settings.budget is not None
-    return MOST_SPP if asked else MOST_SPP_BY_DEFAULT, asked
+    return MAX_SPP if asked else MAX_SPP_BY_DEFAULT, asked
 
 
 def trace(
-    world: World,
+    world: TracedScene,
     plan: Plan,
     settings: RenderSettings,
     *,
     seed: int = 0,
     checked: np.ndarray | None = None,
     progress: Progress | None = None,
-) -> Traced:
+) -> LightSamples:
     """Trace what the plan says: the light alone, without layers, ambient light or an error estimate.
 
     `checked` are sorted flat pixels whose indirect light is kept by batches, for the error estimate.
@@ -100,11 +100,11 @@ def trace(
     pixels = np.arange(camera.height * camera.width)
     say("direct light", 0.05)
     direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, least_share=plan.least_share)
-    release(len(pixels))
+    trim_memory(len(pixels))
     # only indirect light is counted from where direct light is
     origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
-    release(len(pixels))
+    trim_memory(len(pixels))
     rays, indirect, schedule, reasons = direct.rays, None, None, ()
     if plan.bounces > 1 and brightest > 0:
         schedule, reasons = _schedule(world, plan, settings, direct.samples, origin_m, seed)
@@ -114,16 +114,16 @@ def trace(
     ends = len(light), len(light) + len(specular.samples.pixel)
     light.add(specular.samples)
     if schedule is not None:
-        its_seed = derived_seed(seed, STAGE_INDIRECT)
-        indirect = _indirect(world, plan, settings, schedule, its_seed, origin_m, brightest, checked, light, say)
+        ambient_seed = derived_seed(seed, STAGE_INDIRECT)
+        indirect = _indirect(world, plan, settings, schedule, ambient_seed, origin_m, brightest, checked, light, say)
         rays += schedule.rays(plan.bounces)
     reasons = (*specular.notes, *reasons)
-    samples = light.finished(lambda: release(len(pixels)))
-    return Traced(samples, ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
+    samples = light.finished(lambda: trim_memory(len(pixels)))
+    return LightSamples(samples, ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
 
 
 def _indirect(
-    world: World,
+    world: TracedScene,
     plan: Plan,
     settings: RenderSettings,
     schedule: Schedule,
@@ -149,16 +149,16 @@ def _indirect(
     )
 
 
-def traced_on(
-    world: World,
+def add_samples(
+    world: TracedScene,
     plan: Plan,
     settings: RenderSettings,
-    traced: Traced,
+    traced: LightSamples,
     more: Schedule,
     seed: int,
     checked: np.ndarray,
     say: Progress,
-) -> Traced:
+) -> LightSamples:
     """A trace with further paths, weighted by their numbers.
 
     These follow the first paths' noise; the bias of such a stop is of second order in it.
@@ -183,7 +183,7 @@ def traced_on(
 
 
 def _schedule(
-    world: World, plan: Plan, settings: RenderSettings, direct: Samples, origin_m: np.ndarray, seed: int
+    world: TracedScene, plan: Plan, settings: RenderSettings, direct: Samples, origin_m: np.ndarray, seed: int
 ) -> tuple[Schedule, tuple[str, ...]]:
     """How many paths each pixel traces, and why: from the noise of a pilot of a few paths, which is not used again."""
     camera = world.scene.camera
@@ -224,7 +224,7 @@ def _schedule(
     return schedule, tuple(reasons)
 
 
-def spans_of(world: World, plan: Plan, settings: RenderSettings, origin_m: np.ndarray, spp: float) -> Octaves:
+def spans_of(world: TracedScene, plan: Plan, settings: RenderSettings, origin_m: np.ndarray, spp: float) -> Octaves:
     """Octaves of filtered light for so many paths a pixel in all."""
     distance_m = float(origin_m[origin_m > 0].mean()) / 2
     width_m, growth = settings.indirect_tolerance_m, settings.indirect_growth

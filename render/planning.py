@@ -10,9 +10,9 @@ import numpy as np
 from render.direct.integrator import direct_light, least_share_of
 from render.error import PULSE_POWER, error_for_budget, error_of_background, estimate, response
 from render.indirect.camera_paths import energy_by_bounces
-from render.scene.traced_scene import World
+from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
-from render.transient.samples import of_pixels
+from render.transient.samples import select_pixels
 from scenes.errors import InputError
 from scenes.model import Material
 
@@ -27,8 +27,8 @@ CELL_COST = 0.25
 PILOT_SHOWS = 1.25
 # What noise of ambient light adds to the error at the photons in question, in shares of the target; a constant rate is
 # no echo, and what it does to depth grows with its square. At least, and at most, that noise:
-AMBIENT_SHARE, LEAST_AMBIENT_NOISE, MOST_AMBIENT_NOISE = 0.5, 0.02, 0.5
-MOST_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
+AMBIENT_SHARE, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE = 0.5, 0.02, 0.5
+MAX_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
 FINER, FINER_AT_LEAST = 2, 1.5  # direct light is checked against this many times the cells a side
@@ -42,7 +42,7 @@ WIDEST_TOLERANCE_M = 0.005
 PILOT_TOLERANCE_M = 0.01  # of path, within which the pilot's returns merge: a quarter of the pulse's sigma
 
 
-def pilot_pixels(world: World, seed: int) -> np.ndarray:
+def pilot_pixels(world: TracedScene, seed: int) -> np.ndarray:
     """A sorted random subset of flat pixel indices, the same for pilot and error estimate."""
     pixels = world.scene.camera.height * world.scene.camera.width
     if pixels <= PILOT_PIXELS:
@@ -50,7 +50,7 @@ def pilot_pixels(world: World, seed: int) -> np.ndarray:
     return np.sort(np.random.default_rng(seed).choice(pixels, PILOT_PIXELS, replace=False))
 
 
-def pilot_response(world: World, pixels: np.ndarray, grid: int, least_share: float | None = None) -> np.ndarray:
+def pilot_response(world: TracedScene, pixels: np.ndarray, grid: int, least_share: float | None = None) -> np.ndarray:
     """`response` of direct light in a few pixels. Kept with the world: the plan and the error estimate ask the same."""
     share = least_share_of(grid) if least_share is None else least_share
     key = grid, share, pixels.tobytes()
@@ -60,19 +60,19 @@ def pilot_response(world: World, pixels: np.ndarray, grid: int, least_share: flo
     return world.responses[key]
 
 
-def finer_pilot(world: World, pixels: np.ndarray, grid: int, least_share: float) -> np.ndarray:
+def finer_pilot(world: TracedScene, pixels: np.ndarray, grid: int, least_share: float) -> np.ndarray:
     """Direct light of a few pixels by clearly more rays than `grid`: of the plan's pilot, or twice as many a side."""
     if least_share == least_share_of(grid) and grid * FINER_AT_LEAST <= 2 * PILOT_GRID:
         return pilot_response(world, pixels, 2 * PILOT_GRID)
     return pilot_response(world, pixels, FINER * grid, least_share / FINER)
 
 
-def direct_error(world: World, settings: RenderSettings, seed: int) -> float:
+def direct_error(world: TracedScene, settings: RenderSettings, seed: int) -> float:
     """nRMSE of a view's direct light at PILOT_GRID, by twice as many rays a side in some of its pixels."""
     camera, checked = world.scene.camera, pilot_pixels(world, seed)
     tolerance_m = WIDEST_TOLERANCE_M if settings.direct_tolerance_m is None else settings.direct_tolerance_m
     light = direct_light(world, np.arange(camera.height * camera.width), PILOT_GRID, tolerance_m)
-    coarse = response(of_pixels(light.samples, checked), checked)
+    coarse = response(select_pixels(light.samples, checked), checked)
     return estimate(coarse, pilot_response(world, checked, FINER * PILOT_GRID)).total
 
 
@@ -96,7 +96,7 @@ def _direct_share(settings: RenderSettings, direct_alone: bool) -> float:
     return math.sqrt(settings.aim) if direct_alone else DIRECT_SHARE
 
 
-def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
+def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
     """Plan a render: every choice that `settings` leaves open follows from a pilot; every choice gets a reason.
 
     Where nothing is left open there is no pilot.
@@ -141,7 +141,7 @@ def make_plan(world: World, settings: RenderSettings, seed: int) -> Plan:
     )
 
 
-def _ambient(world: World, settings: RenderSettings, target: float) -> tuple[bool, float, str]:
+def _ambient(world: TracedScene, settings: RenderSettings, target: float) -> tuple[bool, float, str]:
     """Whether steady light is rendered: only if there is any, and a photon budget has room for it; and its noise.
 
     Noise that would make an error of AMBIENT_SHARE of the target beside the signal of the budget's photons, or where
@@ -158,11 +158,11 @@ def _ambient(world: World, settings: RenderSettings, target: float) -> tuple[boo
     if settings.ambient_spp is not None:
         return True, 0.0, f"ambient light: rendered, {why}, with {settings.ambient_spp} paths a pixel, forced"
     noise = AMBIENT_SHARE * target / error_of_background(background or 1.0, signal)
-    noise = float(np.clip(noise, LEAST_AMBIENT_NOISE, MOST_AMBIENT_NOISE))
+    noise = float(np.clip(noise, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE))
     return True, noise, f"ambient light: rendered, {why}, until its noise is {noise:.2g} of its mean"
 
 
-def _limits(world: World) -> list[str]:
+def _limits(world: TracedScene) -> list[str]:
     """What this renderer leaves out of the given scene."""
     materials: list[Material] = [surface.material for surface in world.scene.surfaces]
     said = []
@@ -185,7 +185,7 @@ def _target(settings: RenderSettings, fine: np.ndarray | None) -> tuple[float, s
 
 
 def _grid(
-    world: World, settings: RenderSettings, pixels: np.ndarray, allowed: float, paths: float, squared: float
+    world: TracedScene, settings: RenderSettings, pixels: np.ndarray, allowed: float, paths: float, squared: float
 ) -> tuple[int, float, str]:
     """The grid whose direct light is off by at most `allowed`, how much it is off, and why.
 
@@ -224,7 +224,7 @@ def _grid(
 
 
 def _indirect(
-    world: World, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray | None, target: float, seed: int
+    world: TracedScene, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray | None, target: float, seed: int
 ) -> tuple[int, int | None, float, list[str]]:
     """Bounces; paths a pixel, if they are forced; about how many meet the target if every pixel has its own; why."""
     mode = world.scene.laser.mode
@@ -241,7 +241,7 @@ def _indirect(
     whys = []
     bounces = settings.bounces
     if bounces is None:
-        bounces, left_out = _bounces(energy, min(target / 3, MOST_LEFT_OUT))
+        bounces, left_out = _bounces(energy, min(target / 3, MAX_LEFT_OUT))
         share = energy[2:].sum() / energy.sum()
         whys.append(
             f"bounces: {bounces}; indirect light is {share:.2%} of the energy, {left_out:.2%} is left out beyond"

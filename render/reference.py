@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from render.scene.rays import camera_rays, first_opaque, laser_leg, spawn
-from render.scene.traced_scene import Float, UInt32, World, dr, mi
+from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi
 from scenes.model import Scene
 
 MAX_PATHS = 1 << 18  # of one launch
@@ -54,7 +54,7 @@ def ray_grid(scene: Scene, edges_m: np.ndarray, *, grid: int) -> np.ndarray:
 
 def _traced(scene: Scene, edges_m: np.ndarray, places: Any, bounces: int, spp: int) -> np.ndarray:
     """Sum over `spp` paths of every pixel, each from the place in it that `places` gives for its number."""
-    world, camera = World(scene), scene.camera
+    world, camera = TracedScene(scene), scene.camera
     count = camera.height * camera.width
     total = np.zeros((count, len(edges_m) - 1))
     per_launch = max(1, MAX_PATHS // count)

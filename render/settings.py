@@ -15,7 +15,7 @@ MAX_SAMPLES = 1 << 26
 BATCHES = 16  # independent batches of indirect light, whose spread is the error estimate
 FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
-MOST_AMBIENT_SPP = 1 << 12
+MAX_AMBIENT_SPP = 1 << 12
 SHARED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours share it: as little noise as 45 alone
 
 

@@ -16,7 +16,7 @@ from scenes.errors import InputError, require
 from ultraphase.assembly.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
 from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
-from ultraphase.core import PATIENCE, Core, Counters, region_contents
+from ultraphase.core import WATCHDOG_STEPS, Core, Counters, region_contents
 
 _RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
 # In step, a turn costs about as much for one core as for hundreds: so few finish their timestamps one after the other.
@@ -146,7 +146,7 @@ class _Run:
         self.block_end = _block_ends(self.program)
 
     def to_end(self) -> Frame:
-        patience, events, look, live = PATIENCE, 0, 0, self.array._lane
+        patience, events, look, live = WATCHDOG_STEPS, 0, 0, self.array._lane
         while True:
             if self.changed:
                 live, self.changed = np.flatnonzero(self.status == _RUNS), False
@@ -163,10 +163,10 @@ class _Run:
             if word >= len(self.code):
                 raise InputError(f"program {self.program.name}: runs behind its last instruction")
             self._block(word, slice(None) if index.size == self.status.size else index, index)
-            patience = PATIENCE if self.events != events else patience - 1
+            patience = WATCHDOG_STEPS if self.events != events else patience - 1
             events = self.events
             if patience == 0:
-                raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} branches")
+                raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
         self._explain_waiting()
         return self._result()
 

@@ -26,7 +26,7 @@ import numpy as np
 from scenes.errors import InputError, require
 from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
-from ultraphase.core import PATIENCE, Core
+from ultraphase.core import WATCHDOG_STEPS, Core
 
 _PORT_INSTRUCTIONS = ("BNT", "RDT", "BFE")
 
@@ -103,8 +103,8 @@ class TimedCore(Core):
             if word < 0:
                 return TimedFrame(len(waiting), self._read, lost, tuple(self.out), now)
             steps += 1
-            if steps > PATIENCE:
-                raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} branches")
+            if steps > WATCHDOG_STEPS:
+                raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
 
     def _idle(self, word: int, now: int, until: float, before: tuple | None) -> tuple[int, tuple]:
         """The time of the look at the port that comes next before `until`: turns of an idle loop that leave the core

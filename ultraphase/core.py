@@ -15,7 +15,7 @@ from ultraphase.assembly.program import KINDS, Program
 from ultraphase.assembly.translate import source
 from ultraphase.chip import ChipSpec
 
-PATIENCE = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
+WATCHDOG_STEPS = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
 _STOP = -1
 
 
@@ -69,7 +69,7 @@ class Step:
 
 
 @dataclass
-class _Stretch:
+class _BasicBlock:
     """Instructions that always follow each other, as one function that gives the next word (or stops); the last of
     them, and how often they ran."""
 
@@ -110,10 +110,10 @@ class Core:
         self._place = (place[1] & 1) | (place[0] & 1) << 1
         self._port: list[int] = []
         self._read = self._wraps = self._saturations = 0
-        self._parks = self._lent = False
+        self._stop_at_wait = self._attached_to_array = False
         self._stopped = True
-        self._stretches: dict[int, _Stretch] = {}  # by first word
-        self._singles: dict[int, _Stretch] = {}
+        self._stretches: dict[int, _BasicBlock] = {}  # by first word
+        self._singles: dict[int, _BasicBlock] = {}
 
     def frame(self, timestamps: Iterable[int]) -> tuple[tuple[int, ...], Counters]:
         """One frame, to HALT: what left the sensor, and what it cost."""
@@ -128,7 +128,7 @@ class Core:
         port = [int(t) for t in timestamps]
         most = (1 << 16) - 1
         require(not port or (min(port) >= 0 and max(port) <= most), f"timestamps are outside 0 to {most}")
-        self._port, self._read, self._parks, self._stopped, self._lent = port, 0, park, False, False
+        self._port, self._read, self._stop_at_wait, self._stopped, self._attached_to_array = port, 0, park, False, False
         self.out.clear()
         self.word = 0
 
@@ -136,7 +136,13 @@ class Core:
         """Take over a core of an array in the middle of its frame; `run` brings it to where it needs the array again:
         no timestamp left, a link, a word that leaves the sensor, the end. `place` is what ID reads."""
         self.word, self.registers[:], self.ram[:], self._place = word, registers, ram, place
-        self._port, self._read, self._parks, self._stopped, self._lent = timestamps, 0, True, False, True
+        self._port, self._read, self._stop_at_wait, self._stopped, self._attached_to_array = (
+            timestamps,
+            0,
+            True,
+            False,
+            True,
+        )
 
     def step(self) -> Step:
         """One instruction. Raises InputError after the end of the frame."""
@@ -173,7 +179,7 @@ class Core:
         try:
             while True:
                 progress = (self._read, len(self.out))
-                for _ in range(PATIENCE):
+                for _ in range(WATCHDOG_STEPS):
                     stretch = stretches.get(word)
                     if stretch is None:
                         stretch = stretches[word] = self._function(word)
@@ -184,18 +190,18 @@ class Core:
                         return
                     word = after
                 if progress == (self._read, len(self.out)):
-                    raise InputError(f"{self.program.where(word)}: no progress in {PATIENCE} branches")
+                    raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
         finally:
             for first, stretch in stretches.items():
                 for done in range(first, stretch.end + 1):
                     self._visits[done] += stretch.times
                 stretch.times = 0
 
-    def _function(self, word: int, *, single: bool = False) -> _Stretch:
+    def _function(self, word: int, *, single: bool = False) -> _BasicBlock:
         text, end = source(self.program, word, single=single)
         names = {"core": self, "r": self.registers, "ram": self.ram, "halves": self._halves}
         exec(_compiled(text), names)
-        return _Stretch(names["does"], end)
+        return _BasicBlock(names["does"], end)
 
     def contents(self, region: str) -> np.ndarray:
         """Numbers in a region of RAM."""
@@ -233,18 +239,18 @@ class Core:
         return _STOP
 
     def _halt(self, word: int) -> int:
-        return self._not_yet(word) if self._lent else _STOP
+        return self._not_yet(word) if self._attached_to_array else _STOP
 
     def _waits(self, word: int, target: int) -> int:
-        return self._not_yet(word) if self._parks else target
+        return self._not_yet(word) if self._stop_at_wait else target
 
     def _over(self, word: int, target: int) -> int:
-        if self._lent:
+        if self._attached_to_array:
             return self._not_yet(word)
-        return word + 1 if self._parks else target
+        return word + 1 if self._stop_at_wait else target
 
     def _link(self, word: int) -> int:
-        if self._lent:
+        if self._attached_to_array:
             return self._not_yet(word)
         raise InputError(f"{self.program.where(word)}: a core alone has no neighbours; use a CoreArray")
 

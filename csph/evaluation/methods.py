@@ -25,7 +25,7 @@ from csph.evaluation.metrics import (
 )
 from csph.networks.posterior import Decoder
 from csph.training.views import Views
-from render.backend.malloc import keep_freed_memory
+from render.backend.malloc import retain_freed_memory
 from scenes.errors import require
 from spad.detection.detect import sense
 from spad.formats.histogram import TRUTH, Histogram
@@ -44,7 +44,7 @@ Method = Callable[[Histogram], np.ndarray]
 Progress = Callable[[str, float], None]
 
 
-class FindsDepth(Protocol):
+class DepthEstimator(Protocol):
     """What evaluation asks of a model, or of what stands for one."""
 
     def depth_of(self, histogram: Histogram, *, decoder: Decoder | None = None) -> tuple[np.ndarray, int]: ...
@@ -138,7 +138,7 @@ def evaluate(
     empty set or no method, an image smaller than a tile, and what the methods raise.
     """
     require(bool(views.transients) and bool(methods), "evaluation: no view or no method")
-    keep_freed_memory()
+    retain_freed_memory()
     say, result = progress or (lambda what, share: None), Evaluation(depths={name: [] for name in methods})
     total = len(views.transients) * len(levels)
     for view, (transient, scene) in enumerate(zip(views.transients, views.scenes, strict=True)):

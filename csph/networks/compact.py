@@ -28,7 +28,7 @@ FOLD = 16  # fine bins of one coarse bin
 VIEWS = 3  # of the back-projection: as it is, and two averages
 
 
-class _Split(nn.Module):
+class _FactorisedConv(nn.Module):
     """x + relu(convolution over time of relu(convolution over space)): 12 taps instead of 27."""
 
     def __init__(self, channels: int) -> None:
@@ -40,7 +40,7 @@ class _Split(nn.Module):
         return x + _over_time(self.time, self.space(x).relu_(), batch)
 
 
-class _Whole(nn.Module):
+class _ResidualConv3d(nn.Module):
     """x + relu(3^3 convolution of x)."""
 
     def __init__(self, channels: int) -> None:
@@ -64,14 +64,14 @@ class Compact(nn.Module):
         super().__init__()
         near, middle, far = 16, 32, 48
         self.stem = nn.Conv2d(FOLD, near, (3, 1), padding=(1, 0))
-        self.near = _Split(near)
+        self.near = _FactorisedConv(near)
         self.halved = nn.Conv2d(near, middle, 3, stride=2, padding=1)
-        self.middle = nn.ModuleList([_Split(middle), _Split(middle)])
+        self.middle = nn.ModuleList([_FactorisedConv(middle), _FactorisedConv(middle)])
         self.quartered = nn.Conv3d(middle, far, 3, stride=2, padding=1)
-        self.far = nn.Sequential(*(_Whole(far) for _ in range(2)))
+        self.far = nn.Sequential(*(_ResidualConv3d(far) for _ in range(2)))
         self.from_far = nn.Linear(far, middle)
         self.from_middle = nn.Linear(middle, near)
-        self.last = _Split(near)
+        self.last = _FactorisedConv(near)
         self.fine = nn.Linear(near, FOLD)
         self.trust = nn.Linear(near, VIEWS)
         with torch.no_grad():  # begin with what the back-projection says

@@ -45,7 +45,7 @@ from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
 from csph.training.views import Views, packed_sha256, packed_views
 from csph.weights.shipped import RESUME, TIMINGS
-from render.backend.malloc import keep_freed_memory
+from render.backend.malloc import retain_freed_memory
 from scenes.errors import InputError, require
 from scenes.files import append_line, is_unclaimed, whole_file, write_csv
 from scenes.io.inputs import read_json_object
@@ -288,7 +288,7 @@ def train(
     _claim(folder, config)
     if config.threads:
         torch.set_num_threads(config.threads)
-    keep_freed_memory()
+    retain_freed_memory()
     start = time.perf_counter()
     module = DepthTraining(config)
     resume = folder / RESUME

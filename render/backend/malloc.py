@@ -15,19 +15,19 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # names of glibc's malloc.h
 _LARGEST_MMAP_THRESHOLD = 32 << 20  # that glibc takes; a tensor of a training step has a few MB
 
 
-def keep_freed_memory() -> None:
+def retain_freed_memory() -> None:
     """Have malloc keep freed arrays for the next step, image or view instead of giving them back to the system.
 
     Returned pages come back zeroed, one page fault per 4 KiB: a fifth of a training step on a CPU, 0.4 of an estimate
     of 72 x 88 pixels or of the direct light of 64 x 64. For the whole process and for good; nothing happens with
-    another C library. `release` still gives all of it back.
+    another C library. `trim_memory` still gives all of it back.
     """
     mallopt = _glibc("mallopt")
     mallopt(_M_MMAP_THRESHOLD, _LARGEST_MMAP_THRESHOLD)
     mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
-def release(pixels: int) -> None:
+def trim_memory(pixels: int) -> None:
     """Return what Dr.Jit and the C library keep of freed arrays to the system, after work on an image of any size but
     the smallest: there it is little, and to take it again costs a sixteenth of the time of a view of a set (measured).
 

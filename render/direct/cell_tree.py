@@ -6,14 +6,14 @@ import numpy as np
 
 from render.direct.edges import CUT, GLINT, MIXED, Cells, Place, Tree, child_edges, first_edges
 from render.direct.footprints import CLIPPED, LARGE, Footprints, trace
-from render.scene.traced_scene import World, aligned
+from render.scene.traced_scene import TracedScene, aligned
 
 # Refinement ends at this many cells a side of a pixel, however fine the grid it started from; at highlights of polished
 # metal it goes on for so many levels, since all of a pixel's light may come from a hundredth of its width.
-MOST_CELLS = 64
+MAX_CELLS = 64
 GLINT_LEVELS = 2
 # A wire that runs through the image is followed by at most this many launches.
-MOST_LAUNCHES = 256
+MAX_LAUNCHES = 256
 # Passes end when there is less to cut than least_share times this share of what the first one cut: a pass takes as long
 # as ten thousand rays, and the last few edges are worth less (measured in rooms: 4 % more error, 26 % less time).
 LAST_SHARE = 1 / 32
@@ -52,7 +52,7 @@ class CellTree:
     tilt_y: np.ndarray | None
     peak: np.ndarray | None
 
-    def __init__(self, world: World, pixels: np.ndarray, grid: int) -> None:
+    def __init__(self, world: TracedScene, pixels: np.ndarray, grid: int) -> None:
         self.world, self.pixels, self.grid = world, pixels, grid
         self.width = world.scene.camera.width
         self.first = int(pixels[0]) if len(pixels) else 0
@@ -88,7 +88,7 @@ class CellTree:
         if levels == 0:
             return touched
         few = LAST_SHARE * least_share * self.grid**2 * len(pending)
-        for _ in range(MOST_LAUNCHES):
+        for _ in range(MAX_LAUNCHES):
             if len(pending) <= few:
                 break
             touched[self.rank[pending]] = True

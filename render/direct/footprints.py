@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.scene.rays import camera_rays, first_opaque, laser_leg, shape_index, to_camera
-from render.scene.traced_scene import Bool, Float, UInt32, World, dr, mi, upload
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
 SMALL = 1 / 32
 # beside a displaced laser: a cell's extent over its distance to the laser, second order in the laser leg
@@ -49,7 +49,7 @@ class Footprints(NamedTuple):
     peak: np.ndarray | None = None
 
 
-def trace(world: World, column: np.ndarray, row: np.ndarray, level: np.ndarray, grid: int, *, clip: bool = False):
+def trace(world: TracedScene, column: np.ndarray, row: np.ndarray, level: np.ndarray, grid: int, *, clip: bool = False):
     """Footprints of the cells in these columns and rows (N,) of an image of cells 1/(grid 2^level) pixels wide.
 
     With `clip` a footprint that is not small is cut to the path lengths that its face spans.
@@ -76,7 +76,7 @@ def _lanes(count: int) -> int:
     return next(more for more in range(lanes, lanes + 4) if more % 2 and more % 3)
 
 
-def _footprints(world: World, column: Any, packed: Any, grid: Any, *, clip: bool) -> tuple:
+def _footprints(world: TracedScene, column: Any, packed: Any, grid: Any, *, clip: bool) -> tuple:
     level = packed >> LEVEL_BIT
     side = grid << level
     row = packed & ((1 << LEVEL_BIT) - 1)
@@ -158,7 +158,7 @@ def _off_centre(column: Any, row: Any, level: Any) -> tuple[Any, Any]:
     return tuple((Float(number * golden >> 8) - 2.0**23) * cut for number in (row, column))
 
 
-def _glint(world: World, si: Any, ray: Any, to_laser: Any, hit: Any, irradiance: Any) -> tuple[Any, Any, Any]:
+def _glint(world: TracedScene, si: Any, ray: Any, to_laser: Any, hit: Any, irradiance: Any) -> tuple[Any, Any, Any]:
     """Tilt off the highlight's middle, and its radiance there: see `Footprints`."""
     index = shape_index(si)
     peak = dr.gather(Float, world.peak, index, hit) * irradiance
@@ -191,7 +191,7 @@ def _slopes(local: Any, normal: Any, from_laser: Any, distance: Any, colocated: 
     return mi.Vector2f(*slopes), mi.Vector2f(*path_slopes), dr.sqrt(extent2)
 
 
-def _face_span(world: World, si: Any, path: Any, active: Any) -> tuple[Any, Any]:
+def _face_span(world: TracedScene, si: Any, path: Any, active: Any) -> tuple[Any, Any]:
     """Bounds [m] of the path length over the hit triangle.
 
     p(x) = |x - C| + |x - L| is convex: it is largest at a vertex, and nowhere on the face below its linearisation at
@@ -210,7 +210,7 @@ def _face_span(world: World, si: Any, path: Any, active: Any) -> tuple[Any, Any]
     return near, far
 
 
-def albedo(world: World, si: Any, hit: Any) -> Any:
+def albedo(world: TracedScene, si: Any, hit: Any) -> Any:
     """Diffuse reflectance, or a conductor's at normal incidence; 0 where nothing is hit."""
     diffuse = si.bsdf().eval_diffuse_reflectance(si, hit)[0]
     specular = dr.gather(Float, world.albedo, shape_index(si), hit)

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.direct.cell_tree import MOST_CELLS, CellTree
+from render.direct.cell_tree import MAX_CELLS, CellTree
 from render.direct.footprints import albedo
 from render.scene.rays import camera_rays, first_opaque
-from render.scene.traced_scene import Bool, Float, UInt32, World, dr
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr
 from render.transient.samples import Samples, concatenate, merge, no_samples, packed
 
-LANES, LEAST_ROWS = 1 << 19, 16
+LANES, MIN_ROWS = 1 << 19, 16
 REFINE = 6
 # A footprint whose smaller half span is below this is as good as uniform: a thirtieth of the reference sensor's bin.
 NARROW_M = 1e-3
@@ -45,7 +45,7 @@ def least_share_of(grid: int) -> float:
 
 
 def direct_light(
-    world: World,
+    world: TracedScene,
     pixels: np.ndarray,
     grid: int,
     tolerance_m: float = 1e-4,
@@ -55,7 +55,7 @@ def direct_light(
     """Direct returns of the given flat pixel indices (sorted, each once), merged within `tolerance_m`.
 
     Every pixel starts as grid x grid cells, one ray and footprint each (`render.direct.footprints`). A cell is cut in
-    four, at most `refine` times and down to 1/MOST_CELLS of a pixel, where
+    four, at most `refine` times and down to 1/MAX_CELLS of a pixel, where
     - its footprint is not small, so that first order no longer describes it; or
     - it and a neighbouring cell lie on different surfaces, or one is in shadow, or one is painted darker: an edge runs
       through one of them.
@@ -68,12 +68,12 @@ def direct_light(
     Small cells that are not cut, and whose neighbours lie on the same surface, take their spread of path lengths from
     them instead of from the tangent plane (`render.direct.edges.first_edges`).
 
-    Pixels are treated in groups of whole rows, at least LEAST_ROWS and about LANES rays each. Neither across edges of
+    Pixels are treated in groups of whole rows, at least MIN_ROWS and about LANES rays each. Neither across edges of
     groups nor, where not all pixels are asked for, across edges of pixels are cells compared.
     """
     least_share = least_share_of(grid) if least_share is None else least_share
     width = world.scene.camera.width
-    per_chunk = max(LEAST_ROWS, LANES // (grid * grid * width)) * width
+    per_chunk = max(MIN_ROWS, LANES // (grid * grid * width)) * width
     parts = [
         _chunk(world, pixels[i : i + per_chunk], grid, tolerance_m, refine, least_share)
         for i in range(0, max(len(pixels), 1), per_chunk)
@@ -86,10 +86,10 @@ def direct_light(
 
 
 def _chunk(
-    world: World, pixels: np.ndarray, grid: int, tolerance_m: float, refine: int, least_share: float
+    world: TracedScene, pixels: np.ndarray, grid: int, tolerance_m: float, refine: int, least_share: float
 ) -> DirectLight:
     tree = CellTree(world, pixels, grid)
-    touched = tree.refine(max(0, min(refine, int(math.log2(MOST_CELLS / grid)))), least_share / grid**2)
+    touched = tree.refine(max(0, min(refine, int(math.log2(MAX_CELLS / grid)))), least_share / grid**2)
     clipped = tree.clip()
     # pixels that were left alone are a table of equal cells; what was cut is a list
     plain = _merge_plain(tree, np.flatnonzero(~touched), tolerance_m)
@@ -173,7 +173,7 @@ def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, share: 
     return packed(pixel, centroid, np.sqrt(3 * variance), total, np.ones(len(index), np.uint8))
 
 
-def centre_layers(world: World) -> Layers:
+def centre_layers(world: TracedScene) -> Layers:
     """Depth, normal and albedo at every pixel centre, (H, W)."""
     shape = (world.scene.camera.height, world.scene.camera.width)
     pixel = dr.arange(UInt32, shape[0] * shape[1])
@@ -185,7 +185,7 @@ def centre_layers(world: World) -> Layers:
     return Layers(depth.copy(), normal.astype(np.float16), reflectance.astype(np.float16))
 
 
-def _centres(world: World, pixel: Any) -> tuple[Any, ...]:
+def _centres(world: TracedScene, pixel: Any) -> tuple[Any, ...]:
     ray, _ = camera_rays(world, Float(pixel % world.width) + 0.5, Float(pixel // world.width) + 0.5)
     si, _, _, distance = first_opaque(world, ray, Bool(True))
     hit = si.is_valid()

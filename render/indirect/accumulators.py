@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from render.indirect.path_cells import Rows, add_quanta
+from render.indirect.path_cells import MomentHistogram, scatter_add_fixed_point
 from render.scene.traced_scene import Float, UInt32, dr, mi, upload
 
 FINER = 3  # parts of what is spread over watched rows, whose cells are half as wide as the pixels'
 
 
-class Sums:
+class IndirectAccumulator:
     """Where connections are added: rows of the pixels' cells, finer rows of watched pixels by batch, totals by batch.
 
     origin_m   zero of every pixel's cells
@@ -25,13 +25,13 @@ class Sums:
 
     def __init__(
         self,
-        rows: Rows,
+        rows: MomentHistogram,
         origin_m: np.ndarray,
         *,
         rounds: np.ndarray,
         batches: int,
-        watched: Rows | None = None,
-        plain: Rows | None = None,
+        watched: MomentHistogram | None = None,
+        plain: MomentHistogram | None = None,
         watch: np.ndarray | None = None,
     ) -> None:
         self.rows, self.watched, self.plain = rows, watched, plain
@@ -73,7 +73,9 @@ class Sums:
 
     def add_total(self, pixel: Any, batch: Any, radiance: Any) -> None:
         """Add to the pixels' totals by batch."""
-        add_quanta(self.totals, radiance * self.rows.per_quantum, pixel * self.batches + batch, radiance > 0)
+        scatter_add_fixed_point(
+            self.totals, radiance * self.rows.per_quantum, pixel * self.batches + batch, radiance > 0
+        )
 
     def _given(self, pixel: Any, path: Any, radiance: Any, active: Any) -> tuple[Any, Any, Any]:
         """Place from the pixel's origin, share of the pixel's mean, and where there is any."""

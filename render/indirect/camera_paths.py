@@ -13,47 +13,55 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.indirect.glossy import glossy_of
-from render.indirect.launch_layout import BLOCK, Turns, block_order, turns_of
-from render.indirect.light_vertices import Lit, is_wide, joins_of, kept, lit_points, of_parts, parts_of
+from render.indirect.launch_layout import BLOCK, LaunchLayout, block_order, make_launch
+from render.indirect.light_vertices import (
+    LightVertices,
+    connections_per_vertex,
+    is_wide,
+    kept,
+    of_parts,
+    parts_of,
+    sample_light_vertices,
+)
 from render.indirect.path_space_filter import Point, late_from, point_of
-from render.indirect.path_suffixes import Slots, Tails, slots_for, tails_of
-from render.indirect.primary_vertices import Heads, Joined, join_heads, shares_early
+from render.indirect.path_suffixes import PathSuffixes, Slots, slots_for, tails_of
+from render.indirect.primary_vertices import Joined, PrimaryVertices, join_heads, shares_early
 from render.scene.rays import camera_rays, first_opaque, shape_index
-from render.scene.traced_scene import Float, UInt32, World, dr, mi, upload
+from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
 
 # Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32; and of the plain
 GOLDEN = (3242174889, 2447445414)
 PLAIN_GOLDEN = 2654435769
 
 
-class Traced(NamedTuple):
+class PathBatch(NamedTuple):
     """Paths of a launch, the lit points that they were joined to, and the batch that each path belongs to."""
 
-    heads: Heads
+    heads: PrimaryVertices
     joined: tuple[Joined, ...]
-    tails: Tails
-    lit: Lit | None
+    tails: PathSuffixes
+    lit: LightVertices | None
     batch: Any
 
 
 def trace_paths(
-    world: World,
+    world: TracedScene,
     pixels: np.ndarray,
-    turns: Turns,
+    turns: LaunchLayout,
     bounces: int,
     seed: int,
     batches: int,
     *,
     shared: bool,
     from_m: Any = None,
-) -> Traced:
+) -> PathBatch:
     """Trace a path for every member of every turn.
 
     Blocks share their tails if they are `shared`; for light less than `from_m` behind direct light if `shares_early`.
     """
     lanes = len(turns.block) * BLOCK
     seeds = np.random.SeedSequence(seed).generate_state(4)
-    joins = joins_of(world, shared=shared)
+    joins = connections_per_vertex(world, shared=shared)
     lit = _lit(world, turns, lanes, batches, joins, seeds[2:])
     given = _Given(
         tuple(slots_for(world, lit, lanes, bounces - 2)),
@@ -70,18 +78,19 @@ def trace_paths(
     heads, near, tails, batch = world.recordings.call(world, key, work, *given)
     late_m = dr.full(Float, dr.inf if shared else 0, lanes) if from_m is None else heads[-2]
     point = None if from_m is None else Point(*heads[-1])
-    return Traced(
-        Heads(heads[0], of_parts(heads[1]), *heads[2:-2], late_m, point),
+    return PathBatch(
+        PrimaryVertices(heads[0], of_parts(heads[1]), *heads[2:-2], late_m, point),
         tuple(Joined(*light) for light in near),
-        Tails(of_parts(tails[0]), *tails[1:]),
+        PathSuffixes(of_parts(tails[0]), *tails[1:]),
         lit,
         batch,
     )
 
 
 class _Given(NamedTuple):
-    """What paths are traced from, as arrays: `Slots`; `Turns`, those of a turn together; flat pixels; keys of the
-    random numbers; how many batches there are; the parts of `Lit`; and from where on light is filtered [m], or None.
+    """What paths are traced from, as arrays: `Slots`; `LaunchLayout`, those of a turn together; flat pixels; keys of
+    the random numbers; how many batches there are; the parts of `LightVertices`; and from where on light is filtered
+    [m], or None.
 
     Dr.Jit records anew where two inputs have one size that had not before: there are 16 n lanes, 4 n + 2 numbers of
     turns, 16 n + 1 pixels and 2^n + 3 lit points.
@@ -96,11 +105,11 @@ class _Given(NamedTuple):
     from_m: Any
 
 
-def _paths(world: World, *given: Any, shared: bool, joins: int) -> tuple[tuple, tuple, tuple, Any]:
-    """The parts of `Traced`, in plain tuples, which recordings look into."""
+def _paths(world: TracedScene, *given: Any, shared: bool, joins: int) -> tuple[tuple, tuple, tuple, Any]:
+    """The parts of `PathBatch`, in plain tuples, which recordings look into."""
     given = _Given(*given)
     slots, keys, from_m = Slots(*given.slots), given.keys, given.from_m
-    lit = None if given.lit is None else Lit(of_parts(given.lit[0]), *given.lit[1:])
+    lit = None if given.lit is None else LightVertices(of_parts(given.lit[0]), *given.lit[1:])
     turn, member = slots.lane // BLOCK, slots.lane % BLOCK
     block, stream, round_index, stride = (dr.gather(UInt32, given.turns, 4 * turn + part) for part in range(4))
     batch = round_index % given.batches
@@ -135,7 +144,7 @@ def _paths(world: World, *given: Any, shared: bool, joins: int) -> tuple[tuple, 
         late_m = late_from(world, point, from_m)
         shares &= shares_early(world)
     sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*spread), hit)
-    heads = Heads(receiver, kept(si), transmission, path, hit, shares, late_m, point)
+    heads = PrimaryVertices(receiver, kept(si), transmission, path, hit, shares, late_m, point)
     near = join_heads(world, heads, lit, batch, first, joins)
     used = shared or (from_m is not None and shares_early(world))
     tails = tails_of(world, heads, sample, weight[0], pixel, lit, joins, batch, random, slots, used=used)
@@ -150,16 +159,20 @@ def _of_any_length(values: Any) -> Any:
     return type(values)(values[0]) if constant else values
 
 
-def _lit(world: World, turns: Turns, lanes: int, batches: int, joins: int, numbers: np.ndarray) -> Lit | None:
+def _lit(
+    world: TracedScene, turns: LaunchLayout, lanes: int, batches: int, joins: int, numbers: np.ndarray
+) -> LightVertices | None:
     """Lit points of this launch alone."""
     if joins == 0:
         return None
     seeds = np.random.SeedSequence(numbers.tolist(), spawn_key=(int(turns.stream[0]), int(turns.round[0])))
-    return lit_points(world, lanes, batches, tuple(dr.opaque(UInt32, int(key)) for key in seeds.generate_state(2)))
+    return sample_light_vertices(
+        world, lanes, batches, tuple(dr.opaque(UInt32, int(key)) for key in seeds.generate_state(2))
+    )
 
 
 def energy_by_bounces(
-    world: World, pixels: np.ndarray, rounds: int, bounces: int, seed: int
+    world: TracedScene, pixels: np.ndarray, rounds: int, bounces: int, seed: int
 ) -> tuple[np.ndarray, float]:
     """Mean radiance, summed over the pixels, of light that met exactly 0, 1, ..., `bounces` surfaces (0 below 2).
 
@@ -167,7 +180,7 @@ def energy_by_bounces(
     """
     blocks = block_order(pixels, world.scene.camera.width)
     block = np.arange(len(blocks) // BLOCK)
-    turns = turns_of(block, block, np.full(len(block), rounds))
+    turns = make_launch(block, block, np.full(len(block), rounds))
     traced = trace_paths(world, blocks, turns, bounces, seed, 1, shared=False)
     tails, vertices = traced.tails, bounces - 2
     beyond = tails.own_onward.numpy() * tails.values.numpy().reshape(-1, dr.width(traced.batch))

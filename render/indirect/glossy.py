@@ -22,13 +22,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.scene.rays import camera_rays, first_opaque, raster_of, shape_index
-from render.scene.traced_scene import Bool, Float, UInt32, World, dr, upload
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, upload
 
 RATIO = 2.0  # paths that begin in a polished pixel of the laser's image, for every path of others (1 to 2 do best)
 # Where SEEN_BY x SEEN_BY rays a pixel meet no polished surface there may be a sliver: the share that begins there.
 SEEN_BY, ELSEWHERE = 2, 1 / 8
 WIDEST_DEG = 60.0  # off the optical axis, how far such surfaces are looked for
-LEAST_COSINE = 1e-2
+MIN_COSINE = 1e-2
 
 
 class Glossy(NamedTuple):
@@ -43,7 +43,7 @@ class Glossy(NamedTuple):
     height: Any
 
 
-def glossy_of(world: World) -> Glossy | None:
+def glossy_of(world: TracedScene) -> Glossy | None:
     """Where a flood laser lights polished surfaces, looked for once; None if nowhere.
 
     Glass and cut-outs on the way would need to be crossed from the other side, too.
@@ -55,7 +55,7 @@ def glossy_of(world: World) -> Glossy | None:
     return Glossy(*world.glossy) if world.glossy else None
 
 
-def _look_for(world: World) -> tuple[Any, ...]:
+def _look_for(world: TracedScene) -> tuple[Any, ...]:
     """The parts of `Glossy`, none if nowhere: a plain tuple, which recordings take for an input."""
     camera, laser = world.scene.camera, world.scene.laser
     angle = min(math.acos(laser.cos_half_angle(camera)), math.radians(WIDEST_DEG))
@@ -74,7 +74,7 @@ def _look_for(world: World) -> tuple[Any, ...]:
     return upload(Float, shares), *numbers
 
 
-def _shows(world: World, pixel: Any, left: Any, up: Any, width: Any, height: Any) -> Any:
+def _shows(world: TracedScene, pixel: Any, left: Any, up: Any, width: Any, height: Any) -> Any:
     shown = Bool(False)
     for place in range(SEEN_BY**2):
         x, y = ((part + 0.5) / SEEN_BY for part in (place % SEEN_BY, place // SEEN_BY))
@@ -85,18 +85,18 @@ def _shows(world: World, pixel: Any, left: Any, up: Any, width: Any, height: Any
     return shown
 
 
-def laser_rays(world: World, pixel: Any, x: Any, y: Any, left: Any, up: Any, width: Any) -> tuple[Any, Any]:
+def laser_rays(world: TracedScene, pixel: Any, x: Any, y: Any, left: Any, up: Any, width: Any) -> tuple[Any, Any]:
     """`camera_rays` from the laser through places in pixels of its image."""
     column, row = Float(pixel % width) - Float(left), Float(pixel // width) - Float(up)
     return camera_rays(world, column + x, row + y, world.laser)
 
 
-def is_glossy(world: World, si: Any, active: Any) -> Any:
+def is_glossy(world: TracedScene, si: Any, active: Any) -> Any:
     """Whether a point lies on a polished surface."""
     return active & (dr.gather(Float, world.peak, shape_index(si), active) > 0)
 
 
-def left_to_paths(world: World, point: Any, direction: Any, end: Any, active: Any) -> Any:
+def mis_weight_camera_path(world: TracedScene, point: Any, direction: Any, end: Any, active: Any) -> Any:
     """1 - c: what a path from `point` in that direction to `end`, and on to the laser, keeps of its light.
 
     Rays start a little off their points, which tell the direction badly where these are close.
@@ -113,20 +113,20 @@ def left_to_paths(world: World, point: Any, direction: Any, end: Any, active: An
     return dr.select(seen, 1 / (1 + odds), 1)
 
 
-def begun_on_highlight(world: World, pixel: Any, point: Any, direction: Any, end: Any, active: Any) -> Any:
+def mis_weight_light_path(world: TracedScene, pixel: Any, point: Any, direction: Any, end: Any, active: Any) -> Any:
     """c: what the path that begins in this pixel, on `end`, and goes to `point` has of that light; `direction` is the
     way back."""
     odds = dr.gather(Float, glossy_of(world).shares, pixel, active) * _odds(world, point, direction, end, active)
     return dr.select(active, odds / (1 + odds), 0)
 
 
-def _odds(world: World, point: Any, direction: Any, end: Any, active: Any) -> Any:
+def _odds(world: TracedScene, point: Any, direction: Any, end: Any, active: Any) -> Any:
     to_laser, way, normal = world.laser - end.p, -dr.normalize(direction), end.sh_frame.n
     light = dr.normalize(to_laser)
     cosine = dr.dot(normal, way)
     rough2 = dr.square(dr.gather(Float, world.roughness, shape_index(end), active))
     between = dr.square(dr.dot(normal, dr.normalize(light + way)))
     facets = rough2 / (math.pi * dr.square(between * (rough2 - 1) + 1))
-    odds = RATIO * math.pi / 4 * facets / dr.maximum(dr.abs(cosine), LEAST_COSINE)
+    odds = RATIO * math.pi / 4 * facets / dr.maximum(dr.abs(cosine), MIN_COSINE)
     odds *= dr.squared_norm(point - world.eye) / dr.squared_norm(to_laser)
     return dr.select(dr.isfinite(odds) & (cosine * dr.dot(normal, light) > 0), odds, 0)

@@ -8,18 +8,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.backend.malloc import release
-from render.indirect.accumulators import Sums
-from render.indirect.launch_layout import BLOCK, Turns, turns_of
-from render.indirect.light_tracing import Thrown, thrown_light
-from render.indirect.path_cells import Cells, Rows, cell_samples, coarsened, make_cells, quantum_for
-from render.indirect.path_space_filter import READERS, Octaves, Regions
+from render.backend.malloc import trim_memory
+from render.indirect.accumulators import IndirectAccumulator
+from render.indirect.launch_layout import BLOCK, LaunchLayout, make_launch
+from render.indirect.light_tracing import LightPathSplats, trace_light_paths
+from render.indirect.path_cells import Cells, MomentHistogram, cell_samples, coarsened, make_cells, quantum_for
+from render.indirect.path_space_filter import GATHER_POINTS, Octaves, PathSpaceFilter
 from render.indirect.reuse import FILTERED_PATHS, LANES, PATHS, add_paths, noise_of_filtered_paths, noise_of_paths
-from render.scene.traced_scene import Bool, Float, UInt32, World, dr, upload
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, upload
 from render.settings import BATCHES, FILTERED_BATCHES
 from render.transient.samples import Samples, concatenate, no_samples, packed
 
-MOST_CELLS = 700_000  # of one launch: 17 MB of accumulators
+MAX_CELLS = 700_000  # of one launch: 17 MB of accumulators
 OVER = 0.3  # of a launch
 # Seconds of one path with its tail in units of one connection, on 2 cores. Only the choice of who shares depends on it.
 PATH_COST = 9.0
@@ -54,7 +54,7 @@ class Schedule(NamedTuple):
 
     def rays(self, bounces: int) -> int:
         """Rays of all paths, connections and points that read regions; glass and cut-outs on the way not counted."""
-        points = 0 if self.spans is None else READERS * int((self.pixels >= 0).sum())
+        points = 0 if self.spans is None else GATHER_POINTS * int((self.pixels >= 0).sum())
         return self.paths * (2 * bounces - 1) + self.connections + points
 
     @property
@@ -71,7 +71,7 @@ def uniform(blocks: np.ndarray, rounds: int, *, shared: bool) -> Schedule:
 
 
 def pilot_noise(
-    world: World, blocks: np.ndarray, bounces: int, seed: int, from_m: float | None = None
+    world: TracedScene, blocks: np.ndarray, bounces: int, seed: int, from_m: float | None = None
 ) -> tuple[np.ndarray, ...]:
     """Squared contributions of one round summed over the pixels of every block, without and with sharing.
 
@@ -85,7 +85,7 @@ def pilot_noise(
     for first in range(0, count, per_launch):
         size = min(per_launch, count - first)
         block = np.arange(size)
-        turns = turns_of(block, block + first, np.full(size, rounds))
+        turns = make_launch(block, block + first, np.full(size, rounds))
         chosen = blocks[first * BLOCK : (first + size) * BLOCK]
         if from_m is None:
             found = noise_of_paths(world, chosen, turns, bounces, seed)
@@ -138,7 +138,7 @@ def allocate(
     return Schedule(blocks, rounds.astype(np.int64), best == 1)
 
 
-class Watched(NamedTuple):
+class ProbePixels(NamedTuple):
     """Light of a few flat `pixels` by independent batches, in cells half as wide: radiance and its two moments about
     the cell's beginning in the cell's width, (pixels, batches, cells) each.
 
@@ -174,19 +174,19 @@ class IndirectLight(NamedTuple):
     """
 
     noise: np.ndarray
-    watched: Watched
-    plain: Watched | None = None
+    watched: ProbePixels
+    plain: ProbePixels | None = None
 
 
 def combined(one: IndirectLight, other: IndirectLight, share: np.ndarray) -> IndirectLight:
     """The weighted mean of two independent estimates but for their samples; `share` of the first, for every pixel."""
     weight = share[one.watched.pixels][:, None, None]
 
-    def mean(first: Watched | None, second: Watched | None) -> Watched | None:
+    def mean(first: ProbePixels | None, second: ProbePixels | None) -> ProbePixels | None:
         if first is None or second is None:
             return None
         both = (weight * a + (1 - weight) * b for a, b in zip(first[-3:], second[-3:], strict=True))
-        return Watched(*first[:-3], *both)
+        return ProbePixels(*first[:-3], *both)
 
     noise = np.hypot(share * one.noise, (1 - share) * other.noise)
     return IndirectLight(noise, mean(one.watched, other.watched), mean(one.plain, other.plain))
@@ -201,7 +201,7 @@ def combined_samples(one: Samples, other: Samples, share: np.ndarray, cells: Cel
     return coarsened(concatenate(parts), cells, origin_m)
 
 
-def image_cells(world: World, width_m: float, growth: float, origin_m: np.ndarray, bounces: int) -> Cells:
+def image_cells(world: TracedScene, width_m: float, growth: float, origin_m: np.ndarray, bounces: int) -> Cells:
     """Cells that hold every path of up to `bounces` surfaces, counted from the pixels' origins."""
     low, high = world.scene.bounds()
     ends = np.stack((low, high, world.scene.camera.origin, world.scene.laser.position(world.scene.camera)))
@@ -211,7 +211,7 @@ def image_cells(world: World, width_m: float, growth: float, origin_m: np.ndarra
 
 
 def collect(
-    world: World,
+    world: TracedScene,
     schedule: Schedule,
     origin_m: np.ndarray,
     cells: Cells,
@@ -219,14 +219,14 @@ def collect(
     seed: int,
     brightest: float,
     *,
-    watch: Watch | None = None,
+    watch: Probe | None = None,
     say: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Chunk]:
     """Trace a schedule and hand out merged samples, some blocks at a time.
 
     `origin_m` belongs to flat pixels of the image.
     """
-    per_chunk = max(1, MOST_CELLS // (cells.count * BLOCK))
+    per_chunk = max(1, MAX_CELLS // (cells.count * BLOCK))
     done = 0
     for shared in (False, True):
         numbers = np.flatnonzero(schedule.shared == shared)
@@ -235,8 +235,8 @@ def collect(
             done += len(chosen)
             pixels = schedule.pixels.reshape(-1, BLOCK)[chosen].ravel()
             rounds = schedule.rounds[chosen]
-            rows = Rows(len(pixels), cells, quantum_for(brightest))
-            sums = Sums(
+            rows = MomentHistogram(len(pixels), cells, quantum_for(brightest))
+            sums = IndirectAccumulator(
                 rows,
                 origin_m[pixels],
                 rounds=np.repeat(rounds, BLOCK),
@@ -247,7 +247,7 @@ def collect(
             )
             regions = None
             if schedule.spans is not None:
-                regions = Regions(world, pixels, schedule.spans, schedule.batches, rows.quantum, seed)
+                regions = PathSpaceFilter(world, pixels, schedule.spans, schedule.batches, rows.quantum, seed)
             most = LANES // BLOCK**2 if shared else (PATHS if regions is None else FILTERED_PATHS) // BLOCK
             launches = 0
             for turns in _launches(chosen, rounds, schedule.batches, most):
@@ -255,7 +255,7 @@ def collect(
                 launches += 1
                 add_paths(world, pixels, turns, bounces, seed, sums, schedule.batches, shared=shared, regions=regions)
             if regions is None or launches > 1:  # the next regions take the memory of the last
-                release(world.scene.camera.height * world.scene.camera.width)  # what the launches took
+                trim_memory(world.scene.camera.height * world.scene.camera.width)  # what the launches took
             if regions is not None:
                 regions.read(sums)
             totals = sums.totals.numpy().reshape(len(pixels), -1) * rows.quantum
@@ -264,49 +264,49 @@ def collect(
             yield Chunk(pixels, samples, totals)
 
 
-def _launches(streams: np.ndarray, rounds: np.ndarray, batches: int, most: int) -> Iterator[Turns]:
+def _launches(streams: np.ndarray, rounds: np.ndarray, batches: int, most: int) -> Iterator[LaunchLayout]:
     """All rounds of some blocks in launches of one size: memory of another is not reused.
 
     A launch has at most `most` turns, or OVER more where that saves one.
     """
     count = int(rounds.sum())
     for turns in np.array_split(np.arange(count), max(1, math.ceil(count / most - OVER))):
-        yield turns_of(np.arange(len(rounds)), streams, rounds, batches, turns)
+        yield make_launch(np.arange(len(rounds)), streams, rounds, batches, turns)
 
 
-class Watch(NamedTuple):
+class Probe(NamedTuple):
     """The watched row of every flat pixel of the image, or -1; rows by batch, and such without a filter."""
 
     row_of: np.ndarray
-    rows: Rows
-    plain: Rows | None
+    rows: MomentHistogram
+    plain: MomentHistogram | None
 
 
-def _watch(pixels: np.ndarray, image_pixels: int, cells: Cells, schedule: Schedule, brightest: float) -> Watch | None:
+def _watch(pixels: np.ndarray, image_pixels: int, cells: Cells, schedule: Schedule, brightest: float) -> Probe | None:
     """What it takes to watch a sorted few of the image's pixels."""
     if len(pixels) == 0:
         return None
     row_of = np.full(image_pixels, -1)
     row_of[pixels] = np.arange(len(pixels))
     kinds = 1 if schedule.spans is None else 2
-    rows = [Rows(len(pixels) * schedule.batches, cells, quantum_for(brightest)) for _ in range(kinds)]
-    return Watch(row_of, rows[0], rows[1] if kinds == 2 else None)
+    rows = [MomentHistogram(len(pixels) * schedule.batches, cells, quantum_for(brightest)) for _ in range(kinds)]
+    return Probe(row_of, rows[0], rows[1] if kinds == 2 else None)
 
 
 def _caustics(
-    world: World,
+    world: TracedScene,
     schedule: Schedule,
     bounces: int,
     seed: int,
     origin_m: np.ndarray,
     cells: Cells,
-    watch: Watch | None,
+    watch: Probe | None,
     add: Callable[[Samples], None],
 ) -> np.ndarray:
     """Give out light that polished surfaces throw; every pixel's total of it by batch, (pixels, batches)."""
     batches = schedule.batches
     totals, merged = np.zeros((len(origin_m), batches)), no_samples()
-    for light in thrown_light(world, schedule.cost, batches, bounces, seed):
+    for light in trace_light_paths(world, schedule.cost, batches, bounces, seed):
         np.add.at(totals, (light.pixel, light.batch), light.radiance)
         if watch is not None:
             _watch_thrown(watch, light, origin_m, batches)
@@ -317,7 +317,7 @@ def _caustics(
     return totals
 
 
-def _watch_thrown(watch: Watch, light: Thrown, origin_m: np.ndarray, batches: int) -> None:
+def _watch_thrown(watch: Probe, light: LightPathSplats, origin_m: np.ndarray, batches: int) -> None:
     """Add what is thrown on watched pixels to their rows."""
     seen = np.flatnonzero(watch.row_of[light.pixel] >= 0)
     if len(seen) == 0:
@@ -332,7 +332,7 @@ def _watch_thrown(watch: Watch, light: Thrown, origin_m: np.ndarray, batches: in
 
 
 def indirect_light(
-    world: World,
+    world: TracedScene,
     schedule: Schedule,
     bounces: int,
     seed: int,
@@ -365,10 +365,10 @@ def indirect_light(
             totals = chunk.totals[real] + thrown[chunk.pixels[real]]
             noise[chunk.pixels[real]] = totals.std(axis=1, ddof=1) * np.sqrt(batches)
 
-    def seen(rows: Rows | None) -> Watched:
+    def seen(rows: MomentHistogram | None) -> ProbePixels:
         sums = (np.zeros(0),) * 3 if rows is None else rows.sums()
         shape = len(watched), batches, fine.count
-        return Watched(watched, fine, origin_m[watched], *(values.reshape(shape) for values in sums))
+        return ProbePixels(watched, fine, origin_m[watched], *(values.reshape(shape) for values in sums))
 
     rows, plain = (None, None) if watch is None else watch[1:]
     return IndirectLight(noise, seen(rows), None if plain is None else seen(plain))

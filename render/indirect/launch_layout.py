@@ -9,7 +9,7 @@ import numpy as np
 BLOCK = 16  # pixels that share their paths
 
 
-class Turns(NamedTuple):
+class LaunchLayout(NamedTuple):
     """One launch: turn n traces a path in each pixel of its block `block[n]`, number `stream[n]` of the image.
 
     `round` numbers the turns of a block. With the seed, stream and round decide the random numbers. `stride` is a power
@@ -22,15 +22,15 @@ class Turns(NamedTuple):
     stride: np.ndarray
 
 
-def turns_of(
+def make_launch(
     blocks: np.ndarray, streams: np.ndarray, rounds: np.ndarray, batches: int = 1, turns: np.ndarray | None = None
-) -> Turns:
+) -> LaunchLayout:
     """The turns of some blocks, `rounds` each, block by block; or those that `turns` numbers among them."""
     ends = np.cumsum(rounds)
     turns = np.arange(int(ends[-1])) if turns is None else turns
     place = np.searchsorted(ends, turns, side="right")
     stride = 1 << np.ceil(np.log2(np.maximum(rounds / batches, 1))).astype(np.int64)
-    return Turns(blocks[place], streams[place], turns - (ends - rounds)[place], stride[place])
+    return LaunchLayout(blocks[place], streams[place], turns - (ends - rounds)[place], stride[place])
 
 
 def block_order(pixels: np.ndarray, width: int) -> np.ndarray:

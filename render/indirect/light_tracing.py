@@ -21,15 +21,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.indirect.glossy import RATIO, begun_on_highlight, glossy_of, is_glossy, laser_rays
+from render.indirect.glossy import RATIO, glossy_of, is_glossy, laser_rays, mis_weight_light_path
 from render.scene.rays import first_opaque, in_beam, pixel_of, segment, spawn, to_camera
-from render.scene.traced_scene import Bool, Float, UInt32, World, dr, mi, upload
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
 PATHS = 1 << 17  # of one launch
-LEAST_COSINE = 1e-4
+MIN_COSINE = 1e-4
 
 
-class Thrown(NamedTuple):
+class LightPathSplats(NamedTuple):
     """Light that some paths throw on other pixels: flat pixel, path [m], radiance over the number of paths, batch."""
 
     pixel: np.ndarray
@@ -38,7 +38,9 @@ class Thrown(NamedTuple):
     batch: np.ndarray
 
 
-def thrown_light(world: World, paths: float, batches: int, bounces: int, seed: int) -> Iterator[Thrown]:
+def trace_light_paths(
+    world: TracedScene, paths: float, batches: int, bounces: int, seed: int
+) -> Iterator[LightPathSplats]:
     """Trace RATIO times `paths` paths for every polished pixel, fewer for others, launch by launch.
 
     A flood's intensity is the same everywhere.
@@ -61,12 +63,12 @@ def thrown_light(world: World, paths: float, batches: int, bounces: int, seed: i
         target, path, radiance = (values.numpy() for values in found)
         kept = np.flatnonzero(radiance)
         radiance = radiance[kept].astype(np.float64) / rounds[pixel[kept % len(lane)]]
-        yield Thrown(target[kept].astype(np.int64), path[kept], radiance, batch[kept % len(lane)])
+        yield LightPathSplats(target[kept].astype(np.int64), path[kept], radiance, batch[kept % len(lane)])
 
 
 @dr.syntax
 def _thrown(
-    world: World, pixel: Any, lane: Any, number: Any, batch: Any, keys: list[Any], bounces: int
+    world: TracedScene, pixel: Any, lane: Any, number: Any, batch: Any, keys: list[Any], bounces: int
 ) -> tuple[Any, Any, Any]:
     """Target pixels, paths and radiances, (bounces - 1) x lanes flat."""
     lanes = dr.width(lane)
@@ -75,7 +77,7 @@ def _thrown(
     place, stride, last = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes), dr.opaque(UInt32, bounces - 1)
     key = mi.sample_tea_32(lane ^ keys[0], keys[1])
     random = mi.PCG32(initstate=mi.UInt64(key[0]), initseq=mi.UInt64(key[1]))
-    si, path, sample, value, active = _begun(world, pixel, number, batch, keys, random)
+    si, path, sample, value, active = _sample_first_vertex(world, pixel, number, batch, keys, random)
     begun, start = Bool(True), mi.SurfaceInteraction3f(si)
     slot = dr.zeros(UInt32, lanes)
     while active:
@@ -84,7 +86,7 @@ def _thrown(
         active &= si.is_valid()
         path += leg
         if begun:
-            value *= begun_on_highlight(world, pixel, si.p, -towards.d, start, active)
+            value *= mis_weight_light_path(world, pixel, si.p, -towards.d, start, active)
             begun = Bool(False)
         target, seen = pixel_of(world, si.p)
         # the camera has to see it; the laser need not shine on it
@@ -115,7 +117,9 @@ def _thrown(
     return targets, paths, values
 
 
-def _begun(world: World, pixel: Any, number: Any, batch: Any, keys: list[Any], random: Any) -> tuple[Any, ...]:
+def _sample_first_vertex(
+    world: TracedScene, pixel: Any, number: Any, batch: Any, keys: list[Any], random: Any
+) -> tuple[Any, ...]:
     """x1, the path to it, a sample of where light goes from there, its value, and whether there is any."""
     glossy, intensity = glossy_of(world), dr.gather(Float, world.intensity, UInt32(0))
     jitter = mi.Point2f(random.next_float32(), random.next_float32())
@@ -134,4 +138,4 @@ def _begun(world: World, pixel: Any, number: Any, batch: Any, keys: list[Any], r
 def _ratio(si: Any, local: Any) -> Any:
     """Cosine to the shading normal over that to the surface, of a direction in the shading frame."""
     shading, true = dr.abs(local.z), dr.abs(dr.dot(si.n, si.to_world(local)))
-    return dr.maximum(shading, LEAST_COSINE) / dr.maximum(true, LEAST_COSINE)
+    return dr.maximum(shading, MIN_COSINE) / dr.maximum(true, MIN_COSINE)

@@ -19,31 +19,31 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from render.indirect.glossy import left_to_paths
+from render.indirect.glossy import mis_weight_camera_path
 from render.scene.rays import first_opaque, laser_light, segment, to_world
-from render.scene.traced_scene import Bool, Float, UInt32, World, dr, mi
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
-MOST_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
-LEAST_COSINE = 1e-9
+MAX_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
+MIN_COSINE = 1e-9
 # Lit points that x1 is joined to, of a path alone and of one that is shared: as many as lowered the noise of a second
 # most. Under a lamp, whose paths seldom meet what is close to it, later vertices are joined to one, too. A flash lights
 # what its pixels see, which paths meet often: there joining hardly pays.
 WIDE_JOINS, NARROW_JOINS = (4, 8), (1, 0)
 
 
-def joins_of(world: World, *, shared: bool) -> int:
+def connections_per_vertex(world: TracedScene, *, shared: bool) -> int:
     """Lit points that every x1 is joined to; none where the laser is no flood, and lights another place every time."""
     if world.scene.laser.mode != "flood":
         return 0
     return (WIDE_JOINS if is_wide(world) else NARROW_JOINS)[shared]
 
 
-def is_wide(world: World) -> bool:
+def is_wide(world: TracedScene) -> bool:
     """Whether the laser lights half the sphere or more."""
     return world.scene.laser.cos_half_angle(world.scene.camera) <= 0
 
 
-class Lit(NamedTuple):
+class LightVertices(NamedTuple):
     """Points of a launch, `each` for every batch: direction and optical path to the laser, irradiance, and density.
 
     `density` is that of one point per area [1/m^2]. At the end are a few that belong to no batch.
@@ -57,9 +57,9 @@ class Lit(NamedTuple):
     each: Any
 
 
-def lit_points(world: World, lanes: int, batches: int, key: tuple[Any, Any]) -> Lit:
+def sample_light_vertices(world: TracedScene, lanes: int, batches: int, key: tuple[Any, Any]) -> LightVertices:
     """Points where uniform directions of the laser's cone meet a surface, for a launch of so many paths."""
-    wanted = min(MOST_POINTS, max(int(lanes * POINTS_PER_PATH), 1))
+    wanted = min(MAX_POINTS, max(int(lanes * POINTS_PER_PATH), 1))
     parts = 1 << (batches - 1).bit_length()
     each = max(1, (1 << (wanted - 1).bit_length()) // parts)
     count = each * parts
@@ -67,11 +67,11 @@ def lit_points(world: World, lanes: int, batches: int, key: tuple[Any, Any]) -> 
     index = dr.arange(UInt32, count + 3)  # of no other input's length (`render.indirect.camera_paths`)
     dr.eval(index)
     parts, *columns = world.recordings.call(world, "lit points", _lit_points, index, opaque, *key)
-    return Lit(of_parts(parts), *columns, opaque)
+    return LightVertices(of_parts(parts), *columns, opaque)
 
 
-def _lit_points(world: World, index: Any, each: Any, *key: Any) -> tuple[Any, ...]:
-    """The parts of `Lit`, in plain tuples."""
+def _lit_points(world: TracedScene, index: Any, each: Any, *key: Any) -> tuple[Any, ...]:
+    """The parts of `LightVertices`, in plain tuples."""
     # each batch has a randomised (0, 2)-sequence of its own
     shift = mi.sample_tea_32(index // each + key[0], index * 0 + key[1])
     number = index % each
@@ -108,13 +108,13 @@ def kept(si: Any) -> Any:
     return of_parts(parts_of(si))
 
 
-def density_of(world: World, si: Any, to_laser: Any) -> Any:
+def density_of(world: TracedScene, si: Any, to_laser: Any) -> Any:
     """Density per area [1/m^2] of a lit point at an interaction, if the laser lights it."""
     distance2 = dr.squared_norm(world.laser - si.p)
     return dr.abs(dr.dot(si.n, to_laser)) / (distance2 * 2 * math.pi * _cap(world))
 
 
-def _cap(world: World) -> Any:
+def _cap(world: TracedScene) -> Any:
     """Solid angle of the laser's cone over 2 pi: 1 - cos, without cancellation."""
     return 2 * dr.square(dr.sin(0.5 * world.half_angle))
 
@@ -122,7 +122,7 @@ def _cap(world: World) -> Any:
 def densities(cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> tuple[Any, Any]:
     """Per solid angle: density of `copies` diffuse lobes at that cosine, and of these and lit points together."""
     lobes = copies / math.pi * dr.abs(cosine)
-    return lobes, lobes + density * distance2 / dr.maximum(dr.abs(far_cosine), LEAST_COSINE)
+    return lobes, lobes + density * distance2 / dr.maximum(dr.abs(far_cosine), MIN_COSINE)
 
 
 def share_by_chance(diffuse: Any, cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> Any:
@@ -132,7 +132,7 @@ def share_by_chance(diffuse: Any, cosine: Any, distance2: Any, far_cosine: Any, 
     return 1 - diffuse * dr.select(both > 0, 1 - lobes / both, 0)
 
 
-def diffuse_share(world: World, si: Any, direction: Any, value: Any, active: Any) -> Any:
+def diffuse_share(world: TracedScene, si: Any, direction: Any, value: Any, active: Any) -> Any:
     """Share of a surface's reflectance `value`, cosine included, that is diffuse; of what is not mirror-like."""
     if not world.has_mixed_lobes:
         return 1
@@ -140,7 +140,9 @@ def diffuse_share(world: World, si: Any, direction: Any, value: Any, active: Any
     return dr.select(value > 0, dr.clip(diffuse / value, 0, 1), 0)
 
 
-def by_chance(world: World, si: Any, sample: Any, weight: Any, end: Any, density: Any, copies: Any, active: Any) -> Any:
+def by_chance(
+    world: TracedScene, si: Any, sample: Any, weight: Any, end: Any, density: Any, copies: Any, active: Any
+) -> Any:
     """`share_by_chance` of a lit point `end` that was met in the direction of a sample, with its weight, of `si`."""
     direction = si.to_world(sample.wo)
     diffuse = diffuse_share(world, si, direction, weight * sample.pdf, active)
@@ -157,9 +159,9 @@ def _diffuse() -> Any:
 
 
 def joined(
-    world: World,
+    world: TracedScene,
     si: Any,
-    lit: Lit,
+    lit: LightVertices,
     batch: Any,
     number: Any,
     active: Any,
@@ -190,5 +192,5 @@ def joined(
     path = leg + dr.gather(Float, lit.path, point, active)
     density = dr.gather(Float, lit.density, point, active) * joins
     _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))
-    light = dr.select(active, value * passed / both * left_to_paths(world, si.p, direction, end, active), 0)
+    light = dr.select(active, value * passed / both * mis_weight_camera_path(world, si.p, direction, end, active), 0)
     return dr.select(dr.isfinite(light), light, 0), path, direction

@@ -17,7 +17,7 @@ UInt64 = mi.UInt64
 # One quantum is 2^-43 of the brightest pixel's direct radiance: 2^26 samples of a tenth of it keep 13 bits each, and a
 # cell overflows only beyond 2^21 times that radiance. A single sample above 2^17 times is clipped, and counted.
 QUANTA_PER_BRIGHTEST = 2.0**43
-MOST_QUANTA = 2.0**60
+MAX_QUANTA = 2.0**60
 READ = 1 << 16  # cells read at a time
 
 
@@ -54,13 +54,13 @@ def _cell_number(x: Any, width_m: float, growth: float) -> Any:
     return np.log1p(growth * x / width_m) / growth if growth > 0 else x / width_m
 
 
-def add_quanta(target: Any, amount: Any, index: Any, active: Any) -> None:
+def scatter_add_fixed_point(target: Any, amount: Any, index: Any, active: Any) -> None:
     """Add an amount, in quanta and rounded to whole ones, to a fixed-point sum."""
-    whole = UInt64(dr.minimum(amount, MOST_QUANTA) + 0.5)
+    whole = UInt64(dr.minimum(amount, MAX_QUANTA) + 0.5)
     dr.scatter_add(target, whole, index, active, mode=dr.ReduceMode.Direct)
 
 
-class Rows:
+class MomentHistogram:
     """Accumulators of several rows (a pixel, or a pixel and batch, each).
 
     Of each cell there are its energy and its first and second moment about the cell's beginning in the cell's width,
@@ -94,7 +94,7 @@ class Rows:
         second = dr.square(share) + dr.square(half_m / (high - low)) / 3
         for number, factor in enumerate((1, share, second)):
             index = (row * self._count + cell) * 3 + number
-            add_quanta(self.moments, radiance * factor * self.per_quantum, index, active)
+            scatter_add_fixed_point(self.moments, radiance * factor * self.per_quantum, index, active)
 
     def add_between(self, row: Any, low_m: Any, high_m: Any, radiance: Any, active: Any) -> None:
         """Add radiance that is even between two values of x, no farther apart than cells are wide there, or little."""
@@ -154,7 +154,7 @@ def cell_samples(
 
 
 def coarsened(samples: Samples, cells: Cells, origin_m: np.ndarray) -> Samples:
-    """Samples merged into cells counted from their pixels' origins, as `Rows` would."""
+    """Samples merged into cells counted from their pixels' origins, as `MomentHistogram` would."""
     samples = with_energy(samples)
     origin = origin_m[samples.pixel]
     cell = np.clip(np.searchsorted(cells.edges_m, samples.path_m - origin, side="right") - 1, 0, cells.count - 1)

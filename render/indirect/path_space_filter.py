@@ -21,21 +21,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.indirect.accumulators import Sums
-from render.indirect.path_cells import add_quanta
+from render.indirect.accumulators import IndirectAccumulator
+from render.indirect.path_cells import scatter_add_fixed_point
 from render.scene.rays import camera_rays, first_opaque
-from render.scene.traced_scene import Float, UInt32, World, dr, mi, upload
+from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
 
 UInt64, Int32 = mi.UInt64, mi.Int32
 # Width of a region in its octave's excess path, and of the widest in the mean distance, at PATHS paths a pixel. They
 # shrink with paths^-SHRINKING, so that the bias goes where the noise does.
 KAPPA, WIDEST, PATHS, SHRINKING = 0.2, 0.15, 16, 0.3
-READERS = 8  # points of a pixel that read
+GATHER_POINTS = 8  # points of a pixel that read
 # Every region is one of a grid, and there are so many grids, shifted against one another: their mean is smooth where
 # one grid has steps, and has less noise. Two were best for their time (measured).
-GRIDS = 2
-MOST_OCTAVES = 16
-FULL = 1 << 24  # weight of all paths of a pixel: divided by their number, it stays a whole one
+HASH_GRIDS = 2
+MAX_OCTAVES = 16
+UNIT_WEIGHT = 1 << 24  # weight of all paths of a pixel: divided by their number, it stays a whole one
 FINENESS = 0.8  # of cells, in those of the pixels that read them: wider ones are faster and have less noise, more bias
 GROWTH = 0.03  # of a region's cells along the path
 KEY_BITS, NORMAL_BITS = 15, 2  # of a cube's number along an axis (they wrap around), and of a class of normals
@@ -70,7 +70,7 @@ def octaves(
     """Octaves for so many paths a pixel, from regions of a pixel's footprint to the widest; the last one is open."""
     shrunk = (PATHS / paths) ** SHRINKING
     count = 1 + max(0, round(math.log2(shrunk * WIDEST * distance_m / footprint_m)))
-    count = min(count, MOST_OCTAVES)
+    count = min(count, MAX_OCTAVES)
     size = footprint_m * 2.0 ** np.arange(count)
     start = size / (shrunk * KAPPA)
     width = FINENESS * (width_m + growth * start)
@@ -94,30 +94,30 @@ def point_of(si: Any, ray: Any, path_m: Any, transmission: Any, hit: Any) -> Poi
     return Point(mi.Point3f(si.p), normal, Float(path_m), reflectance)
 
 
-def late_from(world: World, point: Point, from_m: Any) -> Any:
+def late_from(world: TracedScene, point: Point, from_m: Any) -> Any:
     """The path from the laser to points [m] from which on light there is late: so much behind direct light."""
     return point.path + dr.norm(point.p - world.laser) - dr.norm(point.p - world.eye) + from_m
 
 
-class Regions:
+class PathSpaceFilter:
     """The regions that some pixels of the image see, and the light in them, by batches.
 
-    `pixels` are flat (-1: none); what is read is added to `Sums` by their places in that list.
+    `pixels` are flat (-1: none); what is read is added to `IndirectAccumulator` by their places in that list.
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
     def __init__(
-        self, world: World, pixels: np.ndarray, spans: Octaves, batches: int, quantum: float, seed: int
+        self, world: TracedScene, pixels: np.ndarray, spans: Octaves, batches: int, quantum: float, seed: int
     ) -> None:
         self.spans, self.batches = spans, batches
         numbers = np.random.SeedSequence(seed).generate_state(4)
-        shift = numbers[:3] * 2.0**-32 + np.arange(GRIDS)[:, None] / GRIDS
+        shift = numbers[:3] * 2.0**-32 + np.arange(HASH_GRIDS)[:, None] / HASH_GRIDS
         self._shift = mi.Vector3f(*(upload(Float, np.tile(part, spans.count)) for part in shift.T))
         self._quantum, self._per_quantum = dr.opaque(Float, quantum), dr.opaque(Float, 1 / quantum)
         self.from_m, self._size = dr.opaque(Float, float(spans.from_m[0])), _by_level(spans.size_m)
         self._width, self._last = _by_level(spans.width_m), dr.opaque(UInt32, spans.count - 1)
         self.place, self.points = _points(world, pixels, dr.opaque(UInt32, int(numbers[3])))
-        reader, level = _each(dr.width(self.place), spans.count * GRIDS)
+        reader, level = _each(dr.width(self.place), spans.count * HASH_GRIDS)
         point = _gathered(self.points, reader)
         key = self._key(point, level)
         dr.eval(key, point.path)
@@ -126,14 +126,14 @@ class Regions:
         nearest = np.full(len(found), np.inf, np.float32)  # of the paths' type: ten times as fast
         np.minimum.at(nearest, row, point.path.numpy())
         # the length of the search is part of its kernel: one for all views of a size, but where there are very many
-        self._searched = 1 << max(len(pixels) * MOST_OCTAVES * GRIDS, len(found)).bit_length()
+        self._searched = 1 << max(len(pixels) * MAX_OCTAVES * HASH_GRIDS, len(found)).bit_length()
         self._keys = upload(UInt64, np.append(found, np.uint64(2**64 - 1)), self._searched)
         self._nowhere = len(found)
         self._lay_out(found, nearest)
 
     def _lay_out(self, found: np.ndarray, nearest_m: np.ndarray) -> None:
         """Cells for the regions with these keys, whose points are at least so far from the camera."""
-        octave = (found >> np.uint64(3 * (KEY_BITS + NORMAL_BITS))).astype(np.int64) // GRIDS
+        octave = (found >> np.uint64(3 * (KEY_BITS + NORMAL_BITS))).astype(np.int64) // HASH_GRIDS
         cells = self.spans.cells[octave]
         reach = 0.5 * math.sqrt(3) * self.spans.size_m[octave]
         self._base = upload(Float, np.append(nearest_m + self.spans.from_m[octave] - 3 * reach, 0))
@@ -170,7 +170,7 @@ class Regions:
 
         A pixel's paths count FULL together, however many they are: a region's light is the mean over its pixels.
         """
-        number, level = _each(dr.width(points.path), self.spans.count * GRIDS)
+        number, level = _each(dr.width(points.path), self.spans.count * HASH_GRIDS)
         point = _gathered(points, number)
         row, known = self._row(self._key(point, level), point.reflectance > 0)
         row = dr.select(known, row, dr.opaque(UInt32, self._nowhere))
@@ -201,11 +201,11 @@ class Regions:
         number = Int32(dr.floor(dr.log2(dr.maximum(excess_m, self.from_m) / self.from_m)))
         octave = UInt32(dr.clip(number, 0, Int32(self._last)))
         lit = late & (radiance > 0) & dr.isfinite(radiance)
-        value = radiance / point.reflectance * self._per_quantum * (Float(weight) / FULL)
+        value = radiance / point.reflectance * self._per_quantum * (Float(weight) / UNIT_WEIGHT)
         lanes = dr.width(point.path)
         lane = dr.arange(UInt32, lanes)
-        for grid in range(GRIDS):
-            level = octave * GRIDS + grid
+        for grid in range(HASH_GRIDS):
+            level = octave * HASH_GRIDS + grid
             row = dr.gather(UInt32, rows, level * dr.opaque(UInt32, lanes) + lane, lit)
             known = lit & (row != dr.opaque(UInt32, self._nowhere))
             # the path grows away from x2
@@ -214,22 +214,26 @@ class Regions:
             last = dr.gather(UInt32, self._cells, row, known) - 1
             cell = dr.minimum(UInt32(dr.log(1 + GROWTH * x) / GROWTH), last)
             index = dr.gather(UInt32, self._first, row, known) + cell
-            add_quanta(self.energy, value, index * self.batches + batch, known)
+            scatter_add_fixed_point(self.energy, value, index * self.batches + batch, known)
             dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, known, mode=dr.ReduceMode.Direct)
             for axis, part in enumerate(-towards):
-                add_quanta(self.growing, value * dr.clip(0.5 + 0.5 * part, 0, 1), 3 * index + axis, known)
+                scatter_add_fixed_point(self.growing, value * dr.clip(0.5 + 0.5 * part, 0, 1), 3 * index + axis, known)
         return active & ~late
 
     def evaluate(self) -> None:
         """Run what was added so far."""
         dr.eval(self.energy, self.growing, self.paths, self.filled)
 
-    def read(self, sums: Sums) -> None:
+    def read(self, sums: IndirectAccumulator) -> None:
         """Add every region's light to the pixels that have points there."""
         if dr.width(self.place) == 0:
             return
         place, level, row, weight, point = self._readings()
-        weight = weight * self._quantum / (READERS * GRIDS / FULL * Float(dr.gather(UInt64, self.paths, row)))
+        weight = (
+            weight
+            * self._quantum
+            / (GATHER_POINTS * HASH_GRIDS / UNIT_WEIGHT * Float(dr.gather(UInt64, self.paths, row)))
+        )
         base = dr.gather(Float, self._base, row) + point.path
         reading = _Reading(place, level, row, weight, base, self._from_middle(point, level))
         dr.eval(*reading)
@@ -247,15 +251,15 @@ class Regions:
 
         Points of one place lie next to each other.
         """
-        reader, level = _each(dr.width(self.place), self.spans.count * GRIDS)
+        reader, level = _each(dr.width(self.place), self.spans.count * HASH_GRIDS)
         place, row = dr.gather(UInt32, self.place, reader), self._row_of
         first = dr.gather(UInt64, self.paths, row) > 0
-        for step in range(1, READERS):
+        for step in range(1, GATHER_POINTS):
             first &= ~self._reads(Int32(reader) - step, level, place, row)
         chosen = dr.compress(first)
         reader, level, place, row = (dr.gather(UInt32, column, chosen) for column in (reader, level, place, row))
         sums = [Float(0)] * 8
-        for step in range(READERS):
+        for step in range(GATHER_POINTS):
             reads = self._reads(Int32(reader) + step, level, place, row)
             point = _gathered(self.points, dr.select(reads, reader + step, 0))
             share = dr.select(reads, point.reflectance, 0)
@@ -283,7 +287,7 @@ class Regions:
         return dr.select(energy > 0, mi.Vector3f(*parts) / energy, 0)
 
     @dr.syntax
-    def _read(self, sums: Sums, reading: Any, batch: Any) -> Any:
+    def _read(self, sums: IndirectAccumulator, reading: Any, batch: Any) -> Any:
         """Read cell by cell; returns each batch's total. Of one `batch` a lane for the watched rows, or of all."""
         place, row, weight, off = reading.place, reading.row, reading.weight, reading.off
         width = dr.gather(Float, self._width, reading.level)
@@ -327,7 +331,7 @@ def _numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _by_level(of_octaves: np.ndarray) -> Any:
     """Values of octaves for their levels: one a grid."""
-    return upload(Float, np.repeat(of_octaves, GRIDS))
+    return upload(Float, np.repeat(of_octaves, HASH_GRIDS))
 
 
 def _plus(totals: list, energies: list, weight: Any) -> list:
@@ -349,10 +353,10 @@ def _gathered(columns: NamedTuple, index: Any) -> Any:
     return type(columns)(*(dr.gather(type(column), column, index) for column in columns))
 
 
-def _points(world: World, pixels: np.ndarray, key: Any) -> tuple[Any, Point]:
+def _points(world: TracedScene, pixels: np.ndarray, key: Any) -> tuple[Any, Point]:
     """READERS points of every pixel, spread evenly, where they reflect diffusely, and their places in `pixels`."""
-    lane = dr.arange(UInt32, len(pixels) * READERS)
-    place, number = lane // READERS, lane % READERS
+    lane = dr.arange(UInt32, len(pixels) * GATHER_POINTS)
+    place, number = lane // GATHER_POINTS, lane % GATHER_POINTS
     pixel = dr.gather(UInt32, upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF), place)
     valid = pixel != 0xFFFFFFFF
     pixel = dr.select(valid, pixel, 0)

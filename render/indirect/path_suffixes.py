@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from render.indirect.glossy import left_to_paths
-from render.indirect.light_vertices import Lit, by_chance, density_of, is_wide, joined, kept
-from render.indirect.primary_vertices import Heads, copies_of
+from render.indirect.glossy import mis_weight_camera_path
+from render.indirect.light_vertices import LightVertices, by_chance, density_of, is_wide, joined, kept
+from render.indirect.primary_vertices import PrimaryVertices, copies_of
 from render.scene.rays import first_opaque, laser_light, shape_index, spawn
-from render.scene.traced_scene import Bool, Float, UInt32, World, dr, mi
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 
-class Tails(NamedTuple):
+class PathSuffixes(NamedTuple):
     """x2 and beyond.
 
     direction, diffuse  from x1 to x2, by a diffuse lobe or not
@@ -54,7 +54,7 @@ class Slots(NamedTuple):
     count: Any
 
 
-def slots_for(world: World, lit: Lit | None, lanes: int, vertices: int) -> Slots:
+def slots_for(world: TracedScene, lit: LightVertices | None, lanes: int, vertices: int) -> Slots:
     """Empty slots for so many vertices: a vertex has one of its own, and one before it if the last one was joined."""
     count = (2 if _joins(world, lit) else 1) * vertices
     lane, values, paths = dr.arange(UInt32, lanes), *(dr.zeros(Float, lanes * max(count, 1)) for _ in range(2))
@@ -62,25 +62,25 @@ def slots_for(world: World, lit: Lit | None, lanes: int, vertices: int) -> Slots
     return Slots(lane, values, paths, dr.opaque(UInt32, lanes), dr.opaque(UInt32, count))
 
 
-def _joins(world: World, lit: Lit | None) -> bool:
+def _joins(world: TracedScene, lit: LightVertices | None) -> bool:
     """Whether vertices after x1 are joined to lit points."""
     return lit is not None and is_wide(world)
 
 
 def tails_of(
-    world: World,
-    heads: Heads,
+    world: TracedScene,
+    heads: PrimaryVertices,
     sample: Any,
     weight: Any,
     pixel: Any,
-    lit: Lit | None,
+    lit: LightVertices | None,
     joins: int,
     batch: Any,
     random: Any,
     slots: Slots,
     *,
     used: bool,
-) -> Tails:
+) -> PathSuffixes:
     """Tails in sampled directions. If neighbours may use them (`used`), x2 on a rough coat is not joined to lit points:
     what it reflects diffusely depends on where it is seen from, and joined light is handed on as one number."""
     context = mi.BSDFContext()
@@ -96,7 +96,7 @@ def tails_of(
         value *= by_chance(world, x1, sample, weight, si, density, copies_of(heads, leg + laser_path), alive)
     # what is reflected by a mirror in the first place cannot be read backwards
     readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    value *= left_to_paths(world, x1.p, direction, si, readable)
+    value *= mis_weight_camera_path(world, x1.p, direction, si, readable)
     value = dr.select(alive & dr.isfinite(value), own * value, 0)
     onward, onward_weight = si.bsdf().sample(
         context, si, random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32()), alive
@@ -106,12 +106,12 @@ def tails_of(
     if used and world.has_rough_coats:
         joinable &= dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
     scale = dr.select(onward_weight > 0, onward_weight, 1)
-    way = _Way(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, joinable, readable)
+    way = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, joinable, readable)
     soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
-    light = _beyond(world, lit, batch, slots, way, alive, pixel, random, soonest)
+    light = _trace_suffix(world, lit, batch, slots, way, alive, pixel, random, soonest)
     shared = alive & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
     shared &= heads.shares & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    return Tails(
+    return PathSuffixes(
         kept(si),
         direction,
         alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection),
@@ -130,7 +130,7 @@ def tails_of(
     )
 
 
-class _Way(NamedTuple):
+class _SuffixState(NamedTuple):
     """Where paths stand and how they go on: a sample of the surface's lobes and its weight. `through` is the factor of
     light that comes from there, `here` that of light reflected on the spot, reflectance counted in that light, and
     `joinable` says whether there is such; `readable` whether other paths bring a part of it (`glossy`)."""
@@ -145,12 +145,12 @@ class _Way(NamedTuple):
 
 
 @dr.syntax
-def _beyond(
-    world: World,
-    lit: Lit | None,
+def _trace_suffix(
+    world: TracedScene,
+    lit: LightVertices | None,
     batch: Any,
     slots: Slots,
-    way: _Way,
+    way: _SuffixState,
     active: Any,
     pixel: Any,
     random: Any,
@@ -185,7 +185,7 @@ def _beyond(
         if dr.hint(joining, mode="scalar"):
             density = density_of(world, si, to_laser)
             light *= dr.select(joinable, by_chance(world, before, sample, weight, si, density, 1, active), 1)
-        light *= left_to_paths(world, before.p, towards.d, si, active & way.readable)
+        light *= mis_weight_camera_path(world, before.p, towards.d, si, active & way.readable)
         here = through * passed
         light = dr.select(dr.isfinite(light), here * light, 0)
         dr.scatter(paths, path + leg, slot * stride + lane, active)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from render.indirect.launch_layout import BLOCK
-from render.indirect.light_vertices import Lit, is_wide, joined
+from render.indirect.light_vertices import LightVertices, is_wide, joined
 from render.indirect.path_space_filter import Point
-from render.scene.traced_scene import Float, World, dr
+from render.scene.traced_scene import Float, TracedScene, dr
 
 
-class Heads(NamedTuple):
+class PrimaryVertices(NamedTuple):
     """x1 of every path of a launch and where it belongs; as a `point` of `path_space_filter`, if that is asked for.
 
     `late_m` is the path from the laser to x1 [m] up to which light comes by the tails of the whole block, where the
@@ -40,12 +40,14 @@ class Joined(NamedTuple):
     direction: Any
 
 
-def shares_early(world: World) -> bool:
+def shares_early(world: TracedScene) -> bool:
     """Whether blocks share what comes too early to be filtered: under a lamp that is little of the light."""
     return not is_wide(world)
 
 
-def join_heads(world: World, heads: Heads, lit: Lit | None, batch: Any, first: Any, joins: int) -> tuple[Joined, ...]:
+def join_heads(
+    world: TracedScene, heads: PrimaryVertices, lit: LightVertices | None, batch: Any, first: Any, joins: int
+) -> tuple[Joined, ...]:
     """x1 joined to lit points, each of which has a share of their light. No loop: one would be a kernel of its own."""
     found = []
     for join in range(joins):
@@ -56,6 +58,6 @@ def join_heads(world: World, heads: Heads, lit: Lit | None, batch: Any, first: A
     return tuple(found)
 
 
-def copies_of(heads: Heads, path: Any) -> Any:
+def copies_of(heads: PrimaryVertices, path: Any) -> Any:
     """How many lobes look for light that has come so far from the laser to x1: those of the whole block, or one."""
     return dr.select(path < heads.early_m, Float(BLOCK), Float(1))

@@ -19,15 +19,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.indirect.accumulators import Sums
-from render.indirect.camera_paths import Traced, trace_paths
-from render.indirect.glossy import left_to_paths
-from render.indirect.launch_layout import BLOCK, Turns
+from render.indirect.accumulators import IndirectAccumulator
+from render.indirect.camera_paths import PathBatch, trace_paths
+from render.indirect.glossy import mis_weight_camera_path
+from render.indirect.launch_layout import BLOCK, LaunchLayout
 from render.indirect.light_vertices import diffuse_share, of_parts, parts_of, share_by_chance
-from render.indirect.path_space_filter import FULL, Regions
+from render.indirect.path_space_filter import UNIT_WEIGHT, PathSpaceFilter
 from render.indirect.primary_vertices import shares_early
 from render.scene.rays import segment
-from render.scene.traced_scene import Bool, Float, UInt32, World, dr, mi
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 # Of one launch, 30 and 75 MB in its course.
 LANES = 3 << 18  # connections
@@ -36,16 +36,16 @@ FILTERED_PATHS = 13 << 12  # which may have connections, too
 
 
 def add_paths(
-    world: World,
+    world: TracedScene,
     pixels: np.ndarray,
-    turns: Turns,
+    turns: LaunchLayout,
     bounces: int,
     seed: int,
-    sums: Sums,
+    sums: IndirectAccumulator,
     batches: int,
     *,
     shared: bool,
-    regions: Regions | None = None,
+    regions: PathSpaceFilter | None = None,
 ) -> None:
     """Trace paths of the given blocks of flat pixels (-1: none) and add their light to `sums`; `shared` by blocks.
 
@@ -66,13 +66,13 @@ def add_paths(
     sums.evaluate()
 
 
-def _weight(traced: Traced, sums: Sums) -> Any:
+def _weight(traced: PathBatch, sums: IndirectAccumulator) -> Any:
     """Of a path in the regions: all of a pixel count as much as those of another."""
-    return UInt32(FULL * dr.gather(Float, sums.scale, traced.heads.receiver) + 0.5)
+    return UInt32(UNIT_WEIGHT * dr.gather(Float, sums.scale, traced.heads.receiver) + 0.5)
 
 
 def noise_of_paths(
-    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int
+    world: TracedScene, pixels: np.ndarray, turns: LaunchLayout, bounces: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sum of the squared contributions of a turn's paths to the pixels of its block, own and shared.
 
@@ -88,7 +88,7 @@ def noise_of_paths(
 
 
 def noise_of_filtered_paths(
-    world: World, pixels: np.ndarray, turns: Turns, bounces: int, seed: int, from_m: float
+    world: TracedScene, pixels: np.ndarray, turns: LaunchLayout, bounces: int, seed: int, from_m: float
 ) -> np.ndarray:
     """The same of filtered light: what is later than `from_m` behind direct light is read from regions, whose area, and
     with it the number of paths in them, grows with the square of its excess path."""
@@ -109,7 +109,8 @@ def noise_of_filtered_paths(
 
 
 class _Squares:
-    """In place of `Sums`: the sum of squares of what every lane adds, late light counted as little as its noise.
+    """In place of `IndirectAccumulator`: the sum of squares of what every lane adds, late light counted as little as
+    its noise.
 
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
@@ -156,7 +157,7 @@ def _all_pairs(lanes: int) -> _Pairs:
     return _pairs_of(dr.arange(UInt32, lanes * BLOCK))
 
 
-def _pairs(traced: Traced, *, shared: bool, early: bool) -> _Pairs | None:
+def _pairs(traced: PathBatch, *, shared: bool, early: bool) -> _Pairs | None:
     """The pairs that may have light for each other."""
     if shared:
         return _all_pairs(dr.width(traced.batch))
@@ -168,7 +169,7 @@ def _pairs(traced: Traced, *, shared: bool, early: bool) -> _Pairs | None:
     return _pairs_of(dr.arange(UInt32, dr.width(chosen) * BLOCK), chosen)
 
 
-def _early(traced: Traced) -> Any:
+def _early(traced: PathBatch) -> Any:
     """Whether a tail may carry light that is early to any head of its block."""
     heads, tails, pairs = traced.heads, traced.tails, _all_pairs(dr.width(traced.batch))
     x1, x2 = (dr.gather(mi.Point3f, si.p, index) for si, index in ((heads.si, pairs.head), (tails.si, pairs.tail)))
@@ -178,8 +179,8 @@ def _early(traced: Traced) -> Any:
 
 
 class _Ends(NamedTuple):
-    """What pairs need of heads and tails, as arrays and plain tuples, which recordings look into: see `Heads` and
-    `Tails`."""
+    """What pairs need of heads and tails, as arrays and plain tuples, which recordings look into: see
+    `PrimaryVertices` and `PathSuffixes`."""
 
     si1: tuple
     transmission: Any
@@ -206,7 +207,7 @@ class _Connections(NamedTuple):
     onward_density: Any
 
 
-def _connect(world: World, number: Any, chosen: Any, *ends: Any) -> tuple[Any, ...]:
+def _connect(world: TracedScene, number: Any, chosen: Any, *ends: Any) -> tuple[Any, ...]:
     """The parts of `_Connections`."""
     head, tail, _ = _pairs_of(number, chosen)[:3]
     ends = _Ends(*ends)
@@ -242,7 +243,7 @@ def _connect(world: World, number: Any, chosen: Any, *ends: Any) -> tuple[Any, .
             dr.gather(Float, ends.density, tail, active),
             BLOCK,
         )
-    value2 *= left_to_paths(world, si1.p, direction, si2, active)
+    value2 *= mis_weight_camera_path(world, si1.p, direction, si2, active)
     # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
     density = dr.select(active & (value1[0] > 0), density1 * area, 0)
     onward_density = dr.select(going & (value3[0] > 0), density * density3, 0)
@@ -260,7 +261,7 @@ class _Weights(NamedTuple):
     onward: Any
 
 
-def _weights(world: World, traced: Traced, pairs: _Pairs) -> _Weights:
+def _weights(world: TracedScene, traced: PathBatch, pairs: _Pairs) -> _Weights:
     heads, tails = traced.heads, traced.tails
     ends = _Ends(
         parts_of(heads.si),
@@ -276,7 +277,7 @@ def _weights(world: World, traced: Traced, pairs: _Pairs) -> _Weights:
     return _Weights(made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0))
 
 
-def _pair_lanes(world: World, traced: Traced, pairs: _Pairs) -> _Lanes:
+def _pair_lanes(world: TracedScene, traced: PathBatch, pairs: _Pairs) -> _Lanes:
     """Early light that every pixel of a block gets from every tail of the block."""
     heads, weights = traced.heads, _weights(world, traced, pairs)
     return _Lanes(
@@ -291,7 +292,7 @@ def _pair_lanes(world: World, traced: Traced, pairs: _Pairs) -> _Lanes:
     )
 
 
-def _own_lanes(traced: Traced) -> _Lanes:
+def _own_lanes(traced: PathBatch) -> _Lanes:
     """Light that a pixel gets from its own path alone."""
     heads, tails = traced.heads, traced.tails
     tail = dr.arange(UInt32, dr.width(traced.batch))
@@ -316,7 +317,13 @@ class _Lanes(NamedTuple):
 
 @dr.syntax
 def _add(
-    lanes: _Lanes, traced: Traced, sums: Sums, regions: Regions | None = None, rows: Any = None, *, own: bool
+    lanes: _Lanes,
+    traced: PathBatch,
+    sums: IndirectAccumulator,
+    regions: PathSpaceFilter | None = None,
+    rows: Any = None,
+    *,
+    own: bool,
 ) -> None:
     receiver, batch, tail, path1, leg, early_m, first, onward = lanes
     joined, tails = traced.joined, traced.tails

@@ -1,15 +1,15 @@
-"""Rays in a `World`: from the camera, past glass and cut-outs, to the laser, and what its light does at a surface."""
+"""Rays in a `TracedScene`: from the camera, past glass and cut-outs, to the laser, and what its light does."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from render.scene.traced_scene import OPACITY, Bool, Float, UInt32, World, dr, mi
+from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi
 
 MAX_LAYERS = 64  # of glass and cut-outs that one ray passes
 
 
-def camera_rays(world: World, x: Any, y: Any, eye: Any = None) -> tuple[Any, Any]:
+def camera_rays(world: TracedScene, x: Any, y: Any, eye: Any = None) -> tuple[Any, Any]:
     """Rays from the camera's centre through raster positions, and their camera-frame directions with z = 1; from
     another `eye` that looks as the camera does, if there is one."""
     local = mi.Vector3f(
@@ -18,13 +18,13 @@ def camera_rays(world: World, x: Any, y: Any, eye: Any = None) -> tuple[Any, Any
     return mi.Ray3f(mi.Point3f(world.eye if eye is None else eye), dr.normalize(to_world(world, local))), local
 
 
-def to_world(world: World, local: Any) -> Any:
+def to_world(world: TracedScene, local: Any) -> Any:
     """A camera-frame vector in the world."""
     right, down, forward = world.axes
     return right * local.x + down * local.y + forward * local.z
 
 
-def to_camera(world: World, vector: Any) -> Any:
+def to_camera(world: TracedScene, vector: Any) -> Any:
     """A world vector in the camera's frame."""
     return mi.Vector3f(*(dr.dot(axis, vector) for axis in world.axes))
 
@@ -42,7 +42,7 @@ def spawn(si: Any, direction: Any) -> Any:
     return mi.Ray3f(dr.fma(off, si.n, si.p), direction)
 
 
-def first_opaque(world: World, ray: Any, active: Any, origin: Any = None) -> tuple[Any, Any, Any, Any]:
+def first_opaque(world: TracedScene, ray: Any, active: Any, origin: Any = None) -> tuple[Any, Any, Any, Any]:
     """The first surface that stops light, past glass and the holes of cut-outs, in a straight line.
 
     `origin` is the surface point that the ray was spawned from, a little off its own start; None is the camera.
@@ -60,7 +60,7 @@ def first_opaque(world: World, ray: Any, active: Any, origin: Any = None) -> tup
 
 
 @dr.syntax
-def _pass_layers(world: World, ray: Any, origin: Any, active: Any, limit: Any, in_air: bool) -> tuple[Any, ...]:
+def _pass_layers(world: TracedScene, ray: Any, origin: Any, active: Any, limit: Any, in_air: bool) -> tuple[Any, ...]:
     """`first_opaque` with layers, no farther than `limit`; where nothing stops the ray the paths run to the limit.
 
     A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
@@ -117,7 +117,7 @@ def _pass_layers(world: World, ray: Any, origin: Any, active: Any, limit: Any, i
 
 
 def laser_leg(
-    world: World, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
+    world: TracedScene, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
 ) -> tuple[Any, Any, Any, Any]:
     """What the laser does at a surface: radiance scattered towards `si.wi` [1/(m^2 sr)], and the laser leg's path [m].
 
@@ -130,7 +130,7 @@ def laser_leg(
 
 
 def laser_light(
-    world: World, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
+    world: TracedScene, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
 ) -> tuple[Any, Any, Any]:
     """Direction to the laser, irradiance I(w) T / d^2 [1/m^2] across it, and the laser leg's path [m] at a surface.
 
@@ -168,7 +168,7 @@ def spreading(distance: Any, shortening: Any) -> Any:
     return dr.square(distance / dr.maximum(distance - shortening, 1e-3 * distance))
 
 
-def in_beam(world: World, point: Any, pixel: Any) -> Any:
+def in_beam(world: TracedScene, point: Any, pixel: Any) -> Any:
     """Whether the laser shines on a point: in its cone (flood), or in the row (line) or pixel (scan) being measured."""
     laser = world.scene.laser
     if laser.mode == "flood":
@@ -178,7 +178,7 @@ def in_beam(world: World, point: Any, pixel: Any) -> Any:
     return same & (seen_in == pixel if laser.mode == "scan" else seen_in // world.width == pixel // world.width)
 
 
-def pixel_of(world: World, point: Any, *, columns: bool = True) -> tuple[Any, Any]:
+def pixel_of(world: TracedScene, point: Any, *, columns: bool = True) -> tuple[Any, Any]:
     """The flat pixel in whose pyramid a point lies, and whether there is one; not in which of its row's `columns` if
     these do not matter."""
     column, row, seen = raster_of(world, world.eye, point)
@@ -187,7 +187,7 @@ def pixel_of(world: World, point: Any, *, columns: bool = True) -> tuple[Any, An
     return UInt32(dr.select(inside, row, 0)) * world.width + UInt32(dr.select(inside, column, 0)), inside
 
 
-def raster_of(world: World, eye: Any, point: Any) -> tuple[Any, Any, Any]:
+def raster_of(world: TracedScene, eye: Any, point: Any) -> tuple[Any, Any, Any]:
     """Where an eye that looks as the camera does sees a point: in pixels from the image's corner; and whether it lies
     before it."""
     local = to_camera(world, mi.Vector3f(point) - eye)
@@ -195,7 +195,7 @@ def raster_of(world: World, eye: Any, point: Any) -> tuple[Any, Any, Any]:
     return x + Float(world.width) / 2, y + Float(world.height) / 2, local.z > 0
 
 
-def segment(world: World, si: Any, point: Any, active: Any) -> tuple[Any, Any]:
+def segment(world: TracedScene, si: Any, point: Any, active: Any) -> tuple[Any, Any]:
     """Transmission of the straight way from a surface to a point, 0 where it is blocked, and its optical path [m].
 
     The transmission includes the glass's `spreading`: it is what f cos I / distance^2 is to be multiplied by.
@@ -213,7 +213,9 @@ def segment(world: World, si: Any, point: Any, active: Any) -> tuple[Any, Any]:
     return transmission * spreading(distance, shortening), optical + (distance - short)
 
 
-def passage(world: World, ray: Any, origin: Any, limit: Any, active: Any, *, in_air: bool) -> tuple[Any, Any, Any]:
+def passage(
+    world: TracedScene, ray: Any, origin: Any, limit: Any, active: Any, *, in_air: bool
+) -> tuple[Any, Any, Any]:
     """Transmission (0: blocked), optical path and shortening (`spreading`) [m] from `origin` along `ray` to `limit`.
 
     `ray` starts at or a little off `origin`; `in_air` says that it starts outside of all glass, else its first

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from render.backend.llvm import start_mitsuba
-from render.backend.malloc import keep_freed_memory
+from render.backend.malloc import retain_freed_memory
 from scenes.model import Camera, Material, Scene, Surface, Texture
 
 mi = start_mitsuba()
 import drjit as dr  # noqa: E402  (other modules take dr and mi from here: only now has an LLVM been chosen)
 
-keep_freed_memory()
+retain_freed_memory()
 
 Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
 ALIGNMENT = 64  # bytes
@@ -31,12 +31,12 @@ FACE_ALBEDO = "face_albedo"
 RAMP_FROM, RAMP = 0.25, 0.5
 
 
-class World:
+class TracedScene:
     """A scene ready to trace: merged meshes, tables of their materials, the laser's intensity per pixel.
 
     The traced world has the scene's axes. Its origin is the camera, where float32 resolves best; or, of a place that
-    several cameras look at (`of_place`), the middle of the scene: then `seen_from` gives the world of another camera
-    without building anything again. `eye` is the camera in the traced world.
+    several cameras look at (`origin_in_scene`), the middle of the scene: then `with_camera` gives the world of another
+    camera without building anything again. `eye` is the camera in the traced world.
     Surfaces whose materials differ in nothing but a plain albedo share one mesh, with an albedo per face: the number of
     meshes decides which kernels are compiled, so scenes of a set with the same kinds of material share their kernels.
     `groups[i]` are the surfaces of mesh i, `shape_ids[i]` its registered index; `solid_indices` those of solid glass.
@@ -51,7 +51,7 @@ class World:
         self,
         scene: Scene,
         *,
-        of_place: bool = False,
+        origin_in_scene: bool = False,
         cutouts_by_mitsuba: bool = False,
         plastics: Mapping[tuple, Any] | None = None,
     ) -> None:
@@ -63,7 +63,7 @@ class World:
         self.has_glass = any(m.is_glass for m in materials)
         self.has_cutouts = any(_has_cutouts(m) for m in materials)
         masks = "mitsuba" if cutouts_by_mitsuba else "ours" if self.has_cutouts else "none"
-        self.origin = np.mean(scene.bounds(), axis=0) if of_place else scene.camera.origin
+        self.origin = np.mean(scene.bounds(), axis=0) if origin_in_scene else scene.camera.origin
         self.plastics: dict[tuple, Any] = {}
         meshes = {}
         for i, group in enumerate(self.groups):
@@ -94,15 +94,15 @@ class World:
         self.solid_indices = sorted({m.ior for m in materials if m.kind == "dielectric"})
         self.solid_index = dr.opaque(Float, max(self.solid_indices, default=1.0))
         self.recordings = Recordings()
-        self._look(scene)
+        self._bind_camera(scene)
 
-    def seen_from(self, camera: Camera) -> World:
+    def with_camera(self, camera: Camera) -> TracedScene:
         """The same surfaces and lights before another camera, its laser with it: nothing is built or recorded again."""
         other = copy.copy(self)
-        other._look(replace(self.scene, camera=camera))
+        other._bind_camera(replace(self.scene, camera=camera))
         return other
 
-    def _look(self, scene: Scene) -> None:
+    def _bind_camera(self, scene: Scene) -> None:
         # What differs between the views of a set is opaque: a literal would compile every kernel again.
         self.scene, camera = scene, scene.camera
         self.responses: dict[tuple, np.ndarray] = {}  # `render.planning.pilot_response`
@@ -144,7 +144,7 @@ class World:
         }
         return {**held, "traced": self.traced}
 
-    def with_arrays(self, arrays: dict[str, Any]) -> World:
+    def with_arrays(self, arrays: dict[str, Any]) -> TracedScene:
         """A copy with other Dr.Jit arrays: a recording refuses those that are not among its arguments."""
         other = copy.copy(self)
         vars(other).update(arrays)
@@ -164,9 +164,9 @@ class Recordings:
 
     def __init__(self) -> None:
         self.calls: dict[Any, Callable] = {}
-        self.world: weakref.ref[World] | None = None
+        self.world: weakref.ref[TracedScene] | None = None
 
-    def call(self, world: World, key: Hashable, work: Callable, *arguments: Any) -> Any:
+    def call(self, world: TracedScene, key: Hashable, work: Callable, *arguments: Any) -> Any:
         """`work(world, *arguments)`, recorded at the first call of `key` for this world's surfaces, then replayed.
 
         What Python and Dr.Jit need to trace a small launch takes longer than its rays. `arguments` are Dr.Jit arrays.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from render.scene.rays import camera_rays, first_opaque, in_beam, passage, shape_index, spawn, spreading
-from render.scene.traced_scene import OPACITY, Bool, Float, UInt32, World, dr, mi, upload
+from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, upload
 from render.specular.mirrors import (
     COATED,
     MAX_ORDER,
@@ -43,7 +43,7 @@ class SpecularLight(NamedTuple):
     notes: tuple[str, ...]
 
 
-def specular_light(world: World, grid: int = 4, tolerance_m: float = 1e-4) -> SpecularLight:
+def specular_light(world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4) -> SpecularLight:
     """Deterministic returns by way of smooth plane surfaces, as `Samples` merged within `tolerance_m`.
 
     Glints: pixel-mean radiance T R_1 ... R_k I(w) / (D^2 Omega), with D the unfolded one-way length laser -> mirrors ->
@@ -75,7 +75,7 @@ def specular_light(world: World, grid: int = 4, tolerance_m: float = 1e-4) -> Sp
 class _Tables:
     """Planes and, per registered shape, what decides a smooth reflectance, as Dr.Jit arrays."""
 
-    def __init__(self, world: World, mirrors: Mirrors) -> None:
+    def __init__(self, world: TracedScene, mirrors: Mirrors) -> None:
         # one row more: an array of a single value would compile other kernels
         columns = np.vstack((np.column_stack((mirrors.normal, mirrors.offset)), np.zeros(4)))
         self.normal = mi.Vector3f(*(upload(Float, column) for column in columns[:, :3].T))
@@ -107,7 +107,14 @@ def _reflectance(tables: _Tables, shape: Any, cosine: Any, active: Any) -> Any:
 
 
 def _connect(
-    world: World, tables: _Tables, start: Any, lift: Any, target: Any, sequence: list[Any], active: Any, in_air: bool
+    world: TracedScene,
+    tables: _Tables,
+    start: Any,
+    lift: Any,
+    target: Any,
+    sequence: list[Any],
+    active: Any,
+    in_air: bool,
 ) -> tuple[Any, Any, Any, Any]:
     """The way from `start` toward the laser's image `target`, folded by the planes of `sequence`.
 
@@ -161,7 +168,7 @@ def _connect(
 # ---- glints ----
 
 
-def _glints(world: World, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray) -> Samples:
+def _glints(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray) -> Samples:
     """The laser itself in rows of (m, k) planes, from the camera on."""
     camera, laser = world.scene.camera, world.scene.laser
     laser_point = laser.position(camera) - camera.origin
@@ -214,7 +221,7 @@ def _made_up(image: np.ndarray, came_back: np.ndarray) -> np.ndarray:
     return np.where(count >= LOBE_RAYS - 2, LOBE_RAYS / np.maximum(count, 1), 1.0)
 
 
-def _raster(world: World, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _raster(world: TracedScene, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Column and row (floored, -1: behind the camera) of the pixels that look in the given directions (m, 3)."""
     camera = world.scene.camera
     x, y, z = (direction @ camera.rotation).T
@@ -226,7 +233,7 @@ def _raster(world: World, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _shines_on(
-    world: World, point: np.ndarray, laser_point: np.ndarray, column: np.ndarray, row: np.ndarray
+    world: TracedScene, point: np.ndarray, laser_point: np.ndarray, column: np.ndarray, row: np.ndarray
 ) -> np.ndarray:
     """Whether the laser shines on points (m, 3) while the pixel (column, row) is measured: `in_beam` in float64."""
     camera, laser = world.scene.camera, world.scene.laser
@@ -253,7 +260,7 @@ def _lobe(image: np.ndarray) -> np.ndarray:
 # ---- mirrored light ----
 
 
-def _mirrored(world: World, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray, grid: int) -> list[Samples]:
+def _mirrored(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray, grid: int) -> list[Samples]:
     """What the camera sees, directly or by way of up to MAX_ORDER mirrors, lit by the planes of `sequence` (k,)."""
     camera, laser = world.scene.camera, world.scene.laser
     image = image_of(mirrors, sequence[None], laser.position(camera) - camera.origin)[0]
@@ -275,7 +282,7 @@ def _mirrored(world: World, tables: _Tables, mirrors: Mirrors, sequence: np.ndar
 
 
 def _cells(
-    world: World, tables: _Tables, first: int, lanes: int, grid: int, target: Any, planes: list[Any]
+    world: TracedScene, tables: _Tables, first: int, lanes: int, grid: int, target: Any, planes: list[Any]
 ) -> tuple[Any, Any, Any, Any]:
     """Per cell of the pixels from `first` on: path and its half width [m], radiance / cells, mirrors met on the way."""
     side = dr.opaque(UInt32, grid)
@@ -306,7 +313,7 @@ def _cells(
 
 
 @dr.syntax
-def _seen(world: World, tables: _Tables, ray: Any, lanes: int) -> tuple[Any, ...]:
+def _seen(world: TracedScene, tables: _Tables, ray: Any, lanes: int) -> tuple[Any, ...]:
     """The first surface that is no plane mirror: interaction, weight of the way, optical and geometric length [m].
 
     Also the camera's axes as the mirrors show them (the unfolded camera's frame) and the number of mirrors met.

@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.scene.traced_scene import World
+from render.scene.traced_scene import TracedScene
 from scenes.errors import listed, require
 from scenes.model import Surface
 
 MAX_ORDER = 3  # mirrors in a row
-MOST_PLANES = 64  # a smooth mesh of more planes is a curved surface
-MOST_SEQUENCES = 1 << 18
-MOST_IMAGES = 64
-MOST_SLAB_ERROR_M = 0.010
+MAX_PLANES = 64  # a smooth mesh of more planes is a curved surface
+MAX_SEQUENCES = 1 << 18
+MAX_IMAGES = 64
+MAX_SLAB_ERROR_M = 0.010
 COATED = ("conductor", "plastic", "dielectric", "thindielectric")
 
 
@@ -47,7 +47,7 @@ class SlabError(NamedTuple):
     flat: bool
 
 
-def find_mirrors(world: World) -> tuple[Mirrors, list[str]]:
+def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
     """All plane smooth faces of a scene, and notes that name the smooth surfaces that are curved."""
     rows, notes, curved = [], [], {}
     for shape, group in zip(world.shape_ids, world.groups, strict=True):
@@ -105,7 +105,7 @@ def planes_of(surface: Surface, origin: np.ndarray) -> list[tuple] | None:
 def _cluster(corners: np.ndarray, normal: np.ndarray) -> list[tuple] | None:
     planes: list[tuple] = []
     while len(corners):
-        if len(planes) == MOST_PLANES:
+        if len(planes) == MAX_PLANES:
             return None
         n, c = normal[0], float(normal[0] @ corners[0, 0])
         size = np.abs(corners).max()
@@ -132,16 +132,16 @@ def _add_plane(planes: list[tuple], plane: tuple) -> None:
 def glint_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
     """Mirrors in a row, (m, k) plane indices for k = 1, 2, 3. Solid glass, which refracts, stands alone."""
     found = [np.arange(len(mirrors.offset))[:, None]] if len(mirrors.offset) else []
-    return found + _longer(np.flatnonzero(~mirrors.is_solid), MOST_SEQUENCES, notes, "glints")
+    return found + _longer(np.flatnonzero(~mirrors.is_solid), MAX_SEQUENCES, notes, "glints")
 
 
 def image_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
     """Sequences (k,) of metal mirrors that light the scene, the shorter ones first."""
     metal = np.flatnonzero(mirrors.is_metal)
-    if len(metal) > MOST_IMAGES:
-        notes.append(f"mirrors: {len(metal) - MOST_IMAGES} of {len(metal)} planes light no other surface")
-        metal = metal[:MOST_IMAGES]
-    longer = _longer(metal, MOST_IMAGES - len(metal), notes, "mirrored light")
+    if len(metal) > MAX_IMAGES:
+        notes.append(f"mirrors: {len(metal) - MAX_IMAGES} of {len(metal)} planes light no other surface")
+        metal = metal[:MAX_IMAGES]
+    longer = _longer(metal, MAX_IMAGES - len(metal), notes, "mirrored light")
     return [row for rows in ([metal[:, None]] if len(metal) else []) + longer for row in rows]
 
 
@@ -193,7 +193,7 @@ def specular_points(
     return position, possible
 
 
-def check_slabs(world: World) -> list[str]:
+def check_slabs(world: TracedScene) -> list[str]:
     """Notes on light that a straight line through solid glass puts in a wrong place.
 
     Raises InputError where that is more than 10 mm of path beside a displaced laser.
@@ -207,8 +207,8 @@ def check_slabs(world: World) -> list[str]:
         return notes
     worst = max(slabs, key=lambda error: error.path_m)
     off = f"{1e3 * max(e.shift_m for e in slabs):.1f} mm beside it, {1e3 * worst.path_m:.1f} mm of path"
-    allowed = world.scene.laser.is_colocated or worst.path_m <= MOST_SLAB_ERROR_M
-    limit = f"the limit with a displaced laser is {1e3 * MOST_SLAB_ERROR_M:.0f} mm"
+    allowed = world.scene.laser.is_colocated or worst.path_m <= MAX_SLAB_ERROR_M
+    limit = f"the limit with a displaced laser is {1e3 * MAX_SLAB_ERROR_M:.0f} mm"
     require(allowed, f"glass {worst.name}: a straight line through it is up to {off} off the refracted one; {limit}")
     names = _gathered([error.name for error in slabs])
     return [*notes, f"glass {names}: crossed in a straight line, up to {off} off the refracted one"]
@@ -219,7 +219,7 @@ def _gathered(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"({len(names)} solids: {listed(names)})"
 
 
-def slab_error_m(world: World) -> list[SlabError]:
+def slab_error_m(world: TracedScene) -> list[SlabError]:
     """Bounds over the view on the error of a straight line through each solid of glass that the camera faces.
 
     At incidence a (b inside, sin a = n sin b) a slab of thickness t shifts a ray sideways by

@@ -65,7 +65,7 @@ def select(samples: Samples, kept: np.ndarray | slice) -> Samples:
     return Samples(*(column[kept] for column in samples))
 
 
-def of_pixels(samples: Samples, pixels: np.ndarray) -> Samples:
+def select_pixels(samples: Samples, pixels: np.ndarray) -> Samples:
     """Those of some pixels."""
     return select(samples, np.isin(samples.pixel, pixels))
 

@@ -23,7 +23,7 @@ from csph.networks.published import DeepBoosting, parameters_of
 from csph.training.config import NETWORKS, ModelConfig, preset
 from csph.training.loss import kl_divergence
 from csph.training.views import packed_views, split_views
-from render.backend.malloc import keep_freed_memory
+from render.backend.malloc import retain_freed_memory
 from render.pipeline import Progress
 from scene2spad.datasets.planes import random_planes
 from scene2spad.options.experiments import Bench
@@ -97,7 +97,7 @@ def _step(network: nn.Module, x: Tensor) -> Callable[[], None]:
 def run(command: Bench, progress: Progress) -> dict:
     """Measure, write the table (.csv), and return its rows."""
     require(not command.out.is_file(), f"{command.out}: is a file, expected a folder for the results")
-    keep_freed_memory()  # as training does
+    retain_freed_memory()  # as training does
     limit = QUICK_SECONDS if command.quick else SECONDS
     rows = []
     for number, name in enumerate(("compact", "published")):

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.pipeline import Progress
-from render.scene.traced_scene import World
+from render.scene.traced_scene import TracedScene
 from scene2spad.bench.rendering import ours, peers, settings
 from scene2spad.bench.rendering.binning import binned
 from scene2spad.bench.rendering.curves import Ratio, ratio_at
@@ -110,7 +110,7 @@ def _cases(command: Bench) -> list[Case]:
 def _measure(case: Case, transport: str, command: Bench, with_peer: bool, say: Progress) -> tuple[list[Row], dict]:
     """All methods of one case and transport, and what the reference is and how ours agrees with it."""
     methods = [m for m in METHODS[transport] if m.code == "ours" or with_peer]
-    world = World(case.scene)
+    world = TracedScene(case.scene)
     truth = _reference(case, transport, world, command, with_peer, lambda share: say("reference", 0.5 * share))
     bounces = BOUNCES[transport]
     runners = []
@@ -137,7 +137,7 @@ def _measure(case: Case, transport: str, command: Bench, with_peer: bool, say: P
 
 
 def _reference(
-    case: Case, transport: str, world: World, command: Bench, with_peer: bool, progress: Callable[[float], None]
+    case: Case, transport: str, world: TracedScene, command: Bench, with_peer: bool, progress: Callable[[float], None]
 ) -> Reference:
     """Two halves made by mitransient, so that ours has no home advantage; by ours alone where it is not wanted."""
     passes, spp = settings.reference_passes(transport, case.size)

@@ -19,7 +19,7 @@ from spad.zones.sensor import expected_zone_counts
 if TYPE_CHECKING:
     from scene2spad.cli.calibrate import Calibrate
 
-LEAST_CAPTURES = 16
+MIN_CAPTURES = 16
 CALIBRATED = ("gain", "delay", "clock", "background", "trials", "recovery", "compression", "crosstalk")
 
 
@@ -35,8 +35,8 @@ def run(command: Calibrate, progress: Progress) -> dict:
     path = shipped_captures() if str(command.captures) == "shipped" else command.captures
     chosen = within(read_plane_captures(path), command.nearest)
     number = len(chosen.distance_m)
-    enough = number >= LEAST_CAPTURES
-    require(enough, f"{path}: {number} captures from {command.nearest:g} m on, expected {LEAST_CAPTURES} or more")
+    enough = number >= MIN_CAPTURES
+    require(enough, f"{path}: {number} captures from {command.nearest:g} m on, expected {MIN_CAPTURES} or more")
     began = time.perf_counter()
     progress("render the plane", 0.0)
     captures = zone_captures(chosen, start.sensor, start.zones)

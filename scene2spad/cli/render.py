@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("scene2spad")
 SENSIBLE_DEPTH_M = (0.01, 1000.0)
-MOST_LUX = 1e6
+MAX_LUX = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class Render(Common):
     scene: Positional[str] = "living-room"
     """A name (see `scenes`), a mesh (.obj .ply .stl .glb), a Mitsuba scene (.xml), or a photograph with --depth."""
     out: File = None
-    """The .exr file (default: the scene's name in this folder)."""
+    """The .exr file (default: the scene's name in this folder, - for /)."""
     width: Pixels = None
     """Image width, pixels (default: the scene's own; one of width and height alone keeps the proportions)."""
     height: Pixels = None
@@ -127,7 +127,7 @@ def run(command: Render, progress: Progress) -> dict:
     if command.out is not None:
         output_file(command.out, ".exr", "transient")
     scene = _load(command)
-    out = command.out or output_file(Path(f"{scene.name}.exr"), ".exr", "transient")
+    out = command.out or output_file(Path(f"{scene.name.replace('/', '-')}.exr"), ".exr", "transient")
     scene = _lit(scene, command)
     start = time.perf_counter()
     if command.offset and command.offset_mode != "time":
@@ -179,7 +179,7 @@ def _lit(scene: Scene, command: Render) -> Scene:
         laser = replace(laser, baseline_m=command.baseline)
     if command.sunlight is None:
         return replace(scene, laser=laser)
-    require(0 <= command.sunlight <= MOST_LUX, f"--sunlight {command.sunlight:g} lux is outside 0 to {MOST_LUX:g}")
+    require(0 <= command.sunlight <= MAX_LUX, f"--sunlight {command.sunlight:g} lux is outside 0 to {MAX_LUX:g}")
     sky = Ambient(radiance=sunlit_sky_w_per_m2_sr_nm(command.sunlight, DEFAULT_WAVELENGTH_M))
     return replace(scene, laser=laser, ambient=sky)
 

@@ -21,8 +21,8 @@ from ultraphase.power import READINGS, Cost, Load, as_csv, measured_cost, power,
 if TYPE_CHECKING:
     from scene2spad.cli.ultraphase import Ultraphase
 
-_MOST_PHOTONS = 20_000
-_MOST_WATCHED = 100
+_MAX_PHOTONS = 20_000
+_MAX_WATCHED = 100
 
 
 def run(command: Ultraphase, progress: Progress) -> dict:
@@ -171,8 +171,8 @@ def _run(command: Ultraphase, progress: Progress) -> dict:
     program, chosen = load(command)
     require(len(command.photons) == 1, f"ultraphase run: {len(command.photons)} photon counts, expected one")
     photons = command.photons[0]
-    good = 0 <= command.signal <= photons <= _MOST_PHOTONS
-    require(good, f"{command.signal:g} signal of {photons:g} photons: expected 0 to {_MOST_PHOTONS}, signal among them")
+    good = 0 <= command.signal <= photons <= _MAX_PHOTONS
+    require(good, f"{command.signal:g} signal of {photons:g} photons: expected 0 to {_MAX_PHOTONS}, signal among them")
     family = chosen.family if chosen else ""
     require(family not in ("learned", "addressed"), f"{program.name}: has no frame of 2 x 2 pixels to run")
     tables: dict[str, np.ndarray] = {}
@@ -219,7 +219,7 @@ def _looked_at(command: Ultraphase, program: Program, tables: dict, stream: np.n
     if command.watch:
         core = Core(program, own)
         core.start(stream, park=True)
-        changes = zip(range(_MOST_WATCHED), core.watch(command.watch), strict=False)
+        changes = zip(range(_MAX_WATCHED), core.watch(command.watch), strict=False)
         shown["watch"] = [f"{step.before.word:4d}  {list(contents)}" for _, (step, contents) in changes]
     return shown
 

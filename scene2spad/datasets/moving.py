@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from render.direct.integrator import centre_layers
-from render.scene.traced_scene import World
+from render.scene.traced_scene import TracedScene
 from scenes.errors import InputError, require
 from scenes.model import Scene
 from scenes.offsets import moved_away, pushed_along_rays
@@ -17,7 +17,7 @@ def moved(scene: Scene, metres: float, mode: str) -> Scene:
         return pushed_along_rays(scene, metres)
     if mode != "rigid":
         raise InputError(f"offset mode {mode!r}, expected ray or rigid for a scene in space")
-    depth = centre_layers(World(scene)).depth_m.reshape(-1).astype(np.float64)
+    depth = centre_layers(TracedScene(scene)).depth_m.reshape(-1).astype(np.float64)
     axial = depth * (scene.camera.rays() @ scene.camera.rotation)[..., 2].ravel()
     axial = axial[np.isfinite(axial)]
     require(axial.size > 0, f"scene {scene.name}: nothing in view, a rigid offset has no median depth to match")

@@ -20,14 +20,14 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from csph.evaluation.methods import FindsDepth
+from csph.evaluation.methods import DepthEstimator
 from csph.evaluation.metrics import PHOTON_LEVELS, image_errors
 from csph.networks.grid import published_centroid_bins
 from csph.networks.model import DepthModel, load_model
 from csph.networks.posterior import DECODERS, Decoder
 from csph.weights.cards import checkpoint_of
 from render.pipeline import Progress
-from scene2spad.networks.registry import Subject, Wanted
+from scene2spad.networks.registry import EvaluatedModel, ModelSpec
 from scene2spad.options.networks import Evaluate
 from scene2spad.studies.results import Store
 from scenes.errors import InputError, require
@@ -112,7 +112,7 @@ PUBLISHED: dict[tuple[str, tuple[int, int, int]], dict[int, Published]] = {
 }
 
 
-def printed(wanted: Wanted) -> Published | None:
+def printed(wanted: ModelSpec) -> Published | None:
     """What was published of that design at that compression, if it was."""
     design = f"{'full ' if wanted.full else ''}{wanted.design}"
     if not wanted.coded:
@@ -166,7 +166,7 @@ def _shrunk(image: np.ndarray) -> np.ndarray:
 
 def errors_of(
     store: Store,
-    subjects: Sequence[Subject],
+    subjects: Sequence[EvaluatedModel],
     photographs: Sequence[Pair],
     levels: Sequence[tuple[float, float]],
     offset_m: float,
@@ -212,11 +212,11 @@ def _drawn(pair: Pair, level: tuple[float, float], offset_m: float, key: tuple[i
     )
 
 
-def _errors(subject: Subject, histogram: Histogram) -> dict[str, float]:
+def _errors(subject: EvaluatedModel, histogram: Histogram) -> dict[str, float]:
     return errors_as_published(subject.model, histogram, "soft-argmax")
 
 
-def errors_as_published(model: FindsDepth, histogram: Histogram, decoder: Decoder) -> dict[str, float]:
+def errors_as_published(model: DepthEstimator, histogram: Histogram, decoder: Decoder) -> dict[str, float]:
     """Compare a model with the published label and with the pulse's arrival: MAE, RMSE [mm], share within 10 mm.
 
     Models of the published grid know the label alone: their columns of the arrival mean nothing.
@@ -288,7 +288,7 @@ def available(count: int | None) -> tuple[list[Pair], str]:
         return [], str(error)
 
 
-def beside_ours(rows: Sequence[dict], wanted: Sequence[Wanted], offsets_m: Sequence[float]) -> list[dict]:
+def beside_ours(rows: Sequence[dict], wanted: Sequence[ModelSpec], offsets_m: Sequence[float]) -> list[dict]:
     """Our models on the photographs beside what was published, near and far [mm]; `of`: how much of the test set."""
     found = []
     scenes, levels = len({row["pair"] for row in rows}), len({(row["signal"], row["background"]) for row in rows})
@@ -307,7 +307,7 @@ def beside_ours(rows: Sequence[dict], wanted: Sequence[Wanted], offsets_m: Seque
 
 def compared(
     store: Store,
-    models: Mapping[Wanted, Subject],
+    models: Mapping[ModelSpec, EvaluatedModel],
     count: int | None,
     levels: Sequence[tuple[float, float]],
     offsets_m: Sequence[float],

@@ -34,7 +34,7 @@ from scenes.model import MAX_IMAGE_SIDE, Scene
 from scenes.offsets import OffsetMode, check_offset
 
 if TYPE_CHECKING:
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
 log = logging.getLogger("scene2spad")
 
@@ -48,7 +48,7 @@ AIM, INDIRECT_AIM = 0.95, 1.4
 PLANNED_PLACES, OF_A_PLACE = 8, 3  # views that tell how many rays an endless set takes
 THINNED = 0.02  # of a pixel, the most that merging neighbouring direct returns changes after the reference pulse
 # of the last place
-_WORLDS: dict[tuple, World] = {}
+_WORLDS: dict[tuple, TracedScene] = {}
 _PLANS: dict[tuple[Job, str], Plan] = {}
 _ONE_AT_A_TIME = Lock()  # Dr.Jit works on one scene at a time, but a Dask worker may have several threads
 
@@ -130,14 +130,14 @@ def render_views(job: Job, views: Sequence[int]) -> list[Done]:
 def _direct_errors(job: Job, views: Sequence[int]) -> list[float]:
     """`render.planning.direct_error` of some views; NaN of one that cannot be rendered, which its record will say."""
     from render.planning import direct_error
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
     found = []
     for view in views:
         with _ONE_AT_A_TIME:
             try:
                 scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
-                world = _world(job, view, scene) or World(scene)
+                world = _world(job, view, scene) or TracedScene(scene)
                 found.append(direct_error(world, job.settings(), _seed(job, view)))
             except Exception:  # as in `render_view`
                 log.debug("view %d cannot be planned", view, exc_info=True)
@@ -211,12 +211,12 @@ def _seed(job: Job, view: int, again: int = 0) -> int:
     return int(np.random.SeedSequence(job.seed, spawn_key=key).generate_state(1)[0])
 
 
-def _world(job: Job, view: int, scene: Scene) -> World | None:
+def _world(job: Job, view: int, scene: Scene) -> TracedScene | None:
     """The world of a place that several cameras look at, built once for all of them; None: the scene's own.
 
     Its origin is the place's, not a camera's, so a view's bytes are the same whether others were rendered before.
     """
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
     chosen = scene_set(job.set)
     if chosen.views_per_place == 1 or (job.offset_m and job.offset_mode != "time"):
@@ -225,11 +225,11 @@ def _world(job: Job, view: int, scene: Scene) -> World | None:
     if place not in _WORLDS:
         plastics = {key: made for world in _WORLDS.values() for key, made in world.plastics.items()}
         _forget()  # before the next is built: calls are compiled for all materials that are there
-        _WORLDS[place] = World(scene, of_place=True, plastics=plastics)
-    return _WORLDS[place].seen_from(scene.camera)
+        _WORLDS[place] = TracedScene(scene, origin_in_scene=True, plastics=plastics)
+    return _WORLDS[place].with_camera(scene.camera)
 
 
-def _plan(job: Job, view: int, world: World | None) -> Plan | None:
+def _plan(job: Job, view: int, world: TracedScene | None) -> Plan | None:
     """The plan for the first camera of a place, which holds for the others too; None: the view's own."""
     from render.engine import planned
 
@@ -240,7 +240,7 @@ def _plan(job: Job, view: int, world: World | None) -> Plan | None:
     key = job, chosen.place(view)
     if key not in _PLANS:
         camera = chosen.view(first, seed=job.seed, width=job.width, height=job.height).camera
-        _PLANS[key] = planned(world.seen_from(camera), job.settings(), _seed(job, first))
+        _PLANS[key] = planned(world.with_camera(camera), job.settings(), _seed(job, first))
     return _PLANS[key]
 
 

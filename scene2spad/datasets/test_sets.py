@@ -14,7 +14,7 @@ from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.training.views import Views, read_views
 from render.pipeline import Progress
 from scene2spad.datasets.rendering import Job, make_set, pack_set
-from scene2spad.networks.registry import Subject
+from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.networks.training import network_method
 from scene2spad.studies.results import Store
 from scenes.errors import require
@@ -93,7 +93,7 @@ def rooms(folder: Path, progress: Progress) -> Path:
 
 def evaluated(
     store: Store,
-    subjects: Sequence[Subject],
+    subjects: Sequence[EvaluatedModel],
     test: TestSet,
     levels: Sequence[tuple[float, float]],
     *,
@@ -123,7 +123,13 @@ def evaluated(
 
 
 def depth_map(
-    store: Store, subject: Subject, test: TestSet, view: int, level: tuple[float, float], delay_m: float, seed: int
+    store: Store,
+    subject: EvaluatedModel,
+    test: TestSet,
+    view: int,
+    level: tuple[float, float],
+    delay_m: float,
+    seed: int,
 ) -> np.ndarray:
     """(H, W) depth [m] that `evaluated` kept."""
     return np.load(store.map_file(subject.digest, **_key(test, view, level, delay_m, seed)))
@@ -139,14 +145,14 @@ def _key(test: TestSet, view: int, level: tuple[float, float], delay_m: float, s
     }
 
 
-def _has(store: Store, one: Subject, key: dict[str, object], with_map: bool) -> bool:
+def _has(store: Store, one: EvaluatedModel, key: dict[str, object], with_map: bool) -> bool:
     there = store.get(one.digest, **key) is not None
     return there and (not with_map or store.map_file(one.digest, **key).is_file())
 
 
 def _evaluate(
     store: Store,
-    subjects: Sequence[Subject],
+    subjects: Sequence[EvaluatedModel],
     test: TestSet,
     view: int,
     level: tuple[float, float],
@@ -158,7 +164,7 @@ def _evaluate(
     one_view = Views(test.views.transients[view : view + 1], test.views.scenes[view : view + 1])
     estimates: dict[str, np.ndarray] = {}
 
-    def method(subject: Subject) -> Method:
+    def method(subject: EvaluatedModel) -> Method:
         depth_of = network_method(subject.model)
 
         def kept(histogram: Histogram) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from csph.weights.shipped import WEIGHTS
 from render.pipeline import Progress
 from scene2spad.datasets.test_sets import rooms
-from scene2spad.networks.registry import Library, Trained, Wanted
+from scene2spad.networks.registry import ModelRegistry, ModelSpec, Trained
 from scene2spad.networks.training import PLANES
 from scene2spad.options.experiments import Study
 from scenes.errors import InputError
@@ -20,11 +20,11 @@ OTHER_SEEDS = (1, 2)
 log = logging.getLogger("scene2spad")
 
 
-class Obtained(NamedTuple):
+class ModelLookup(NamedTuple):
     """Models that are there, in the order asked for, and those that are not."""
 
-    found: dict[Wanted, Trained]
-    absent: list[Wanted]
+    found: dict[ModelSpec, Trained]
+    absent: list[ModelSpec]
 
     def described(self) -> dict[str, list]:
         return {
@@ -33,7 +33,7 @@ class Obtained(NamedTuple):
         }
 
 
-def obtain(wanted: Sequence[Wanted], command: Study, progress: Progress) -> Obtained:
+def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> ModelLookup:
     """Models of --models (else of --out), then of the package; with --retrain, and in `smoke`, all trained there.
 
     Absent ones are named, with the command that makes each. Raises InputError where none is found, and for a model of
@@ -55,17 +55,17 @@ def obtain(wanted: Sequence[Wanted], command: Study, progress: Progress) -> Obta
     for one in absent:
         log.warning("absent: %s; made by: %s", one.name, one.spelled(command.preset, training, library.folder))
     _say_if_unlike(found.values())
-    return Obtained(found, absent)
+    return ModelLookup(found, absent)
 
 
-def other_seeds(wanted: Iterable[Wanted], command: Study) -> dict[Wanted, Trained]:
+def other_seeds(wanted: Iterable[ModelSpec], command: Study) -> dict[ModelSpec, Trained]:
     """Trainings of the same models by OTHER_SEEDS, where there are any: none is missed, and none is trained for it."""
     return _library(command).gather([replace(one, seed=seed) for one in wanted for seed in OTHER_SEEDS])
 
 
-def _library(command: Study) -> Library:
+def _library(command: Study) -> ModelRegistry:
     retrain = command.retrain or command.preset == "smoke"
-    return Library(command.models or command.out / command.preset / "models", None if retrain else WEIGHTS)
+    return ModelRegistry(command.models or command.out / command.preset / "models", None if retrain else WEIGHTS)
 
 
 def _say_if_unlike(found: Iterable[Trained]) -> None:

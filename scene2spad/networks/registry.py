@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 
 from csph.codes.design import Design
-from csph.evaluation.methods import FindsDepth
+from csph.evaluation.methods import DepthEstimator
 from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training.config import ModelConfig, TrainConfig
 from csph.weights.shipped import RESUME, RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
@@ -28,7 +28,7 @@ log = logging.getLogger("scene2spad")
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ModelSpec:
     """A model that a study needs: everything that its conclusions hang on, as `train` takes it.
 
     design         as of `train`, none and peak among them (block and compression then mean nothing)
@@ -88,11 +88,11 @@ class Wanted:
         return f"scene2spad train --design {self.design}{coded}{more} {made}"
 
 
-class Subject(NamedTuple):
+class EvaluatedModel(NamedTuple):
     """A model to be evaluated, or what stands for one, under a name of its own."""
 
     name: str
-    model: FindsDepth
+    model: DepthEstimator
     digest: str
 
 
@@ -100,7 +100,7 @@ class Subject(NamedTuple):
 class Trained:
     """A model that was found or made, and where."""
 
-    wanted: Wanted
+    wanted: ModelSpec
     model: DepthModel
     config: TrainConfig
     state: dict
@@ -111,10 +111,10 @@ class Trained:
         return weights_sha256(self.model)
 
     @property
-    def subject(self) -> Subject:
+    def subject(self) -> EvaluatedModel:
         # results of the same weights read by another decoder are other results
         read = hashlib.sha256(f"{self.digest} {self.config.model.decoder}".encode()).hexdigest()
-        return Subject(self.wanted.name, self.model, read)
+        return EvaluatedModel(self.wanted.name, self.model, read)
 
     @property
     def shipped(self) -> bool:
@@ -142,7 +142,7 @@ class Trained:
         }
 
 
-def check(config: TrainConfig, wanted: Wanted, path: Path) -> None:
+def check(config: TrainConfig, wanted: ModelSpec, path: Path) -> None:
     """InputError in one line for a checkpoint that is not what is wanted: other design, seed, sensor, time offsets."""
     expected = config_of(wanted.command("laptop", Path("planes"), Path()))
     pairs = {
@@ -167,14 +167,14 @@ def _sensor(model: ModelConfig) -> str:
 
 
 @dataclass(frozen=True)
-class Library:
+class ModelRegistry:
     """Where models are looked for: `folder/NAME` as `train --out` fills it, then among those that come with the package
     (`shipped`; None: not there)."""
 
     folder: Path
     shipped: Path | None = WEIGHTS
 
-    def find(self, wanted: Wanted) -> Trained | None:
+    def find(self, wanted: ModelSpec) -> Trained | None:
         """The model if it is there and its training came to its end. Raises InputError for another under its name."""
         run = self.folder / wanted.name / "model.safetensors"
         if run.is_file():
@@ -186,12 +186,12 @@ class Library:
         packaged = None if self.shipped is None else shipped_file(wanted.name, self.shipped)
         return _loaded(wanted, packaged) if packaged is not None and packaged.is_file() else None
 
-    def gather(self, wanted: Sequence[Wanted]) -> dict[Wanted, Trained]:
+    def gather(self, wanted: Sequence[ModelSpec]) -> dict[ModelSpec, Trained]:
         """Those that are there, in the order asked for."""
         found = {one: self.find(one) for one in wanted}
         return {one: model for one, model in found.items() if model is not None}
 
-    def train(self, wanted: Sequence[Wanted], preset: str, training: Path, progress: Progress) -> None:
+    def train(self, wanted: Sequence[ModelSpec], preset: str, training: Path, progress: Progress) -> None:
         """Train what is not finished in the folder; interrupted runs go on. Says how long it takes."""
         todo = [one for one in wanted if self.find(one) is None]
         start = time.perf_counter()
@@ -210,7 +210,7 @@ def _share(progress: Progress, name: str, number: int, of: int) -> Progress:
     return lambda what, share: progress(f"{name}: {what}", (number + share) / of)
 
 
-def _loaded(wanted: Wanted, path: Path) -> Trained:
+def _loaded(wanted: ModelSpec, path: Path) -> Trained:
     model, config, state = load_model(path)
     check(config, wanted, path)
     device = "cuda" if torch.cuda.is_available() else "cpu"

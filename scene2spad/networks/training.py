@@ -15,7 +15,7 @@ from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.codes.design import Design
-from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, FindsDepth, Method, as_dicts, evaluate
+from csph.evaluation.methods import LEVEL_GROUPS, DepthEstimator, Evaluation, Method, as_dicts, evaluate
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.networks.model import DepthModel, load_model
 from csph.training.config import ModelConfig, TrainConfig, preset
@@ -138,7 +138,7 @@ def run_train(command: Train, progress: Progress) -> dict:
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
 
 
-def network_method(model: FindsDepth, *, overflows: list[int] | None = None, **reading: Any) -> Method:
+def network_method(model: DepthEstimator, *, overflows: list[int] | None = None, **reading: Any) -> Method:
     """Depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`.
 
     `reading` is passed on to `DepthModel.depth_of`: int8, int8_rule, decoder.

@@ -27,7 +27,7 @@ from scenes.io.set_index import read_set_index
 
 TITLE = "scene2spad: results"
 PACKAGES = ("scene2spad", "mitsuba", "drjit", "torch", "pytorch-lightning", "numpy", "scipy", "OpenEXR", "matplotlib")
-MOST_CONFIGURATIONS = 200
+MAX_CONFIGURATIONS = 200
 
 
 def run(command: Report, progress: Progress) -> dict:
@@ -224,7 +224,7 @@ def _configurations(found: Found) -> Iterator[str]:
     models = list(_models(found))
     if models:
         found.tables += 1
-        yield html.table(models, "Models that studies stood on", MOST_CONFIGURATIONS)
+        yield html.table(models, "Models that studies stood on", MAX_CONFIGURATIONS)
     for name, (title, columns) in CONFIGURATIONS.items():
         rows = [
             {
@@ -237,7 +237,7 @@ def _configurations(found: Found) -> Iterator[str]:
         ]
         if rows:
             found.tables += 1
-            yield html.table(rows, f"{title} ({name} of each)", MOST_CONFIGURATIONS)
+            yield html.table(rows, f"{title} ({name} of each)", MAX_CONFIGURATIONS)
 
 
 def _views_of(folder: Path, found: Found) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 
 from scene2spad.datasets.published import printed
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.registry import ModelSpec
 from scene2spad.report import html
 from scene2spad.studies.ablations.plan import sheets_of
 from scene2spad.studies.depth_offset.plan import plan_of
@@ -39,7 +39,7 @@ def published_tables(which: str, rows_of: RowsOf) -> list[str]:
     return [html.table(rows, caption, most=200)] if rows else []
 
 
-def _wanted(study: str, figure: str) -> list[Wanted]:
+def _wanted(study: str, figure: str) -> list[ModelSpec]:
     """Every model that the figure has in the paper."""
     if study == "depth-offset":
         return [one for one in plan_of("paper", True).headline if one.seed == 0]
@@ -47,7 +47,7 @@ def _wanted(study: str, figure: str) -> list[Wanted]:
     return list(dict.fromkeys(one for sheet in sheets for one in sheet.wanted))
 
 
-def error_rows(wanted: Iterable[Wanted], measured: Sequence[dict], far: bool) -> list[dict[str, object]]:
+def error_rows(wanted: Iterable[ModelSpec], measured: Sequence[dict], far: bool) -> list[dict[str, object]]:
     """A row a measured model: published and ours, as they are and with `far` 7 m farther too."""
     ours, rows = {row.get("model"): row for row in measured}, []
     for one in wanted:

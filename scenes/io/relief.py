@@ -29,7 +29,7 @@ HAIR_PX = 2e-3
 OFF_CENTRE_PX = 0.01
 SPANS_PX = (16, 8, 4, 2, 1)  # dequantising: distances over which straight lines are sought, and how often
 PASSES = 12
-MOST_LEVEL = 0.485
+MAX_LEVEL = 0.485
 DATA_VARIABLE = "SCENE2SPAD_DATA"
 DEPTH_EXTENSIONS = (".png", ".exr")
 IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -170,10 +170,10 @@ def dequantised(levels: np.ndarray) -> np.ndarray:
     """Whole levels made smooth: straight lines through the steps, never half a level from the given value.
 
     Each pass replaces a pixel by the mean of what lies opposite each other, `span` pixels to both sides along rows or
-    columns, where both are within the span's slope of the pixel (no edge between), and clips to MOST_LEVEL from the
+    columns, where both are within the span's slope of the pixel (no edge between), and clips to MAX_LEVEL from the
     given value. Straight slopes are left as they are, steps of one level become slopes, edges stay.
     """
-    low, high = levels - MOST_LEVEL, levels + MOST_LEVEL
+    low, high = levels - MAX_LEVEL, levels + MAX_LEVEL
     smooth = levels.astype(np.float64)
     for span in SPANS_PX:
         if span >= min(levels.shape) // 2:

@@ -27,7 +27,7 @@ NEAREST_M, FARTHEST_M = 0.6, 6.9
 MEDIAN_M = (1.9, 3.9)  # of one view, by upright boxes; drawn evenly
 OFF_M = 0.5  # below it, at most
 CANDIDATES, DRAWS, ATTEMPTS = 120, 6, 8  # views of a room at a time, as often as it takes, rooms
-LEAST_BUSY = 0.3  # of a view, by upright boxes: what stands before the walls
+MIN_BUSY = 0.3  # of a view, by upright boxes: what stands before the walls
 VIEWS_PER_ROOM = 6  # raw frames of NYUv2 show a place some eighty times
 APART_M, APART_DEG = 0.5, 30.0  # any two cameras of a room, at least
 HEAD_M = 0.28  # half the side of the square that a head takes
@@ -326,7 +326,7 @@ def _candidates(rng: Random, floor: Floor, ceiling: float) -> list[Seen]:
     if not cameras:
         return []
     *quantiles, farthest = np.quantile(distances, (0.05, 0.5, 0.95, 0.99), axis=1)
-    good = (farthest <= FARTHEST_M) & (quantiles[1] >= MEDIAN_M[0] - OFF_M) & (np.array(busy) >= LEAST_BUSY)
+    good = (farthest <= FARTHEST_M) & (quantiles[1] >= MEDIAN_M[0] - OFF_M) & (np.array(busy) >= MIN_BUSY)
     bare = np.maximum(0.0, 0.6 - np.array(busy))
     return [Seen(cameras[i], np.array(quantiles)[:, i], float(bare[i])) for i in np.flatnonzero(good)]
 

@@ -16,14 +16,14 @@ from scenes.errors import InputError
 from scenes.limits import require_memory
 from spad.detection.flux import Rates, expected_counts
 from spad.detection.laws import (
-    Detected,
+    Detections,
     add_crosstalk,
     crosstalk_events,
     first_of_each_cycle,
     first_photon_counts,
     live_detections,
 )
-from spad.detection.photons import Events, Light, draw_primaries
+from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import Sensor
 
@@ -33,8 +33,8 @@ STAGE_CROSSTALK = 22
 STREAM_PIXELS = 1024
 # From this many primary detections a bin on, drawing every bin is cheaper than drawing every photon (measured).
 DENSE_FROM = 4.0
-MOST_EVENTS = 1 << 22  # held at once by the event-by-event laws, about 200 MB
-MOST_CROSSTALK_EVENTS = 1 << 26
+MAX_EVENTS = 1 << 22  # held at once by the event-by-event laws, about 200 MB
+MAX_CROSSTALK_EVENTS = 1 << 26
 
 Progress = Callable[[str, float], None]
 
@@ -46,7 +46,7 @@ class Exposure:
     transient: Transient
     sensor: Sensor
     rates: Rates
-    whole: Light
+    whole: PixelFlux
     model: str
     seed: int
     part: int = 0
@@ -72,10 +72,10 @@ class Exposure:
         seeds = np.random.SeedSequence(self.seed, spawn_key=(stage, self.part, block.start // STREAM_PIXELS))
         return np.random.Generator(np.random.SFC64(seeds))
 
-    def light(self, block: slice) -> Light:
+    def light(self, block: slice) -> PixelFlux:
         first, last = self.transient.offsets[block.start], self.transient.offsets[block.stop]
         owner, *returns, background = self.whole
-        return Light(owner[first:last] - block.start, *(r[first:last] for r in returns), background[block])
+        return PixelFlux(owner[first:last] - block.start, *(r[first:last] for r in returns), background[block])
 
 
 def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
@@ -164,33 +164,37 @@ def _dense(exposure: Exposure, block: slice, rng: np.random.Generator) -> np.nda
     return first_photon_counts(rate / round(exposure.sensor.cycles), last - first, rng)
 
 
-def _places(detected: Detected | Events, sensor: Sensor) -> np.ndarray:
+def _places(detected: Detections | PhotonEvents, sensor: Sensor) -> np.ndarray:
     return detected.pixel.astype(np.int32) * np.int32(sensor.bins) + detected.position.astype(np.int32)
 
 
-def _first_photons(exposure: Exposure, light: Light, rng: np.random.Generator, events: tuple | None = None) -> Detected:
+def _first_photons(
+    exposure: Exposure, light: PixelFlux, rng: np.random.Generator, events: tuple | None = None
+) -> Detections:
     events = events or draw_primaries(light, exposure.sensor, rng, share=exposure.share)
     cycle = rng.integers(*exposure.cycles, len(events.pixel))
-    return first_of_each_cycle(Detected(events.pixel, cycle, events.position), exposure.sensor)
+    return first_of_each_cycle(Detections(events.pixel, cycle, events.position), exposure.sensor)
 
 
-def _free_running(exposure: Exposure, light: Light, rng: np.random.Generator, ready: np.ndarray) -> Iterator[Detected]:
+def _free_running(
+    exposure: Exposure, light: PixelFlux, rng: np.random.Generator, ready: np.ndarray
+) -> Iterator[Detections]:
     """Detections in turn of as many cycles as memory allows; `ready` (P,) in bins is carried on."""
     sensor, (first, last) = exposure.sensor, exposure.cycles
     primaries = float(light.signal.sum() + light.background.sum()) * exposure.share
-    pieces = min(max(1, math.ceil(primaries / MOST_EVENTS)), last - first)
+    pieces = min(max(1, math.ceil(primaries / MAX_EVENTS)), last - first)
     edges = [first + (last - first) * piece // pieces for piece in range(pieces + 1)]
     for start, stop in pairwise(edges):
         share = (stop - start) / round(sensor.cycles)
         events = draw_primaries(light, sensor, rng, share=share, fractional=True)
-        primary = Detected(events.pixel, rng.integers(start, stop, len(events.pixel)), events.position)
+        primary = Detections(events.pixel, rng.integers(start, stop, len(events.pixel)), events.position)
         yield _alive(primary, sensor, ready)
 
 
-def _alive(events: Detected, sensor: Sensor, ready: np.ndarray) -> Detected:
+def _alive(events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
     time = events.cycle * float(sensor.bins_per_period) + events.position
     kept = live_detections(events.pixel, time, sensor.dead_time_s / sensor.bin_width_s, ready)
-    return Detected(*(column[kept] for column in events))
+    return Detections(*(column[kept] for column in events))
 
 
 def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
@@ -210,16 +214,16 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
             parts = list(_free_running(exposure, light, rng, before[block]))
         everything += [part._replace(pixel=part.pixel + block.start) for part in parts]
         total += sum(len(part.pixel) for part in parts)
-        if total > MOST_CROSSTALK_EVENTS:
+        if total > MAX_CROSSTALK_EVENTS:
             raise InputError(
-                f"crosstalk event by event: over {MOST_CROSSTALK_EVENTS} detections; "
+                f"crosstalk event by event: over {MAX_CROSSTALK_EVENTS} detections; "
                 "lower the photon budget or the exposure, or take model poisson"
             )
-    events = Detected(*(np.concatenate(columns) for columns in zip(*everything, strict=True)))
+    events = Detections(*(np.concatenate(columns) for columns in zip(*everything, strict=True)))
     rng = exposure.rng(STAGE_CROSSTALK, slice(0, 0))
     cause, pixel = crosstalk_events(events.pixel, sensor.crosstalk, transient.height, transient.width, rng)
-    fired = Detected(pixel, events.cycle[cause], events.position[cause])
-    both = Detected(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
+    fired = Detections(pixel, events.cycle[cause], events.position[cause])
+    both = Detections(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
     detected = first_of_each_cycle(both, sensor) if exposure.model == "first-photon" else _alive(both, sensor, ready)
     places = np.sort(detected.pixel * np.int64(sensor.bins) + detected.position.astype(np.int64))
     edges = [block.start * sensor.bins for block in exposure.blocks]

@@ -39,7 +39,7 @@ def first_photon_counts(flux: np.ndarray, cycles: int, rng: np.random.Generator)
     return rng.multinomial(cycles, first_photon_shares(flux))[:, :-1]
 
 
-class Detected(NamedTuple):
+class Detections(NamedTuple):
     """Detections of an event-by-event law: pixel, laser cycle and position in bins within the period, (M,) each."""
 
     pixel: np.ndarray
@@ -47,14 +47,14 @@ class Detected(NamedTuple):
     position: np.ndarray
 
 
-def first_of_each_cycle(events: Detected, sensor: Sensor) -> Detected:
+def first_of_each_cycle(events: Detections, sensor: Sensor) -> Detections:
     """Those that are the first in their pixel and cycle, by pixel and cycle; positions are whole bins."""
     cycles, bins = int(events.cycle.max(initial=0)) + 1, sensor.bins
     place = np.sort((events.pixel.astype(np.int64) * cycles + events.cycle) * bins + events.position)
     group = place // bins
     first = place[np.concatenate(([True], group[1:] != group[:-1]))] if len(place) else place
     pixel_cycle, position = np.divmod(first, bins)
-    return Detected(*np.divmod(pixel_cycle, cycles), position)
+    return Detections(*np.divmod(pixel_cycle, cycles), position)
 
 
 def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from spad.sensor.model import Sensor
 GATED_PIXELS = 1024  # whose rates are held at once
 
 
-class Light(NamedTuple):
+class PixelFlux(NamedTuple):
     """What falls on some pixels in one exposure: N returns grouped by pixel, and a flat background in each of P."""
 
     owner: np.ndarray  # (N,) int32 pixel
@@ -38,7 +38,7 @@ class Light(NamedTuple):
         return np.bincount(self.owner, self.signal, minlength=self.pixels)
 
 
-class Events(NamedTuple):
+class PhotonEvents(NamedTuple):
     """Detections in no order: pixel (M,) int32 and position (M,) in bins within the period, int32 or float64."""
 
     pixel: np.ndarray
@@ -52,14 +52,14 @@ def paths_in_bins(near_m: np.ndarray, far_m: np.ndarray, sensor: Sensor) -> tupl
     return near / per_bin, (far_m - near) / per_bin
 
 
-def light_of(transient: Transient, sensor: Sensor, rates: Rates, pixels: slice) -> Light:
+def light_of(transient: Transient, sensor: Sensor, rates: Rates, pixels: slice) -> PixelFlux:
     """The returns of some pixels at a budget's rates; pixels are counted from the slice's first."""
     first, last = int(transient.offsets[pixels.start]), int(transient.offsets[pixels.stop])
     sizes = np.diff(transient.offsets[pixels.start : pixels.stop + 1])
     owner = np.repeat(np.arange(pixels.stop - pixels.start, dtype=np.int32), sizes)
     start, length = paths_in_bins(transient.path_near_m[first:last], transient.path_far_m[first:last], sensor)
     alive = rates.alive.reshape(-1)[pixels]
-    return Light(
+    return PixelFlux(
         owner=owner,
         start=start,
         length=length,
@@ -69,8 +69,8 @@ def light_of(transient: Transient, sensor: Sensor, rates: Rates, pixels: slice) 
 
 
 def draw_primaries(
-    light: Light, sensor: Sensor, rng: np.random.Generator, *, share: float = 1.0, fractional: bool = False
-) -> Events:
+    light: PixelFlux, sensor: Sensor, rng: np.random.Generator, *, share: float = 1.0, fractional: bool = False
+) -> PhotonEvents:
     """Primary detections within the sensor's bins in a share of the exposure.
 
     Whole bins (int64), or positions within them (float64) where a dead time needs to know.
@@ -100,9 +100,9 @@ def draw_primaries(
         _fold(position, period, at[:total])
         at[total:] = _uniform_bins(rng, period, rest)
     if sensor.bins == period:
-        return Events(pixel, at)
+        return PhotonEvents(pixel, at)
     seen = at < sensor.bins  # the rest of the period has no bins: nothing is detected there
-    return Events(pixel[seen], at[seen])
+    return PhotonEvents(pixel[seen], at[seen])
 
 
 def _fold(position: np.ndarray, period: int, out: np.ndarray) -> None:
@@ -122,7 +122,7 @@ def _uniform_bins(rng: np.random.Generator, period: int, size: int) -> np.ndarra
     return words.view(np.uint16)[:size] & np.uint16(period - 1)
 
 
-def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: Light) -> tuple[np.ndarray, float]:
+def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: PixelFlux) -> tuple[np.ndarray, float]:
     """Expected primary signal detections within the bins of every pixel, (H, W), and how much of the light wrapped."""
     shape = (transient.height, transient.width)
     if sensor.bins == sensor.bins_per_period:
@@ -135,7 +135,7 @@ def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: L
     return np.clip(inside, 0, None).reshape(shape), _wrapped(light, sensor)
 
 
-def _wrapped(light: Light, sensor: Sensor) -> float:
+def _wrapped(light: PixelFlux, sensor: Sensor) -> float:
     """Expected signal that arrives later than one period after the laser's emission."""
     period, width = sensor.bins_per_period, sensor.bin_width_s
     late = light.start + light.length + sensor.response.window_s(8.5)[1] / width > period

@@ -23,7 +23,7 @@ from torch import Tensor
 from render.transient import Transient
 from scenes.errors import InputError
 from spad.detection.flux import background_scales
-from spad.detection.photons import Events, Light, draw_primaries, paths_in_bins
+from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries, paths_in_bins
 from spad.sensor.model import PhotonBudget, Sensor
 
 STAGE_FLY = 23
@@ -148,7 +148,7 @@ def sense_patches(
     )
 
 
-def _count(events: Events, counts: Tensor) -> None:
+def _count(events: PhotonEvents, counts: Tensor) -> None:
     """Detections of each bin and pixel, into `counts` (T, P); whole numbers, so that no order of additions shows.
 
     On a CPU in the narrowest type that holds the fullest pixel, so that a core's cache holds the patch, and then wide.
@@ -169,7 +169,7 @@ def _count(events: Events, counts: Tensor) -> None:
     np.copyto(counts.numpy(), narrow)
 
 
-def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, height: int, width: int) -> Light:
+def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, height: int, width: int) -> PixelFlux:
     scenes, rows, columns = packed.depth_m.shape
     inside = 0 <= patch.scene < scenes and 0 <= patch.row <= rows - height and 0 <= patch.column <= columns - width
     if not inside:
@@ -193,7 +193,7 @@ def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, heig
     # each pixel's returns are a run: start of its run minus where the run goes, plus a running index
     index = np.repeat(first - np.cumsum(number) + number, number) + np.arange(int(number.sum()))
     start, length = paths_in_bins(packed.path_near_m[index], packed.path_far_m[index], sensor)
-    return Light(
+    return PixelFlux(
         owner=np.repeat(np.arange(height * width, dtype=np.int32), number),
         start=start + patch.time_offset_m / sensor.bin_depth_m,
         length=length,

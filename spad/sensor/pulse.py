@@ -18,7 +18,7 @@ from scenes.constants import REFERENCE_PULSE_SIGMA_S
 from scenes.errors import InputError, require
 from scenes.files import read_array
 
-MOST_SAMPLES = 1 << 16
+MAX_SAMPLES = 1 << 16
 # Steps of a table that stands for two kernels in one, per standard deviation of the narrower: the table widens the
 # pulse's variance by 1 / (12 * 16^2) of that one's, 0.03 %.
 _STEPS_PER_STD = 16
@@ -98,7 +98,7 @@ class SampledPulse:
     def __post_init__(self) -> None:
         object.__setattr__(self, "samples", tuple(float(value) for value in self.samples))
         count = len(self.samples)
-        require(1 <= count <= MOST_SAMPLES, f"measured pulse: {count} samples, expected 1 to {MOST_SAMPLES}")
+        require(1 <= count <= MAX_SAMPLES, f"measured pulse: {count} samples, expected 1 to {MAX_SAMPLES}")
         good = all(math.isfinite(value) and value >= 0 for value in self.samples) and sum(self.samples) > 0
         require(good, "measured pulse: samples must be finite, 0 or more, and not all 0")
         good = math.isfinite(self.sample_s) and 0 < self.sample_s < 1e-3
@@ -179,10 +179,10 @@ def convolved(pulse: AnyPulse, kernel: AnyPulse | None) -> AnyPulse:
     for part in (pulse, kernel):
         before, after = part.window_s(_TABLE_SIGMAS)
         count = math.ceil(before / step) + math.ceil(after / step)
-        require(count <= MOST_SAMPLES, f"pulse and jitter differ too much in width ({part.std_s:g} s and the other)")
+        require(count <= MAX_SAMPLES, f"pulse and jitter differ too much in width ({part.std_s:g} s and the other)")
         tables.append(part.shares((np.arange(count + 1) - math.ceil(before / step)) * step))
     both = np.convolve(*tables)
-    require(len(both) <= MOST_SAMPLES, f"pulse and jitter together take {len(both)} steps of {step:g} s")
+    require(len(both) <= MAX_SAMPLES, f"pulse and jitter together take {len(both)} steps of {step:g} s")
     return SampledPulse(tuple(np.clip(both, 0, None).tolist()), step)
 
 

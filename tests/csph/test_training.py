@@ -317,13 +317,13 @@ def test_histograms_that_do_not_fit():
 def test_freed_memory_is_kept():
     script = (
         "import resource, numpy as np\n"
-        "from render.backend.malloc import keep_freed_memory\n"
+        "from render.backend.malloc import retain_freed_memory\n"
         "def faults():\n"
         "    start = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
         "    for _ in range(20):\n"
         "        np.ones(1 << 21)\n"
         "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - start\n"
-        "keep_freed_memory()\n"
+        "retain_freed_memory()\n"
         "print(faults(), faults())\n"
     )
     said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout

@@ -7,7 +7,7 @@ import pytest
 
 from render.ambient import ambient_light, shared
 from render.direct.integrator import Layers, centre_layers
-from render.scene.traced_scene import World, mi
+from render.scene.traced_scene import TracedScene, mi
 from scene2spad.bench.hard import oracles
 from scenes.library.things.shapes import box, sphere
 from scenes.model import Ambient, Material, Scene, Surface
@@ -32,7 +32,7 @@ def windowed_room() -> Scene:
     return Scene("windowed room", (walls, pane, sky, *balls), oracles.camera(8, 6, 70))
 
 
-def mitsuba(world: World, spp: int, bounces: int, seed: int) -> float:
+def mitsuba(world: TracedScene, spp: int, bounces: int, seed: int) -> float:
     """The image's mean by Mitsuba's path integrator, whose camera has x to the left and y up."""
     camera, turned = world.scene.camera, np.eye(4)
     turned[:3, :3] = camera.rotation @ np.diag([-1.0, -1.0, 1.0])
@@ -45,7 +45,7 @@ def mitsuba(world: World, spp: int, bounces: int, seed: int) -> float:
 
 def test_light_through_panes_is_what_mitsuba_finds_by_chance():
     """The means of independent runs agree within 4 standard errors of their difference."""
-    world = World(windowed_room())
+    world = TracedScene(windowed_room())
     ours = np.array([ambient_light(world, 128, 30, seed).radiance.mean() for seed in range(8)])
     theirs = np.array([mitsuba(world, 1024, 30, seed) for seed in range(8)])
     error = np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / 8)
@@ -53,7 +53,7 @@ def test_light_through_panes_is_what_mitsuba_finds_by_chance():
 
 
 def test_the_stated_noise_is_that_of_repetitions():
-    world = World(windowed_room())
+    world = TracedScene(windowed_room())
     runs = [ambient_light(world, 32, 16, seed) for seed in range(12)]
     images = np.array([run.radiance for run in runs])
     spread = np.sqrt(images.var(axis=0, ddof=1).mean()) / images.mean()
@@ -65,7 +65,7 @@ def test_the_stated_noise_is_that_of_repetitions():
 
 def test_paths_are_traced_until_the_noise_asked_for_and_no_further():
     """As good as that many at once; where the noise is out of reach, all that are allowed."""
-    world = World(windowed_room())
+    world = TracedScene(windowed_room())
     light = ambient_light(world, 4096, 16, 3, noise=0.05)
     assert 0.025 < light.error <= 0.05 and 64 < light.spp < 4096
     at_once = ambient_light(world, light.spp, 16, 3)
@@ -81,7 +81,7 @@ def test_a_light_of_no_power_costs_no_noise():
     room = windowed_room()
     speck = replace(room.surfaces[2], vertices=room.surfaces[2].vertices * 1e-3 + (0, -1.4, 0))
     noise = [
-        np.mean([ambient_light(World(one), 64, 16, seed).error ** 2 for seed in range(4)])
+        np.mean([ambient_light(TracedScene(one), 64, 16, seed).error ** 2 for seed in range(4)])
         for one in (room, replace(room, surfaces=(*room.surfaces, speck)))
     ]
     assert noise[1] == pytest.approx(noise[0], rel=0.4)
@@ -92,9 +92,9 @@ def test_a_light_without_area_is_none():
     walls = windowed_room().surfaces[0]
     flat = Surface(np.full((3, 3), -1.0), [[0, 1, 2]], Material(albedo=0.5), emission=1.0)
     dark = Scene("degenerate light", (replace(walls, material=Material(albedo=0.4)), flat), oracles.camera(8, 6, 70))
-    assert not ambient_light(World(dark), 4, 4, 1).radiance.any()
+    assert not ambient_light(TracedScene(dark), 4, 4, 1).radiance.any()
     lit = replace(dark, surfaces=(flat,), ambient=Ambient(radiance=0.1))
-    assert np.allclose(ambient_light(World(lit), 4, 4, 1).radiance, 0.1)
+    assert np.allclose(ambient_light(TracedScene(lit), 4, 4, 1).radiance, 0.1)
 
 
 def test_neighbours_share_irradiance_whatever_their_albedo_and_not_past_edges():
@@ -118,7 +118,7 @@ def test_neighbours_share_irradiance_whatever_their_albedo_and_not_past_edges():
 def test_shared_light_keeps_what_is_seen_directly_and_its_mean():
     """Against the unshared light of the same room: the mean within 4 standard errors, the noise far below it."""
     room = windowed_room()
-    world = World(replace(room, camera=room.camera.resized(32, 24)))
+    world = TracedScene(replace(room, camera=room.camera.resized(32, 24)))
     layers = centre_layers(world)
     alone = [ambient_light(world, 16, 16, seed) for seed in range(6)]
     together = [ambient_light(world, 16, 16, 100 + seed, layers) for seed in range(6)]

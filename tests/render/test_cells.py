@@ -5,12 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from render.indirect.path_cells import Rows, coarsened, make_cells
+from render.indirect.path_cells import MomentHistogram, coarsened, make_cells
 from render.scene.traced_scene import Bool, Float, UInt32, dr, upload
 from render.transient.samples import Samples, packed
 
 
-def samples_of(rows: Rows, pixels: int = 1) -> Samples:
+def samples_of(rows: MomentHistogram, pixels: int = 1) -> Samples:
     dr.eval(rows.moments)
     return rows.samples(np.arange(pixels), np.zeros(pixels))
 
@@ -24,7 +24,7 @@ def second_moment(samples: Samples) -> float:
 def test_light_between_two_paths_keeps_its_energy_and_place(growth):
     """Also beyond the last cell, where an interval reaches past the end of all cells."""
     rng, cells = np.random.default_rng(1), make_cells(0.03, growth, -0.5, 5.0)
-    rows = Rows(1, cells, 2.0**-40)
+    rows = MomentHistogram(1, cells, 2.0**-40)
     low = rng.uniform(-0.6, 5.5, 5000)
     high = low + rng.uniform(0, 0.03, len(low))
     radiance = rng.uniform(0, 1, len(low))
@@ -33,7 +33,7 @@ def test_light_between_two_paths_keeps_its_energy_and_place(growth):
     energy, _, _ = (values[0] for values in rows.sums())
     assert energy.sum() == pytest.approx(radiance.sum(), rel=1e-6)
     inside = (low > -0.4) & (high < 4.9)
-    rows = Rows(1, cells, 2.0**-40)
+    rows = MomentHistogram(1, cells, 2.0**-40)
     columns = (upload(Float, part[inside]) for part in (low, high, radiance))
     rows.add_between(UInt32(0), *columns, Bool(True))
     energy, moment, _ = (values[0] for values in rows.sums())
@@ -52,7 +52,7 @@ def test_few_paths_in_a_cell_are_no_bias(paths):
     """
     rng, cells, pixels = np.random.default_rng(paths), make_cells(0.1, 0.0, 0.0, 1.0), 4000
     x = rng.uniform(0.5, 0.6, (pixels, paths))
-    rows = Rows(pixels, cells, 2.0**-40)
+    rows = MomentHistogram(pixels, cells, 2.0**-40)
     rows.add(upload(UInt32, np.repeat(np.arange(pixels), paths)), upload(Float, x.ravel()), Float(1), Bool(True))
     samples = samples_of(rows, pixels)
     assert len(samples.pixel) == pixels and samples.radiance == pytest.approx(paths, rel=1e-6)
@@ -72,7 +72,7 @@ def test_merging_again_changes_nothing_and_two_rows_add_up():
     x, radiance = rng.uniform(0, 4, 500), rng.exponential(1, 500)
     parts = []
     for some in (slice(None), slice(250), slice(250, None)):
-        rows = Rows(1, cells, 2.0**-40)
+        rows = MomentHistogram(1, cells, 2.0**-40)
         rows.add(UInt32(0), upload(Float, x[some]), upload(Float, radiance[some]), Bool(True))
         parts.append(samples_of(rows))
     whole, *halves = parts

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from render.direct.integrator import DirectLight, direct_light
-from render.scene.traced_scene import World, dr
+from render.scene.traced_scene import TracedScene, dr
 from scenes import Camera, Laser, Material, Scene, Surface
 from scenes.library.things.shapes import sphere
 
@@ -38,7 +38,7 @@ def camera(width: int, height: int, fov_deg: float) -> Camera:
 def direct(scene: Scene, grid: int = 2, **options) -> DirectLight:
     view = scene.camera
     options = {"least_share": 0.04, **options}
-    return direct_light(World(scene), np.arange(view.width * view.height), grid, **options)
+    return direct_light(TracedScene(scene), np.arange(view.width * view.height), grid, **options)
 
 
 def moments(scene: Scene, light: DirectLight) -> Moments:
@@ -359,11 +359,11 @@ def test_close_and_absent_surfaces(z_m, refine):
 def test_a_few_pixels_are_what_they_are_in_the_whole_image():
     scene = Scene("plane", (wall(-2.0),), camera(16, 12, 40))
     chosen = np.array([3, 17, 18, 90, 191])
-    whole, part = (direct_light(World(scene), pixels, 2, 0.0) for pixels in (np.arange(16 * 12), chosen))
+    whole, part = (direct_light(TracedScene(scene), pixels, 2, 0.0) for pixels in (np.arange(16 * 12), chosen))
     # cells at the edge of lone pixels have one neighbour to follow and no bend: (c_x + c_y) / 24 is missing, where a
     # cell of w = 1/2 pixel = 45 mm at d = 2 m has c = 2 w^2 / d = 2 mm
     a, b = (moments(scene, light) for light in (whole, part))
     assert set(part.samples.pixel.tolist()) == set(chosen.tolist())
     assert a.total.ravel()[chosen] == pytest.approx(b.total.ravel()[chosen], rel=1e-6)
     assert a.mean.ravel()[chosen] == pytest.approx(b.mean.ravel()[chosen], abs=2e-4)
-    assert len(direct_light(World(scene), chosen[:0], 2).samples.pixel) == 0
+    assert len(direct_light(TracedScene(scene), chosen[:0], 2).samples.pixel) == 0

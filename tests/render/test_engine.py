@@ -12,7 +12,7 @@ from render import pipeline as tracing
 from render.engine import render
 from render.error import BIN_M, PULSE_POWER, SIGMA_M, estimate, response, target_verdict, worst_share_of
 from render.planning import _bounces, make_plan, rays_for_all
-from render.scene.traced_scene import World
+from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
 from render.transient.samples import Samples
 from scene2spad.bench.hard import oracles
@@ -98,7 +98,7 @@ def test_ambient_light_is_rendered_only_where_a_budget_has_room_for_it():
 def test_the_plan_asks_of_ambient_light_what_its_photons_are_worth():
     """Noise that would make a fixed share of the target; the more background, the less of it, within limits."""
     dark = room()
-    lit = World(replace(dark, surfaces=(replace(dark.surfaces[0], emission=0.3), dark.surfaces[1])))
+    lit = TracedScene(replace(dark, surfaces=(replace(dark.surfaces[0], emission=0.3), dark.surfaces[1])))
 
     def noise(**asked: object) -> float:
         return make_plan(lit, RenderSettings(bounces=1, **asked), 1).ambient_noise
@@ -124,13 +124,13 @@ def test_a_missed_target_is_made_good():
     """Where the first paths' own noise tells that the pilot was too hopeful, more are traced: the mean stays right."""
     scene, pixels = room(), np.arange(24 * 18)
     fine = as_response(render(scene, RenderSettings(spp=8192, grid=16, bounces=4), seed=99), pixels)
-    world, settings = World(scene), RenderSettings(bounces=4, error=0.02)
+    world, settings = TracedScene(scene), RenderSettings(bounces=4, error=0.02)
     plan = replace(make_plan(world, settings, 1), noise=0.1)  # a pilot that promises five times too much
     first = tracing.trace(world, plan, settings, seed=1, checked=pixels)
     error = engine._estimated(world, plan, settings, first, pixels)
-    more = engine._missing(world, plan, settings, first, error)
+    more = engine._additional_schedule(world, plan, settings, first, error)
     assert error.total > 0.02 and more is not None
-    both = tracing.traced_on(world, plan, settings, first, more, 1, pixels, lambda what, share: None)
+    both = tracing.add_samples(world, plan, settings, first, more, 1, pixels, lambda what, share: None)
     assert both.spp > first.spp
 
     def true(traced: tracing.Traced) -> float:

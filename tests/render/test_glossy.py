@@ -10,9 +10,9 @@ import pytest
 import render.indirect.glossy
 import render.indirect.light_tracing
 from render.indirect.glossy import ELSEWHERE, glossy_of
-from render.indirect.light_tracing import thrown_light
-from render.pipeline import Traced, trace
-from render.scene.traced_scene import World
+from render.indirect.light_tracing import trace_light_paths
+from render.pipeline import LightSamples, trace
+from render.scene.traced_scene import TracedScene
 from render.settings import Plan, RenderSettings
 from scenes import Camera, Laser, Material, Scene, Surface
 from scenes.library.hard_cases import hard_case
@@ -49,14 +49,14 @@ def room(polished: Material, laser: Laser, *, smooth: bool = False) -> Scene:
     return Scene("polished", surfaces, view, laser)
 
 
-def light(scene: Scene, spp: int, seed: int, *, bounces: int = 3, filtered: bool = False) -> Traced:
+def light(scene: Scene, spp: int, seed: int, *, bounces: int = 3, filtered: bool = False) -> LightSamples:
     forced = {"bounces": bounces, "spp": spp, "grid": 2, "filter": filtered, "least_share": 1.0}
     settings = RenderSettings(**forced, direct_tolerance_m=1e-3)
     plan = Plan(**forced, direct_tolerance_m=1e-3, ambient=False, reasons=())
-    return trace(World(scene), plan, settings, seed=seed, checked=np.arange(0, WIDTH * HEIGHT, 3))
+    return trace(TracedScene(scene), plan, settings, seed=seed, checked=np.arange(0, WIDTH * HEIGHT, 3))
 
 
-def totals(traced: Traced) -> np.ndarray:
+def totals(traced: LightSamples) -> np.ndarray:
     samples = traced.indirect_samples
     return np.bincount(samples.pixel, weights=samples.radiance, minlength=len(traced.origin_m))
 
@@ -77,7 +77,7 @@ def by_chance(monkeypatch):
 @pytest.mark.parametrize("material", [METAL, GLOSS], ids=["metal", "gloss"])
 def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, by_chance):
     scene = room(material, LASERS[laser], smooth=smooth)
-    assert glossy_of(World(scene)) is not None
+    assert glossy_of(TracedScene(scene)) is not None
     seeds = range(4)
     both = np.array([totals(light(scene, 512, seed)) for seed in seeds])
     by_chance()
@@ -125,10 +125,10 @@ def test_same_seed_same_light():
 
 
 def test_paths_begin_where_something_shines_and_a_few_elsewhere():
-    world = World(room(METAL, LASERS["flash"]))
+    world = TracedScene(room(METAL, LASERS["flash"]))
     glossy = glossy_of(world)
     assert set(glossy.shares) == {0.0, ELSEWHERE, 1.0}
-    found = list(thrown_light(world, 64, BATCHES, 3, 1))
+    found = list(trace_light_paths(world, 64, BATCHES, 3, 1))
     assert all(part.radiance.min() > 0 and part.pixel.max() < WIDTH * HEIGHT for part in found)
     assert np.bincount(np.concatenate([part.batch for part in found])).min() > 0
 
@@ -143,8 +143,8 @@ def test_paths_begin_where_something_shines_and_a_few_elsewhere():
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_nothing_begins_elsewhere(scene, why):
-    world = World(scene)
-    assert glossy_of(world) is None and not list(thrown_light(world, 4, 1, 3, 0)), why
+    world = TracedScene(scene)
+    assert glossy_of(world) is None and not list(trace_light_paths(world, 4, 1, 3, 0)), why
 
 
 def test_polished_things_behind_the_camera_alone():
@@ -152,4 +152,4 @@ def test_polished_things_behind_the_camera_alone():
     scene = room(METAL, LASERS["lamp"])
     behind = quad([(-1, -1, 2), (1, -1, 2), (1, 1, 2), (-1, 1, 2)], METAL)
     scene = replace(scene, surfaces=(*scene.surfaces[:3], behind))
-    assert glossy_of(World(scene)) is None
+    assert glossy_of(TracedScene(scene)) is None

@@ -8,8 +8,8 @@ import pytest
 from render.direct.footprints import trace
 from render.engine import render
 from render.indirect.camera_paths import trace_paths
-from render.indirect.launch_layout import BLOCK, block_order, turns_of
-from render.scene.traced_scene import World, dr
+from render.indirect.launch_layout import BLOCK, block_order, make_launch
+from render.scene.traced_scene import TracedScene, dr
 from render.settings import RenderSettings
 from render.specular.image_method import specular_light
 from scenes import Camera, Laser, Material, Scene, Surface
@@ -80,13 +80,13 @@ def test_polished_metal_compiles_nothing_from_the_third_view_on(filtered):
 
 
 def test_specular_light_compiles_nothing_from_the_third_view_on():
-    views = [compiled(lambda s=s: specular_light(World(room(s, ("plastic",), mirrors=2)), 2)) for s in range(4)]
+    views = [compiled(lambda s=s: specular_light(TracedScene(room(s, ("plastic",), mirrors=2)), 2)) for s in range(4)]
     assert views[2:] == [0, 0], views
 
 
 def test_launches_of_any_size_are_recorded_once():
     """Dr.Jit records anew where a launch is as long as one of the scene's arrays and an earlier one was not."""
-    world = World(room(14, ("plastic", "diffuse", "roughplastic"), balls=5))
+    world = TracedScene(room(14, ("plastic", "diffuse", "roughplastic"), balls=5))
     sizes = {len(values) for surface in world.scene.surfaces for values in (surface.faces, surface.vertices.ravel())}
     for size in sorted({*range(1, 70), *sizes, *(2 * len(s.vertices) for s in world.scene.surfaces)}):
         column = np.arange(size) % 24
@@ -98,12 +98,12 @@ def test_launches_of_any_size_are_recorded_once():
 def test_launches_of_paths_are_recorded_once_and_replayed_as_they_would_be_traced(laser):
     """Dr.Jit records anew where a launch is as long as a mesh or a table of the scene; none of these is."""
     scene = replace(room(21, ("plastic", "diffuse", "roughplastic"), balls=3), laser=laser)
-    world, pixels = World(scene), block_order(np.arange(24 * 18), 24)
+    world, pixels = TracedScene(scene), block_order(np.arange(24 * 18), 24)
     for blocks, rounds in [(1, 3), (2, 8), (2, 16), (5, 5), (16, 1), (27, 4)]:
         block = np.arange(blocks)
-        turns = turns_of(block, block, np.full(blocks, rounds), 2)
+        turns = make_launch(block, block, np.full(blocks, rounds), 2)
         ours, new = (
-            trace_paths(w, pixels[: blocks * BLOCK], turns, 4, 3, 2, shared=False) for w in (world, World(scene))
+            trace_paths(w, pixels[: blocks * BLOCK], turns, 4, 3, 2, shared=False) for w in (world, TracedScene(scene))
         )
         for name in ("own_value", "own_onward", "values", "paths", "soonest_m"):
             assert np.array_equal(getattr(ours.tails, name).numpy(), getattr(new.tails, name).numpy()), name
@@ -115,10 +115,10 @@ def test_launches_of_paths_are_recorded_once_and_replayed_as_they_would_be_trace
 def test_the_next_world_takes_plastics_and_renders_the_same():
     """Their tables are those of equal parameters, whatever the albedo; cut-outs have tables of their own."""
     first, second = (room(seed, ("plastic", "diffuse", "roughplastic"), balls=4) for seed in (15, 16))
-    plastics = World(first).plastics
-    handed = World(second, plastics=plastics)
+    plastics = TracedScene(first).plastics
+    handed = TracedScene(second, plastics=plastics)
     assert len(plastics) == 2 and all(handed.plastics[key] is made for key, made in plastics.items())
     settings = RenderSettings(bounces=3, spp=16, grid=2)
     assert render(second, settings, world=handed).sha256() == render(second, settings).sha256()
     pane = replace(first.surfaces[-1], material=Material("plastic", opacity=0.3))
-    assert not World(replace(first, surfaces=(first.surfaces[0], pane)), cutouts_by_mitsuba=True).plastics
+    assert not TracedScene(replace(first, surfaces=(first.surfaces[0], pane)), cutouts_by_mitsuba=True).plastics

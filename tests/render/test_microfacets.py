@@ -8,7 +8,7 @@ import pytest
 from scipy.special import erf
 
 from render.engine import render
-from render.scene.traced_scene import World, mi
+from render.scene.traced_scene import TracedScene, mi
 from render.settings import RenderSettings
 from scene2spad.bench.hard import oracles
 from scenes import Material, Scene
@@ -88,4 +88,4 @@ def test_surfaces_of_one_distribution_share_a_mesh():
     (one,), camera = wall(Material("roughplastic")).surfaces, oracles.camera(4, 4, 60)
     coats = [Material("roughplastic", albedo=0.1, distribution=d) for d in ("ggx", "beckmann")]
     others = [replace(oracles.wall(3.0, 0.5), material=coat) for coat in coats]
-    assert len(World(Scene("walls", (one, *others), camera)).groups) == 2
+    assert len(TracedScene(Scene("walls", (one, *others), camera)).groups) == 2

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from render.direct.integrator import centre_layers, direct_light
-from render.scene.traced_scene import World
+from render.scene.traced_scene import TracedScene
 from render.specular.image_method import specular_light
 from render.specular.mirrors import check_slabs, find_mirrors, slab_error_m
 from scenes import Camera, InputError, Laser, Material, Scene, Surface, Texture
@@ -51,7 +51,7 @@ def glint(scene: Scene, toward, reflectance: float, one_way_m: float) -> tuple[i
 
 def check(scene: Scene, expected: list[tuple], *, energy: float = 1e-4, path_m: float = 1e-4) -> None:
     """The scene's specular samples are exactly those expected: (toward, reflectance, D, path, bounces) each."""
-    samples = specular_light(World(scene)).samples
+    samples = specular_light(TracedScene(scene)).samples
     assert len(samples.pixel) == len(expected), samples
     order = np.argsort(samples.path_m)
     for i, (toward, reflectance, one_way, path, bounces) in zip(
@@ -93,7 +93,7 @@ def test_tilted_mirror_shines_where_its_normal_meets_the_camera(tilt_deg):
 
 def test_half_of_a_glint_on_the_edge_of_a_mirror():
     mirror = quad([(0, -1, -2), (1, -1, -2), (1, 1, -2), (0, 1, -2)], GOOD_MIRROR)
-    samples = specular_light(World(scene_of(mirror))).samples
+    samples = specular_light(TracedScene(scene_of(mirror))).samples
     _, whole = glint(scene_of(mirror), (0, 0, -1), 0.8, 4)
     assert samples.radiance.sum() == pytest.approx(whole / 2, rel=0.15)
 
@@ -120,14 +120,14 @@ def test_displaced_laser_in_a_mirror():
 def test_nothing_from_a_blocked_or_unlit_mirror():
     mirror = square((0, 0, -2), (0, 0, 1), 1, GOOD_MIRROR)
     post = square((0, 0, -1), (0, 0, 1), 0.1, Material(albedo=0.5))
-    assert (specular_light(World(scene_of(mirror, post))).samples.bounces > 1).all()
+    assert (specular_light(TracedScene(scene_of(mirror, post))).samples.bounces > 1).all()
     check(scene_of(mirror, square((0.5, 0, -1), (0, 0, 1), 0.1, Material(albedo=0.0))), [((0, 0, -1), 0.8, 4, 4, 1)])
     tilted = square((0, 0, -2), (math.sin(0.2), 0, math.cos(0.2)), 1, GOOD_MIRROR)
-    assert len(specular_light(World(scene_of(tilted))).samples.pixel) == 1
+    assert len(specular_light(TracedScene(scene_of(tilted))).samples.pixel) == 1
     check(scene_of(tilted, laser=Laser("flood", cone_deg=20.0)), [])
     hidden_laser = scene_of(mirror, square((0.2, 0, -0.5), (0, 0, 1), 0.05, Material(albedo=0)),
                             laser=Laser("flood", (0.25, 0, 0), 60.0))  # fmt: skip
-    assert not (specular_light(World(hidden_laser)).samples.bounces == 1).any()
+    assert not (specular_light(TracedScene(hidden_laser)).samples.bounces == 1).any()
 
 
 def corner_cube(apex, turn_deg: float, size_m: float, material: Material) -> list[Surface]:
@@ -168,7 +168,7 @@ def test_thin_pane_before_a_mirror():
     normal = np.array([0.03, 0, 1]) / math.hypot(0.03, 1)
     d = 2 * normal[2]
     passed = ((1 - F) / (1 + F)) ** 2
-    samples = specular_light(World(scene_of(pane, mirror))).samples
+    samples = specular_light(TracedScene(scene_of(pane, mirror))).samples
     first = samples.bounces == 1
     for toward, reflectance, one_way in (((0, 0, -1), 2 * F / (1 + F), 2), (-normal, 0.8 * passed, 2 * d)):
         pixel, radiance = glint(scene_of(pane), toward, reflectance, one_way)
@@ -201,8 +201,8 @@ def test_a_wall_behind_slabs_is_dimmed_delayed_and_brightened_by_their_spreading
     slabs = [slab(-0.5 - i, t, n) for i, n in enumerate(glasses)]
     for laser in (Laser(), Laser("flood", (1e-3, 0, 0), 2.0)):
         pixels = np.arange(25)
-        bare = direct_light(World(scene_of(wall, view=view, laser=laser)), pixels, 2).samples
-        seen = direct_light(World(scene_of(wall, *slabs, view=view, laser=laser)), pixels, 2).samples
+        bare = direct_light(TracedScene(scene_of(wall, view=view, laser=laser)), pixels, 2).samples
+        seen = direct_light(TracedScene(scene_of(wall, *slabs, view=view, laser=laser)), pixels, 2).samples
         near = d - sum(t * (1 - 1 / n) for n in glasses)
         dimmed = math.prod((1 - ((n - 1) / (n + 1)) ** 2) ** 4 for n in glasses)
         ratio = seen.radiance.sum() / bare.radiance.sum()
@@ -225,8 +225,8 @@ def test_tilted_glass_dims_by_its_angle(angle_deg, thick):
     glass = slab(0, 1e-3, half=2) if thick else square((0, 0, 0), (0, 0, 1), 2, Material("thindielectric", ior=N))
     glass = replace(glass, vertices=glass.vertices @ turn.T + (0, 0, -1.5))
     wall, view = square((0, 0, -4), (0, 0, 1), 9, Material(albedo=0.5)), camera(3, 3, 0.2)
-    bare = direct_light(World(scene_of(wall, view=view)), np.arange(9), 2).samples
-    seen = direct_light(World(scene_of(wall, glass, view=view)), np.arange(9), 2).samples
+    bare = direct_light(TracedScene(scene_of(wall, view=view)), np.arange(9), 2).samples
+    seen = direct_light(TracedScene(scene_of(wall, glass, view=view)), np.arange(9), 2).samples
     assert seen.radiance.sum() / bare.radiance.sum() == pytest.approx(passed**2, rel=2e-3)
 
 
@@ -237,12 +237,12 @@ def test_a_wall_seen_in_a_mirror(tilt):
     mirror = square((0, 0, -2), (1, 0, 1), 3, GOOD_MIRROR)
     wall = square((3, 0, -2), (-1, 0, tilt), 9, Material(albedo=0.5))
     view = camera(17, 13, 20)
-    samples = specular_light(World(scene_of(mirror, wall, view=view)), 4).samples
+    samples = specular_light(TracedScene(scene_of(mirror, wall, view=view)), 4).samples
     assert set(samples.bounces) == {3}
     # the image of the wall: x and z + 2 swap with opposite signs
     x, y, z = wall.vertices.T
     unfolded = replace(wall, vertices=np.column_stack((-(z + 2), y, -x - 2)))
-    plain = direct_light(World(scene_of(unfolded, view=view)), np.arange(17 * 13), 4).samples
+    plain = direct_light(TracedScene(scene_of(unfolded, view=view)), np.arange(17 * 13), 4).samples
     got, want = (np.bincount(s.pixel, s.radiance, 17 * 13) for s in (samples, plain))
     assert np.abs(got / (0.64 * want) - 1).max() < 1e-4
     moments = [np.bincount(s.pixel, s.radiance * s.path_m, 17 * 13) for s in (samples, plain)]
@@ -260,7 +260,7 @@ def test_a_wall_lit_by_way_of_a_mirror():
     mirror = square((1, 0, -2), (-1, 0, 0), 5, GOOD_MIRROR)
     wall = square((0, 0, -3), (0, 0, 1), 0.9, Material(albedo=0.5))
     scene = scene_of(mirror, wall, laser=Laser("flood", cone_deg=180.0), view=camera(17, 13, 30))
-    samples = specular_light(World(scene), 8).samples
+    samples = specular_light(TracedScene(scene), 8).samples
     image = np.array([2.0, 0, 0])
     rays = scene.camera.rays()
     point = 3 * rays / -rays[..., 2:]
@@ -278,9 +278,9 @@ def test_displaced_laser_lights_a_wall_seen_in_a_mirror():
     mirror = square((0, 0, -2), (1, 0, 1), 3, GOOD_MIRROR)
     wall = square((3, 0, -2), (-1, 0, 0), 9, Material(albedo=0.5))
     laser = Laser("flood", (0, 0.2, 0), 60.0)
-    samples = specular_light(World(scene_of(mirror, wall, laser=laser)), 2).samples
+    samples = specular_light(TracedScene(scene_of(mirror, wall, laser=laser)), 2).samples
     unfolded = square((0, 0, -5), (0, 0, 1), 9, Material(albedo=0.5))
-    plain = direct_light(World(scene_of(unfolded, laser=laser)), np.arange(33 * 25), 2).samples
+    plain = direct_light(TracedScene(scene_of(unfolded, laser=laser)), np.arange(33 * 25), 2).samples
     seen = samples.bounces == 3
     assert samples.radiance[seen].sum() == pytest.approx(0.64 * plain.radiance.sum(), rel=1e-3)
     assert np.average(samples.path_m[seen], weights=samples.radiance[seen]) == pytest.approx(
@@ -299,12 +299,12 @@ def test_light_passes_the_holes_of_a_leaf_both_ways():
     wall = square((0, 0, -2), (0, 0, 1), 9, Material(albedo=0.5))
     view = camera(33, 3, 40)
     x = view.rays()[1, :, 0] / -view.rays()[1, :, 2]
-    depth = centre_layers(World(scene_of(wall, leaf(-1, 0.5), view=view))).depth_m[1] * -view.rays()[1, :, 2]
+    depth = centre_layers(TracedScene(scene_of(wall, leaf(-1, 0.5), view=view))).depth_m[1] * -view.rays()[1, :, 2]
     off_edge = (np.abs(x) > 0.04) & (np.abs(np.abs(x) - 0.5) > 0.04)
     assert np.allclose(depth[off_edge], np.where((x > -0.5) & (x < 0), 1, 2)[off_edge], atol=1e-4)
     # a laser 0.4 m to the right: the shadow of x = -0.5 to 0 at 1 m falls on x = -1.4 to -0.4 at 2 m
     laser = Laser("flood", (0.4, 0, 0), 120.0)
-    samples = direct_light(World(scene_of(wall, leaf(-1, 0.5), view=view, laser=laser)), np.arange(99), 4).samples
+    samples = direct_light(TracedScene(scene_of(wall, leaf(-1, 0.5), view=view, laser=laser)), np.arange(99), 4).samples
     far = samples.path_m > 3.5
     lit = np.bincount(samples.pixel[far], samples.radiance[far], 99).reshape(3, 33)[1] > 0
     on_wall, x = (x > 0.04) | (x < -0.54), 2 * x
@@ -326,42 +326,44 @@ def test_depth_label_is_the_first_opaque_surface():
     pane = square((0, 0, -1), (0, 0, 1), 9, Material("thindielectric", ior=N))
     mirror = quad([(0, -9, -2), (9, -9, -2), (9, 9, -2), (0, 9, -2)], GOOD_MIRROR)
     view = camera(32, 3, 40)
-    layers = centre_layers(World(scene_of(wall, pane, slab(-1.2, 0.2, half=9), mirror, view=view)))
+    layers = centre_layers(TracedScene(scene_of(wall, pane, slab(-1.2, 0.2, half=9), mirror, view=view)))
     depth = layers.depth_m * -view.rays()[..., 2]
     assert np.allclose(depth, np.where(np.arange(32) < 16, 3, 2), atol=1e-4)
 
 
 def test_slab_error_is_stated_and_refused_beside_a_displaced_laser():
     wall, glass = square((0, 0, -3), (0, 0, 1), 9, Material(albedo=0.5)), slab(-1, 0.3, half=2)
-    (error,) = slab_error_m(World(scene_of(wall, glass)))
+    (error,) = slab_error_m(TracedScene(scene_of(wall, glass)))
     a = math.atan(math.hypot(16.5, 12.5) / camera().focal_px)
     b = math.asin(math.sin(a) / N)
     assert error.thickness_m == pytest.approx(0.3)
     assert error.shift_m == pytest.approx(0.3 * math.sin(a - b) / math.cos(b), rel=1e-6)
     assert error.path_m == pytest.approx(2 * N * 0.3 * (1 / math.cos(a) - 1 / math.cos(b)), rel=1e-6)
-    notes = specular_light(World(scene_of(wall, glass))).notes
+    notes = specular_light(TracedScene(scene_of(wall, glass))).notes
     assert any("glass slab" in note and f"{1e3 * error.shift_m:.1f} mm" in note for note in notes)
     with pytest.raises(InputError, match=r"glass slab: .* mm of path .* limit .* 10 mm"):
-        specular_light(World(scene_of(wall, glass, laser=Laser("flood", (0.1, 0, 0), 40.0))))
+        specular_light(TracedScene(scene_of(wall, glass, laser=Laser("flood", (0.1, 0, 0), 40.0))))
     narrow = scene_of(wall, slab(-1, 0.01), laser=Laser("flood", (0.01, 0, 0), 10.0), view=camera(9, 7, 5))
-    assert any("glass slab" in note for note in specular_light(World(narrow)).notes)
+    assert any("glass slab" in note for note in specular_light(TracedScene(narrow)).notes)
 
 
 def test_what_is_left_out_is_said():
     vertices, faces, _ = sphere(0.5, 4)
     ball = Surface(vertices - (0, 0, 3), faces, GOOD_MIRROR, name="chrome ball")
-    light = specular_light(World(scene_of(ball)))
+    light = specular_light(TracedScene(scene_of(ball)))
     assert any("chrome ball" in note for note in light.notes) and not len(light.samples.pixel)
     smooth = replace(ball, normals=vertices)
-    assert any("chrome ball" in note for note in specular_light(World(scene_of(smooth))).notes)
-    assert specular_light(World(scene_of(square((0, 0, -2), (0, 0, 1), 1, Material())))).notes == ()
+    assert any("chrome ball" in note for note in specular_light(TracedScene(scene_of(smooth))).notes)
+    assert specular_light(TracedScene(scene_of(square((0, 0, -2), (0, 0, 1), 1, Material())))).notes == ()
     many = [square((0, 0, -2 - i), (0.01 * i, 0, 1), 0.1, GOOD_MIRROR) for i in range(12)]
-    assert any("left out" in note and "12 planes" in note for note in specular_light(World(scene_of(*many))).notes)
+    assert any(
+        "left out" in note and "12 planes" in note for note in specular_light(TracedScene(scene_of(*many))).notes
+    )
 
 
 def test_planes_of_a_box():
     vertices, faces, uv = box((1, 2, 3))
-    mirrors, _ = find_mirrors(World(scene_of(Surface(vertices - (0, 0, 9), faces, GOOD_MIRROR, uv=uv))))
+    mirrors, _ = find_mirrors(TracedScene(scene_of(Surface(vertices - (0, 0, 9), faces, GOOD_MIRROR, uv=uv))))
     assert sorted(np.abs(mirrors.offset).tolist()) == pytest.approx([0.5, 0.5, 1, 1, 7.5, 10.5])
 
 
@@ -370,7 +372,7 @@ def test_many_panes_and_lenses_take_one_line_each_kind():
     panes = [replace(slab(-1 - 0.1 * i, 0.01 * (1 + i % 3)), name=f"pane {i}") for i in range(12)]
     vertices, faces, _ = sphere(0.1, 2)
     bulbs = [Surface(vertices - (0, 0, 4 + i), faces, panes[0].material, name=f"bulb {i}") for i in range(104)]
-    notes = check_slabs(World(scene_of(*panes, *bulbs)))
+    notes = check_slabs(TracedScene(scene_of(*panes, *bulbs)))
     assert len(notes) == 2
     assert (
         "104 solids" in notes[0]
@@ -378,7 +380,7 @@ def test_many_panes_and_lenses_take_one_line_each_kind():
         and "bulb 7 and 96 more" in notes[0]
         and "bulb 8" not in notes[0]
     )
-    worst = max(slab_error_m(World(scene_of(*panes))), key=lambda error: error.path_m)
+    worst = max(slab_error_m(TracedScene(scene_of(*panes))), key=lambda error: error.path_m)
     assert (
         "12 solids" in notes[1]
         and "crossed in a straight line" in notes[1]

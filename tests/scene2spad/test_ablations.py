@@ -11,7 +11,7 @@ from csph.evaluation.methods import Row
 from csph.training.loop import train
 from scene2spad.cli import main
 from scene2spad.datasets.published import printed
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.registry import ModelSpec
 from scene2spad.networks.training import config_of
 from scene2spad.studies.ablations import plan as plans
 from scene2spad.studies.ablations.study import decided, verdict
@@ -39,7 +39,7 @@ def test_every_model_can_be_trained_and_every_conclusion_decided(study, preset, 
 
 
 def test_the_largest_tensor_is_a_gpus_work():
-    largest = Wanted("learned", (1024, 8, 8), 32)
+    largest = ModelSpec("learned", (1024, 8, 8), 32)
     of = {p: {w for s in plans.sheets_of("spatial-block", p, True) for w in s.wanted} for p in ("laptop", "paper")}
     assert largest in of["paper"] and largest not in of["laptop"]
 
@@ -62,9 +62,9 @@ def test_intervals_decide(relation, interval, expected):
 
 
 def test_a_conclusion_is_decided_scene_by_scene_and_says_what_is_absent():
-    claim = plans.Claim("c", Wanted(), plans.BETTER, Wanted(block=(256, 2, 2)))
+    claim = plans.Claim("c", ModelSpec(), plans.BETTER, ModelSpec(block=(256, 2, 2)))
 
-    def row(one: Wanted, scene: int, mae: float) -> Row:
+    def row(one: ModelSpec, scene: int, mae: float) -> Row:
         return Row(one.name, str(scene), scene, 10.0, 10.0, "all", mae, mae, 0, 0, 0.5, 1.0, 0.0, 4, 0, 0)
 
     # hard scenes are hard for both: the pairs tell the two apart though their ranges overlap

@@ -248,3 +248,8 @@ def test_interrupt_ends_with_its_own_status(capfd, folder, monkeypatch):
     monkeypatch.setattr("render.engine.render", stop)
     status, out, err = run(capfd, "render", "sphere", *SMALL)
     assert status == 130 and out == "" and "interrupted" in err and list(folder.iterdir()) == []
+
+
+def test_a_scene_with_a_slash_in_its_name_gets_a_file_in_this_folder(folder, capfd):
+    assert main(["render", "rooms/test/0", *SMALL, "--bounces", "1", "--no-figure"]) == 0
+    assert read_transient(folder / "rooms-test-0.exr").height > 0

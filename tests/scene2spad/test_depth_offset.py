@@ -18,7 +18,7 @@ from scene2spad.cli import main
 from scene2spad.datasets import published
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.test_sets import TestSet, evaluated
-from scene2spad.networks.registry import Library, Subject, Wanted
+from scene2spad.networks.registry import EvaluatedModel, ModelRegistry, ModelSpec
 from scene2spad.studies.depth_offset import plan as plans
 from scene2spad.studies.depth_offset import study as depth_offset
 from scene2spad.studies.depth_offset import tables
@@ -115,7 +115,7 @@ def test_a_time_offset_leaves_every_pixel_its_signal():
 def test_results_are_computed_once_and_shared_by_parts_of_a_set(tmp_path):
     views = random_planes(2, size=10, seed=1)
     test, store = TestSet("planes", views), Store(tmp_path)
-    one = Subject("one", Counting(), "1" * 64)
+    one = EvaluatedModel("one", Counting(), "1" * 64)
     levels = ((10.0, 10.0), (50.0, 50.0))
     Counting.asked = 0
     rows = evaluated(store, [one], test, levels, delay_m=1.0, maps=(0,))
@@ -162,7 +162,7 @@ def test_arrival_lies_where_the_published_pulse_has_its_centroid(tmp_path):
     bright = from_rgbd(pair.depth_m, pair.luma, pair.luma, SENSOR, PhotonBudget(1e5, 0), convention="published")
     counts = np.round(bright.rates).astype(np.int32)
     clean = SimpleNamespace(counts=counts, sensor=SENSOR, depth_m=bright.depth_m.astype(np.float32))
-    errors = published._errors(Subject("mean", Counting(), "x"), clean)
+    errors = published._errors(EvaluatedModel("mean", Counting(), "x"), clean)
     taps = published_taps(SENSOR)
     early_mm = 1e3 * (taps.argmax() - taps @ np.arange(len(taps))) * 3e8 * SENSOR.bin_width_s / 2
     assert errors["mae_mm_arrival"] < 0.1
@@ -181,7 +181,7 @@ def test_pairs_have_the_published_size_and_depths(shared_data, monkeypatch, name
 
 
 def test_published_rows_stand_beside_ours(tmp_path):
-    wanted = Wanted("learned", (1024, 4, 4), 128)
+    wanted = ModelSpec("learned", (1024, 4, 4), 128)
     figures = {"mae_mm_label": 8.0, "mae_mm_arrival": 5.0, "rmse_mm_label": 9.0}
     rows = [
         {
@@ -239,12 +239,12 @@ def test_training_depths_are_the_models_own_or_those_of_the_set_given(tmp_path):
     silent = SimpleNamespace(config=SimpleNamespace(data={}))
     told = SimpleNamespace(config=SimpleNamespace(data={"training_reach_m": 6.5}))
     options = (plans.SMOKE, Store(tmp_path / "r"), tmp_path, 0, None)
-    session = depth_offset.Session(options[0], {Wanted(): silent}, *options[1:], packed)
+    session = depth_offset.Session(options[0], {ModelSpec(): silent}, *options[1:], packed)
     depth = np.concatenate([t.depth_m[np.isfinite(t.depth_m)] for t in views.transients[:3]])
     assert session.reach_m == pytest.approx(float(np.quantile(depth, 0.999)), abs=0.5)
-    session = depth_offset.Session(options[0], {Wanted(): silent, Wanted(seed=1): told}, *options[1:], packed)
+    session = depth_offset.Session(options[0], {ModelSpec(): silent, ModelSpec(seed=1): told}, *options[1:], packed)
     assert session.reach_m == 6.5
-    assert depth_offset.Session(options[0], {Wanted(): silent}, *options[1:]).reach_m is None
+    assert depth_offset.Session(options[0], {ModelSpec(): silent}, *options[1:]).reach_m is None
 
 
 @pytest.mark.slow
@@ -262,7 +262,7 @@ def test_interrupted_and_resumed_repeats_nothing(capfd, tmp_path, monkeypatch):
     }  # fmt: skip
 
     counts = {"put": 0, "stop": 0}
-    put, share = Store.put, Library.train
+    put, share = Store.put, ModelRegistry.train
 
     def counted(self, *values, **key):
         counts["put"] += 1
@@ -276,9 +276,9 @@ def test_interrupted_and_resumed_repeats_nothing(capfd, tmp_path, monkeypatch):
 
     results = tmp_path / "whole/smoke/results"
     whole = sum(len(path.read_text().splitlines()) for path in results.glob("*.jsonl"))
-    monkeypatch.setattr(Library, "train", stopped)
+    monkeypatch.setattr(ModelRegistry, "train", stopped)
     assert run(tmp_path / "cut") == 130
-    monkeypatch.setattr(Library, "train", share)
+    monkeypatch.setattr(ModelRegistry, "train", share)
     monkeypatch.setattr(Store, "put", counted)
     for stop in (3, 8, whole):
         counts["stop"] = stop

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from scene2spad.datasets.planes import wall
-from scene2spad.networks.registry import Library, Wanted
+from scene2spad.networks.registry import ModelRegistry, ModelSpec
 from scene2spad.networks.training import network_method
 from scene2spad.studies.depth_offset import range_end
 from spad.detection.detect import sense
@@ -16,7 +16,7 @@ SENSOR = Sensor()
 
 @pytest.fixture(scope="module")
 def fourier(tmp_path_factory):
-    return Library(tmp_path_factory.mktemp("none")).find(Wanted("fourier", (1024, 1, 1)))
+    return ModelRegistry(tmp_path_factory.mktemp("none")).find(ModelSpec("fourier", (1024, 1, 1)))
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from csph.evaluation.methods import Row
 from scene2spad.cli import main
 from scene2spad.datasets.planes import random_planes
-from scene2spad.networks.registry import Subject
+from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.studies.multipath import study as multipath
 from scene2spad.studies.multipath.plan import FILTER, LIGHTS, MODELS, PLANS
 from scene2spad.studies.transport.study import direct_alone
@@ -30,7 +30,7 @@ def test_conclusions_count_scenes_and_find_the_least_background():
         for scene, mae in zip("ab", both, strict=True)
     ]
     rows += [row("net", "a", near, 999, "mixed")]  # of a group that is not asked for
-    subjects = [Subject(name, None, name) for name in (FILTER, "net")]
+    subjects = [EvaluatedModel(name, None, name) for name in (FILTER, "net")]
     means = multipath.summary({"flood": rows}, subjects, LEVELS)
     scenes = multipath.by_scene({"flood": rows}, subjects, "ab")
     assert {(m["method"], m["background"]): m["mae_mm"] for m in means} == {

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from scene2spad.cli import main
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.registry import ModelSpec
 from scene2spad.options.experiments import ABLATIONS
 from scene2spad.report import html as report_html
 from scene2spad.report import page as report
@@ -292,7 +292,7 @@ def test_every_file_expected_is_written_somewhere_in_the_package():
 
 
 def test_published_numbers_stand_beside_ours():
-    one, other = Wanted("fourier", (1024, 1, 1)), Wanted("gray", (1024, 1, 1))
+    one, other = ModelSpec("fourier", (1024, 1, 1)), ModelSpec("gray", (1024, 1, 1))
     rows = report_published.error_rows([one, other], [{"model": one.name, "near_mae_mm_label": 80.68}], far=False)
     assert rows[0]["near published"] == 40.34 and rows[0]["near ours / published"] == "2.00 worse"
     assert len(rows) == 1  # print stands beside what was measured, alone beside nothing

@@ -13,12 +13,12 @@ import tyro
 from csph.networks.model import load_model, save_model
 from scene2spad.cli.main import Command
 from scene2spad.datasets.planes import random_planes
-from scene2spad.networks.registry import Library, Wanted, check, ship_all
+from scene2spad.networks.registry import ModelRegistry, ModelSpec, check, ship_all
 from scene2spad.networks.training import config_of, training_reach_m
 from scene2spad.studies.results import Store
 from scenes import InputError
 
-LEARNED = Wanted("learned", (256, 4, 4), 128, 1)
+LEARNED = ModelSpec("learned", (256, 4, 4), 128, 1)
 
 
 def quietly(what: str, share: float) -> None:
@@ -29,12 +29,17 @@ def quietly(what: str, share: float) -> None:
 def folder(tmp_path_factory) -> Path:
     """A folder of runs that holds one."""
     path = tmp_path_factory.mktemp("models")
-    Library(path, None).train([LEARNED], "smoke", Path("planes"), quietly)
+    ModelRegistry(path, None).train([LEARNED], "smoke", Path("planes"), quietly)
     return path
 
 
 def test_names_and_labels():
-    wanted = [Wanted(), Wanted("fourier+learned", full=True), Wanted("none", seed=2), Wanted(time_offset_m=7.5)]
+    wanted = [
+        ModelSpec(),
+        ModelSpec("fourier+learned", full=True),
+        ModelSpec("none", seed=2),
+        ModelSpec(time_offset_m=7.5),
+    ]
     assert [one.name for one in wanted] == [
         "learned-256x4x4-128x-s0",
         "full-fourier-learned-256x4x4-128x-s0",
@@ -48,10 +53,10 @@ def test_names_and_labels():
     "wanted",
     [
         LEARNED,
-        Wanted("none"),
-        Wanted("peak"),
-        Wanted("fourier", (1024, 1, 1), 64, 2),
-        Wanted(time_offset_m=8, full=True),
+        ModelSpec("none"),
+        ModelSpec("peak"),
+        ModelSpec("fourier", (1024, 1, 1), 64, 2),
+        ModelSpec(time_offset_m=8, full=True),
     ],
     ids=lambda one: one.name,
 )
@@ -64,22 +69,22 @@ def test_spelled_command_is_the_command(wanted):
 
 
 def test_found_trained_shipped_or_absent(folder, tmp_path, caplog):
-    found = Library(folder, None).find(LEARNED)
+    found = ModelRegistry(folder, None).find(LEARNED)
     assert found.described()["trained_on"] == "planes" and not found.shipped and found.table("energy.csv")
-    assert Library(tmp_path, None).find(LEARNED) is None
+    assert ModelRegistry(tmp_path, None).find(LEARNED) is None
     names = ship_all([found], tmp_path / "weights")
     assert names == [str(tmp_path / "weights" / f"{LEARNED.name}.safetensors")]
-    shipped = Library(tmp_path, tmp_path / "weights").find(LEARNED)
+    shipped = ModelRegistry(tmp_path, tmp_path / "weights").find(LEARNED)
     assert shipped.shipped and shipped.digest != found.digest and len(shipped.table("log.csv")) == 2
     assert shipped.config.data["training_reach_m"] == found.config.data["training_reach_m"]
     assert ship_all([shipped], tmp_path / "none") == []
-    other = Wanted("fourier", (1024, 1, 1), seed=99)  # of a seed that nobody ships
-    assert [*Library(folder).gather([other, LEARNED])] == [LEARNED]
+    other = ModelSpec("fourier", (1024, 1, 1), seed=99)  # of a seed that nobody ships
+    assert [*ModelRegistry(folder).gather([other, LEARNED])] == [LEARNED]
 
 
 def test_finished_runs_are_not_trained_again(folder, monkeypatch):
     monkeypatch.setattr("scene2spad.networks.registry.run_train", lambda *_: pytest.fail("trained again"))
-    Library(folder).train([LEARNED], "smoke", Path("planes"), quietly)
+    ModelRegistry(folder).train([LEARNED], "smoke", Path("planes"), quietly)
 
 
 def test_a_run_killed_before_its_last_weights_goes_on(folder, tmp_path):
@@ -88,7 +93,7 @@ def test_a_run_killed_before_its_last_weights_goes_on(folder, tmp_path):
     shutil.copytree(folder / LEARNED.name, run)
     last = (run / "last.safetensors").read_bytes()
     (run / "last.safetensors").unlink()
-    library = Library(tmp_path / "models", None)
+    library = ModelRegistry(tmp_path / "models", None)
     assert library.find(LEARNED) is None
     library.train([LEARNED], "smoke", Path("planes"), quietly)
     assert (run / "last.safetensors").read_bytes() == last and library.find(LEARNED) is not None
@@ -99,11 +104,11 @@ def test_unfinished_runs_are_left_out(folder, tmp_path, caplog):
     run.mkdir()
     for name in ("model.safetensors", "config.json", "log.csv"):
         (run / name).write_bytes((folder / LEARNED.name / name).read_bytes())
-    assert Library(tmp_path).find(LEARNED) is not None  # its log reaches the last step
+    assert ModelRegistry(tmp_path).find(LEARNED) is not None  # its log reaches the last step
     rows = list(csv.reader((run / "log.csv").open()))
     (run / "log.csv").write_text("\n".join(",".join(row) for row in rows[:-1]) + "\n")
     with caplog.at_level(logging.WARNING, "scene2spad"):
-        assert Library(tmp_path).find(LEARNED) is None
+        assert ModelRegistry(tmp_path).find(LEARNED) is None
     assert "not come to its end" in caplog.text
 
 
@@ -118,9 +123,9 @@ def test_other_models_under_its_name_are_refused_in_one_line(folder, tmp_path):
         run.mkdir(exist_ok=True)
         save_model(model, replace(config, **changes), state, run / "model.safetensors")
         with pytest.raises(InputError, match=said):
-            Library(tmp_path).find(LEARNED)
+            ModelRegistry(tmp_path).find(LEARNED)
     with pytest.raises(InputError, match="design learned 256x4x4 K32, expected learned 1024x4x4 K128"):
-        check(config, Wanted("learned", (1024, 4, 4), 128, 1), Path("x"))
+        check(config, ModelSpec("learned", (1024, 4, 4), 128, 1), Path("x"))
 
 
 def test_reach_is_the_depth_that_one_pixel_in_a_thousand_passes():

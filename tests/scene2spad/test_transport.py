@@ -13,8 +13,8 @@ from csph.evaluation.methods import Row
 from csph.evaluation.metrics import Interval
 from render.transient import Transient
 from scene2spad.cli import main
-from scene2spad.networks.lookup import Obtained
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.lookup import ModelLookup
+from scene2spad.networks.registry import ModelSpec
 from scene2spad.networks.training import run_train
 from scene2spad.studies.transport import plan as transport_plan
 from scene2spad.studies.transport import planned_renders as transport_planned
@@ -213,7 +213,7 @@ def made_up_rows(turned: str) -> dict[tuple[str, str], list[Row]]:
 
 def contenders() -> list[transport_tables.Contender]:
     plan = replace(PLANS["smoke"], codes=("fourier-8", "gray-8", "coarse-8"))
-    return transport.contenders_of(plan, Obtained({}, []))[1:]
+    return transport.contenders_of(plan, ModelLookup({}, []))[1:]
 
 
 def test_a_pair_that_turns_is_found_where_it_turns():
@@ -243,7 +243,7 @@ def test_the_table_has_the_change_by_each_step():
 
 
 def test_codes_are_ranked_among_their_own():
-    plan, models = PLANS["laptop"], Obtained({}, [])
+    plan, models = PLANS["laptop"], ModelLookup({}, [])
     kinds = {one.name: (one.decoder, one.compression) for one in transport.contenders_of(plan, models)}
     assert kinds["log-matched"][1] == 1 and kinds["fourier-8"][1] == 128 and kinds["gray-16"][1] == 64
     assert len({one.subject.digest for one in transport.contenders_of(plan, models)}) == len(kinds)
@@ -263,7 +263,7 @@ def test_every_model_tiles_the_images(preset):
 
 @pytest.mark.slow
 def test_a_small_run_ends_and_again_without_work(capfd, tmp_path, monkeypatch):
-    one = Wanted("fourier", (1024, 1, 1))
+    one = ModelSpec("fourier", (1024, 1, 1))
     run_train(one.command("smoke", Path("planes"), tmp_path / "models"), lambda what, share: None)
     capfd.readouterr()
     command = ["study", "transport", "--preset", "smoke", "--out", str(tmp_path / "out"), "--json"]

@@ -22,9 +22,9 @@ def view(index: int, split: str = "train") -> Scene:
 @cache
 def depth(index: int) -> np.ndarray:
     from render.direct.integrator import centre_layers
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
-    return centre_layers(World(view(index))).depth_m
+    return centre_layers(TracedScene(view(index))).depth_m
 
 
 def test_equal_numbers_give_equal_bytes_and_others_other_views():
@@ -104,8 +104,8 @@ def test_materials_of_all_views_are_of_the_same_kinds():
 def test_depths_of_two_hundred_views():
     """From arm's length to the end of a hall: nothing under 0.3 m, most within rooms' depths, some beyond 8 m."""
     from render.direct.integrator import centre_layers
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
-    seen = np.array([centre_layers(World(clutter_view(i, width=32, height=32))).depth_m for i in range(200)])
+    seen = np.array([centre_layers(TracedScene(clutter_view(i, width=32, height=32))).depth_m for i in range(200)])
     assert np.isfinite(seen).all() and seen.min() >= NEAREST_M and seen.max() < 26
     assert 1.5 < np.median(seen) < 3.5 and 0.05 < (seen > 6.3).mean() < 0.3 and (seen > 8).mean() > 0.02

@@ -11,9 +11,9 @@ GREY = Texture(np.full((40, 60), 0.4, np.float32), "grey")
 
 def layers(scene):
     from render.direct.integrator import centre_layers
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
-    found = centre_layers(World(scene))
+    found = centre_layers(TracedScene(scene))
     shape = scene.camera.height, scene.camera.width
     axial = (scene.camera.rays() @ scene.camera.rotation)[..., 2]
     return found.depth_m.reshape(shape) * axial, found

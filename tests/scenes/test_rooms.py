@@ -26,9 +26,9 @@ def view(index: int, split: str = "train") -> Scene:
 @cache
 def depth(index: int) -> np.ndarray:
     from render.direct.integrator import centre_layers
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
-    return centre_layers(World(view(index))).depth_m
+    return centre_layers(TracedScene(view(index))).depth_m
 
 
 def test_equal_numbers_give_equal_bytes_and_others_other_rooms():
@@ -157,7 +157,7 @@ def test_names_lead_to_views_and_wrong_ones_are_one_line():
 
 def test_tabletop_scenes_are_named_fixed_and_in_range():
     from render.direct.integrator import centre_layers
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
     from scenes.library.tabletop import SCENES, tabletop
 
     assert len(SCENES) == 8
@@ -166,7 +166,7 @@ def test_tabletop_scenes_are_named_fixed_and_in_range():
         assert scene.name == f"tabletop/{name}" and scene.digest() == tabletop(name, width=44, height=36).digest()
         # traces of light from where none is seen would be all the ambient light, in a few pixels
         assert not scene.has_ambient
-        seen = centre_layers(World(scene)).depth_m
+        seen = centre_layers(TracedScene(scene)).depth_m
         assert seen.min() >= 1.1 and seen.max() <= 2.9 and np.median(seen) < 2.6
 
 
@@ -174,9 +174,9 @@ def test_tabletop_scenes_are_named_fixed_and_in_range():
 def test_depths_of_two_hundred_views():
     """Quantiles as NYUv2's: 0.5 to 7 m, median 2 to 3.5 m, under 1 % beyond 7 m; no view with over 2 % empty pixels."""
     from render.direct.integrator import centre_layers
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
-    seen = np.array([centre_layers(World(room_view(i, width=32, height=32))).depth_m for i in range(200)])
+    seen = np.array([centre_layers(TracedScene(room_view(i, width=32, height=32))).depth_m for i in range(200)])
     assert np.isnan(seen).mean(axis=1).max() <= 0.02
     assert np.nanquantile(seen, 0.001) >= 0.5 and 2.0 <= np.nanmedian(seen) <= 3.5 and np.nanmean(seen > 7) < 0.01
     assert len({row.tobytes() for row in seen}) == 200

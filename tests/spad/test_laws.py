@@ -11,7 +11,7 @@ from test_flux import transient_of
 from scenes import InputError
 from spad.detection.detect import expected_in_pixel, sense, sense_timestamps, stream_timestamps
 from spad.detection.laws import (
-    Detected,
+    Detections,
     add_crosstalk,
     coates,
     crosstalk_events,
@@ -293,7 +293,7 @@ def test_crosstalk_of_counts_is_binomial() -> None:
 
 
 def test_first_of_each_cycle_keeps_the_earliest() -> None:
-    events = Detected(np.array([1, 0, 1, 1, 0]), np.array([3, 0, 3, 4, 0]), np.array([9, 5, 2, 7, 5]))
+    events = Detections(np.array([1, 0, 1, 1, 0]), np.array([3, 0, 3, 4, 0]), np.array([9, 5, 2, 7, 5]))
     first = first_of_each_cycle(events, SMALL)
     assert [tuple(map(int, event)) for event in zip(*first, strict=True)] == [(0, 0, 5), (1, 3, 2), (1, 4, 7)]
 

@@ -30,13 +30,13 @@ from ultraphase.assembly.source import Cursor, Line, Token, source_lines
 from ultraphase.chip import ChipSpec
 
 _REGISTER = re.compile(r"r(\d+)\Z")
-_MOST_STATEMENTS = 20_000
-_MOST_INCLUDES = 8  # inside one another
-_MOST_NESTED = 32  # parentheses and signs, and loops
-_MOST_REPEATED = 1 << 18  # lines of all loops' turns, those of loops inside others counted each time
-_MOST_BYTES = 1 << 22
-_MOST_VALUE = 1 << 31
-_MOST_DIGITS = 64
+_MAX_STATEMENTS = 20_000
+_MAX_INCLUDES = 8  # inside one another
+_MAX_NESTED = 32  # parentheses and signs, and loops
+_MAX_REPEATED = 1 << 18  # lines of all loops' turns, those of loops inside others counted each time
+_MAX_BYTES = 1 << 22
+_MAX_VALUE = 1 << 31
+_MAX_DIGITS = 64
 
 Reader = Callable[[str], str]
 
@@ -81,7 +81,7 @@ def assemble_file(
 
 
 def _source_text(path: Path) -> str:
-    return read_text(path, "assembler source", most_bytes=_MOST_BYTES)
+    return read_text(path, "assembler source", most_bytes=_MAX_BYTES)
 
 
 class _Assembly:
@@ -107,8 +107,8 @@ class _Assembly:
                 at = body + 1
                 continue
             self.statements += 1
-            if self.statements > _MOST_STATEMENTS:
-                raise lines[at].fail(1, f"more than {_MOST_STATEMENTS} statements")
+            if self.statements > _MAX_STATEMENTS:
+                raise lines[at].fail(1, f"more than {_MAX_STATEMENTS} statements")
             self._statement(lines[at])
             at += 1
 
@@ -132,11 +132,11 @@ class _Assembly:
         last = self._expression(cursor)
         cursor.end()
         column = head.tokens[0].column
-        if self.loops >= _MOST_NESTED:
-            raise head.fail(column, f".for inside {_MOST_NESTED} others, expected fewer")
+        if self.loops >= _MAX_NESTED:
+            raise head.fail(column, f".for inside {_MAX_NESTED} others, expected fewer")
         self.repeated += max(0, last - first + 1) * max(1, len(body))
-        if self.repeated > _MOST_REPEATED:
-            raise head.fail(column, f"loops repeat {self.repeated} lines, expected {_MOST_REPEATED} at the most")
+        if self.repeated > _MAX_REPEATED:
+            raise head.fail(column, f"loops repeat {self.repeated} lines, expected {_MAX_REPEATED} at the most")
         self.loops += 1
         for value in range(first, last + 1):
             loops = {**head.loops, variable.text: value}
@@ -186,8 +186,8 @@ class _Assembly:
 
     def _include(self, line: Line) -> None:
         at = line.tokens[-1]
-        if self.read is None or self.includes >= _MOST_INCLUDES or at.kind != "file":
-            raise line.fail(at.column, f'.include "file" is not possible here, or more than {_MOST_INCLUDES} deep')
+        if self.read is None or self.includes >= _MAX_INCLUDES or at.kind != "file":
+            raise line.fail(at.column, f'.include "file" is not possible here, or more than {_MAX_INCLUDES} deep')
         try:
             text = self.read(at.text)
         except InputError as error:
@@ -333,13 +333,13 @@ class _Assembly:
             if operator.text != "*" and right == 0:
                 raise cursor.line.fail(operator.column, "division by zero")
             total = total * right if operator.text == "*" else total // right if operator.text == "/" else total % right
-            if abs(total) >= _MOST_VALUE:
+            if abs(total) >= _MAX_VALUE:
                 raise cursor.line.fail(operator.column, f"{total} does not fit into 32 bits")
         return total
 
     def _atom(self, cursor: Cursor, more: Mapping[str, int]) -> int:
-        if cursor.depth > _MOST_NESTED:
-            raise cursor.fail(f"more than {_MOST_NESTED} parentheses or signs deep")
+        if cursor.depth > _MAX_NESTED:
+            raise cursor.fail(f"more than {_MAX_NESTED} parentheses or signs deep")
         if cursor.next.text in ("-", "("):
             cursor.depth += 1
             negative = cursor.mark("-")
@@ -351,8 +351,8 @@ class _Assembly:
             cursor.at += 1
             base = {"0x": 16, "0b": 2}.get(token.text[:2].lower(), 10)
             # Python refuses to convert very long decimals
-            value = int(token.text, base) if len(token.text) <= _MOST_DIGITS else _MOST_VALUE
-            if value >= _MOST_VALUE:
+            value = int(token.text, base) if len(token.text) <= _MAX_DIGITS else _MAX_VALUE
+            if value >= _MAX_VALUE:
                 raise cursor.line.fail(token.column, f"{token.text} does not fit into 32 bits")
             return value
         token = cursor.take("name", "a number or a name")

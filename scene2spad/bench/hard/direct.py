@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from render.direct.cell_tree import MOST_CELLS
+from render.direct.cell_tree import MAX_CELLS
 from render.engine import render
 from render.settings import RenderSettings
 from scene2spad.bench.hard import oracles
@@ -170,7 +170,7 @@ def _wire(seed: int) -> Outcome:
     column = int(scene.camera.width / 2 + scene.camera.focal_px * scenes.WIRE_X_M / scenes.WIRE_M)
     dimmed = 1 - on_wall.total[:, column] / bare.total[:, column]
     # the wire, of a round profile, shines from its middle, but hides the wall to its edges: known to half a finest cell
-    half_cell = 0.5 / MOST_CELLS / expected.coverage_px
+    half_cell = 0.5 / MAX_CELLS / expected.coverage_px
     errors = {
         "energy of a row": Measured(worst(by_row, expected.radiance), 0.02),
         "energy": Measured(relative(by_row.sum(), expected.radiance.sum()), 0.02),

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from render.scene.traced_scene import World, dr
+from render.scene.traced_scene import TracedScene, dr
 from scene2spad.bench.rendering import ours
 from scene2spad.bench.rendering.binning import binned
 from scene2spad.bench.rendering.curves import Point, flattens, slopes
@@ -70,7 +70,7 @@ class Runner:
     release: Callable[[], None] = field(default=lambda: None)
 
 
-def our_runner(world: World, method: Method, transport: str) -> Runner:
+def our_runner(world: TracedScene, method: Method, transport: str) -> Runner:
     """Trace and bin.
 
     The last histogram is dropped right before the next is made, in its place. Tracing gives freed memory back to the

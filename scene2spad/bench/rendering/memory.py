@@ -46,16 +46,16 @@ def measure(name: str, scene_name: str, size: int, data: Path | None) -> float:
     Ours ends at its samples, since nothing of ours needs bins; mitransient has nothing but the dense tensor.
     """
     method = next(m for m in METHODS["full"] if m.name == name)
-    from render.scene.traced_scene import World
+    from render.scene.traced_scene import TracedScene
 
     if method.code != "ours":
         import mitransient  # noqa: F401  (an import, so not counted)
     before = reset_peak_mb()
     scene = settings.bench_scene(scene_name, size, data)
     if method.code == "ours":
-        kept = ours.trace(World(scene), method, BOUNCES["full"], SPP, 1)
+        kept = ours.trace(TracedScene(scene), method, BOUNCES["full"], SPP, 1)
     else:
-        kept = peers.Peer(World(scene), method.sampler, BOUNCES["full"], BINS, BIN_M).render(SPP, 1)
+        kept = peers.Peer(TracedScene(scene), method.sampler, BOUNCES["full"], BINS, BIN_M).render(SPP, 1)
     peak = peak_mb() - before
     del kept
     return peak

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from render.direct.integrator import least_share_of
 from render.pipeline import trace as trace_light
-from render.scene.traced_scene import World
+from render.scene.traced_scene import TracedScene
 from render.settings import Plan, RenderSettings
 from render.transient.samples import Samples
 from scene2spad.bench.rendering.settings import Method, grid_beside
@@ -12,7 +12,7 @@ from scene2spad.bench.rendering.settings import Method, grid_beside
 MERGED_M = 0.0  # nothing is merged: a histogram follows at once
 
 
-def trace(world: World, method: Method, bounces: int, quality: int, seed: int) -> Samples:
+def trace(world: TracedScene, method: Method, bounces: int, quality: int, seed: int) -> Samples:
     """Merged samples of all pixels, nothing planned or estimated: every setting is forced."""
     grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality), quality)
     forced = {"bounces": bounces, "spp": spp, "grid": grid, "filter": method.filter}

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from render.scene.traced_scene import World, dr, mi
+from render.scene.traced_scene import TracedScene, dr, mi
 from scenes.errors import InputError
 from scenes.files import silenced
 from scenes.model import Scene
@@ -31,7 +31,7 @@ class Peer:
     compiles calls for every such object there is, so a second set of them would slow both codes down.
     """
 
-    def __init__(self, world: World, sampler: str, bounces: int, bins: int, bin_m: float) -> None:
+    def __init__(self, world: TracedScene, sampler: str, bounces: int, bins: int, bin_m: float) -> None:
         with silenced():
             import mitransient  # noqa: F401  (registers its plugins with Mitsuba)
         scene = world.scene

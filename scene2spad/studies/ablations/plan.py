@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.registry import ModelSpec
 from scene2spad.studies.depth_offset.tables import RATIO_LEVELS
 
 Level = tuple[float, float]
@@ -24,7 +24,7 @@ class Sheet:
 
     figure: str
     title: str
-    wanted: tuple[Wanted, ...]
+    wanted: tuple[ModelSpec, ...]
     shown: tuple[Level, ...]
 
     @property
@@ -37,14 +37,14 @@ class Claim:
     """A conclusion of the paper: the first model stands in `relation` to the second at a group of levels."""
 
     text: str
-    first: Wanted
+    first: ModelSpec
     relation: str
-    second: Wanted
+    second: ModelSpec
     levels: str = "all"
 
 
-def _learned(bins: int, side: int, ratio: int, *, full: bool = False) -> Wanted:
-    return Wanted("learned", (bins, side, side), ratio, full=full)
+def _learned(bins: int, side: int, ratio: int, *, full: bool = False) -> ModelSpec:
+    return ModelSpec("learned", (bins, side, side), ratio, full=full)
 
 
 def _spatial(ratio: int, preset: str) -> tuple[Sheet, ...]:
@@ -77,13 +77,13 @@ def _size(ratio: int, preset: str) -> tuple[Sheet, ...]:
 def _fourier(ratio: int, preset: str) -> tuple[Sheet, ...]:
     wanted = (
         _learned(256, 4, ratio),
-        Wanted("fourier+learned", (256, 4, 4), ratio),
+        ModelSpec("fourier+learned", (256, 4, 4), ratio),
         _learned(256, 2, ratio),
-        Wanted("fourier+learned", (256, 2, 2), ratio),
+        ModelSpec("fourier+learned", (256, 2, 2), ratio),
         _learned(256, 1, ratio),
-        Wanted("fourier", (256, 1, 1), ratio),
-        Wanted("fourier", (1024, 1, 1), ratio),
-        Wanted("gray", (1024, 1, 1), ratio),
+        ModelSpec("fourier", (256, 1, 1), ratio),
+        ModelSpec("fourier", (1024, 1, 1), ratio),
+        ModelSpec("gray", (1024, 1, 1), ratio),
     )
     return (Sheet("11" if ratio == 64 else "12", "learned and Fourier temporal codes", wanted, (MIDDLE, LAST)),)
 
@@ -96,7 +96,7 @@ _SHEETS = {
 _SMOKE = {
     "spatial-block": (_learned(256, 1, 128), _learned(256, 2, 128)),
     "tensor-size": (_learned(256, 4, 128), _learned(64, 4, 128)),
-    "fourier": (Wanted("fourier", (1024, 1, 1), 128), Wanted("gray", (1024, 1, 1), 128)),
+    "fourier": (ModelSpec("fourier", (1024, 1, 1), 128), ModelSpec("gray", (1024, 1, 1), 128)),
 }
 
 
@@ -131,7 +131,7 @@ CLAIMS: dict[str, tuple[Claim, ...]] = {
     "fourier": (
         Claim(
             "Fourier temporal codes do at 64x",
-            Wanted("fourier+learned", (256, 4, 4), 64),
+            ModelSpec("fourier+learned", (256, 4, 4), 64),
             ALIKE,
             _learned(256, 4, 64),
         ),
@@ -139,10 +139,10 @@ CLAIMS: dict[str, tuple[Claim, ...]] = {
             "learned ones win at 128x, low SBR, 2 x 2",
             _learned(256, 2, 128),
             BETTER,
-            Wanted("fourier+learned", (256, 2, 2), 128),
+            ModelSpec("fourier+learned", (256, 2, 2), 128),
             "low_sbr",
         ),
-        Claim("4 x 4 is best at 128x", _learned(256, 4, 128), BETTER, Wanted("fourier", (1024, 1, 1), 128)),
-        Claim("also beside Gray Fourier", _learned(256, 4, 128), BETTER, Wanted("gray", (1024, 1, 1), 128)),
+        Claim("4 x 4 is best at 128x", _learned(256, 4, 128), BETTER, ModelSpec("fourier", (1024, 1, 1), 128)),
+        Claim("also beside Gray Fourier", _learned(256, 4, 128), BETTER, ModelSpec("gray", (1024, 1, 1), 128)),
     ),
 }

@@ -20,7 +20,7 @@ from render.pipeline import Progress
 from scene2spad.datasets import published
 from scene2spad.datasets.test_sets import TestSet, depth_map, evaluated, rendered
 from scene2spad.networks.lookup import obtain, other_seeds
-from scene2spad.networks.registry import Trained, Wanted, ship_all
+from scene2spad.networks.registry import ModelSpec, Trained, ship_all
 from scene2spad.options.experiments import Study
 from scene2spad.studies.ablations import figures
 from scene2spad.studies.ablations.plan import ALIKE_WITHIN, BETTER, CLAIMS, LEVELS, Claim, Sheet, sheets_of
@@ -70,7 +70,7 @@ def run(command: Study, progress: Progress) -> dict:
     return {**(numbers if command.json else _told(numbers)), **files, "shipped": shipped}
 
 
-def decided(claim: Claim, rows: Sequence[Row], models: Mapping[Wanted, Trained]) -> dict[str, Any]:
+def decided(claim: Claim, rows: Sequence[Row], models: Mapping[ModelSpec, Trained]) -> dict[str, Any]:
     """A conclusion with its numbers: holds, does not hold, or not decided.
 
     The paired difference of MAE over scenes and levels decides, by its 95 % interval: `better` holds where it lies
@@ -112,7 +112,7 @@ def verdict(relation: str, apart: Sequence[float], second_mm: float) -> str:
 def _drawn(
     command: Study,
     sheet: Sheet,
-    models: Mapping[Wanted, Trained],
+    models: Mapping[ModelSpec, Trained],
     test: TestSet,
     rows: Sequence[Row],
     store: Store,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from csph.evaluation.metrics import PHOTON_LEVELS
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.registry import ModelSpec
 
 Level = tuple[float, float]
 TEST_SET = "tabletop"
@@ -13,15 +13,15 @@ WITHIN = 0.02  # of the float model's MAE: what the chip may lose
 PAIR_LEVELS: tuple[Level, ...] = ((10.0, 10.0), (10.0, 200.0), (50.0, 50.0), (50.0, 500.0))
 ROOM_VIEWS, ROOM_SIZE = 8, (64, 64)
 MAIN = (
-    Wanted("fourier+learned", (256, 2, 2), 128),
-    Wanted("fourier+learned", (256, 2, 2), 64),
-    Wanted("fourier", (1024, 1, 1), 128),
-    Wanted("fourier", (1024, 1, 1), 64),
+    ModelSpec("fourier+learned", (256, 2, 2), 128),
+    ModelSpec("fourier+learned", (256, 2, 2), 64),
+    ModelSpec("fourier", (1024, 1, 1), 128),
+    ModelSpec("fourier", (1024, 1, 1), 64),
 )
 OTHERS = (
-    Wanted("gray", (1024, 1, 1), 128),
-    Wanted("fourier+learned", (256, 4, 4), 128),
-    Wanted("fourier", (256, 1, 1), 128),
+    ModelSpec("gray", (1024, 1, 1), 128),
+    ModelSpec("fourier+learned", (256, 4, 4), 128),
+    ModelSpec("fourier", (256, 1, 1), 128),
 )
 
 
@@ -32,7 +32,7 @@ class Plan:
     views, size   of each set; None: all, as they come
     """
 
-    models: tuple[Wanted, ...] = (*MAIN, *OTHERS)
+    models: tuple[ModelSpec, ...] = (*MAIN, *OTHERS)
     levels: tuple[Level, ...] = PHOTON_LEVELS
     other_levels: tuple[Level, ...] = PAIR_LEVELS
     views: int | None = None

@@ -20,7 +20,7 @@ from render.pipeline import Progress
 from scene2spad.datasets import published
 from scene2spad.datasets.test_sets import TestSet, evaluated, rendered
 from scene2spad.networks.lookup import obtain
-from scene2spad.networks.registry import Subject, Trained, Wanted
+from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained
 from scene2spad.options.experiments import Study
 from scene2spad.studies.chip.chain import ChipDepth, interpret
 from scene2spad.studies.chip.code import codes_by_torch, compile_model
@@ -68,16 +68,18 @@ def run(command: Study, progress: Progress) -> dict:
     return {**shown, "csv": [str(each) for each in made], "numbers": str(path)}
 
 
-def _pair(found: Trained, chip: ChipDepth) -> tuple[Subject, Subject]:
+def _pair(found: Trained, chip: ChipDepth) -> tuple[EvaluatedModel, EvaluatedModel]:
     """The float model, and the same on the chip: what its program and tables are is part of the digest."""
     compiled = chip.chip.compiled
     sha = hashlib.sha256(f"{found.subject.digest} {compiled.source}".encode())
     for values in compiled.tables(compiled.block).values():
         sha.update(np.ascontiguousarray(values).tobytes())
-    return found.subject, Subject(f"{found.wanted.name}{_CHIP}", chip, sha.hexdigest())
+    return found.subject, EvaluatedModel(f"{found.wanted.name}{_CHIP}", chip, sha.hexdigest())
 
 
-def _pairs(store: Store, subjects: Sequence[Subject], plan: Plan, options: dict[str, Any]) -> list[dict[str, Any]]:
+def _pairs(
+    store: Store, subjects: Sequence[EvaluatedModel], plan: Plan, options: dict[str, Any]
+) -> list[dict[str, Any]]:
     """Rows on the published pairs; none where the photographs are not at hand."""
     try:
         photographs = published.pairs(plan.pairs)
@@ -127,7 +129,7 @@ def compared_rows(
     return rows
 
 
-def _interpreted(one: Wanted, chip: ChipDepth, test: TestSet, seed: int) -> dict[str, Any]:
+def _interpreted(one: ModelSpec, chip: ChipDepth, test: TestSet, seed: int) -> dict[str, Any]:
     """A view, interpreted to its last photon: what the cores counted, and how its integers differ from two others."""
     compiled = chip.chip.compiled
     histogram = sense(test.views.transients[0], Sensor(), PhotonBudget(*_INTERPRETED), seed=seed)

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 
 from csph import CodingTensor, Design, make_coding
 from csph.evaluation.metrics import is_low_sbr
-from scene2spad.networks.registry import Trained, Wanted
+from scene2spad.networks.registry import ModelSpec, Trained
 from scene2spad.plots.figures import DEPTH_COLOURS, plain_log, plt, save
 from scene2spad.studies import tensors as tensor_figures
 from scene2spad.studies.depth_offset.tables import ENERGY_BAR, LEAST, boundary_bin, energy_history, energy_ratio
@@ -257,7 +257,7 @@ def _pairs(panel: Axes, names: Sequence[str], rows: Sequence[dict], offset_m: fl
     panel.grid(alpha=0.3, axis="y")
 
 
-def energy(models: Mapping[Wanted, Trained], ratios: Sequence[dict], path: Path) -> Path:
+def energy(models: Mapping[ModelSpec, Trained], ratios: Sequence[dict], path: Path) -> Path:
     """Above, energy of a long code by depth and training step, one panel a design; below, the ratio against step."""
     first = [w for w in models if w.seed == 0 and w.compression == 128]
     shown = first or [*models][:1]

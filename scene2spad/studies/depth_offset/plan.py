@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from csph.evaluation.metrics import PHOTON_LEVELS
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.registry import ModelSpec
 from scene2spad.studies.depth_offset.tables import RATIO_LEVELS
 
 OFFSET_M = 7.0
@@ -49,27 +49,27 @@ class Plan:
     pair_levels: tuple[Level, ...] = SHOWN_LEVELS
 
     @property
-    def headline(self) -> tuple[Wanted, ...]:
+    def headline(self) -> tuple[ModelSpec, ...]:
         """Every design at every compression and seed, then the lines without codes."""
         coded = [
-            Wanted(design, block, ratio, seed)
+            ModelSpec(design, block, ratio, seed)
             for ratio in self.compressions
             for design, block in self.designs
             for seed in range(self.seeds if ratio == 128 else 1)
         ]
-        return (*coded, *(Wanted(design) for design in self.baselines))
+        return (*coded, *(ModelSpec(design) for design in self.baselines))
 
     @property
-    def every_seed(self) -> tuple[Wanted, ...]:
+    def every_seed(self) -> tuple[ModelSpec, ...]:
         """Every seed at 128x, and the lines without codes."""
         return tuple(one for one in self.headline if one.compression == 128 or not one.coded)
 
     @property
-    def cured(self) -> tuple[Wanted, ...]:
-        return tuple(Wanted(design, block, 128, time_offset_m=CURE_M) for design, block in self.cures)
+    def cured(self) -> tuple[ModelSpec, ...]:
+        return tuple(ModelSpec(design, block, 128, time_offset_m=CURE_M) for design, block in self.cures)
 
     @property
-    def wanted(self) -> tuple[Wanted, ...]:
+    def wanted(self) -> tuple[ModelSpec, ...]:
         return (*self.headline, *self.cured)
 
 

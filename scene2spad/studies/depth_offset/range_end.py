@@ -23,7 +23,7 @@ from csph.layer import CompressiveLayer
 from csph.networks.model import DepthModel
 from csph.networks.posterior import Decoder
 from scene2spad.datasets.planes import wall
-from scene2spad.networks.registry import Subject, Trained, Wanted
+from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained
 from scene2spad.studies.depth_offset.tables import by_design, mean_error
 from scene2spad.studies.results import Store
 from spad.detection.detect import sense
@@ -88,12 +88,12 @@ class Correlated:
         return decode_depth(codes, self.coding, histogram.sensor).numpy(), 0
 
 
-def arm(trained: Trained, name: str, offset_m: float = 0.0) -> Subject:
+def arm(trained: Trained, name: str, offset_m: float = 0.0) -> EvaluatedModel:
     """The model with one thing changed, by its key in ARMS; `offset_m` is how far inputs are moved back."""
     bins = round(offset_m / trained.config.model.sensor.bin_depth_m)
     layer, network = trained.model.layer, trained.model.network
     if name == "correlation":
-        return Subject(f"{trained.wanted.name}, {name}", Correlated(layer.coding()), _digest(trained, name))
+        return EvaluatedModel(f"{trained.wanted.name}, {name}", Correlated(layer.coding()), _digest(trained, name))
     if name == "near input, far place":
         layer, name = NearInput(layer, bins), f"{name} {bins}"
     elif name == "far input, near place":
@@ -104,7 +104,7 @@ def arm(trained: Trained, name: str, offset_m: float = 0.0) -> Subject:
         return trained.subject
     model = DepthModel(trained.config.model)
     model.layer, model.network = layer, network
-    return Subject(f"{trained.wanted.name}, {name}", model.eval(), _digest(trained, name))
+    return EvaluatedModel(f"{trained.wanted.name}, {name}", model.eval(), _digest(trained, name))
 
 
 def _digest(trained: Trained, how: str) -> str:
@@ -116,7 +116,7 @@ def arm_rows(errors: Mapping[tuple[str, float], Sequence[float]]) -> list[dict[s
     return [{"arm": name, "offset_m": metres, **_over_seeds(values)} for (name, metres), values in errors.items()]
 
 
-def seed_rows(rows: Mapping[float, Sequence[Row]], wanted: Iterable[Wanted]) -> list[dict[str, Any]]:
+def seed_rows(rows: Mapping[float, Sequence[Row]], wanted: Iterable[ModelSpec]) -> list[dict[str, Any]]:
     """A row a design and offset: MAE [mm] over its seeds, from rows by offset."""
     designs = by_design(wanted)
     return [
@@ -134,7 +134,7 @@ def _over_seeds(values: Sequence[float]) -> dict[str, Any]:
 
 
 def wall_errors(
-    store: Store, subject: Subject, depths_m: Sequence[float], level: tuple[float, float], seed: int
+    store: Store, subject: EvaluatedModel, depths_m: Sequence[float], level: tuple[float, float], seed: int
 ) -> list[dict[str, float]]:
     """Bias and MAE [mm] of a model before a wall at each depth, every pixel equally far; kept in the store."""
     found = []

@@ -23,7 +23,7 @@ from render.pipeline import Progress
 from scene2spad.datasets import published
 from scene2spad.datasets.test_sets import TestSet, depth_map, evaluated, rendered
 from scene2spad.networks.lookup import obtain
-from scene2spad.networks.registry import Subject, Trained, Wanted, ship_all
+from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained, ship_all
 from scene2spad.networks.training import PLANES, training_reach_m
 from scene2spad.options.experiments import Study
 from scene2spad.studies.depth_offset import figures, range_end, tables
@@ -50,7 +50,7 @@ class Session:
     tell the depths of their training set, it does."""
 
     plan: Plan
-    models: dict[Wanted, Trained]
+    models: dict[ModelSpec, Trained]
     store: Store
     sets: Path
     seed: int
@@ -58,11 +58,11 @@ class Session:
     trained_on: Path | None = None
     rows: list[dict] = field(default_factory=list)
 
-    def named(self, wanted: Iterable[Wanted]) -> list[Subject]:
+    def named(self, wanted: Iterable[ModelSpec]) -> list[EvaluatedModel]:
         """Those of them that were found."""
         return [self.models[one].subject for one in wanted if one in self.models]
 
-    def one_seed(self) -> list[Wanted]:
+    def one_seed(self) -> list[ModelSpec]:
         """Seed 0 of every design at 128x."""
         return [w for w in self.plan.headline if w.coded and w.seed == 0 and w.compression == 128]
 
@@ -78,7 +78,7 @@ class Session:
     def measure(
         self,
         part: str,
-        subjects: Sequence[Subject],
+        subjects: Sequence[EvaluatedModel],
         test: TestSet,
         levels: Sequence[Level],
         delay_m: float = 0.0,
@@ -195,7 +195,7 @@ def _relief(study: Session) -> list[dict]:
 def _sweep(study: Session, base: TestSet) -> dict[str, Any]:
     """MAE [mm] against the offset, where each design breaks, and where its training depths ended."""
     plan, test = study.plan, base.first(study.plan.sweep_views)
-    mine = [w for w in (*study.one_seed(), Wanted("none"), *plan.cured) if w in study.models]
+    mine = [w for w in (*study.one_seed(), ModelSpec("none"), *plan.cured) if w in study.models]
     rows = [study.measure("sweep", study.named(mine), test, plan.sweep_levels, metres) for metres in plan.sweep_m]
     curves = []
     for one in mine:
@@ -258,7 +258,7 @@ def _cure(study: Session, base: TestSet) -> list[dict]:
     return _near_and_far(study, "cure", subjects, base)
 
 
-def _near_and_far(study: Session, part: str, subjects: Sequence[Subject], base: TestSet) -> list[dict]:
+def _near_and_far(study: Session, part: str, subjects: Sequence[EvaluatedModel], base: TestSet) -> list[dict]:
     levels = [level for level in SHOWN_LEVELS if level in study.plan.levels]
     levels = levels[:1] if part == "swap" else levels
     rows = [study.measure(part, subjects, base, levels, moved) for moved in (0.0, OFFSET_M)]
@@ -291,7 +291,7 @@ def _swap(study: Session, base: TestSet) -> list[dict]:
     return found
 
 
-def swapped(codes: Trained, network: Trained) -> Subject:
+def swapped(codes: Trained, network: Trained) -> EvaluatedModel:
     """A model of one's codes and the other's network. InputError where the designs differ."""
     alike = codes.config.model == network.config.model
     require(alike, f"{codes.wanted.name} and {network.wanted.name} are of different designs: nothing to swap")
@@ -299,7 +299,9 @@ def swapped(codes: Trained, network: Trained) -> Subject:
     model.layer.load_state_dict(codes.model.layer.state_dict())
     model.network.load_state_dict(network.model.network.state_dict())
     model = model.to(next(codes.model.parameters()).device).eval()
-    return Subject(f"codes of {codes.wanted.name}, network of {network.wanted.name}", model, weights_sha256(model))
+    return EvaluatedModel(
+        f"codes of {codes.wanted.name}, network of {network.wanted.name}", model, weights_sha256(model)
+    )
 
 
 def _energies(study: Session) -> list[dict]:

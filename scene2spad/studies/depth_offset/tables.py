@@ -11,7 +11,7 @@ import numpy as np
 from csph.codes.temporal import bin_energy, grouped_energy
 from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, Row
 from csph.layer import make_coding
-from scene2spad.networks.registry import Trained, Wanted
+from scene2spad.networks.registry import ModelSpec, Trained
 from spad.sensor.model import Sensor
 
 # Decided before any model of the study was trained: the geometric mean over seeds and over 64x and 128x of
@@ -54,7 +54,7 @@ def geometric_mean(values: Sequence[float]) -> float:
     return float(np.exp(np.mean(np.log(values)))) if len(values) else math.nan
 
 
-def ratio_rows(near: Sequence[Row], far: Sequence[Row], wanted: Sequence[Wanted]) -> list[dict]:
+def ratio_rows(near: Sequence[Row], far: Sequence[Row], wanted: Sequence[ModelSpec]) -> list[dict]:
     """MAE [mm] near and far of every model and seed at RATIO_LEVELS, and far over near."""
     rows = []
     for one in wanted:
@@ -64,7 +64,7 @@ def ratio_rows(near: Sequence[Row], far: Sequence[Row], wanted: Sequence[Wanted]
     return rows
 
 
-def verdicts(ratios: Sequence[dict], wanted: Sequence[Wanted]) -> list[dict]:
+def verdicts(ratios: Sequence[dict], wanted: Sequence[ModelSpec]) -> list[dict]:
     """Each bar: the geometric mean over seeds at each compression, then over compressions, and whether it holds.
 
     `holds` is None where no model of the design was found.
@@ -79,13 +79,13 @@ def verdicts(ratios: Sequence[dict], wanted: Sequence[Wanted]) -> list[dict]:
         }
         mean = geometric_mean([geometric_mean(values) for values in each.values() if values])
         holds = None if math.isnan(mean) else mean >= limit if sense == LEAST else mean < limit
-        label = Wanted(design, block).label
+        label = ModelSpec(design, block).label
         told = {f"{ratio}x": values for ratio, values in each.items()}
         found.append({"design": label, "bar": f"{sense} {limit:g}", "geometric_mean": mean, "holds": holds, **told})
     return found
 
 
-def summary_rows(rows: Sequence[Row], wanted: Sequence[Wanted], told: Mapping[str, object]) -> list[dict]:
+def summary_rows(rows: Sequence[Row], wanted: Sequence[ModelSpec], told: Mapping[str, object]) -> list[dict]:
     """Per design and compression, seeds together: mean and 95 % interval over scenes and seeds, by level group."""
     evaluation, found = Evaluation(list(rows)), []
     for (label, ratio), members in by_design(wanted).items():
@@ -100,9 +100,9 @@ def summary_rows(rows: Sequence[Row], wanted: Sequence[Wanted], told: Mapping[st
     return found
 
 
-def by_design(wanted: Iterable[Wanted]) -> dict[tuple[str, int], list[Wanted]]:
+def by_design(wanted: Iterable[ModelSpec]) -> dict[tuple[str, int], list[ModelSpec]]:
     """Trainings of one design at one compression by different seeds; without codes the compression is 1."""
-    found: dict[tuple[str, int], list[Wanted]] = {}
+    found: dict[tuple[str, int], list[ModelSpec]] = {}
     for one in wanted:
         found.setdefault((one.label, one.compression if one.coded else 1), []).append(one)
     return found

@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from render.settings import RenderSettings
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.registry import ModelSpec
 
 BACKGROUNDS = (50.0, 20.0, 5.0, 1.0)
 LEVELS = tuple((signal, background) for signal in (50.0, 10.0) for background in BACKGROUNDS)
 HEADLINE = (50.0, 50.0)
 FILTER, PEAK = "log-matched", "argmax"
 MODELS = (
-    Wanted("learned", (256, 4, 4)),
-    Wanted("learned", (1024, 4, 4)),
-    Wanted("fourier", (1024, 1, 1)),
-    Wanted("none"),
+    ModelSpec("learned", (256, 4, 4)),
+    ModelSpec("learned", (1024, 4, 4)),
+    ModelSpec("fourier", (1024, 1, 1)),
+    ModelSpec("none"),
 )
 # What of a render is sensed: the same surfaces, truth and mean counts.
 LIGHTS: dict[str, str] = {"flood": "direct and indirect light", "direct": "direct light alone"}

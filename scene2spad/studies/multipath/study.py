@@ -22,7 +22,7 @@ from render.pipeline import Progress
 from render.transient import Transient
 from scene2spad.datasets.test_sets import TestSet, evaluated
 from scene2spad.networks.lookup import obtain
-from scene2spad.networks.registry import Subject
+from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import plain_log, plt, save
 from scene2spad.studies.multipath.plan import FILTER, HEADLINE, LIGHTS, MODELS, PEAK, PLANS, Plan
@@ -88,7 +88,7 @@ def _described(name: str, transient: Transient) -> dict[str, Any]:
     return {"scene": name, "indirect_share": transient.indirect_fraction, "render_error": error}
 
 
-def summary(rows: Mapping[str, Sequence[Row]], subjects: Sequence[Subject], levels: Sequence) -> list[dict]:
+def summary(rows: Mapping[str, Sequence[Row]], subjects: Sequence[EvaluatedModel], levels: Sequence) -> list[dict]:
     """MAE [mm] and share within 10 mm of every method, light and level: means over scenes, all pixels."""
     found = []
     for light, some in rows.items():
@@ -101,7 +101,7 @@ def summary(rows: Mapping[str, Sequence[Row]], subjects: Sequence[Subject], leve
     return found
 
 
-def by_scene(rows: Mapping[str, Sequence[Row]], subjects: Sequence[Subject], names: Sequence[str]) -> list[dict]:
+def by_scene(rows: Mapping[str, Sequence[Row]], subjects: Sequence[EvaluatedModel], names: Sequence[str]) -> list[dict]:
     """MAE [mm] at HEADLINE, a row a scene and light."""
     return [
         {

@@ -18,7 +18,7 @@ from csph.weights.shipped import WEIGHTS
 from render.pipeline import Progress
 from render.transient import Transient
 from scene2spad.datasets.published import PUBLISHED as PUBLISHED_ERRORS
-from scene2spad.networks.registry import Library
+from scene2spad.networks.registry import ModelRegistry
 from scene2spad.studies.chip.chain import ChipDepth, core_tables, measured
 from scene2spad.studies.chip.code import compile_model
 from scene2spad.studies.chip.plan import MAIN, OTHERS
@@ -69,7 +69,7 @@ class Design:
 
 def designs(folder: Path) -> tuple[list[Design], list[str]]:
     """Trained designs of a folder of runs, else of the package, and coarse histograms; and the names of absent ones."""
-    library, found, absent = Library(folder, WEIGHTS), [], []
+    library, found, absent = ModelRegistry(folder, WEIGHTS), [], []
     for wanted in (*MAIN, *OTHERS):
         trained = library.find(wanted)
         if trained is None:

@@ -12,7 +12,7 @@ from scene2spad.plots.figures import DEPTH_COLOURS, plt, save
 from spad.estimators.depth import depth_errors
 from spad.sensor.model import Sensor
 
-MOST_POINTS = 20000  # of a cloud: more make one colour
+MAX_POINTS = 20000  # of a cloud: more make one colour
 YAW_DEG, PITCH_DEG = -25.0, 20.0  # of the viewer of clouds
 STRONG = 5.0  # standard deviations above a pixel's mean count a bin from which a bin is a point of the raw cloud
 
@@ -173,7 +173,7 @@ def _cloud(
     depth = np.linalg.norm(points, axis=1)
     inside = (depth >= scale[0]) & (depth <= scale[1])
     off = 1 - inside.mean() if len(points) else 0.0
-    step = -(-int(inside.sum()) // MOST_POINTS) or 1
+    step = -(-int(inside.sum()) // MAX_POINTS) or 1
     flat, depth = projected(points[inside][::step]), depth[inside][::step]
     order = np.argsort(-flat[:, 2])
     size = float(np.clip(9000 / max(len(flat), 1), 0.7, 12))

@@ -17,7 +17,7 @@ from scene2spad.studies.transport.plan import KEPT, LASERS, LATER, LEVELS, LIMIT
 LABELS = [label.replace(", ", ",\n") for label in STEPS.values()]
 VERDICTS = {KEPT: "tab:blue", REVERSED: "tab:red", OPEN: "0.6"}
 MARKS = "os^DvP*X<>hd"
-MOST_PAIRS = 24  # of a panel
+MAX_PAIRS = 24  # of a panel
 
 
 def draw_steps(summary: Sequence[Mapping[str, Any]], rows: Mapping[tuple[str, str], Sequence[Row]], path: Path) -> Path:
@@ -61,7 +61,7 @@ def _curve(axes: Axes, intervals: Sequence[tuple[float, float, float]], number: 
 def draw_ranking(ranked: Sequence[Mapping[str, Any]], path: Path) -> Path:
     """Gap of each pair of codes with RGB-D rates (hollow) and at each later step (filled), all levels together."""
     mine = [r for r in ranked if r["levels"] == "all"]
-    pairs = list(dict.fromkeys((r["first"], r["second"]) for r in mine))[:MOST_PAIRS]
+    pairs = list(dict.fromkeys((r["first"], r["second"]) for r in mine))[:MAX_PAIRS]
     size = (3.4 * len(LATER) + 1.5, len(LASERS) * (1.6 + 0.34 * len(pairs)))
     figure, panels = plt.subplots(
         len(LASERS), len(LATER), figsize=size, layout="constrained", squeeze=False, sharey=True, sharex=True

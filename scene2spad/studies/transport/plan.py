@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from render.settings import RenderSettings
-from scene2spad.networks.registry import Wanted
+from scene2spad.networks.registry import ModelSpec
 
 # Each step adds one thing to the one before it; all see the same surfaces and are scaled to the same mean counts.
 STEPS: dict[str, str] = {
@@ -24,13 +24,13 @@ CODES = ("fourier-8", "gray-8", "coarse-8", "hadamard-8", "fourier-16", "gray-16
 SMOKE_CODES = CODES[:3]
 CHECKED = (UNCOMPRESSED, "fourier-8", "gray-8")  # on planned and on full renders
 MODELS = (
-    Wanted("none"),
-    Wanted("fourier", (1024, 1, 1)),
-    Wanted("gray", (1024, 1, 1)),
-    Wanted("learned", (1024, 1, 1)),
-    Wanted("learned", (1024, 4, 4)),
-    Wanted("learned", (256, 4, 4)),
-    Wanted("fourier+learned", (256, 4, 4)),
+    ModelSpec("none"),
+    ModelSpec("fourier", (1024, 1, 1)),
+    ModelSpec("gray", (1024, 1, 1)),
+    ModelSpec("learned", (1024, 1, 1)),
+    ModelSpec("learned", (1024, 4, 4)),
+    ModelSpec("learned", (256, 4, 4)),
+    ModelSpec("fourier+learned", (256, 4, 4)),
 )
 LIMIT = 0.02  # relative, of the MAE on a planned render from that on a full one
 

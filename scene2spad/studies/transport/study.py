@@ -29,8 +29,8 @@ from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
 from scene2spad.bench.rendering.references import key_of
 from scene2spad.datasets.test_sets import TestSet, evaluated
-from scene2spad.networks.lookup import Obtained, obtain
-from scene2spad.networks.registry import Library, Subject
+from scene2spad.networks.lookup import ModelLookup, obtain
+from scene2spad.networks.registry import EvaluatedModel, ModelRegistry
 from scene2spad.networks.training import baseline
 from scene2spad.options.experiments import Study
 from scene2spad.studies.real_data.study import sun_and_sky
@@ -63,9 +63,9 @@ class WithoutNetwork:
         return self._depth_of(histogram), 0
 
 
-def without_network(name: str) -> Subject:
+def without_network(name: str) -> EvaluatedModel:
     """A method without a network, whose results are kept by its name."""
-    return Subject(name, WithoutNetwork(name), hashlib.sha256(f"{name} {FORMAT}".encode()).hexdigest())
+    return EvaluatedModel(name, WithoutNetwork(name), hashlib.sha256(f"{name} {FORMAT}".encode()).hexdigest())
 
 
 def run(command: Study, progress: Progress) -> dict:
@@ -109,19 +109,19 @@ def run(command: Study, progress: Progress) -> dict:
 # Designs
 
 
-def _models(command: Study, progress: Progress) -> Obtained:
+def _models(command: Study, progress: Progress) -> ModelLookup:
     """Trained models, where there are any: this study has something to say without them."""
     if command.retrain:
         return obtain(MODELS, command, progress)
-    library = Library(command.models or command.out / command.preset / "models")
+    library = ModelRegistry(command.models or command.out / command.preset / "models")
     found = library.gather(MODELS)
     absent = [one for one in MODELS if one not in found]
     if absent:
         log.warning("no trained %s: left out", ", ".join(one.name for one in absent))
-    return Obtained(found, absent)
+    return ModelLookup(found, absent)
 
 
-def contenders_of(plan: Plan, models: Obtained) -> list[Contender]:
+def contenders_of(plan: Plan, models: ModelLookup) -> list[Contender]:
     """The uncompressed estimator, codes decoded by correlation, and the networks that were found."""
     found = []
     for name in (UNCOMPRESSED, *plan.codes):

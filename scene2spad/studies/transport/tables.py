@@ -12,7 +12,7 @@ import numpy as np
 
 from csph.evaluation.methods import LEVEL_GROUPS, PIXELS, Evaluation, Row
 from csph.evaluation.metrics import Interval, paired_difference
-from scene2spad.networks.registry import Subject
+from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.studies.transport.plan import FIRST, KEPT, LASERS, LATER, OPEN, REVERSED, STEPS
 
 Rows = Mapping[tuple[str, str], Sequence[Row]]  # by laser and step
@@ -22,7 +22,7 @@ Rows = Mapping[tuple[str, str], Sequence[Row]]  # by laser and step
 class Contender:
     """A design and how its codes are decoded; codes of one decoder and compression (1: none) are ranked."""
 
-    subject: Subject
+    subject: EvaluatedModel
     decoder: str
     compression: int
 

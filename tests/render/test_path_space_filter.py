@@ -8,10 +8,10 @@ import pytest
 
 from render.engine import render
 from render.error import response
-from render.indirect.path_space_filter import READERS, SHRINKING, octaves
+from render.indirect.path_space_filter import GATHER_POINTS, SHRINKING, octaves
 from render.pipeline import trace
 from render.planning import make_plan
-from render.scene.traced_scene import World, dr
+from render.scene.traced_scene import TracedScene, dr
 from render.settings import RenderSettings
 from render.transient.samples import Samples, select
 from scene2spad.bench.hard import oracles
@@ -84,7 +84,7 @@ def test_energy_is_kept(kind):
     Coated and rough surfaces: their diffuse lobe is filtered, the rest stays with its pixel.
     """
     scene = room(kind=kind)
-    world = World(scene)
+    world = TracedScene(scene)
     wanted = indirect(render(scene, RenderSettings(bounces=4, spp=1024, grid=2), seed=99, world=world))
     settings = RenderSettings(bounces=4, spp=16, grid=2, filter=True)
     totals = [indirect(render(scene, settings, seed=seed, world=world)).sum() for seed in range(8)]
@@ -98,7 +98,7 @@ def test_noise_falls_and_the_bias_goes_with_more_paths():
     Direct light is not touched.
     """
     scene = room()
-    world, pixels = World(scene), np.arange(24 * 24)
+    world, pixels = TracedScene(scene), np.arange(24 * 24)
     fine = render(scene, RenderSettings(bounces=4, spp=8192, grid=4), seed=99, world=world)
 
     def late(spp: int, filtered: bool, seed: int) -> np.ndarray:
@@ -132,7 +132,7 @@ def test_same_seed_same_bytes_with_one_and_two_threads():
 def test_the_stated_error_is_the_true_one():
     """Of the mean over seeds, within the issue's factor of 1.3; a filtered result says that it is biased."""
     scene = room(32)
-    world, pixels = World(scene), np.arange(32 * 32)
+    world, pixels = TracedScene(scene), np.arange(32 * 32)
     given = RenderSettings(bounces=4, spp=64, grid=4, filter=True)
     fine = render(scene, RenderSettings(bounces=4, spp=8192, grid=16), seed=99, world=world)
 
@@ -151,7 +151,7 @@ def test_rays_count_the_points_that_read():
         render(room(8), RenderSettings(bounces=3, spp=4, grid=2, filter=f, adaptive=False)).meta["rays"]
         for f in (True, False)
     )
-    assert filtered == plain + READERS * 8 * 8
+    assert filtered == plain + GATHER_POINTS * 8 * 8
 
 
 def test_a_target_is_met_by_more_paths():
@@ -189,7 +189,7 @@ def test_bias_and_depth_under_a_flash():
     from spad.sensor.model import Sensor
 
     size, sensor = 64, Sensor()
-    world = World(settings.bench_scene("flash", size))
+    world = TracedScene(settings.bench_scene("flash", size))
 
     def half_means(spp: int, runs: int, first_seed: int, filtered: bool) -> list[np.ndarray]:
         """Means of two independent halves of the runs, after the pulse."""

@@ -9,9 +9,9 @@ from render.indirect import camera_paths as paths
 from render.indirect import light_vertices as lit
 from render.indirect import reuse as sharing
 from render.indirect.camera_paths import trace_paths
-from render.indirect.launch_layout import BLOCK, block_order, turns_of
+from render.indirect.launch_layout import BLOCK, block_order, make_launch
 from render.scene.rays import laser_light
-from render.scene.traced_scene import Float, UInt32, World, dr
+from render.scene.traced_scene import Float, TracedScene, UInt32, dr
 from scene2spad.bench.hard import oracles
 from scenes import Laser, Material, Scene, Surface
 from scenes.library.things.shapes import box, sphere
@@ -29,12 +29,12 @@ def room(kind: str = "diffuse", laser: Laser = LAMP, width: int = 12) -> Scene:
     return Scene("room", (walls, ball), oracles.camera(width, width, 60), laser)
 
 
-def points(world: World, lanes: int = 1 << 18, batches: int = 1) -> lit.Lit:
-    return lit.lit_points(world, lanes, batches, (dr.opaque(UInt32, 1), dr.opaque(UInt32, 2)))
+def points(world: TracedScene, lanes: int = 1 << 18, batches: int = 1) -> lit.LightVertices:
+    return lit.sample_light_vertices(world, lanes, batches, (dr.opaque(UInt32, 1), dr.opaque(UInt32, 2)))
 
 
 class Sum:
-    """In place of `Sums`: what every lane adds."""
+    """In place of `IndirectAccumulator`: what every lane adds."""
 
     lanes = None
 
@@ -50,10 +50,10 @@ def totals(scene: Scene, seed: int, *, shared: bool, rounds: int = 64, from_m: f
 
     Blocks share all of it, none, or what comes less than `from_m` behind direct light.
     """
-    world, pixels = World(scene), scene.camera.height * scene.camera.width
+    world, pixels = TracedScene(scene), scene.camera.height * scene.camera.width
     blocks = block_order(np.arange(pixels), scene.camera.width)
     count = len(blocks) // BLOCK
-    turns = turns_of(np.arange(count), np.arange(count), np.full(count, rounds))
+    turns = make_launch(np.arange(count), np.arange(count), np.full(count, rounds))
     start = None if from_m is None else dr.opaque(Float, from_m)
     traced = trace_paths(world, blocks, turns, 4, seed, 1, shared=shared, from_m=start)
     own = Sum()
@@ -72,7 +72,7 @@ def test_lit_points_cover_what_the_laser_lights(cone_deg):
     """The mean of 1 / density is the area lit: all of a closed room, or the patch that a cone cuts from a wall."""
     vertices, faces, _ = box((4, 3, 5))
     walls = Surface(vertices + [0, 0, -1.5], faces[:, ::-1], Material(albedo=0.6))
-    found = points(World(Scene("box", (walls,), oracles.camera(8, 8, 20), Laser("flood", cone_deg=cone_deg))))
+    found = points(TracedScene(Scene("box", (walls,), oracles.camera(8, 8, 20), Laser("flood", cone_deg=cone_deg))))
     assert (found.irradiance.numpy() > 0).mean() > 0.999
     inverse = 1 / found.density.numpy().astype(np.float64)
     area = 2 * (4 * 3 + 4 * 5 + 3 * 5) if cone_deg == 360 else np.pi * (4 * np.tan(np.radians(20))) ** 2
@@ -81,7 +81,7 @@ def test_lit_points_cover_what_the_laser_lights(cone_deg):
 
 def test_lit_points_carry_the_lasers_light():
     """Irradiance and path are those of `laser_light`; batches have points of their own, spread as evenly."""
-    world = World(room())
+    world = TracedScene(room())
     found = points(world, 1 << 12, batches=4)
     _, irradiance, path = laser_light(
         world,
@@ -105,7 +105,7 @@ def test_joined_paths_carry_the_same_light_with_less_noise(kind, shared, monkeyp
     """Against paths by chance alone, over all blocks; a lamp close to a wall is what chance misses."""
     scene = room(kind)
     joined = totals(scene, 1, shared=shared)
-    monkeypatch.setattr(paths, "joins_of", lambda world, shared: 0)
+    monkeypatch.setattr(paths, "connections_per_vertex", lambda world, shared: 0)
     plain = totals(scene, 2, shared=shared, rounds=128)
     means, errors = zip(*((t.sum(1).mean(), t.sum(1).std() / np.sqrt(len(t))) for t in (joined, plain)), strict=True)
     assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
@@ -143,7 +143,7 @@ def test_any_cone_and_a_displaced_laser(cone_deg, monkeypatch):
     scene = room("roughplastic", Laser("flood", cone_deg=cone_deg, baseline_m=(0.3, 0.1, 0)))
     monkeypatch.setattr(lit, "NARROW_JOINS", (2, 2))
     joined = totals(scene, 1, shared=True)
-    monkeypatch.setattr(paths, "joins_of", lambda world, shared: 0)
+    monkeypatch.setattr(paths, "connections_per_vertex", lambda world, shared: 0)
     plain = totals(scene, 2, shared=True, rounds=128)
     means, errors = zip(*((t.sum(1).mean(), t.sum(1).std() / np.sqrt(len(t))) for t in (joined, plain)), strict=True)
     assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
@@ -151,10 +151,10 @@ def test_any_cone_and_a_displaced_laser(cone_deg, monkeypatch):
 
 @pytest.mark.parametrize("mode", ["scan", "line"])
 def test_a_laser_that_moves_has_no_lit_points(mode):
-    world = World(room(laser=Laser(mode)))
-    assert lit.joins_of(world, shared=True) == lit.joins_of(world, shared=False) == 0
-    wide, narrow = World(room()), World(replace(room(), laser=Laser("flood", cone_deg=60)))
-    assert lit.joins_of(wide, shared=False) > lit.joins_of(narrow, shared=False)
+    world = TracedScene(room(laser=Laser(mode)))
+    assert lit.connections_per_vertex(world, shared=True) == lit.connections_per_vertex(world, shared=False) == 0
+    wide, narrow = TracedScene(room()), TracedScene(replace(room(), laser=Laser("flood", cone_deg=60)))
+    assert lit.connections_per_vertex(wide, shared=False) > lit.connections_per_vertex(narrow, shared=False)
 
 
 def test_shares_are_whole_and_stay_finite():
