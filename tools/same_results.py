@@ -32,9 +32,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "render direct": ("render plane --bounces 1 --width 48",),
     "render indirect": ("render gallery --width 48 --bounces 4 --spp 16 --seed 1",),
     "render filtered": ("render living-room --width 48 --filter --bounces 4 --spp 16",),
-    "render ambient": (
-        "render rooms/test/0 --width 48 --bounces 2 --spp 16 --ambient on --ambient-spp 8 --out a.exr",
-    ),
+    "render ambient": ("render rooms/test/0 --width 48 --bounces 2 --spp 16 --ambient on --ambient-spp 8 --out a.exr",),
     "render offset": ("render gallery --width 32 --bounces 1 --offset 7 --offset-mode rigid",),
     "sense": (
         "render gallery --width 32 --bounces 1",

@@ -18,15 +18,12 @@ from render.indirect.light_vertices import (
     LightVertices,
     connections_per_vertex,
     is_wide,
-    kept,
-    of_parts,
-    parts_of,
     sample_light_vertices,
 )
 from render.indirect.path_space_filter import Point, late_from, point_of
 from render.indirect.path_suffixes import PathSuffixes, Slots, slots_for, tails_of
 from render.indirect.primary_vertices import Joined, PrimaryVertices, join_heads, shares_early
-from render.scene.rays import camera_rays, first_opaque, shape_index
+from render.scene.rays import camera_rays, first_opaque, kept, of_parts, parts_of, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
 
 # Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32; and of the plain
@@ -59,6 +56,7 @@ def trace_paths(
 
     Blocks share their tails if they are `shared`; for light less than `from_m` behind direct light if `shares_early`.
     """
+    glossy_of(world)  # looked for before anything is recorded
     lanes = len(turns.block) * BLOCK
     seeds = np.random.SeedSequence(seed).generate_state(4)
     joins = connections_per_vertex(world, shared=shared)
@@ -72,7 +70,6 @@ def trace_paths(
         None if lit is None else (parts_of(lit.si), *lit[1:]),
         from_m,
     )
-    glossy_of(world)  # looked for before anything is recorded
     work = partial(_paths, shared=shared, joins=joins)
     key = "paths", shared, joins, is_wide(world)
     heads, near, tails, batch = world.recordings.call(world, key, work, *given)

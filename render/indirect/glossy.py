@@ -5,13 +5,14 @@ where that sends the light of the laser on its way, once in ten thousand times, 
 laser that begins on the metal, in a direction that its lobe sends light to, finds the wall
 (`render.indirect.light_tracing`).
 
-Both ways sample paths C ... y x L whose last point x before the laser is such metal. The one that begins on x keeps
+Both ways sample paths C ... y x L whose last point x before the laser is such a surface. The one that begins on x keeps
 
-    c = r / (1 + r),   r = RATIO pi D / (4 cos) (|y - C| / |x - L|)^2,
+    c = a / (a + b),   a = RATIO p_x(L -> y) cos_xL cos_yx |y - C|^2,   b = p_y(C -> x) cos_yC cos_xy |x - L|^2,
 
-the other 1 - c: the balance heuristic (Veach 1997, eq. 9.8) for the two densities of the pair x, y, a GGX lobe's D / 4
-beside a diffuse one's cos / pi. Beckmann lobes, of the same peak, take it too. Whatever c is, the sum of both is right,
-as long as both take it from the same points.
+the other 1 - c: the balance heuristic (Veach 1997, eq. 9.8) for the densities of the pair x, y per area, as both ways
+sample it. p_x and p_y are the densities of all lobes of both surfaces together: what y reflects is taken as the camera
+sees it, which is exact where y is the pixel's own surface, and the same for both ways elsewhere. Whatever c is, the sum
+of both is right, as long as both take it from the same points.
 """
 
 from __future__ import annotations
@@ -21,14 +22,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from render.scene.rays import camera_rays, first_opaque, raster_of, shape_index
-from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, upload
+from render.scene.rays import camera_rays, first_opaque, of_parts, parts_of, raster_of, shape_index
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
-RATIO = 2.0  # paths that begin in a polished pixel of the laser's image, for every path of others (1 to 2 do best)
+RATIO = 1.0  # paths that begin in a polished pixel of the laser's image, for every path of others (1 to 2 do best)
 # Where SEEN_BY x SEEN_BY rays a pixel meet no polished surface there may be a sliver: the share that begins there.
 SEEN_BY, ELSEWHERE = 2, 1 / 8
 WIDEST_DEG = 60.0  # off the optical axis, how far such surfaces are looked for
-MIN_COSINE = 1e-2
 
 
 class Glossy(NamedTuple):
@@ -48,7 +48,7 @@ def glossy_of(world: TracedScene) -> Glossy | None:
 
     Glass and cut-outs on the way would need to be crossed from the other side, too.
     """
-    if not world.has_glints or world.sees_through or world.scene.laser.mode != "flood":
+    if not world.has_glossy or world.sees_through or world.scene.laser.mode != "flood":
         return None
     if world.glossy is None:
         world.glossy = _look_for(world)
@@ -71,7 +71,8 @@ def _look_for(world: TracedScene) -> tuple[Any, ...]:
         return ()
     own = shares[up : up + camera.height, left : left + camera.width]
     own[own == 0] = ELSEWHERE
-    return upload(Float, shares), *numbers
+    # of no launch's length, or Dr.Jit would record it anew (`render.indirect.camera_paths`)
+    return upload(Float, shares, 16 * (shares.size // 16 + 1) + 5), *numbers
 
 
 def _shows(world: TracedScene, pixel: Any, left: Any, up: Any, width: Any, height: Any) -> Any:
@@ -93,40 +94,46 @@ def laser_rays(world: TracedScene, pixel: Any, x: Any, y: Any, left: Any, up: An
 
 def is_glossy(world: TracedScene, si: Any, active: Any) -> Any:
     """Whether a point lies on a polished surface."""
-    return active & (dr.gather(Float, world.peak, shape_index(si), active) > 0)
+    return active & (dr.gather(Float, world.glossy_materials, shape_index(si), active) > 0)
 
 
-def mis_weight_camera_path(world: TracedScene, point: Any, direction: Any, end: Any, active: Any) -> Any:
-    """1 - c: what a path from `point` in that direction to `end`, and on to the laser, keeps of its light.
+def mis_weight_camera_path(world: TracedScene, y: Any, direction: Any, x: Any, active: Any) -> Any:
+    """Return 1 - c: what a path from `y` in that direction to `x`, and on to the laser, keeps of its light.
 
     Rays start a little off their points, which tell the direction badly where these are close.
     """
     glossy = glossy_of(world)
     if glossy is None:
         return 1
-    x, y, seen = raster_of(world, world.laser, end.p)
-    column, row = dr.floor(x) + Float(glossy.left), dr.floor(y) + Float(glossy.up)
+    column, row, seen = raster_of(world, world.laser, x.p)
+    column, row = dr.floor(column) + Float(glossy.left), dr.floor(row) + Float(glossy.up)
     seen &= (column >= 0) & (column < Float(glossy.width)) & (row >= 0) & (row < Float(glossy.height))
-    seen &= is_glossy(world, end, active)
+    seen &= is_glossy(world, x, active)
     pixel = UInt32(dr.select(seen, row, 0)) * glossy.width + UInt32(dr.select(seen, column, 0))
-    odds = dr.gather(Float, glossy.shares, pixel, seen) * _odds(world, point, direction, end, seen)
-    return dr.select(seen, 1 / (1 + odds), 1)
+    return 1 - _light_path_weight(world, pixel, y, direction, x, seen)
 
 
-def mis_weight_light_path(world: TracedScene, pixel: Any, point: Any, direction: Any, end: Any, active: Any) -> Any:
-    """c: what the path that begins in this pixel, on `end`, and goes to `point` has of that light; `direction` is the
+def mis_weight_light_path(world: TracedScene, pixel: Any, y: Any, direction: Any, x: Any, active: Any) -> Any:
+    """Return c: what the path that begins in this pixel, on `x`, and goes to `y` has of that light; `direction` is the
     way back."""
-    odds = dr.gather(Float, glossy_of(world).shares, pixel, active) * _odds(world, point, direction, end, active)
-    return dr.select(active, odds / (1 + odds), 0)
+    return _light_path_weight(world, pixel, y, direction, x, active)
 
 
-def _odds(world: TracedScene, point: Any, direction: Any, end: Any, active: Any) -> Any:
-    to_laser, way, normal = world.laser - end.p, -dr.normalize(direction), end.sh_frame.n
-    light = dr.normalize(to_laser)
-    cosine = dr.dot(normal, way)
-    rough2 = dr.square(dr.gather(Float, world.roughness, shape_index(end), active))
-    between = dr.square(dr.dot(normal, dr.normalize(light + way)))
-    facets = rough2 / (math.pi * dr.square(between * (rough2 - 1) + 1))
-    odds = RATIO * math.pi / 4 * facets / dr.maximum(dr.abs(cosine), MIN_COSINE)
-    odds *= dr.squared_norm(point - world.eye) / dr.squared_norm(to_laser)
-    return dr.select(dr.isfinite(odds) & (cosine * dr.dot(normal, light) > 0), odds, 0)
+def _light_path_weight(world: TracedScene, pixel: Any, y: Any, direction: Any, x: Any, active: Any) -> Any:
+    """c of the module's text; 0 where no path from the laser samples the pair."""
+    to_x, to_laser, to_eye = dr.normalize(direction), world.laser - x.p, world.eye - y.p
+    light, eye = dr.normalize(to_laser), dr.normalize(to_eye)
+    begun = dr.gather(Float, glossy_of(world).shares, pixel, active) * RATIO
+    begun *= dr.abs(dr.dot(x.n, light) * dr.dot(y.n, to_x)) * dr.squared_norm(to_eye)
+    begun *= _density(x, light, -to_x, active)
+    ended = dr.abs(dr.dot(y.n, eye) * dr.dot(x.n, to_x)) * dr.squared_norm(to_laser)
+    ended *= _density(y, eye, to_x, active)
+    weight = begun / (begun + ended)
+    return dr.select(active & (begun > 0) & dr.isfinite(weight), weight, 0)
+
+
+def _density(si: Any, seen_from: Any, towards: Any, active: Any) -> Any:
+    """Density per solid angle with which the lobes of a surface, seen from one direction, sample another."""
+    seen = of_parts(parts_of(si))
+    seen.wi = si.to_local(seen_from)
+    return si.bsdf().pdf(mi.BSDFContext(), seen, si.to_local(towards), active)

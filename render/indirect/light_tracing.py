@@ -48,7 +48,8 @@ def trace_light_paths(
     glossy = glossy_of(world)
     if glossy is None:
         return
-    rounds = np.ceil(RATIO * paths * np.array(glossy.shares, np.float64)).astype(np.int64)
+    shares = np.array(glossy.shares, np.float64)[: int(glossy.width[0]) * int(glossy.height[0])]
+    rounds = np.ceil(RATIO * paths * shares).astype(np.int64)
     ends = np.cumsum(rounds)
     parts = np.linspace(0, ends[-1], math.ceil(ends[-1] / PATHS) + 1).astype(np.int64)
     keys = [dr.opaque(UInt32, int(number)) for number in np.random.SeedSequence(seed).generate_state(2)]
@@ -86,7 +87,7 @@ def _thrown(
         active &= si.is_valid()
         path += leg
         if begun:
-            value *= mis_weight_light_path(world, pixel, si.p, -towards.d, start, active)
+            value *= mis_weight_light_path(world, pixel, si, -towards.d, start, active)
             begun = Bool(False)
         target, seen = pixel_of(world, si.p)
         # the camera has to see it; the laser need not shine on it

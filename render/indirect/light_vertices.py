@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from render.indirect.glossy import mis_weight_camera_path
-from render.scene.rays import first_opaque, laser_light, segment, to_world
+from render.scene.rays import first_opaque, laser_light, of_parts, parts_of, segment, to_world
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 MAX_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
@@ -85,27 +85,6 @@ def _lit_points(world: TracedScene, index: Any, each: Any, *key: Any) -> tuple[A
     found = si.is_valid()
     to_laser, irradiance, path = laser_light(world, si, 0 * index, found, seen_by_camera=None)
     return parts_of(si), to_laser, path, irradiance, density_of(world, si, to_laser)
-
-
-_KEPT = ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index")
-
-
-def parts_of(si: Any) -> tuple[Any, ...]:
-    """What reflectance and rays need of an interaction."""
-    return tuple(getattr(si, name) for name in _KEPT)
-
-
-def of_parts(parts: tuple[Any, ...]) -> Any:
-    """The interaction with these parts alone."""
-    few = dr.zeros(mi.SurfaceInteraction3f, dr.width(parts[0]))
-    for name, part in zip(_KEPT, parts, strict=True):
-        setattr(few, name, part)
-    return few
-
-
-def kept(si: Any) -> Any:
-    """The interaction with what is needed of it alone: most of a launch's memory is interactions."""
-    return of_parts(parts_of(si))
 
 
 def density_of(world: TracedScene, si: Any, to_laser: Any) -> Any:
@@ -192,5 +171,5 @@ def joined(
     path = leg + dr.gather(Float, lit.path, point, active)
     density = dr.gather(Float, lit.density, point, active) * joins
     _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))
-    light = dr.select(active, value * passed / both * mis_weight_camera_path(world, si.p, direction, end, active), 0)
+    light = dr.select(active, value * passed / both * mis_weight_camera_path(world, si, direction, end, active), 0)
     return dr.select(dr.isfinite(light), light, 0), path, direction

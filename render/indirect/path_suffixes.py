@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from render.indirect.glossy import mis_weight_camera_path
-from render.indirect.light_vertices import LightVertices, by_chance, density_of, is_wide, joined, kept
+from render.indirect.light_vertices import LightVertices, by_chance, density_of, is_wide, joined
 from render.indirect.primary_vertices import PrimaryVertices, copies_of
-from render.scene.rays import first_opaque, laser_light, shape_index, spawn
+from render.scene.rays import first_opaque, kept, laser_light, shape_index, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 
@@ -96,7 +96,7 @@ def tails_of(
         value *= by_chance(world, x1, sample, weight, si, density, copies_of(heads, leg + laser_path), alive)
     # what is reflected by a mirror in the first place cannot be read backwards
     readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    value *= mis_weight_camera_path(world, x1.p, direction, si, readable)
+    value *= mis_weight_camera_path(world, x1, direction, si, readable)
     value = dr.select(alive & dr.isfinite(value), own * value, 0)
     onward, onward_weight = si.bsdf().sample(
         context, si, random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32()), alive
@@ -185,7 +185,7 @@ def _trace_suffix(
         if dr.hint(joining, mode="scalar"):
             density = density_of(world, si, to_laser)
             light *= dr.select(joinable, by_chance(world, before, sample, weight, si, density, 1, active), 1)
-        light *= mis_weight_camera_path(world, before.p, towards.d, si, active & way.readable)
+        light *= mis_weight_camera_path(world, before, towards.d, si, active & way.readable)
         here = through * passed
         light = dr.select(dr.isfinite(light), here * light, 0)
         dr.scatter(paths, path + leg, slot * stride + lane, active)

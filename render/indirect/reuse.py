@@ -23,10 +23,10 @@ from render.indirect.accumulators import IndirectAccumulator
 from render.indirect.camera_paths import PathBatch, trace_paths
 from render.indirect.glossy import mis_weight_camera_path
 from render.indirect.launch_layout import BLOCK, LaunchLayout
-from render.indirect.light_vertices import diffuse_share, of_parts, parts_of, share_by_chance
+from render.indirect.light_vertices import diffuse_share, share_by_chance
 from render.indirect.path_space_filter import UNIT_WEIGHT, PathSpaceFilter
 from render.indirect.primary_vertices import shares_early
-from render.scene.rays import segment
+from render.scene.rays import of_parts, parts_of, segment
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 # Of one launch, 30 and 75 MB in its course.
@@ -243,7 +243,7 @@ def _connect(world: TracedScene, number: Any, chosen: Any, *ends: Any) -> tuple[
             dr.gather(Float, ends.density, tail, active),
             BLOCK,
         )
-    value2 *= mis_weight_camera_path(world, si1.p, direction, si2, active)
+    value2 *= mis_weight_camera_path(world, si1, direction, si2, active)
     # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
     density = dr.select(active & (value1[0] > 0), density1 * area, 0)
     onward_density = dr.select(going & (value3[0] > 0), density * density3, 0)

@@ -33,6 +33,27 @@ def shape_index(si: Any) -> Any:
     return dr.reinterpret_array(UInt32, si.shape)
 
 
+_KEPT = ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index")
+
+
+def parts_of(si: Any) -> tuple[Any, ...]:
+    """What reflectance and rays need of an interaction."""
+    return tuple(getattr(si, name) for name in _KEPT)
+
+
+def of_parts(parts: tuple[Any, ...]) -> Any:
+    """The interaction with these parts alone."""
+    few = dr.zeros(mi.SurfaceInteraction3f, dr.width(parts[0]))
+    for name, part in zip(_KEPT, parts, strict=True):
+        setattr(few, name, part)
+    return few
+
+
+def kept(si: Any) -> Any:
+    """The interaction with what is needed of it alone: most of a launch's memory is interactions."""
+    return of_parts(parts_of(si))
+
+
 def spawn(si: Any, direction: Any) -> Any:
     """A ray that leaves a surface from a little off it: a share of its distance to the origin, as float32 rounds.
 

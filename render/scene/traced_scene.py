@@ -24,7 +24,8 @@ retain_freed_memory()
 Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
 ALIGNMENT = 64  # bytes
 OPACITY = "opacity"
-GLINT = 1.0  # 1/sr, three times white paint
+GLINT = 1.0  # 1/sr, three times white paint: direct light is refined at brighter highlights
+LIGHT_PATH_PEAK = 0.05  # 1/sr: of surfaces with brighter highlights paths may begin at the laser
 FACE_ALBEDO = "face_albedo"
 # u of albedo 0 on a plastic's ramp, and how much more albedo 1 has; the ramp's mean, 1/2 whatever the albedo, only says
 # how often paths follow the coat
@@ -88,8 +89,10 @@ class TracedScene:
         self.albedo = self.table([_specular_albedo(m) for m in materials])
         # highlights that outshine paint and may be narrower than what a ray stands for (`render.direct.edges`)
         peaks = [_peak(m) for m in materials]
-        self.has_glints = any(peaks)
-        self.peak = self.table(peaks)
+        self.has_glints = max(peaks, default=0) > GLINT
+        self.peak = self.table([peak if peak > GLINT else 0 for peak in peaks])
+        self.has_glossy = max(peaks, default=0) > LIGHT_PATH_PEAK
+        self.glossy_materials = self.table([peak > LIGHT_PATH_PEAK for peak in peaks])
         self.roughness = self.table([m.roughness for m in materials])
         self.solid_indices = sorted({m.ior for m in materials if m.kind == "dielectric"})
         self.solid_index = dr.opaque(Float, max(self.solid_indices, default=1.0))
@@ -245,15 +248,14 @@ def _specular_albedo(material: Material) -> float:
 
 def _peak(material: Material) -> float:
     """f cos of a rough lobe at the middle of its highlight seen along the light, F_0 / (4 pi alpha^2) [1/sr] (GGX or
-    Beckmann with all cosines 1); 0 below GLINT."""
+    Beckmann with all cosines 1); 0 for other lobes."""
     if material.kind == "roughconductor":
         mirrored = _specular_albedo(material)
     elif material.kind == "roughplastic":
         mirrored = material.specular * ((material.ior - 1) / (material.ior + 1)) ** 2
     else:
         return 0.0
-    peak = mirrored / (4 * math.pi * material.roughness**2)
-    return peak if peak > GLINT else 0.0
+    return mirrored / (4 * math.pi * material.roughness**2)
 
 
 def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: Any, masks: str) -> Any:

@@ -78,14 +78,14 @@ def by_chance(monkeypatch):
 def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, by_chance):
     scene = room(material, LASERS[laser], smooth=smooth)
     assert glossy_of(TracedScene(scene)) is not None
-    seeds = range(4)
-    both = np.array([totals(light(scene, 512, seed)) for seed in seeds])
+    seeds = range(8)
+    both = np.array([totals(light(scene, 256, seed)) for seed in seeds])
     by_chance()
-    alone = np.array([totals(light(scene, 2048, 100 + seed)) for seed in seeds])
+    alone = np.array([totals(light(scene, 1024, 100 + seed)) for seed in seeds])
     noise = np.hypot(*(runs.sum(axis=1).std(ddof=1) / len(seeds) ** 0.5 for runs in (both, alone)))
     off = both.sum(axis=1).mean() - alone.sum(axis=1).mean()
-    assert abs(off) < 5 * noise
-    assert noise < 0.06 * alone.sum() / len(seeds)
+    assert abs(off) < 5 * noise  # Student's t of 7 to 14 degrees of freedom: one in 600 at the worst
+    assert noise < 0.1 * alone.sum() / len(seeds)
 
 
 def test_a_caustic_is_even_where_paths_by_chance_find_sparks(by_chance):
@@ -137,7 +137,7 @@ def test_paths_begin_where_something_shines_and_a_few_elsewhere():
     ("scene", "why"),
     [
         (room(METAL, Laser("scan")), "scanning"),
-        (room(Material("roughconductor", roughness=0.4, eta=2.9, k=3.1), LASERS["flash"]), "dull"),
+        (room(Material("roughplastic", roughness=0.3), LASERS["flash"]), "dull"),
         (room(Material("thindielectric"), LASERS["flash"]), "glass"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

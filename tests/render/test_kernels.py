@@ -109,7 +109,7 @@ def test_launches_of_paths_are_recorded_once_and_replayed_as_they_would_be_trace
             assert np.array_equal(getattr(ours.tails, name).numpy(), getattr(new.tails, name).numpy()), name
         assert np.count_nonzero(ours.tails.values.numpy()) > 0
     recorded = {key: call.n_recordings for key, call in world.recordings.calls.items()}
-    assert len(recorded) == 2 and set(recorded.values()) == {1}, recorded
+    assert len(recorded) == 3 and set(recorded.values()) == {1}, recorded
 
 
 def test_the_next_world_takes_plastics_and_renders_the_same():
