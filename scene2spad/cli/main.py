@@ -22,6 +22,7 @@ from scene2spad.cli import (
     demo,
     depth,
     evaluate,
+    inspect,
     models,
     render,
     report,
@@ -44,6 +45,7 @@ Command = (
     | Annotated[dataset.Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[sense.Sense, tyro.conf.subcommand("sense")]
     | Annotated[depth.Depth, tyro.conf.subcommand("depth")]
+    | Annotated[inspect.Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[calibrate.Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[train.Train, tyro.conf.subcommand("train")]
     | Annotated[models.Models, tyro.conf.subcommand("models")]
@@ -60,6 +62,7 @@ RUNNERS: dict[type, Callable[[Any, Progress], dict]] = {
     dataset.Dataset: dataset.run,
     sense.Sense: sense.run,
     depth.Depth: depth.run,
+    inspect.Inspect: inspect.run,
     calibrate.Calibrate: calibrate.run,
     train.Train: train.run,
     models.Models: models.run,

@@ -54,6 +54,51 @@ class Histogram:
                 raise InputError(f"histogram: {name} is {array.shape}, expected {self.counts.shape[:2]}")
             array.setflags(write=False)
 
+    @classmethod
+    def from_counts(cls, counts: np.ndarray, sensor: Sensor, meta: dict | None = None) -> Histogram:
+        """Make a histogram of measured counts whose truth nobody knows.
+
+        Parameters
+        ----------
+        counts : (H, W, T) whole numbers from 0 on, one for each pixel and time bin
+        sensor : what recorded them; its number of bins is T
+        meta : what is to be kept beside them, anything JSON holds
+
+        Returns
+        -------
+        A histogram with NaN for depth, albedo and expected detections. Its budget states all detections as background.
+
+        Raises
+        ------
+        InputError for counts of another shape, below 0, above 2^31 - 1, or that are no whole numbers.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from spad.sensor.model import Sensor
+        >>> Histogram.from_counts(np.ones((2, 3, 8), int), Sensor(bins=8)).timestamps()[0].shape
+        (48,)
+        """
+        counts = np.asarray(counts)
+        if counts.ndim != 3 or counts.shape[2] != sensor.bins or counts.dtype.kind not in "iufb":
+            raise InputError(f"histogram: counts are {counts.dtype}{counts.shape}, expected (H, W, {sensor.bins})")
+        least, most = (float(f(counts)) if counts.size else 0.0 for f in (np.min, np.max))
+        if not (least >= 0 and most <= np.iinfo(np.int32).max and (counts.dtype.kind in "iub" or _are_whole(counts))):
+            raise InputError(f"histogram: counts from {least:g} to {most:g}, expected whole numbers from 0 to 2^31 - 1")
+        unknown = np.full(counts.shape[:2], np.nan, np.float32)
+        return cls(
+            counts=np.ascontiguousarray(counts, np.int32),
+            sensor=sensor,
+            budget=PhotonBudget(0.0, float(counts.sum(dtype=float) / max(unknown.size, 1))),
+            depth_m=unknown,
+            mixed=np.zeros(unknown.shape, bool),
+            albedo=unknown.astype(np.float16),
+            expected_signal=unknown.copy(),
+            expected_background=unknown.copy(),
+            meta={"model": "poisson", "plan": ["measured counts"], "pile_up": 0.0, "wrapped": 0.0, "dark_share": 0.0}
+            | (meta or {}),
+        )
+
     def __repr__(self) -> str:
         (height, width, bins), sensor = self.counts.shape, self.sensor
         return (
@@ -73,6 +118,10 @@ class Histogram:
         for array in (self.counts, *(getattr(self, name) for name in TRUTH)):
             sha.update(np.ascontiguousarray(array).tobytes())
         return sha.hexdigest()
+
+
+def _are_whole(counts: np.ndarray) -> bool:
+    return bool((counts == np.floor(counts)).all())
 
 
 def write_histogram(histogram: Histogram, path: Path) -> None:

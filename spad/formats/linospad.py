@@ -21,7 +21,7 @@ from scenes.limits import require_memory
 from spad.formats.histogram import Histogram
 from spad.formats.matfile import load_mat, save_mat
 from spad.formats.timestamps import Timestamps
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import Sensor, sensor_by_name
 
 BINS = 1536
 COUNTS, IMAGES = "spad_processed_data", "cam_processed_data"
@@ -117,18 +117,8 @@ def capture_histogram(capture: Capture, sensor: Sensor | None = None) -> Histogr
     whole = bool((found == np.floor(found)).all() and found.max(initial=0) <= np.iinfo(np.int32).max)
     require(whole, "holds counts that are no whole numbers of 32 bits")
     columns_first = capture.counts.astype(np.int32).T.toarray().reshape(side, side, bins)
-    unknown = np.full((side, side), np.nan, np.float32)
-    return Histogram(
-        counts=np.ascontiguousarray(columns_first.swapaxes(0, 1)),
-        sensor=sensor,
-        budget=PhotonBudget(0.0, float(found.sum() / pixels)),
-        depth_m=unknown,
-        mixed=np.zeros((side, side), bool),
-        albedo=unknown.astype(np.float16),
-        expected_signal=unknown.copy(),
-        expected_background=unknown.copy(),
-        meta={"model": "poisson", "plan": ["read from a capture"], "pile_up": 0.0, "wrapped": 0.0, "dark_share": 0.0},
-    )
+    counts = np.ascontiguousarray(columns_first.swapaxes(0, 1))
+    return Histogram.from_counts(counts, sensor, {"plan": ["read from a capture"]})
 
 
 def rebinning(bins: int, new_bins: int) -> scipy.sparse.csr_matrix:

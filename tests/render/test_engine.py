@@ -133,7 +133,7 @@ def test_a_missed_target_is_made_good():
     both = tracing.add_samples(world, plan, settings, first, more, 1, pixels, lambda what, share: None)
     assert both.spp > first.spp
 
-    def true(traced: tracing.Traced) -> float:
+    def true(traced: tracing.LightSamples) -> float:
         return np.linalg.norm(response(traced.samples, pixels) - fine) / np.linalg.norm(fine)
 
     assert true(both) < true(first)
@@ -257,7 +257,7 @@ def test_camera_of_one_pixel():
 def test_an_image_larger_than_memory_is_refused_before_anything_is_built(monkeypatch):
     """16384 x 16384 needs 174 GB at least, a plane's: no machine is asked for what it has not."""
     monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "32")
-    monkeypatch.setattr(engine, "World", lambda *_: pytest.fail("nothing may be built"))
+    monkeypatch.setattr(engine, "TracedScene", lambda *_: pytest.fail("nothing may be built"))
     scene = room(width=16384, height=16384)
     with pytest.raises(InputError, match="a render of 16384 x 16384: needs 174 GB of memory, the limit is 32 GB"):
         render(scene, RenderSettings(bounces=1))

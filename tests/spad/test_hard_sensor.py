@@ -12,7 +12,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from spad.detection.detect import sense, sense_timestamps
 from spad.estimators.depth import METHODS, estimate_depth
-from spad.formats.histogram import read_histogram, write_histogram
+from spad.formats.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 
 REFERENCE = Sensor()
@@ -175,3 +175,23 @@ def test_auto_says_why() -> None:
     ):
         meta = sense(scene, sensor, budget).meta
         assert meta["model"] == model and words in " ".join(meta["plan"])
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [np.zeros((2, 8)), np.zeros((2, 2, 9)), np.full((1, 1, 8), -1), np.full((1, 1, 8), 0.5), np.full((1, 1, 8), np.nan)]
+    + [np.full((1, 1, 8), 2.0**31), np.full((1, 1, 8), "a")],
+    ids=["flat", "bins", "negative", "half", "nan", "large", "text"],
+)
+def test_measured_counts_that_are_none_are_refused(counts) -> None:
+    with pytest.raises(InputError, match="counts"):
+        Histogram.from_counts(counts, Sensor(bins=8))
+
+
+def test_measured_counts_become_a_histogram_without_truth(tmp_path) -> None:
+    counts = np.arange(48).reshape(2, 3, 8)
+    made = Histogram.from_counts(counts.astype(float), Sensor(bins=8))
+    write_histogram(made, tmp_path / "made.h5")
+    read = read_histogram(tmp_path / "made.h5")
+    assert np.array_equal(read.counts, counts) and np.isnan(read.depth_m).all()
+    assert read.budget.background == counts.sum() / 6

@@ -1,0 +1,85 @@
+"""`inspect`: what is in a file, and in one pixel of it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from render.transient import read_transient
+from scene2spad.cli import main
+from scene2spad.cli.inspect import BARS, WIDTH, drawn
+from spad.formats.histogram import read_histogram
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main(["render", "gallery", "--width", "16", "--height", "12", "--bounces", "1", "--no-figure"]) == 0
+        assert main(["sense", "gallery.exr", "--no-figure"]) == 0
+        size = ("--width", "16", "--height", "12", "--bounces", "1", "--count", "3")
+        assert main(["dataset", "rooms", *size, "--out", "set", "--pack", "set.h5"]) == 0
+    return folder
+
+
+def told(capfd: pytest.CaptureFixture, *argv: object) -> dict:
+    capfd.readouterr()
+    assert main(["inspect", *map(str, argv), "--json"]) == 0
+    return json.loads(capfd.readouterr().out)
+
+
+def test_a_transient_and_the_returns_of_a_pixel(files, capfd):
+    found, transient = told(capfd, files / "gallery.exr", "--pixel", 5, 7), read_transient(files / "gallery.exr")
+    assert found["kind"] == "transient" and (found["rows"], found["columns"]) == (12, 16)
+    assert found["returns"] == transient.returns and found["depth_m"][0] == pytest.approx(np.nanmin(transient.depth_m))
+    mine = slice(*transient.offsets[5 * 16 + 7 :][:2])
+    assert [one["radiance_per_m2_sr"] for one in found["pixel"]["returns"]] == transient.radiance[mine].tolist()
+
+
+def test_a_histogram_and_the_counts_of_a_pixel(files, capfd):
+    found, histogram = told(capfd, files / "gallery.h5", "--pixel", 5, 7), read_histogram(files / "gallery.h5")
+    assert (found["kind"], found["bins"], found["sensor"]) == ("histogram", 1024, "reference")
+    counts = np.zeros(1024, int)
+    for one in found["pixel"]["counts"]:
+        counts[one["bin"]] = one["counts"]
+    assert np.array_equal(counts, histogram.counts[5, 7]) and found["pixel"]["detections"] == counts.sum()
+
+
+def test_a_pack_shows_the_view_asked_for(files, capfd):
+    assert told(capfd, files / "set.h5", "--view", 2)["views"] == 3
+    assert main(["inspect", str(files / "set.h5"), "--view", "3"]) == 2
+    assert "no view 3, there are 0 to 2" in capfd.readouterr().err
+
+
+def test_text_is_short_and_readable(files, capfd):
+    capfd.readouterr()
+    assert main(["inspect", str(files / "gallery.h5"), "--pixel", "5", "7"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert len(lines) < 80 and any(" to " in line and line.startswith("depth_m: ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["gallery.exr", "--pixel", "12", "0"], "no pixel in row 12, column 0 (rows 0 to 11, columns 0 to 15)"),
+        (["gallery.exr", "--pixel", "-1", "0"], "no pixel in row -1"),
+        (["nothing.exr"], "file not found"),
+        (["set/index.jsonl"], "expected a transient"),
+    ],
+)
+def test_mistakes_are_one_line(files, capfd, monkeypatch, argv, message):
+    monkeypatch.chdir(files)
+    capfd.readouterr()
+    assert main(["inspect", *argv]) == 2
+    error = capfd.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("bins", [1, 10, 64, 1000])
+def test_drawn_histograms(bins):
+    counts = np.arange(bins)
+    line = drawn(counts)
+    assert len(line) == min(bins, WIDTH) and (bins == 1 or line[-1] == BARS[-1])
+    assert set(drawn(np.zeros(bins, int))) == {BARS[0]}
