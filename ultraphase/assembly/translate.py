@@ -88,7 +88,7 @@ def _saturate(d: str, s: str, low: int, high: int) -> list[str]:
 
 def _leave(word: int, s: str, low: int, high: int) -> list[str]:
     return [
-        f"if core._lent: return core._not_yet({word})",
+        f"if core._attached_to_array: return core._not_yet({word})",
         f"if not {low} <= {s} <= {high}: core._wraps += 1",
         f"core.out.append(({s} - {low}) % {high - low + 1} + {low})",
     ]
