@@ -34,7 +34,7 @@ from torchmetrics import MeanMetric
 
 from csph.codes.rank import coherence, participation_rank
 from csph.networks.grid import on_published_grid, published_target
-from csph.networks.model import DepthModel, load_model, save_model
+from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
 from csph.networks.posterior import DECODERS
 from csph.networks.published import soft_argmax
 from csph.training.config import TrainConfig
@@ -59,10 +59,12 @@ class DepthTraining(pl.LightningModule):
     """KL divergence to the pulse at the label, plus total variation and coherence where asked; Adam, and an average of
     the weights where asked."""
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, init: DepthModel | None = None) -> None:
         super().__init__()
         self.config = config
         self.model = DepthModel(config.model, config.seed)
+        if init is not None:
+            self.model.load_state_dict(init.state_dict())
         self.averaged: DepthModel | None = None
         if config.average:  # a module of its own: Lightning's checkpoint then holds it
             self.averaged = deepcopy(self.model).requires_grad_(False).eval()
@@ -214,6 +216,21 @@ def _claim(folder: Path, config: TrainConfig) -> None:
         beside.write_text(text)
 
 
+def _check_init(init: DepthModel, config: TrainConfig) -> None:
+    """InputError unless a trained model has the tensors and the sensor of the one to be trained."""
+    mine, other = config.model, init.config
+    alike = (mine.front, mine.network, mine.design, mine.sensor) == (
+        other.front,
+        other.network,
+        other.design,
+        other.sensor,
+    )
+    require(
+        alike,
+        f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}",
+    )
+
+
 def _listed(views: Views | Sequence[Views]) -> list[Views]:
     return [views] if isinstance(views, Views) else list(views)
 
@@ -261,23 +278,29 @@ def train(
     validation: Views | Sequence[Views],
     folder: Path,
     *,
+    init: DepthModel | None = None,
     workers: int = 0,
     progress: Progress | None = None,
     **trainer: Any,
 ) -> dict[str, Any]:
     """Run a configuration to its end in a folder, or go on where an interrupted run of the same configuration stopped.
 
-    Sets are one or several; patches are drawn from the training sets by `config.weights`. `trainer` holds further
-    arguments of Lightning's Trainer (accelerator, devices, strategy). Returns steps, seconds (of this call),
-    val_rmse_mm of the weights kept, their checkpoint, and the number of parameters. Raises InputError for sets that do
-    not fit, and a folder of another run.
+    Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
+    the same design to begin with, instead of random weights. `trainer` holds further arguments of Lightning's Trainer
+    (accelerator, devices, strategy). Returns steps, seconds (of this call), val_rmse_mm of the weights kept, their
+    checkpoint, and the number of parameters. Raises InputError for sets or an `init` that do not fit, and a folder of
+    another run.
     """
     config.check_memory()
+    if init is not None:
+        _check_init(init, config)
     sets = [[packed_views(one) for one in _listed(views)] for views in (training, validation)]
     data = {}
     for name, packs in zip(("training", "validation"), sets, strict=True):
         hashes = [packed_sha256(packed) for packed in packs]
         data[f"{name}_sha256"] = hashes[0] if len(hashes) == 1 else hashes
+    if init is not None:  # a run that goes on must have begun with the same weights
+        data["init_sha256"] = weights_sha256(init)
     config = replace(config, data={**config.data, **data})
     if config.model.grid == "published":
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
@@ -290,7 +313,7 @@ def train(
         torch.set_num_threads(config.threads)
     retain_freed_memory()
     start = time.perf_counter()
-    module = DepthTraining(config)
+    module = DepthTraining(config, init)
     resume = folder / RESUME
     if resume.is_file():
         check_resume(resume, module)

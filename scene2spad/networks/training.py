@@ -124,6 +124,10 @@ def run_train(command: Train, progress: Progress) -> dict:
     from csph.training.loop import train  # and Lightning, which takes seconds to import
 
     training, validation, said = views_of(command)
+    init = None
+    if command.init is not None:
+        init = load_model(checkpoint_of(command.init))[0]
+        said["init"] = Path(command.init).name
     name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
     folder = command.out or Path("out/train") / name
     result = train(
@@ -131,6 +135,7 @@ def run_train(command: Train, progress: Progress) -> dict:
         training,
         validation,
         folder,
+        init=init,
         workers=command.workers,
         progress=progress,
         devices=command.devices or "auto",

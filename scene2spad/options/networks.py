@@ -43,6 +43,9 @@ class Train(Common):
     """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
     sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
     """Sensor preset."""
+    init: Annotated[str | None, may_stay_open("MODEL")] = None
+    """Begin with the weights of a trained model of the same design, a shipped name or a checkpoint, instead of random
+    ones (fine-tuning)."""
     steps: Count = None
     """Steps of the whole run (default: the preset's)."""
     batch: Count = None

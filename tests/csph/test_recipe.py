@@ -13,7 +13,7 @@ from test_training import FEW, MODEL, SMALL, Stopped, near_planes
 from csph.codes.design import Design
 from csph.evaluation.metrics import PHOTON_LEVELS, TRAIN_LEVELS
 from csph.networks.grid import on_published_grid, published_centroid_bins, published_position, published_target
-from csph.networks.model import load_model, weights_sha256
+from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training.config import RECIPE, ModelConfig, TrainConfig, preset
 from csph.training.data import Samples, SetData, _sensed
 from csph.training.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
@@ -159,6 +159,25 @@ def test_the_average_is_what_is_kept_and_resumes_exactly(tmp_path):
     assert plain["steps"] == 9
     kept, last = (load_model(tmp_path / name / "last.safetensors")[0] for name in ("whole", "plain"))
     assert weights_sha256(kept) != weights_sha256(last)
+
+
+def test_a_run_begins_with_a_trained_model(tmp_path):
+    """At a learning rate of nearly 0 it stays that model; a run that goes on needs the same; others are refused."""
+    training, validation = split_views(near_planes(6))
+    config = preset("smoke", MODEL, **FEW)
+    train(config, training, validation, tmp_path / "first")
+    first, _, _ = load_model(tmp_path / "first")
+    still = replace(config, seed=1, rate=1e-12, average=0.0)
+    train(still, training, validation, tmp_path / "second", init=first)
+    second, said, _ = load_model(tmp_path / "second")
+    for name, value in second.state_dict().items():
+        torch.testing.assert_close(value, first.state_dict()[name], rtol=0, atol=1e-9)
+    assert said.data["init_sha256"] == weights_sha256(first)
+    with pytest.raises(InputError, match="holds a run with other options"):
+        train(still, training, validation, tmp_path / "second")
+    other = DepthModel(replace(MODEL, design=Design("learned", (32, 2, 2), 4)))
+    with pytest.raises(InputError, match="init: a model of learned 32x2x2 K4"):
+        train(config, training, validation, tmp_path / "third", init=other)
 
 
 def test_the_published_grid_puts_one_return_where_print_has_it():

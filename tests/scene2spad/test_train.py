@@ -12,8 +12,11 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+import torch
 
 from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.networks.model import load_model
+from csph.weights.cards import checkpoint_of
 from render.transient import write_transient
 from render.transient.packs import write_pack
 from scene2spad.bench import network as bench
@@ -109,6 +112,18 @@ def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
     assert set(layers) == {"Z", "confidence"}
     sure = layers["confidence"].pixels
     assert sure.shape == (16, 16) and sure.mean() == pytest.approx(median["posterior_within_3_bins"], abs=1e-6)
+
+
+def test_training_goes_on_from_a_model_by_name(capfd, packed, tmp_path):
+    """One step at a learning rate of nearly 0 keeps the shipped weights, of 11 bits each."""
+    design = ["--design", "learned", "--block", "256", "4", "4", "--init", "learned-256x4x4-128x-s0"]
+    more = ["--rate", "1e-12", "--steps", "1", "--set", str(packed), "--out", str(tmp_path / "run")]
+    run(capfd, "train", *QUICK, *design, *more)
+    tuned, config, _ = load_model(tmp_path / "run")
+    shipped, _, _ = load_model(checkpoint_of("learned-256x4x4-128x-s0"))
+    assert config.data["init"] == "learned-256x4x4-128x-s0"
+    for name, value in tuned.state_dict().items():
+        torch.testing.assert_close(value, shipped.state_dict()[name], rtol=0, atol=1e-9)
 
 
 def test_models_are_listed_with_their_limits(capfd):
