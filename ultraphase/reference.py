@@ -94,3 +94,12 @@ def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ra
                         "BBS": bit == 1, "BBC": bit == 0,
                     }[one.name]  # fmt: skip
                     at = one.target if taken else at
+
+
+def add_photons(histogram: Sequence[int], table: np.ndarray) -> list[int]:
+    """Add a row of `table` (timestamps, numbers) for every photon of one pixel's histogram, without a limit."""
+    sums = [0] * table.shape[1]
+    for timestamp, photons in enumerate(histogram):
+        for _ in range(int(photons)):
+            sums = [held + int(added) for held, added in zip(sums, table[timestamp], strict=True)]
+    return sums

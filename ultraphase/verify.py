@@ -11,10 +11,7 @@ from scenes.errors import InputError, require
 from ultraphase.array import CoreArray, Frame
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.chip import ChipSpec
-
-_EXACT_IN_FLOAT32 = 1 << 24
-_CHUNK = 256  # pixels at a time: 1 MB of float32 histogram, which a cache holds
-_ONE_THREAD = 1 << 18  # multiplications of a product that OpenBLAS does without threads, at most
+from ultraphase.products import photon_sums
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,29 +34,11 @@ class Tabulated:
     states: int
 
     def sums(self, histograms: np.ndarray) -> np.ndarray:
-        """histogram @ D without a limit: counts (pixels, timestamps) of any integer type -> (pixels, numbers) int64.
-
-        By float32 products where no sum can reach 2^24, so that they are exact, else by float64 (exact to 2^53).
-        """
-        count, bins = histograms.shape
+        """Add the photons of every pixel without a limit: counts (pixels, timestamps) of any integer type -> (pixels,
+        numbers) int64, exact. Raises InputError for other bins, and negative counts."""
+        bins = histograms.shape[1]
         require(bins == len(self.table), f"histograms of {bins} bins, {self.program} has {len(self.table)} timestamps")
-        largest, numbers = max(int(np.abs(self.table).max()), 1), self.table.shape[1]
-        narrow, result = self.table.astype(np.float32), np.empty((count, numbers), np.int64)
-        # products so small that a BLAS with threads of its own does them in the caller's: those threads wait for each
-        # other, which took 9 s of CPU a megapixel on two busy cores instead of 0.5 (measured)
-        rows = 1 << max(0, (_ONE_THREAD // (bins * numbers)).bit_length() - 1)
-        rows = min(rows, _CHUNK)
-        block = np.zeros((_CHUNK // rows, rows, bins), np.float32)
-        product = np.empty((_CHUNK // rows, rows, numbers), np.float32)
-        for first in range(0, count, _CHUNK):
-            part = histograms[first : first + _CHUNK]
-            if largest * _most_photons(part) < _EXACT_IN_FLOAT32:
-                np.copyto(block.reshape(_CHUNK, bins)[: len(part)], part, casting="unsafe")
-                np.matmul(block, narrow, out=product)
-                result[first : first + len(part)] = product.reshape(_CHUNK, numbers)[: len(part)]
-            else:
-                result[first : first + len(part)] = part.astype(np.float64) @ self.table.astype(np.float64)
-        return result
+        return photon_sums(histograms, self.table)
 
     def frame(self, histograms: np.ndarray) -> np.ndarray:
         """Numbers in RAM at the end of a frame that began with zeros, (pixels, timestamps) -> (pixels, numbers) int64:
@@ -76,14 +55,6 @@ class Tabulated:
     def overflowed(self, sums: np.ndarray) -> int:
         """How many sums the RAM cannot hold."""
         return int(np.count_nonzero((sums < self.low) | (sums > self.high)))
-
-
-def _most_photons(histograms: np.ndarray) -> int:
-    """Bound on the photons of a pixel: from the fullest bin where that is enough to be small, else counted."""
-    least = int(histograms.min(initial=0)) if histograms.dtype.kind != "u" else 0
-    require(least >= 0, f"histogram holds {least} counts")
-    bound = int(histograms.max(initial=0)) * histograms.shape[1]
-    return bound if bound < 1 << 16 else int(histograms.sum(axis=1, dtype=np.int64).max(initial=0))
 
 
 def verify(

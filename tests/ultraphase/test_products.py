@@ -1,0 +1,60 @@
+"""Fast exact products of histograms with integer tables, against one photon after the other and integer arithmetic."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scenes.errors import InputError
+from ultraphase import method
+from ultraphase.products import equal_blocks, photon_sums
+from ultraphase.reference import add_photons
+from ultraphase.tables import block_matrix, coarse_matrix, fourier_matrix, int8_codes, wave_matrix
+
+QUARTER = int8_codes(np.cos(2 * np.pi * (np.arange(256) + 0.5) / 1024))
+BLOCK = wave_matrix(QUARTER[2::4], (1, 2, 3, 4))
+TABLES = {
+    "fourier-8": fourier_matrix(QUARTER, 8).T,
+    "fourier-16": fourier_matrix(QUARTER, 16).T,
+    "separable": block_matrix(BLOCK, 1024).T,
+    "coarse": coarse_matrix(64, 1024).T,
+    "learned": np.random.default_rng(0).integers(-127, 128, (1024, 5)),
+    "odd length": np.random.default_rng(1).integers(-127, 128, (999, 3)),
+    "zeros": np.zeros((1024, 2), np.int64),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_sums_are_those_of_one_photon_after_the_other(name):
+    table, random = TABLES[name], np.random.default_rng(2)
+    histograms = random.poisson(0.3, (3, len(table))).astype(np.uint8)
+    histograms[1, 7] = 127
+    assert photon_sums(histograms, table).tolist() == [add_photons(one, table) for one in histograms]
+
+
+@settings(deadline=None, derandomize=True, max_examples=10)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(TABLES)), st.sampled_from([2, 256, 70_000]))
+def test_every_type_and_brightness_is_exact(seed, name, high):
+    """Several chunks, the last one cut off; also where a byte or float32 would not hold the sums."""
+    table, random = TABLES[name], np.random.default_rng(seed)
+    dtype = np.uint8 if high <= 256 else random.choice([np.int32, np.int64, np.uint32])
+    histograms = random.poisson(0.5, (random.integers(1, 1100), len(table))).astype(dtype)
+    bright = random.integers(0, len(histograms), 5)
+    histograms[bright, random.integers(0, len(table), 5)] = random.integers(high // 2, high, 5)
+    expected = histograms.astype(np.int64) @ table
+    assert np.array_equal(photon_sums(histograms, table), expected)
+    assert np.array_equal(photon_sums(histograms[::2], table), expected[::2])  # not contiguous
+    assert np.array_equal(photon_sums(np.asfortranarray(histograms), table), expected)
+
+
+def test_structure_is_found_where_it_is_and_nowhere_else():
+    assert [equal_blocks(TABLES[name]) for name in ("separable", "coarse", "fourier-16", "learned")] == [4, 64, 1, 1]
+    spoilt = TABLES["separable"].copy()
+    spoilt[700, 0] += 1
+    assert equal_blocks(spoilt) == 1
+    assert np.array_equal(method("separable-8").matrix(BLOCK).T[:256, :8], BLOCK.T)
+
+
+def test_negative_counts_are_refused():
+    with pytest.raises(InputError, match="-1 counts"):
+        photon_sums(np.full((2, 1024), -1), TABLES["fourier-8"])
