@@ -179,11 +179,11 @@ def estimate_depth(histogram: Histogram, method: str | CodingTensor | DepthModel
 
     if isinstance(method, str) and method in METHODS:
         return histogram_depth_m(histogram, method)
-    from csph import CodingTensor, decode_depth, encode
+    from csph import CodingTensor
+    from scene2spad.methods import decoded_by
 
     if isinstance(method, CodingTensor):
-        coding = method
-        return histogram_depth_m(histogram, lambda counts, sensor: decode_depth(encode(counts, coding), coding, sensor))
+        return decoded_by(method)(histogram)
     if isinstance(method, str):
         try:
             method = load_model(method)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import time
 from dataclasses import dataclass
@@ -11,14 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
+from scene2spad.cli.opening import open_histogram
 from scene2spad.cli.paths import holds_kind, input_file, output_file, picture
+from scene2spad.methods import depth_method
 from scene2spad.options.common import Common, File, Positional, Progress, may_stay_open
-from scenes.errors import InputError
-from scenes.files import ATTRIBUTE, seal, whole_file
+from scenes.errors import InputError, require
+from spad.formats.depth_map import write_depth
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from csph.networks.model import DepthModel
     from spad.formats.histogram import Histogram
+    from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")
 
@@ -50,6 +54,8 @@ class Depth(Common):
     the first two in their published rows."""
     codes: int = 16
     """Number K of codes kept per pixel by `--method compressive`."""
+    codes_file: File = None
+    """Codes of your own for `--method compressive`, (K, T) in a .npy file, instead of --code and --codes."""
     frame: int = 0
     """Frame of a capture (.mat) of several, from 0."""
     figure: bool = True
@@ -65,12 +71,12 @@ def run(command: Depth, progress: Progress) -> dict:
     source = input_file(command.file)
     _expect_histogram(source)
     out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
-    histogram = _read(source, command.frame)
+    histogram = open_histogram(source, command.frame)
     progress(command.method, 0.1)
     network, share = _network(command), None
     start = time.perf_counter()
     if network is None:
-        depth = depth_map(histogram, command.method, command.codes, command.code, command.seed)
+        depth = _chosen_method(command, histogram.sensor)(histogram)
     else:
         rule = command.int8_rule or "calibrated"
         depth, share, overflows = network.estimate(
@@ -84,7 +90,9 @@ def run(command: Depth, progress: Progress) -> dict:
     errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
     if np.isnan(histogram.depth_m).all():
         log.info("%s: holds no true depth, so that no error can be stated", source)
-    _write_depth(depth, out, {"method": label, "histogram_sha256": histogram.sha256()}, share)
+    meta = {"method": label, "histogram_sha256": histogram.sha256()}
+    camera = histogram.meta.get("transient", {}).get("camera")
+    write_depth(depth, out, meta | ({"camera": camera} if camera else {}), share)
     result = {
         "seconds": seconds,
         "method": label,
@@ -104,6 +112,8 @@ def run(command: Depth, progress: Progress) -> dict:
 
 def depth_label(command: Depth) -> str:
     """Name a depth map after its method, so that results of two checkpoints do not overwrite one another."""
+    if command.method == "compressive" and command.codes_file is not None:
+        return command.codes_file.stem
     if command.method == "compressive":
         return f"{command.code}-{command.codes}"
     if command.method == "network" and command.model is not None:
@@ -127,29 +137,21 @@ def _expect_histogram(path: Path) -> None:
         raise InputError(f"{path}: is a checkpoint, expected a histogram; give it as --method network --checkpoint")
 
 
-def _read(path: Path, frame: int) -> Histogram:
-    if path.suffix.lower() == ".mat":
-        from spad.formats.mat import read_mat
-
-        return read_mat(path, frame)
-    from spad.formats.histogram import read_histogram
-
-    if frame:
-        raise InputError(f"{path}: --frame {frame} is for captures (.mat)")
-    return read_histogram(path)
-
-
 def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:
     """Estimate depth [m] by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code."""
-    from spad.estimators.depth import histogram_depth_m
+    return depth_method(f"{code}-{codes}" if method == "compressive" else method, histogram.sensor, seed=seed)(
+        histogram
+    )
 
-    if method != "compressive":
-        return histogram_depth_m(histogram, method)
-    from csph import CodingTensor, decode_depth, encode, temporal_code
 
-    temporal = temporal_code(code, codes, histogram.sensor.bins, histogram.sensor, seed)
-    coding = CodingTensor(f"{code}-{codes}", temporal)
-    return histogram_depth_m(histogram, lambda counts, sensor: decode_depth(encode(counts, coding), coding, sensor))
+def _chosen_method(command: Depth, sensor: Sensor) -> Callable[[Histogram], np.ndarray]:
+    """Return the method without a network that the options name."""
+    compressive = command.method == "compressive"
+    if command.codes_file is not None:
+        require(compressive, "depth: --codes-file goes with --method compressive")
+        return depth_method(str(input_file(command.codes_file)), sensor)
+    name = f"{command.code}-{command.codes}" if compressive else command.method
+    return depth_method(name, sensor, seed=command.seed)
 
 
 def _network(command: Depth) -> DepthModel | None:
@@ -167,24 +169,3 @@ def _network(command: Depth) -> DepthModel | None:
     from csph.weights.cards import shipped_model
 
     return load_model(command.checkpoint or shipped_model(command.model))[0]
-
-
-def _write_depth(depth_m: np.ndarray, path: Path, meta: dict, confidence: np.ndarray | None = None) -> None:
-    """Write a depth map (Z [m]), and beside it how sure a network is of it (`confidence`, in [0, 1])."""
-    import OpenEXR
-
-    # of the depth alone, as before confidence was written, where there is none
-    sha256 = hashlib.sha256(depth_m.tobytes() + (b"" if confidence is None else confidence.tobytes())).hexdigest()
-    layers = {"Z": depth_m} if confidence is None else {"Z": depth_m, "confidence": confidence}
-    channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
-
-    header = {
-        "type": OpenEXR.scanlineimage,
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        ATTRIBUTE: seal({**meta, "unit": "m"}, "depth", sha256),
-    }
-    with whole_file(path) as beside:
-        try:
-            OpenEXR.File(header, channels).write(str(beside))
-        except RuntimeError as error:
-            raise OSError(str(error)) from None

@@ -18,16 +18,19 @@ import tyro
 from scene2spad.cli import (
     bench,
     calibrate,
+    compare,
     dataset,
     demo,
     depth,
     evaluate,
+    export,
     inspect,
     models,
     render,
     report,
     scenes,
     sense,
+    show,
     study,
     train,
     ultraphase,
@@ -46,6 +49,9 @@ Command = (
     | Annotated[sense.Sense, tyro.conf.subcommand("sense")]
     | Annotated[depth.Depth, tyro.conf.subcommand("depth")]
     | Annotated[inspect.Inspect, tyro.conf.subcommand("inspect")]
+    | Annotated[compare.Compare, tyro.conf.subcommand("compare")]
+    | Annotated[export.Export, tyro.conf.subcommand("export")]
+    | Annotated[show.Show, tyro.conf.subcommand("show")]
     | Annotated[calibrate.Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[train.Train, tyro.conf.subcommand("train")]
     | Annotated[models.Models, tyro.conf.subcommand("models")]
@@ -62,7 +68,10 @@ RUNNERS: dict[type, Callable[[Any, Progress], dict]] = {
     dataset.Dataset: dataset.run,
     sense.Sense: sense.run,
     depth.Depth: depth.run,
+    compare.Compare: compare.run,
+    export.Export: export.run,
     inspect.Inspect: inspect.run,
+    show.Show: show.run,
     calibrate.Calibrate: calibrate.run,
     train.Train: train.run,
     models.Models: models.run,

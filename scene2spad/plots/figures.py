@@ -13,6 +13,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.files import whole_file
 from spad.detection.detect import expected_in_pixel
 from spad.formats.histogram import Histogram
+from spad.sensor.model import Sensor
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -26,9 +27,11 @@ COMMON, FAR_BEYOND = (0.005, 0.995), 0.5
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG, or as PDF where the path ends so, whole or not at all; the same figure, the same bytes."""
+    pdf = path.suffix.lower() == ".pdf"
+    kind, metadata = ("pdf", {"CreationDate": None}) if pdf else ("png", {"Software": None})
     with whole_file(path) as beside:
-        figure.savefig(beside, dpi=130, format="png", metadata={"Software": None})
+        figure.savefig(beside, dpi=130, format=kind, metadata=metadata)
     plt.close(figure)
     return path
 
@@ -204,6 +207,59 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
     _image(axes[1], depth_m, title, "m", cmap=DEPTH_COLOURS, **limits)
     error_mm = 1000 * np.abs(depth_m - histogram.depth_m)
     _image(axes[2], error_mm, "absolute error (colours end at 100 mm)", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
+    return save(figure, path)
+
+
+def draw_depth_map(depth_m: np.ndarray, confidence: np.ndarray | None, title: str, path: Path) -> Path:
+    """A depth map on its own, and the confidence where a network stated one."""
+    columns = 1 if confidence is None else 2
+    figure, axes = plt.subplots(1, columns, figsize=(6 * columns, 4.8), layout="constrained", squeeze=False)
+    _image(axes[0, 0], depth_m, title, "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
+    if confidence is not None:
+        _image(axes[0, 1], confidence, "confidence", "", cmap="gray", vmin=0, vmax=1)
+    return save(figure, path)
+
+
+def draw_comparison(
+    histogram: Histogram, depths: dict[str, np.ndarray], errors: dict[str, dict], path: Path, *, columns: int = 4
+) -> Path:
+    """Depth of every method above its absolute error, on one scale; depth alone where no truth is known."""
+    known = bool(np.isfinite(histogram.depth_m).any())
+    panels = {"true depth": histogram.depth_m, **depths} if known else depths
+    across = min(columns, len(panels))
+    bands, rows = -(-len(panels) // across), 2 if known else 1
+    size = (3.6 * across, bands * rows * 3.4 * histogram.depth_m.shape[0] / histogram.depth_m.shape[1] + 0.6 * bands)
+    figure, axes = plt.subplots(rows * bands, across, figsize=size, layout="constrained", squeeze=False)
+    for panel in axes.ravel():
+        panel.set_axis_off()
+    limits = depth_limits(histogram.depth_m if known else np.stack([*depths.values()]))
+    for number, (name, depth) in enumerate(panels.items()):
+        band, column = divmod(number, across)
+        above = axes[rows * band, column]
+        above.set_axis_on()
+        told = errors.get(name)
+        said = f"{name}\nMAE {told['mae_mm']:.0f} mm" if told and known else name
+        _image(above, depth, said, "m", cmap=DEPTH_COLOURS, **limits)
+        if known and told:
+            below = axes[rows * band + 1, column]
+            below.set_axis_on()
+            error_mm = 1000 * np.abs(depth - histogram.depth_m)
+            _image(below, error_mm, "absolute error", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
+    return save(figure, path)
+
+
+def draw_pulse(sensor: Sensor, path: Path) -> Path:
+    """The pulse of a sensor with its jitter: what one photon's arrival time becomes, and the bins beneath."""
+    figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    before, after = sensor.response.window_s(4)
+    edges_s = np.linspace(-before, after, 401)
+    density = sensor.response.shares(edges_s) / np.diff(edges_s)
+    axes.stairs(1e-9 * density, 1e9 * edges_s)
+    width_ns = 1e9 * sensor.bin_width_s
+    for edge in np.arange(np.ceil(-1e9 * before / width_ns), 1e9 * after / width_ns):
+        axes.axvline(edge * width_ns, color="0.85", lw=0.6, zorder=0)
+    title = f"{sensor.name}: pulse with jitter; grey: bins of {1000 * width_ns:.4g} ps"
+    axes.set(xlabel="time after arrival [ns]", ylabel="density [1/ns]", title=title)
     return save(figure, path)
 
 

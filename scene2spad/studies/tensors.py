@@ -11,6 +11,7 @@ from matplotlib.figure import SubFigure
 from torch import Tensor
 
 from csph import CodingTensor, Design, make_coding
+from csph.codes.files import read_codes
 from csph.weights.torch_files import load_torch_file
 from render.pipeline import Progress
 from scene2spad.options.experiments import Study
@@ -65,10 +66,7 @@ def coding_of(path: Path) -> CodingTensor:
     """
     regular_file(path)
     if path.suffix == ".npy":
-        try:
-            return CodingTensor(path.stem, torch.from_numpy(np.load(path, allow_pickle=False)))
-        except (OSError, ValueError, TypeError, EOFError) as error:
-            raise InputError(f"{path}: no .npy array of codes ({' '.join(str(error).split())[:120]})") from None
+        return read_codes(path)
     state = load_torch_file(path)
     state = state.get("state_dict", state) if isinstance(state, dict) else {}
     found = [name for name in state if name.split(".")[-1] == "temporal" and isinstance(state[name], Tensor)]

@@ -1,0 +1,66 @@
+"""Coding tensors in files: .npy in, and text tables out, in decimal or as the 8-bit integers of an in-pixel core."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from csph.codes.quantise import quantised
+from csph.codes.tensor import CodingTensor
+from scenes.errors import InputError
+from scenes.files import read_array, whole_file
+
+
+def read_codes(path: Path) -> CodingTensor:
+    """Read a coding tensor, (K, Mt) or (K, Mt, Mr, Mc), from a .npy file; the file's name is its name.
+
+    Raises InputError in one line that names the file.
+    """
+    values = read_array(path)
+    if values.ndim not in (2, 4):
+        raise InputError(f"{path}: shape {values.shape}, expected codes (K, T) or (K, Mt, Mr, Mc)")
+    try:
+        return CodingTensor(Path(path).stem, torch.from_numpy(values.astype(np.float32)))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def write_codes(coding: CodingTensor, path: Path, *, int8: bool = False) -> Path:
+    """Write a coding tensor as .npy, (K, Mt) or (K, Mt, Mr, Mc) float32 or int8, or as text with a row a code.
+
+    Text names each factor of a separable tensor, and with `int8` the value of one step. Raises InputError for another
+    ending.
+    """
+    if path.suffix.lower() == ".npy":
+        whole = quantised(coding).tensor if int8 else coding.tensor.numpy()
+        flat = whole[..., 0, 0] if coding.block[1:] == (1, 1) else whole
+        with whole_file(path) as beside:
+            np.save(beside, np.ascontiguousarray(flat))
+        return path
+    if path.suffix.lower() != ".txt":
+        raise InputError(f"{path}: codes go to .npy or .txt")
+    with whole_file(path) as beside:
+        beside.write_text(codes_text(coding, int8=int8))
+    return path
+
+
+def codes_text(coding: CodingTensor, *, int8: bool = False) -> str:
+    """Return the text form: comments with #, then for each factor a row a code, numbers apart by spaces."""
+    (bins, rows, columns), codes = coding.block, coding.codes
+    lines = [f"# {coding.name}: {codes} codes of blocks of {bins} bins x {rows} rows x {columns} columns"]
+    if int8:
+        exact = quantised(coding)
+        factors = [("temporal", exact.temporal, exact.temporal_scale), ("spatial", exact.spatial, exact.spatial_scale)]
+    else:
+        spatial = None if coding.spatial is None else coding.spatial.numpy()
+        factors = [("temporal", coding.temporal.numpy(), 1.0), ("spatial", spatial, 1.0)]
+    for name, values, scale in factors:
+        if values is None:
+            continue
+        step = f", int8, one step is {scale:.9g}" if int8 else ""
+        lines.append(f"# {name}, shape {' x '.join(map(str, values.shape))}{step}")
+        for row in values.reshape(codes, -1):
+            lines.append(" ".join(str(int(v)) if int8 else f"{v:.9g}" for v in row))
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,75 @@
+"""`compare FILE`: several depth methods on one histogram, as one table and one figure."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from scene2spad.cli.opening import open_histogram
+from scene2spad.cli.paths import input_file, output_file
+from scene2spad.options.common import Common, File, Positional, Progress
+from scenes.errors import require
+
+FIGURES = ("mae_mm", "rmse_mm", "median_mm", "within_10mm", "pixels", "missing")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(Common):
+    """Estimate depth from one histogram by several methods: one table (.csv) and one figure (.png). Every method sees
+    the same photons."""
+
+    file: Positional[Path]
+    """A histogram written by `sense` (.h5), or a frame or capture of the published family (.mat)."""
+    methods: tuple[str, ...] = ("argmax", "log-matched", "fourier-16", "learned-256x4x4-128x-s0")
+    """Estimators of `depth`, codes with their number (fourier-16), codes of your own (K, T) in a .npy file, names of
+    networks (see `models`) or their checkpoints."""
+    frame: int = 0
+    """Frame of a capture (.mat) of several, from 0."""
+    unmixed: bool = False
+    """Leave out pixels that see surfaces more than 50 mm apart."""
+    out: File = None
+    """The table to write (.csv); the figure lies beside it (default: the histogram's name with -compare.csv)."""
+
+
+def run(command: Compare, progress: Progress) -> dict:
+    """One histogram -> depth by every method, a table and a figure."""
+    from scene2spad.methods import depth_method
+    from scene2spad.plots.figures import draw_comparison
+    from scenes.files import write_csv
+    from spad.estimators.depth import depth_errors
+
+    require(bool(command.methods), "compare: no method")
+    require(len(set(command.methods)) == len(command.methods), "compare: a method is named twice")
+    source = input_file(command.file)
+    out = command.out or source.with_name(f"{source.stem}-compare.csv")
+    require(out.suffix.lower() == ".csv", f"{out}: the table must end in .csv")
+    figure = out.with_suffix(".png")
+    output_file(figure.with_suffix(".exr"), ".exr", "depth")  # the folder is there and may be written to
+    histogram = open_histogram(source, command.frame)
+    methods = {name: depth_method(name, histogram.sensor, seed=command.seed) for name in command.methods}
+    rows, depths = [], {}
+    for number, (name, method) in enumerate(methods.items()):
+        progress(name, number / len(methods))
+        start = time.perf_counter()
+        depths[name] = method(histogram)
+        seconds = time.perf_counter() - start
+        exclude = histogram.mixed if command.unmixed else None
+        errors = depth_errors(depths[name], histogram.depth_m, range_m=histogram.sensor.range_m, exclude=exclude)
+        rows.append({"method": name, **{key: errors[key] for key in FIGURES}, "seconds": round(seconds, 3)})
+    write_csv(rows, out)
+    drawn = draw_comparison(histogram, depths, {row["method"]: row for row in rows}, figure)
+    shown = rows if command.json else _table(rows)
+    return {"methods": shown, "table": str(out), "figure": str(drawn)}
+
+
+def _table(rows: list[dict]) -> list[str]:
+    """The rows as aligned lines."""
+    width = max(len(row["method"]) for row in rows)
+    lines = [f"{'method':<{width}}  {'MAE mm':>8} {'RMSE mm':>8} {'< 10 mm':>8} {'missing':>8} {'seconds':>8}"]
+    for row in rows:
+        lines.append(
+            f"{row['method']:<{width}}  {row['mae_mm']:>8.1f} {row['rmse_mm']:>8.1f} {row['within_10mm']:>8.1%} "
+            f"{row['missing']:>8d} {row['seconds']:>8.2f}"
+        )
+    return lines

@@ -1,0 +1,110 @@
+"""`export FILE --out X`: dense arrays, point clouds and coding tensors for other programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient
+from scene2spad.options.common import Common, File, Positional, Progress, may_stay_open
+from scenes.errors import InputError, require
+
+DENSE = (".npz", ".h5", ".hdf5")
+CODES = (".txt", ".npy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Common):
+    """Write for other programs: a dense array (.npz, .h5) of a transient or a histogram, a point cloud (.ply) of a
+    depth map or of true depth, or a coding tensor (.txt, .npy) of a model, with --int8 in the integers of a core."""
+
+    file: Positional[Path]
+    """A transient or depth map (.exr), a histogram (.h5), codes (.npy), a checkpoint, or a model's name."""
+    out: Path
+    """What to write: .npz or .h5 (dense), .ply (points), .txt or .npy (codes)."""
+    layout: Literal["hwt", "thw"] = "hwt"
+    """Order of the dense array's axes: row, column, time, or time first."""
+    sensor: Annotated[str | None, may_stay_open("NAME")] = None
+    """Sensor, by name or file, whose bins and pulse a transient is put into (default: reference)."""
+    intensity: File = None
+    """The histogram (.h5) whose detections become the intensity of a depth map's points (default: all 1)."""
+    int8: bool = False
+    """Codes as the 8-bit integers that a core in the pixel adds, with the value of one step."""
+    view: int = 0
+    """Of a pack: which view, from 0."""
+
+
+def run(command: Export, progress: Progress) -> dict:
+    """Open the file, and write it in the form that the output's ending asks for."""
+    path, out, suffix = command.file, command.out, command.out.suffix.lower()
+    kind = kind_of(path)
+    require(out.parent.is_dir(), f"{out}: folder {out.parent} does not exist")
+    require(not (out.exists() and path.exists() and out.samefile(path)), f"{out}: is the file itself")
+    codes = kind in ("codes", "network")
+    require(not command.int8 or codes, f"{path}: --int8 is for codes")
+    require(command.sensor is None or kind in ("transient", "pack"), f"{path}: --sensor is for a transient")
+    if codes and suffix in CODES:
+        from csph.codes.files import write_codes
+
+        coding = open_coding(path, kind)
+        write_codes(coding, out, int8=command.int8)
+        return {"codes": coding.codes, "block": list(coding.block), "out": str(out)}
+    if suffix in DENSE and kind in ("transient", "pack", "histogram"):
+        arrays = _dense(command, kind)
+        from spad.formats.dense import write_dense
+
+        write_dense(arrays, out, layout=command.layout)
+        return {"shape": list(arrays["data"].shape), "layout": command.layout, "out": str(out)}
+    if suffix == ".ply" and kind in ("transient", "pack", "histogram", "depth"):
+        return {"points": _points(command, kind), "out": str(out)}
+    wanted = {"codes": CODES, "network": CODES, "depth": (".ply",)}.get(kind, (".npz", ".h5", ".ply"))
+    raise InputError(f"{out}: a {kind} goes to {', '.join(wanted)}")
+
+
+def _dense(command: Export, kind: str) -> dict[str, np.ndarray]:
+    from spad.formats.dense import dense_counts, dense_radiance
+    from spad.sensor.files import load_sensor
+
+    if kind == "histogram":
+        return dense_counts(open_histogram(command.file))
+    sensor = load_sensor(command.sensor or "reference").sensor
+    return dense_radiance(open_transient(command.file, kind, command.view), sensor)
+
+
+def _points(command: Export, kind: str) -> int:
+    """Write the cloud, and return how many points it has."""
+    from scene2spad.viewer.sources import camera_points
+    from spad.formats.ply import write_ply
+
+    depth_m, intensity, confidence, camera = _depth_of(command, kind)
+    points = camera_points(depth_m, camera)
+    require(points is not None, f"{command.file}: does not say which camera it was seen with, so there are no points")
+    known = np.isfinite(depth_m)
+    top = float(np.quantile(intensity[known], 0.995)) if known.any() else 1.0
+    share = np.clip(intensity[known] / (top or 1.0), 0, 1)
+    write_ply(points[known], command.out, intensity=share, confidence=confidence[known])
+    return int(known.sum())
+
+
+def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
+    """Return depth, intensity and confidence (H, W), and the camera."""
+    if kind == "depth":
+        found = open_depth(command.file)
+        sure = np.ones_like(found.depth_m) if found.confidence is None else found.confidence
+        bright = np.ones_like(found.depth_m)
+        if command.intensity is not None:
+            bright = open_histogram(command.intensity).counts.sum(axis=2, dtype=np.int64).astype(np.float32)
+            require(bright.shape == found.depth_m.shape, f"{command.intensity}: is of another size than {command.file}")
+        return found.depth_m, bright, sure, found.meta.get("camera")
+    require(command.intensity is None, f"{command.file}: --intensity is for a depth map")
+    if kind == "histogram":
+        histogram = open_histogram(command.file)
+        bright = histogram.counts.sum(axis=2, dtype=np.int64).astype(np.float32)
+        camera = histogram.meta.get("transient", {}).get("camera")
+        return histogram.depth_m, bright, np.ones_like(histogram.depth_m), camera
+    transient = open_transient(command.file, kind, command.view)
+    bright = transient.total_radiance().astype(np.float32)
+    return transient.depth_m, bright, np.ones_like(bright), transient.meta.get("camera")

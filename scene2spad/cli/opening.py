@@ -1,0 +1,132 @@
+"""Open a file of any kind that we write, and say what it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scene2spad.cli.paths import holds_kind, input_file
+from scenes.errors import InputError, require
+
+if TYPE_CHECKING:
+    from csph.codes.tensor import CodingTensor
+    from render.transient import Transient
+    from spad.formats.histogram import Histogram
+
+BY_SUFFIX = {
+    ".exr": ("transient", "depth"),
+    ".h5": ("histogram", "pack"),
+    ".mat": ("histogram",),
+    ".safetensors": ("network",),
+    ".npy": ("codes",),
+    ".toml": ("sensor",),
+    ".csv": ("table",),
+    ".s": ("program",),
+}
+SEALED = ("transient", "depth", "histogram", "pack", "network")
+KNOWN = (
+    "a transient or depth map (.exr), a histogram or pack (.h5), a frame (.mat), a checkpoint (.safetensors) or a "
+    "model's name, codes (.npy), a sensor (.toml), a table (.csv), a program (.s), or the folder of a set or a run"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """What a depth map's file holds."""
+
+    depth_m: np.ndarray
+    confidence: np.ndarray | None
+    meta: dict[str, Any]
+
+
+def kind_of(path: Path) -> str:
+    """Return the kind of a file, of a folder ("set" or "network"), or of a model's name ("network").
+
+    Raises InputError in one line that lists what is known.
+    """
+    if path.is_dir():
+        require((path / "index.jsonl").is_file() or (path / "set.json").is_file() or _is_run(path),
+                f"{path}: is a folder, but of no set and of no run; expected {KNOWN}")  # fmt: skip
+        return "network" if _is_run(path) else "set"
+    if not path.suffix and len(path.parts) == 1 and not path.exists():
+        from csph.weights.cards import shipped_model
+
+        shipped_model(path.name)
+        return "network"
+    kinds = BY_SUFFIX.get(input_file(path).suffix.lower(), ())
+    unsealed = path.suffix.lower() == ".mat"
+    found = next((kind for kind in kinds if kind not in SEALED or unsealed or holds_kind(path, kind)), None)
+    if found is None:
+        raise InputError(f"{path}: expected {KNOWN}")
+    return found
+
+
+def _is_run(path: Path) -> bool:
+    from csph.weights.shipped import RUN_WEIGHTS
+
+    return any((path / f"{name}.safetensors").is_file() for name in RUN_WEIGHTS)
+
+
+def open_transient(path: Path, kind: str, view: int) -> Transient:
+    """Read a transient, or one view of a pack; InputError for a view that is not there."""
+    if kind == "transient":
+        from render.transient import read_transient
+
+        return read_transient(path)
+    from render.transient.packs import read_pack
+
+    pack = read_pack(path)
+    require(0 <= view < len(pack), f"{path}: no view {view}, there are 0 to {len(pack) - 1}")
+    return pack[view]
+
+
+def open_histogram(path: Path, frame: int = 0) -> Histogram:
+    """Read a histogram of ours (.h5), or a frame or capture of the published family (.mat)."""
+    if path.suffix.lower() == ".mat":
+        from spad.formats.mat import read_mat
+
+        return read_mat(path, frame)
+    from spad.formats.histogram import read_histogram
+
+    require(not frame, f"{path}: --frame {frame} is for captures (.mat)")
+    return read_histogram(path)
+
+
+def open_depth(path: Path) -> DepthMap:
+    """Read a depth map."""
+    from spad.formats.depth_map import read_depth
+
+    return DepthMap(*read_depth(path))
+
+
+def open_coding(path: Path, kind: str) -> CodingTensor:
+    """Read the coding tensor of a .npy file, a checkpoint, a run's folder or a shipped model's name."""
+    if kind == "codes":
+        from csph.codes.files import read_codes
+
+        return read_codes(path)
+    from csph.networks.model import load_model
+    from csph.weights.cards import checkpoint_of
+
+    model = load_model(checkpoint_of(path))[0]
+    require(model.layer is not None, f"{path}: a network without codes, it takes the counts themselves")
+    return model.layer.coding()
+
+
+def transient_of(histogram: Histogram, path: Path, given: Path | None) -> Transient | None:
+    """Return the transient that a histogram was sensed from: the one given, or that beside it if its hash agrees.
+
+    Raises InputError where the given one is another.
+    """
+    wanted = histogram.meta.get("transient", {}).get("sha256")
+    source = given or path.with_suffix(".exr")
+    if given is None and not (source.is_file() and holds_kind(source, "transient")):
+        return None
+    transient = open_transient(input_file(source), "transient", 0)
+    if transient.sha256() == wanted:
+        return transient
+    require(given is None, f"{given}: is not the transient that {path} was sensed from")
+    return None

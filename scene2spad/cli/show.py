@@ -1,0 +1,212 @@
+"""`show FILE`: a page to look into a file of ours, or a picture, an animation or a PDF of it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient, transient_of
+from scene2spad.options.common import Common, File, Positional, Progress
+from scenes.errors import InputError, require
+from scenes.io.inputs import read_text, read_whole_lines
+
+if TYPE_CHECKING:
+    from scene2spad.viewer.content import Content, Cube
+
+log = logging.getLogger("scene2spad")
+SUFFIXES = (".html", ".png", ".pdf", ".gif")
+MAX_SHEET = 24  # views of a set on its sheet
+PAGE_MARK = b'content="scene2spad show"'
+
+
+@dataclass(frozen=True, kw_only=True)
+class Show(Common):
+    """Make a page of a file: point at a pixel and see its returns, expected counts and detections, turn the point
+    cloud, play the light. The page is one file and loads nothing. Or make a picture (.png, .pdf) or an animation
+    (.gif). FILE is anything that a command writes, or the name of a model that comes with the package."""
+
+    file: Positional[Path]
+    """The file, the folder of a set or of a run, or a model's name."""
+    out: File = None
+    """What to write: .html, .png, .pdf or .gif (default: the file's name with .html)."""
+    transient: File = None
+    """The transient that a histogram was sensed from (default: the .exr beside it, if it is that one)."""
+    view: int = 0
+    """Of a pack: which view, from 0."""
+    frame: int = 0
+    """Of a capture (.mat): which frame, from 0."""
+
+
+def run(command: Show, progress: Progress) -> dict:
+    """Open the file, and write its page or picture."""
+    path = command.file
+    kind = kind_of(path)
+    out = command.out or Path(f"{path.resolve().name if path.is_dir() else path.stem}.html")
+    if command.out is None and path.parent != Path() and not path.is_dir():
+        out = path.parent / out
+    require(out.suffix.lower() in SUFFIXES, f"{out}: the output must end in {', '.join(SUFFIXES)}")
+    _check_target(out, path)
+    require(command.transient is None or kind == "histogram", f"{path}: --transient goes with a histogram")
+    if out.suffix.lower() in (".png", ".pdf"):
+        drawn = _picture(command, kind, out)
+    elif out.suffix.lower() == ".gif":
+        from scene2spad.plots.animation import write_gif
+
+        drawn = write_gif(_cube(command, kind), out)
+    else:
+        from scene2spad.viewer.page import write_page
+
+        drawn = write_page(_content(command, kind), out)
+    return {"kind": kind, "bytes": drawn.stat().st_size, "out": str(drawn)}
+
+
+def _check_target(out: Path, source: Path) -> None:
+    """Refuse a target that cannot be written, and a file of another program."""
+    require(out.parent.is_dir(), f"{out}: folder {out.parent} does not exist")
+    require(not out.is_dir(), f"{out}: is a folder, expected a file name")
+    require(not (out.exists() and source.exists() and out.samefile(source)), f"{out}: is the file itself")
+    if out.is_file() and out.suffix.lower() == ".html":
+        with out.open("rb") as file:
+            require(PAGE_MARK in file.read(4096), f"{out}: exists and is no page of `show`; choose another --out")
+
+
+def _content(command: Show, kind: str) -> Content:
+    """Return what the page shows."""
+    from scene2spad.viewer import sources
+    from scene2spad.viewer.content import Content
+
+    path = command.file
+    if kind in ("transient", "pack"):
+        title = path.name + (f", view {command.view}" if kind == "pack" else "")
+        return sources.transient_content(open_transient(path, kind, command.view), title)
+    if kind == "histogram":
+        histogram = open_histogram(path, command.frame)
+        return sources.histogram_content(histogram, path.name, transient_of(histogram, path, command.transient))
+    if kind == "depth":
+        found = open_depth(path)
+        return sources.depth_content(found.depth_m, found.confidence, found.meta, path.name)
+    if kind == "program":
+        return Content(path.name, {"kind": "program of the in-pixel core"}, text=read_text(path))
+    if kind == "table":
+        rows = list(csv.DictReader(read_text(path).splitlines()))
+        require(bool(rows), f"{path}: an empty table")
+        return Content(path.name, {"kind": "table", "rows": str(len(rows))}, tables=((path.name, rows),))
+    figure = _as_png(command, kind)
+    facts, tables = _facts(command, kind)
+    return Content(path.name, {"kind": kind, **facts}, figures=((path.name, figure),), tables=tables)
+
+
+def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, list[dict[str, Any]]], ...]]:
+    """What a sensor, a code, a model or a set says of itself: short facts, and tables."""
+    path = command.file
+    if kind == "sensor":
+        from spad.sensor.files import read_sensor, sensor_tables
+
+        contents = read_sensor(path)
+        rows = [
+            {"table": name, "key": key, "value": value, "source": contents.sources.get(f"{name}.{key}", "")}
+            for name, table in sensor_tables(contents).items()
+            if isinstance(table, dict) and name != "sources"
+            for key, value in table.items()
+        ]
+        return {"sensor": contents.sensor.name}, (("What the file states", rows),)
+    if kind == "set":
+        records = [r for r in _index(path) if isinstance(r, dict)]
+        return {"views": str(len(records))}, (("Views", [_flat(r) for r in records]),)
+    facts: list[dict[str, Any]] = []
+    if kind == "network":
+        from csph.weights.cards import checkpoint_of
+
+        source = checkpoint_of(path)
+        card = source.with_suffix(".json")
+        facts = [{"key": k, "value": v} for k, v in _model_facts(source, card).items()]
+    return {}, ((("What made it", facts),) if facts else ())
+
+
+def _model_facts(source: Path, card: Path) -> dict[str, Any]:
+    if card.is_file():
+        from csph.weights.cards import read_card
+
+        return read_card(card).to_dict()
+    from csph.networks.model import load_model
+
+    model, config, state = load_model(source)
+    return {"name": config.model.name, "parameters": model.parameters_count, **state, **_flat(config.to_dict())}
+
+
+def _flat(record: dict[str, Any]) -> dict[str, Any]:
+    return {key: json.dumps(value) if isinstance(value, (dict, list)) else value for key, value in record.items()}
+
+
+def _index(folder: Path) -> list[Any]:
+    lines = [line for name in ("index.jsonl", "journal.jsonl") for line in read_whole_lines(folder / name)]
+    require(bool(lines), f"{folder}: a set without a view")
+    return lines
+
+
+def _as_png(command: Show, kind: str) -> bytes:
+    with tempfile.TemporaryDirectory(prefix="scene2spad-") as folder:
+        return _picture(command, kind, Path(folder) / "figure.png").read_bytes()
+
+
+def _picture(command: Show, kind: str, out: Path) -> Path:
+    """Draw the file's figure, as PNG or PDF."""
+    from scene2spad.plots import figures
+
+    path = command.file
+    if kind in ("transient", "pack"):
+        return figures.draw_transient(open_transient(path, kind, command.view), out)
+    if kind == "histogram":
+        return _histogram_figure(command, out)
+    if kind == "depth":
+        found = open_depth(path)
+        return figures.draw_depth_map(found.depth_m, found.confidence, str(found.meta.get("method", "depth")), out)
+    if kind == "sensor":
+        from spad.sensor.files import read_sensor
+
+        return figures.draw_pulse(read_sensor(path).sensor, out)
+    if kind == "set":
+        from render.transient import read_transient
+        from scene2spad.datasets.contact_sheets import draw_views
+
+        files = [path / r["file"] for r in _index(path) if isinstance(r, dict) and r.get("file")][:MAX_SHEET]
+        require(bool(files), f"{path}: a set without a view that was rendered")
+        return draw_views([read_transient(file) for file in files], out, columns=min(8, len(files)))
+    if kind in ("network", "codes"):
+        from scene2spad.studies.tensors import draw
+
+        return draw([open_coding(path, kind)], out)
+    raise InputError(f"{path}: a {kind} has no picture; write a page (.html)")
+
+
+def _histogram_figure(command: Show, out: Path) -> Path:
+    from functools import partial
+
+    from scene2spad.plots import figures
+    from spad.detection.detect import expected_in_pixel
+
+    histogram = open_histogram(command.file, command.frame)
+    transient, rate = transient_of(histogram, command.file, command.transient), None
+    if transient is not None:
+        seed = int(histogram.meta.get("seed", 0))
+        rate = partial(expected_in_pixel, transient, histogram.sensor, histogram.budget, seed=seed)
+    return figures.draw_histogram(histogram, out, expected=rate)
+
+
+def _cube(command: Show, kind: str) -> Cube:
+    """Return what an animation plays."""
+    from scene2spad.viewer import sources
+    from scene2spad.viewer.content import Cube
+
+    path = command.file
+    if kind in ("transient", "pack"):
+        return sources.light_over_path(open_transient(path, kind, command.view))
+    if kind == "histogram":
+        histogram = open_histogram(path, command.frame)
+        return Cube("detections", "per bin", histogram.counts, 0.0, histogram.sensor.bin_width_s * 1e9, "bars")
+    raise InputError(f"{path}: a {kind} has nothing to play; expected a transient, a pack or a histogram")

@@ -1,0 +1,64 @@
+"""Light over time as an animated GIF: what a cube (H, W, T) of one page looks like, frame by frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from PIL import Image, ImageDraw
+
+from scene2spad.viewer.content import NS_PER_M, Cube
+from scenes.files import whole_file
+
+FRAMES = 48  # at the most
+SIDE = 384  # pixels of the longer side, where the image is smaller
+WHITE = 0.9  # quantile of the pixels' brightest moments that is shown white
+COLOURS = 64
+MILLISECONDS = 80
+
+
+def write_gif(cube: Cube, path: Path, *, frames: int = FRAMES, side: int = SIDE) -> Path:
+    """Write the animation, whole or not at all: from the first light on, until a hundredth of it is left."""
+    first, last = _lit(cube.values)
+    chosen = np.linspace(first, last, min(frames, last - first + 1)).round().astype(int)
+    width = max(int(np.median(np.diff(chosen))) if len(chosen) > 1 else 1, 1)
+    shown = np.stack([cube.values[..., t : t + width].sum(axis=2, dtype=float) for t in chosen])
+    steady = float(np.median(cube.values.mean(axis=(0, 1)))) * width
+    lit = np.clip(shown - steady, 0, None)
+    white = float(np.quantile(lit.max(axis=0), WHITE)) or 1.0
+    pictures = [
+        _picture(np.clip(frame / white, 0, 1), cube.start_ns + (t + width / 2) * cube.step_ns, side)
+        for frame, t in zip(lit, chosen, strict=True)
+    ]
+    with whole_file(path) as beside:
+        pictures[0].save(
+            beside,
+            format="GIF",
+            save_all=True,
+            append_images=pictures[1:],
+            duration=MILLISECONDS,
+            loop=0,
+            optimize=True,
+        )
+    return path
+
+
+def _lit(values: np.ndarray) -> tuple[int, int]:
+    """First and last bin that hold more than the steady light of the image, by a hundredth of the most."""
+    total = values.sum(axis=(0, 1), dtype=float)
+    excess = total - np.median(total)
+    lit = np.flatnonzero(excess > 0.01 * excess.max(initial=0))
+    return (int(max(lit[0] - 2, 0)), int(lit[-1])) if lit.size else (0, values.shape[2] - 1)
+
+
+def _picture(share: np.ndarray, at_ns: float, side: int) -> Image.Image:
+    """One frame (H, W) in [0, 1], enlarged by a whole factor, with its time and the depth seen then."""
+    factor = max(1, side // max(share.shape))
+    rgb = np.rint(255 * matplotlib.colormaps["inferno"](share ** (1 / 2.2))[..., :3]).astype(np.uint8)
+    image = Image.fromarray(rgb.repeat(factor, axis=0).repeat(factor, axis=1))
+    if image.width >= 160:  # else there is no room for words
+        ImageDraw.Draw(image).text(
+            (6, image.height - 16), f"{at_ns:5.1f} ns, {at_ns / NS_PER_M / 2:.2f} m", fill="white"
+        )
+    return image.quantize(COLOURS, dither=Image.Dither.NONE)

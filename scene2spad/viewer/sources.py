@@ -1,0 +1,238 @@
+"""From a transient, a histogram or a depth map to what its page shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from render.transient import Transient
+from scene2spad.viewer.content import NS_PER_M, Content, Cube, Layer, Returns, grey_layer
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.model import Camera
+from spad.detection.flux import Rates, rates_for
+from spad.formats.histogram import Histogram
+from spad.sensor.model import Sensor
+
+FRAMES = 256  # bins of path length of a transient that no sensor has seen
+TAIL = 0.999  # share of the light that these span
+DIRECT_NS, INDIRECT_NS = 0.05, 1.0  # returns of a pixel that come closer together are one line
+BLOCK = 1024  # pixels whose rates are computed at once
+FINER = 4  # cells of a bin that arrivals are rounded to
+POINT = 1e-3  # cells below which a return has no length
+MIXED_LOW, MIXED_HIGH = 0.0, 1.0
+
+
+def transient_content(transient: Transient, title: str) -> Content:
+    """Show a transient: its images, its light over path length, its returns and its surface."""
+    total = transient.total_radiance()
+    direct = transient.bounces == 1
+    late = np.bincount(transient.return_pixel[~direct], transient.radiance[~direct], total.size).reshape(total.shape)
+    share = np.divide(late, total, out=np.zeros_like(total), where=total > 0)
+    layers = (
+        grey_layer("laser light", "1/(m² sr)", total),
+        depth_layer("depth", transient.depth_m),
+        Layer("indirect share", "", share, "error", 0.0, float(share.max(initial=0)) or 1.0),
+        grey_layer("ambient light", "W/(m² sr nm)", transient.ambient),
+        Layer("two surfaces", "", transient.mixed, "gray", MIXED_LOW, MIXED_HIGH),
+    )
+    return Content(
+        title,
+        transient_facts(transient),
+        layers,
+        (light_over_path(transient),),
+        merged_returns(transient, 1.0, "1/(m² sr)"),
+        **surface(transient.depth_m, transient.meta.get("camera"), total),
+    )
+
+
+def histogram_content(histogram: Histogram, title: str, transient: Transient | None = None) -> Content:
+    """Show a histogram: its images, detections, and with its transient the expected counts and the returns."""
+    sensor, step_ns = histogram.sensor, histogram.sensor.bin_width_s * 1e9
+    counts = histogram.counts
+    detections = counts.sum(axis=2, dtype=np.int64)
+    layers = [grey_layer("detections", "", detections)]
+    if np.isfinite(histogram.expected_signal).any():
+        layers += [
+            grey_layer("expected signal", "photons", histogram.expected_signal),
+            grey_layer("expected background", "photons", histogram.expected_background),
+        ]
+    if np.isfinite(histogram.depth_m).any():
+        layers += [
+            depth_layer("true depth", histogram.depth_m),
+            Layer("two surfaces", "", histogram.mixed, "gray", MIXED_LOW, MIXED_HIGH),
+        ]
+    cubes = [Cube("detections", "per bin", counts, 0.0, step_ns, "bars")]
+    returns, notes = None, []
+    if transient is None:
+        notes.append("Expected counts and returns are in the transient: lay it beside the histogram, or give it.")
+    else:
+        rates = rates_for(transient, sensor, histogram.budget, seed=int(histogram.meta.get("seed", 0)))
+        expected = expected_cube(transient, sensor, rates)
+        cubes.append(Cube("expected", "per bin", expected, 0.0, step_ns, "line"))
+        returns = merged_returns(transient, rates.signal_scale, "photons")
+    camera = histogram.meta.get("transient", {}).get("camera")
+    cloud = surface(histogram.depth_m, camera, detections)
+    return Content(title, histogram_facts(histogram), tuple(layers), tuple(cubes), returns, notes=notes, **cloud)
+
+
+def depth_content(depth_m: np.ndarray, confidence: np.ndarray | None, meta: Mapping[str, Any], title: str) -> Content:
+    """Show a depth map: depth, confidence where a network stated it, and the points."""
+    layers = [depth_layer("depth", depth_m)]
+    if confidence is not None:
+        layers.append(Layer("confidence", "", confidence, "gray", 0.0, 1.0))
+    facts = {"kind": "depth map", "method": str(meta.get("method", "")), "pixels": _size(depth_m)}
+    return Content(title, facts, tuple(layers), **surface(depth_m, meta.get("camera"), confidence))
+
+
+def depth_layer(name: str, depth_m: np.ndarray) -> Layer:
+    from scene2spad.plots.figures import depth_limits
+
+    limits = depth_limits(depth_m)
+    return Layer(name, "m", depth_m, "depth", limits["vmin"], limits["vmax"])
+
+
+def surface(depth_m: np.ndarray, camera: Mapping[str, Any] | None, value: np.ndarray | None) -> dict[str, Any]:
+    """Points (N, 3) in the camera's frame and their brightness; nothing where the field of view is unknown."""
+    points = camera_points(depth_m, camera)
+    if points is None:
+        return {}
+    known = np.isfinite(depth_m)
+    if value is None:
+        return {"points": points[known].astype(np.float32)}
+    seen = value[known].astype(float)
+    top = float(np.quantile(seen, 0.98)) if seen.size else 1.0
+    return {"points": points[known].astype(np.float32), "point_value": np.clip(seen / (top or 1.0), 0, 1)}
+
+
+def camera_points(depth_m: np.ndarray, camera: Mapping[str, Any] | None) -> np.ndarray | None:
+    """Points (H, W, 3) [m] of radial depths (H, W), x right, y down, z forward; None without a camera of this size."""
+    height, width = depth_m.shape
+    if not camera or (camera.get("height"), camera.get("width")) != (height, width):
+        return None
+    return Camera(np.eye(4), float(camera["fov_deg"]), width, height).rays() * depth_m[..., None]
+
+
+def light_over_path(transient: Transient) -> Cube:
+    """Radiance of every pixel over FRAMES equal steps of path length, each return spread evenly over its interval."""
+    near, far = transient.path_near_m.astype(float), transient.path_far_m.astype(float)
+    low, high = _span(near, far, transient.radiance)
+    step = (high - low) / FRAMES
+    seen = near < high
+    cube = np.zeros((transient.height * transient.width, FRAMES))
+    spread(cube, transient.return_pixel[seen], (near[seen] - low) / step, (far[seen] - low) / step,
+           transient.radiance[seen])  # fmt: skip
+    shape = (transient.height, transient.width, FRAMES)
+    return Cube("light", "1/(m² sr) per step", cube.reshape(shape), low * NS_PER_M, step * NS_PER_M, "line")
+
+
+def spread(cube: np.ndarray, row: np.ndarray, near: np.ndarray, far: np.ndarray, energy: np.ndarray) -> None:
+    """Add returns, each uniform from `near` to `far` (in cells), to rows of a cube (P, T); what lies beyond T is left
+    out, what begins before 0 goes to the first cell."""
+    rows, cells = cube.shape
+    near, far = np.clip(near, 0, cells), np.clip(far, 0, cells)
+    length = far - near
+    point = length < POINT
+    ramps = np.zeros((rows, cells + 2))
+    # the light that has arrived rises with a constant slope from `near` to `far`: each kink's slope, then summed
+    for place, sign in ((near[~point], 1.0), (far[~point], -1.0)):
+        cell = np.floor(place).astype(np.int64)
+        slope = sign * energy[~point] / length[~point]
+        np.add.at(ramps, (row[~point], cell), slope * (1 - (place - cell)))
+        np.add.at(ramps, (row[~point], cell + 1), slope * (place - cell))
+    cube += np.clip(np.cumsum(ramps, axis=1)[:, :cells], 0, None)  # sums of kinks end a rounding beside 0
+    inside = point & (near < cells)
+    np.add.at(cube, (row[inside], np.floor(near[inside]).astype(np.int64)), energy[inside])
+
+
+def _span(near: np.ndarray, far: np.ndarray, radiance: np.ndarray) -> tuple[float, float]:
+    if not len(near):
+        return 0.0, 1.0
+    order = np.argsort(far, kind="stable")
+    passed = np.cumsum(radiance[order], dtype=float)
+    end = far[order[int(np.searchsorted(passed, TAIL * passed[-1]))]] if passed[-1] > 0 else far.max()
+    low = float(near.min())
+    margin = 0.01 * (float(end) - low) + 0.01
+    return max(low - margin, 0.0), float(end) + margin
+
+
+def merged_returns(transient: Transient, scale: float, unit: str) -> Returns:
+    """Make one line of the returns of a pixel that lie in one cell of time and are of one kind: energies are summed,
+    times weighted by energy."""
+    time = 0.5 * (transient.path_near_m.astype(float) + transient.path_far_m) * NS_PER_M
+    direct = transient.bounces == 1
+    cell = np.floor(time / np.where(direct, DIRECT_NS, INDIRECT_NS)).astype(np.int64)
+    cells = int(cell.max(initial=0)) + 1
+    key = (transient.return_pixel * 2 + ~direct) * cells + cell
+    kinds, place = np.unique(key, return_inverse=True)
+    energy = np.bincount(place, transient.radiance, len(kinds))
+    moment = np.bincount(place, transient.radiance * time, len(kinds))
+    centre = np.bincount(place, time, len(kinds)) / np.maximum(np.bincount(place, minlength=len(kinds)), 1)
+    centre = np.divide(moment, energy, out=centre, where=energy > 0)
+    owner, late = np.divmod(kinds // cells, 2)
+    order = np.lexsort((centre, owner))
+    sizes = np.bincount(owner, minlength=transient.height * transient.width)
+    note = f"{unit}; lines stand for direct returns within {DIRECT_NS:g} ns and indirect ones within {INDIRECT_NS:g} ns"
+    offsets = np.concatenate(([0], np.cumsum(sizes)))
+    return Returns(offsets, centre[order], scale * energy[order], late[order] == 0, note)
+
+
+def expected_cube(transient: Transient, sensor: Sensor, rates: Rates) -> np.ndarray:
+    """Return the rates (H, W, T) float32 that detections are drawn from, before pile-up and dead time.
+
+    For looking: arrivals are rounded to quarters of a bin before the pulse is applied, by FFT over the period. The
+    exact rates of a pixel are those of `spad.detection.detect.expected_in_pixel`.
+    """
+    period = sensor.bins_per_period
+    fine = period * FINER
+    per_cell = SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s / FINER
+    edges_s = (np.arange(fine + 1) - fine // 2 - 0.5) * sensor.bin_width_s / FINER
+    pulse = np.fft.rfft(np.roll(sensor.response.shares(edges_s), -(fine // 2)))
+    pixels = transient.height * transient.width
+    found = np.empty((pixels, sensor.bins), np.float32)
+    alive = rates.signal_scale * rates.alive.reshape(-1)
+    for start in range(0, pixels, BLOCK):
+        part = slice(start, min(start + BLOCK, pixels))
+        mine = slice(int(transient.offsets[part.start]), int(transient.offsets[part.stop]))
+        near, far = (path[mine].astype(float) / per_cell for path in (transient.path_near_m, transient.path_far_m))
+        turns = np.floor(near / fine) * fine  # time wraps at the period
+        light = np.zeros((part.stop - part.start, 2 * fine))
+        spread(light, transient.return_pixel[mine] - start, near - turns, far - turns, transient.radiance[mine])
+        light = light[:, :fine] + light[:, fine:]
+        # a cell's light stands at its centre, a bin's edge between two of them
+        blurred = np.fft.irfft(np.fft.rfft(light, axis=1) * pulse, fine, axis=1).reshape(len(light), period, FINER)
+        signal = np.clip(blurred.sum(axis=2), 0, None)[:, : sensor.bins]
+        found[part] = signal * alive[part, None] + (rates.background.reshape(-1)[part] / period)[:, None]
+    return found.reshape(transient.height, transient.width, sensor.bins)
+
+
+def transient_facts(transient: Transient) -> dict[str, str]:
+    meta = transient.meta
+    error = meta.get("relative_error", {}).get("total")
+    return {
+        "kind": "transient",
+        "scene": str(meta.get("scene", "unnamed")),
+        "pixels": _size(transient.depth_m),
+        "returns": f"{transient.returns:,}",
+        "indirect light": f"{transient.indirect_fraction:.1%}",
+        "estimated error": "not stated" if error is None else f"{error:.2%}",
+        "seed": str(meta.get("seed", "none")),
+    }
+
+
+def histogram_facts(histogram: Histogram) -> dict[str, str]:
+    sensor, budget = histogram.sensor, histogram.budget
+    return {
+        "kind": "histogram",
+        "sensor": f"{sensor.name}: {sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps",
+        "pixels": _size(histogram.depth_m),
+        "photon budget": f"{budget.signal:g} signal + {budget.background:g} background detections a pixel",
+        "detections": f"{int(histogram.counts.sum(dtype=np.int64)):,}",
+        "detection law": str(histogram.meta.get("model", "not stated")),
+        "seed": str(histogram.meta.get("seed", "none")),
+    }
+
+
+def _size(image: np.ndarray) -> str:
+    return f"{image.shape[0]} rows x {image.shape[1]} columns"

@@ -1,0 +1,62 @@
+"""A depth map's file: one OpenEXR with Z [m], `confidence` where it is known, and what made it."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenes.errors import InputError
+from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
+
+
+def write_depth(depth_m: np.ndarray, path: Path, meta: dict[str, Any], confidence: np.ndarray | None = None) -> None:
+    """Write a depth map (H, W) [m], and beside it how sure a network is of it (`confidence`, in [0, 1])."""
+    import OpenEXR
+
+    layers = {"Z": depth_m} if confidence is None else {"Z": depth_m, "confidence": confidence}
+    channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        ATTRIBUTE: seal({**meta, "unit": "m"}, "depth", _sha256(channels)),
+    }
+    with whole_file(path) as beside:
+        try:
+            OpenEXR.File(header, channels).write(str(beside))
+        except RuntimeError as error:
+            raise OSError(str(error)) from None
+
+
+def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
+    """Read a depth map, its confidence or None, and its metadata; check its hash.
+
+    Raises InputError in one line for a missing, foreign, truncated or altered file.
+    """
+    import OpenEXR
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: file not found")
+    try:
+        # OpenEXR reports damage on stdout and returns what it could read
+        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
+            header, channels = dict(file.header()), {k: c.pixels for k, c in file.channels().items()}
+    except Exception as error:  # OpenEXR raises bare exceptions of its own
+        raise InputError(f"{path}: not a readable EXR file ({' '.join(str(error).split())[:120]})") from None
+    try:
+        if ATTRIBUTE not in header or "Z" not in channels:
+            raise InputError("no depth map of scene2spad")
+        meta, sha256 = open_seal(header[ATTRIBUTE], "depth")
+        meta = check_seal(meta, sha256, _sha256(channels))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return channels["Z"], channels.get("confidence"), meta
+
+
+def _sha256(channels: dict[str, np.ndarray]) -> str:
+    """Hash the depth, and the confidence where there is one."""
+    layers = [channels[name] for name in ("Z", "confidence") if name in channels]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(layer).tobytes() for layer in layers)).hexdigest()
