@@ -27,6 +27,7 @@ class Card:
     levels        photon levels of training, in words
     cpu_minutes   of its training; None where they were not recorded
     val_mae_mm    on its validation set, as the model was decoded then
+    init          model whose weights its training began with; None: random weights
     errors        MAE [mm] by set and level, where `ship` was told
     not_for       what it must not be used for
     """
@@ -40,6 +41,7 @@ class Card:
     steps: int
     cpu_minutes: float | None
     val_mae_mm: float | None
+    init: str | None
     errors: dict[str, dict[str, float]]
     not_for: tuple[str, ...]
 
@@ -65,6 +67,7 @@ def read_card(path: Path) -> Card:
         steps=config.steps,
         cpu_minutes=told.get("cpu_minutes"),
         val_mae_mm=state.get("val_mae_mm"),
+        init=config.data.get("init"),
         errors=told.get("errors", {}),
         not_for=limits(config),
     )

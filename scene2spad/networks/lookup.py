@@ -59,8 +59,13 @@ def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> M
 
 
 def other_seeds(wanted: Iterable[ModelSpec], command: Study) -> dict[ModelSpec, Trained]:
-    """Trainings of the same models by OTHER_SEEDS, where there are any: none is missed, and none is trained for it."""
-    return _library(command).gather([replace(one, seed=seed) for one in wanted for seed in OTHER_SEEDS])
+    """Look up the same models trained with OTHER_SEEDS. Missing ones are skipped, not trained or reported."""
+    return where_trained([replace(one, seed=seed) for one in wanted for seed in OTHER_SEEDS], command)
+
+
+def where_trained(wanted: Sequence[ModelSpec], command: Study) -> dict[ModelSpec, Trained]:
+    """Look up models that a study can do without. Missing ones are skipped, not trained or reported."""
+    return _library(command).gather(wanted)
 
 
 def _library(command: Study) -> ModelRegistry:

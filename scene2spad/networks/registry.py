@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 
@@ -33,6 +33,8 @@ class ModelSpec:
 
     design         as of `train`, none and peak among them (block and compression then mean nothing)
     time_offset_m  random delays in training, 0 as published
+    trained_on     rooms: direct light in rooms, the recipe of the offset study; mixed: rooms and clutter with indirect
+                   light as well, levels over their whole range
     """
 
     design: str = "learned"
@@ -41,6 +43,7 @@ class ModelSpec:
     seed: int = 0
     time_offset_m: float = 0.0
     full: bool = False
+    trained_on: Literal["rooms", "mixed"] = "rooms"
 
     @property
     def coded(self) -> bool:
@@ -49,20 +52,23 @@ class ModelSpec:
     @property
     def label(self) -> str:
         """Without compression and seed: what a line in a figure is called."""
+        mixed = ", mixed training" if self.trained_on == "mixed" else ""
         if not self.coded:
-            return {"none": "no compression", "peak": "peak"}[self.design]
+            return {"none": "no compression", "peak": "peak"}[self.design] + mixed
         sort = f"{'full ' if self.full else ''}{self.design}"
         moved = f", trained with offsets to {self.time_offset_m:g} m" if self.time_offset_m else ""
-        return f"{sort} {'x'.join(map(str, self.block))}{moved}"
+        return f"{sort} {'x'.join(map(str, self.block))}{moved}{mixed}"
 
     @property
     def name(self) -> str:
-        """Of its run's folder and of the shipped file: learned-1024x4x4-128x-s0, none-s0, ...-t8-s0."""
+        """Of its run's folder and of the shipped file: learned-1024x4x4-128x-s0, none-mixed-s0, ...-t8-s0."""
         parts = [f"{'full-' if self.full else ''}{self.design.replace('+', '-')}"]
         if self.coded:
             parts += ["x".join(map(str, self.block)), f"{self.compression}x"]
         if self.time_offset_m:
             parts.append(f"t{self.time_offset_m:g}")
+        if self.trained_on != "rooms":
+            parts.append(self.trained_on)
         return "-".join([*parts, f"s{self.seed}"])
 
     def command(self, preset: str, training: Path, folder: Path) -> Train:

@@ -39,14 +39,17 @@ def test_names_and_labels():
         ModelSpec("fourier+learned", full=True),
         ModelSpec("none", seed=2),
         ModelSpec(time_offset_m=7.5),
+        ModelSpec(trained_on="mixed"),
     ]
     assert [one.name for one in wanted] == [
         "learned-256x4x4-128x-s0",
         "full-fourier-learned-256x4x4-128x-s0",
         "none-s2",
         "learned-256x4x4-128x-t7.5-s0",
+        "learned-256x4x4-128x-mixed-s0",
     ]
-    assert [one.label for one in wanted[2:]] == ["no compression", "learned 256x4x4, trained with offsets to 7.5 m"]
+    labels = ["no compression", "learned 256x4x4, trained with offsets to 7.5 m", "learned 256x4x4, mixed training"]
+    assert [one.label for one in wanted[2:]] == labels
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from render.settings import RenderSettings
 from scene2spad.networks.registry import ModelSpec
 
-BACKGROUNDS = (50.0, 20.0, 5.0, 1.0)
-LEVELS = tuple((signal, background) for signal in (50.0, 10.0) for background in BACKGROUNDS)
+BACKGROUNDS = (50.0, 10.0, 5.0, 1.0)
+LEVELS = tuple((signal, background) for signal in (100.0, 50.0, 10.0) for background in BACKGROUNDS)
 HEADLINE = (50.0, 50.0)
 FILTER, PEAK = "log-matched", "argmax"
 MODELS = (
@@ -17,6 +17,8 @@ MODELS = (
     ModelSpec("fourier", (1024, 1, 1)),
     ModelSpec("none"),
 )
+# The same designs trained with indirect light, too
+MIXED = tuple(replace(one, trained_on="mixed") for one in MODELS)
 # What of a render is sensed: the same surfaces, truth and mean counts.
 LIGHTS: dict[str, str] = {"flood": "direct and indirect light", "direct": "direct light alone"}
 

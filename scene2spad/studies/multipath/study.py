@@ -1,4 +1,4 @@
-"""`study multipath`: networks trained on direct light beside the filter on all bins, where light takes several paths.
+"""`study multipath`: networks beside the filter on all bins, where light takes several paths.
 
 Every room is rendered once under a flood laser, with indirect and ambient light. The same render without its indirect
 light stands beside it, scaled to the same mean counts: what differs between the two is multipath alone. The background
@@ -21,11 +21,11 @@ from csph.training.views import Views
 from render.pipeline import Progress
 from render.transient import Transient
 from scene2spad.datasets.test_sets import TestSet, evaluated
-from scene2spad.networks.lookup import obtain
+from scene2spad.networks.lookup import ModelLookup, obtain, where_trained
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import plain_log, plt, save
-from scene2spad.studies.multipath.plan import FILTER, HEADLINE, LIGHTS, MODELS, PEAK, PLANS, Plan
+from scene2spad.studies.multipath.plan import FILTER, HEADLINE, LIGHTS, MIXED, MODELS, PEAK, PLANS, Plan
 from scene2spad.studies.results import Store
 from scene2spad.studies.transport.study import direct_alone, rendered_once, without_network
 from scenes.files import finite, whole_file, write_csv
@@ -34,14 +34,18 @@ from scenes.model import Laser
 
 log = logging.getLogger("scene2spad")
 
-COLOURS = {FILTER: "black", PEAK: "tab:grey", **{one.name: f"C{n}" for n, one in enumerate(MODELS)}}
+COLOURS = {FILTER: "black", PEAK: "tab:grey"}
+COLOURS |= {one.name: f"C{n}" for models in (MODELS, MIXED) for n, one in enumerate(models)}
+# a model trained on direct light -> the same design trained with indirect light
+MIXED_NAMES = {plain.name: mixed.name for plain, mixed in zip(MODELS, MIXED, strict=True)}
 
 
 def run(command: Study, progress: Progress) -> dict:
     """Render, measure every method on both kinds of light, compare; table, JSON and figure in `command.out`."""
     plan, folder = PLANS[command.preset], command.out / command.preset
     models = obtain(MODELS, command, progress)
-    subjects = [without_network(name) for name in (FILTER, PEAK)] + [one.subject for one in models.found.values()]
+    trained = models.found | where_trained(MIXED, command)
+    subjects = [without_network(name) for name in (FILTER, PEAK)] + [one.subject for one in trained.values()]
     full = rendered_rooms(plan, folder, progress)
     names = tuple(name for name, _ in plan.scenes)
     lights = dict(zip(LIGHTS, (full, tuple(direct_alone(one) for one in full)), strict=True))
@@ -54,7 +58,7 @@ def run(command: Study, progress: Progress) -> dict:
     }  # fmt: skip
     numbers: dict[str, Any] = {
         "preset": command.preset,
-        **models.described(),
+        **ModelLookup(trained, models.absent).described(),
         "lights": LIGHTS,
         "scenes": [_described(name, one) for name, one in zip(names, full, strict=True)],
         "summary": summary(rows, subjects, plan.levels),
@@ -158,29 +162,31 @@ def _told(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
 
 
 def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
-    """MAE against the background, a panel a signal: full light as lines, direct light alone dashed."""
-    signals = list(dict.fromkeys(line["signal"] for line in means))
+    """MAE under all light against the background, a panel a signal. Networks trained on direct light alone are dashed
+    where the same design trained with indirect light is there."""
+    mine = [line for line in means if line["light"] == "flood"]
+    signals, methods = ([*dict.fromkeys(line[key] for line in mine)] for key in ("signal", "method"))
     figure, panels = plt.subplots(
-        1, len(signals), figsize=(6.2 * len(signals), 5), layout="constrained", sharey=True, squeeze=False
+        1, len(signals), figsize=(2 + 4.2 * len(signals), 5), layout="constrained", sharey=True, squeeze=False
     )
     for axes, signal in zip(panels[0], signals, strict=True):
-        for method in dict.fromkeys(line["method"] for line in means):
-            for light, style in zip(LIGHTS, ("-", "--"), strict=True):
-                mine = [m for m in means if (m["method"], m["light"], m["signal"]) == (method, light, signal)]
-                points = [[m[key] for m in mine] for key in ("background", "mae_mm")]
-                label = method if light == "flood" else None
-                axes.plot(*points, style, marker="o", ms=3.5, color=COLOURS[method], label=label)
+        for method in methods:
+            points = [
+                [m[key] for m in mine if (m["method"], m["signal"]) == (method, signal)]
+                for key in ("background", "mae_mm")
+            ]
+            style = "--" if MIXED_NAMES.get(method) in methods else "-"
+            axes.plot(*points, style, marker="o", ms=3.5, color=COLOURS[method], label=method)
         axes.set_xscale("log")
         plain_log(axes)
-        ticks = sorted({m["background"] for m in means})
+        ticks = sorted({m["background"] for m in mine})
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
         axes.set(xlabel="mean background photons per pixel", title=f"{signal:g} signal photons")
         axes.grid(alpha=0.3)
     panels[0, 0].set_ylabel("mean absolute depth error [mm]")
-    panels[0, 0].plot([], [], "--", color="0.4", label="dashed: direct light alone")
     handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
     rooms = f"{scenes} room{'s' if scenes != 1 else ''}"
     figure.suptitle(f"Multipath: {rooms} under a flood laser, mean of scenes", fontsize=11)
     return save(figure, path)
