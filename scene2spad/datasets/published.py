@@ -261,6 +261,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     """Networks on the paper's pairs in its own simulation, by both decoders: a table (.csv), and the means."""
     named = {str(path): load_model(checkpoint_of(path))[0] for path in command.checkpoints}
     require(bool(named), "evaluate: give at least one checkpoint")
+    require(not command.levels, "evaluate: --levels does not go with --set published, whose 16 levels are the paper's")
     rows = evaluate_as_published(named, seed=command.seed, offset_m=command.offset, progress=progress)
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(rows, command.out / "evaluation-published.csv")

@@ -192,6 +192,20 @@ def baseline(name: str) -> Method:
     return lambda histogram: histogram_depth_m(histogram, depth_of)
 
 
+def photon_levels(said: Sequence[str]) -> tuple[tuple[float, float], ...]:
+    """Mean (signal, background) photons of levels such as "1+100"; the paper's 16 of none. InputError for others."""
+    found = []
+    for one in said:
+        try:
+            signal, background = map(float, one.split("+"))
+        except ValueError:
+            raise InputError(f"levels {one!r}: expected SIGNAL+BACKGROUND in photons a pixel, as in 1+100") from None
+        fits = 0 < signal < math.inf and 0 <= background < math.inf
+        require(fits, f"levels {one!r}: expected signal photons above 0 and background photons of 0 or more")
+        found.append((signal, background))
+    return tuple(found) or PHOTON_LEVELS
+
+
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     """Networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
     models = [load_model(checkpoint_of(path))[0] for path in command.checkpoints]
@@ -222,7 +236,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         methods,
         views,
         sensor,
-        levels=PHOTON_LEVELS,
+        levels=photon_levels(command.levels),
         tile=common_tile(models) if command.tiled else (1, 1),
         offset_m=command.offset,
         seed=command.seed,
@@ -231,7 +245,29 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
     first = f"{models[0].config.name}{in_8_bits if command.int8 else ''}"
-    return {**results(found, groups, first, command.json), "overflows": sum(overflows), "csv": str(table)}
+    shown = results(found, groups, first, command.json)
+    if command.levels:
+        shown["by_level"] = by_level(found, groups, command.json)
+    return {**shown, "overflows": sum(overflows), "csv": str(table)}
+
+
+def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[dict[str, Any]]:
+    """Mean MAE [mm] and share within 10 mm of every level and group; as lines unless `full`."""
+    rows = [row for row in found.rows if row.group == "all"]
+    lines: list[dict[str, Any]] = []
+    for signal, background in dict.fromkeys((row.signal, row.background) for row in rows):
+        here = [row for row in rows if (row.signal, row.background) == (signal, background)]
+        for name, members in groups.items():
+            mine = [row for row in here if row.method in members]
+            means = {key: float(np.nanmean([getattr(row, key) for row in mine])) for key in ("mae_mm", "within_10mm")}
+            lines.append({"signal": signal, "background": background, "method": name, **means})
+    if full:
+        return lines
+    return [
+        f"{line['signal']:g} + {line['background']:g} photons, {line['method']}: MAE {line['mae_mm']:.1f} mm, "
+        f"{line['within_10mm']:.1%} within 10 mm"
+        for line in lines
+    ]
 
 
 def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> dict[str, Any]:
@@ -244,6 +280,7 @@ def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: b
             name: found.difference(groups[first], groups[name], levels)._asdict() for name in groups if name != first
         }
         for levels in LEVEL_GROUPS
+        if found.values(groups[first], levels=levels)  # chosen levels may all be of one group
     }
     head = {"method": first, "trainings": len(groups[first]), **head}
     if not full:

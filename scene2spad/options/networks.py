@@ -102,6 +102,8 @@ class Evaluate(Common):
     project, in its own simulation, read by both decoders."""
     baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
     """Estimators of `depth`, and CODE-K decoded without a network."""
+    levels: tuple[str, ...] = ()
+    """Photon levels, mean signal + background a pixel, as in 1+100 3+3 (default: the paper's 16); each gets a line."""
     views: Count = None
     """Only the first N views (default: all)."""
     offset: float = 0.0

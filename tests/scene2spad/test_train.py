@@ -96,6 +96,12 @@ def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
     assert by_sbr["high_sbr"]["mae_mm"] < by_sbr["low_sbr"]["mae_mm"]
     every = found["methods"]["log-matched"]["all"]["all"]
     assert every["mae_interval_mm"][0] < every["mae_mm"] < every["mae_interval_mm"][1]
+    few = run(capfd, "evaluate", "run", "--set", str(packed), "--levels", "2+100", "50+1", "--out", "few")
+    assert [(one["signal"], one["background"]) for one in few["by_level"][::4]] == [(2, 100), (50, 1)]
+    dim, bright = (
+        [x["mae_mm"] for x in few["by_level"] if x["signal"] == s and x["method"] == "argmax"] for s in (2, 50)
+    )
+    assert dim > bright and len(Path("few/evaluation.csv").read_text().splitlines()) == 1 + 6 * 2 * 4 * 3
     moved = run(capfd, "evaluate", "run", "--set", str(packed), "--views", "1", "--offset", "2", "--out", "table")
     assert min(b["near_m"] for b in moved["methods"]["argmax"]["bias_by_depth"]) >= 2
 
@@ -178,6 +184,10 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
     assert "trained for another sensor" in refused(capfd, *depth, "--checkpoint", str(trained))
     evaluate = ["evaluate", str(trained), "--set", str(packed)]
     assert "expected argmax" in refused(capfd, *evaluate, "--baselines", "guess")
+    for level in ("10", "1+x", "0+5", "2+-1", "nan+1"):
+        assert f"levels '{level}': expected" in refused(capfd, *evaluate, "--levels", level)
+    paper = refused(capfd, "evaluate", str(trained), "--set", "published", "--levels", "1+1")
+    assert "--levels does not go with --set published" in paper
     assert "outside 0 to the sensor's range" in refused(capfd, *evaluate, "--offset", "20")
     assert "file not found" in refused(capfd, "evaluate", "nowhere", "--set", str(packed))
 
