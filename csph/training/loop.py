@@ -3,7 +3,8 @@
     config.json         every number of the run, written before its first step
     log.csv             one row an epoch: step, learning rate, training loss, validation RMSE and MAE by both decoders,
                         participation rank of spatial codes
-    model.safetensors   weights of the lowest validation RMSE, with the configuration in the header
+    model.safetensors   the weights that are kept, with the configuration in the header: those of the last epoch with
+                        one cosine, whose rate ends near 0; else those of the lowest validation RMSE
     timings.jsonl       seconds of each epoch
     energy.csv          energy of a learned temporal code by groups of time bins, now and then from the start on
     last.safetensors    weights after the last step
@@ -128,7 +129,7 @@ class DepthTraining(pl.LightningModule):
 
 
 class Record(pl.Callback):
-    """At the end of each epoch: a row of the log, the weights if they are the best so far, and what to resume from."""
+    """At the end of each epoch: a row of the log, the weights that are kept, and what to resume from."""
 
     def __init__(self, folder: Path, progress: Progress) -> None:
         self.folder, self.progress = folder, progress
@@ -172,7 +173,9 @@ class Record(pl.Callback):
             metric.reset()
         self.rows = [*self.rows, row]
         if trainer.is_global_zero:
-            if row["val_rmse_mm"] < best or not (self.folder / "model.safetensors").is_file():
+            # the hardest photon levels rule the RMSE of a few frames, and hide what the end of a cosine gains elsewhere
+            better = module.config.schedule == "cosine" or row["val_rmse_mm"] < best
+            if better or not (self.folder / "model.safetensors").is_file():
                 save_model(module.kept, module.config, row, self.folder / "model.safetensors")
             write_csv(self.rows, self.folder / "log.csv")
             log.info(

@@ -155,6 +155,8 @@ def test_the_average_is_what_is_kept_and_resumes_exactly(tmp_path):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
     header = (tmp_path / "whole" / "log.csv").read_text().splitlines()[0].split(",")
     assert {"val_mae_mm_soft-argmax", "val_mae_mm_median", "spatial_rank"} <= set(header)
+    # one cosine: the last weights are kept
+    assert load_model(tmp_path / "whole")[2]["step"] == 9
     plain = train(replace(config, average=0.0), training, validation, tmp_path / "plain")
     assert plain["steps"] == 9
     kept, last = (load_model(tmp_path / name / "last.safetensors")[0] for name in ("whole", "plain"))

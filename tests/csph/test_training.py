@@ -183,8 +183,11 @@ def test_a_run_that_stops_goes_on_to_the_same_weights(tmp_path):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
     rows = (tmp_path / "whole" / "log.csv").read_text().splitlines()
     assert [row.split(",")[1] for row in rows] == ["step", "3", "6", "9"]
-    best = min(float(row.split(",")[4]) for row in rows[1:])
-    assert whole["val_rmse_mm"] == pytest.approx(best)
+    rmse_mm = [float(row.split(",")[4]) for row in rows[1:]]
+    assert whole["val_rmse_mm"] == pytest.approx(rmse_mm[-1])  # one cosine: the last
+    stepped = train(replace(config, schedule="steps"), *views, tmp_path / "steps")
+    rows = (tmp_path / "steps" / "log.csv").read_text().splitlines()
+    assert stepped["val_rmse_mm"] == pytest.approx(min(float(row.split(",")[4]) for row in rows[1:]))
     # the same folder, other numbers or another set
     with pytest.raises(InputError, match="holds a run with other options or another set"):
         train(replace(config, rate=1e-4), *views, tmp_path / "whole")
