@@ -52,16 +52,15 @@ class LayerOptions:
 def make_coding(
     design: Design, sensor: Sensor | None = None, seed: int = 0, spatial_start: SpatialStart = "uniform"
 ) -> CodingTensor:
-    """The coding tensor that a design begins with: fixed codes, and learned parts uniform in +-1/sqrt(n), n the entries
-    of one code of that part; a spatial part may begin orthogonal instead, with the same mean square. `sensor` (default:
-    the reference) lends its pulse to Gray Fourier.
+    """Return the coding tensor that a design begins with: fixed codes, and learned parts uniform in +-1/sqrt(n), n the
+    entries of one code of that part; a spatial part may begin orthogonal instead, with the same mean square. `sensor`
+    (default: the reference) lends its pulse to Gray Fourier.
 
     Raises InputError where K does not fit the code.
     """
     (bins, rows, columns), codes = design.block, design.codes
     if design.full:
-        start = uniform_start((codes, bins, rows, columns), design.size, seed)
-        return CodingTensor(design.name, start)
+        return CodingTensor(design.name, uniform_start((codes, bins, rows, columns), design.size, seed))
     if design.code in ("learned", "random"):
         temporal = uniform_start((codes, bins), bins, seed)
     else:
@@ -84,6 +83,11 @@ class CompressiveLayer(nn.Module):
     Sums are in float32 whatever the counts' type and autocast, in float64 where the weights are.
     """
 
+    temporal: Tensor
+    spatial: Tensor | None
+    pulse: Tensor | None
+    background: Tensor | None
+
     def __init__(
         self,
         coding: CodingTensor,
@@ -100,10 +104,11 @@ class CompressiveLayer(nn.Module):
         self.name, self.block, self.codes, self.computed = coding.name, coding.block, coding.codes, coding.computed
         self.options = options or LayerOptions()
         for name, part in parts.items():
-            if name in learned:
-                self.register_parameter(name, nn.Parameter(part.clone()))
+            copied = None if part is None else part.clone()
+            if copied is not None and name in learned:
+                self.register_parameter(name, nn.Parameter(copied))
             else:
-                self.register_buffer(name, None if part is None else part.clone())
+                self.register_buffer(name, copied)
         self.register_buffer("pulse", self._pulse(sensor or Sensor()), persistent=False)
         self.register_buffer("background", self._background(background), persistent=False)
 
@@ -117,8 +122,8 @@ class CompressiveLayer(nn.Module):
         spatial_start: SpatialStart = "uniform",
         **options: bool,
     ) -> CompressiveLayer:
-        """The layer of a design at its start; `options` are switches of LayerOptions."""
-        switches = LayerOptions(zero_mean=design.zero_mean)
+        """Return the layer of a design at its start; `options` are switches of LayerOptions."""
+        switches = LayerOptions(zero_mean=bool(design.zero_mean))
         return cls(
             make_coding(design, sensor, seed, spatial_start),
             learned=design.learned,
@@ -137,13 +142,16 @@ class CompressiveLayer(nn.Module):
     def _background(self, shape: Tensor | None) -> Tensor | None:
         if shape is None:
             return None
-        good = shape.ndim == 1 and bool(shape.isfinite().all()) and len(shape) % self.block[0] == 0 and shape.any()
-        said = f"background of shape {tuple(shape.shape)}: expected finite values over time, a multiple of"
-        require(bool(good), f"{said} {self.block[0]} bins, not all zero")
+        good = (
+            shape.ndim == 1 and bool(shape.isfinite().all()) and len(shape) % self.block[0] == 0 and bool(shape.any())
+        )
+        message = f"background of shape {tuple(shape.shape)}: expected finite values over time, a multiple of"
+        require(good, f"{message} {self.block[0]} bins, not all zero")
         return (shape / shape.abs().max()).float()
 
     def _blurred(self, weights: Tensor) -> Tensor:
         """sum_i C[k, i, ...] h_i(tau): the codes of a pulse that arrives at each bin centre."""
+        assert self.pulse is not None
         flat = weights.reshape(*weights.shape[:2], -1)
         return (self.pulse.to(weights.dtype).T @ flat).view(weights.shape)
 
@@ -152,15 +160,15 @@ class CompressiveLayer(nn.Module):
         return self._blurred(part) if self.options.pulse_in_codes else part
 
     def weights(self) -> Tensor:
-        """(K, Mt, Mr, Mc) that counts are encoded with: the constraint and the pulse applied."""
+        """Return (K, Mt, Mr, Mc) that counts are encoded with: the constraint and the pulse applied."""
         return full_tensor(self._temporal_part(), self.spatial)
 
     def coding(self) -> CodingTensor:
-        """The weights as they are now, constraint and pulse applied; separable ones stay so."""
+        """Return the weights as they are now, constraint and pulse applied; separable ones stay so."""
         return CodingTensor(self.name, self._temporal_part(), self.spatial, computed=self.computed)
 
     def pixel_gram(self) -> Tensor:
-        """Inner products of the codes of each two pixels of a block, (Mr Mc, Mr Mc): see `csph.codes.rank`."""
+        """Return inner products of the codes of each two pixels of a block, (Mr Mc, Mr Mc): see `csph.codes.rank`."""
         temporal = self._temporal_part()
         return rank.pixel_gram(temporal) if self.spatial is None else rank.separable_gram(temporal, self.spatial)
 
@@ -168,40 +176,43 @@ class CompressiveLayer(nn.Module):
         return self.spatial is None or blocks.forms(self.codes, self.block, counts)
 
     def encode(self, counts: Tensor) -> Tensor:
-        """Codes of a histogram. Raises InputError for counts of another shape or type, or that blocks do not tile."""
+        """Return codes of a histogram. Raises InputError for counts of another shape or type, or that blocks do not
+        tile."""
         with torch.autocast(counts.device.type, enabled=False):
-            if not self._forms(counts.numel()):
+            if self.spatial is not None and not self._forms(counts.numel()):
                 return blocks.encode_separable(counts, self._temporal_part(), self.spatial)
             return blocks.encode_blocks(counts, self.weights())
 
     def encode_timestamps(self, timestamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
-        """The same codes from detections; size (T, R, C) of the histogram that is not built. See `encode_photons`."""
+        """Return the same codes from detections; size (T, R, C) of the histogram that is not built. See
+        `encode_photons`."""
         with torch.autocast(timestamps.device.type, enabled=False):
             return encode_photons(timestamps, offsets, photon_table(self.weights()), self.block, size, name=self.name)
 
     def decode(self, codes: Tensor) -> Tensor:
-        """ZN(C~)^T ZN(y). Raises InputError for codes of another shape."""
+        """Return ZN(C~)^T ZN(y). Raises InputError for codes of another shape."""
         good = codes.ndim == 5 and codes.shape[1] == self.codes
         require(good, f"codes of shape {tuple(codes.shape)}: expected (batch, {self.codes}, time, rows, columns)")
         with torch.autocast(codes.device.type, enabled=False):
             return self._projected(codes.to(self.temporal.dtype))
 
     def forward(self, counts: Tensor) -> Tensor:
-        """`decode(encode(counts))`, the input of the depth network."""
+        """Return `decode(encode(counts))`, the input of the depth network."""
         with torch.autocast(counts.device.type, enabled=False):
             return self._projected(self.encode(counts))
 
     def _projected(self, codes: Tensor) -> Tensor:
         centre = not (self.options.keep_mean and self.codes <= KEEP_MEAN_UP_TO)
         over = (2,) if self.options.per_pixel_norm else ()
-        if self.background is None and not self._forms(codes.numel() * math.prod(self.block) // self.codes):
+        counts = codes.numel() * math.prod(self.block) // self.codes
+        if self.background is None and self.spatial is not None and not self._forms(counts):
             unit = blocks.zero_normalised(codes, 1, centre=centre, over=over)
             temporal = self._temporal_part()
             if self.options.pulse_in_decoder:
                 temporal = self._blurred(temporal)
             return blocks.correlate_separable(unit, temporal, self.spatial, centre=centre)
         weights = self.weights()
-        direction = None if self.background is None else self._direction(weights, codes.shape[2])
+        direction = None if self.background is None else self._direction(self.background, weights, codes.shape[2])
         if self.options.pulse_in_decoder:
             weights = self._blurred(weights)
         if direction is not None:
@@ -213,9 +224,9 @@ class CompressiveLayer(nn.Module):
         axis = 0 if direction is None else 1
         return blocks.back_project(unit, blocks.zero_normalised(weights, axis, centre=centre))
 
-    def _direction(self, weights: Tensor, times: int) -> Tensor:
+    def _direction(self, background: Tensor, weights: Tensor, times: int) -> Tensor:
         """(T/Mt, K) unit vectors along what the background leaves in the codes of each time block; 0 where nothing."""
-        shape = self.background.to(weights.dtype).view(-1, self.block[0])
+        shape = background.to(weights.dtype).view(-1, self.block[0])
         require(len(shape) == times, f"background of {shape.numel()} bins, codes of {times * self.block[0]}")
         per_bin = weights.sum((2, 3))
         left = shape @ per_bin.T

@@ -32,7 +32,7 @@ def zero_normalised(values: Tensor, axis: int, epsilon: float) -> Tensor:
 
 
 def back_project(codes: Tensor, tensor: Tensor, epsilon: float) -> Tensor:
-    """Back-project codes by a transposed strided convolution, codes and tensor zero-normalised over K.
+    """Return back-project codes by a transposed strided convolution, codes and tensor zero-normalised over K.
 
     codes (B, K, T / Mt, R / Mr, C / Mc), tensor (K, Mt, Mr, Mc) -> (B, 1, T, R, C).
     """

@@ -7,10 +7,11 @@ it by chance alone. Here a straight line passes thin panes and the holes of cut-
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, Rays, UInts, Vectors
 from render.direct.integrator import Layers
 from render.scene.rays import MAX_LAYERS, camera_rays, shape_index, spawn
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, recorded, upload
@@ -23,13 +24,14 @@ CERTAIN, MIN_WEIGHT, MAX_LIKELY = 3, 1 / 6, 0.95
 FIRST_SPP, MIN_MORE, MAX_MORE = 64, 1.25, 8  # paths a pixel whose noise tells how many times as many are needed
 # Pixels share reflected light: a Gaussian of so many pixels, ended at that radius, of points that lie within a share of
 # the distance of the tangent plane, weighted by the cosine between normals to this power of 2.
-SHARED_SIGMA, SHARED_RADIUS, SHARED_PLANE, SHARED_NORMAL_DOUBLED = 2.0, 4, 0.02, 4
+FILTER_SIGMA, FILTER_RADIUS, FILTER_PLANE, FILTER_NORMAL_DOUBLED = 2.0, 4, 0.02, 4
 
 
 class AmbientLight(NamedTuple):
     """Radiance of each pixel [W/(m^2 sr nm)], (H, W) float32, its noise (rms over pixels by the image's mean), paths.
 
-    Where pixels shared their light (`shared`) the noise is what is left of it; how far it is blurred is not in it.
+    Where pixels share their light (`bilateral_filter`) the noise is what is left of it; how far it is blurred is not in
+    it.
     """
 
     radiance: np.ndarray
@@ -38,19 +40,20 @@ class AmbientLight(NamedTuple):
 
 
 def ambient_light(
-    world: TracedScene, spp: int, bounces: int, seed: int, shared_by: Layers | None = None, *, noise: float = 0.0
+    world: TracedScene, spp: int, bounces: int, seed: int, guide_layers: Layers | None = None, *, noise: float = 0.0
 ) -> AmbientLight:
-    """Steady spectral radiance of environment and area lights at each pixel, after up to `bounces - 1` surfaces.
+    """Return steady spectral radiance of environment and area lights at each pixel, after up to `bounces - 1` surfaces.
 
     L(p) = E[sum over vertices of the path's weight and the light emitted there], with multiple importance sampling
-    (balance heuristic) between lights and reflectance at every surface; unbiased. Same seed, same bytes. With the
-    `shared_by` layers of the pixels' centres, neighbours share what is reflected (`shared`): far less noise, biased.
-    `spp` paths a pixel; where a `noise` is enough, as many as take the `AmbientLight.error` there, `spp` at most.
+    (balance heuristic) between lights and reflectance at every surface; unbiased. Same seed, same bytes. With
+    `guide_layers` of the pixels' centres, neighbours share what is reflected (`bilateral_filter`): far less noise,
+    biased. `spp` paths a pixel; where a `noise` is enough, as many as take the `AmbientLight.error` there, `spp` at
+    most.
     """
     sums, wanted = _Sums(world), spp if noise == 0 else min(spp, FIRST_SPP)
     while True:
         sums.trace(wanted, bounces, seed)
-        light = sums.light(shared_by)
+        light = sums.light(guide_layers)
         if light.error <= noise or wanted == spp:
             return light
         # the first paths underrate what is rare: by steps
@@ -85,27 +88,30 @@ class _Sums:
             self.squares += np.square((seen, seen + light)).sum(axis=2)
             self.spp += now
 
-    def light(self, shared_by: Layers | None) -> AmbientLight:
+    def light(self, guide_layers: Layers | None) -> AmbientLight:
         spp, shape = self.spp, (self.camera.height, self.camera.width)
         emitted = self.emitted / spp
         mean = emitted + self.halves.sum(axis=0) / spp
         variance = np.maximum(self.squares / spp - np.square((emitted, mean)), 0)
         of_emitted, noise2 = variance.mean(axis=1) / max(spp - 1, 1)
-        if shared_by is not None:
+        if guide_layers is not None:
             number = np.array([[spp - spp // 2], [spp // 2]])
-            smooth = shared((self.halves / np.maximum(number, 1)).reshape(2, *shape), shared_by, self.camera)
+            smooth = bilateral_filter(
+                (self.halves / np.maximum(number, 1)).reshape(2, *shape), guide_layers, self.camera
+            )
             mean = emitted + (smooth.reshape(2, -1) * number).sum(axis=0) / spp
             noise2 = of_emitted + np.square(smooth[0] - smooth[1]).mean() / 4
         error = float(np.sqrt(noise2) / mean.mean()) if mean.any() else 0.0
         return AmbientLight(mean.reshape(shape).astype(np.float32), error, spp)
 
 
-def shared(light: np.ndarray, layers: Layers, camera: Camera) -> np.ndarray:
-    """Reflected light (..., H, W) whose irradiance neighbouring pixels of one surface share: a joint bilateral filter.
+def bilateral_filter(light: np.ndarray, layers: Layers, camera: Camera) -> np.ndarray:
+    """Return reflected light (..., H, W) whose irradiance neighbouring pixels of one surface share: a joint bilateral
+    filter.
 
     L_i = a_i sum_j w_ij L_j / sum_j w_ij a_j, with the albedos a and w_ij = exp(-|ij|^2 / 2 sigma^2) (n_i . n_j)^16
     exp(-(n_i . (x_i - x_j) / (share of d_i))^2). Light on surfaces of even irradiance is kept whatever their albedo;
-    edges of shadows and glossy reflections are blurred over some SHARED_SIGMA pixels. Where nothing is hit, or the
+    edges of shadows and glossy reflections are blurred over some FILTER_SIGMA pixels. Where nothing is hit, or the
     albedo is 0, light stays what it is.
     """
     there = np.isfinite(layers.depth_m) & (layers.albedo > 0)
@@ -117,53 +123,55 @@ def shared(light: np.ndarray, layers: Layers, camera: Camera) -> np.ndarray:
     lights = [upload(Float, part) for part in light.reshape(-1, there.size)]
     pixel = dr.arange(UInt32, there.size)
     dr.eval(pixel)
-    found = _shared(pixel, columns, lights, *(dr.opaque(UInt32, side) for side in (camera.width, camera.height)))
+    found = _bilateral_filter(
+        pixel, columns, lights, *(dr.opaque(UInt32, side) for side in (camera.width, camera.height))
+    )
     dr.eval(found)
     return np.stack([part.numpy() for part in found]).reshape(light.shape).astype(np.float64)
 
 
 @recorded
-def _shared(pixel: Any, columns: list, lights: list, width: Any, height: Any) -> list:
-    """`shared` of each pixel; what has an albedo is hit."""
+def _bilateral_filter(pixel: UInts, columns: list, lights: list, width: UInts, height: UInts) -> list:
+    """`bilateral_filter` of each pixel; what has an albedo is hit."""
     albedo = columns[0]
     albedos, *totals = _sums(pixel, columns, lights, width, height)
-    share = albedo / dr.select(albedos > 0, albedos, 1)
-    return [dr.select(albedo > 0, total * share, own) for total, own in zip(totals, lights, strict=True)]
+    fraction = albedo / dr.select(albedos > 0, albedos, 1)
+    return [dr.select(albedo > 0, total * fraction, own) for total, own in zip(totals, lights, strict=True)]
 
 
 @dr.syntax
-def _sums(pixel: Any, columns: list, lights: list, width: Any, height: Any) -> list:
+def _sums(pixel: UInts, columns: list, lights: list, width: UInts, height: UInts) -> list:
     """Weighted sums over each pixel's neighbours of the albedo and of all lights."""
-    side, tap = 2 * SHARED_RADIUS + 1, dr.zeros(UInt32, dr.width(pixel))
+    side, tap = 2 * FILTER_RADIUS + 1, dr.zeros(UInt32, dr.width(pixel))
     sums = [dr.zeros(Float, dr.width(pixel)) for _ in range(1 + len(lights))]
     while tap < side * side:
-        right, down = mi.Int32(tap % side) - SHARED_RADIUS, mi.Int32(tap // side) - SHARED_RADIUS
+        right, down = mi.Int32(tap % side) - FILTER_RADIUS, mi.Int32(tap // side) - FILTER_RADIUS
         sums = _with_neighbour(sums, pixel, columns, lights, (right, down), (mi.Int32(width), mi.Int32(height)))
         tap += 1
     return sums
 
 
-def _with_neighbour(sums: list, pixel: Any, columns: list, lights: list, way: tuple, size: tuple) -> list:
+def _with_neighbour(sums: list, pixel: UInts, columns: list, lights: list, way: tuple, size: tuple) -> list:
     """The sums with what the pixel that way adds."""
     albedo, depth, point, normal = columns[0], columns[1], mi.Vector3f(*columns[2:5]), mi.Vector3f(*columns[5:])
     (right, down), (width, height) = way, size
     column, row = mi.Int32(pixel) % width + right, mi.Int32(pixel) // width + down
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     away2 = right * right + down * down
-    inside &= away2 <= SHARED_RADIUS**2
+    inside &= away2 <= FILTER_RADIUS**2
     other = UInt32(row * width + column)
     its_albedo, _, *its = (dr.gather(Float, values, other, inside) for values in columns)
-    off = dr.dot(mi.Vector3f(*its[:3]) - point, normal) / (SHARED_PLANE * dr.select(albedo > 0, depth, 1))
+    off = dr.dot(mi.Vector3f(*its[:3]) - point, normal) / (FILTER_PLANE * dr.select(albedo > 0, depth, 1))
     alike = dr.maximum(dr.dot(mi.Vector3f(*its[3:]), normal), 0)
-    for _ in range(SHARED_NORMAL_DOUBLED):
+    for _ in range(FILTER_NORMAL_DOUBLED):
         alike *= alike
-    weight = dr.exp(-Float(away2) / (2 * SHARED_SIGMA**2) - off * off) * alike
+    weight = dr.exp(-Float(away2) / (2 * FILTER_SIGMA**2) - off * off) * alike
     weight = dr.select(inside & (its_albedo > 0), weight, 0)
     its_lights = (dr.gather(Float, values, other, inside) for values in lights)
     return [total + weight * more for total, more in zip(sums, (its_albedo, *its_lights), strict=True)]
 
 
-def _of_paths(world: TracedScene, lane: Any, seed: Any, paths: Any, bounces: Any) -> tuple[Any, Any]:
+def _of_paths(world: TracedScene, lane: UInts, seed: UInts, paths: Floats, bounces: UInts) -> tuple[Array, Array]:
     """Light of camera rays, `paths` in a row through random positions of each pixel: seen where emitted; reflected."""
     pixel = lane // paths
     sampler = mi.load_dict({"type": "independent"})
@@ -176,9 +184,9 @@ def _of_paths(world: TracedScene, lane: Any, seed: Any, paths: Any, bounces: Any
 
 
 @dr.syntax
-def _traced(world: TracedScene, sampler: Any, ray: Any, most: Any) -> tuple[Any, Any]:
+def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple[Array, Array]:
     """Light that comes back along each ray: what the ray itself meets, and what surfaces reflect."""
-    scene, context = world.traced, mi.BSDFContext()
+    scene, context = world.mi_scene, mi.BSDFContext()
     lanes = dr.width(ray.d)
     seen, light, weight = dr.zeros(Float, lanes), dr.zeros(Float, lanes), dr.full(Float, 1, lanes)
     before = dr.zeros(mi.Interaction3f, lanes)  # the surface that the ray left, past all that it went straight through
@@ -192,8 +200,8 @@ def _traced(world: TracedScene, sampler: Any, ray: Any, most: Any) -> tuple[Any,
         to_light = mi.DirectionSample3f(scene, si, before)
         chosen = active & (density > 0) & (emitter != None)  # noqa: E711 (an array of pointers)
         of_lights = scene.pdf_emitter_direction(before, to_light, chosen)
-        share = dr.select(chosen, density / (density + of_lights), 1)
-        found = dr.select(active, weight * share * emitter.eval(si, active)[0], 0)
+        fraction = dr.select(chosen, density / (density + of_lights), 1)
+        found = dr.select(active, weight * fraction * emitter.eval(si, active)[0], 0)
         seen += dr.select(met == 0, found, 0)
         light += dr.select(met == 0, 0, found)
 
@@ -207,8 +215,8 @@ def _traced(world: TracedScene, sampler: Any, ray: Any, most: Any) -> tuple[Any,
         lit &= sample.pdf > 0
         value, of_bsdf = bsdf.eval_pdf(context, si, si.to_local(sample.d), lit)
         lit &= value[0] > 0
-        share = dr.select(sample.delta, 1, sample.pdf / (sample.pdf + of_bsdf))
-        light += dr.select(lit, weight * value[0] * emitted[0] * share * _open(world, si, sample, lit), 0)
+        fraction = dr.select(sample.delta, 1, sample.pdf / (sample.pdf + of_bsdf))
+        light += dr.select(lit, weight * value[0] * emitted[0] * fraction * _open(world, si, sample, lit), 0)
 
         bounce, reflected = bsdf.sample(context, si, sampler.next_1d(surface), sampler.next_2d(surface), surface)
         onward = si.to_world(bounce.wo)
@@ -228,7 +236,7 @@ def _traced(world: TracedScene, sampler: Any, ray: Any, most: Any) -> tuple[Any,
     return seen, light
 
 
-def _pane(world: TracedScene, si: Any, ray: Any, sample: Any, hit: Any) -> tuple[Any, Any]:
+def _pane(world: TracedScene, si: Interactions, ray: Rays, sample: LobeSamples, hit: Masks) -> tuple[Array, Array]:
     """Whether a ray passes straight through what it meets, thin glass or the hole of a cut-out, or glass mirrors it."""
     passing, mirrored = Bool(False), Bool(False)
     if world.has_glass:
@@ -241,24 +249,24 @@ def _pane(world: TracedScene, si: Any, ray: Any, sample: Any, hit: Any) -> tuple
     return passing, mirrored
 
 
-def _transmission(ior: Any, ray: Any, si: Any) -> Any:
+def _transmission(ior: Array, ray: Rays, si: Interactions) -> Array:
     """Of a thin pane with all its inner reflections, (1 - F) / (1 + F)."""
     fresnel = mi.fresnel(dr.abs(dr.dot(ray.d, si.n)), dr.maximum(ior, 1.0001))[0]
     return (1 - fresnel) / (1 + fresnel)
 
 
 @dr.syntax
-def _open(world: TracedScene, si: Any, to_light: Any, active: Any) -> Any:
+def _open(world: TracedScene, si: Interactions, to_light: Vectors, active: Masks) -> Array:
     """Transmission of the straight way from a surface to a sampled light; solid glass blocks it, as it bends light."""
     ray = si.spawn_ray_to(to_light.p)
     transmission = dr.full(Float, 1, dr.width(ray.d))
     if dr.hint(not world.sees_through, mode="scalar"):
-        transmission = dr.select(world.traced.ray_test(ray, active), Float(0), Float(1))
+        transmission = dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1))
     else:
         layer, searching, end = dr.zeros(UInt32, dr.width(ray.d)), Bool(active), ray.o + ray.d * ray.maxt
         while searching:
             # most rays are stopped or meet nothing: all about a point is worked out only where it matters
-            first = world.traced.ray_intersect_preliminary(ray, coherent=False, active=searching)
+            first = world.mi_scene.ray_intersect_preliminary(ray, coherent=False, active=searching)
             hit = searching & first.is_valid()
             thin = dr.gather(Float, world.thin_ior, shape_index(first), hit)
             passing = hit & (thin > 0)

@@ -20,15 +20,22 @@ from render.error import (
     noise_power,
     response,
     target_verdict,
-    worst_share_of,
+    worst_fraction_of,
 )
-from render.indirect.integrator import (
-    ProbePixels,
-    Schedule,
-    image_cells,
-)
+from render.indirect.integrator import image_cells
 from render.indirect.path_cells import coarsened
-from render.pipeline import LightSamples, Progress, add_samples, derived_seed, most_spp, spans_of, trace
+from render.indirect.probe import ProbePixels
+from render.indirect.schedule import Schedule
+from render.pipeline import (
+    LightSamples,
+    MoreSamples,
+    Progress,
+    add_samples,
+    derived_seed,
+    filter_octaves_of,
+    most_spp,
+    trace,
+)
 from render.planning import finer_pilot, make_plan, pilot_pixels
 from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, MAX_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
@@ -64,46 +71,33 @@ def render(
     trace, where it is there already, and `plan` what was planned for it, say before another camera in the same room.
     """
     settings = settings or RenderSettings()
-    say = progress or (lambda what, share: None)
+    report = progress or (lambda what, fraction: None)
     camera = scene.camera
     require_memory(MIN_PIXEL_BYTES * camera.width * camera.height, f"a render of {camera.width} x {camera.height}")
     world = TracedScene(scene) if world is None else world
-    say("plan", 0.0)
+    report("plan", 0.0)
     plan = planned(world, settings, seed) if plan is None else plan
-    checked = pilot_pixels(world, derived_seed(seed, STAGE_PLAN))
-    traced = trace(world, plan, settings, seed=seed, checked=checked, progress=say)
+    plan, traced, error = _traced_to_target(world, plan, settings, seed, report)
     layers = centre_layers(world)
     # where nothing is in view there is nothing to explain
-    plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, *traced.reasons))
-    error = _estimated(world, plan, settings, traced, checked)
-    for number in range(MAX_FILTERED_PASSES if plan.filter else 1):
-        more = _additional_schedule(world, plan, settings, traced, error)
-        if more is None:
-            break
-        traced = add_samples(
-            world, plan, settings, traced, more, derived_seed(seed, STAGE_MORE, 0, number), checked, say
-        )
-        plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
-        error = _estimated(world, plan, settings, traced, checked)
-    plan = replace(plan, reasons=(*plan.reasons, *_said_of_bias(plan, traced, error)))
     for line in (*scene.notes, *plan.reasons) if len(traced.samples.pixel) else ():
         log.info("%s", line)
     noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
 
     ambient = AmbientLight(np.zeros((camera.height, camera.width), np.float32), 0.0, 0)
     if plan.ambient:
-        say("ambient light", 0.9)
-        by, spp = layers if settings.ambient_shared else None, settings.ambient_spp or MAX_AMBIENT_SPP
+        report("ambient light", 0.9)
+        by, spp = layers if settings.ambient_filtered else None, settings.ambient_spp or MAX_AMBIENT_SPP
         ambient_seed = derived_seed(seed, STAGE_AMBIENT)
         ambient = ambient_light(world, spp, AMBIENT_BOUNCES, ambient_seed, by, noise=plan.ambient_noise)
-        told = f"ambient light: {ambient.spp} paths a pixel, noise {ambient.error:.2g} of its mean"
-        plan = replace(plan, reasons=(*plan.reasons, told))
-        log.info("%s", told)
+        message = f"ambient light: {ambient.spp} paths a pixel, noise {ambient.error:.2g} of its mean"
+        plan = replace(plan, reasons=(*plan.reasons, message))
+        log.info("%s", message)
     verdict = target_verdict(error, plan.target, len(noise))
     plan = replace(plan, reasons=(*plan.reasons, verdict))
     if len(traced.samples.pixel):
         log.log(logging.INFO if is_met(error, plan.target) else logging.WARNING, "%s", verdict)
-    say("done", 1.0)
+    report("done", 1.0)
     return Transient(
         camera.height,
         camera.width,
@@ -118,8 +112,27 @@ def render(
     )
 
 
+def _traced_to_target(
+    world: TracedScene, plan: Plan, settings: RenderSettings, seed: int, report: Progress
+) -> tuple[Plan, LightSamples, ErrorEstimate]:
+    """Trace what the plan says, and more where its error misses the target; the plan then says so."""
+    checked = pilot_pixels(world, derived_seed(seed, STAGE_PLAN))
+    traced = trace(world, plan, settings, seed=seed, checked=checked, progress=report)
+    plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, *traced.reasons))
+    error = _estimated(world, plan, settings, traced, checked)
+    for number in range(MAX_FILTERED_PASSES if plan.filter else 1):
+        more = _additional_schedule(world, plan, settings, traced, error)
+        if more is None:
+            break
+        extra = MoreSamples(more, derived_seed(seed, STAGE_MORE, 0, number), checked)
+        traced = add_samples(world, plan, settings, traced, extra, report)
+        plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
+        error = _estimated(world, plan, settings, traced, checked)
+    return replace(plan, reasons=(*plan.reasons, *_bias_reasons(plan, traced, error))), traced, error
+
+
 def planned(world: TracedScene, settings: RenderSettings, seed: int = 0) -> Plan:
-    """The plan that `render` makes with these settings and this seed."""
+    """Return the plan that `render` makes with these settings and this seed."""
     return make_plan(world, settings, derived_seed(seed, STAGE_PLAN))
 
 
@@ -130,26 +143,26 @@ def _additional_schedule(
     if settings.spp is not None or traced.schedule is None or traced.indirect is None or plan.target <= 0:
         return None
     batches = traced.schedule.batches
-    allowed = settings.aim * plan.target**2 - error.direct**2 - error.merging**2 - error.bias**2
+    allowed = settings.target_fraction * plan.target**2 - error.direct**2 - error.merging**2 - error.bias**2
     if plan.filter and error.bias < plan.target:
         # what merging and the filter seem to cost after few paths falls with more
-        allowed = max(allowed, MIN_ALLOWED * settings.aim * plan.target**2)
-    enough = error.total**2 <= settings.aim * plan.target**2
+        allowed = max(allowed, MIN_ALLOWED * settings.target_fraction * plan.target**2)
+    enough = error.total**2 <= settings.target_fraction * plan.target**2
     if enough or allowed <= 0 or batches < (FILTERED_BATCHES if plan.filter else BATCHES):
         return None
     left = most_spp(settings)[0] / traced.schedule.cost - 1
     factor = min(error.monte_carlo**2 / allowed - 1, MAX_MORE_FILTERED if plan.filter else MAX_MORE, left)
     if factor <= 0:
         return None
-    rounds = np.ceil(traced.schedule.rounds * factor / batches).astype(np.int64) * batches
-    more = traced.schedule._replace(rounds=rounds)
+    rounds = np.ceil(traced.schedule.spp * factor / batches).astype(np.int64) * batches
+    more = traced.schedule._replace(spp=rounds)
     if plan.filter:
-        spans = spans_of(world, plan, settings, traced.origin_m, traced.schedule.cost + more.cost)
-        return more._replace(spans=spans)
+        filter_octaves = filter_octaves_of(world, plan, settings, traced.origin_m, traced.schedule.cost + more.cost)
+        return more._replace(filter_octaves=filter_octaves)
     return more
 
 
-def _said_of_bias(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
+def _bias_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
     """What to know of a filter's bias, measured against the same paths without it."""
     if not plan.filter or traced.schedule is None:
         return ()
@@ -157,10 +170,10 @@ def _said_of_bias(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tup
         return ("filter: biased, and one path a pixel does not tell by how much",)
     if error.bias == 0:
         return ("filter: biased, by less than the noise of as many paths shows",)
-    told = f"filter: biased by {error.bias:.2g}, measured against the same paths without it"
+    message = f"filter: biased by {error.bias:.2g}, measured against the same paths without it"
     if error.bias > plan.target:
-        told += f", more than the target of {plan.target:.2g}: render without a filter"
-    return (told,)
+        message += f", more than the target of {plan.target:.2g}: render without a filter"
+    return (message,)
 
 
 def _estimated(
@@ -169,11 +182,11 @@ def _estimated(
     """The error of a trace, from the checked pixels' batches and from finer direct light there."""
     coarse = response(select_pixels(traced.direct, checked), checked)
     glints = response(select_pixels(traced.specular, checked), checked)
-    fine = finer_pilot(world, checked, plan.grid, plan.least_share) + glints
+    fine = finer_pilot(world, checked, plan.grid, plan.edge_threshold) + glints
     coarse += glints
     if traced.indirect is None:
         return estimate(coarse, fine)
-    seen = traced.indirect.watched
+    seen = traced.indirect.probed
     place, origin_m = np.arange(len(checked)), traced.origin_m[checked]
     cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
     # what merging changes, in two independent halves: their noise, which merging smooths, cancels in the product
@@ -184,22 +197,22 @@ def _estimated(
         changes.append(response(concatenate([merged, kept._replace(radiance=-kept.radiance)]), place))
     merging = (changes[0] * changes[1]).sum(axis=1)
     bias = 0.0
-    if traced.indirect.plain is None:
+    if traced.indirect.unfiltered is None:
         indirect = response(seen.samples(), place)
         noise = noise_power(seen.radiance, seen.cells.width_of_m)
     else:
         batches = [response(seen.samples(slice(b, b + 1)), place) for b in range(seen.radiance.shape[1])]
         indirect, noise = np.mean(batches, axis=0), noise_of_responses(batches)
-        bias = _filter_bias(batches, traced.indirect.plain, place)
+        bias = _filter_bias(batches, traced.indirect.unfiltered, place)
     # few pixels hold the rare bright paths: the noise of all pixels' totals says how typical the checked ones are
     variance = traced.indirect.noise**2
     of_checked = variance[checked].mean()
     typical = variance.mean() / of_checked if of_checked > 0 else 1.0
     error = estimate(coarse, fine, indirect, noise * typical, merging, bias)
-    return replace(error, worst_share=worst_share_of(traced.indirect.noise, error))
+    return replace(error, worst_share=worst_fraction_of(traced.indirect.noise, error))
 
 
-def _filter_bias(filtered: list[np.ndarray], plain: ProbePixels, place: np.ndarray) -> np.ndarray | float:
+def _filter_bias(filtered: list[np.ndarray], unfiltered: ProbePixels, place: np.ndarray) -> np.ndarray | float:
     """Squared difference that the filter makes, per pixel, from two independent halves of the batches.
 
     What noise adds to it has mean 0; 0 where the sum is not CLEAR standard deviations above that.
@@ -207,7 +220,7 @@ def _filter_bias(filtered: list[np.ndarray], plain: ProbePixels, place: np.ndarr
     if len(filtered) < 2:
         return 0.0
     changes = [
-        np.mean(filtered[half], axis=0) - response(plain.samples(half), place)
+        np.mean(filtered[half], axis=0) - response(unfiltered.samples(half), place)
         for half in (slice(0, None, 2), slice(1, None, 2))
     ]
     squared = (changes[0] * changes[1]).sum(axis=1)
@@ -217,7 +230,7 @@ def _filter_bias(filtered: list[np.ndarray], plain: ProbePixels, place: np.ndarr
 def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> dict:
     if not plan.ambient:
         return {}
-    paths = {"ambient_spp": ambient.spp, "ambient_shared": settings.ambient_shared}
+    paths = {"ambient_spp": ambient.spp, "ambient_filtered": settings.ambient_filtered}
     return paths | {"ambient_error": round(ambient.error, 6)}
 
 

@@ -30,8 +30,8 @@ RULED = 0.5  # share of the squared error in these pixels above which they rule 
 class ErrorEstimate:
     """Relative errors: overall (nRMSE) and its parts, `bias` the filter's; median and 95th percentile of pixels.
 
-    `worst_share` is the share of the squared overall error in the worst pixels (`worst_share_of`). The overall error is
-    a sum of squares: one firefly can rule it, while the median pixel is fine, and being in both of its sums holds it
+    `worst_share` is the share of the squared overall error in the worst pixels (`worst_fraction_of`). The overall error
+    is a sum of squares: one firefly can rule it, while the median pixel is fine, and being in both of its sums holds it
     below 1. It is the error all the same, so that a target it exceeds is missed; the share says what to do about it.
     """
 
@@ -49,7 +49,7 @@ class ErrorEstimate:
 
 
 def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
-    """Energy per reference bin after the pulse, (len(pixels), bins) float64, wrapped at the period.
+    """Return energy per reference bin after the pulse, (len(pixels), bins) float64, wrapped at the period.
 
     A sample's pulse and footprint are taken as one Gaussian of variance sigma^2 + h^2 / 3 at bin centres: exact to
     second order, which is all an error estimate needs of a footprint no wider than the pulse. Wider ones are cut into
@@ -104,7 +104,8 @@ def estimate(
     merging: np.ndarray | float = 0.0,
     bias: np.ndarray | float = 0.0,
 ) -> ErrorEstimate:
-    """Error of direct light by `coarse` against `fine` cells beside the indirect light's `noise`, `merging` and `bias`.
+    """Return error of direct light by `coarse` against `fine` cells beside the indirect light's `noise`, `merging` and
+    `bias`.
 
     coarse, fine, indirect are (pixels, bins) responses; noise, merging and bias squared errors of the pixels. Without
     these four there is direct light alone.
@@ -119,7 +120,7 @@ def estimate(
     per_pixel = np.sqrt(np.maximum(direct + merging + noise + bias, 0)[power > 0] / power[power > 0])
     return ErrorEstimate(
         math.sqrt(sum(parts)),
-        *(math.sqrt(part) for part in parts),
+        *(math.sqrt(part) for part in parts),  # type: ignore[misc]  # mypy cannot count them
         pixel_median=float(np.median(per_pixel)),
         pixel_p95=float(np.quantile(per_pixel, 0.95)),
     )
@@ -130,7 +131,7 @@ def worst_pixels(pixels: int) -> int:
     return min(max(round(WORST_FRACTION * pixels), MIN_WORST), pixels)
 
 
-def worst_share_of(standard_error: np.ndarray, error: ErrorEstimate) -> float:
+def worst_fraction_of(standard_error: np.ndarray, error: ErrorEstimate) -> float:
     """Estimate the share of the squared error in the worst pixels, from every pixel's Monte-Carlo error (H*W,).
 
     Only that part of the error is known of every pixel, and only it is ruled by a few.
@@ -144,7 +145,7 @@ def worst_share_of(standard_error: np.ndarray, error: ErrorEstimate) -> float:
 
 
 def is_met(error: ErrorEstimate, target: float) -> bool:
-    """Whether the stated error is at most the target."""
+    """Return whether the stated error is at most the target."""
     return error.total <= target
 
 
@@ -152,17 +153,19 @@ def target_verdict(error: ErrorEstimate, target: float, pixels: int) -> str:
     """Say in one line whether the stated error meets the target; where a few pixels rule a missed one, say so."""
     if is_met(error, target):
         return f"error: {error.total:.2g} stated, meets the target of {target:.2g}"
-    told = f"warning: the stated error of {error.total:.2g} MISSES the target of {target:.2g}"
-    told += f"; the median pixel's is {error.pixel_median:.2g}"
+    message = f"warning: the stated error of {error.total:.2g} MISSES the target of {target:.2g}"
+    message += f"; the median pixel's is {error.pixel_median:.2g}"
     if error.worst_share > RULED:
         rest = error.total * math.sqrt(1 - error.worst_share)
-        told += f"; {error.worst_share:.0%} of its square lies in the worst {worst_pixels(pixels)} of {pixels} pixels"
-        told += f" (fireflies), {rest:.2g} without them"
-    return told
+        message += (
+            f"; {error.worst_share:.0%} of its square lies in the worst {worst_pixels(pixels)} of {pixels} pixels"
+        )
+        message += f" (fireflies), {rest:.2g} without them"
+    return message
 
 
 def noise_power(batches: np.ndarray, width_m: np.ndarray) -> np.ndarray:
-    """Expected squared error of the mean of independent batches after the pulse, per pixel.
+    """Return expected squared error of the mean of independent batches after the pulse, per pixel.
 
     batches (pixels, batches, cells) radiance; cells of width w. A cell's variance of the mean is
     sum_b (r_b - mean)^2 / (n (n - 1)); spread over the cell and the pulse, a Gaussian of variance
@@ -178,7 +181,7 @@ def noise_power(batches: np.ndarray, width_m: np.ndarray) -> np.ndarray:
 
 
 def noise_of_responses(responses: list[np.ndarray]) -> np.ndarray:
-    """Expected squared error of the mean of independent batches, per pixel, from each one's response.
+    """Return expected squared error of the mean of independent batches, per pixel, from each one's response.
 
     Takes what cells have in common into account, as `noise_power` does not: filtered light spreads over some.
     """
@@ -188,7 +191,8 @@ def noise_of_responses(responses: list[np.ndarray]) -> np.ndarray:
 
 
 def power_of(direct: Samples) -> tuple[float, float]:
-    """Squared sum of direct light's response over bins and pixels; and that of a unit of energy with the pulse alone.
+    """Return squared sum of direct light's response over bins and pixels; and that of a unit of energy with the pulse
+    alone.
 
     A pixel's light is taken as one Gaussian, of the pulse's variance and its own: an underestimate where it is mixed.
     """
@@ -204,7 +208,7 @@ def power_of(direct: Samples) -> tuple[float, float]:
 
 
 def error_for_budget(reference: np.ndarray, signal: float, background: float) -> float:
-    """The error at which Monte-Carlo variance is 1 % of shot variance for that many photons per pixel.
+    """Return the error at which Monte-Carlo variance is 1 % of shot variance for that many photons per pixel.
 
     Shot noise alone has nRMSE sqrt(sum(lambda)) / ||signal part||, with sum(lambda) = pixels (signal + background).
     """
@@ -216,7 +220,7 @@ def error_for_budget(reference: np.ndarray, signal: float, background: float) ->
 
 
 def error_of_background(background: float, signal: float) -> float:
-    """nRMSE that a background of that many photons a pixel would make, were it an error of the signal's photons.
+    """Return nRMSE that a background of that many photons a pixel would make, were it an error of the signal's photons.
 
     b / N in each of N bins, beside s photons of one return with the pulse alone:
     (b / s) sqrt(1 / N) / sqrt(PULSE_POWER).

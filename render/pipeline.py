@@ -12,22 +12,21 @@ from render.direct.integrator import direct_light
 from render.error import power_of
 from render.indirect.integrator import (
     IndirectLight,
-    Schedule,
-    allocate,
+    IndirectTask,
     combined,
     combined_samples,
     image_cells,
     indirect_light,
-    pilot_noise,
-    uniform,
+    path_grid,
 )
 from render.indirect.launch_layout import BLOCK, block_order
 from render.indirect.light_vertices import is_wide
 from render.indirect.path_space_filter import Octaves, octaves
+from render.indirect.schedule import Schedule, allocate, pilot_noise, uniform
 from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, Plan, RenderSettings
 from render.specular.image_method import specular_light
-from render.transient.samples import Growing, Samples, concatenate, no_samples, select
+from render.transient.samples import SampleBuffer, Samples, concatenate, no_samples, select
 
 STAGE_INDIRECT, STAGE_PILOT = 11, 13
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
@@ -72,12 +71,12 @@ class LightSamples(NamedTuple):
 
 
 def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
-    """A 32-bit seed for one pass of one stage of one scene: independent streams from one number."""
+    """Return a 32-bit seed for one pass of one stage of one scene: independent streams from one number."""
     return int(np.random.SeedSequence(seed, spawn_key=(stage, scene, number)).generate_state(1)[0])
 
 
 def most_spp(settings: RenderSettings) -> tuple[int, bool]:
-    """Paths a pixel that a plan may spend, and whether a target was asked for."""
+    """Return paths a pixel that a plan may spend, and whether a target was asked for."""
     asked = settings.error is not None or settings.budget is not None
     return MAX_SPP if asked else MAX_SPP_BY_DEFAULT, asked
 
@@ -95,11 +94,11 @@ def trace(
 
     `checked` are sorted flat pixels whose indirect light is kept by batches, for the error estimate.
     """
-    say = progress or (lambda what, share: None)
+    report = progress or (lambda what, fraction: None)
     camera = world.scene.camera
     pixels = np.arange(camera.height * camera.width)
-    say("direct light", 0.05)
-    direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, least_share=plan.least_share)
+    report("direct light", 0.05)
+    direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, edge_threshold=plan.edge_threshold)
     trim_memory(len(pixels))
     # only indirect light is counted from where direct light is
     origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
@@ -108,21 +107,22 @@ def trace(
     rays, indirect, schedule, reasons = direct.rays, None, None, ()
     if plan.bounces > 1 and brightest > 0:
         schedule, reasons = _schedule(world, plan, settings, direct.samples, origin_m, seed)
-    light = Growing()
+    light = SampleBuffer()
     light.add(direct.samples)
     direct = direct._replace(samples=no_samples())  # they are in the list now
     ends = len(light), len(light) + len(specular.samples.pixel)
     light.add(specular.samples)
     if schedule is not None:
-        ambient_seed = derived_seed(seed, STAGE_INDIRECT)
-        indirect = _indirect(world, plan, settings, schedule, ambient_seed, origin_m, brightest, checked, light, say)
+        task = _task(world, plan, settings, schedule, derived_seed(seed, STAGE_INDIRECT), origin_m, brightest)
+        probed = np.empty(0, np.int64) if checked is None else checked
+        indirect = indirect_light(task, probed, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part))
         rays += schedule.rays(plan.bounces)
     reasons = (*specular.notes, *reasons)
     samples = light.finished(lambda: trim_memory(len(pixels)))
     return LightSamples(samples, ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
 
 
-def _indirect(
+def _task(
     world: TracedScene,
     plan: Plan,
     settings: RenderSettings,
@@ -130,54 +130,43 @@ def _indirect(
     seed: int,
     origin_m: np.ndarray,
     brightest: float,
-    checked: np.ndarray | None,
-    light: Growing,
-    say: Progress,
-) -> IndirectLight:
-    return indirect_light(
-        world,
-        schedule,
-        plan.bounces,
-        seed,
-        origin_m,
-        brightest,
-        np.empty(0, np.int64) if checked is None else checked,
-        light.add,
-        width_m=settings.indirect_tolerance_m,
-        growth=settings.indirect_growth,
-        say=lambda share: say("indirect light", 0.1 + 0.8 * share),
-    )
+) -> IndirectTask:
+    """Describe what is to be traced of indirect light."""
+    width_m, growth = settings.indirect_tolerance_m, settings.indirect_growth
+    grid = path_grid(world, origin_m, brightest, plan.bounces, width_m, growth)
+    return IndirectTask(world, schedule, plan.bounces, seed, grid)
+
+
+class MoreSamples(NamedTuple):
+    """Paths to trace on top of a render: their schedule, seed and probe pixels (sorted, flat)."""
+
+    schedule: Schedule
+    seed: int
+    checked: np.ndarray
 
 
 def add_samples(
-    world: TracedScene,
-    plan: Plan,
-    settings: RenderSettings,
-    traced: LightSamples,
-    more: Schedule,
-    seed: int,
-    checked: np.ndarray,
-    say: Progress,
+    world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, extra: MoreSamples, report: Progress
 ) -> LightSamples:
-    """A trace with further paths, weighted by their numbers.
+    """Return a render's light with further paths, weighted by their numbers.
 
     These follow the first paths' noise; the bias of such a stop is of second order in it.
     """
     _, brightest = mean_path(traced.direct, len(traced.origin_m))
-    light = Growing()
-    added = _indirect(world, plan, settings, more, seed, traced.origin_m, brightest, checked, light, say)
+    light, more = SampleBuffer(), extra.schedule
+    task = _task(world, plan, settings, more, extra.seed, traced.origin_m, brightest)
+    added = indirect_light(task, extra.checked, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part))
     before = traced.schedule
-    share = np.ones(len(traced.origin_m))
+    fraction = np.ones(len(traced.origin_m))
     pixels, real = before.pixels, before.pixels >= 0
-    share[pixels[real]] = np.repeat(before.rounds / (before.rounds + more.rounds), BLOCK)[real]
-    cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
-    merged = combined_samples(traced.indirect_samples, light.finished(), share, cells, traced.origin_m)
+    fraction[pixels[real]] = np.repeat(before.spp / (before.spp + more.spp), BLOCK)[real]
+    merged = combined_samples(traced.indirect_samples, light.finished(), fraction, task.grid.cells, traced.origin_m)
     reason = f"indirect light: the work of {more.cost:.0f} paths a pixel on top, as the target was missed"
     return traced._replace(
         samples=concatenate([traced.direct, traced.specular, merged]),
-        indirect=combined(traced.indirect, added, share),
+        indirect=combined(traced.indirect, added, fraction),
         rays=traced.rays + more.rays(plan.bounces),
-        schedule=before._replace(rounds=before.rounds + more.rounds),
+        schedule=before._replace(spp=before.spp + more.spp),
         reasons=(*traced.reasons, reason),
     )
 
@@ -190,42 +179,45 @@ def _schedule(
     blocks = block_order(np.arange(camera.height * camera.width), camera.width)
     if plan.filter:
         spp = FIRST_FILTERED_SPP if plan.spp is None else plan.spp
-        spans = spans_of(world, plan, settings, origin_m, spp)
+        filter_octaves = filter_octaves_of(world, plan, settings, origin_m, spp)
         rounds = spp if spp < FILTERED_BATCHES else -(-spp // FILTERED_BATCHES) * FILTERED_BATCHES
-        schedule = uniform(blocks, rounds, shared=False)
+        schedule = uniform(blocks, rounds, reuses_paths=False)
         # under a lamp the noise that the filter leaves is even, and a pilot costs more than it saves
         if plan.adaptive and spp >= FIRST_FILTERED_SPP and not is_wide(world):
-            from_m = float(spans.from_m[0])
+            from_m = float(filter_octaves.from_m[0])
             noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT), from_m)
             schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES)
-        least, most = schedule.rounds.min(), schedule.rounds.max()
-        told = f"indirect light: filtered, later than {spans.from_m[0]:.2g} m behind direct light, over regions of "
-        told += f"surfaces {spans.size_m[0]:.2g} to {spans.size_m[-1]:.2g} m wide; {least} to {most} paths a pixel"
-        return schedule._replace(spans=spans), (told,)
+        least, most = schedule.spp.min(), schedule.spp.max()
+        least_m, most_m = filter_octaves.size_m[0], filter_octaves.size_m[-1]
+        message = f"indirect light: filtered, later than {filter_octaves.from_m[0]:.2g} m behind direct light, over "
+        message += f"regions of surfaces {least_m:.2g} to {most_m:.2g} m wide; {least} to {most} paths a pixel"
+        return schedule._replace(filter_octaves=filter_octaves), (message,)
     if plan.spp is not None and (not plan.adaptive or plan.spp < BATCHES):
         rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
-        return uniform(blocks, rounds, shared=False), ()
-    own, shared = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT))
+        return uniform(blocks, rounds, reuses_paths=False), ()
+    own, reused = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT))
     if not plan.adaptive:
-        own, shared = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
+        own, reused = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
     if plan.spp is not None:
-        return allocate(blocks, own, shared, cost=plan.spp), ()
+        return allocate(blocks, own, reused, cost=plan.spp), ()
     power, per_sample = power_of(direct)
     allowed = plan.noise**2 * power / per_sample
-    schedule = allocate(blocks, own, shared, squared_error=allowed)
+    schedule = allocate(blocks, own, reused, squared_error=allowed)
     limit, asked = most_spp(settings)
     wanted, reasons = schedule.cost, []
     if wanted > limit:
-        schedule = allocate(blocks, own, shared, cost=limit)
+        schedule = allocate(blocks, own, reused, cost=limit)
         remedy = "force more with spp" if asked else "ask for more with an error target"
         reasons.append(f"indirect light: the work of {wanted:.0f} paths a pixel would meet the target; {remedy}")
-    spread = f"{schedule.rounds.min()} to {schedule.rounds.max()} paths a pixel, {schedule.shared.mean():.0%} shared"
+    spread = f"{schedule.spp.min()} to {schedule.spp.max()} paths a pixel, {schedule.reuses_paths.mean():.0%} shared"
     reasons.append(f"indirect light: {spread}; the work of {schedule.cost:.0f} paths a pixel")
     return schedule, tuple(reasons)
 
 
-def spans_of(world: TracedScene, plan: Plan, settings: RenderSettings, origin_m: np.ndarray, spp: float) -> Octaves:
-    """Octaves of filtered light for so many paths a pixel in all."""
+def filter_octaves_of(
+    world: TracedScene, plan: Plan, settings: RenderSettings, origin_m: np.ndarray, spp: float
+) -> Octaves:
+    """Return octaves of filtered light for so many paths a pixel in all."""
     distance_m = float(origin_m[origin_m > 0].mean()) / 2
     width_m, growth = settings.indirect_tolerance_m, settings.indirect_growth
     longest_m = float(image_cells(world, width_m, growth, origin_m, plan.bounces).edges_m[-1])
@@ -234,7 +226,8 @@ def spans_of(world: TracedScene, plan: Plan, settings: RenderSettings, origin_m:
 
 
 def mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:
-    """Radiance-weighted mean path of each pixel [m], 0 where there is none; and the brightest pixel's radiance."""
+    """Return radiance-weighted mean path of each pixel [m], 0 where there is none; and the brightest pixel's
+    radiance."""
     total = np.bincount(samples.pixel, weights=samples.radiance, minlength=pixels)
     moment = np.bincount(samples.pixel, weights=samples.radiance * samples.path_m, minlength=pixels)
     return np.divide(moment, total, out=np.zeros(pixels), where=total > 0), float(total.max(initial=0))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from render.direct.integrator import direct_light, least_share_of
+from render.direct.integrator import default_edge_threshold, direct_light
 from render.error import PULSE_POWER, error_for_budget, error_of_background, estimate, response
 from render.indirect.camera_paths import energy_by_bounces
 from render.scene.traced_scene import TracedScene
@@ -19,7 +19,7 @@ from scenes.model import Material
 DEFAULT_ERROR = 0.02
 # What direct light may be off, in shares of the target, where there is other light; and what is planned for of the
 # square that is aimed at: the rest is for merged returns and what twice as many rays a side still miss.
-DIRECT_SHARE, PLANNED = 0.4, 0.96
+DIRECT_FRACTION, PLANNED = 0.4, 0.96
 # Time of a cell in that of a path: where many paths are to come, finer cells leave them more of the error.
 CELL_COST = 0.25
 # The pilot's pixels are not compared with those beside them, so that it shows 1.3 to 1.4 times the error of cells at
@@ -27,15 +27,15 @@ CELL_COST = 0.25
 PILOT_SHOWS = 1.25
 # What noise of ambient light adds to the error at the photons in question, in shares of the target; a constant rate is
 # no echo, and what it does to depth grows with its square. At least, and at most, that noise:
-AMBIENT_SHARE, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE = 0.5, 0.02, 0.5
+AMBIENT_FRACTION, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE = 0.5, 0.02, 0.5
 MAX_LEFT_OUT = 0.02  # energy left out is bias, which no number of photons averages away: it stays small at any target
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
-FINER, FINER_AT_LEAST = 2, 1.5  # direct light is checked against this many times the cells a side
+CHECK_REFINEMENT, MIN_CHECK_REFINEMENT = 2, 1.5  # direct light is checked against this many times the cells a side
 PILOT_GRID = 4
 # Errors of direct light fall at least with this power of the grid (1.2 to 1.9 in rooms); trusted so far beyond a grid.
 GRID_POWER, EXTRAPOLATED = 1.3, 2
-SHARE_POWER = 0.7  # with which they fall as fewer edges are left alone (0.7 at grid 4, 0.5 at 5)
+THRESHOLD_POWER = 0.7  # with which they fall as fewer edges are left alone (0.7 at grid 4, 0.5 at 5)
 # Merging direct returns within 1 mm makes an error of 5e-4 on the reference sensor (measured): a tenth of the target.
 TOLERANCE_M_PER_ERROR = 0.2
 WIDEST_TOLERANCE_M = 0.005
@@ -43,41 +43,46 @@ PILOT_TOLERANCE_M = 0.01  # of path, within which the pilot's returns merge: a q
 
 
 def pilot_pixels(world: TracedScene, seed: int) -> np.ndarray:
-    """A sorted random subset of flat pixel indices, the same for pilot and error estimate."""
+    """Return a sorted random subset of flat pixel indices, the same for pilot and error estimate."""
     pixels = world.scene.camera.height * world.scene.camera.width
     if pixels <= PILOT_PIXELS:
         return np.arange(pixels)
     return np.sort(np.random.default_rng(seed).choice(pixels, PILOT_PIXELS, replace=False))
 
 
-def pilot_response(world: TracedScene, pixels: np.ndarray, grid: int, least_share: float | None = None) -> np.ndarray:
-    """`response` of direct light in a few pixels. Kept with the world: the plan and the error estimate ask the same."""
-    share = least_share_of(grid) if least_share is None else least_share
-    key = grid, share, pixels.tobytes()
+def pilot_response(
+    world: TracedScene, pixels: np.ndarray, grid: int, edge_threshold: float | None = None
+) -> np.ndarray:
+    """Return `response` of direct light in a few pixels. Kept with the world: the plan and the error estimate ask the
+    same."""
+    fraction = default_edge_threshold(grid) if edge_threshold is None else edge_threshold
+    key = grid, fraction, pixels.tobytes()
     if key not in world.responses:
-        light = direct_light(world, pixels, grid, PILOT_TOLERANCE_M, least_share=share)
+        light = direct_light(world, pixels, grid, PILOT_TOLERANCE_M, edge_threshold=fraction)
         world.responses[key] = response(light.samples, pixels)
     return world.responses[key]
 
 
-def finer_pilot(world: TracedScene, pixels: np.ndarray, grid: int, least_share: float) -> np.ndarray:
-    """Direct light of a few pixels by clearly more rays than `grid`: of the plan's pilot, or twice as many a side."""
-    if least_share == least_share_of(grid) and grid * FINER_AT_LEAST <= 2 * PILOT_GRID:
+def finer_pilot(world: TracedScene, pixels: np.ndarray, grid: int, edge_threshold: float) -> np.ndarray:
+    """Return direct light of a few pixels by clearly more rays than `grid`: of the plan's pilot, or twice as many a
+    side."""
+    if edge_threshold == default_edge_threshold(grid) and grid * MIN_CHECK_REFINEMENT <= 2 * PILOT_GRID:
         return pilot_response(world, pixels, 2 * PILOT_GRID)
-    return pilot_response(world, pixels, FINER * grid, least_share / FINER)
+    return pilot_response(world, pixels, CHECK_REFINEMENT * grid, edge_threshold / CHECK_REFINEMENT)
 
 
 def direct_error(world: TracedScene, settings: RenderSettings, seed: int) -> float:
-    """nRMSE of a view's direct light at PILOT_GRID, by twice as many rays a side in some of its pixels."""
+    """Return nRMSE of a view's direct light at PILOT_GRID, by twice as many rays a side in some of its pixels."""
     camera, checked = world.scene.camera, pilot_pixels(world, seed)
     tolerance_m = WIDEST_TOLERANCE_M if settings.direct_tolerance_m is None else settings.direct_tolerance_m
     light = direct_light(world, np.arange(camera.height * camera.width), PILOT_GRID, tolerance_m)
     coarse = response(select_pixels(light.samples, checked), checked)
-    return estimate(coarse, pilot_response(world, checked, FINER * PILOT_GRID)).total
+    return estimate(coarse, pilot_response(world, checked, CHECK_REFINEMENT * PILOT_GRID)).total
 
 
 def rays_for_all(errors: Sequence[float], settings: RenderSettings) -> tuple[int, float]:
-    """Grid and `least_share` at which many views together, their mean squared error, meet direct light's target.
+    """Return grid and `edge_threshold` at which many views together, their mean squared error, meet direct light's
+    target.
 
     `errors` are some views' `direct_error`. One choice for all costs less than each view's own: rays grow with the
     square of the grid, so that the views that need most would take most of them for the least gain. Between two grids
@@ -85,15 +90,15 @@ def rays_for_all(errors: Sequence[float], settings: RenderSettings) -> tuple[int
     """
     target = DEFAULT_ERROR if settings.error is None else settings.error
     off = math.sqrt(np.mean(np.square(errors)))
-    ideal = PILOT_GRID * (off / (_direct_share(settings, settings.bounces == 1) * target)) ** (1 / GRID_POWER)
+    ideal = PILOT_GRID * (off / (_direct_fraction(settings, settings.bounces == 1) * target)) ** (1 / GRID_POWER)
     ideal = min(max(ideal, GRIDS[0]), GRIDS[-1])
     grid = math.floor(ideal + 1e-6)
-    return grid, least_share_of(grid) * (grid / ideal) ** (GRID_POWER / SHARE_POWER)
+    return grid, default_edge_threshold(grid) * (grid / ideal) ** (GRID_POWER / THRESHOLD_POWER)
 
 
-def _direct_share(settings: RenderSettings, direct_alone: bool) -> float:
+def _direct_fraction(settings: RenderSettings, direct_alone: bool) -> float:
     """Of the target; where there is no other light, direct light has all that is aimed at."""
-    return math.sqrt(settings.aim) if direct_alone else DIRECT_SHARE
+    return math.sqrt(settings.target_fraction) if direct_alone else DIRECT_FRACTION
 
 
 def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
@@ -115,14 +120,16 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
         fine = pilot_response(world, pixels, PILOT_GRID)
     target, why = _target(settings, fine)
     reasons.append(why)
-    bounces, spp, paths, whys = _indirect(world, settings, pixels, fine, target, seed)
-    share = _direct_share(settings, direct_alone)
-    grid, off, why = _grid(world, settings, pixels, share * target, paths, PLANNED * settings.aim * target**2)
-    reasons += [why, *whys]
+    bounces, spp, paths, more_reasons = _indirect(world, settings, pixels, fine, target, seed)
+    fraction = _direct_fraction(settings, direct_alone)
+    grid, off, why = _grid(
+        world, settings, pixels, fraction * target, paths, PLANNED * settings.target_fraction * target**2
+    )
+    reasons += [why, *more_reasons]
     tolerance_m = settings.direct_tolerance_m
     if tolerance_m is None:
         tolerance_m = float(np.clip(TOLERANCE_M_PER_ERROR * target, 1e-4, WIDEST_TOLERANCE_M))
-    share = least_share_of(grid) if settings.least_share is None else settings.least_share
+    fraction = default_edge_threshold(grid) if settings.edge_threshold is None else settings.edge_threshold
     ambient, ambient_noise, why = _ambient(world, settings, target)
     reasons.append(why)
     return Plan(
@@ -131,9 +138,9 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
         grid,
         ambient,
         tuple(reasons),
-        least_share=share,
+        edge_threshold=fraction,
         direct_tolerance_m=tolerance_m,
-        noise=math.sqrt(max(PLANNED * settings.aim * target**2 - off**2, 0.0)),
+        noise=math.sqrt(max(PLANNED * settings.target_fraction * target**2 - off**2, 0.0)),
         target=target,
         adaptive=settings.adaptive and mode_is_flood,
         filter=settings.filter,
@@ -144,7 +151,7 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
 def _ambient(world: TracedScene, settings: RenderSettings, target: float) -> tuple[bool, float, str]:
     """Whether steady light is rendered: only if there is any, and a photon budget has room for it; and its noise.
 
-    Noise that would make an error of AMBIENT_SHARE of the target beside the signal of the budget's photons, or where
+    Noise that would make an error of AMBIENT_FRACTION of the target beside the signal of the budget's photons, or where
     there is no budget beside as many signal photons as background.
     """
     if not world.scene.has_ambient:
@@ -157,7 +164,7 @@ def _ambient(world: TracedScene, settings: RenderSettings, target: float) -> tup
     why = "as asked" if settings.ambient else "the scene has environment or area lights"
     if settings.ambient_spp is not None:
         return True, 0.0, f"ambient light: rendered, {why}, with {settings.ambient_spp} paths a pixel, forced"
-    noise = AMBIENT_SHARE * target / error_of_background(background or 1.0, signal)
+    noise = AMBIENT_FRACTION * target / error_of_background(background or 1.0, signal)
     noise = float(np.clip(noise, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE))
     return True, noise, f"ambient light: rendered, {why}, until its noise is {noise:.2g} of its mean"
 
@@ -165,12 +172,12 @@ def _ambient(world: TracedScene, settings: RenderSettings, target: float) -> tup
 def _limits(world: TracedScene) -> list[str]:
     """What this renderer leaves out of the given scene."""
     materials: list[Material] = [surface.material for surface in world.scene.surfaces]
-    said = []
+    lines = []
     if world.has_cutouts:
-        said.append("cut-outs: solid where their opacity is 1/2 or more")
+        lines.append("cut-outs: solid where their opacity is 1/2 or more")
     if any(m.kind == "roughdiffuse" for m in materials):
-        said.append("rough diffuse surfaces: rendered as Lambertian")
-    return said
+        lines.append("rough diffuse surfaces: rendered as Lambertian")
+    return lines
 
 
 def _target(settings: RenderSettings, fine: np.ndarray | None) -> tuple[float, str]:
@@ -238,24 +245,24 @@ def _indirect(
     energy[1] = fine.sum()
     if energy.sum() <= 0:
         return settings.bounces or 1, settings.spp or BATCHES, 0.0, ["indirect light: nothing is lit"]
-    whys = []
+    lines = []
     bounces = settings.bounces
     if bounces is None:
         bounces, left_out = _bounces(energy, min(target / 3, MAX_LEFT_OUT))
-        share = energy[2:].sum() / energy.sum()
-        whys.append(
-            f"bounces: {bounces}; indirect light is {share:.2%} of the energy, {left_out:.2%} is left out beyond"
+        fraction = energy[2:].sum() / energy.sum()
+        lines.append(
+            f"bounces: {bounces}; indirect light is {fraction:.2%} of the energy, {left_out:.2%} is left out beyond"
         )
     else:
-        whys.append(f"bounces: {bounces}, forced")
+        lines.append(f"bounces: {bounces}, forced")
     if bounces == 1:
-        return 1, 0, 0.0, [*whys, "indirect light: none, what it adds is less than may be left out"]
+        return 1, 0, 0.0, [*lines, "indirect light: none, what it adds is less than may be left out"]
     if settings.spp is not None:
-        whys.append(f"indirect light: the work of {settings.spp} paths a pixel, forced")
-        return bounces, settings.spp, 0.0, whys
+        lines.append(f"indirect light: the work of {settings.spp} paths a pixel, forced")
+        return bounces, settings.spp, 0.0, lines
     power = float((fine**2).sum())
-    paths = noise * PULSE_POWER / (PLANNED * settings.aim * target**2 * power) if power > 0 else 0.0
-    return bounces, None, 0.0 if settings.filter else paths, whys
+    paths = noise * PULSE_POWER / (PLANNED * settings.target_fraction * target**2 * power) if power > 0 else 0.0
+    return bounces, None, 0.0 if settings.filter else paths, lines
 
 
 def _bounces(energy: np.ndarray, allowed: float) -> tuple[int, float]:

@@ -8,10 +8,9 @@ Slow and plain on purpose. Only tests and benches import this module.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from render.backend.drjit_types import Array, Floats, Masks, UInts
 from render.scene.rays import camera_rays, first_opaque, laser_leg, spawn
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi
 from scenes.model import Scene
@@ -34,7 +33,7 @@ def path_traced(scene: Scene, edges_m: np.ndarray, *, bounces: int, spp: int, se
     (H, W, T) float64 time-integrated radiance per joule [1/(m^2 sr)] in each interval
     """
 
-    def jittered(number: Any, launch: int) -> tuple[Any, Any, Any]:
+    def jittered(number: UInts, launch: int) -> tuple[Array, Array, Array]:
         # opaque: a number in the kernel's text would compile it anew for every launch
         random = mi.PCG32(dr.width(number), initstate=dr.opaque(mi.UInt64, seed * 1_000_003 + launch))
         return random.next_float32(), random.next_float32(), random
@@ -45,14 +44,14 @@ def path_traced(scene: Scene, edges_m: np.ndarray, *, bounces: int, spp: int, se
 def ray_grid(scene: Scene, edges_m: np.ndarray, *, grid: int) -> np.ndarray:
     """Integrate direct light by a grid x grid of rays in each pixel: (H, W, T) float64, as `path_traced` returns it."""
 
-    def centres(number: Any, launch: int) -> tuple[Any, Any, Any]:
+    def centres(number: UInts, launch: int) -> tuple[Array, Array, Array]:
         x, y = ((Float(index) + 0.5) / grid for index in (number % grid, number // grid))
         return x, y, mi.PCG32(dr.width(number))
 
     return _traced(scene, edges_m, centres, 1, grid * grid)
 
 
-def _traced(scene: Scene, edges_m: np.ndarray, places: Any, bounces: int, spp: int) -> np.ndarray:
+def _traced(scene: Scene, edges_m: np.ndarray, places: Array, bounces: int, spp: int) -> np.ndarray:
     """Sum over `spp` paths of every pixel, each from the place in it that `places` gives for its number."""
     world, camera = TracedScene(scene), scene.camera
     count = camera.height * camera.width
@@ -81,7 +80,7 @@ def _traced(scene: Scene, edges_m: np.ndarray, places: Any, bounces: int, spp: i
     return total.reshape(camera.height, camera.width, -1)
 
 
-def _add(total: np.ndarray, edges_m: np.ndarray, light: Any, path: Any, active: Any) -> None:
+def _add(total: np.ndarray, edges_m: np.ndarray, light: Floats, path: Floats, active: Masks) -> None:
     """Add light to the intervals of its paths; lanes run over pixels, then over paths of a pixel."""
     values, paths = (np.array(array).astype(float) for array in (dr.select(active, light, 0), path))
     pixel = np.arange(len(values)) % len(total)

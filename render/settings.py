@@ -16,7 +16,7 @@ BATCHES = 16  # independent batches of indirect light, whose spread is the error
 FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
 MAX_AMBIENT_SPP = 1 << 12
-SHARED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours share it: as little noise as 45 alone
+FILTERED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours share it: as little noise as 45 alone
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class RenderSettings:
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
     ambient_spp paths per pixel of ambient light; open: as many as its noise asks for
-    ambient_shared  whether neighbouring pixels share the ambient light they reflect: far less noise, edges of shadows
+    ambient_filtered  whether neighbouring pixels share the ambient light they reflect: far less noise, edges of shadows
                 and reflections in it are blurred by some pixels
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
-    aim         share of the squared target that is planned for; the rest is for what pilots miss
+    target_fraction  part of the squared target that is planned for; the rest is for what pilots miss
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
-    least_share edges of surfaces and shadows are followed where they could change this share of a cell or more;
+    edge_threshold  edges of surfaces and shadows are followed where they could change this share of a cell or more;
                 0 follows all of them
     direct_tolerance_m, indirect_tolerance_m   returns of one pixel closer than this in path length merge; direct ones
                 do not with 0
@@ -49,11 +49,11 @@ class RenderSettings:
     grid: int | None = None
     ambient: bool | None = None
     ambient_spp: int | None = None
-    ambient_shared: bool = False
+    ambient_filtered: bool = False
     error: float | None = None
-    aim: float = 0.75
+    target_fraction: float = 0.75
     budget: tuple[float, float] | None = None
-    least_share: float | None = None
+    edge_threshold: float | None = None
     direct_tolerance_m: float | None = None
     indirect_tolerance_m: float = 0.03
     indirect_growth: float = 0.05
@@ -64,8 +64,8 @@ class RenderSettings:
             ("spp", 1, MAX_SAMPLES),
             ("grid", 1, 64),
             ("error", 1e-4, 1.0),
-            ("aim", 0.1, 2.0),
-            ("least_share", 0, 1),
+            ("target_fraction", 0.1, 2.0),
+            ("edge_threshold", 0, 1),
             ("ambient_spp", 1, 1 << 16),
         )
         for name, low, high in limits:
@@ -104,7 +104,7 @@ class Plan:
     grid: int
     ambient: bool
     reasons: tuple[str, ...]
-    least_share: float = 0.5
+    edge_threshold: float = 0.5
     direct_tolerance_m: float = 0.005
     noise: float = 0.0
     target: float = 0.0

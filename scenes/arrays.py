@@ -13,16 +13,17 @@ MAX_RADIANCE = 1e9
 
 
 def frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: str) -> np.ndarray:
-    """`value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError.
+    """Return `value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError.
 
     A read-only array that owns its memory is kept as it is: copies of big meshes were most of a room's time.
     """
-    kept = isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable
-    kept = kept and value.dtype == dtype and value.flags.c_contiguous
-    try:
-        array = value if kept else np.array(value, dtype=dtype, order="C")
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what}: not an array of numbers ({error})") from None
+    array = value if isinstance(value, np.ndarray) else None
+    sound = array is not None and array.dtype == dtype and array.base is None
+    if array is None or not sound or array.flags.writeable or not array.flags.c_contiguous:
+        try:
+            array = np.array(value, dtype=dtype, order="C")
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"{what}: not an array of numbers ({error})") from None
     tail = array.shape[array.ndim - len(shape_tail) :] if array.ndim >= len(shape_tail) else None
     require(tail == shape_tail, f"{what}: shape {array.shape}, expected (..., {', '.join(map(str, shape_tail))})")
     array.setflags(write=False)
@@ -30,13 +31,14 @@ def frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: 
 
 
 def check_faces(faces: np.ndarray, vertices: int, where: str) -> None:
-    """InputError if a face refers to a vertex that is not there."""
+    """Raise InputError if a face refers to a vertex that is not there."""
     worst = faces.min() if faces.min() < 0 else faces.max()
     require(0 <= worst < vertices, f"{where}: a face refers to vertex {worst}, expected 0 to {vertices - 1}")
 
 
 def rigid_pose(value: object, what: str) -> np.ndarray:
-    """`value` as a read-only 4x4 rotation and translation (camera or environment to world); a reflection is refused."""
+    """Return `value` as a read-only 4x4 rotation and translation (camera or environment to world); a reflection is
+    refused."""
     pose = frozen_array(value, np.float64, (4, 4), what)
     require(pose.ndim == 2 and bool(np.isfinite(pose).all()), f"{what}: needs 4x4 finite numbers")
     rotation = pose[:3, :3]
@@ -48,15 +50,15 @@ def rigid_pose(value: object, what: str) -> np.ndarray:
 
 
 def finite_number(value: object, what: str) -> float:
-    """`value` as a finite float, or an InputError."""
-    good = isinstance(value, (int, float, np.number)) and math.isfinite(value)
-    require(good, f"{what} {value!r} is not a finite number")
+    """Return `value` as a finite float, or an InputError."""
+    if not isinstance(value, (int, float, np.number)) or not math.isfinite(value):
+        raise InputError(f"{what} {value!r} is not a finite number")
     return float(value)
 
 
 def checked_radiance(value: object, what: str) -> float:
-    """`value` as a radiance, 0 to MAX_RADIANCE."""
-    value = finite_number(value, what)
-    require(value >= 0, f"{what} {value:g} is negative")
-    require(value <= MAX_RADIANCE, f"{what} {value:g} is above {MAX_RADIANCE:g} W/(m2 sr nm), no light is so bright")
-    return value
+    """Return `value` as a radiance, 0 to MAX_RADIANCE."""
+    number = finite_number(value, what)
+    require(number >= 0, f"{what} {number:g} is negative")
+    require(number <= MAX_RADIANCE, f"{what} {number:g} is above {MAX_RADIANCE:g} W/(m2 sr nm), no light is so bright")
+    return number

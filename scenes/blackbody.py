@@ -16,7 +16,7 @@ PEAK_EFFICACY_LM_PER_W = 683.0
 
 
 def planck_w_per_m2_nm(wavelength_m: np.ndarray | float, temperature_k: float = SUN_TEMPERATURE_K) -> np.ndarray:
-    """Spectral exitance of a black body [W/(m^2 nm)], 2 pi h c^2 / lambda^5 / (exp(h c / (lambda k T)) - 1)."""
+    """Return spectral exitance of a black body [W/(m^2 nm)], 2 pi h c^2 / lambda^5 / (exp(h c / (lambda k T)) - 1)."""
     wavelength = np.asarray(wavelength_m, dtype=np.float64)
     energy = PLANCK_J_S * SPEED_OF_LIGHT_M_PER_S / (wavelength * BOLTZMANN_J_PER_K * temperature_k)
     exitance = 2 * math.pi * PLANCK_J_S * SPEED_OF_LIGHT_M_PER_S**2 / wavelength**5 / np.expm1(energy)
@@ -24,7 +24,7 @@ def planck_w_per_m2_nm(wavelength_m: np.ndarray | float, temperature_k: float = 
 
 
 def photopic(wavelength_m: np.ndarray) -> np.ndarray:
-    """CIE 1931 luminous efficiency V(lambda), 0 to 1, by the two-lobe fit of Wyman, Sloan and Shirley (2013)."""
+    """Return CIE 1931 luminous efficiency V(lambda), 0 to 1, by the two-lobe fit of Wyman, Sloan and Shirley (2013)."""
     nm = np.asarray(wavelength_m, dtype=np.float64) * 1e9
     return 0.821 * _lobe(nm, 568.8, 46.9, 40.5) + 0.286 * _lobe(nm, 530.9, 16.3, 31.1)
 
@@ -34,7 +34,7 @@ def _lobe(nm: np.ndarray, centre: float, left: float, right: float) -> np.ndarra
 
 
 def sunlight_w_per_m2_nm(illuminance_lux: float, wavelength_m: float) -> float:
-    """Spectral irradiance of sunlight of a given illuminance [W/(m^2 nm)]: the sun as a black body of 5778 K.
+    """Return spectral irradiance of sunlight of a given illuminance [W/(m^2 nm)]: the sun as a black body of 5778 K.
 
     E(lambda) = illuminance M(lambda) / (683 lm/W x integral of V M). The black body knows nothing of the atmosphere's
     absorption bands: there the real sunlight is weaker.
@@ -45,7 +45,7 @@ def sunlight_w_per_m2_nm(illuminance_lux: float, wavelength_m: float) -> float:
 
 
 def sunlit_sky_w_per_m2_sr_nm(illuminance_lux: float, wavelength_m: float) -> float:
-    """Radiance of an even sky that lights an open, level surface as strongly as sunlight of that illuminance.
+    """Return radiance of an even sky that lights an open, level surface as strongly as sunlight of that illuminance.
 
     E / pi, with E as in `sunlight_w_per_m2_nm`. It has the sun's strength and no shadows.
     """
@@ -53,6 +53,6 @@ def sunlit_sky_w_per_m2_sr_nm(illuminance_lux: float, wavelength_m: float) -> fl
 
 
 def seen_radiance_w_per_m2_sr_nm(temperature_k: float) -> float:
-    """Spectral radiance of a black body as the eye weights it: its mean over V(lambda), 360 to 830 nm."""
+    """Return spectral radiance of a black body as the eye weights it: its mean over V(lambda), 360 to 830 nm."""
     grid = np.arange(360e-9, 830e-9, 1e-9)
     return float(np.average(planck_w_per_m2_nm(grid, temperature_k), weights=photopic(grid))) / math.pi

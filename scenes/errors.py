@@ -21,7 +21,7 @@ def printable(text: str) -> str:
 
 
 def require(condition: bool, message: str) -> None:
-    """InputError with `message` unless `condition` holds."""
+    """Raise InputError with `message` unless `condition` holds."""
     if not condition:
         raise InputError(message)
 

@@ -28,7 +28,7 @@ SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 2, "network": 1}
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` to write to; renamed to `path` at the end, removed if anything goes wrong.
+    """Yield a temporary path beside `path` to write to; renamed to `path` at the end, removed if anything goes wrong.
 
     What killed processes of this machine left in the folder is removed before the first file goes there. Raises
     InputError in one line when the folder is missing, the disk is full, or writing is not allowed.
@@ -141,7 +141,7 @@ def read_array(path: Path) -> np.ndarray:
 
 
 def write_csv(rows: Sequence[Mapping[str, object]], path: Path) -> Path:
-    """Rows of the same keys as a table, whole or not at all; returns the path."""
+    """Write rows of the same keys as a table, whole or not at all; returns the path."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [*rows[0]], lineterminator="\n")
     writer.writeheader()
@@ -152,13 +152,14 @@ def write_csv(rows: Sequence[Mapping[str, object]], path: Path) -> Path:
 
 
 def seal(meta: dict, kind: str, arrays_sha256: str) -> str:
-    """The JSON that a file of ours carries: `meta`, its kind and schema, and a SHA-256 over these and the arrays."""
+    """Return the JSON that a file of ours carries: `meta`, its kind and schema, and a SHA-256 over these and the
+    arrays."""
     body = {**meta, "kind": kind, "schema": SCHEMAS[kind]}
     return json.dumps({**body, "sha256": _digest(body, arrays_sha256)}, sort_keys=True)
 
 
 def open_seal(text: str, kind: str) -> tuple[dict, str]:
-    """Metadata and SHA-256 of a sealed file of the expected kind; `check_seal` follows when the arrays are read.
+    """Return metadata and SHA-256 of a sealed file of the expected kind; `check_seal` follows when the arrays are read.
 
     Raises InputError if it is something else, or of a newer schema.
     """
@@ -178,7 +179,7 @@ def open_seal(text: str, kind: str) -> tuple[dict, str]:
 
 
 def check_seal(body: dict, sha256: str, arrays_sha256: str) -> dict:
-    """The metadata as it was given to `seal`; InputError where metadata or arrays changed since."""
+    """Return the metadata as it was given to `seal`; InputError where metadata or arrays changed since."""
     if _digest(body, arrays_sha256) != sha256:
         raise InputError("contents do not match their SHA-256: the file is damaged or was altered")
     return {key: value for key, value in body.items() if key not in ("kind", "schema")}
@@ -209,7 +210,7 @@ def silenced() -> Iterator[None]:
 
 
 def finite(value: object) -> object:
-    """JSON knows no NaN: null instead."""
+    """Return JSON knows no NaN: null instead."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

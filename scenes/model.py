@@ -10,7 +10,7 @@ import hashlib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -22,9 +22,9 @@ MaterialKind = Literal[
 ]
 MicrofacetDistribution = Literal["ggx", "beckmann"]
 LaserMode = Literal["flood", "line", "scan"]
-MATERIAL_KINDS: tuple[str, ...] = MaterialKind.__args__
-LASER_MODES: tuple[str, ...] = LaserMode.__args__
-DISTRIBUTIONS: tuple[str, ...] = MicrofacetDistribution.__args__
+MATERIAL_KINDS: tuple[str, ...] = get_args(MaterialKind)
+LASER_MODES: tuple[str, ...] = get_args(LaserMode)
+DISTRIBUTIONS: tuple[str, ...] = get_args(MicrofacetDistribution)
 # Fields that came later, left out of a hash at these values: what was there before keeps its hash.
 _ADDED_AT = {"distribution": "ggx"}
 # Metres from the origin: float32, in which rays are traced, resolves 1 m there.
@@ -174,10 +174,10 @@ class Camera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", rigid_pose(self.pose, "camera pose"))
         for label, value in (("width", self.width), ("height", self.height)):
-            value = finite_number(value, f"camera {label}")
-            good = value == int(value) and 1 <= value <= MAX_IMAGE_SIDE
-            require(good, f"camera {label} {value:g} is outside 1 to {MAX_IMAGE_SIDE} whole pixels")
-            object.__setattr__(self, label, int(value))
+            side = finite_number(value, f"camera {label}")
+            good = side == int(side) and 1 <= side <= MAX_IMAGE_SIDE
+            require(good, f"camera {label} {side:g} is outside 1 to {MAX_IMAGE_SIDE} whole pixels")
+            object.__setattr__(self, label, int(side))
         object.__setattr__(self, "fov_deg", finite_number(self.fov_deg, "camera fov"))
         require(0.01 <= self.fov_deg <= 170, f"camera fov {self.fov_deg:g} degrees is outside 0.01 to 170")
 
@@ -192,7 +192,7 @@ class Camera:
         height: int,
         up: Iterable[float] = (0.0, 1.0, 0.0),
     ) -> Camera:
-        """A camera at `origin` whose axis meets `target`, with `up` (world) upwards in the image."""
+        """Return a camera at `origin` whose axis meets `target`, with `up` (world) upwards in the image."""
         origin, target, up = (np.asarray(tuple(v), float) for v in (origin, target, up))
         forward = target - origin
         right = _cross(forward, up)
@@ -219,17 +219,17 @@ class Camera:
         return 0.5 * self.width / math.tan(math.radians(self.fov_deg) / 2)
 
     def resized(self, width: int | None = None, height: int | None = None) -> Camera:
-        """The same horizontal angle with another image size; one size alone keeps the proportions."""
-        if width is None and height is None:
-            return self
+        """Return the same horizontal angle with another image size; one size alone keeps the proportions."""
         if width is None:
+            if height is None:
+                return self
             width = max(1, round(self.width * height / self.height))
-        if height is None:
+        elif height is None:
             height = max(1, round(self.height * width / self.width))
         return replace(self, width=width, height=height)
 
     def rays(self, x: np.ndarray | None = None, y: np.ndarray | None = None) -> np.ndarray:
-        """Unit directions in the world, float64, through raster positions x, y (default: all pixel centres)."""
+        """Return unit directions in the world, float64, through raster positions x, y (default: all pixel centres)."""
         if x is None or y is None:
             x, y = np.arange(self.width) + 0.5, np.arange(self.height)[:, None] + 0.5
         local = np.ones((*np.broadcast_shapes(np.shape(x), np.shape(y)), 3))
@@ -238,7 +238,8 @@ class Camera:
         return local @ self.rotation.T
 
     def pixel_solid_angle(self) -> np.ndarray:
-        """Solid angle of each pixel [sr], (H, W), exact: the sum over corners of +-atan(x y / sqrt(1 + x^2 + y^2))."""
+        """Return solid angle of each pixel [sr], (H, W), exact: the sum over corners of +-atan(x y / sqrt(1 + x^2 +
+        y^2))."""
         x = (np.arange(self.width + 1) - self.width / 2) / self.focal_px
         y = (np.arange(self.height + 1)[:, None] - self.height / 2) / self.focal_px
         corner = np.arctan(x * y / np.sqrt(1 + x * x + y * y))
@@ -276,17 +277,18 @@ class Laser:
         return self.baseline_m == (0.0, 0.0, 0.0)
 
     def position(self, camera: Camera) -> np.ndarray:
-        """Laser position in the world, metres."""
+        """Return laser position in the world, metres."""
         return camera.origin + camera.rotation @ np.asarray(self.baseline_m)
 
     def cos_half_angle(self, camera: Camera) -> float:
-        """Cosine of the flood cone's half angle."""
+        """Return cosine of the flood cone's half angle."""
         if self.cone_deg is not None:
             return math.cos(math.radians(self.cone_deg) / 2)
         return camera.focal_px / math.hypot(camera.focal_px, camera.width / 2, camera.height / 2)
 
     def intensity(self, camera: Camera) -> np.ndarray:
-        """Radiant intensity of the lit cone, row or pixel while each pixel is measured [1/sr per joule], (H, W)."""
+        """Return radiant intensity of the lit cone, row or pixel while each pixel is measured [1/sr per joule], (H,
+        W)."""
         if self.mode == "flood":
             return np.full((camera.height, camera.width), 1 / (2 * math.pi * (1 - self.cos_half_angle(camera))))
         solid_angle = camera.pixel_solid_angle()
@@ -349,16 +351,16 @@ class Scene:
         return lit or any(surface.emission > 0 for surface in self.surfaces)
 
     def without_lights(self) -> Scene:
-        """The same scene under no light but the laser's."""
+        """Return the same scene under no light but the laser's."""
         return replace(self, surfaces=tuple(replace(s, emission=0.0) for s in self.surfaces), ambient=Ambient())
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of all surfaces, metres."""
+        """Return lowest and highest corner of all surfaces, metres."""
         low = np.min([s.vertices.min(axis=0) for s in self.surfaces], axis=0)
         return low, np.max([s.vertices.max(axis=0) for s in self.surfaces], axis=0)
 
     def digest(self) -> str:
-        """SHA-256 over everything that decides what is rendered; names and notes do not count.
+        """Return SHA-256 over everything that decides what is rendered; names and notes do not count.
 
         It is the hash of the parts' hashes, which textures, materials and surfaces keep: views share them.
         """

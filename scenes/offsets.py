@@ -24,13 +24,13 @@ LIMIT_M = 1e4
 
 
 def check_offset(metres: float) -> float:
-    """`metres` if it is a distance a scene may be moved by, else an InputError."""
+    """Return `metres` if it is a distance a scene may be moved by, else an InputError."""
     require(math.isfinite(metres) and 0 <= metres <= LIMIT_M, f"offset {metres:g} m is outside 0 to {LIMIT_M:g}")
     return metres
 
 
 def pushed_along_rays(scene: Scene, metres: float) -> Scene:
-    """Every point p at distance d in direction r from the camera goes to p + metres r, d + metres.
+    """Return every point p at distance d in direction r from the camera goes to p + metres r, d + metres.
 
     A flat face does not stay flat, so faces are divided until pushed edges lie within 0.6 mm of their place. Shading
     normals follow: n' is along r (r n) + (n - r (r n)) / (1 + metres / d), the inverse transpose of the map.
@@ -116,7 +116,7 @@ def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
 
 
 def moved_away(scene: Scene, metres: float, *, median_m: float, nearest_m: float) -> Scene:
-    """The content `metres` farther along the camera's axis, which is the same as the camera that far back.
+    """Return the content `metres` farther along the camera's axis, which is the same as the camera that far back.
 
     median_m, nearest_m: median and least depth along the axis of what the image shows. The new image holds, at the
     median depth, what the old one held: tan(fov'/2) = tan(fov/2) median / (median + metres). What lies nearer than
@@ -156,13 +156,13 @@ def _beyond(surface: Surface, origin: np.ndarray, axis: np.ndarray, least_m: flo
         start = sum(map(len, made))
         n = len(a)
         for other in (b, c):
-            share = depth[a] / (depth[a] - depth[other])
-            made.append(table[a] + share[:, None] * (table[other] - table[a]))
+            fraction = depth[a] / (depth[a] - depth[other])
+            made.append(table[a] + fraction[:, None] * (table[other] - table[a]))
         ab, ac = start + np.arange(n), start + n + np.arange(n)
         pieces = [(a, ab, ac)] if corners == 1 else [(ab, b, c), (ab, c, ac)]
         faces += [np.column_stack(piece) for piece in pieces]
-    used, faces = np.unique(np.concatenate(faces), return_inverse=True)
+    used, renumbered = np.unique(np.concatenate(faces), return_inverse=True)
     table = np.concatenate(made)[used]
     uv = None if surface.uv is None else table[:, 3:5]
     normals = None if surface.normals is None else table[:, -3:]
-    return replace(surface, vertices=table[:, :3], faces=faces.reshape(-1, 3), uv=uv, normals=normals)
+    return replace(surface, vertices=table[:, :3], faces=renumbered.reshape(-1, 3), uv=uv, normals=normals)

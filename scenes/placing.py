@@ -57,8 +57,8 @@ class Placing:
         if self.origin is None and self.target is None:
             return replace(camera, fov_deg=fov)
         origin = camera.origin if self.origin is None else self.origin
-        target = target if self.target is None else self.target
-        return Camera.look_at(origin, target, fov_deg=fov, width=camera.width, height=camera.height)
+        aimed_at = target if self.target is None else self.target
+        return Camera.look_at(origin, aimed_at, fov_deg=fov, width=camera.width, height=camera.height)
 
 
 AS_IT_IS = Placing()
@@ -69,7 +69,8 @@ def scaled(scene: Scene, factor: float) -> Scene:
     pose = scene.camera.pose.copy()
     pose[:3, 3] *= factor
     surfaces = tuple(replace(surface, vertices=surface.vertices * factor) for surface in scene.surfaces)
-    laser = replace(scene.laser, baseline_m=tuple(factor * value for value in scene.laser.baseline_m))
+    right, down, forward = (factor * value for value in scene.laser.baseline_m)
+    laser = replace(scene.laser, baseline_m=(right, down, forward))
     return replace(scene, surfaces=surfaces, camera=replace(scene.camera, pose=pose), laser=laser)
 
 

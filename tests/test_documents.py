@@ -66,10 +66,10 @@ def test_the_worked_example_of_the_photon_budget_runs(tmp_path, monkeypatch, cap
     exec(compile(block, "radiometric.md", "exec"), {})
     (command,) = re.findall(r"scene2spad (sense wall\.exr.*?)\n    scene2spad", text, re.S)
     assert main([*command.replace("\\\n", " ").split(), "--no-figure", "--json"]) == 0
-    told = json.loads(capfd.readouterr().out.splitlines()[-1])
-    assert told["mean_signal"] == pytest.approx(163.9, abs=0.1)
-    assert told["mean_background"] == pytest.approx(408089, rel=2e-4)
-    assert told["model"] == "first-photon"
+    message = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert message["mean_signal"] == pytest.approx(163.9, abs=0.1)
+    assert message["mean_background"] == pytest.approx(408089, rel=2e-4)
+    assert message["model"] == "first-photon"
 
 
 @pytest.mark.slow

@@ -53,9 +53,11 @@ def test_a_full_disk_is_one_line_and_with_space_the_run_goes_on(apart, tmp_path,
     for size in sizes:
         output.write_text("")
         status = run(f"import os; os.system('mount -o remount,size={size}k out')\n{code}")
-        told = output.read_text()
-        refused = re.findall(r"^scene2spad: out\S*: .*No space left on device.*$", told, flags=re.MULTILINE)
-        assert status == 2 and len(refused) == 1 and "Traceback" not in told, f"{size} kB: {status} {told[-2000:]}"
+        message = output.read_text()
+        refused = re.findall(r"^scene2spad: out\S*: .*No space left on device.*$", message, flags=re.MULTILINE)
+        assert status == 2 and len(refused) == 1 and "Traceback" not in message, (
+            f"{size} kB: {status} {message[-2000:]}"
+        )
     copied = f"import shutil; shutil.copytree('out', {str(tmp_path / 'kept/out')!r})"
     finished = (
         f"import os; os.system('mount -o remount,size=100m out')\ntry:\n    exec({code!r})\nfinally:\n    {copied}"

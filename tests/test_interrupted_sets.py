@@ -124,9 +124,9 @@ def test_ctrl_c_ends_in_one_line_and_the_run_goes_on(whole, warm, tmp_path, wher
             child = run.start()
         warm.kill(child, signal.SIGINT)
         status = warm.wait(child, seconds=PATIENCE_S)
-        told = run.output.read_text()
+        message = run.output.read_text()
         run.output.write_text("")
-        assert (status, told) in ((130, STOPPED), (0, told)) and "Traceback" not in told, told[-3000:]
+        assert (status, message) in ((130, STOPPED), (0, message)) and "Traceback" not in message, message[-3000:]
         end = time.monotonic() + PATIENCE_S
         while not is_alone(child) and time.monotonic() < end:
             time.sleep(0.05)
@@ -157,10 +157,10 @@ def test_ten_killed_schedulers_are_one_line_each_and_the_run_goes_on(whole, warm
         status = wait_for_views(run, child, 2 * number, moments.uniform(0, 0.3))
         cluster.kill_scheduler()
         status = warm.wait(child, seconds=PATIENCE_S) if status is None else status
-        told = run.output.read_text()
+        message = run.output.read_text()
         run.output.write_text("")
-        gone = re.fullmatch(r"scene2spad: scheduler tcp://\S+: (has gone away|cannot be reached)[^\n]*\n", told)
-        assert (status == 2 and gone) or status == 0, f"{status} {told[-3000:]}"
+        gone = re.fullmatch(r"scene2spad: scheduler tcp://\S+: (has gone away|cannot be reached)[^\n]*\n", message)
+        assert (status == 2 and gone) or status == 0, f"{status} {message[-3000:]}"
         check_whole(run.folder / "out")
         cluster.close()
         cluster.start()
@@ -176,6 +176,6 @@ def test_an_address_where_nobody_listens_is_one_line(tmp_path, capsys, monkeypat
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     assert main([*SET, "--out", str(tmp_path / "set"), "--scheduler", address]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"scene2spad: scheduler {address}: cannot be reached") and told.count("\n") == 1
+    message = capsys.readouterr().err
+    assert message.startswith(f"scene2spad: scheduler {address}: cannot be reached") and message.count("\n") == 1
     assert main([*SET, "--out", str(tmp_path / "set"), "--count", "1"]) == 0

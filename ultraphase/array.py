@@ -79,7 +79,7 @@ class CoreArray:
         self._neighbour = [_neighbours(row + down, column + right, shape) for down, right in STEPS]
 
     def frame(self, timestamps: np.ndarray, offsets: np.ndarray, *, park: bool = False) -> Frame:
-        """One frame to HALT on every core; with `park` to where a core would wait for another timestamp.
+        """Return one frame to HALT on every core; with `park` to where a core would wait for another timestamp.
 
         timestamps (N,) core after core, in the order of detection; offsets (cores + 1,) where each core's begin.
         """
@@ -94,7 +94,7 @@ class CoreArray:
         return _Run(self, port, offsets, park).to_end()
 
     def contents(self, region: str) -> np.ndarray:
-        """Numbers in a region of every core's RAM, (cores, count)."""
+        """Return numbers in a region of every core's RAM, (cores, count)."""
         return region_contents(self.program, self.ram, region)
 
 
@@ -358,17 +358,17 @@ class _Run:
         blocked = np.flatnonzero(self.status == _BLOCKED)
         if not blocked.size:
             return
-        said = []
+        lines = []
         for lane in blocked[:4]:
             one = self.program.instructions[self.word[lane]]
             other = self.array._neighbour[one.value][lane]
             verb = "to take a word" if one.name == "SEND" else "for a word"
             does = {_HALTED: "has halted", _PARKED: "waits for a timestamp", _BLOCKED: "waits itself"}
-            said.append(
+            lines.append(
                 f"core {self._name(lane)} waits at {self.program.where(int(self.word[lane]))} for core "
                 f"{self._name(other)} {verb}, which {does[int(self.status[other])]}"
             )
-        raise InputError(f"{blocked.size} of {len(self.status)} cores are blocked: {'; '.join(said)}")
+        raise InputError(f"{blocked.size} of {len(self.status)} cores are blocked: {'; '.join(lines)}")
 
     def _result(self) -> Frame:
         array, lanes = self.array, len(self.status)

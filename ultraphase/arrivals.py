@@ -69,7 +69,7 @@ class TimedCore(Core):
     def timed_frame(
         self, clocks: np.ndarray, timestamps: np.ndarray, frame_clocks: int, *, drain: bool = True
     ) -> TimedFrame:
-        """One frame of `frame_clocks` clocks, to HALT; photons that come while it is drained belong to no frame.
+        """Return one frame of `frame_clocks` clocks, to HALT; photons that come while it is drained belong to no frame.
 
         clocks (N,) when each photon comes, rising, 0 to frame_clocks; timestamps (N,) as the port tells them. Without
         `drain` it stops where the program would end the frame: there the cores of a block need each other.
@@ -136,7 +136,7 @@ class TimedCore(Core):
 def lost_fraction(
     rate: float, service_clocks: np.ndarray | float, idle_clocks: float = 9, read_clocks: float = 3
 ) -> float:
-    """Share of Poisson photons that a core with a port of one timestamp loses (module docstring).
+    """Return share of Poisson photons that a core with a port of one timestamp loses (module docstring).
 
     rate            photons a clock
     service_clocks  D, from look to look, of every timestamp alike likely, or of all
@@ -153,12 +153,12 @@ def lost_fraction(
 
 
 def md1_lost_fraction(rho: float) -> float:
-    """The same of the queue M/D/1 with one place to wait: a core that looks at its port all the time."""
+    """Return the same of the queue M/D/1 with one place to wait: a core that looks at its port all the time."""
     return float(1 - 1 / (rho + np.exp(-rho)))
 
 
 def poisson_arrivals(rate: float, frame_clocks: int, seed: int) -> np.ndarray:
-    """Rising clocks of a Poisson process of `rate` photons a clock."""
+    """Return rising clocks of a Poisson process of `rate` photons a clock."""
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(10,)))
     return np.sort(random.random(random.poisson(rate * frame_clocks))) * frame_clocks
 
@@ -166,7 +166,8 @@ def poisson_arrivals(rate: float, frame_clocks: int, seed: int) -> np.ndarray:
 def periodic_arrivals(
     timestamps: np.ndarray, frame_clocks: int, seed: int, *, period_s: float = 100e-9, chip: ChipSpec | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Clocks of photons that a pulsed laser brings: every timestamp in a cycle of its own, at its place in the period.
+    """Return clocks of photons that a pulsed laser brings: every timestamp in a cycle of its own, at its place in the
+    period.
 
     timestamps (N,) of 0 .. 1023 over the period -> clocks (N,) rising, and the timestamps in that order.
     """

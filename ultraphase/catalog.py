@@ -106,7 +106,7 @@ class Method:
         return {**wide, "separable": TIME_BLOCK, "learned": TIME_BLOCK}.get(self.family, 0)
 
     def program(self, chip: ChipSpec | None = None) -> Program:
-        """Assembled, and checked against the chip. Raises InputError for what is over."""
+        """Return assembled, and checked against the chip. Raises InputError for what is over."""
         constants = {"K": self.codes}
         if self.family == "coarse":
             constants["SHIFT"] = (TIMESTAMPS // self.codes).bit_length() - 1
@@ -115,10 +115,12 @@ class Method:
         return assemble_file(FOLDER / f"{self.family}.s", constants, chip, name=self.name)
 
     def tables(self, temporal: np.ndarray | None = None, weights: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Tables for `CoreArray`: from the int8 temporal tensor (K, Mt), and of spatial weights (..., K) a core."""
+        """Return tables for `CoreArray`: from the int8 temporal tensor (K, Mt), and of spatial weights (..., K) a
+        core."""
         if self.temporal_bins == 0:
             return {}
-        require(temporal is not None, f"program {self.name}: needs an int8 temporal tensor (K, {self.temporal_bins})")
+        if temporal is None:
+            raise InputError(f"program {self.name}: needs an int8 temporal tensor (K, {self.temporal_bins})")
         self._check(temporal)
         learned = self.family == "learned"
         tables = {"learned": temporal.reshape(-1)} if learned else {"quarter": quarter_wave(temporal)}
@@ -127,10 +129,12 @@ class Method:
         return tables
 
     def matrix(self, temporal: np.ndarray | None = None) -> np.ndarray:
-        """The integer matrix (numbers in RAM, timestamps) that the program computes, from the int8 temporal tensor."""
+        """Return the integer matrix (numbers in RAM, timestamps) that the program computes, from the int8 temporal
+        tensor."""
         if self.family == "coarse":
             return coarse_matrix(self.codes, TIMESTAMPS)
-        require(temporal is not None, f"program {self.name}: needs an int8 temporal tensor (K, {self.temporal_bins})")
+        if temporal is None:
+            raise InputError(f"program {self.name}: needs an int8 temporal tensor (K, {self.temporal_bins})")
         self._check(temporal)
         if self.family == "learned":
             return block_matrix(np.asarray(temporal, np.int64), TIMESTAMPS)
@@ -146,7 +150,8 @@ class Method:
 
 
 def method(name: str) -> Method:
-    """The method of a name such as `fourier-16`, or `coarse-16-shift-2`: shifts of at most 2 bits an instruction."""
+    """Return the method of a name such as `fourier-16`, or `coarse-16-shift-2`: shifts of at most 2 bits an
+    instruction."""
     found = re.fullmatch(r"([a-z]+)-(\d{1,4})(?:-shift-(\d{1,2}))?", name)
     if not found or found[1] not in FAMILIES:
         raise InputError(f"program {name!r}: expected a file (.s) or FAMILY-K with one of {', '.join(FAMILIES)}")

@@ -65,17 +65,17 @@ class ChipSpec:
         return 1 / (self.clock_s * self.clocks_per_instruction)
 
     def processing_time_s(self, photons: float, clocks_per_photon: float) -> float:
-        """Time one core works on one frame."""
+        """Return time one core works on one frame."""
         return photons * clocks_per_photon * self.clock_s
 
     def energy_j(self, clocks: float) -> float:
-        """Energy of the instructions that fill `clocks` clock cycles of one core."""
+        """Return energy of the instructions that fill `clocks` clock cycles of one core."""
         return clocks / self.clocks_per_instruction * self.energy_per_instruction_j
 
     def data_rate_bit_per_s(self, bits_per_pixel: float, pixels: int, frames_per_s: float) -> float:
-        """What leaves the sensor."""
+        """Return what leaves the sensor."""
         return bits_per_pixel * pixels * frames_per_s
 
     def readout_power_w(self, data_rate_bit_per_s: float) -> float:
-        """P = rate C V^2 of the digital output (S.2)."""
+        """Return P = rate C V^2 of the digital output (S.2)."""
         return data_rate_bit_per_s * self.io_load_f * self.io_voltage_v**2

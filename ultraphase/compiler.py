@@ -47,8 +47,8 @@ class Layout:
 def layout(
     codes: int, bins: int, cores: int, chip: ChipSpec, *, folded: bool, weighted: bool, shared: int = 1
 ) -> Layout:
-    """RAM of one core for K codes over blocks of `bins` timestamps and `cores` cores; `shared`: cores that hold the
-    table together. Sums begin at an even address, in front."""
+    """Return RAM of one core for K codes over blocks of `bins` timestamps and `cores` cores; `shared`: cores that hold
+    the table together. Sums begin at an even address, in front."""
     table = bins // 4 if folded else -(-codes * bins // shared)
     many = cores > 1
     return Layout(table, codes if many and weighted else 0, int(many), 2 * codes * (chip.timestamps // bins))
@@ -91,7 +91,7 @@ class Compiled:
         return all(part <= whole for part, whole in zip(self.block, self.chip.cores, strict=True))
 
     def tables(self, shape: tuple[int, int]) -> dict[str, np.ndarray]:
-        """Contents of RAM for an array of rows x columns cores, as `CoreArray` takes them.
+        """Return contents of RAM for an array of rows x columns cores, as `CoreArray` takes them.
 
         Raises InputError for an array that blocks do not tile.
         """
@@ -129,8 +129,8 @@ def _ways(block: tuple[int, int]) -> np.ndarray:
 
 
 def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
-    """Program and tables of a code. Raises InputError in one line that names the bytes needed and there, and what
-    would fit: fewer codes, a shorter block, or a table that the cores of a block share."""
+    """Return program and tables of a code. Raises InputError in one line that names the bytes needed and there, and
+    what would fit: fewer codes, a shorter block, or a table that the cores of a block share."""
     chip = chip or ChipSpec()
     known = chip.timestamps % code.bins == 0 and code.bins & (code.bins - 1) == 0
     require(known, f"code {code.name}: blocks of {code.bins} bins, expected a power of two up to {chip.timestamps}")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import CodeType
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,7 @@ class Step:
     instruction: Instruction
 
     def changes(self) -> list[str]:
-        """Registers and RAM bytes that it changed, as `r3: 4 -> 5` and `[17]: 0 -> 1`."""
+        """Return registers and RAM bytes that it changed, as `r3: 4 -> 5` and `[17]: 0 -> 1`."""
         registers = zip(self.before.registers, self.after.registers, strict=True)
         changed = [f"r{n}: {old} -> {new}" for n, (old, new) in enumerate(registers) if old != new]
         ram = zip(self.before.ram, self.after.ram, strict=True)
@@ -116,7 +117,7 @@ class Core:
         self._singles: dict[int, _BasicBlock] = {}
 
     def frame(self, timestamps: Iterable[int]) -> tuple[tuple[int, ...], Counters]:
-        """One frame, to HALT: what left the sensor, and what it cost."""
+        """Return one frame, to HALT: what left the sensor, and what it cost."""
         before = self.counters
         self.start(timestamps)
         self.run()
@@ -145,7 +146,7 @@ class Core:
         )
 
     def step(self) -> Step:
-        """One instruction. Raises InputError after the end of the frame."""
+        """Return one instruction. Raises InputError after the end of the frame."""
         require(not self._stopped, f"program {self.program.name}: the frame is over")
         before, word = self.state, self.word
         self._visits[word] += 1
@@ -159,21 +160,22 @@ class Core:
         return Step(before, self.state, self.program.instructions[word])
 
     def trace(self, most: int | None = None) -> Iterator[Step]:
-        """Steps to the end of the frame, or the first `most` of them."""
+        """Yield steps to the end of the frame, or the first `most` of them."""
         done = 0
         while not self._stopped and (most is None or done < most):
             yield self.step()
             done += 1
 
     def watch(self, region: str) -> Iterator[tuple[Step, tuple[int, ...]]]:
-        """The steps that change a region of RAM, to the end of the frame, each with the region's contents after it."""
+        """Yield the steps that change a region of RAM, to the end of the frame, each with the region's contents after
+        it."""
         part = self.program.region(region)
         for step in self.trace():
             if step.before.ram[part.address : part.end] != step.after.ram[part.address : part.end]:
                 yield step, tuple(self.contents(region).tolist())
 
     def run(self) -> None:
-        """To the end of the frame, at speed: no states in between."""
+        """Run it: to the end of the frame, at speed: no states in between."""
         require(not self._stopped, f"program {self.program.name}: no frame was started")
         stretches, word = self._stretches, self.word
         try:
@@ -199,12 +201,12 @@ class Core:
 
     def _function(self, word: int, *, single: bool = False) -> _BasicBlock:
         text, end = source(self.program, word, single=single)
-        names = {"core": self, "r": self.registers, "ram": self.ram, "halves": self._halves}
+        names: dict[str, Any] = {"core": self, "r": self.registers, "ram": self.ram, "halves": self._halves}
         exec(_compiled(text), names)
         return _BasicBlock(names["does"], end)
 
     def contents(self, region: str) -> np.ndarray:
-        """Numbers in a region of RAM."""
+        """Return numbers in a region of RAM."""
         return region_contents(self.program, np.frombuffer(bytes(self.ram), np.uint8)[None], region)[0]
 
     @property
@@ -275,6 +277,6 @@ def _compiled(statements: str) -> CodeType:
 
 
 def region_contents(program: Program, ram: np.ndarray, region: str) -> np.ndarray:
-    """Numbers in a region, of RAM (lanes, bytes) uint8: (lanes, count)."""
+    """Return numbers in a region, of RAM (lanes, bytes) uint8: (lanes, count)."""
     part = program.region(region)
     return np.ascontiguousarray(ram[:, part.address : part.end]).view(KINDS[part.kind])

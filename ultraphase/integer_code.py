@@ -61,5 +61,6 @@ class IntegerCode:
 
 
 def folded_temporal(code: IntegerCode) -> np.ndarray:
-    """(K, Mt) integers that a Fourier code's quarter wave gives back: its rows, even harmonics half a step late."""
+    """Return (K, Mt) integers that a Fourier code's quarter wave gives back: its rows, even harmonics half a step
+    late."""
     return wave_matrix(quarter_wave(code.temporal), code.harmonics)

@@ -77,7 +77,7 @@ class Power:
 
 
 def power(cost: Cost, load: Load, chip: ChipSpec | None = None) -> Power:
-    """Both readings of the processing power (module docstring), and readout power = rate C V^2."""
+    """Return both readings of the processing power (module docstring), and readout power = rate C V^2."""
     chip = chip or ChipSpec()
     time_s = chip.processing_time_s(load.photons, cost.clocks_per_photon)
     rate = chip.data_rate_bit_per_s(cost.bits_per_pixel, load.pixels, load.frames_per_s)
@@ -93,8 +93,8 @@ def power(cost: Cost, load: Load, chip: ChipSpec | None = None) -> Power:
 
 
 def measured_cost(method: Method, temporal: np.ndarray | None, chip: ChipSpec | None = None) -> Cost:
-    """Clocks of a program on emulated cores: all timestamps once, and a frame of no photons for its end. That neither
-    depends on what is in RAM, `verify` proves.
+    """Return clocks of a program on emulated cores: all timestamps once, and a frame of no photons for its end. That
+    neither depends on what is in RAM, `verify` proves.
 
     temporal   int8 temporal tensor (K, Mt) of the method, None for coarse histograms
     """
@@ -109,7 +109,7 @@ def cost_of(
     block_tables: Mapping[str, np.ndarray],
     chip: ChipSpec | None = None,
 ) -> Cost:
-    """`measured_cost` of any program: tables of one core, and of the block of cores whose codes leave as one."""
+    """Return `measured_cost` of any program: tables of one core, and of the block of cores whose codes leave as one."""
     stamps = np.arange(TIMESTAMPS)
     photons = CoreArray(program, (1, TIMESTAMPS), core_tables, chip=chip)
     per_photon = photons.frame(stamps, np.arange(TIMESTAMPS + 1), park=True).cycles.mean()
@@ -121,13 +121,13 @@ def cost_of(
 
 
 def reference_bits(photons: float, chip: ChipSpec | None = None) -> dict[str, float]:
-    """Bits a pixel and frame without any compression: every timestamp, or the full histogram in 8 bits a bin."""
+    """Return bits a pixel and frame without any compression: every timestamp, or the full histogram in 8 bits a bin."""
     chip = chip or ChipSpec()
     return {"raw timestamps": photons * chip.timestamp_bits, "full histogram": chip.timestamps * 8.0}
 
 
 def table(costs: dict[str, Cost], chip: ChipSpec | None = None) -> list[dict]:
-    """Supplementary Figure 5, a dictionary a row: printed, recomputed from printed clocks, emulated, residuals.
+    """Return Supplementary Figure 5, a dictionary a row: printed, recomputed from printed clocks, emulated, residuals.
 
     costs   emulated cost by the method's name; residual_clocks = emulated - printed
     """
@@ -173,7 +173,8 @@ def sweep(
     pixels: Iterable[int],
     chip: ChipSpec | None = None,
 ) -> list[dict]:
-    """A row for every program, photon count, frame rate and number of pixels, with the two references beside them."""
+    """Return a row for every program, photon count, frame rate and number of pixels, with the two references beside
+    them."""
     chip, rates, sizes, rows = chip or ChipSpec(), tuple(frame_rates), tuple(pixels), []
     for count in photons:
         bare = {name: Cost(0, 0, bits) for name, bits in reference_bits(count, chip).items()}
@@ -192,7 +193,7 @@ def sweep(
 
 
 def as_csv(rows: list[dict]) -> str:
-    """Flat rows as CSV, nested dictionaries as `outer.inner` columns."""
+    """Return flat rows as CSV, nested dictionaries as `outer.inner` columns."""
     flat = []
     for row in rows:
         parts = [({k: v} if not isinstance(v, dict) else {f"{k}.{n}": x for n, x in v.items()}) for k, v in row.items()]

@@ -40,8 +40,8 @@ def photon_sums(histograms: np.ndarray, table: np.ndarray) -> np.ndarray:
 
 
 def equal_blocks(table: np.ndarray) -> int:
-    """How many equal blocks along its diagonal a table (timestamps, numbers) consists of, zero elsewhere; a power of
-    two."""
+    """Return how many equal blocks along its diagonal a table (timestamps, numbers) consists of, zero elsewhere; a
+    power of two."""
     bins, numbers = table.shape
     found = 1
     while found * 2 <= numbers and bins % (found * 2) == 0 and numbers % (found * 2) == 0:

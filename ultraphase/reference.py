@@ -27,7 +27,8 @@ def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ra
     -------
     registers `r`, bytes of `ram`, words sent `out`, instructions done `n`, 16-bit and 8-bit wraps `w`, saturations `s`
     """
-    r, ram, out = np.zeros(16, np.int32), np.zeros(ram_bytes, np.uint8), []
+    r, ram = np.zeros(16, np.int32), np.zeros(ram_bytes, np.uint8)
+    out: list[int] = []
     halves, port, at, done = ram.view(np.int16), list(timestamps), 0, 0
     wraps = saturations = 0
     with np.errstate(over="ignore"):
@@ -40,11 +41,11 @@ def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ra
                 case "HALT":
                     return {"r": r.tolist(), "ram": ram.tolist(), "out": out, "n": done, "w": wraps, "s": saturations}
                 case "ADD" | "SUB" | "MUL":
-                    ufunc = {"ADD": np.add, "SUB": np.subtract, "MUL": np.multiply}[one.name]
-                    r[one.rd] = ufunc(r[one.rs], other, dtype=np.int32)
+                    arithmetic = {"ADD": np.add, "SUB": np.subtract, "MUL": np.multiply}[one.name]
+                    r[one.rd] = arithmetic(r[one.rs], other, dtype=np.int32)
                 case "AND" | "OR" | "XOR":
-                    ufunc = {"AND": np.bitwise_and, "OR": np.bitwise_or, "XOR": np.bitwise_xor}[one.name]
-                    r[one.rd] = ufunc(r[one.rs], other)
+                    bitwise = {"AND": np.bitwise_and, "OR": np.bitwise_or, "XOR": np.bitwise_xor}[one.name]
+                    r[one.rd] = bitwise(r[one.rs], other)
                 case "MIN" | "MAX":
                     r[one.rd] = {"MIN": np.minimum, "MAX": np.maximum}[one.name](r[one.rs], other)
                 case "MOV":

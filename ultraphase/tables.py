@@ -15,7 +15,7 @@ INT8_SCALE = 127  # a coding tensor's 1.0
 
 
 def int8_codes(tensor: np.ndarray) -> np.ndarray:
-    """round(127 C) of a coding tensor with values in [-1, 1], int64, clipped to +-127: +-128 would wrap in int8.
+    """Return round(127 C) of a coding tensor with values in [-1, 1], int64, clipped to +-127: +-128 would wrap in int8.
 
     Raises InputError for values that are not finite.
     """
@@ -25,7 +25,8 @@ def int8_codes(tensor: np.ndarray) -> np.ndarray:
 
 
 def quarter_wave(matrix: np.ndarray) -> np.ndarray:
-    """The table of the Fourier programs: the first quarter of the first row of an int8 truncated-Fourier tensor (S.2).
+    """Return the table of the Fourier programs: the first quarter of the first row of an int8 truncated-Fourier tensor
+    (S.2).
 
     That row is cos(2 pi (t + 1/2) / M), M a multiple of 4. Raises InputError for a row that a quarter wave does not
     give back: cos(pi - x) = -cos(x), cos(pi + x) = -cos(x), cos(2 pi - x) = cos(x).
@@ -42,7 +43,8 @@ def _whole_wave(quarter: np.ndarray) -> np.ndarray:
 
 
 def wave_matrix(quarter: np.ndarray, harmonics: Sequence[int]) -> np.ndarray:
-    """What the Fourier programs add, (2 H, 4 Q): rows cos and sin in turn of each harmonic h from a quarter wave (Q,).
+    """Return what the Fourier programs add, (2 H, 4 Q): rows cos and sin in turn of each harmonic h from a quarter wave
+    (Q,).
 
     w[h t + floor(h / 2)] and a quarter later, w the whole wave with its half-step: phase h (t + 1/2) exactly for odd h,
     half a step more for even h, where a table of Q entries has no better one.
@@ -57,13 +59,13 @@ def wave_matrix(quarter: np.ndarray, harmonics: Sequence[int]) -> np.ndarray:
 
 
 def fourier_matrix(quarter: np.ndarray, codes: int) -> np.ndarray:
-    """What `fourier.s` adds, (K, 4 Q): the `wave_matrix` of harmonics 1 .. K/2."""
+    """Return what `fourier.s` adds, (K, 4 Q): the `wave_matrix` of harmonics 1 .. K/2."""
     return wave_matrix(quarter, range(1, codes // 2 + 1))
 
 
 def block_matrix(temporal: np.ndarray, timestamps: int) -> np.ndarray:
-    """What `separable.s` and `learned.s` add, (timestamps / Mt x K, timestamps): the temporal codes (K, Mt) of every
-    block of Mt timestamps, block after block."""
+    """Return what `separable.s` and `learned.s` add, (timestamps / Mt x K, timestamps): the temporal codes (K, Mt) of
+    every block of Mt timestamps, block after block."""
     codes, width = temporal.shape
     matrix = np.zeros((timestamps // width, codes, timestamps), np.int64)
     for block in range(timestamps // width):
@@ -72,13 +74,13 @@ def block_matrix(temporal: np.ndarray, timestamps: int) -> np.ndarray:
 
 
 def coarse_matrix(codes: int, timestamps: int) -> np.ndarray:
-    """What `coarse.s` adds: 1 to the counter that the timestamp falls into, (K, timestamps)."""
+    """Return what `coarse.s` adds: 1 to the counter that the timestamp falls into, (K, timestamps)."""
     return (np.arange(timestamps) * codes // timestamps == np.arange(codes)[:, None]).astype(np.int64)
 
 
 def spatial_sum(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The frame end of 2 x 2 cores (`sum2x2.s`): sum over the cores of w s / 128, rounded (halves up), then saturated
-    to 16 bits.
+    """Return the frame end of 2 x 2 cores (`sum2x2.s`): sum over the cores of w s / 128, rounded (halves up), then
+    saturated to 16 bits.
 
     sums (..., cores, blocks, K) and weights (cores, K), both integer -> (..., blocks, K) int64.
     """
@@ -87,7 +89,7 @@ def spatial_sum(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def block_sum(sums: np.ndarray, weights: np.ndarray | None, shift: int) -> np.ndarray:
-    """The frame end of a block of cores (`sumblock.s`): sum over the cores of w s / 2^shift, rounded, halves up.
+    """Return the frame end of a block of cores (`sumblock.s`): sum over the cores of w s / 2^shift, rounded, halves up.
 
     sums and weights as of `spatial_sum`; weights None: of s / 2^shift.
     """

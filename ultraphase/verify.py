@@ -41,19 +41,19 @@ class Tabulated:
         return photon_sums(histograms, self.table)
 
     def frame(self, histograms: np.ndarray) -> np.ndarray:
-        """Numbers in RAM at the end of a frame that began with zeros, (pixels, timestamps) -> (pixels, numbers) int64:
-        what the core holds after the same photons in any order."""
+        """Return numbers in RAM at the end of a frame that began with zeros, (pixels, timestamps) -> (pixels, numbers)
+        int64: what the core holds after the same photons in any order."""
         return self.limited(self.sums(histograms))
 
     def limited(self, sums: np.ndarray) -> np.ndarray:
-        """Sums as the RAM holds them: saturated or wrapped."""
+        """Return sums as the RAM holds them: saturated or wrapped."""
         if not self.overflowed(sums):
             return sums
         wrapped = (sums - self.low) % (self.high - self.low + 1) + self.low
         return np.where(self.saturates, np.minimum(sums, self.high), wrapped)
 
     def overflowed(self, sums: np.ndarray) -> int:
-        """How many sums the RAM cannot hold."""
+        """Return how many sums the RAM cannot hold."""
         return int(np.count_nonzero((sums < self.low) | (sums > self.high)))
 
 
@@ -104,6 +104,7 @@ def verify(
         if bad.any() or slow.any():
             raise InputError(_not_additive(program, bad, before, after, added, slow))
         states += 1
+    assert added is not None, "a program that was run on no state"
     if matrix is not None:
         _compare(program, added, np.asarray(matrix))
     return Tabulated(program.name, added, low, high, saturates & ~wraps, clocks, states)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from csph.autograd import Context
 from scenes.errors import require
 
 EPSILON = 1e-5  # of zero-normalisation, as published
@@ -25,7 +26,7 @@ COUNT_TYPES = (
 
 
 def check_counts(counts: Tensor, block: tuple[int, int, int]) -> None:
-    """InputError in one line unless `counts` is (B, 1, T, R, C) of a known type and the block tiles it."""
+    """Raise InputError in one line unless `counts` is (B, 1, T, R, C) of a known type and the block tiles it."""
     shape = tuple(counts.shape)
     good = len(shape) == 5 and shape[1] == 1 and 0 not in shape[2:]
     require(good, f"histogram of shape {shape}: expected (batch, 1, time, rows, columns)")
@@ -35,10 +36,10 @@ def check_counts(counts: Tensor, block: tuple[int, int, int]) -> None:
 
 
 def check_tiling(size: tuple[int, ...], block: tuple[int, int, int]) -> None:
-    """InputError unless blocks of Mt x Mr x Mc tile a histogram of T x R x C."""
+    """Raise InputError unless blocks of Mt x Mr x Mc tile a histogram of T x R x C."""
     tiles = all(whole % part == 0 for whole, part in zip(size, block, strict=True))
-    said, asked = (" x ".join(map(str, numbers)) for numbers in (size, block))
-    require(tiles, f"histogram of {said} (time x rows x columns) is not tiled by blocks of {asked}")
+    given, asked = (" x ".join(map(str, numbers)) for numbers in (size, block))
+    require(tiles, f"histogram of {given} (time x rows x columns) is not tiled by blocks of {asked}")
 
 
 def _wide(values: Tensor, columns: int) -> Tensor:
@@ -67,14 +68,14 @@ class _Gather(torch.autograd.Function):
     """(B, 1, T, R, C) -> (blocks, Mt Mr Mc); blocks in order batch, time, row, column, as are entries in a block."""
 
     @staticmethod
-    def forward(ctx: object, counts: Tensor, block: tuple[int, int, int]) -> Tensor:
+    def forward(ctx: Context, counts: Tensor, block: tuple[int, int, int]) -> Tensor:
         ctx.block, ctx.size = block, counts.shape
         (batch, _, bins, rows, columns), (mt, mr, mc) = counts.shape, block
         shape = (batch, bins // mt, mt, rows // mr, mr, columns // mc, mc)
         return _rearranged(counts, shape, (0, 1, 3, 5, 2, 4, 6)).view(-1, mt * mr * mc)
 
     @staticmethod
-    def backward(ctx: object, grad: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Context, grad: Tensor) -> tuple[Tensor, None]:
         return _Scatter.apply(grad, ctx.block, ctx.size), None
 
 
@@ -82,14 +83,14 @@ class _Scatter(torch.autograd.Function):
     """(blocks, Mt Mr Mc) -> (B, 1, T, R, C): the inverse of `_Gather`."""
 
     @staticmethod
-    def forward(ctx: object, blocks: Tensor, block: tuple[int, int, int], size: torch.Size) -> Tensor:
+    def forward(ctx: Context, blocks: Tensor, block: tuple[int, int, int], size: torch.Size) -> Tensor:
         ctx.block = block
         (batch, _, bins, rows, columns), (mt, mr, mc) = size, block
         shape = (batch, bins // mt, rows // mr, columns // mc, mt, mr, mc)
         return _rearranged(blocks, shape, (0, 1, 4, 2, 5, 3, 6)).view(size)
 
     @staticmethod
-    def backward(ctx: object, grad: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Context, grad: Tensor) -> tuple[Tensor, None, None]:
         return _Gather.apply(grad, ctx.block), None, None
 
 
@@ -98,24 +99,24 @@ class _Centre(torch.autograd.Function):
     takes a third of the time of a reduction over an outer axis."""
 
     @staticmethod
-    def forward(ctx: object, values: Tensor, axis: int) -> Tensor:
+    def forward(ctx: Context, values: Tensor, axis: int) -> Tensor:
         ctx.axis = axis
         return values - mean_over(values, axis)
 
     @staticmethod
-    def backward(ctx: object, grad: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Context, grad: Tensor) -> tuple[Tensor, None]:
         return _Centre.apply(grad, ctx.axis), None
 
 
 def mean_over(values: Tensor, axis: int) -> Tensor:
-    """Mean over the first or second axis, kept with length 1."""
+    """Return mean over the first or second axis, kept with length 1."""
     flat = values.reshape(*values.shape[: axis + 1], math.prod(values.shape[axis + 1 :]))
     weights = torch.full((1, flat.shape[axis]), 1 / flat.shape[axis], dtype=values.dtype, device=values.device)
     return (weights @ flat).view(*values.shape[:axis], 1, *values.shape[axis + 1 :])
 
 
 def centred(values: Tensor, axis: int) -> Tensor:
-    """v - mean of v over axis 0 or 1."""
+    """Return v - mean of v over axis 0 or 1."""
     return _Centre.apply(values, axis)
 
 
@@ -125,7 +126,7 @@ class _ZeroNormalise(torch.autograd.Function):
     takes time."""
 
     @staticmethod
-    def forward(ctx: object, values: Tensor, axis: int, centre: bool, over: tuple[int, ...]) -> Tensor:
+    def forward(ctx: Context, values: Tensor, axis: int, centre: bool, over: tuple[int, ...]) -> Tensor:
         unit = values - mean_over(values, axis) if centre else values.clone()
         norm = (unit * unit).sum((axis, *over), keepdim=True).sqrt_()
         unit.div_(norm + EPSILON)
@@ -135,7 +136,7 @@ class _ZeroNormalise(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: object, grad: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Context, grad: Tensor) -> tuple[Tensor, None, None, None]:
         unit, norm = ctx.saved_tensors
         along = (unit * grad).sum((ctx.axis, *ctx.over), keepdim=True)
         slope = torch.where(norm > 0, along / norm.clamp(min=torch.finfo(norm.dtype).tiny), 0.0)
@@ -146,7 +147,7 @@ class _ZeroNormalise(torch.autograd.Function):
 
 
 def zero_normalised(values: Tensor, axis: int, *, centre: bool = True, over: tuple[int, ...] = ()) -> Tensor:
-    """ZN(v) = (v - mean v) / (|v - mean v|_2 + 1e-5) over the codes, axis 0 or 1 (supplement S.5.2, equation 1).
+    """Return ZN(v) = (v - mean v) / (|v - mean v|_2 + 1e-5) over the codes, axis 0 or 1 (supplement S.5.2, equation 1).
 
     `centre` = False leaves the mean in; the norm is taken over the axes `over` too.
     """
@@ -154,26 +155,26 @@ def zero_normalised(values: Tensor, axis: int, *, centre: bool = True, over: tup
 
 
 def encode_blocks(counts: Tensor, weights: Tensor) -> Tensor:
-    """y_k = sum over a block of C_k n: (B, 1, T, R, C), (K, Mt, Mr, Mc) -> (B, K, T/Mt, R/Mr, C/Mc).
+    """Return y_k = sum over a block of C_k n: (B, 1, T, R, C), (K, Mt, Mr, Mc) -> (B, K, T/Mt, R/Mr, C/Mc).
 
     In the type of the weights. Raises InputError for counts of another shape or that blocks do not tile.
     """
-    codes, *block = weights.shape
-    mt, mr, mc = block
-    check_counts(counts, tuple(block))
+    codes, mt, mr, mc = weights.shape
+    block = mt, mr, mc
+    check_counts(counts, block)
     batch, _, bins, rows, columns = counts.shape
     matrix = weights.reshape(codes, -1)
     if mr == mc == 1:
         stacked = counts.reshape(batch * (bins // mt), mt, rows * columns).to(weights.dtype)
         product = torch.bmm(matrix.expand(len(stacked), -1, -1), stacked)
         return product.view(batch, bins // mt, codes, rows, columns).transpose(1, 2)
-    gathered = _Gather.apply(counts, tuple(block)).to(weights.dtype)
+    gathered = _Gather.apply(counts, block).to(weights.dtype)
     product = gathered @ matrix.T
     return product.view(batch, bins // mt, rows // mr, columns // mc, codes).permute(0, 4, 1, 2, 3)
 
 
 def back_project(codes: Tensor, weights: Tensor) -> Tensor:
-    """x = sum_k C_k y_k in every block, unfiltered: (B, K, T', R', C') -> (B, 1, T' Mt, R' Mr, C' Mc).
+    """Return x = sum_k C_k y_k in every block, unfiltered: (B, K, T', R', C') -> (B, 1, T' Mt, R' Mr, C' Mc).
 
     weights (K, Mt, Mr, Mc), or (T', K, Mt, Mr, Mc) where every time block has its own.
     """
@@ -194,13 +195,14 @@ def back_project(codes: Tensor, weights: Tensor) -> Tensor:
 
 
 def forms(codes: int, block: tuple[int, int, int], counts: int) -> bool:
-    """Whether to form a separable coding tensor for so many counts. Else a batch of 6 x 16 x 16 pixels takes a fifth
-    of the time with 512 codes of 1024 x 8 x 8 (measured), but up to twice the time where C is small."""
+    """Return whether to form a separable coding tensor for so many counts. Else a batch of 6 x 16 x 16 pixels takes a
+    fifth of the time with 512 codes of 1024 x 8 x 8 (measured), but up to twice the time where C is small."""
     return codes * math.prod(block) <= FORMED * counts
 
 
 def encode_separable(counts: Tensor, temporal: Tensor, spatial: Tensor) -> Tensor:
-    """`encode_blocks` with C[k, t, r, c] = temporal[k, t] spatial[k, r, c], (K, Mt) and (K, Mr, Mc), without forming C.
+    """Return `encode_blocks` with C[k, t, r, c] = temporal[k, t] spatial[k, r, c], (K, Mt) and (K, Mr, Mc), without
+    forming C.
 
     As many multiplications; where C is far larger than all counts (`forms`) it is memory that takes time.
     """
@@ -215,7 +217,7 @@ def encode_separable(counts: Tensor, temporal: Tensor, spatial: Tensor) -> Tenso
 
 
 def correlate_separable(codes: Tensor, temporal: Tensor, spatial: Tensor, *, centre: bool = True) -> Tensor:
-    """`back_project(codes, zero_normalised(C, 0, centre=centre))` of a separable C, without forming it.
+    """Return `back_project(codes, zero_normalised(C, 0, centre=centre))` of a separable C, without forming it.
 
     With `centre` the codes must have no mean over K, as after `zero_normalised`: what C has then falls out of the
     product. Of C itself only its norms over K are needed, n(t, s)^2 = sum_k T^2 S^2 - K m^2, m = sum_k T S / K.
@@ -231,6 +233,6 @@ def correlate_separable(codes: Tensor, temporal: Tensor, spatial: Tensor, *, cen
     squared_norm = square - (wide @ flat).square() / count if centre else square
     there = squared_norm > NO_NORM * square
     norm = torch.where(there, squared_norm, 1.0).sqrt() * there
-    share = (1 / (norm + EPSILON)).to(codes.dtype).view(mt, 1, mr, 1, mc)
-    scaled = product.view(batch * times, mt, rows, mr, columns, mc) * share
+    fraction = (1 / (norm + EPSILON)).to(codes.dtype).view(mt, 1, mr, 1, mc)
+    scaled = product.view(batch * times, mt, rows, mr, columns, mc) * fraction
     return scaled.view(batch, 1, times * mt, rows * mr, columns * mc)

@@ -67,7 +67,7 @@ def _bias_m(coding: CodingTensor, sensor: Sensor) -> float:
 
 
 def decode_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
-    """Depth [m] at the highest score <y, C h(tau)> / |C h(tau)| over arrivals tau, (..., K) -> (...,) float32.
+    """Return depth [m] at the highest score <y, C h(tau)> / |C h(tau)| over arrivals tau, (..., K) -> (...,) float32.
 
     h(tau) is the binned pulse. Searched over the bin centres, then over a grid of eighths of a bin and a parabola; of
     equal scores the first, of neighbours that score alike their middle; the noise-free answer is subtracted as in

@@ -37,8 +37,8 @@ class Design:
         good = len(self.block) == 3 and all(isinstance(n, int) and n >= 1 for n in self.block)
         require(good, f"block {self.block}: expected three positive numbers of bins, rows and columns")
         most = self.size if self.code in ("learned", "random") else self.block[0]
-        said = f"{self.codes} codes over a block of {self.block_name}, expected 1 to {most} for {self.code} codes"
-        require(1 <= self.codes <= most, said)
+        message = f"{self.codes} codes over a block of {self.block_name}, expected 1 to {most} for {self.code} codes"
+        require(1 <= self.codes <= most, message)
         free = self.code in ("learned", "random")
         require(free or not self.full, f"design {self.code}: full coding tensors are learned or random")
         if self.zero_mean is None:
@@ -54,7 +54,7 @@ class Design:
         compression: float | None = None,
         full: bool = False,
     ) -> Design:
-        """From a name as the command line has it: a code, or CODE+learned with a learned spatial part.
+        """Return from a name as the command line has it: a code, or CODE+learned with a learned spatial part.
 
         K is given, or follows from the compression ratio Mt Mr Mc / K, which must divide. A fixed code alone has no
         spatial part: over several pixels it needs +learned. Raises InputError.
@@ -65,11 +65,11 @@ class Design:
         require(code in CODES, f"design {name!r} is unknown{did_you_mean(code, CODES)}, {known}")
         alone = code in ("learned", "random") or plus or math.prod(block[1:]) == 1
         require(bool(alone), f"design {name!r} over {block[1]} x {block[2]} pixels has no spatial part: {code}+learned")
-        if (codes is None) == (compression is None):
-            raise InputError(f"design {name!r}: give the number of codes or the compression ratio, one of them")
-        if codes is None:
+        if codes is None and compression is not None:
             codes = codes_for(block, compression)
-        return cls(code, tuple(block), codes, full=full, spatial_learned=code == "learned" or bool(plus))
+        elif codes is None or compression is not None:
+            raise InputError(f"design {name!r}: give the number of codes or the compression ratio, one of them")
+        return cls(code, block, codes, full=full, spatial_learned=code == "learned" or bool(plus))
 
     @property
     def size(self) -> int:
@@ -126,9 +126,9 @@ class Design:
 
 
 def codes_for(block: tuple[int, int, int], compression: float) -> int:
-    """K = Mt Mr Mc / CR. Raises InputError unless it is a whole number of at least 1."""
+    """Return K = Mt Mr Mc / CR. Raises InputError unless it is a whole number of at least 1."""
     size = math.prod(block)
     whole = math.isfinite(compression) and compression > 0 and size % compression == 0 and size >= compression
-    said = f"compression ratio {compression:g} does not divide the {size} counts of a block of"
-    require(whole, f"{said} {' x '.join(map(str, block))}")
+    message = f"compression ratio {compression:g} does not divide the {size} counts of a block of"
+    require(whole, f"{message} {' x '.join(map(str, block))}")
     return int(size / compression)

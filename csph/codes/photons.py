@@ -22,7 +22,7 @@ EXACT_FLOAT = 1 << 24  # float32 holds whole numbers up to here
 
 
 def photon_table(weights: Tensor) -> Tensor:
-    """(K, Mt, Mr, Mc) -> (Mr Mc Mt, K), the column of C at each place of a block as one row.
+    """Return (K, Mt, Mr, Mc) -> (Mr Mc Mt, K), the column of C at each place of a block as one row.
 
     Time runs fastest: detections of one pixel then stay within Mt neighbouring rows, which a cache may hold.
     """
@@ -64,7 +64,8 @@ def encode_photons(
     *,
     name: str = "the histogram",
 ) -> Tensor:
-    """What `encode_blocks` gives for the histogram of these detections: (B, K, T/Mt, R/Mr, C/Mc), type of the table.
+    """Return what `encode_blocks` gives for the histogram of these detections: (B, K, T/Mt, R/Mr, C/Mc), type of the
+    table.
 
     timestamps (N,) time bin of each detection, pixel after pixel, row by row, image after image; offsets (P + 1,)
     where each pixel's begin, and the end, P = B R C; `table` of `photon_table`; block (Mt, Mr, Mc); size (T, R, C).
@@ -114,7 +115,8 @@ def _checked(timestamps: Tensor, offsets: Tensor, bins: int, name: str) -> tuple
         low, high = _extremes(timestamps)
         inside = low >= 0 and high < bins
         require(inside, f"timestamps from {low} to {high} are outside the bins 0 to {bins - 1} of {name}")
-    return timestamps.to(kind), *(torch.from_numpy(v).to(timestamps.device, kind) for v in (starts, counts))
+    device = timestamps.device
+    return timestamps.to(kind), torch.from_numpy(starts).to(device, kind), torch.from_numpy(counts).to(device, kind)
 
 
 def _extremes(stamps: Tensor) -> tuple[int, int]:
@@ -122,7 +124,8 @@ def _extremes(stamps: Tensor) -> tuple[int, int]:
     if stamps.device.type == "cpu":
         values = stamps.numpy()
         return int(values.min()), int(values.max())
-    return tuple(int(value) for value in torch.aminmax(stamps.to(torch.int64)))
+    low, high = torch.aminmax(stamps.to(torch.int64))
+    return int(low), int(high)
 
 
 def _bags(index: Tensor, table: Tensor, starts: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ class Quantised:
     spatial_scale: float
 
     def coding(self) -> CodingTensor:
-        """The values that the 8-bit tensor stands for."""
+        """Return the values that the 8-bit tensor stands for."""
         return CodingTensor(
             f"{self.name} int8", torch.from_numpy(self.tensor.astype(np.float32) * np.float32(self.scale))
         )
@@ -96,7 +96,7 @@ class IntegerCodes(NamedTuple):
 
 
 def encode_int16(counts: Tensor, tensor: Quantised) -> IntegerCodes:
-    """Sums of 8-bit weights in 16-bit accumulators that wrap around: (B, 1, T, R, C) -> int16 codes.
+    """Return sums of 8-bit weights in 16-bit accumulators that wrap around: (B, 1, T, R, C) -> int16 codes.
 
     Wrapping is modular, so the result does not depend on the order of detections, and a sum that leaves the range and
     comes back is right. Exact for up to 2^53 / 127 photons a block. Raises InputError as `encode_blocks` does.

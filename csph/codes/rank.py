@@ -7,26 +7,26 @@ from torch import Tensor
 
 
 def pixel_gram(weights: Tensor) -> Tensor:
-    """Inner products of what the codes of a tensor (K, Mt, Mr, Mc) are for each two pixels, (Mr Mc, Mr Mc)."""
+    """Return inner products of what the codes of a tensor (K, Mt, Mr, Mc) are for each two pixels, (Mr Mc, Mr Mc)."""
     rows = weights.flatten(2).flatten(0, 1)
     return rows.T @ rows
 
 
 def separable_gram(temporal: Tensor, spatial: Tensor) -> Tensor:
-    """`pixel_gram` of temporal (K, Mt) x spatial (K, Mr, Mc) without forming it."""
+    """Return `pixel_gram` of temporal (K, Mt) x spatial (K, Mr, Mc) without forming it."""
     flat = spatial.flatten(1)
     return flat.T @ (flat * temporal.square().sum(1, keepdim=True))
 
 
 def participation_rank(gram: Tensor) -> float:
-    """(sum l)^2 / sum l^2 of a Gram matrix's eigenvalues l = (trace)^2 / |G|_F^2: from 1, all pixels are coded alike,
-    to Mr Mc, all directions are coded with the same energy. 0 of a matrix of zeros."""
+    """Return (sum l)^2 / sum l^2 of a Gram matrix's eigenvalues l = (trace)^2 / |G|_F^2: from 1, all pixels are coded
+    alike, to Mr Mc, all directions are coded with the same energy. 0 of a matrix of zeros."""
     square = float(gram.double().square().sum())
     return float(gram.double().trace()) ** 2 / square if square > 0 else 0.0
 
 
 def coherence(gram: Tensor) -> Tensor:
-    """Mean squared cosine between the codes of two different pixels, in [0, 1]; 0 for a single pixel."""
+    """Return mean squared cosine between the codes of two different pixels, in [0, 1]; 0 for a single pixel."""
     pixels = len(gram)
     if pixels == 1:
         return gram.new_zeros(())

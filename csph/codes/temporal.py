@@ -36,7 +36,8 @@ BAND_LIMIT = 0.2  # of the pulse's spectrum at harmonic 1: what Gray Fourier kee
 
 
 def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 0) -> Tensor:
-    """(K, Mt) float32 of one of FIXED_CODES; the sensor lends its pulse to the Gray codes, the seed is `random`'s.
+    """Return (K, Mt) float32 of one of FIXED_CODES; the sensor lends its pulse to the Gray codes, the seed is
+    `random`'s.
 
     Raises InputError for another name and for K that does not fit the code.
     """
@@ -66,23 +67,24 @@ def truncated_fourier(codes: int, bins: int, rows: Rows = "centred") -> Tensor:
 
 
 def block_pulse(bins: int, sensor: Sensor) -> Tensor:
-    """(Mt,) float64: the binned pulse of an arrival at the centre of bin 0, on a circle of Mt of the sensor's bins."""
+    """Return (Mt,) float64: the binned pulse of an arrival at the centre of bin 0, on a circle of Mt of the sensor's
+    bins."""
     return binned_pulse(torch.tensor(0.5 * sensor.bin_width_s), circle_of(bins, sensor))
 
 
 def published_pulse(bins: int, sensor: Sensor) -> Tensor:
-    """(Mt,) float64: the pulse's published taps (`rgbd.published_taps`) from bin 0 on, one sample a bin."""
+    """Return (Mt,) float64: the pulse's published taps (`rgbd.published_taps`) from bin 0 on, one sample a bin."""
     taps = torch.from_numpy(published_taps(circle_of(bins, sensor)))
     return torch.nn.functional.pad(taps, (0, bins - len(taps)))
 
 
 def circle_of(bins: int, sensor: Sensor) -> Sensor:
-    """The sensor on a period of `bins` bins: what a block of that many bins sees of a periodic pulse."""
+    """Return the sensor on a period of `bins` bins: what a block of that many bins sees of a periodic pulse."""
     return replace(sensor, name=f"{sensor.name}, {bins} bins", bins=bins, period_s=bins * sensor.bin_width_s)
 
 
 def gray_frequencies(pulse: Tensor) -> list[int]:
-    """Harmonics in the order that Gray Fourier takes them, for a pulse (Mt,) sampled on a circle of Mt bins.
+    """Return harmonics in the order that Gray Fourier takes them, for a pulse (Mt,) sampled on a circle of Mt bins.
 
     Usable are those below Mt/2 where the pulse's spectrum is at least 0.2 of that at harmonic 1; among them the powers
     of two come first, then the others, ascending (Gutierrez-Barragan et al., CVPR 2022, as published for ICCV 2023).
@@ -108,13 +110,13 @@ def gray_fourier(codes: int, bins: int, pulse: Tensor, rows: Rows = "centred") -
 
 
 def coarse_gates(codes: int, bins: int) -> Tensor:
-    """(K, Mt) float32: row k is 1 in bins k Mt/K to (k + 1) Mt/K, else 0. InputError unless K divides Mt."""
+    """Return (K, Mt) float32: row k is 1 in bins k Mt/K to (k + 1) Mt/K, else 0. InputError unless K divides Mt."""
     require(1 <= codes <= bins and bins % codes == 0, f"coarse histogram: {codes} gates do not divide {bins} bins")
     return torch.eye(codes).repeat_interleave(bins // codes, dim=1)
 
 
 def walsh_hadamard(codes: int, bins: int) -> Tensor:
-    """(K, Mt) float32 of +-1: the Walsh functions with 1 .. K sign changes, so that every row sums to zero.
+    """Return (K, Mt) float32 of +-1: the Walsh functions with 1 .. K sign changes, so that every row sums to zero.
 
     Entry (s, i) is (-1)^popcount(i & r), r the bit-reversed Gray code of s. Raises InputError unless Mt is a power of
     two and K <= Mt - 1.
@@ -131,13 +133,14 @@ def walsh_hadamard(codes: int, bins: int) -> Tensor:
 
 
 def uniform_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
-    """Uniform in +-1/sqrt(taps), float32: where learned factors begin; taps is the number of entries of one code."""
+    """Return uniform in +-1/sqrt(taps), float32: where learned factors begin; taps is the number of entries of one
+    code."""
     generator = torch.Generator().manual_seed(seed)
     return (2 * torch.rand(shape, generator=generator) - 1) / math.sqrt(taps)
 
 
 def orthogonal_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
-    """Codes (K, ...) of `taps` entries, float32: rows of random orthogonal matrices, one under the other.
+    """Return codes (K, ...) of `taps` entries, float32: rows of random orthogonal matrices, one under the other.
 
     All rows have the root mean square length of `uniform_start`'s, 1/sqrt(3). Any `taps` rows that follow one another
     from a multiple of `taps` are orthogonal; of K a multiple of `taps` so are the columns, and the rank is full.
@@ -151,14 +154,14 @@ def orthogonal_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
 
 
 def bin_energy(temporal: Tensor) -> np.ndarray:
-    """(Mt,) float64: mean over K (and pixels) of C~^2 in each time bin, C~ = C less its mean over time."""
+    """Return (Mt,) float64: mean over K (and pixels) of C~^2 in each time bin, C~ = C less its mean over time."""
     code = temporal.detach().double().cpu()
     code = code - code.mean(1, keepdim=True)
     return code.square().transpose(0, 1).flatten(1).mean(1).numpy()
 
 
 def grouped_energy(temporal: Tensor) -> np.ndarray:
-    """`bin_energy` averaged over each of at most GROUPS groups of neighbouring bins."""
+    """Return `bin_energy` averaged over each of at most GROUPS groups of neighbouring bins."""
     energy = bin_energy(temporal)
     groups = next(n for n in range(min(GROUPS, len(energy)), 0, -1) if len(energy) % n == 0)
     return energy.reshape(groups, -1).mean(1)

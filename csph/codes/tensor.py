@@ -116,7 +116,8 @@ class CodingTensor:
 
 
 def full_tensor(temporal: Tensor, spatial: Tensor | None) -> Tensor:
-    """C[k, t, r, c] = temporal[k, t] spatial[k, r, c], or the full tensor that `temporal` is: (K, Mt, Mr, Mc)."""
+    """Return C[k, t, r, c] = temporal[k, t] spatial[k, r, c], or the full tensor that `temporal` is: (K, Mt, Mr,
+    Mc)."""
     if temporal.ndim == 4:
         return temporal
     wide = temporal[..., None, None]
@@ -135,12 +136,13 @@ def as_tensor(values: Tensor | np.ndarray) -> Tensor:
     """
     if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
         return torch.from_numpy(np.require(values, requirements=["C", "W"]))
-    require(isinstance(values, Tensor), f"expected a tensor or an array of numbers, got {type(values).__name__}")
+    if not isinstance(values, Tensor):
+        raise InputError(f"expected a tensor or an array of numbers, got {type(values).__name__}")
     return values
 
 
 def encode(counts: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
-    """y = C n of every pixel: counts (..., T) -> codes (..., K) float32, C over one pixel and all T bins.
+    """Return y = C n of every pixel: counts (..., T) -> codes (..., K) float32, C over one pixel and all T bins.
 
     `counts` may be a numpy array. Raises InputError for another number of bins.
     Blocks of several pixels: `csph.codes.blocks.encode_blocks`.
@@ -158,7 +160,7 @@ def encode(counts: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
 
 
 def encode_timestamps(timestamps: Tensor, offsets: Tensor, coding: CodingTensor) -> Tensor:
-    """Sum of the columns of C that a pixel's detections name, without a histogram: (P, K) float32.
+    """Return the sum of the columns of C that a pixel's detections name, without a histogram: (P, K) float32.
 
     timestamps (N,) bin of each detection, any integer type, pixel after pixel; offsets (P + 1,) where each pixel's
     begin, and the end: 0 .. N. A pixel without detections gives zeros. Raises InputError for bad offsets or bins.

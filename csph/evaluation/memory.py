@@ -15,12 +15,12 @@ SEPARABLE_FACTOR = 16.0  # how much smaller a separable tensor is than a full on
 
 
 def transmitted(compressive: ArrayLike, codes: ArrayLike) -> np.ndarray:
-    """B K numbers leave the sensor."""
+    """Count the numbers that leave the sensor: B K."""
     return np.asarray(compressive, dtype=float) * np.asarray(codes, dtype=float)
 
 
 def stored(counts: ArrayLike, compressive: ArrayLike, codes: ArrayLike, factor: float = 1.0) -> np.ndarray:
-    """K (B + M / factor) numbers stay in the sensor, M = N / B; factor is 1 for full coding tensors."""
+    """Count the numbers that stay in the sensor: K (B + M / factor), M = N / B; factor is 1 for full coding tensors."""
     blocks, k = np.asarray(compressive, dtype=float), np.asarray(codes, dtype=float)
     require(
         bool((blocks > 0).all() and (k > 0).all()) and factor > 0, "memory: blocks, codes and factor must be positive"
@@ -29,20 +29,21 @@ def stored(counts: ArrayLike, compressive: ArrayLike, codes: ArrayLike, factor: 
 
 
 def data_compression(counts: ArrayLike, compressive: ArrayLike, codes: ArrayLike) -> np.ndarray:
-    """Off-sensor: N / (B K)."""
+    """Return off-sensor: N / (B K)."""
     return np.asarray(counts, dtype=float) / transmitted(compressive, codes)
 
 
 def memory_compression(counts: ArrayLike, compressive: ArrayLike, codes: ArrayLike, factor: float = 1.0) -> np.ndarray:
-    """In-sensor: N / (K (B + M / factor)). Below 1 the codes and their tensor need more than the histogram."""
+    """Return in-sensor: N / (K (B + M / factor)). Below 1 the codes and their tensor need more than the histogram."""
     return np.asarray(counts, dtype=float) / stored(counts, compressive, codes, factor)
 
 
 def best_blocks(counts: ArrayLike, factor: float = 1.0) -> np.ndarray:
-    """The number of blocks sqrt(N / factor) at which `memory_compression` is largest, whatever K: B = M / factor."""
+    """Return the number of blocks sqrt(N / factor) at which `memory_compression` is largest, whatever K: B = M /
+    factor."""
     return np.sqrt(np.asarray(counts, dtype=float) / factor)
 
 
 def separable_factor(bins: int, rows: int, columns: int) -> float:
-    """Mt Mr Mc / (Mt + Mr Mc): how much smaller a separable tensor of this block is than a full one."""
+    """Return mt Mr Mc / (Mt + Mr Mc): how much smaller a separable tensor of this block is than a full one."""
     return bins * rows * columns / (bins + rows * columns)

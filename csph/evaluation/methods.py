@@ -82,8 +82,10 @@ class Evaluation:
     def values(
         self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
     ) -> dict[str, np.ndarray]:
-        """{scene: (methods, images)} of a figure; several methods are trainings of one design by different seeds."""
-        chosen, found = LEVEL_GROUPS[levels], {}
+        """Return {scene: (methods, images)} of a figure; several methods are trainings of one design by different
+        seeds."""
+        chosen = LEVEL_GROUPS[levels]
+        found: dict[str, dict[str, list[float]]] = {}
         for row in self.rows:
             if row.method in methods and row.group == group and chosen(row.signal, row.background):
                 by_method = found.setdefault(row.scene, {name: [] for name in methods})
@@ -93,16 +95,17 @@ class Evaluation:
     def interval(
         self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
     ) -> Interval | None:
-        """Mean over scenes with its bootstrap interval; None where there is no finite value."""
+        """Return mean over scenes with its bootstrap interval; None where there is no finite value."""
         found = self.values(methods, group, levels, figure)
         return bootstrap_mean(found) if any(np.isfinite(v).any() for v in found.values()) else None
 
     def difference(self, first: Sequence[str], second: Sequence[str], levels: str = "all") -> Interval:
-        """Paired difference of MAE [mm], first - second, over scenes and levels."""
+        """Return paired difference of MAE [mm], first - second, over scenes and levels."""
         return paired_difference(self.values(first, levels=levels), self.values(second, levels=levels))
 
     def summary(self, methods: Sequence[str]) -> dict[str, Any]:
-        """Figures by level group and pixel group (means over scenes), intervals of the MAE, and the bias by depth."""
+        """Return figures by level group and pixel group (means over scenes), intervals of the MAE, and the bias by
+        depth."""
         table: dict[str, Any] = {}
         for levels in LEVEL_GROUPS:
             table[levels] = {}
@@ -139,12 +142,12 @@ def evaluate(
     """
     require(bool(views.transients) and bool(methods), "evaluation: no view or no method")
     retain_freed_memory()
-    say, result = progress or (lambda what, share: None), Evaluation(depths={name: [] for name in methods})
+    report, result = progress or (lambda what, fraction: None), Evaluation(depths={name: [] for name in methods})
     total = len(views.transients) * len(levels)
     for view, (transient, scene) in enumerate(zip(views.transients, views.scenes, strict=True)):
         moved = transient.delayed(offset_m) if offset_m else transient
         for number, (signal, background) in enumerate(levels):
-            say(f"{scene}, {signal:g} + {background:g} photons", (view * len(levels) + number) / total)
+            report(f"{scene}, {signal:g} + {background:g} photons", (view * len(levels) + number) / total)
             draw = np.random.SeedSequence(seed, spawn_key=(STAGE_EVALUATE, view, number)).generate_state(1)[0]
             histogram = sense(moved, sensor, PhotonBudget(signal, background), seed=int(draw), model="poisson")
             histogram = _tiled(histogram, tile)

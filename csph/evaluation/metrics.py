@@ -26,16 +26,17 @@ _SSIM_SIDE = 7  # pixels of scikit-image's window
 
 
 def is_low_sbr(signal: float, background: float) -> bool:
-    """Whether signal / background is at most 0.1, without dividing by zero."""
+    """Return whether signal / background is at most 0.1, without dividing by zero."""
     return signal <= LOW_SBR * background
 
 
 def image_errors(estimate: np.ndarray, truth: np.ndarray, range_m: float, exclude: np.ndarray | None = None) -> dict:
-    """`spad.estimators.depth.depth_errors` with the shares strictly within 1, 5, 10 and 20 mm; depths (H, W) [m]."""
+    """Return `spad.estimators.depth.depth_errors` with the shares strictly within 1, 5, 10 and 20 mm; depths (H, W)
+    [m]."""
     errors = depth_errors(estimate, truth, range_m=range_m, exclude=exclude)
     error = _error_mm(estimate, truth, range_m, exclude)
-    shares = {f"within_{t}mm": float((np.abs(error) < t).mean()) if error.size else math.nan for t in TOLERANCES_MM}
-    return {**errors, **shares}
+    fractions = {f"within_{t}mm": float((np.abs(error) < t).mean()) if error.size else math.nan for t in TOLERANCES_MM}
+    return {**errors, **fractions}
 
 
 def _error_mm(estimate: np.ndarray, truth: np.ndarray, range_m: float, exclude: np.ndarray | None) -> np.ndarray:
@@ -45,7 +46,7 @@ def _error_mm(estimate: np.ndarray, truth: np.ndarray, range_m: float, exclude: 
 
 
 def grouped_errors(estimate: np.ndarray, truth: np.ndarray, mixed: np.ndarray, range_m: float) -> dict[str, dict]:
-    """`image_errors` of all pixels, of those with one surface, and of those where surfaces mix; SSIM of all."""
+    """Return `image_errors` of all pixels, of those with one surface, and of those where surfaces mix; SSIM of all."""
     left_out = {"all": None, "unmixed": mixed, "mixed": ~mixed}
     groups = {name: image_errors(estimate, truth, range_m, exclude) for name, exclude in left_out.items()}
     groups["all"]["ssim"] = ssim(estimate, truth, range_m)
@@ -53,7 +54,7 @@ def grouped_errors(estimate: np.ndarray, truth: np.ndarray, mixed: np.ndarray, r
 
 
 def ssim(estimate: np.ndarray, truth: np.ndarray, range_m: float) -> float:
-    """Mean structural similarity (Wang et al. 2004, 7 x 7 windows) over the pixels that have a truth.
+    """Return mean structural similarity (Wang et al. 2004, 7 x 7 windows) over the pixels that have a truth.
 
     The data range is that of the truth, so that a wild estimate cannot raise its own score. Where there is no truth,
     or no estimate, both are set to the truth's (mean) value. NaN for a truth that is flat, or under 7 pixels.
@@ -85,7 +86,7 @@ class Bias(NamedTuple):
 def bias_by_depth(
     estimate: np.ndarray, truth: np.ndarray, edges_m: Sequence[float], exclude: np.ndarray | None = None
 ) -> list[Bias]:
-    """Mean and median of estimate - truth in intervals of true depth; those without a pixel are left out.
+    """Return mean and median of estimate - truth in intervals of true depth; those without a pixel are left out.
 
     What soft-argmax draws towards mid-range shows as a mean that falls with depth while the median stays.
     """
@@ -107,7 +108,8 @@ class Interval(NamedTuple):
 
 
 def bootstrap_mean(values: Mapping[str, ArrayLike], *, draws: int = 2000, seed: int = 0) -> Interval:
-    """Mean of the scenes' means, and its interval: seeds, scenes, and each scene's values are drawn with replacement.
+    """Return mean of the scenes' means, and its interval: seeds, scenes, and each scene's values are drawn with
+    replacement.
 
     values: scene -> (values,) or (seeds, values), the photon levels of that scene under one or several trainings.
     Levels of one scene are not independent, and one training is the same in all scenes: scenes and seeds are what is
@@ -135,7 +137,7 @@ def bootstrap_mean(values: Mapping[str, ArrayLike], *, draws: int = 2000, seed: 
 
 
 def paired_difference(first: Mapping[str, ArrayLike], second: Mapping[str, ArrayLike], **bootstrap: int) -> Interval:
-    """Mean of first - second, value by value, with its interval; both as in `bootstrap_mean`.
+    """Return mean of first - second, value by value, with its interval; both as in `bootstrap_mean`.
 
     What makes a scene or a level hard is in both and cancels. Other numbers of seeds: of the means over seeds.
     """

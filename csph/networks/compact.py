@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from csph.autograd import Context
 from csph.networks.published import check_input
 
 FOLD = 16  # fine bins of one coarse bin
@@ -82,7 +83,8 @@ class Compact(nn.Module):
         for module in self.modules():
             if isinstance(module, (nn.Conv2d, nn.Conv3d)):
                 flat = isinstance(module, nn.Conv2d)
-                module.to(memory_format=torch.channels_last if flat else torch.channels_last_3d)
+                order = torch.channels_last if flat else torch.channels_last_3d
+                module.to(memory_format=order)  # type: ignore[call-overload]  # not in torch's stubs
 
     def forward(self, x: Tensor) -> Tensor:
         check_input(x, FOLD)
@@ -105,18 +107,18 @@ class _Fold(torch.autograd.Function):
     """(N, A, B) -> (N, B, A), by a product with the identity: half the time of a strided copy on a CPU."""
 
     @staticmethod
-    def forward(ctx: object, values: Tensor) -> Tensor:
+    def forward(ctx: Context, values: Tensor) -> Tensor:
         one = torch.eye(min(values.shape[1:]), dtype=values.dtype, device=values.device).expand(len(values), -1, -1)
         turned = values.transpose(1, 2)
         return torch.bmm(turned, one) if turned.shape[2] == one.shape[1] else torch.bmm(one, turned)
 
     @staticmethod
-    def backward(ctx: object, grad: Tensor) -> Tensor:
+    def backward(ctx: Context, grad: Tensor) -> Tensor:
         return _Fold.apply(grad.contiguous())
 
 
 def fold(slices: Tensor) -> Tensor:
-    """(N, 16, R, C) with channels last in memory: the fine bins of a coarse bin side by side."""
+    """Return (N, 16, R, C) with channels last in memory: the fine bins of a coarse bin side by side."""
     return _Fold.apply(slices.flatten(2)).transpose(1, 2).unflatten(2, slices.shape[2:])
 
 
@@ -137,7 +139,7 @@ class _ReadOut(torch.autograd.Function):
     """See `read_out`."""
 
     @staticmethod
-    def forward(ctx: object, features: Tensor, slices: Tensor, *weights: Tensor) -> Tensor:
+    def forward(ctx: Context, features: Tensor, slices: Tensor, *weights: Tensor) -> Tensor:
         matrix, bias, trust, trust_bias = weights
         views = tuple(v.flatten(2).to(slices.dtype) for v in (slices, *averages(slices)))
         across = features.transpose(1, 2)
@@ -151,7 +153,7 @@ class _ReadOut(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: object, grad: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Context, grad: Tensor) -> tuple[Tensor | None, ...]:
         features, matrix, trust, gates, *views = ctx.saved_tensors
         slopes, scratch = torch.empty_like(gates), torch.empty_like(grad)
         for number, view in enumerate(views):
@@ -167,15 +169,15 @@ class _ReadOut(torch.autograd.Function):
 def read_out(
     features: Tensor, slices: Tensor, fine: Tensor, fine_bias: Tensor, trust: Tensor, trust_bias: Tensor
 ) -> Tensor:
-    """fine + sum_v gate_v view_v of each slice: fine and gates are linear in the features, the views are the slice and
-    its averages. features (N, P, channels), slices (N, F, R, C), P = R C; weights (F, channels), (F,), (3, channels)
-    and (3,) -> (N, F, P), in memory as the histogram lies."""
+    """Return fine + sum_v gate_v view_v of each slice: fine and gates are linear in the features, the views are the
+    slice and its averages. features (N, P, channels), slices (N, F, R, C), P = R C; weights (F, channels), (F,), (3,
+    channels) and (3,) -> (N, F, P), in memory as the histogram lies."""
     return _ReadOut.apply(features, slices, fine, fine_bias, trust, trust_bias)
 
 
 def averages(slices: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of each time slice (N, F, R, C) over 3 x 3 pixels, and over 3 x 3 squares of 2 x 2; at the border, of what
-    there is. Both are products with a matrix on either side, R + C multiplications a value."""
+    """Return means of each time slice (N, F, R, C) over 3 x 3 pixels, and over 3 x 3 squares of 2 x 2; at the border,
+    of what there is. Both are products with a matrix on either side, R + C multiplications a value."""
     flat = slices.reshape(-1, *slices.shape[2:])
     near, wide = (
         torch.bmm(left.expand(len(flat), -1, -1), flat @ right.T).view(slices.shape)
@@ -206,7 +208,7 @@ def _mean_matrices(size: int, dtype: torch.dtype, device: str) -> tuple[Tensor, 
         pairs = torch.arange(-(-size // 2))
         member = (torch.arange(size) // 2 == pairs.unsqueeze(-1)).double()
         wide = member.T @ _of_three(len(pairs)) @ (member / member.sum(1, keepdim=True))
-        return tuple(matrix.to(device, dtype) for matrix in (_of_three(size), wide))
+        return _of_three(size).to(device, dtype), wide.to(device, dtype)
 
 
 def _of_three(size: int) -> Tensor:
@@ -219,7 +221,7 @@ class _Enlarged(torch.autograd.Function):
     """See `enlarged`."""
 
     @staticmethod
-    def forward(ctx: object, coarse: Tensor, fine: Tensor, axes: tuple[int, ...]) -> Tensor:
+    def forward(ctx: Context, coarse: Tensor, fine: Tensor, axes: tuple[int, ...]) -> Tensor:
         ctx.axes, ctx.shape, total = axes, coarse.shape, fine.clone()
         for part, whole in _parts(total, coarse, axes):
             part.add_(whole)
@@ -227,7 +229,7 @@ class _Enlarged(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: object, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Context, grad: Tensor) -> tuple[Tensor, Tensor, None]:
         coarse = torch.zeros_like(grad[_every_other(ctx.axes, (0,) * len(ctx.axes))])
         for part, whole in _parts(grad, coarse, ctx.axes):
             whole.add_(part)
@@ -248,5 +250,5 @@ def _parts(fine: Tensor, coarse: Tensor, axes: tuple[int, ...]) -> list[tuple[Te
 
 
 def enlarged(coarse: Tensor, fine: Tensor, axes: tuple[int, ...]) -> Tensor:
-    """fine + coarse, each of whose values stands for two neighbours along `axes` (for one at an odd end)."""
+    """Return fine + coarse, each of whose values stands for two neighbours along `axes` (for one at an odd end)."""
     return _Enlarged.apply(coarse, fine, axes)

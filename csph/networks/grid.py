@@ -21,14 +21,14 @@ GRIDS: tuple[str, ...] = ("continuous", "published")
 
 
 def published_centroid_bins(sensor: Sensor) -> float:
-    """Centroid of the published test pulse in bins after its fullest bin (-0.44 on the reference sensor)."""
+    """Return centroid of the published test pulse in bins after its fullest bin (-0.44 on the reference sensor)."""
     taps = published_taps(sensor)
     return float(taps @ np.arange(len(taps)) - taps.argmax())
 
 
 def on_published_grid(packed: PackedTransients, sensor: Sensor) -> PackedTransients:
-    """One return a pixel as in the published simulation: all its light arrives so that the pulse's fullest bin is
-    round(depth / bin) - 1, and the label is that bin's centre. Pixels without a depth within the range are dark."""
+    """Return one return a pixel as in the published simulation: all its light arrives so that the pulse's fullest bin
+    is round(depth / bin) - 1, and the label is that bin's centre. Pixels without a depth within the range are dark."""
     depth = packed.depth_m.astype(np.float64)
     known = np.isfinite(depth) & (depth < sensor.range_m)
     fullest = np.maximum(np.rint(np.where(known, depth, 0.0) / sensor.bin_depth_m), 1) - 1
@@ -50,11 +50,12 @@ def on_published_grid(packed: PackedTransients, sensor: Sensor) -> PackedTransie
 
 
 def published_position(position: Tensor, bins: int) -> Tensor:
-    """Where the published decoding puts an answer, in bins: weights i/(T - 1) of the range instead of bin centres."""
+    """Return where the published decoding puts an answer, in bins: weights i/(T - 1) of the range instead of bin
+    centres."""
     return (position - 0.5) * (bins / (bins - 1)) + 0.5
 
 
 def published_target(depth: Tensor, sensor: Sensor) -> Tensor:
-    """The depth [m] whose published decoding is `depth`: where a network's pulse is to stand."""
+    """Return the depth [m] whose published decoding is `depth`: where a network's pulse is to stand."""
     half = 0.5 * sensor.bin_depth_m
     return (depth - half) * ((sensor.bins - 1) / sensor.bins) + half

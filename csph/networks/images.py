@@ -11,7 +11,8 @@ TILE = 96  # rows and columns of a tile's own, about
 
 
 def mirrored(start: int, stop: int, size: int) -> np.ndarray:
-    """Indices start .. stop - 1 of an axis that is reflected at both ends, the outermost repeated: -1 is 0, -2 is 1."""
+    """Return indices start .. stop - 1 of an axis that is reflected at both ends, the outermost repeated: -1 is 0, -2
+    is 1."""
     index = np.arange(start, stop) % (2 * size)
     return np.minimum(index, 2 * size - 1 - index)
 
@@ -25,7 +26,7 @@ class Span(NamedTuple):
 
 
 def spans(size: int, block: int, unit: int, halo: int, tile: int | None) -> list[Span]:
-    """Tiles along an axis of `size` pixels, which is reflected at its end to a whole number of blocks.
+    """Return tiles along an axis of `size` pixels, which is reflected at its end to a whole number of blocks.
 
     `tile` pixels each with `halo` pixels more on either side as far as the image goes, both rounded up to units (whole
     blocks, and whole steps of the network's coarsest level); None: one tile.

@@ -46,16 +46,22 @@ class Estimate(NamedTuple):
     overflows: int
 
 
+def _inside(span: Span) -> slice:
+    """Return the part of what a tile reads that is its own."""
+    return slice(span.inner, span.inner + span.own.stop - span.own.start)
+
+
 class DepthModel(nn.Module):
     """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin."""
 
     def __init__(self, config: ModelConfig, seed: int = 0) -> None:
         super().__init__()
         self.config = config
-        self.layer = None
+        self.layer: CompressiveLayer | None = None
         if config.design is not None:
-            start = {"seed": seed, "spatial_start": config.spatial_start}
-            self.layer = CompressiveLayer.of(config.design, sensor=config.sensor, **start, **config.layer)
+            self.layer = CompressiveLayer.of(
+                config.design, sensor=config.sensor, seed=seed, spatial_start=config.spatial_start, **config.layer
+            )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             compact = config.network == "compact"
@@ -66,7 +72,8 @@ class DepthModel(nn.Module):
         return parameters_of(self)
 
     def seen(self, counts: Tensor) -> Tensor:
-        """What the network sees, (B, 1, T, R, C): back-projection, counts, these matched, or 1 at the fullest bin."""
+        """Return what the network sees, (B, 1, T, R, C): back-projection, counts, these matched, or 1 at the fullest
+        bin."""
         if self.layer is not None:
             return self.layer(counts)
         if self.config.front == "counts":
@@ -76,48 +83,51 @@ class DepthModel(nn.Module):
         return torch.zeros(counts.shape, device=counts.device).scatter_(2, counts.argmax(2, keepdim=True), 1.0)
 
     def windowed(self, counts: Tensor, first_bin: Tensor, window: int) -> Tensor:
-        """Logits (B, window, R, C) of the bins from `first_bin` (B,) on, whose blocks alone are encoded."""
-        coded = self.layer is not None
-        whole = counts if coded else self.seen(counts)
+        """Return logits (B, window, R, C) of the bins from `first_bin` (B,) on, whose blocks alone are encoded."""
+        whole = counts if self.layer is not None else self.seen(counts)
         firsts = first_bin.tolist()
         cut = torch.stack([one[:, first : first + window] for one, first in zip(whole, firsts, strict=True)])
-        return self.network(self.layer(cut) if coded else cut)
+        return self.network(self.layer(cut) if self.layer is not None else cut)
 
     def forward(self, counts: Tensor) -> Tensor:
         return self.network(self.seen(counts))
 
     def position(self, logits: Tensor, decoder: Decoder | None = None) -> Tensor:
-        """The answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C); decoder None: the configuration's."""
+        """Return the answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C); decoder None: the
+        configuration's."""
         return self._on_grid(decoded(logits, decoder or self.config.decoder))
 
     def _on_grid(self, bins: Tensor) -> Tensor:
         return bins if self.config.grid == "continuous" else published_position(bins, self.config.sensor.bins)
 
     def depth_m(self, counts: Tensor, decoder: Decoder | None = None) -> Tensor:
-        """Depth of counts (B, 1, T, R, C) that blocks tile, (B, R, C) [m]; decoder as in `position`."""
+        """Return depth of counts (B, 1, T, R, C) that blocks tile, (B, R, C) [m]; decoder as in `position`."""
         return self.position(self(counts), decoder) * self.config.sensor.bin_depth_m
 
     def depth_of_codes(self, codes: Tensor, decoder: Decoder | None = None) -> Tensor:
-        """Depth (B, R, C) [m] from codes (B, K, T/Mt, R/Mr, C/Mc) that a sensor has made; decoder as in `position`.
+        """Return depth (B, R, C) [m] from codes (B, K, T/Mt, R/Mr, C/Mc) that a sensor has made; decoder as in
+        `position`.
 
         Raises InputError for a model without codes, and codes of another shape.
         """
-        require(self.layer is not None, f"{self.config.name}: has no codes to find depth from")
+        if self.layer is None:
+            raise InputError(f"{self.config.name}: has no codes to find depth from")
         logits = self.network(self.layer.decode(codes))
         return self.position(logits, decoder) * self.config.sensor.bin_depth_m
 
     def check_histogram(self, histogram: Histogram) -> None:
-        """InputError unless the histogram is of the sensor that the model was trained for."""
+        """Raise InputError unless the histogram is of the sensor that the model was trained for."""
         mine, other = self.config.sensor, histogram.sensor
         alike = (mine.bins, mine.bin_width_s, mine.response) == (other.bins, other.bin_width_s, other.response)
-        told = ", ".join(f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps)" for s in (mine, other))
-        require(alike, f"the network was trained for another sensor or pulse than the histogram's: {told}")
+        message = ", ".join(f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps)" for s in (mine, other))
+        require(alike, f"the network was trained for another sensor or pulse than the histogram's: {message}")
 
     def _tiles(self, rows: int, columns: int, tile: int | None) -> Iterator[tuple[Span, Span]]:
         _, height, width = self.config.block
         units = (math.lcm(side, self.network.coarsest) for side in (height, width))
         axes = zip((rows, columns), (height, width), units, strict=True)
-        return product(*(spans(*axis, self.network.reach, tile) for axis in axes))
+        down, across = (spans(*axis, self.network.reach, tile) for axis in axes)
+        return iter(product(down, across))
 
     @torch.no_grad()
     def estimate(
@@ -153,7 +163,7 @@ class DepthModel(nn.Module):
             # turned over as a matrix, which torch does in tiles: a third of the time
             size = (1, 1, bins, len(down.read), len(across.read))
             counts = torch.from_numpy(part).reshape(-1, bins).T.contiguous().view(size)
-            inside = tuple(slice(one.inner, one.inner + one.own.stop - one.own.start) for one in (down, across))
+            inside = _inside(down), _inside(across)
             if int8:
                 logits, wrapped = self._logits_int8(counts, inside, int8_rule)
             else:
@@ -190,7 +200,7 @@ class DepthModel(nn.Module):
         int8_rule: Int8Rule = "calibrated",
         decoder: Decoder | None = None,
     ) -> tuple[np.ndarray, int]:
-        """Depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped (0 without int8)."""
+        """Return depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped (0 without int8)."""
         found = self.estimate(histogram, int8=int8, int8_rule=int8_rule, decoder=decoder)
         return found.depth_m, found.overflows
 
@@ -205,12 +215,12 @@ def _weights_sha256(weights: dict[str, Tensor]) -> str:
 
 
 def weights_sha256(model: nn.Module) -> str:
-    """SHA-256 over names, shapes and values of all weights."""
+    """Return SHA-256 over names, shapes and values of all weights."""
     return _weights_sha256(model.state_dict())
 
 
 def save_model(model: DepthModel, config: TrainConfig, state: dict, path: Path, *, half: bool = False) -> None:
-    """Weights as safetensors, whole or not at all; configuration and `state` (step, validation) in its header.
+    """Write weights as safetensors, whole or not at all; configuration and `state` (step, validation) in its header.
 
     `half` keeps them in float16, in half the space; `load_model` gives float32 again, 11 bits of each.
     """
@@ -224,13 +234,13 @@ def save_model(model: DepthModel, config: TrainConfig, state: dict, path: Path, 
 
 
 def checkpoint_file(path: Path) -> Path:
-    """The checkpoint that a path names: the file, or `model.safetensors` in the folder of a run."""
+    """Return the checkpoint that a path names: the file, or `model.safetensors` in the folder of a run."""
     path = Path(path)
     return regular_file(path / "model.safetensors" if path.is_dir() else path)
 
 
 def load_model(path: Path) -> tuple[DepthModel, TrainConfig, dict]:
-    """A model as it was saved, in evaluation mode, its configuration, and the state it was saved in.
+    """Return a model as it was saved, in evaluation mode, its configuration, and the state it was saved in.
 
     Weights in float16 or bfloat16 become float32. Raises InputError in one line for a missing, foreign or altered
     file, a newer schema, or weights of another design or that are not finite.
@@ -241,7 +251,8 @@ def load_model(path: Path) -> tuple[DepthModel, TrainConfig, dict]:
     try:
         with safe_open(path, "pt") as file:
             header = (file.metadata() or {}).get(ATTRIBUTE)
-            require(header is not None, "is no checkpoint of scene2spad")
+            if header is None:
+                raise InputError("is no checkpoint of scene2spad")
             meta, sha256 = open_seal(header, KIND)
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
         meta = check_seal(meta, sha256, _weights_sha256(weights))

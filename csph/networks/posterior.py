@@ -15,7 +15,7 @@ CONFIDENT_BINS = 3.0  # either side of the answer: what `confidence` counts as a
 
 
 def posterior_median(logits: Tensor) -> Tensor:
-    """Median of softmax(logits) over time, (B, T, R, C) -> (B, R, C) float32, in bins from the edge of bin 0.
+    """Return median of softmax(logits) over time, (B, T, R, C) -> (B, R, C) float32, in bins from the edge of bin 0.
 
     Probability is taken as uniform within a bin, so that the median is continuous and moves with the posterior. Unlike
     the mean (`soft_argmax`) it is not drawn to mid-range by a background that is flat. NaN where a logit is NaN.
@@ -30,7 +30,8 @@ def posterior_median(logits: Tensor) -> Tensor:
 
 
 def confidence(logits: Tensor, position: Tensor, within: float = CONFIDENT_BINS) -> Tensor:
-    """Share of softmax(logits) within `within` bins of a position, (B, T, R, C), (B, R, C) -> (B, R, C) in [0, 1].
+    """Return share of softmax(logits) within `within` bins of a position, (B, T, R, C), (B, R, C) -> (B, R, C) in [0,
+    1].
 
     Positions are in bins from the edge of bin 0; a bin that the interval cuts counts in part. NaN where a logit or the
     position is NaN.
@@ -41,7 +42,7 @@ def confidence(logits: Tensor, position: Tensor, within: float = CONFIDENT_BINS)
 
 
 def decoded(logits: Tensor, decoder: Decoder) -> Tensor:
-    """Position of the answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C), by `soft_argmax` or
+    """Return position of the answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C), by `soft_argmax` or
     `posterior_median`."""
     return posterior_median(logits) if decoder == "median" else soft_argmax(logits)
 

@@ -69,41 +69,43 @@ class DeepBoosting(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Kaiming-normal by fan-in (of transposed convolutions, the output channels), up4 N(0, 0.001^2), biases 0."""
+        """Draw weights: Kaiming-normal by fan-in (of transposed convolutions, the output channels), up4 N(0, 0.001^2),
+        biases 0."""
         for module in self.modules():
             if isinstance(module, (nn.Conv3d, nn.ConvTranspose3d)):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
-        nn.init.normal_(self.up[-1].weight, std=_UP_INIT_STD)
+        nn.init.normal_(_weight(self.up[-1]), std=_UP_INIT_STD)
 
     def multiscale(self, x: Tensor) -> Tensor:
-        """(B, 1, T, R, C) -> (B, 8, T, R, C), features at dilations 1, 2, 1 on 2, and 2 on 1."""
+        """Return (B, 1, T, R, C) -> (B, 8, T, R, C), features at dilations 1, 2, 1 on 2, and 2 on 1."""
         first, second = self.a1(x).relu_(), self.a2(x).relu_()
         return torch.cat([first, second, self.a3(second).relu_(), self.a4(first).relu_()], 1)
 
     def contract(self, features: Tensor) -> Tensor:
-        """(B, 8, T, R, C) -> (B, 32, T/16, R, C)"""
+        """Return (B, 8, T, R, C) -> (B, 32, T/16, R, C)"""
         x = self.c1(features).relu_()
         for step in self.ds:
             x = step(x).relu_()
         return x
 
     def boost(self, x: Tensor) -> Tensor:
-        """(B, 32, T/16, R, C) -> (B, 112, T/16, R, C)"""
+        """Return (B, 32, T/16, R, C) -> (B, 112, T/16, R, C)"""
         for block in self.blocks:
             x = block(x)
         return x
 
     def expand(self, x: Tensor) -> Tensor:
-        """(B, 112, T/16, R, C) -> logits (B, T, R, C).
+        """Return (B, 112, T/16, R, C) -> logits (B, T, R, C).
 
         No ReLU stands between up4 and the 1x1x1 convolution: their product is one transposed convolution to a single
         channel, a seventh of up4's work.
         """
         for step in self.up[:-1]:
-            x = doubled(x, step.weight).relu_()
-        joined = torch.einsum("ioxyz,o->ixyz", self.up[-1].weight, self.out.weight.flatten()).unsqueeze(1)
+            x = doubled(x, _weight(step)).relu_()
+        joined = torch.einsum("ioxyz,o->ixyz", _weight(self.up[-1]), self.out.weight.flatten()).unsqueeze(1)
+        assert self.out.bias is not None
         logits = doubled(x, joined).squeeze(1) + self.out.bias
         return logits.relu_() if self.can_die else logits
 
@@ -112,8 +114,14 @@ class DeepBoosting(nn.Module):
         return self.expand(self.boost(self.contract(self.multiscale(x))))
 
 
+def _weight(module: nn.Module) -> Tensor:
+    weight = module.weight
+    assert isinstance(weight, Tensor)
+    return weight
+
+
 def doubled(x: Tensor, weight: Tensor) -> Tensor:
-    """The transposed convolution of kernel 6 x 3 x 3, stride 2 x 1 x 1, padding 2 x 1 x 1, by an ordinary one.
+    """Return the transposed convolution of kernel 6 x 3 x 3, stride 2 x 1 x 1, padding 2 x 1 x 1, by an ordinary one.
 
     An output at time 2 t + p takes inputs t - 1, t, t + 1 with taps p + 4, p + 2, p: a 3^3 convolution to twice the
     channels, whose pairs then interleave in time. (B, I, T, R, C), (I, O, 6, 3, 3) -> (B, O, 2 T, R, C).
@@ -127,7 +135,7 @@ def doubled(x: Tensor, weight: Tensor) -> Tensor:
 
 
 def check_input(x: Tensor, factor: int) -> None:
-    """InputError unless x is (B, 1, T, R, C) with T a multiple of `factor`."""
+    """Raise InputError unless x is (B, 1, T, R, C) with T a multiple of `factor`."""
     shape = tuple(x.shape)
     good = len(shape) == 5 and shape[1] == 1 and 0 not in shape
     require(good, f"network input of shape {shape}: expected (batch, 1, time, rows, columns)")
@@ -135,7 +143,7 @@ def check_input(x: Tensor, factor: int) -> None:
 
 
 def soft_argmax(logits: Tensor) -> Tensor:
-    """sum_i softmax(logits)_i (i + 1/2), the mean bin centre: (B, T, R, C) -> (B, R, C) float32, in bins.
+    """Return sum_i softmax(logits)_i (i + 1/2), the mean bin centre: (B, T, R, C) -> (B, R, C) float32, in bins.
 
     Its mean over a softmax that is flat in part is drawn towards T / 2: `metrics.bias_by_depth` measures it.
     """

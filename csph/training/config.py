@@ -62,8 +62,8 @@ class ModelConfig:
         if self.design is not None:
             bins, block = self.sensor.bins, self.design.block
             require(bins % block[0] == 0, f"blocks of {block[0]} bins do not divide the sensor's {bins}")
-            said = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
-            require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{said}, or --layer keep_mean")
+            message = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
+            require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{message}, or --layer keep_mean")
 
     @property
     def block(self) -> tuple[int, int, int]:
@@ -162,8 +162,8 @@ class TrainConfig:
         weighted = all(math.isfinite(weight) and weight > 0 for weight in self.weights)
         require(weighted, f"training: set weights {', '.join(map(str, self.weights))} are not all positive")
         if self.window:
-            said = window_refused(self.model, self.window)
-            require(not said, f"training: windows of {self.window} bins {said}")
+            refusal = window_refused(self.model, self.window)
+            require(not refusal, f"training: windows of {self.window} bins {refusal}")
             require(not self.time_offset_m, "training: windows and random time offsets do not go together")
         still = self.model.grid == "continuous" or not self.time_offset_m
         require(still, "training: the published grid and random time offsets do not go together")
@@ -175,15 +175,17 @@ class TrainConfig:
     def check_memory(self) -> None:
         """Raise InputError unless the least that one step holds fits in memory: ask before sets are read."""
         counts = self.batch * self.crop**2 * self.model.sensor.bins
-        told = f"a step of {self.batch} patches of {self.crop} x {self.crop} pixels and {self.model.sensor.bins} bins"
-        require_memory(COUNT_BYTES * counts, told)
+        message = (
+            f"a step of {self.batch} patches of {self.crop} x {self.crop} pixels and {self.model.sensor.bins} bins"
+        )
+        require_memory(COUNT_BYTES * counts, message)
 
     def to_dict(self) -> dict:
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict) -> TrainConfig:
-        """Raises InputError for an entry that is missing or unknown."""
+        """Raise InputError for an entry that is missing or unknown."""
         try:
             model = dict(values["model"])
             design = model.pop("design")
@@ -206,7 +208,7 @@ WINDOW_STEP = 256  # bins; windows begin at multiples of it
 
 
 def window_refused(model: ModelConfig, window: int) -> str:
-    """Why a model cannot be trained on windows of so many bins; empty where it can."""
+    """Return why a model cannot be trained on windows of so many bins; empty where it can."""
     if window % WINDOW_STEP or not 0 < window < model.sensor.bins:
         return f"are no multiple of {WINDOW_STEP} below the sensor's {model.sensor.bins}"
     if model.design is not None and WINDOW_STEP % model.block[0]:
@@ -254,7 +256,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def preset(name: str, model: ModelConfig, **changes: Any) -> TrainConfig:
-    """A preset's configuration with a model; `changes` that are None leave it as it is.
+    """Return a preset's configuration with a model; `changes` that are None leave it as it is.
 
     smoke (seconds), laptop (compact, one core, 25 minutes at the most), workstation (compact, two cores, 2 hours at the
     most), paper (the published network, levels and schedule), laptop-v1 (the recipe of the first models). Windows are

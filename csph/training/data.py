@@ -52,8 +52,8 @@ class Samples(Dataset):
             most = min(shape[1:])
             require(config.crop <= most, f"crops of {config.crop} pixels do not fit views of {most}")
         weights = config.weights or (1.0,) * len(sets)
-        said = f"training: {len(weights)} set weights for {len(sets)} training sets"
-        require(len(weights) == len(sets), said)
+        message = f"training: {len(weights)} set weights for {len(sets)} training sets"
+        require(len(weights) == len(sets), message)
         self.edges = np.cumsum(weights)[:-1] / np.sum(weights)
 
     def __len__(self) -> int:

@@ -23,7 +23,7 @@ def draw_level(rng: np.random.Generator, levels: Levels) -> Level:
     The background is exp(low + (high - low) u^0.6) for a uniform u, so that the harder half of its range (in
     logarithms) is drawn 68 times of 100.
     """
-    if levels != CONTINUOUS:
+    if not isinstance(levels, str):
         return levels[rng.integers(len(levels))]
     low, high = map(math.log, SIGNAL)
     signal = math.exp(rng.uniform(low, high))

@@ -308,7 +308,7 @@ def train(
     if config.model.grid == "published":
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
     module_data = SetData(*sets, config, workers)
-    record = Record(folder, progress or (lambda what, share: None))
+    record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():
         runner = _trainer(config, record, **trainer)
     _claim(folder, config)

@@ -8,7 +8,8 @@ from csph.training.config import TrainConfig
 
 
 def rate_factor(step: int, config: TrainConfig) -> float:
-    """What the rate of `config` is multiplied by at a step, from 0: a linear warm-up, then steps down or one cosine.
+    """Return what the rate of `config` is multiplied by at a step, from 0: a linear warm-up, then steps down or one
+    cosine.
 
     steps: decay^(step // decay_steps). cosine: from 1 to `rate_end` over all steps of the run, and there from then on.
     """

@@ -14,7 +14,7 @@ from scenes.errors import require
 from scenes.io.set_index import read_set_index
 from spad.detection.training_patches import PackedTransients, packed_transients
 
-VALIDATION_SHARE = 0.1  # of a set's scenes, its last, where no validation set is given
+VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
 
 
 class Views(NamedTuple):
@@ -25,7 +25,7 @@ class Views(NamedTuple):
 
 
 def read_views(path: Path) -> Views:
-    """All views of a pack (.h5), or of the folder that `scene2spad dataset` filled.
+    """Return all views of a pack (.h5), or of the folder that `scene2spad dataset` filled.
 
     Raises InputError in one line for anything else, an empty set, and a laser that is not at the camera.
     """
@@ -53,11 +53,12 @@ def _scene(meta: dict, number: int) -> str:
     return str(meta.get("place", meta.get("scene", number)))
 
 
-def split_views(views: Views, share: float = VALIDATION_SHARE) -> tuple[Views, Views]:
-    """Training and validation views of different scenes: the last scenes are validation's. InputError for one scene."""
+def split_views(views: Views, fraction: float = VALIDATION_FRACTION) -> tuple[Views, Views]:
+    """Return training and validation views of different scenes: the last scenes are validation's. InputError for one
+    scene."""
     names = list(dict.fromkeys(views.scenes))
     require(len(names) >= 2, f"a set of one scene ({names[0]}) has none left to validate on; give a validation set")
-    held = set(names[-max(1, round(share * len(names))) :])
+    held = set(names[-max(1, round(fraction * len(names))) :])
     parts = []
     for wanted in (False, True):
         kept = [i for i, name in enumerate(views.scenes) if (name in held) == wanted]
@@ -66,7 +67,7 @@ def split_views(views: Views, share: float = VALIDATION_SHARE) -> tuple[Views, V
 
 
 def packed_sha256(packed: PackedTransients) -> str:
-    """SHA-256 over what is sensed: a run that goes on must go on with the same set."""
+    """Return SHA-256 over what is sensed: a run that goes on must go on with the same set."""
     sha = hashlib.sha256(str(packed.depth_m.shape).encode())
     for name in ("offsets", "path_near_m", "path_far_m", "radiance", "depth_m", "ambient", "mixed"):
         sha.update(np.ascontiguousarray(getattr(packed, name)).tobytes())
@@ -74,5 +75,5 @@ def packed_sha256(packed: PackedTransients) -> str:
 
 
 def packed_views(views: Views) -> PackedTransients:
-    """One packed set; InputError where views are of different sizes."""
+    """Return one packed set; InputError where views are of different sizes."""
     return packed_transients(views.transients)

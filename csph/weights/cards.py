@@ -50,10 +50,10 @@ class Card:
 
 
 def read_card(path: Path) -> Card:
-    """The card of a shipped model's JSON file; InputError in one line where it cannot be read."""
+    """Return the card of a shipped model's JSON file; InputError in one line where it cannot be read."""
     try:
-        told = json.loads(path.read_text())
-        config, state = TrainConfig.from_dict(told["config"]), told["state"]
+        stored = json.loads(path.read_text())
+        config, state = TrainConfig.from_dict(stored["config"]), stored["state"]
     except (OSError, ValueError, KeyError, TypeError, InputError) as error:
         raise InputError(f"{path}: is no card of a model ({' '.join(str(error).split())[:80]})") from None
     design = config.model.design
@@ -65,16 +65,16 @@ def read_card(path: Path) -> Card:
         training_sha256=_several(config.data.get("training_sha256", ())),
         levels=levels_in_words(config),
         steps=config.steps,
-        cpu_minutes=told.get("cpu_minutes"),
+        cpu_minutes=stored.get("cpu_minutes"),
         val_mae_mm=state.get("val_mae_mm"),
         init=config.data.get("init"),
-        errors=told.get("errors", {}),
+        errors=stored.get("errors", {}),
         not_for=limits(config),
     )
 
 
 def cards(folder: Path = WEIGHTS) -> list[Card]:
-    """Cards of all models of a folder, by name."""
+    """Return cards of all models of a folder, by name."""
     return [read_card(path) for path in sorted(folder.glob("*.json")) if path.with_suffix(".safetensors").is_file()]
 
 
@@ -83,7 +83,7 @@ def _several(value: str | list[str] | tuple[str, ...]) -> tuple[str, ...]:
 
 
 def levels_in_words(config: TrainConfig) -> str:
-    """As in "signal 2 to 10, background 2 to 50"."""
+    """Return as in "signal 2 to 10, background 2 to 50"."""
     listed = config.levels != CONTINUOUS
     columns = zip(*config.levels, strict=True) if listed else (SIGNAL, BACKGROUND)
     (low, high), (least, most) = ((min(column), max(column)) for column in columns)
@@ -91,7 +91,7 @@ def levels_in_words(config: TrainConfig) -> str:
 
 
 def limits(config: TrainConfig) -> tuple[str, ...]:
-    """What a model trained so must not be used for."""
+    """Return what a model trained so must not be used for."""
     model, sensor = config.model, config.model.sensor
     found = [f"histograms of other than {sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps, or another pulse"]
     found.append(f"photon levels far from its training's ({levels_in_words(config)})")
@@ -105,7 +105,7 @@ def limits(config: TrainConfig) -> tuple[str, ...]:
 
 
 def shipped_model(name: str, folder: Path = WEIGHTS) -> Path:
-    """The file of a shipped model by its name; InputError that names the nearest ones for another."""
+    """Return the file of a shipped model by its name; InputError that names the nearest ones for another."""
     path = folder / f"{name}.safetensors"
     if not path.is_file():
         import difflib
@@ -117,7 +117,7 @@ def shipped_model(name: str, folder: Path = WEIGHTS) -> Path:
 
 
 def checkpoint_of(name_or_path: Path | str, folder: Path = WEIGHTS) -> Path:
-    """A checkpoint's path as it is if something lies there, else the shipped model of that name. InputError."""
+    """Return a checkpoint's path as it is if something lies there, else the shipped model of that name. InputError."""
     path = Path(name_or_path)
     if path.exists() or path.suffix or len(path.parts) > 1:
         require(path.exists(), f"{path}: file not found")

@@ -115,8 +115,8 @@ def _coding(weights: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
 def _check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) -> None:
     shape = tuple(tensor.shape)
     fits = len(shape) == len(expected) and all(e in (None, n) and n > 0 for n, e in zip(shape, expected, strict=True))
-    said = ", ".join("any" if n is None else str(n) for n in expected)
-    require(fits, f"tensor {name} is {shape}, expected ({said})")
+    message = ", ".join("any" if n is None else str(n) for n in expected)
+    require(fits, f"tensor {name} is {shape}, expected ({message})")
 
 
 def _design(temporal: Tensor, spatial: Tensor | None) -> Design:

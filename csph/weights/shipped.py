@@ -25,12 +25,12 @@ _BESIDE = {"log.csv": ".csv", "energy.csv": ".energy.csv"}
 
 
 def shipped_file(name: str, folder: Path = WEIGHTS) -> Path:
-    """Where the shipped model of that name lies, if it does."""
+    """Return where the shipped model of that name lies, if it does."""
     return folder / f"{name}.safetensors"
 
 
 def file_names(paths: str | Sequence[str]) -> str | list[str]:
-    """Names of a set's file, or of several sets' files, without their folders."""
+    """Return names of a set's file, or of several sets' files, without their folders."""
     return Path(paths).name if isinstance(paths, str) else [Path(path).name for path in paths]
 
 
@@ -62,7 +62,7 @@ def ship(run: Path, name: str, folder: Path = WEIGHTS, *, errors: dict[str, dict
 
 
 def cpu_minutes(run: Path) -> float | None:
-    """CPU-minutes of a run's epochs as far as `timings.jsonl` tells them; None without that file.
+    """Return CPU-minutes of a run's epochs as far as `timings.jsonl` tells them; None without that file.
 
     An epoch that was done again after a kill counts once.
     """
@@ -70,13 +70,13 @@ def cpu_minutes(run: Path) -> float | None:
     if not path.is_file():
         return None
     seconds = {}
-    for told in read_whole_lines(path):
-        match told:
+    for line in read_whole_lines(path):
+        match line:
             case {"epoch": int(epoch), "cpu_s": float(cpu) | int(cpu)}:
                 seconds[epoch] = cpu
     return round(sum(seconds.values()) / 60, 1)
 
 
 def beside(checkpoint: Path, kind: str) -> Path:
-    """`log.csv` or `energy.csv` of a checkpoint, in its run's folder or as shipped; it need not exist."""
+    """Return `log.csv` or `energy.csv` of a checkpoint, in its run's folder or as shipped; it need not exist."""
     return checkpoint.with_name(kind if checkpoint.stem in RUN_WEIGHTS else f"{checkpoint.stem}{_BESIDE[kind]}")

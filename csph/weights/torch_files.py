@@ -54,7 +54,8 @@ def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
 
 
 def check_torch_file(path: Path) -> None:
-    """InputError unless a file is a whole archive of torch.save: every entry stored as it is, its CRC-32 fitting."""
+    """Raise InputError unless a file is a whole archive of torch.save: every entry stored as it is, its CRC-32
+    fitting."""
     try:
         with zipfile.ZipFile(path) as archive:
             size = path.stat().st_size

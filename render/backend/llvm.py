@@ -40,7 +40,7 @@ REMEDY = f"install the pinned wheel ({WHEEL}) or set {PATH_VARIABLE} to a libLLV
 
 
 def choose_llvm() -> Path | None:
-    """The LLVM library to use: an explicit variable, else the pinned wheel, else the newest system LLVM >= 19.
+    """Return the LLVM library to use: an explicit variable, else the pinned wheel, else the newest system LLVM >= 19.
 
     Raises InputError when the variable names a file that is not there.
     """
@@ -53,7 +53,8 @@ def choose_llvm() -> Path | None:
 
 
 def wheel_llvm() -> Path | None:
-    """libLLVM of the pinned wheel, by its real file name: the symlinks appear only at the next interpreter start."""
+    """Return libLLVM of the pinned wheel, by its real file name: the symlinks appear only at the next interpreter
+    start."""
     try:
         files = importlib.metadata.files(WHEEL) or []
     except importlib.metadata.PackageNotFoundError:
@@ -63,7 +64,7 @@ def wheel_llvm() -> Path | None:
 
 
 def system_llvm(root: Path = Path("/usr")) -> Path | None:
-    """The newest system libLLVM of version 19 or more, by file name (libLLVM.so.19.1, libLLVM-19.so.1)."""
+    """Return the newest system libLLVM of version 19 or more, by file name (libLLVM.so.19.1, libLLVM-19.so.1)."""
     versions: dict[int, Path] = {}
     for pattern in SYSTEM_PATTERNS:
         for path in sorted(root.glob(pattern)):
@@ -75,7 +76,8 @@ def system_llvm(root: Path = Path("/usr")) -> Path | None:
 
 
 def backends() -> list[str]:
-    """The backends to try, best first: what SCENE2SPAD_BACKEND forces, else CUDA if its libraries are there, and LLVM.
+    """Return the backends to try, best first: what SCENE2SPAD_BACKEND forces, else CUDA if its libraries are there, and
+    LLVM.
 
     Raises InputError when the variable names neither, or CUDA where a library of the driver is missing.
     """
@@ -169,7 +171,7 @@ def reload_llvm(library: Path) -> bool:
     if not fresh or getattr(drjit, "__version__", "") != RELOADABLE_DRJIT:
         return False
     try:
-        core = ctypes.CDLL(str(Path(drjit.__file__).with_name("libdrjit-core.so")))
+        core = ctypes.CDLL(str(Path(str(drjit.__file__)).with_name("libdrjit-core.so")))
         shut_down, start = (
             core._Z12jit_shutdowni,
             core._Z8jit_initj,

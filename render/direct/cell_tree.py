@@ -16,7 +16,7 @@ GLINT_LEVELS = 2
 MAX_LAUNCHES = 256
 # Passes end when there is less to cut than least_share times this share of what the first one cut: a pass takes as long
 # as ten thousand rays, and the last few edges are worth less (measured in rooms: 4 % more error, 26 % less time).
-LAST_SHARE = 1 / 32
+LAST_FRACTION = 1 / 32
 
 _TYPES = dict.fromkeys(("rank", "column", "row", "level", "child"), np.int32)
 _TYPES |= dict.fromkeys(Footprints._fields, np.float32) | {"flags": np.uint32}
@@ -56,11 +56,11 @@ class CellTree:
         self.world, self.pixels, self.grid = world, pixels, grid
         self.width = world.scene.camera.width
         self.first = int(pixels[0]) if len(pixels) else 0
-        span = int(pixels[-1]) - self.first + 1 if len(pixels) else 0
-        self.rank_of = aligned(span, np.int32)
+        interval = int(pixels[-1]) - self.first + 1 if len(pixels) else 0
+        self.rank_of = aligned(interval, np.int32)
         self.rank_of[:] = -1
         self.rank_of[pixels - self.first] = np.arange(len(pixels))
-        self.whole_rows = self.first % self.width == 0 and span == len(pixels) and span % self.width == 0
+        self.whole_rows = self.first % self.width == 0 and interval == len(pixels) and interval % self.width == 0
         self.used = self.rays = 0
         self.least = np.float32(0)
         self.mixed = np.zeros(len(pixels), bool)
@@ -73,21 +73,21 @@ class CellTree:
         row = (pixel_row[:, None] * grid + cell_row).ravel()
         self._add(np.repeat(np.arange(len(pixels), dtype=np.int32), grid * grid), column, row, 0)
 
-    def refine(self, levels: int, least_share: float) -> np.ndarray:
+    def refine(self, levels: int, edge_threshold: float) -> np.ndarray:
         """Cut cells until none needs it or is `levels` deep; whether a cell of each pixel was, (pixels,) bool.
 
-        An edge that could change less than `least_share` of the root mean square of the pixels' radiance is left, and
-        so are the last few (LAST_SHARE) where many were cut.
+        An edge that could change less than `edge_threshold` of the root mean square of the pixels' radiance is left,
+        and so are the last few (LAST_FRACTION) where many were cut.
         """
         touched = np.zeros(len(self.pixels), bool)
         if len(self.pixels) == 0:
             return touched
         per_pixel = self.radiance[: self.used].reshape(len(self.pixels), -1).mean(axis=1, dtype=np.float64)
-        self.least = np.float32(least_share * np.sqrt(np.square(per_pixel).mean()))
+        self.least = np.float32(edge_threshold * np.sqrt(np.square(per_pixel).mean()))
         pending = self._first_cuts()
         if levels == 0:
             return touched
-        few = LAST_SHARE * least_share * self.grid**2 * len(pending)
+        few = LAST_FRACTION * edge_threshold * self.grid**2 * len(pending)
         for _ in range(MAX_LAUNCHES):
             if len(pending) <= few:
                 break
@@ -104,7 +104,7 @@ class CellTree:
         return int(np.count_nonzero(found.flags & CLIPPED))
 
     def pitch(self, index: np.ndarray | slice) -> np.ndarray:
-        """Width of cells in pixels, float32."""
+        """Return width of cells in pixels, float32."""
         return np.ldexp(np.float32(1 / self.grid), -self.level[index])
 
     def _trace(self, index: np.ndarray | slice, *, clip: bool = False) -> Footprints:
@@ -136,13 +136,13 @@ class CellTree:
 
     def _first_cuts(self) -> np.ndarray:
         """Compare the cells of level 0, which then follow their neighbours: those to cut, sorted."""
-        spans = [span[: self.used] for span in (self.path_m, self.half_width_m, self.minor_m)]
+        path_intervals = [interval[: self.used] for interval in (self.path_m, self.half_width_m, self.minor_m)]
         columns = (getattr(self, name) for name in Cells._fields)
         cells = Cells(*(None if column is None else column[: self.used] for column in columns))
         of_image = self.width if self.whole_rows else 0
-        bits, *found = first_edges(cells, spans, self.grid, of_image, self.least)
-        for span, new in zip(spans, found, strict=True):
-            span[:] = new
+        bits, *found = first_edges(cells, path_intervals, self.grid, of_image, self.least)
+        for interval, new in zip(path_intervals, found, strict=True):
+            interval[:] = new
         self.mixed[self.rank[_having(bits, MIXED)]] = True
         return _having(bits, CUT | GLINT)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.drjit_types import Array, Floats, Masks, UInts
 from render.direct.footprints import HIT, LARGE, LIT
 from render.scene.traced_scene import Bool, Float, UInt32, dr, mi, recorded, upload
 
@@ -32,24 +33,24 @@ ACROSS, PAIRS = 8, 12  # pairs of a cut cell's children: with what lies beyond i
 class Cells(NamedTuple):
     """What is compared of cells, (N,) each: see `render.direct.footprints.Footprints`."""
 
-    distance_m: Any
-    slope_x_m: Any
-    slope_y_m: Any
-    facing: Any
-    radiance: Any
-    flags: Any
-    tilt_x: Any = None
-    tilt_y: Any = None
-    peak: Any = None
+    distance_m: Floats
+    slope_x_m: Floats
+    slope_y_m: Floats
+    facing: Floats
+    radiance: Floats
+    flags: UInts
+    tilt_x: Floats = None
+    tilt_y: Floats = None
+    peak: Floats = None
 
 
 class Place(NamedTuple):
     """Where cells lie: level, column and row in cells of that level, and the rank of their pixel, (N,) each."""
 
-    level: Any
-    column: Any
-    row: Any
-    rank: Any
+    level: UInts
+    column: UInts
+    row: UInts
+    rank: UInts
 
 
 class Tree(NamedTuple):
@@ -68,15 +69,15 @@ class _Between(NamedTuple):
     from nothing), the share of the brighter one's radiance that misplacing it can change, whether both are hits on
     one surface, bent or not, and the mean radiance that a highlight between them may add to a cell."""
 
-    differ: Any
-    apart: Any
-    contrast: Any
-    joined: Any
-    glint: Any
+    differ: Array
+    apart: Array
+    contrast: Array
+    joined: Array
+    glint: Masks
 
 
 def first_edges(
-    cells: Cells, spans: Sequence[np.ndarray], grid: int, width: int, least: float
+    cells: Cells, path_intervals: Sequence[np.ndarray], grid: int, width: int, least: float
 ) -> tuple[np.ndarray, ...]:
     """Compare all cells of whole pixels, grid x grid each, with their neighbours: CUT, MIXED, GLINT bits, and spans.
 
@@ -84,8 +85,8 @@ def first_edges(
     where an edge could change radiance times a pixel's area by `least` or more, or where the cell is large; GLINT
     where a highlight between two cells could.
 
-    `spans` are path centres, half widths and smaller half spans [m]; all columns are `aligned`. Small cells are spread
-    between their neighbours on the same surface instead of on the tangent plane. Along each axis
+    `path_intervals` are path centres, half widths and smaller half spans [m]; all columns are `aligned`. Small cells
+    are spread between their neighbours on the same surface instead of on the tangent plane. Along each axis
     p = p_0 + s x + c x^2 / 2 and r = r_0 + g x, with s, g the mean of the steps to both neighbours (the one step where
     the other neighbour lies across an edge) and c their difference. Then the half span is |s| / 2 (c adds c^2 / 720 to
     the variance), and the mean path p_0 + c / 24 + g s / (12 r_0), summed over the axes: second order in the cell's
@@ -93,13 +94,12 @@ def first_edges(
     agrees with one of the steps instead of their mean, and is kept.
     """
     if len(cells.flags) < 2:  # arrays of one entry are scalars to Dr.Jit: another kernel
-        return np.where(cells.flags & LARGE, np.uint32(CUT), np.uint32(0)), *spans
-    columns = tuple(Float(column) for column in spans)
+        return np.where(cells.flags & LARGE, np.uint32(CUT), np.uint32(0)), *path_intervals
+    columns = tuple(Float(column) for column in path_intervals)
     lane = dr.arange(UInt32, len(cells.flags))
     dr.eval(lane)
-    numbers = (dr.opaque(UInt32, value) for value in (grid, width, len(cells.flags) // grid**2))
-    least = dr.opaque(Float, float(least))
-    found = _first_edges(_seen(cells), *columns, lane, *numbers, least)
+    counts = tuple(dr.opaque(UInt32, value) for value in (grid, width, len(cells.flags) // grid**2))
+    found = _first_edges(_seen(cells), columns, lane, counts, dr.opaque(Float, float(least)))
     dr.eval(found)
     return tuple(values.numpy() for values in found)
 
@@ -116,30 +116,28 @@ def child_edges(
     number = max(len(parents), 2)  # arrays of one entry are scalars to Dr.Jit: another kernel
     lane = dr.arange(UInt32, PAIRS * number)
     dr.eval(lane)
-    counts = (dr.opaque(UInt32, value) for value in (tree.grid, tree.width, tree.first, len(tree.rank_of), start))
+    counts = tuple(dr.opaque(UInt32, value) for value in (tree.grid, tree.width, tree.first, len(tree.rank_of), start))
     found = _child_edges(
         tuple(mi.Int32(column) for column in (tree.rank_of, tree.child)),
         tuple(UInt32(column.view(np.uint32)) for column in places),
         _seen(cells),
         upload(UInt32, parents, number),
         lane,
-        *counts,
+        counts,
         dr.opaque(Float, float(least)),
     )
     dr.eval(found)
     return tuple(values.numpy() for values in found)
 
 
-def _seen(cells: Cells) -> tuple[Any, ...]:
+def _seen(cells: Cells) -> tuple[Array, ...]:
     """The same memory, as Dr.Jit sees it."""
     return tuple((UInt32 if column.dtype == np.uint32 else Float)(column) for column in cells if column is not None)
 
 
 @recorded
-def _first_edges(
-    cells: Any, path: Any, half: Any, minor: Any, lane: Any, grid: Any, width: Any, pixels: Any, least: Any
-) -> tuple[Any, ...]:
-    cells = Cells(*cells)
+def _first_edges(cells: tuple, path_intervals: tuple, lane: UInts, counts: tuple, least: Floats) -> tuple[Array, ...]:
+    cells, (path, half, minor), (grid, width, pixels) = Cells(*cells), path_intervals, counts
     per_pixel = grid * grid
     rank = lane // per_pixel
     row = (lane - rank * per_pixel) // grid
@@ -179,11 +177,11 @@ def _first_edges(
             step = dr.select(joined, way * (dr.gather(Float, path, index, there) - path), 0)
             run, bends = run + step, bends + way * step
             gain += dr.select(joined, way * (other.radiance - cells.radiance), 0)
-        share, two = dr.rcp(dr.maximum(number, 1)), dr.select(number == 2, Float(1), Float(0))
-        off = dr.abs(slope - rise * share)
+        fraction, two = dr.rcp(dr.maximum(number, 1)), dr.select(number == 2, Float(1), Float(0))
+        off = dr.abs(slope - rise * fraction)
         follows &= (number > 0) & (off <= dr.maximum(dr.abs(rises) * two / 4, FOLLOWED * cells.distance_m))
-        run, bend = run * share, bends * two
-        gain = dr.clip(gain * share * per_radiance, -2, 2)
+        run, bend = run * fraction, bends * two
+        gain = dr.clip(gain * fraction * per_radiance, -2, 2)
         mean += bend / 24 + gain * run / 12
         halves.append(dr.abs(run) / 2)
         variance += dr.square(run) / 4 + dr.square(bend) / 240
@@ -197,19 +195,9 @@ def _first_edges(
 
 @recorded
 def _child_edges(
-    tree: Any,
-    places: Any,
-    cells: Any,
-    parent: Any,
-    lane: Any,
-    grid: Any,
-    width: Any,
-    first: Any,
-    pixels: Any,
-    start: Any,
-    least: Any,
-) -> tuple[Any, Any, Any]:
-    rank_of, child = tree
+    tree: tuple, places: tuple, cells: tuple, parent: UInts, lane: UInts, counts: tuple, least: Floats
+) -> tuple[Array, Array, Array]:
+    (rank_of, child), (grid, width, first, pixels, start) = tree, counts
     places, cells = Place(*places), Cells(*cells)
     number = lane // PAIRS
     pair = lane - number * PAIRS
@@ -228,7 +216,7 @@ def _child_edges(
     level = dr.gather(UInt32, places.level, of)
     column, row = (mi.Int32(dr.gather(UInt32, numbers, of)) for numbers in (places.column, places.row))
     column, row = column + dr.select(upright, way, 0), row + dr.select(upright, 0, way)
-    beside = _cell_at(rank_of, child, level, column, row, across, grid, width, first, pixels)
+    beside = _cell_at((rank_of, child, grid, width, first, pixels), level, column, row, across)
     met = across & (beside >= 0)
     its_child = dr.gather(mi.Int32, child, beside, met)
     cut = met & (its_child >= 0)
@@ -243,19 +231,9 @@ def _child_edges(
 
 
 @dr.syntax
-def _cell_at(
-    rank_of: Any,
-    child: Any,
-    level: Any,
-    column: Any,
-    row: Any,
-    active: Any,
-    grid: Any,
-    width: Any,
-    first: Any,
-    pixels: Any,
-) -> Any:
-    """The deepest cell, no deeper than `level`, that holds the cell (column, row) of that level; -1 where none."""
+def _cell_at(tree: tuple, level: UInts, column: UInts, row: UInts, active: Masks) -> Array:
+    """Return the deepest cell, no deeper than `level`, that holds cell (column, row) of that level; -1: none."""
+    rank_of, child, grid, width, first, pixels = tree
     depth = mi.Int32(level)
     column_0, row_0 = column >> depth, row >> depth
     active = active & (column_0 >= 0) & (row_0 >= 0)  # a copy: &= would change the caller's
@@ -277,8 +255,9 @@ def _cell_at(
     return found
 
 
-def compared(places: Place, cells: Cells, one: Any, other: Any, grid: Any, least: Any) -> Any:
-    """CUT, MIXED and GLINT bits of pairs of cells of any size, side by side, as `first_edges` sets them of a cell.
+def compared(places: Place, cells: Cells, one: UInts, other: UInts, grid: UInts, least: Floats) -> Array:
+    """Return CUT, MIXED and GLINT bits of pairs of cells of any size, side by side, as `first_edges` sets them of a
+    cell.
 
     `one` and `other` number the pairs' cells in `places` and `cells`.
     """
@@ -300,18 +279,18 @@ def compared(places: Place, cells: Cells, one: Any, other: Any, grid: Any, least
     return _bits(cut, mixed, glint)
 
 
-def _bits(cut: Any, mixed: Any, glint: Any) -> Any:
+def _bits(cut: Masks, mixed: Masks, glint: Masks) -> Array:
     bits = ((cut, CUT), (mixed, MIXED), (glint, GLINT))
     return sum((dr.select(condition, bit, UInt32(0)) for condition, bit in bits), UInt32(0))
 
 
-def _at(columns: Any, index: Any, active: bool | Any = True) -> Any:
+def _at(columns: Array, index: UInts, active: bool | Masks = True) -> Array:
     """Those of other cells; of nothing where not `active`."""
     gathered = (dr.gather(type(column), column, index, active) for column in columns if column is not None)
     return type(columns)(*gathered)
 
 
-def _between(one: Cells, other: Cells, step: Any, rise: Any, other_rise: Any) -> _Between:
+def _between(one: Cells, other: Cells, step: UInts, rise: Floats, other_rise: Floats) -> _Between:
     """Compare cells with their neighbours.
 
     `step` is the difference of two hits' distances [m], the rises what each one's tangent plane predicts for it. Across
@@ -332,7 +311,7 @@ def _between(one: Cells, other: Cells, step: Any, rise: Any, other_rise: Any) ->
     return _Between(differ, apart, dr.select(edge, Float(1), dr.maximum(bend, tone)), joined, glint)
 
 
-def _highlight(one: Cells, other: Cells) -> Any:
+def _highlight(one: Cells, other: Cells) -> Array:
     """Mean radiance of a cell that holds the highlight between two neighbours on a surface that bends.
 
     Between them the tilt off its middle, in units of the roughness, runs from one's to the other's, and in the
@@ -346,5 +325,5 @@ def _highlight(one: Cells, other: Cells) -> Any:
     off = dr.norm(mi.Vector2f(one.tilt_x + part * step_x, one.tilt_y + part * step_y))
     step = dr.sqrt(step2)
     off = dr.maximum(off - step / 2, 0)
-    share = dr.minimum(GLINT_WIDTH / dr.maximum(step, GLINT_WIDTH), 1)
-    return dr.minimum(one.peak, other.peak) / dr.square(1 + dr.square(off)) * share
+    fraction = dr.minimum(GLINT_WIDTH / dr.maximum(step, GLINT_WIDTH), 1)
+    return dr.minimum(one.peak, other.peak) / dr.square(1 + dr.square(off)) * fraction

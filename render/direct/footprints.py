@@ -12,10 +12,11 @@ SMALL bounds D: 1/32 means 2.5e-4 of energy, and a shift of 1 % of the standard 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.drjit_types import Array, Floats, Interactions, Masks, Rays, UInts, Vectors
 from render.scene.rays import camera_rays, first_opaque, laser_leg, shape_index, to_camera
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
@@ -50,7 +51,7 @@ class Footprints(NamedTuple):
 
 
 def trace(world: TracedScene, column: np.ndarray, row: np.ndarray, level: np.ndarray, grid: int, *, clip: bool = False):
-    """Footprints of the cells in these columns and rows (N,) of an image of cells 1/(grid 2^level) pixels wide.
+    """Return footprints of the cells in these columns and rows (N,) of an image of cells 1/(grid 2^level) pixels wide.
 
     With `clip` a footprint that is not small is cut to the path lengths that its face spans.
     """
@@ -76,7 +77,7 @@ def _lanes(count: int) -> int:
     return next(more for more in range(lanes, lanes + 4) if more % 2 and more % 3)
 
 
-def _footprints(world: TracedScene, column: Any, packed: Any, grid: Any, *, clip: bool) -> tuple:
+def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *, clip: bool) -> tuple:
     level = packed >> LEVEL_BIT
     side = grid << level
     row = packed & ((1 << LEVEL_BIT) - 1)
@@ -87,12 +88,7 @@ def _footprints(world: TracedScene, column: Any, packed: Any, grid: Any, *, clip
     step = pitch / world.focal_px
     aside, down = _off_centre(column, row, level)
     ray, aim = camera_rays(world, x + aside * pitch, y + down * pitch)
-    if world.sees_through:
-        si, transmission, optical, distance = first_opaque(world, ray, Bool(True))
-    else:
-        # neighbouring lanes are neighbouring rays: told so, Embree is three times as fast
-        si = world.traced.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=Bool(True))
-        transmission, optical, distance = Float(1), si.t, si.t
+    si, transmission, optical, distance = _first_hit(world, ray)
     hit = si.is_valid()
     value, to_laser, irradiance, leg = laser_leg(world, si, pixel, hit, seen_by_camera=(transmission, optical))
     normal, point = to_camera(world, si.n), to_camera(world, si.p - world.eye)
@@ -123,11 +119,8 @@ def _footprints(world: TracedScene, column: Any, packed: Any, grid: Any, *, clip
         lit = hit & ((radiance > 0) | (albedo(world, si, hit) == 0))
     flags = dr.select(hit, HIT, UInt32(0)) | dr.select(lit, LIT, UInt32(0)) | dr.select(hit & ~small, LARGE, UInt32(0))
     if clip:
-        near, far = _face_span(world, si, path, hit & ~small)
-        low, high = dr.maximum(path - half, near), dr.minimum(path + half, far)
-        cut = hit & ~small & ~((near <= path - half) & (far >= path + half))
-        path, half = dr.select(cut, 0.5 * (low + high), path), dr.select(cut, 0.5 * (high - low), half)
-        flags |= dr.select(cut, CLIPPED, UInt32(0))
+        path, half, clipped = _clip_to_face(world, si, path, half, hit & ~small)
+        flags |= dr.select(clipped, CLIPPED, UInt32(0))
     facing = dr.abs(dr.dot(si.sh_frame.n, to_laser))
     zero = Float(0)
     per_pixel = dr.rcp(world.focal_px)
@@ -145,7 +138,26 @@ def _footprints(world: TracedScene, column: Any, packed: Any, grid: Any, *, clip
     )
 
 
-def _off_centre(column: Any, row: Any, level: Any) -> tuple[Any, Any]:
+def _first_hit(world: TracedScene, ray: Rays) -> tuple[Array, Array, Array, Array]:
+    """`first_opaque` of rays from the camera in the order of their pixels."""
+    if world.sees_through:
+        return first_opaque(world, ray, Bool(True))
+    # neighbouring lanes are neighbouring rays: told so, Embree is three times as fast
+    si = world.mi_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=Bool(True))
+    return si, Float(1), si.t, si.t
+
+
+def _clip_to_face(
+    world: TracedScene, si: Interactions, path: Floats, half: Floats, active: Masks
+) -> tuple[Array, Array, Array]:
+    """Clip intervals of path length to the face that they lie on; middle, half width and whether that changes them."""
+    near, far = _face_span(world, si, path, active)
+    low, high = dr.maximum(path - half, near), dr.minimum(path + half, far)
+    cut = active & ~((near <= path - half) & (far >= path + half))
+    return dr.select(cut, 0.5 * (low + high), path), dr.select(cut, 0.5 * (high - low), half), cut
+
+
+def _off_centre(column: UInts, row: UInts, level: UInts) -> tuple[Array, Array]:
     """Where in its cell a ray goes, off the centre along x and y in cells' widths: 0 in cells of level 0.
 
     Cells that were cut lie along edges, and edges of rooms run along rows or columns: with rays in the middle all cells
@@ -158,7 +170,9 @@ def _off_centre(column: Any, row: Any, level: Any) -> tuple[Any, Any]:
     return tuple((Float(number * golden >> 8) - 2.0**23) * cut for number in (row, column))
 
 
-def _glint(world: TracedScene, si: Any, ray: Any, to_laser: Any, hit: Any, irradiance: Any) -> tuple[Any, Any, Any]:
+def _glint(
+    world: TracedScene, si: Interactions, ray: Rays, to_laser: Vectors, hit: Masks, irradiance: Floats
+) -> tuple[Array, Array, Array]:
     """Tilt off the highlight's middle, and its radiance there: see `Footprints`."""
     index = shape_index(si)
     peak = dr.gather(Float, world.peak, index, hit) * irradiance
@@ -169,7 +183,9 @@ def _glint(world: TracedScene, si: Any, ray: Any, to_laser: Any, hit: Any, irrad
     return dr.select(glossy, tilt.x, 0), dr.select(glossy, tilt.y, 0), dr.select(glossy, peak, 0)
 
 
-def _slopes(local: Any, normal: Any, from_laser: Any, distance: Any, colocated: bool) -> tuple[Any, Any, Any]:
+def _slopes(
+    local: Vectors, normal: Vectors, from_laser: Vectors, distance: Floats, colocated: bool
+) -> tuple[Array, Array, Array]:
     """Change of distance and of path length per unit of camera-frame x and y (z = 1), (2,) each, and of the point [m].
 
     On the tangent plane n . (p - C) = const the distance along l = (x, y, 1) is rho = const |l| / (n . l), so
@@ -191,7 +207,7 @@ def _slopes(local: Any, normal: Any, from_laser: Any, distance: Any, colocated: 
     return mi.Vector2f(*slopes), mi.Vector2f(*path_slopes), dr.sqrt(extent2)
 
 
-def _face_span(world: TracedScene, si: Any, path: Any, active: Any) -> tuple[Any, Any]:
+def _face_span(world: TracedScene, si: Interactions, path: Floats, active: Masks) -> tuple[Array, Array]:
     """Bounds [m] of the path length over the hit triangle.
 
     p(x) = |x - C| + |x - L| is convex: it is largest at a vertex, and nowhere on the face below its linearisation at
@@ -210,8 +226,8 @@ def _face_span(world: TracedScene, si: Any, path: Any, active: Any) -> tuple[Any
     return near, far
 
 
-def albedo(world: TracedScene, si: Any, hit: Any) -> Any:
-    """Diffuse reflectance, or a conductor's at normal incidence; 0 where nothing is hit."""
+def albedo(world: TracedScene, si: Interactions, hit: Masks) -> Array:
+    """Return diffuse reflectance, or a conductor's at normal incidence; 0 where nothing is hit."""
     diffuse = si.bsdf().eval_diffuse_reflectance(si, hit)[0]
     specular = dr.gather(Float, world.albedo, shape_index(si), hit)
     return dr.select(hit, dr.select(specular >= 0, specular, diffuse), 0)

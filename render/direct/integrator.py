@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.drjit_types import Array, UInts
 from render.direct.cell_tree import MAX_CELLS, CellTree
 from render.direct.footprints import albedo
 from render.scene.rays import camera_rays, first_opaque
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr
 from render.transient.samples import Samples, concatenate, merge, no_samples, packed
 
-LANES, MIN_ROWS = 1 << 19, 16
+RAYS_PER_LAUNCH, MIN_ROWS = 1 << 19, 16
 REFINE = 6
 # A footprint whose smaller half span is below this is as good as uniform: a thirtieth of the reference sensor's bin.
 NARROW_M = 1e-3
@@ -36,8 +37,8 @@ class Layers(NamedTuple):
     albedo: np.ndarray
 
 
-def least_share_of(grid: int) -> float:
-    """Share of a first cell of a typical pixel below which an edge is not worth its rays.
+def default_edge_threshold(grid: int) -> float:
+    """Return share of a first cell of a typical pixel below which an edge is not worth its rays.
 
     Falls with the grid, as the error of all other cells does: what both leave costs least in sum (measured).
     """
@@ -50,17 +51,17 @@ def direct_light(
     grid: int,
     tolerance_m: float = 1e-4,
     refine: int = REFINE,
-    least_share: float | None = None,
+    edge_threshold: float | None = None,
 ) -> DirectLight:
-    """Direct returns of the given flat pixel indices (sorted, each once), merged within `tolerance_m`.
+    """Return direct returns of the given flat pixel indices (sorted, each once), merged within `tolerance_m`.
 
     Every pixel starts as grid x grid cells, one ray and footprint each (`render.direct.footprints`). A cell is cut in
     four, at most `refine` times and down to 1/MAX_CELLS of a pixel, where
     - its footprint is not small, so that first order no longer describes it; or
     - it and a neighbouring cell lie on different surfaces, or one is in shadow, or one is painted darker: an edge runs
       through one of them.
-      An edge that could change less than `least_share` of a first cell's energy, in a pixel of the root mean square of
-      all pixels' radiance, is left alone; by default `least_share_of` the grid.
+      An edge that could change less than `edge_threshold` of a first cell's energy, in a pixel of the root mean square
+      of all pixels' radiance, is left alone; by default `default_edge_threshold` the grid.
     New cells are compared with their neighbours too, of whatever size and pixel, and those are cut in turn: a wire
     thinner than a cell is followed from wherever a ray hit it. All cuts of a pass are traced in one launch. Footprints
     not small at the end are clipped to the face they lie on, and counted if that changes them.
@@ -71,11 +72,11 @@ def direct_light(
     Pixels are treated in groups of whole rows, at least MIN_ROWS and about LANES rays each. Neither across edges of
     groups nor, where not all pixels are asked for, across edges of pixels are cells compared.
     """
-    least_share = least_share_of(grid) if least_share is None else least_share
+    edge_threshold = default_edge_threshold(grid) if edge_threshold is None else edge_threshold
     width = world.scene.camera.width
-    per_chunk = max(MIN_ROWS, LANES // (grid * grid * width)) * width
+    per_chunk = max(MIN_ROWS, RAYS_PER_LAUNCH // (grid * grid * width)) * width
     parts = [
-        _chunk(world, pixels[i : i + per_chunk], grid, tolerance_m, refine, least_share)
+        _chunk(world, pixels[i : i + per_chunk], grid, tolerance_m, refine, edge_threshold)
         for i in range(0, max(len(pixels), 1), per_chunk)
     ]
     if len(parts) == 1:
@@ -86,10 +87,10 @@ def direct_light(
 
 
 def _chunk(
-    world: TracedScene, pixels: np.ndarray, grid: int, tolerance_m: float, refine: int, least_share: float
+    world: TracedScene, pixels: np.ndarray, grid: int, tolerance_m: float, refine: int, edge_threshold: float
 ) -> DirectLight:
     tree = CellTree(world, pixels, grid)
-    touched = tree.refine(max(0, min(refine, int(math.log2(MAX_CELLS / grid)))), least_share / grid**2)
+    touched = tree.refine(max(0, min(refine, int(math.log2(MAX_CELLS / grid)))), edge_threshold / grid**2)
     clipped = tree.clip()
     # pixels that were left alone are a table of equal cells; what was cut is a list
     plain = _merge_plain(tree, np.flatnonzero(~touched), tolerance_m)
@@ -132,7 +133,7 @@ def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Sampl
     """
     cells = tree.grid**2
     index = ranks[:, None] * cells + np.arange(cells)
-    share = 1 / cells
+    fraction = 1 / cells
     if cells > 64 or tolerance_m == 0:
         return merge(_samples(tree, index.ravel(), 1 / tree.grid, tolerance_m), tolerance_m)
     radiance = tree.radiance[index]
@@ -140,7 +141,7 @@ def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Sampl
     key = np.floor(tree.path_m[index] / tolerance_m)
     columns = [key[:, k] for k in range(cells)]
     same = _all([columns[0] == column for column in columns[1:]], len(ranks)) & _all(list(lit.T), len(ranks))
-    parts = [_merge_rows(tree, index[same], radiance[same], share)]
+    parts = [_merge_rows(tree, index[same], radiance[same], fraction)]
     rest = index[~same]
     if cells == 1:
         return parts[0]
@@ -161,9 +162,9 @@ def _all(conditions: list[np.ndarray], length: int) -> np.ndarray:
     return every
 
 
-def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, share: float) -> Samples:
+def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, fraction: float) -> Samples:
     """One return for each row of cells, with the sum of energy, the centroid and the variance of its cells."""
-    weight = radiance.astype(np.float64).T * share
+    weight = radiance.astype(np.float64).T * fraction
     path = tree.path_m[index].astype(np.float64).T
     half_width = tree.half_width_m[index].astype(np.float64).T
     total = sum(weight)
@@ -174,7 +175,7 @@ def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, share: 
 
 
 def centre_layers(world: TracedScene) -> Layers:
-    """Depth, normal and albedo at every pixel centre, (H, W)."""
+    """Return depth, normal and albedo at every pixel centre, (H, W)."""
     shape = (world.scene.camera.height, world.scene.camera.width)
     pixel = dr.arange(UInt32, shape[0] * shape[1])
     dr.eval(pixel)
@@ -185,7 +186,7 @@ def centre_layers(world: TracedScene) -> Layers:
     return Layers(depth.copy(), normal.astype(np.float16), reflectance.astype(np.float16))
 
 
-def _centres(world: TracedScene, pixel: Any) -> tuple[Any, ...]:
+def _centres(world: TracedScene, pixel: UInts) -> tuple[Array, ...]:
     ray, _ = camera_rays(world, Float(pixel % world.width) + 0.5, Float(pixel // world.width) + 0.5)
     si, _, _, distance = first_opaque(world, ray, Bool(True))
     hit = si.is_valid()

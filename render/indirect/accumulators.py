@@ -1,25 +1,24 @@
-"""Where the light of paths is added: per pixel and cell, per watched pixel, batch and cell, per pixel and batch."""
+"""Accumulators of indirect light: per pixel and cell, per probe pixel, batch and cell, per pixel and batch."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from render.backend.drjit_types import Array, Floats, Masks, UInts
 from render.indirect.path_cells import MomentHistogram, scatter_add_fixed_point
 from render.scene.traced_scene import Float, UInt32, dr, mi, upload
 
-FINER = 3  # parts of what is spread over watched rows, whose cells are half as wide as the pixels'
+PROBE_PARTS = 3  # parts of what is spread over probe rows, whose cells are half as wide as the pixels'
 
 
 class IndirectAccumulator:
-    """Where connections are added: rows of the pixels' cells, finer rows of watched pixels by batch, totals by batch.
+    """Add up light of paths: rows of the pixels' cells, finer rows of probe pixels by batch, totals by batch.
 
     origin_m   zero of every pixel's cells
-    plain      rows like the watched ones, of all light without a filter
-    watch      the watched row of every pixel, -1 for none
-    batches    rounds take turns: round r belongs to batch r modulo this
-    rounds     paths of every pixel: each counts one of them
+    unfiltered rows like the probe's, of all light without a filter
+    probe_row  the probe row of every pixel, -1 for none
+    batches    sample s of a pixel belongs to batch s modulo this
+    spp        paths of every pixel: each counts one of them
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
@@ -28,67 +27,69 @@ class IndirectAccumulator:
         rows: MomentHistogram,
         origin_m: np.ndarray,
         *,
-        rounds: np.ndarray,
+        spp: np.ndarray,
         batches: int,
-        watched: MomentHistogram | None = None,
-        plain: MomentHistogram | None = None,
-        watch: np.ndarray | None = None,
+        probed: MomentHistogram | None = None,
+        unfiltered: MomentHistogram | None = None,
+        probe_row: np.ndarray | None = None,
     ) -> None:
-        self.rows, self.watched, self.plain = rows, watched, plain
+        self.rows, self.probed, self.unfiltered = rows, probed, unfiltered
         self.origin_m = upload(Float, origin_m)
-        self.watch = None if watch is None else upload(mi.Int32, watch)
+        self.probe_row = None if probe_row is None else upload(mi.Int32, probe_row)
         self.totals = dr.zeros(mi.UInt64, rows.rows * batches)
         self.batches = dr.opaque(UInt32, batches)
-        self.scale = upload(Float, 1 / rounds)
+        self.scale = upload(Float, 1 / spp)
 
-    def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
-        """Add samples to the pixels' and the watched rows; returns what was added, for `add_total`."""
+    def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
+        """Add samples to the pixels' and the probe rows; returns what was added, for `add_total`."""
         x, radiance, active = self._given(pixel, path, radiance, active)
         self.rows.add(pixel, x, radiance, active)
-        if self.watched is not None:
-            row, watch = self._watched_row(pixel, batch, active)
-            self.watched.add(row, x, radiance * Float(self.batches), watch)
+        if self.probed is not None:
+            row, probe_row = self._probe_row_of(pixel, batch, active)
+            self.probed.add(row, x, radiance * Float(self.batches), probe_row)
         return radiance
 
-    def add_plain(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> None:
-        """Add samples to the rows of what is watched as it would be without a filter."""
-        if self.plain is not None:
+    def add_unfiltered(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> None:
+        """Add samples to the probe rows of light without a filter."""
+        if self.unfiltered is not None:
             x, radiance, active = self._given(pixel, path, radiance, active)
-            row, watch = self._watched_row(pixel, batch, active)
-            self.plain.add(row, x, radiance * Float(self.batches), watch)
+            row, probe_row = self._probe_row_of(pixel, batch, active)
+            self.unfiltered.add(row, x, radiance * Float(self.batches), probe_row)
 
-    def spread(self, pixel: Any, low: Any, high: Any, radiance: Any, active: Any) -> None:
+    def spread(self, pixel: UInts, low: Floats, high: Floats, radiance: Floats, active: Masks) -> None:
         """Add light that is even between two paths, and a mean over paths already, to the pixels' rows."""
         origin = dr.gather(Float, self.origin_m, pixel, active)
         self.rows.add_between(pixel, low - origin, high - origin, radiance, active)
 
-    def spread_watched(self, pixel: Any, batch: Any, low: Any, high: Any, radiance: Any, active: Any) -> None:
-        """Add one batch's part of such light to the watched rows."""
+    def spread_probed(
+        self, pixel: UInts, batch: UInts, low: Floats, high: Floats, radiance: Floats, active: Masks
+    ) -> None:
+        """Add one batch's part of such light to the probe rows."""
         origin = dr.gather(Float, self.origin_m, pixel, active)
-        row, watch = self._watched_row(pixel, batch, active)
-        radiance = radiance * Float(self.batches) / FINER
-        for part in range(FINER):  # these rows' cells are narrower
-            ends = (dr.lerp(low, high, (part + side) / FINER) - origin for side in (0, 1))
-            self.watched.add_between(row, *ends, radiance, watch)
+        row, probe_row = self._probe_row_of(pixel, batch, active)
+        radiance = radiance * Float(self.batches) / PROBE_PARTS
+        for part in range(PROBE_PARTS):  # these rows' cells are narrower
+            ends = (dr.lerp(low, high, (part + side) / PROBE_PARTS) - origin for side in (0, 1))
+            self.probed.add_between(row, *ends, radiance, probe_row)
 
-    def add_total(self, pixel: Any, batch: Any, radiance: Any) -> None:
+    def add_total(self, pixel: UInts, batch: UInts, radiance: Floats) -> None:
         """Add to the pixels' totals by batch."""
         scatter_add_fixed_point(
             self.totals, radiance * self.rows.per_quantum, pixel * self.batches + batch, radiance > 0
         )
 
-    def _given(self, pixel: Any, path: Any, radiance: Any, active: Any) -> tuple[Any, Any, Any]:
+    def _given(self, pixel: UInts, path: Floats, radiance: Floats, active: Masks) -> tuple[Array, Array, Array]:
         """Place from the pixel's origin, share of the pixel's mean, and where there is any."""
         x = path - dr.gather(Float, self.origin_m, pixel, active)
         radiance = radiance * dr.gather(Float, self.scale, pixel, active)
         radiance = dr.select(active & dr.isfinite(radiance), radiance, 0)
         return x, radiance, active & (radiance > 0)
 
-    def _watched_row(self, pixel: Any, batch: Any, active: Any) -> tuple[Any, Any]:
-        watch = dr.gather(mi.Int32, self.watch, pixel, active)
-        return UInt32(dr.maximum(watch, 0)) * self.batches + batch, active & (watch >= 0)
+    def _probe_row_of(self, pixel: UInts, batch: UInts, active: Masks) -> tuple[Array, Array]:
+        probe_row = dr.gather(mi.Int32, self.probe_row, pixel, active)
+        return UInt32(dr.maximum(probe_row, 0)) * self.batches + batch, active & (probe_row >= 0)
 
     def evaluate(self) -> None:
         """Run what was added so far."""
-        kept = [rows for rows in (self.rows, self.watched, self.plain) if rows is not None]
+        kept = [rows for rows in (self.rows, self.probed, self.unfiltered) if rows is not None]
         dr.eval(self.totals, [rows.moments for rows in kept])

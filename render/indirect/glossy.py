@@ -18,11 +18,12 @@ of both is right, as long as both take it from the same points.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from render.scene.rays import camera_rays, first_opaque, of_parts, parts_of, raster_of, shape_index
+from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts, Vectors
+from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, parts_of, raster_of, shape_index
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
 RATIO = 1.0  # paths that begin in a polished pixel of the laser's image, for every path of others (1 to 2 do best)
@@ -36,15 +37,15 @@ class Glossy(NamedTuple):
     1 where it shows polished surfaces. It is `width` x `height`, and begins so much to the `left` of the camera's and
     `up` that it holds what the laser lights. Arrays of Dr.Jit."""
 
-    shares: Any
-    left: Any
-    up: Any
-    width: Any
-    height: Any
+    sampling_density: Array
+    left: UInts
+    up: UInts
+    width: UInts
+    height: UInts
 
 
 def glossy_of(world: TracedScene) -> Glossy | None:
-    """Where a flood laser lights polished surfaces, looked for once; None if nowhere.
+    """Return where a flood laser lights polished surfaces, looked for once; None if nowhere.
 
     Glass and cut-outs on the way would need to be crossed from the other side, too.
     """
@@ -55,7 +56,7 @@ def glossy_of(world: TracedScene) -> Glossy | None:
     return Glossy(*world.glossy) if world.glossy else None
 
 
-def _look_for(world: TracedScene) -> tuple[Any, ...]:
+def _look_for(world: TracedScene) -> tuple[Array, ...]:
     """The parts of `Glossy`, none if nowhere: a plain tuple, which recordings take for an input."""
     camera, laser = world.scene.camera, world.scene.laser
     angle = min(math.acos(laser.cos_half_angle(camera)), math.radians(WIDEST_DEG))
@@ -66,16 +67,16 @@ def _look_for(world: TracedScene) -> tuple[Any, ...]:
     dr.eval(pixel)
     numbers = [dr.opaque(UInt32, number) for number in (left, up, width, height)]
     polished = world.recordings.call(world, "glossy", _shows, pixel, *numbers).numpy().reshape(height, width)
-    shares = polished.astype(np.float64)
+    sampling_density = polished.astype(np.float64)
     if not polished.any():
         return ()
-    own = shares[up : up + camera.height, left : left + camera.width]
+    own = sampling_density[up : up + camera.height, left : left + camera.width]
     own[own == 0] = ELSEWHERE
     # of no launch's length, or Dr.Jit would record it anew (`render.indirect.camera_paths`)
-    return upload(Float, shares, 16 * (shares.size // 16 + 1) + 5), *numbers
+    return upload(Float, sampling_density, 16 * (sampling_density.size // 16 + 1) + 5), *numbers
 
 
-def _shows(world: TracedScene, pixel: Any, left: Any, up: Any, width: Any, height: Any) -> Any:
+def _shows(world: TracedScene, pixel: UInts, left: UInts, up: UInts, width: UInts, height: UInts) -> Array:
     shown = Bool(False)
     for place in range(SEEN_BY**2):
         x, y = ((part + 0.5) / SEEN_BY for part in (place % SEEN_BY, place // SEEN_BY))
@@ -86,18 +87,22 @@ def _shows(world: TracedScene, pixel: Any, left: Any, up: Any, width: Any, heigh
     return shown
 
 
-def laser_rays(world: TracedScene, pixel: Any, x: Any, y: Any, left: Any, up: Any, width: Any) -> tuple[Any, Any]:
-    """`camera_rays` from the laser through places in pixels of its image."""
+def laser_rays(
+    world: TracedScene, pixel: UInts, x: Floats, y: Floats, left: UInts, up: UInts, width: UInts
+) -> tuple[Array, Array]:
+    """Return `camera_rays` from the laser through places in pixels of its image."""
     column, row = Float(pixel % width) - Float(left), Float(pixel // width) - Float(up)
     return camera_rays(world, column + x, row + y, world.laser)
 
 
-def is_glossy(world: TracedScene, si: Any, active: Any) -> Any:
-    """Whether a point lies on a polished surface."""
+def is_glossy(world: TracedScene, si: Interactions, active: Masks) -> Array:
+    """Return whether a point lies on a polished surface."""
     return active & (dr.gather(Float, world.glossy_materials, shape_index(si), active) > 0)
 
 
-def mis_weight_camera_path(world: TracedScene, y: Any, direction: Any, x: Any, active: Any) -> Any:
+def mis_weight_camera_path(
+    world: TracedScene, y: Interactions, direction: Vectors, x: Interactions, active: Masks
+) -> Array:
     """Return 1 - c: what a path from `y` in that direction to `x`, and on to the laser, keeps of its light.
 
     Rays start a little off their points, which tell the direction badly where these are close.
@@ -113,17 +118,21 @@ def mis_weight_camera_path(world: TracedScene, y: Any, direction: Any, x: Any, a
     return 1 - _light_path_weight(world, pixel, y, direction, x, seen)
 
 
-def mis_weight_light_path(world: TracedScene, pixel: Any, y: Any, direction: Any, x: Any, active: Any) -> Any:
+def mis_weight_light_path(
+    world: TracedScene, pixel: UInts, y: Interactions, direction: Vectors, x: Interactions, active: Masks
+) -> Array:
     """Return c: what the path that begins in this pixel, on `x`, and goes to `y` has of that light; `direction` is the
     way back."""
     return _light_path_weight(world, pixel, y, direction, x, active)
 
 
-def _light_path_weight(world: TracedScene, pixel: Any, y: Any, direction: Any, x: Any, active: Any) -> Any:
+def _light_path_weight(
+    world: TracedScene, pixel: UInts, y: Interactions, direction: Vectors, x: Interactions, active: Masks
+) -> Array:
     """c of the module's text; 0 where no path from the laser samples the pair."""
     to_x, to_laser, to_eye = dr.normalize(direction), world.laser - x.p, world.eye - y.p
     light, eye = dr.normalize(to_laser), dr.normalize(to_eye)
-    begun = dr.gather(Float, glossy_of(world).shares, pixel, active) * RATIO
+    begun = dr.gather(Float, glossy_of(world).sampling_density, pixel, active) * RATIO
     begun *= dr.abs(dr.dot(x.n, light) * dr.dot(y.n, to_x)) * dr.squared_norm(to_eye)
     begun *= _density(x, light, -to_x, active)
     ended = dr.abs(dr.dot(y.n, eye) * dr.dot(x.n, to_x)) * dr.squared_norm(to_laser)
@@ -132,8 +141,8 @@ def _light_path_weight(world: TracedScene, pixel: Any, y: Any, direction: Any, x
     return dr.select(active & (begun > 0) & dr.isfinite(weight), weight, 0)
 
 
-def _density(si: Any, seen_from: Any, towards: Any, active: Any) -> Any:
+def _density(si: Interactions, seen_from: Vectors, towards: Vectors, active: Masks) -> Array:
     """Density per solid angle with which the lobes of a surface, seen from one direction, sample another."""
-    seen = of_parts(parts_of(si))
+    seen = interaction_from_parts(parts_of(si))
     seen.wi = si.to_local(seen_from)
     return si.bsdf().pdf(mi.BSDFContext(), seen, si.to_local(towards), active)

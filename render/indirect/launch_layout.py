@@ -1,4 +1,4 @@
-"""Blocks of pixels that lie together, and the turns in which they trace paths. Plain numpy."""
+"""Blocks of pixels that lie together, and the launches in which they trace paths. Plain numpy."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ BLOCK = 16  # pixels that share their paths
 
 
 class LaunchLayout(NamedTuple):
-    """One launch: turn n traces a path in each pixel of its block `block[n]`, number `stream[n]` of the image.
+    """One launch: entry n traces a path in each pixel of block `block[n]`, number `stream[n]` of the image.
 
-    `round` numbers the turns of a block. With the seed, stream and round decide the random numbers. `stride` is a power
-    of two, at least the rounds that a block has in a batch.
+    `sample_index` numbers the samples of a block. With the seed, stream and sample index decide the random numbers.
+    `stride` is a power of two, at least the samples that a block has in a batch.
     """
 
     block: np.ndarray
     stream: np.ndarray
-    round: np.ndarray
+    sample_index: np.ndarray
     stride: np.ndarray
 
 
 def make_launch(
-    blocks: np.ndarray, streams: np.ndarray, rounds: np.ndarray, batches: int = 1, turns: np.ndarray | None = None
+    blocks: np.ndarray, streams: np.ndarray, spp: np.ndarray, batches: int = 1, indices: np.ndarray | None = None
 ) -> LaunchLayout:
-    """The turns of some blocks, `rounds` each, block by block; or those that `turns` numbers among them."""
-    ends = np.cumsum(rounds)
-    turns = np.arange(int(ends[-1])) if turns is None else turns
-    place = np.searchsorted(ends, turns, side="right")
-    stride = 1 << np.ceil(np.log2(np.maximum(rounds / batches, 1))).astype(np.int64)
-    return LaunchLayout(blocks[place], streams[place], turns - (ends - rounds)[place], stride[place])
+    """Lay out the samples of some blocks, `spp` each, block by block; or those that `indices` numbers among them."""
+    ends = np.cumsum(spp)
+    indices = np.arange(int(ends[-1])) if indices is None else indices
+    place = np.searchsorted(ends, indices, side="right")
+    stride = 1 << np.ceil(np.log2(np.maximum(spp / batches, 1))).astype(np.int64)
+    return LaunchLayout(blocks[place], streams[place], indices - (ends - spp)[place], stride[place])
 
 
 def block_order(pixels: np.ndarray, width: int) -> np.ndarray:
-    """Flat pixel indices along a Z-order curve, so that runs of 16 are square neighbourhoods; padded with -1."""
+    """Return flat pixel indices along a Z-order curve, so that runs of 16 are square neighbourhoods; padded with -1."""
     row, column = np.divmod(pixels.astype(np.uint64), np.uint64(width))
     code = np.zeros(len(pixels), np.uint64)
     for bit in range(15):

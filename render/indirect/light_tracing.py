@@ -17,16 +17,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.drjit_types import Array, Generators, Interactions, UInts, Vectors
 from render.indirect.glossy import RATIO, glossy_of, is_glossy, laser_rays, mis_weight_light_path
-from render.scene.rays import first_opaque, in_beam, pixel_of, segment, spawn, to_camera
+from render.scene.rays import first_opaque, in_beam, pixel_of, sample_bsdf, segment, spawn, to_camera
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
-PATHS = 1 << 17  # of one launch
-MIN_COSINE = 1e-4
+LIGHT_PATHS_PER_LAUNCH = 1 << 17  # of one launch
+MIN_SHADING_COSINE = 1e-4
 
 
 class LightPathSplats(NamedTuple):
@@ -48,29 +49,29 @@ def trace_light_paths(
     glossy = glossy_of(world)
     if glossy is None:
         return
-    shares = np.array(glossy.shares, np.float64)[: int(glossy.width[0]) * int(glossy.height[0])]
-    rounds = np.ceil(RATIO * paths * shares).astype(np.int64)
-    ends = np.cumsum(rounds)
-    parts = np.linspace(0, ends[-1], math.ceil(ends[-1] / PATHS) + 1).astype(np.int64)
+    sampling_density = np.array(glossy.sampling_density, np.float64)[: int(glossy.width[0]) * int(glossy.height[0])]
+    counts = np.ceil(RATIO * paths * sampling_density).astype(np.int64)
+    ends = np.cumsum(counts)
+    parts = np.linspace(0, ends[-1], math.ceil(ends[-1] / LIGHT_PATHS_PER_LAUNCH) + 1).astype(np.int64)
     keys = [dr.opaque(UInt32, int(number)) for number in np.random.SeedSequence(seed).generate_state(2)]
     for begin, end in pairwise(parts):
         lane = np.arange(begin, end)
         pixel = np.searchsorted(ends, lane, side="right")
-        number = lane - (ends - rounds)[pixel]
+        number = lane - (ends - counts)[pixel]
         batch = (number + pixel) % batches
         columns = (upload(UInt32, column) for column in (pixel, lane, number // batches, batch))
-        found = _thrown(world, *columns, keys, bounces)
+        found = _trace_launch(world, *columns, keys, bounces)
         dr.eval(found)
         target, path, radiance = (values.numpy() for values in found)
         kept = np.flatnonzero(radiance)
-        radiance = radiance[kept].astype(np.float64) / rounds[pixel[kept % len(lane)]]
+        radiance = radiance[kept].astype(np.float64) / counts[pixel[kept % len(lane)]]
         yield LightPathSplats(target[kept].astype(np.int64), path[kept], radiance, batch[kept % len(lane)])
 
 
 @dr.syntax
-def _thrown(
-    world: TracedScene, pixel: Any, lane: Any, number: Any, batch: Any, keys: list[Any], bounces: int
-) -> tuple[Any, Any, Any]:
+def _trace_launch(
+    world: TracedScene, pixel: UInts, lane: UInts, number: UInts, batch: UInts, keys: list[Array], bounces: int
+) -> tuple[Array, Array, Array]:
     """Target pixels, paths and radiances, (bounces - 1) x lanes flat."""
     lanes = dr.width(lane)
     targets = dr.zeros(UInt32, lanes * (bounces - 1))
@@ -103,13 +104,7 @@ def _thrown(
         dr.scatter(values, light, slot * stride + place, active)
         slot += 1
         active &= slot < last
-        sample, again = si.bsdf().sample(
-            mi.BSDFContext(),
-            si,
-            random.next_float32(),
-            mi.Point2f(random.next_float32(), random.next_float32()),
-            active,
-        )
+        sample, again = sample_bsdf(si, random, active)
         through = again[0]
         survive = dr.clip(through, 0.05, 0.95)
         active &= (through > 0) & (random.next_float32() < survive)
@@ -119,8 +114,8 @@ def _thrown(
 
 
 def _sample_first_vertex(
-    world: TracedScene, pixel: Any, number: Any, batch: Any, keys: list[Any], random: Any
-) -> tuple[Any, ...]:
+    world: TracedScene, pixel: UInts, number: UInts, batch: UInts, keys: list[Array], random: Generators
+) -> tuple[Array, ...]:
     """x1, the path to it, a sample of where light goes from there, its value, and whether there is any."""
     glossy, intensity = glossy_of(world), dr.gather(Float, world.intensity, UInt32(0))
     jitter = mi.Point2f(random.next_float32(), random.next_float32())
@@ -136,7 +131,7 @@ def _sample_first_vertex(
     return si, path, sample, value, active & (value > 0)
 
 
-def _ratio(si: Any, local: Any) -> Any:
+def _ratio(si: Interactions, local: Vectors) -> Array:
     """Cosine to the shading normal over that to the surface, of a direction in the shading frame."""
     shading, true = dr.abs(local.z), dr.abs(dr.dot(si.n, si.to_world(local)))
-    return dr.maximum(shading, MIN_COSINE) / dr.maximum(true, MIN_COSINE)
+    return dr.maximum(shading, MIN_SHADING_COSINE) / dr.maximum(true, MIN_SHADING_COSINE)

@@ -17,29 +17,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, UInts, Vectors
 from render.indirect.glossy import mis_weight_camera_path
-from render.scene.rays import first_opaque, laser_light, of_parts, parts_of, segment, to_world
+from render.scene.rays import first_opaque, interaction_from_parts, laser_light, parts_of, segment, to_world
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 MAX_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
-MIN_COSINE = 1e-9
-# Lit points that x1 is joined to, of a path alone and of one that is shared: as many as lowered the noise of a second
-# most. Under a lamp, whose paths seldom meet what is close to it, later vertices are joined to one, too. A flash lights
-# what its pixels see, which paths meet often: there joining hardly pays.
-WIDE_JOINS, NARROW_JOINS = (4, 8), (1, 0)
+MIN_FAR_COSINE = 1e-9
+# Light vertices that x1 is connected to, of a path alone and of one that is reused: as many as lowered the noise of a
+# second most. Under a lamp, whose paths seldom meet what is close to it, later vertices are joined to one, too. A flash
+# lights what its pixels see, which paths meet often: there joining hardly pays.
+WIDE_CONNECTIONS, NARROW_CONNECTIONS = (4, 8), (1, 0)
 
 
-def connections_per_vertex(world: TracedScene, *, shared: bool) -> int:
-    """Lit points that every x1 is joined to; none where the laser is no flood, and lights another place every time."""
+def connections_per_vertex(world: TracedScene, *, reuses_paths: bool) -> int:
+    """Return lit points that every x1 is joined to; none where the laser is no flood, and lights another place every
+    time."""
     if world.scene.laser.mode != "flood":
         return 0
-    return (WIDE_JOINS if is_wide(world) else NARROW_JOINS)[shared]
+    return (WIDE_CONNECTIONS if is_wide(world) else NARROW_CONNECTIONS)[reuses_paths]
 
 
 def is_wide(world: TracedScene) -> bool:
-    """Whether the laser lights half the sphere or more."""
+    """Return whether the laser lights half the sphere or more."""
     return world.scene.laser.cos_half_angle(world.scene.camera) <= 0
 
 
@@ -49,16 +51,16 @@ class LightVertices(NamedTuple):
     `density` is that of one point per area [1/m^2]. At the end are a few that belong to no batch.
     """
 
-    si: Any
-    to_laser: Any
-    path: Any
-    irradiance: Any
-    density: Any
-    each: Any
+    si: Interactions
+    to_laser: Vectors
+    path: Floats
+    irradiance: Floats
+    density: Floats
+    each: UInts
 
 
-def sample_light_vertices(world: TracedScene, lanes: int, batches: int, key: tuple[Any, Any]) -> LightVertices:
-    """Points where uniform directions of the laser's cone meet a surface, for a launch of so many paths."""
+def sample_light_vertices(world: TracedScene, lanes: int, batches: int, key: tuple[UInts, UInts]) -> LightVertices:
+    """Return points where uniform directions of the laser's cone meet a surface, for a launch of so many paths."""
     wanted = min(MAX_POINTS, max(int(lanes * POINTS_PER_PATH), 1))
     parts = 1 << (batches - 1).bit_length()
     each = max(1, (1 << (wanted - 1).bit_length()) // parts)
@@ -66,11 +68,11 @@ def sample_light_vertices(world: TracedScene, lanes: int, batches: int, key: tup
     opaque = dr.opaque(UInt32, each)
     index = dr.arange(UInt32, count + 3)  # of no other input's length (`render.indirect.camera_paths`)
     dr.eval(index)
-    parts, *columns = world.recordings.call(world, "lit points", _lit_points, index, opaque, *key)
-    return LightVertices(of_parts(parts), *columns, opaque)
+    parts, *columns = world.recordings.call(world, "lit points", _sample_vertices, index, opaque, *key)
+    return LightVertices(interaction_from_parts(parts), *columns, opaque)
 
 
-def _lit_points(world: TracedScene, index: Any, each: Any, *key: Any) -> tuple[Any, ...]:
+def _sample_vertices(world: TracedScene, index: UInts, each: UInts, *key: UInts) -> tuple[Array, ...]:
     """The parts of `LightVertices`, in plain tuples."""
     # each batch has a randomised (0, 2)-sequence of its own
     shift = mi.sample_tea_32(index // each + key[0], index * 0 + key[1])
@@ -87,75 +89,96 @@ def _lit_points(world: TracedScene, index: Any, each: Any, *key: Any) -> tuple[A
     return parts_of(si), to_laser, path, irradiance, density_of(world, si, to_laser)
 
 
-def density_of(world: TracedScene, si: Any, to_laser: Any) -> Any:
-    """Density per area [1/m^2] of a lit point at an interaction, if the laser lights it."""
+def density_of(world: TracedScene, si: Interactions, to_laser: Vectors) -> Array:
+    """Return density per area [1/m^2] of a lit point at an interaction, if the laser lights it."""
     distance2 = dr.squared_norm(world.laser - si.p)
     return dr.abs(dr.dot(si.n, to_laser)) / (distance2 * 2 * math.pi * _cap(world))
 
 
-def _cap(world: TracedScene) -> Any:
+def _cap(world: TracedScene) -> Array:
     """Solid angle of the laser's cone over 2 pi: 1 - cos, without cancellation."""
     return 2 * dr.square(dr.sin(0.5 * world.half_angle))
 
 
-def densities(cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> tuple[Any, Any]:
-    """Per solid angle: density of `copies` diffuse lobes at that cosine, and of these and lit points together."""
+def densities(
+    cosine: Floats, distance2: Floats, far_cosine: Floats, density: Floats, copies: Floats
+) -> tuple[Array, Array]:
+    """Return per solid angle: density of `copies` diffuse lobes at that cosine, and of these and lit points
+    together."""
     lobes = copies / math.pi * dr.abs(cosine)
-    return lobes, lobes + density * distance2 / dr.maximum(dr.abs(far_cosine), MIN_COSINE)
+    return lobes, lobes + density * distance2 / dr.maximum(dr.abs(far_cosine), MIN_FAR_COSINE)
 
 
-def share_by_chance(diffuse: Any, cosine: Any, distance2: Any, far_cosine: Any, density: Any, copies: Any) -> Any:
-    """Share of a lit point's light that paths keep which go there by chance, from a surface that reflects the share
-    `diffuse` of it diffusely."""
+def mis_weight_bsdf(
+    diffuse: Floats, cosine: Floats, distance2: Floats, far_cosine: Floats, density: Floats, copies: Floats
+) -> Array:
+    """Return share of a lit point's light that paths keep which go there by chance, from a surface that reflects the
+    share `diffuse` of it diffusely."""
     lobes, both = densities(cosine, distance2, far_cosine, density, copies)
     return 1 - diffuse * dr.select(both > 0, 1 - lobes / both, 0)
 
 
-def diffuse_share(world: TracedScene, si: Any, direction: Any, value: Any, active: Any) -> Any:
-    """Share of a surface's reflectance `value`, cosine included, that is diffuse; of what is not mirror-like."""
+def diffuse_fraction(world: TracedScene, si: Interactions, direction: Vectors, value: Floats, active: Masks) -> Array:
+    """Return share of a surface's reflectance `value`, cosine included, that is diffuse; of what is not mirror-like."""
     if not world.has_mixed_lobes:
         return 1
     diffuse = si.bsdf().eval(_diffuse(), si, si.to_local(direction), active)[0]
     return dr.select(value > 0, dr.clip(diffuse / value, 0, 1), 0)
 
 
-def by_chance(
-    world: TracedScene, si: Any, sample: Any, weight: Any, end: Any, density: Any, copies: Any, active: Any
-) -> Any:
-    """`share_by_chance` of a lit point `end` that was met in the direction of a sample, with its weight, of `si`."""
+class Scattered(NamedTuple):
+    """A direction that a surface's lobes were sampled for, and its weight: reflectance times cosine over density."""
+
+    sample: LobeSamples
+    weight: Floats
+
+
+def mis_weight_sampled(
+    world: TracedScene,
+    si: Interactions,
+    scattered: Scattered,
+    end: Interactions,
+    density: Floats,
+    copies: Floats,
+    active: Masks,
+) -> Array:
+    """Return `mis_weight_bsdf` of a lit point `end` that was met in the direction scattered by `si`."""
+    sample, weight = scattered
     direction = si.to_world(sample.wo)
-    diffuse = diffuse_share(world, si, direction, weight * sample.pdf, active)
+    diffuse = diffuse_fraction(world, si, direction, weight * sample.pdf, active)
     diffuse = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, diffuse)
     offset = end.p - si.p
     far_cosine = dr.dot(end.n, direction)
-    return share_by_chance(diffuse, sample.wo.z, dr.squared_norm(offset), far_cosine, density, copies)
+    return mis_weight_bsdf(diffuse, sample.wo.z, dr.squared_norm(offset), far_cosine, density, copies)
 
 
-def _diffuse() -> Any:
+def _diffuse() -> Array:
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.DiffuseReflection
     return context
 
 
-def joined(
-    world: TracedScene,
-    si: Any,
-    lit: LightVertices,
-    batch: Any,
-    number: Any,
-    active: Any,
-    copies: Callable[[Any], Any] = lambda path: 1,
-    joins: int = 1,
-) -> tuple[Any, Any, Any]:
-    """Light that a surface reflects diffusely from one lit point, towards `si.wi`; the path from the laser;
-    the direction of the point.
+def light_vertex_index(light_vertices: LightVertices, batch: UInts, number: UInts) -> Array:
+    """Return which light vertex a number chooses among those of its batch."""
+    return batch * light_vertices.each + number % light_vertices.each
 
-    `number` chooses among the batch's points. The light is divided by the density of all `joins` such points together
-    with as many lobes as `copies` says of the path.
+
+def connect_to_light_vertex(
+    world: TracedScene,
+    si: Interactions,
+    light_vertices: LightVertices,
+    point: Array,
+    active: Masks,
+    copies: Callable[[Floats], Floats] = lambda path: 1,
+    connections: int = 1,
+) -> tuple[Array, Array, Array]:
+    """Connect a surface to one light vertex: light that it reflects diffusely from there, path to the laser, direction.
+
+    The light goes towards `si.wi`. It is divided by the density of all `connections` of this kind together with as many
+    lobes as `copies` says of the path.
     """
-    point = batch * lit.each + number % lit.each
-    end = dr.gather(mi.SurfaceInteraction3f, lit.si, point, active)
-    irradiance = dr.gather(Float, lit.irradiance, point, active)
+    end = dr.gather(mi.SurfaceInteraction3f, light_vertices.si, point, active)
+    irradiance = dr.gather(Float, light_vertices.irradiance, point, active)
     offset = end.p - si.p
     distance2 = dr.squared_norm(offset)
     direction = offset * dr.rsqrt(distance2)
@@ -164,12 +187,12 @@ def joined(
     value = si.bsdf().eval(_diffuse(), si, local, active)[0]
     active &= value > 0
     end.wi = end.to_local(-direction)
-    to_laser = mi.Vector3f(*(dr.gather(Float, part, point, active) for part in lit.to_laser))
+    to_laser = mi.Vector3f(*(dr.gather(Float, part, point, active) for part in light_vertices.to_laser))
     value *= end.bsdf().eval(mi.BSDFContext(), end, end.to_local(to_laser), active)[0] * irradiance
     active &= value > 0
     passed, leg = segment(world, si, end.p, active)
-    path = leg + dr.gather(Float, lit.path, point, active)
-    density = dr.gather(Float, lit.density, point, active) * joins
+    path = leg + dr.gather(Float, light_vertices.path, point, active)
+    density = dr.gather(Float, light_vertices.density, point, active) * connections
     _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))
     light = dr.select(active, value * passed / both * mis_weight_camera_path(world, si, direction, end, active), 0)
     return dr.select(dr.isfinite(light), light, 0), path, direction

@@ -17,10 +17,11 @@ read the regions of some points of theirs: energy is kept. The bias is what diff
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.drjit_types import Array, Floats, Interactions, Masks, Rays, UInts, Vectors
 from render.indirect.accumulators import IndirectAccumulator
 from render.indirect.path_cells import scatter_add_fixed_point
 from render.scene.rays import camera_rays, first_opaque
@@ -29,7 +30,7 @@ from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
 UInt64, Int32 = mi.UInt64, mi.Int32
 # Width of a region in its octave's excess path, and of the widest in the mean distance, at PATHS paths a pixel. They
 # shrink with paths^-SHRINKING, so that the bias goes where the noise does.
-KAPPA, WIDEST, PATHS, SHRINKING = 0.2, 0.15, 16, 0.3
+KAPPA, WIDEST, REFERENCE_SPP, SHRINKING = 0.2, 0.15, 16, 0.3
 GATHER_POINTS = 8  # points of a pixel that read
 # Every region is one of a grid, and there are so many grids, shifted against one another: their mean is smooth where
 # one grid has steps, and has less noise. Two were best for their time (measured).
@@ -51,24 +52,41 @@ class Octaves(NamedTuple):
     cells: np.ndarray
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         return len(self.from_m)
 
 
 class Point(NamedTuple):
     """Points on surfaces: position, normal toward the camera, optical path to the camera, and diffuse reflectance."""
 
-    p: Any
-    n: Any
-    path: Any
-    reflectance: Any
+    p: Vectors
+    n: Vectors
+    path: Floats
+    reflectance: Floats
+
+
+class ArrivingLight(NamedTuple):
+    """Light that comes to points from x2, which lies `towards`, after `path_m` from the laser; late from `late_m` on.
+
+    `radiance` is what the pixel sees of it by one path, which counts with `weight` quanta of UNIT_WEIGHT (see
+    `PathSpaceFilter.count_paths`) in a region of each grid. `diffuse`: whether it leaves by a diffuse lobe.
+    """
+
+    late_m: Floats
+    towards: Vectors
+    diffuse: Masks
+    batch: UInts
+    path_m: Floats
+    radiance: Floats
+    weight: Floats
 
 
 def octaves(
     paths: float, footprint_m: float, distance_m: float, longest_m: float, width_m: float, growth: float
 ) -> Octaves:
-    """Octaves for so many paths a pixel, from regions of a pixel's footprint to the widest; the last one is open."""
-    shrunk = (PATHS / paths) ** SHRINKING
+    """Return octaves for so many paths a pixel, from regions of a pixel's footprint to the widest; the last one is
+    open."""
+    shrunk = (REFERENCE_SPP / paths) ** SHRINKING
     count = 1 + max(0, round(math.log2(shrunk * WIDEST * distance_m / footprint_m)))
     count = min(count, MAX_OCTAVES)
     size = footprint_m * 2.0 ** np.arange(count)
@@ -80,8 +98,8 @@ def octaves(
     return Octaves(start, size, width, cells)
 
 
-def point_of(si: Any, ray: Any, path_m: Any, transmission: Any, hit: Any) -> Point:
-    """The point that a camera's ray met.
+def point_of(si: Interactions, ray: Rays, path_m: Floats, transmission: Floats, hit: Masks) -> Point:
+    """Return the point that a camera's ray met.
 
     What it reflects diffusely depends on where the light comes from, on coated surfaces; that of one direction stands
     for all: regions are divided by it and multiplied with it again.
@@ -94,8 +112,8 @@ def point_of(si: Any, ray: Any, path_m: Any, transmission: Any, hit: Any) -> Poi
     return Point(mi.Point3f(si.p), normal, Float(path_m), reflectance)
 
 
-def late_from(world: TracedScene, point: Point, from_m: Any) -> Any:
-    """The path from the laser to points [m] from which on light there is late: so much behind direct light."""
+def late_from(world: TracedScene, point: Point, from_m: Floats) -> Array:
+    """Return the path from the laser to points [m] from which on light there is late: so much behind direct light."""
     return point.path + dr.norm(point.p - world.laser) - dr.norm(point.p - world.eye) + from_m
 
 
@@ -107,17 +125,17 @@ class PathSpaceFilter:
     """
 
     def __init__(
-        self, world: TracedScene, pixels: np.ndarray, spans: Octaves, batches: int, quantum: float, seed: int
+        self, world: TracedScene, pixels: np.ndarray, filter_octaves: Octaves, batches: int, quantum: float, seed: int
     ) -> None:
-        self.spans, self.batches = spans, batches
+        self.filter_octaves, self.batches = filter_octaves, batches
         numbers = np.random.SeedSequence(seed).generate_state(4)
         shift = numbers[:3] * 2.0**-32 + np.arange(HASH_GRIDS)[:, None] / HASH_GRIDS
-        self._shift = mi.Vector3f(*(upload(Float, np.tile(part, spans.count)) for part in shift.T))
+        self._shift = mi.Vector3f(*(upload(Float, np.tile(part, filter_octaves.size)) for part in shift.T))
         self._quantum, self._per_quantum = dr.opaque(Float, quantum), dr.opaque(Float, 1 / quantum)
-        self.from_m, self._size = dr.opaque(Float, float(spans.from_m[0])), _by_level(spans.size_m)
-        self._width, self._last = _by_level(spans.width_m), dr.opaque(UInt32, spans.count - 1)
+        self.from_m, self._size = dr.opaque(Float, float(filter_octaves.from_m[0])), _by_level(filter_octaves.size_m)
+        self._width, self._last = _by_level(filter_octaves.width_m), dr.opaque(UInt32, filter_octaves.size - 1)
         self.place, self.points = _points(world, pixels, dr.opaque(UInt32, int(numbers[3])))
-        reader, level = _each(dr.width(self.place), spans.count * HASH_GRIDS)
+        reader, level = _each(dr.width(self.place), filter_octaves.size * HASH_GRIDS)
         point = _gathered(self.points, reader)
         key = self._key(point, level)
         dr.eval(key, point.path)
@@ -134,16 +152,16 @@ class PathSpaceFilter:
     def _lay_out(self, found: np.ndarray, nearest_m: np.ndarray) -> None:
         """Cells for the regions with these keys, whose points are at least so far from the camera."""
         octave = (found >> np.uint64(3 * (KEY_BITS + NORMAL_BITS))).astype(np.int64) // HASH_GRIDS
-        cells = self.spans.cells[octave]
-        reach = 0.5 * math.sqrt(3) * self.spans.size_m[octave]
-        self._base = upload(Float, np.append(nearest_m + self.spans.from_m[octave] - 3 * reach, 0))
+        cells = self.filter_octaves.cells[octave]
+        reach = 0.5 * math.sqrt(3) * self.filter_octaves.size_m[octave]
+        self._base = upload(Float, np.append(nearest_m + self.filter_octaves.from_m[octave] - 3 * reach, 0))
         self._first, self._cells = (upload(UInt32, np.append(part, 0)) for part in (np.cumsum(cells) - cells, cells))
         size = max(int(cells.sum()), 1)
         self.energy = dr.zeros(UInt64, size * self.batches)
-        self.growing = dr.zeros(UInt64, size * 3)
+        self.path_gradient = dr.zeros(UInt64, size * 3)
         self.paths, self.filled = dr.zeros(UInt64, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
 
-    def _key(self, point: Point, level: Any) -> Any:
+    def _key(self, point: Point, level: UInts) -> Array:
         """Level, class of normals and cube of a point in one number. A level is a grid of an octave."""
         size, key = dr.gather(Float, self._size, level), UInt64(level)
         for part in point.n:
@@ -153,49 +171,37 @@ class PathSpaceFilter:
             key = (key << KEY_BITS) | UInt64(number)
         return key
 
-    def _from_middle(self, point: Point, level: Any) -> Any:
+    def _from_middle(self, point: Point, level: UInts) -> Array:
         """The way along the surface to a point from the middle of its cube."""
         size = dr.gather(Float, self._size, level)
         parts = [part / size + dr.gather(Float, shift, level) for part, shift in zip(point.p, self._shift, strict=True)]
         off = mi.Vector3f(*(part - dr.floor(part) - 0.5 for part in parts)) * size
         return off - point.n * dr.dot(point.n, off)
 
-    def _row(self, key: Any, active: Any) -> tuple[Any, Any]:
+    def _row(self, key: UInts, active: Masks) -> tuple[Array, Array]:
         """Number of a region, and whether there is one."""
         found = dr.binary_search(0, self._searched - 1, lambda i: dr.gather(UInt64, self._keys, i, active) < key)
         return found, active & (dr.gather(UInt64, self._keys, found, active) == key)
 
-    def count_paths(self, points: Point, weight: Any) -> Any:
-        """One more path for the regions of each point that reflects; returns their numbers, levels x points.
+    def count_paths(self, points: Point, weight: Floats) -> Array:
+        """Return one more path for the regions of each point that reflects; returns their numbers, levels x points.
 
-        A pixel's paths count FULL together, however many they are: a region's light is the mean over its pixels.
+        A pixel's paths count UNIT_WEIGHT together, however many they are: a region's light is the mean over its pixels.
         """
-        number, level = _each(dr.width(points.path), self.spans.count * HASH_GRIDS)
+        number, level = _each(dr.width(points.path), self.filter_octaves.size * HASH_GRIDS)
         point = _gathered(points, number)
         row, known = self._row(self._key(point, level), point.reflectance > 0)
         row = dr.select(known, row, dr.opaque(UInt32, self._nowhere))
         dr.scatter_add(self.paths, UInt64(dr.gather(UInt32, weight, number)), row, known, mode=dr.ReduceMode.Direct)
         return row
 
-    def add(
-        self,
-        point: Point,
-        rows: Any,
-        late_m: Any,
-        towards: Any,
-        diffuse: Any,
-        batch: Any,
-        path_m: Any,
-        radiance: Any,
-        weight: Any,
-        active: Any,
-    ) -> Any:
-        """Add light that comes to points from x2, which lies `towards`, after `path_m` from the laser.
+    def add(self, point: Point, rows: UInts, light: ArrivingLight, active: Masks) -> Array:
+        """Add light that comes to points, to the regions `rows` of `count_paths`.
 
-        It is late from `late_m` on. `radiance` is what the pixel sees of it by one path, which counts with `weight`
-        quanta of FULL (see `count_paths`) in a region of each grid. Returns where it is still to add: where it came too
-        early for any region, or left by no `diffuse` lobe. Late light in a region that no pixel reads is dropped.
+        Returns where it is still to add: where it came too early for any region, or left by no diffuse lobe. Late light
+        in a region that no pixel reads is dropped.
         """
+        late_m, towards, diffuse, batch, path_m, radiance, weight = light
         excess_m = path_m - late_m + self.from_m
         late = active & diffuse & (path_m >= late_m) & (point.reflectance > 0)
         number = Int32(dr.floor(dr.log2(dr.maximum(excess_m, self.from_m) / self.from_m)))
@@ -217,12 +223,14 @@ class PathSpaceFilter:
             scatter_add_fixed_point(self.energy, value, index * self.batches + batch, known)
             dr.scatter_reduce(dr.ReduceOp.Max, self.filled, cell + 1, row, known, mode=dr.ReduceMode.Direct)
             for axis, part in enumerate(-towards):
-                scatter_add_fixed_point(self.growing, value * dr.clip(0.5 + 0.5 * part, 0, 1), 3 * index + axis, known)
+                scatter_add_fixed_point(
+                    self.path_gradient, value * dr.clip(0.5 + 0.5 * part, 0, 1), 3 * index + axis, known
+                )
         return active & ~late
 
     def evaluate(self) -> None:
         """Run what was added so far."""
-        dr.eval(self.energy, self.growing, self.paths, self.filled)
+        dr.eval(self.energy, self.path_gradient, self.paths, self.filled)
 
     def read(self, sums: IndirectAccumulator) -> None:
         """Add every region's light to the pixels that have points there."""
@@ -239,19 +247,19 @@ class PathSpaceFilter:
         dr.eval(*reading)
         for batch, total in enumerate(self._read(sums, reading, None)):
             sums.add_total(place, dr.opaque(UInt32, batch), total)
-        if sums.watched is not None:
-            watched = dr.compress(dr.gather(Int32, sums.watch, place) >= 0)
-            number, batch = _each(dr.width(watched), self.batches)
+        if sums.probed is not None:
+            probed = dr.compress(dr.gather(Int32, sums.probe_row, place) >= 0)
+            number, batch = _each(dr.width(probed), self.batches)
             if dr.width(number):
-                self._read(sums, _gathered(reading, dr.gather(UInt32, watched, number)), batch)
+                self._read(sums, _gathered(reading, dr.gather(UInt32, probed, number)), batch)
         sums.evaluate()
 
-    def _readings(self) -> tuple[Any, Any, Any, Any, Point]:
+    def _readings(self) -> tuple[Array, Array, Array, Array, Point]:
         """Which place reads which region, once, with its points' summed reflectance and their mean.
 
         Points of one place lie next to each other.
         """
-        reader, level = _each(dr.width(self.place), self.spans.count * HASH_GRIDS)
+        reader, level = _each(dr.width(self.place), self.filter_octaves.size * HASH_GRIDS)
         place, row = dr.gather(UInt32, self.place, reader), self._row_of
         first = dr.gather(UInt64, self.paths, row) > 0
         for step in range(1, GATHER_POINTS):
@@ -262,13 +270,13 @@ class PathSpaceFilter:
         for step in range(GATHER_POINTS):
             reads = self._reads(Int32(reader) + step, level, place, row)
             point = _gathered(self.points, dr.select(reads, reader + step, 0))
-            share = dr.select(reads, point.reflectance, 0)
-            sums = [a + share * b for a, b in zip(sums, (1, *point.p, *point.n, point.path), strict=True)]
+            fraction = dr.select(reads, point.reflectance, 0)
+            sums = [a + fraction * b for a, b in zip(sums, (1, *point.p, *point.n, point.path), strict=True)]
         weight, x, y, z, right, up, back, path = sums
         normal = dr.normalize(mi.Vector3f(right, up, back))
         return place, level, row, weight, Point(mi.Point3f(x, y, z) / weight, normal, path / weight, weight)
 
-    def _reads(self, reader: Any, level: Any, place: Any, row: Any) -> Any:
+    def _reads(self, reader: UInts, level: UInts, place: UInts, row: UInts) -> Array:
         """Whether there is such a point of this place, and it reads this region."""
         readers = dr.opaque(UInt32, dr.width(self.place))
         there = (reader >= 0) & (reader < Int32(readers))
@@ -276,19 +284,19 @@ class PathSpaceFilter:
         there &= dr.gather(UInt32, self.place, number, there) == place
         return there & (dr.gather(UInt32, self._row_of, level * readers + number, there) == row)
 
-    def _energies(self, index: Any) -> list:
+    def _energies(self, index: UInts) -> list:
         """Every batch's energy in a cell."""
         return [Float(dr.gather(UInt64, self.energy, index * self.batches + b)) for b in range(self.batches)]
 
-    def _growing(self, index: Any, energies: list) -> Any:
+    def _growing(self, index: UInts, energies: list) -> Array:
         """Mean direction in which the path of a cell's light grows; of all batches, whose energies these are."""
         energy = sum(energies[1:], energies[0])
-        parts = (2 * Float(dr.gather(UInt64, self.growing, 3 * index + axis)) - energy for axis in range(3))
+        parts = (2 * Float(dr.gather(UInt64, self.path_gradient, 3 * index + axis)) - energy for axis in range(3))
         return dr.select(energy > 0, mi.Vector3f(*parts) / energy, 0)
 
     @dr.syntax
-    def _read(self, sums: IndirectAccumulator, reading: Any, batch: Any) -> Any:
-        """Read cell by cell; returns each batch's total. Of one `batch` a lane for the watched rows, or of all."""
+    def _read(self, sums: IndirectAccumulator, reading: Array, batch: UInts) -> Array:
+        """Read cell by cell; returns each batch's total. Of one `batch` a lane for the probe rows, or of all."""
         place, row, weight, off = reading.place, reading.row, reading.weight, reading.off
         width = dr.gather(Float, self._width, reading.level)
         index, cells = dr.gather(UInt32, self._first, row), dr.gather(UInt32, self.filled, row)
@@ -304,7 +312,7 @@ class PathSpaceFilter:
                 sums.spread(place, low + later, high + later, energy, energy > 0)
             else:
                 energy = Float(dr.gather(UInt64, self.energy, index * self.batches + batch)) * weight
-                sums.spread_watched(place, batch, low + later, high + later, energy, energy > 0)
+                sums.spread_probed(place, batch, low + later, high + later, energy, energy > 0)
             cell += 1
             index += 1
         return totals
@@ -314,12 +322,12 @@ class _Reading(NamedTuple):
     """A place that reads a region: factor of its quanta, path at which the region's cells begin, and how far along the
     surface the place's points are from the middle."""
 
-    place: Any
-    level: Any
-    row: Any
-    weight: Any
-    base: Any
-    off: Any
+    place: UInts
+    level: UInts
+    row: UInts
+    weight: Floats
+    base: Array
+    off: Array
 
 
 def _numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -329,31 +337,31 @@ def _numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found, np.repeat(number, np.diff(np.append(begins, len(keys))))
 
 
-def _by_level(of_octaves: np.ndarray) -> Any:
+def _by_level(of_octaves: np.ndarray) -> Array:
     """Values of octaves for their levels: one a grid."""
     return upload(Float, np.repeat(of_octaves, HASH_GRIDS))
 
 
-def _plus(totals: list, energies: list, weight: Any) -> list:
+def _plus(totals: list, energies: list, weight: Floats) -> list:
     return [total + energy * weight for total, energy in zip(totals, energies, strict=True)]
 
 
-def _edge(cell: Any) -> Any:
+def _edge(cell: UInts) -> Array:
     """Where a cell begins, in widths of the first."""
     return (dr.exp(GROWTH * Float(cell)) - 1) / GROWTH
 
 
-def _each(count: int, times: int) -> tuple[Any, Any]:
+def _each(count: int, times: int) -> tuple[Array, Array]:
     """All pairs of 0 .. `count` and 0 .. `times`, the first running faster. Opaque: counts differ from run to run."""
     lane, number = dr.arange(UInt32, count * times), dr.opaque(UInt32, max(count, 1))
     return lane % number, lane // number
 
 
-def _gathered(columns: NamedTuple, index: Any) -> Any:
+def _gathered(columns: NamedTuple, index: UInts) -> Array:
     return type(columns)(*(dr.gather(type(column), column, index) for column in columns))
 
 
-def _points(world: TracedScene, pixels: np.ndarray, key: Any) -> tuple[Any, Point]:
+def _points(world: TracedScene, pixels: np.ndarray, key: UInts) -> tuple[Array, Point]:
     """READERS points of every pixel, spread evenly, where they reflect diffusely, and their places in `pixels`."""
     lane = dr.arange(UInt32, len(pixels) * GATHER_POINTS)
     place, number = lane // GATHER_POINTS, lane % GATHER_POINTS

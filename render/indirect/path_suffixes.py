@@ -1,13 +1,22 @@
-"""The tails of paths: x2, the second surface, and what lies beyond it."""
+"""Path suffixes: x2, the reconnection vertex, and what lies beyond it."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from render.backend.drjit_types import Array, Floats, Generators, Interactions, LobeSamples, Masks, UInts, Vectors
 from render.indirect.glossy import mis_weight_camera_path
-from render.indirect.light_vertices import LightVertices, by_chance, density_of, is_wide, joined
-from render.indirect.primary_vertices import PrimaryVertices, copies_of
-from render.scene.rays import first_opaque, kept, laser_light, shape_index, spawn
+from render.indirect.light_vertices import (
+    LightVertices,
+    Scattered,
+    connect_to_light_vertex,
+    density_of,
+    is_wide,
+    light_vertex_index,
+    mis_weight_sampled,
+)
+from render.indirect.primary_vertices import PrimaryVertices, sampling_techniques
+from render.scene.rays import first_opaque, kept, laser_light, sample_bsdf, shape_index, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 
@@ -17,100 +26,112 @@ class PathSuffixes(NamedTuple):
     direction, diffuse  from x1 to x2, by a diffuse lobe or not
     irradiance, to_laser, laser_path, density  the laser's light at x2, and `light_vertices.density_of` there
     onward_direction    from x2 to x3
-    shared, onward      whether the block may use the laser's light at x2, and what lies beyond
+    reusable, onward    whether the block may use the laser's light at x2, and what lies beyond
     own_value           what the pixel itself gets of the laser's light at x2
     own_onward          factor of what lies beyond: `values` with their `paths` from x2 to the laser, `length` of them
     soonest_m           the shortest of these paths and `laser_path` that carries light
     """
 
-    si: Any
-    direction: Any
-    diffuse: Any
-    leg: Any
-    irradiance: Any
-    to_laser: Any
-    laser_path: Any
-    density: Any
-    onward_direction: Any
-    shared: Any
-    onward: Any
-    own_transmission: Any
-    own_value: Any
-    own_onward: Any
-    values: Any
-    paths: Any
-    length: Any
-    soonest_m: Any
+    si: Interactions
+    direction: Vectors
+    diffuse: Masks
+    leg: Floats
+    irradiance: Floats
+    to_laser: Vectors
+    laser_path: Array
+    density: Floats
+    onward_direction: Vectors
+    reusable: Masks
+    onward: Masks
+    own_transmission: Floats
+    own_value: Floats
+    own_onward: Floats
+    values: Floats
+    paths: Floats
+    length: UInts
+    soonest_m: Floats
 
 
 class Slots(NamedTuple):
     """Where paths put the light of x3, x4, ...: lanes; memory for radiances and paths, slots x lanes; and how many of
     both there are, as arrays."""
 
-    lane: Any
-    values: Any
-    paths: Any
-    lanes: Any
-    count: Any
+    lane: UInts
+    values: Floats
+    paths: Floats
+    lanes: UInts
+    count: UInts
 
 
-def slots_for(world: TracedScene, lit: LightVertices | None, lanes: int, vertices: int) -> Slots:
-    """Empty slots for so many vertices: a vertex has one of its own, and one before it if the last one was joined."""
-    count = (2 if _joins(world, lit) else 1) * vertices
+def slots_for(world: TracedScene, light_vertices: LightVertices | None, lanes: int, vertices: int) -> Slots:
+    """Return empty slots for so many vertices: a vertex has one of its own, and one before it if the last one was
+    joined."""
+    count = (2 if _connects_suffix(world, light_vertices) else 1) * vertices
     lane, values, paths = dr.arange(UInt32, lanes), *(dr.zeros(Float, lanes * max(count, 1)) for _ in range(2))
     dr.make_opaque(lane, values, paths)  # of another length at every call
     return Slots(lane, values, paths, dr.opaque(UInt32, lanes), dr.opaque(UInt32, count))
 
 
-def _joins(world: TracedScene, lit: LightVertices | None) -> bool:
+def _connects_suffix(world: TracedScene, light_vertices: LightVertices | None) -> bool:
     """Whether vertices after x1 are joined to lit points."""
-    return lit is not None and is_wide(world)
+    return light_vertices is not None and is_wide(world)
 
 
-def tails_of(
-    world: TracedScene,
-    heads: PrimaryVertices,
-    sample: Any,
-    weight: Any,
-    pixel: Any,
-    lit: LightVertices | None,
-    joins: int,
-    batch: Any,
-    random: Any,
-    slots: Slots,
-    *,
-    used: bool,
+class SuffixTask(NamedTuple):
+    """What the suffixes of a launch are traced with.
+
+    light_vertices, connections  what vertices are connected to, and how many of them x1 is; None, 0: to none
+    batch, pixel, random         batch, flat pixel and random numbers of every path
+    slots                        memory for the light of later vertices
+    reused                       whether other pixels of a block may use the suffixes
+    """
+
+    light_vertices: LightVertices | None
+    connections: int
+    batch: UInts
+    pixel: UInts
+    random: Generators
+    slots: Slots
+    reused: bool
+
+
+def trace_suffixes(
+    world: TracedScene, primary: PrimaryVertices, scattered: Scattered, task: SuffixTask
 ) -> PathSuffixes:
-    """Tails in sampled directions. If neighbours may use them (`used`), x2 on a rough coat is not joined to lit points:
-    what it reflects diffusely depends on where it is seen from, and joined light is handed on as one number."""
+    """Trace suffixes in sampled directions.
+
+    If they are reused, x2 on a rough coat is not connected to light vertices: what it reflects diffusely depends on
+    where it is seen from, and light of connections is handed on as one number.
+    """
+    (sample, weight), (light_vertices, connections, _, pixel, random, _, reused) = scattered, task
     context = mi.BSDFContext()
-    x1, alive = heads.si, heads.valid & (weight > 0)
+    x1, alive = primary.si, primary.valid & (weight > 0)
     direction = x1.to_world(sample.wo)
     si, passed, leg, _ = first_opaque(world, spawn(x1, direction), alive, x1.p)
     alive &= si.is_valid()
-    own = dr.select(alive, heads.transmission * weight * passed, 0)
+    own = dr.select(alive, primary.transmission * weight * passed, 0)
     to_laser, irradiance, laser_path = laser_light(world, si, pixel, alive, seen_by_camera=None)
-    density = None if lit is None else density_of(world, si, to_laser) * joins
+    density = None if light_vertices is None else density_of(world, si, to_laser) * connections
     value = si.bsdf().eval(context, si, si.to_local(to_laser), alive)[0] * irradiance
-    if lit is not None:
-        value *= by_chance(world, x1, sample, weight, si, density, copies_of(heads, leg + laser_path), alive)
+    if light_vertices is not None:
+        value *= mis_weight_sampled(
+            world, x1, scattered, si, density, sampling_techniques(primary, leg + laser_path), alive
+        )
     # what is reflected by a mirror in the first place cannot be read backwards
     readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     value *= mis_weight_camera_path(world, x1, direction, si, readable)
     value = dr.select(alive & dr.isfinite(value), own * value, 0)
-    onward, onward_weight = si.bsdf().sample(
-        context, si, random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32()), alive
-    )
+    onward, onward_weight = sample_bsdf(si, random, alive)
     onward_weight = onward_weight[0]
-    joinable = Bool(alive)
-    if used and world.has_rough_coats:
-        joinable &= dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
+    connectable = Bool(alive)
+    if reused and world.has_rough_coats:
+        connectable &= dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
     scale = dr.select(onward_weight > 0, onward_weight, 1)
-    way = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, joinable, readable)
+    state = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, connectable, readable)
     soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
-    light = _trace_suffix(world, lit, batch, slots, way, alive, pixel, random, soonest)
-    shared = alive & (dr.gather(Float, world.shares, shape_index(si), alive) > 0)
-    shared &= heads.shares & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    light = _trace_suffix(world, task, state, alive, soonest)
+    reusable = alive & (dr.gather(Float, world.allows_reuse, shape_index(si), alive) > 0)
+    reusable &= primary.allows_reuse & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     return PathSuffixes(
         kept(si),
         direction,
@@ -121,8 +142,8 @@ def tails_of(
         laser_path,
         density,
         si.to_world(onward.wo),
-        shared,
-        shared & ~mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta) & (onward_weight > 0),
+        reusable,
+        reusable & ~mi.has_flag(onward.sampled_type, mi.BSDFFlags.Delta) & (onward_weight > 0),
         dr.select(alive, passed, 0),
         value,
         own * scale,
@@ -131,48 +152,50 @@ def tails_of(
 
 
 class _SuffixState(NamedTuple):
-    """Where paths stand and how they go on: a sample of the surface's lobes and its weight. `through` is the factor of
-    light that comes from there, `here` that of light reflected on the spot, reflectance counted in that light, and
-    `joinable` says whether there is such; `readable` whether other paths bring a part of it (`glossy`)."""
+    """Where paths stand and how they go on: a sample of the surface's lobes and its weight.
 
-    si: Any
-    sample: Any
-    weight: Any
-    through: Any
-    here: Any
-    joinable: Any
-    readable: Any
+    `throughput` is the factor of light that comes from there, `throughput_at_vertex` that of light reflected on the
+    spot, reflectance counted in that light; `connectable` says whether there is such, `readable` whether other paths
+    bring a part of it (`glossy`).
+    """
+
+    si: Interactions
+    sample: LobeSamples
+    weight: Floats
+    throughput: Floats
+    throughput_at_vertex: Floats
+    connectable: Masks
+    readable: Masks
 
 
 @dr.syntax
 def _trace_suffix(
-    world: TracedScene,
-    lit: LightVertices | None,
-    batch: Any,
-    slots: Slots,
-    way: _SuffixState,
-    active: Any,
-    pixel: Any,
-    random: Any,
-    soonest: Any,
-) -> tuple[Any, Any, Any, Any]:
-    """Light of x3, x4, ... that goes to x2 along the way, divided by the density of the path after x2.
+    world: TracedScene, task: SuffixTask, state: _SuffixState, active: Masks, soonest: Floats
+) -> tuple[Array, Array, Array, Array]:
+    """Light of x3, x4, ... that goes to x2 along the path, divided by the density of the path after x2.
 
     Returns radiances and path lengths from x2 to the laser, in their slots; how many slots each lane has filled, and
     the shortest path.
     """
-    lanes, joining = dr.width(pixel), _joins(world, lit)
-    lane, values, paths, stride, last = slots
+    light_vertices, batch, pixel, random = task.light_vertices, task.batch, task.pixel, task.random
+    lanes, connecting = dr.width(pixel), _connects_suffix(world, light_vertices)
+    lane, values, paths, stride, last = task.slots
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
-    si, sample = mi.SurfaceInteraction3f(way.si), mi.BSDFSample3f(way.sample)
-    weight, through, here, joinable = Float(way.weight), Float(way.through), Float(way.here), Bool(way.joinable)
+    si, sample = mi.SurfaceInteraction3f(state.si), mi.BSDFSample3f(state.sample)
+    weight, connectable = Float(state.weight), Bool(state.connectable)
+    throughput, throughput_at_vertex = Float(state.throughput), Float(state.throughput_at_vertex)
     active = Bool(active) & (slot < last)
     while active:
-        if dr.hint(joining, mode="scalar"):
-            light, leg, _ = joined(world, si, lit, batch, random.next_uint32(), active & joinable)
-            light *= here
-            dr.scatter(paths, path + leg, slot * stride + lane, active)
-            dr.scatter(values, light, slot * stride + lane, active)
+        if dr.hint(connecting, mode="scalar"):
+            light, leg, _ = connect_to_light_vertex(
+                world,
+                si,
+                light_vertices,
+                light_vertex_index(light_vertices, batch, random.next_uint32()),
+                active & connectable,
+            )
+            light *= throughput_at_vertex
+            _put(values, paths, slot * stride + lane, light, path + leg, active)
             soonest = dr.select(light > 0, dr.minimum(soonest, path + leg), soonest)
             slot += 1
         active &= weight > 0
@@ -182,30 +205,31 @@ def _trace_suffix(
         active &= si.is_valid()
         to_laser, irradiance, leg = laser_light(world, si, pixel, active, seen_by_camera=None)
         light = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)[0] * irradiance
-        if dr.hint(joining, mode="scalar"):
+        if dr.hint(connecting, mode="scalar"):
             density = density_of(world, si, to_laser)
-            light *= dr.select(joinable, by_chance(world, before, sample, weight, si, density, 1, active), 1)
-        light *= mis_weight_camera_path(world, before, towards.d, si, active & way.readable)
-        here = through * passed
-        light = dr.select(dr.isfinite(light), here * light, 0)
-        dr.scatter(paths, path + leg, slot * stride + lane, active)
-        dr.scatter(values, light, slot * stride + lane, active)
+            light *= dr.select(
+                connectable, mis_weight_sampled(world, before, Scattered(sample, weight), si, density, 1, active), 1
+            )
+        light *= mis_weight_camera_path(world, before, towards.d, si, active & state.readable)
+        throughput_at_vertex = throughput * passed
+        light = dr.select(dr.isfinite(light), throughput_at_vertex * light, 0)
+        _put(values, paths, slot * stride + lane, light, path + leg, active)
         soonest = dr.select(active & (light > 0), dr.minimum(soonest, path + leg), soonest)
         slot += 1
         active &= slot < last
-        sample, again = si.bsdf().sample(
-            mi.BSDFContext(),
-            si,
-            random.next_float32(),
-            mi.Point2f(random.next_float32(), random.next_float32()),
-            active,
-        )
+        sample, again = sample_bsdf(si, random, active)
         weight = again[0]
-        through = here * weight
+        throughput = throughput_at_vertex * weight
         # Russian roulette: paths that carry little end early, the others carry their energy on
-        survive = dr.clip(dr.select(weight > 0, through, here), 0.05, 0.95)
-        active &= (here > 0) & (random.next_float32() < survive)
-        through /= survive
-        here /= survive
-        joinable = Bool(active)
+        survive = dr.clip(dr.select(weight > 0, throughput, throughput_at_vertex), 0.05, 0.95)
+        active &= (throughput_at_vertex > 0) & (random.next_float32() < survive)
+        throughput /= survive
+        throughput_at_vertex /= survive
+        connectable = Bool(active)
     return values, paths, slot, soonest
+
+
+def _put(values: Floats, paths: Floats, slot: UInts, light: Floats, path: Floats, active: Masks) -> None:
+    """Write a vertex's light and its path into their slots."""
+    dr.scatter(paths, path, slot, active)
+    dr.scatter(values, light, slot, active)

@@ -1,11 +1,12 @@
-"""The heads of paths: x1, the first surface of a pixel, and what it reflects of points that the laser lights."""
+"""Primary vertices: x1, the first surface of a pixel, and what it reflects of points that the laser lights."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts, Vectors
 from render.indirect.launch_layout import BLOCK
-from render.indirect.light_vertices import LightVertices, is_wide, joined
+from render.indirect.light_vertices import LightVertices, connect_to_light_vertex, is_wide, light_vertex_index
 from render.indirect.path_space_filter import Point
 from render.scene.traced_scene import Float, TracedScene, dr
 
@@ -13,51 +14,67 @@ from render.scene.traced_scene import Float, TracedScene, dr
 class PrimaryVertices(NamedTuple):
     """x1 of every path of a launch and where it belongs; as a `point` of `path_space_filter`, if that is asked for.
 
-    `late_m` is the path from the laser to x1 [m] up to which light comes by the tails of the whole block, where the
-    head `shares`, and not by the path alone: infinite where blocks share all, 0 where they share nothing.
+    `late_m` is the path from the laser to x1 [m] up to which light comes by the suffixes of the whole block, where
+    the vertex `allows_reuse`, and not by the path alone: infinite where blocks share all, 0 where they share nothing.
     """
 
-    receiver: Any
-    si: Any
-    transmission: Any
-    path: Any
-    valid: Any
-    shares: Any
-    late_m: Any
+    receiver: UInts
+    si: Interactions
+    transmission: Floats
+    path: Floats
+    valid: Masks
+    allows_reuse: Masks
+    late_m: Floats
     point: Point | None
 
     @property
-    def early_m(self) -> Any:
+    def early_m(self) -> Array:
         """`late_m` of those that share, 0 for others."""
-        return dr.select(self.shares, self.late_m, 0)
+        return dr.select(self.allows_reuse, self.late_m, 0)
 
 
-class Joined(NamedTuple):
+class Connection(NamedTuple):
     """What x1 reflects of a lit point: radiance, path to the laser, and direction to the point."""
 
-    value: Any
-    path: Any
-    direction: Any
+    value: Floats
+    path: Floats
+    direction: Vectors
 
 
-def shares_early(world: TracedScene) -> bool:
-    """Whether blocks share what comes too early to be filtered: under a lamp that is little of the light."""
+def reuses_early_paths(world: TracedScene) -> bool:
+    """Return whether blocks share what comes too early to be filtered: under a lamp that is little of the light."""
     return not is_wide(world)
 
 
-def join_heads(
-    world: TracedScene, heads: PrimaryVertices, lit: LightVertices | None, batch: Any, first: Any, joins: int
-) -> tuple[Joined, ...]:
-    """x1 joined to lit points, each of which has a share of their light. No loop: one would be a kernel of its own."""
-    found = []
-    for join in range(joins):
-        light, path, direction = joined(
-            world, heads.si, lit, batch, first + join, heads.valid, lambda path: copies_of(heads, path), joins
+def connect_primary_vertices(
+    world: TracedScene,
+    primary: PrimaryVertices,
+    light_vertices: LightVertices | None,
+    batch: UInts,
+    first: UInts,
+    connections: int,
+) -> tuple[Connection, ...]:
+    """Connect x1 to light vertices, each with a part of their light. No loop: one would be a kernel of its own."""
+    found: list[Connection] = []
+    if light_vertices is None:
+        return ()
+    for number in range(connections):
+        light, path, direction = connect_to_light_vertex(
+            world,
+            primary.si,
+            light_vertices,
+            light_vertex_index(light_vertices, batch, first + number),
+            primary.valid,
+            lambda path: sampling_techniques(primary, path),
+            connections,
         )
-        found.append(Joined(light * heads.transmission, path, direction))
+        found.append(Connection(light * primary.transmission, path, direction))
     return tuple(found)
 
 
-def copies_of(heads: PrimaryVertices, path: Any) -> Any:
-    """How many lobes look for light that has come so far from the laser to x1: those of the whole block, or one."""
-    return dr.select(path < heads.early_m, Float(BLOCK), Float(1))
+def sampling_techniques(primary: PrimaryVertices, path: Floats) -> Array:
+    """Count the BSDF-sampling techniques that can generate a path of this length: BLOCK or 1.
+
+    BLOCK where the block reuses that path. The number enters the balance heuristic.
+    """
+    return dr.select(path < primary.early_m, Float(BLOCK), Float(1))

@@ -1,109 +1,105 @@
-"""Light of paths, added up: each pixel's own, and what the pixels of a block get by each other's tails.
+"""Light of paths, added up: each pixel's own, and what the pixels of a block get by each other's suffixes.
 
-Pixels near each other form a block of T, and every pixel of the block uses the tails of all: it sees T samples for the
-price of one path and T rays that test whether its x1 sees x2 (path reuse: Bekaert, Sbert, Halton 2002, "Accelerating
-path tracing by re-using paths"). Weighted by the balance heuristic (Veach 1997, eq. 9.8) the estimate stays unbiased:
-with F_i the integrand of pixel i over x2 and p_k the density, per area at x2, with which pixel k samples x2 (0 where x2
-is hidden from it),
+Pixels near each other form a block of T, and every pixel of the block uses the path suffixes of all: it sees T samples
+for the price of one path and T rays that test whether its x1 sees x2 (path reuse: Bekaert, Sbert, Halton 2002,
+"Accelerating path tracing by re-using paths"). Weighted by the balance heuristic (Veach 1997, eq. 9.8) the estimate
+stays unbiased: with F_i the integrand of pixel i over x2 and p_k the density, per area at x2, with which pixel k
+samples x2 (0 where x2 is hidden from it),
 
     L_i = sum_j F_i(x2_j) / sum_k p_k(x2_j),
 
-where tail j goes on in a direction that was sampled as seen from x1_j, so that beyond x2 the densities have the factor
-p(w3 | x1_k, x2). Paths that leave x1 (or x2) by a mirror-like lobe, or whose x1 or x2 lies on smooth plastic, are
-disjoint from all others and stay their own.
+where suffix j goes on in a direction that was sampled as seen from x1_j, so that beyond x2 the densities have the
+factor p(w3 | x1_k, x2). Paths that leave x1 (or x2) by a mirror-like lobe, or whose x1 or x2 lies on smooth plastic,
+are disjoint from all others and stay their own.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.drjit_types import Array, Floats, Masks, UInts, Vectors
 from render.indirect.accumulators import IndirectAccumulator
-from render.indirect.camera_paths import PathBatch, trace_paths
+from render.indirect.camera_paths import PathBatch, PathTask, trace_paths
 from render.indirect.glossy import mis_weight_camera_path
 from render.indirect.launch_layout import BLOCK, LaunchLayout
-from render.indirect.light_vertices import diffuse_share, share_by_chance
-from render.indirect.path_space_filter import UNIT_WEIGHT, PathSpaceFilter
-from render.indirect.primary_vertices import shares_early
-from render.scene.rays import of_parts, parts_of, segment
+from render.indirect.light_vertices import diffuse_fraction, mis_weight_bsdf
+from render.indirect.path_space_filter import UNIT_WEIGHT, ArrivingLight, PathSpaceFilter
+from render.indirect.primary_vertices import reuses_early_paths
+from render.scene.rays import interaction_from_parts, parts_of, segment
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 # Of one launch, 30 and 75 MB in its course.
-LANES = 3 << 18  # connections
-PATHS = 1 << 18
-FILTERED_PATHS = 13 << 12  # which may have connections, too
+CONNECTIONS_PER_LAUNCH = 3 << 18  # connections
+PATHS_PER_LAUNCH = 1 << 18
+FILTERED_PATHS_PER_LAUNCH = 13 << 12  # which may have connections, too
 
 
-def add_paths(
-    world: TracedScene,
-    pixels: np.ndarray,
-    turns: LaunchLayout,
-    bounces: int,
-    seed: int,
-    sums: IndirectAccumulator,
-    batches: int,
-    *,
-    shared: bool,
-    regions: PathSpaceFilter | None = None,
-) -> None:
-    """Trace paths of the given blocks of flat pixels (-1: none) and add their light to `sums`; `shared` by blocks.
+def add_own_light(paths: PathBatch, sums: IndirectAccumulator, path_filter: PathSpaceFilter | None = None) -> None:
+    """Add each path's light to its own pixel.
 
-    With `regions` late light goes there instead, to be read from them when all paths are traced, and early light alone
-    is shared, where it matters (`shares_early`).
+    With `path_filter` late light goes there instead, to be read when all paths are traced.
     """
-    from_m = None if regions is None else regions.from_m
-    traced = trace_paths(world, pixels, turns, bounces, seed, batches, shared=shared, from_m=from_m)
     rows = None
-    if regions is not None:
-        rows = regions.count_paths(traced.heads.point, _weight(traced, sums))
-    _add(_own_lanes(traced), traced, sums, regions, rows, own=True)
-    if regions is not None:
-        regions.evaluate()
-    pairs = _pairs(traced, shared=shared, early=regions is not None and shares_early(world))
+    if path_filter is not None:
+        rows = path_filter.count_paths(paths.primary.point, _weight(paths, sums))
+    _add(_own_lanes(paths), paths, sums, path_filter, rows, own=True)
+    if path_filter is not None:
+        path_filter.evaluate()
+
+
+def add_reused_light(
+    world: TracedScene, paths: PathBatch, sums: IndirectAccumulator, *, reuses_paths: bool, filtered: bool
+) -> None:
+    """Add light that the pixels of a block get by each other's suffixes.
+
+    Where late light is `filtered` they are reused for early light alone, where it matters (`reuses_early_paths`).
+    """
+    pairs = _pairs(paths, reuses_paths=reuses_paths, early=filtered and reuses_early_paths(world))
     if pairs is not None:
-        _add(_pair_lanes(world, traced, pairs), traced, sums, own=False)
+        _add(_pair_lanes(world, paths, pairs), paths, sums, own=False)
     sums.evaluate()
 
 
-def _weight(traced: PathBatch, sums: IndirectAccumulator) -> Any:
+def _weight(paths: PathBatch, sums: IndirectAccumulator) -> Array:
     """Of a path in the regions: all of a pixel count as much as those of another."""
-    return UInt32(UNIT_WEIGHT * dr.gather(Float, sums.scale, traced.heads.receiver) + 0.5)
+    return UInt32(UNIT_WEIGHT * dr.gather(Float, sums.scale, paths.primary.receiver) + 0.5)
 
 
 def noise_of_paths(
-    world: TracedScene, pixels: np.ndarray, turns: LaunchLayout, bounces: int, seed: int
+    world: TracedScene, pixels: np.ndarray, launch: LaunchLayout, bounces: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of the squared contributions of a turn's paths to the pixels of its block, own and shared.
+    """Sum squared contributions of a block's sample to the pixels of the block, own and reused.
 
     Histograms of paths that fall into different bins have this variance.
     """
-    traced = trace_paths(world, pixels, turns, bounces, seed, 1, shared=True)
-    own, alone, shared = _Squares(), _Squares(), _Squares()
-    lanes = _own_lanes(traced)
-    _add(lanes._replace(early_m=Float(0)), traced, own, own=True)
-    _add(lanes, traced, alone, own=True)
-    _add(_pair_lanes(world, traced, _all_pairs(dr.width(traced.batch))), traced, shared, own=False)
-    return own.by_block(BLOCK), alone.by_block(BLOCK) + shared.by_block(BLOCK**2)
+    paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, reuses_paths=True))
+    own, alone, reused = _Squares(), _Squares(), _Squares()
+    lanes = _own_lanes(paths)
+    _add(lanes._replace(early_m=Float(0)), paths, own, own=True)
+    _add(lanes, paths, alone, own=True)
+    _add(_pair_lanes(world, paths, _all_pairs(dr.width(paths.batch))), paths, reused, own=False)
+    return own.by_block(BLOCK), alone.by_block(BLOCK) + reused.by_block(BLOCK**2)
 
 
 def noise_of_filtered_paths(
-    world: TracedScene, pixels: np.ndarray, turns: LaunchLayout, bounces: int, seed: int, from_m: float
+    world: TracedScene, pixels: np.ndarray, launch: LaunchLayout, bounces: int, seed: int, from_m: float
 ) -> np.ndarray:
-    """The same of filtered light: what is later than `from_m` behind direct light is read from regions, whose area, and
-    with it the number of paths in them, grows with the square of its excess path."""
+    """Return the same of filtered light: what is later than `from_m` behind direct light is read from regions, whose
+    area, and with it the number of paths in them, grows with the square of its excess path."""
     start = dr.opaque(Float, from_m)
-    traced = trace_paths(world, pixels, turns, bounces, seed, 1, shared=False, from_m=start)
-    heads = traced.heads
-    late_m = heads.path + heads.late_m
+    paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, from_m=start))
+    primary = paths.primary
+    late_m = primary.path + primary.late_m
     own = _Squares(late_m, start)
-    _add(_own_lanes(traced), traced, own, own=True)
+    _add(_own_lanes(paths), paths, own, own=True)
     noise = own.by_block(BLOCK)
-    pairs = _pairs(traced, shared=False, early=shares_early(world))
+    pairs = _pairs(paths, reuses_paths=False, early=reuses_early_paths(world))
     if pairs is not None:
-        early = _Squares(dr.gather(Float, late_m, pairs.head), start)
-        _add(_pair_lanes(world, traced, pairs), traced, early, own=False)
-        block = dr.gather(UInt32, pairs.tail, dr.arange(UInt32, dr.width(pairs.tail) // BLOCK) * BLOCK) // BLOCK
+        early = _Squares(dr.gather(Float, late_m, pairs.vertex), start)
+        _add(_pair_lanes(world, paths, pairs), paths, early, own=False)
+        block = dr.gather(UInt32, pairs.suffix, dr.arange(UInt32, dr.width(pairs.suffix) // BLOCK) * BLOCK) // BLOCK
         np.add.at(noise, block.numpy(), early.by_block(BLOCK))
     return noise
 
@@ -115,10 +111,10 @@ class _Squares:
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
-    def __init__(self, late_m: Any = None, from_m: Any = None) -> None:
+    def __init__(self, late_m: Floats = None, from_m: Floats = None) -> None:
         self._late_m, self._from_m, self._lanes = late_m, from_m, None
 
-    def add(self, pixel: Any, batch: Any, path: Any, radiance: Any, active: Any) -> Any:
+    def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
         """The square of what is added."""
         square = dr.select(active & dr.isfinite(radiance), dr.square(radiance), 0)
         if self._late_m is None:
@@ -126,7 +122,7 @@ class _Squares:
         behind_m = dr.maximum(path - self._late_m, 0)
         return square / dr.square(1 + behind_m / self._from_m)
 
-    def add_total(self, pixel: Any, batch: Any, total: Any) -> None:
+    def add_total(self, pixel: UInts, batch: UInts, total: Floats) -> None:
         """Keep every lane's sum."""
         self._lanes = total
 
@@ -136,111 +132,113 @@ class _Squares:
 
 
 class _Pairs(NamedTuple):
-    """Head and tail of every pair, those of one tail together, and which group of BLOCK that is; its number, and which
-    tails were `chosen` (None: all)."""
+    """Primary vertex and suffix of every pair, those of one suffix together, and which group of BLOCK that is; its
+    number, and which suffixes were `chosen` (None: all)."""
 
-    head: Any
-    tail: Any
-    group: Any
-    number: Any
-    chosen: Any = None
+    vertex: UInts
+    suffix: UInts
+    group: UInts
+    number: UInts
+    chosen: UInts = None
 
 
-def _pairs_of(number: Any, chosen: Any = None) -> _Pairs:
+def _pairs_of(number: UInts, chosen: UInts = None) -> _Pairs:
     """Neighbours in a block are neighbours in the launch, which keeps rays coherent."""
     group = number // BLOCK
-    tail = group if chosen is None else dr.gather(UInt32, chosen, group)
-    return _Pairs(tail // BLOCK * BLOCK + number % BLOCK, tail, group, number, chosen)
+    suffix = group if chosen is None else dr.gather(UInt32, chosen, group)
+    return _Pairs(suffix // BLOCK * BLOCK + number % BLOCK, suffix, group, number, chosen)
 
 
 def _all_pairs(lanes: int) -> _Pairs:
     return _pairs_of(dr.arange(UInt32, lanes * BLOCK))
 
 
-def _pairs(traced: PathBatch, *, shared: bool, early: bool) -> _Pairs | None:
+def _pairs(paths: PathBatch, *, reuses_paths: bool, early: bool) -> _Pairs | None:
     """The pairs that may have light for each other."""
-    if shared:
-        return _all_pairs(dr.width(traced.batch))
+    if reuses_paths:
+        return _all_pairs(dr.width(paths.batch))
     if not early:
         return None
-    chosen = dr.compress(_early(traced))
+    chosen = dr.compress(_early(paths))
     if dr.width(chosen) == 0:
         return None
     return _pairs_of(dr.arange(UInt32, dr.width(chosen) * BLOCK), chosen)
 
 
-def _early(traced: PathBatch) -> Any:
-    """Whether a tail may carry light that is early to any head of its block."""
-    heads, tails, pairs = traced.heads, traced.tails, _all_pairs(dr.width(traced.batch))
-    x1, x2 = (dr.gather(mi.Point3f, si.p, index) for si, index in ((heads.si, pairs.head), (tails.si, pairs.tail)))
-    left = dr.gather(Float, heads.early_m, pairs.head) - dr.gather(Float, tails.soonest_m, pairs.tail)
+def _early(paths: PathBatch) -> Array:
+    """Return whether a suffix may carry light that is early to any primary vertex of its block."""
+    primary, suffixes, pairs = paths.primary, paths.suffixes, _all_pairs(dr.width(paths.batch))
+    x1, x2 = (
+        dr.gather(mi.Point3f, si.p, index) for si, index in ((primary.si, pairs.vertex), (suffixes.si, pairs.suffix))
+    )
+    left = dr.gather(Float, primary.early_m, pairs.vertex) - dr.gather(Float, suffixes.soonest_m, pairs.suffix)
     near = UInt32((left > 0) & (dr.squared_norm(x2 - x1) < dr.square(left)))
-    return tails.shared & (dr.block_reduce(dr.ReduceOp.Max, near, BLOCK) > 0)
+    return suffixes.reusable & (dr.block_reduce(dr.ReduceOp.Max, near, BLOCK) > 0)
 
 
 class _Ends(NamedTuple):
-    """What pairs need of heads and tails, as arrays and plain tuples, which recordings look into: see
+    """What pairs need of primary vertices and suffixes, as arrays and plain tuples, which recordings look into: see
     `PrimaryVertices` and `PathSuffixes`."""
 
     si1: tuple
-    transmission: Any
-    shares: Any
+    transmission: Floats
+    allows_reuse: Masks
     si2: tuple
-    shared: Any
-    own_transmission: Any
-    leg: Any
-    to_laser: Any
-    irradiance: Any
-    onward: Any
-    onward_direction: Any
-    density: Any
+    reusable: Masks
+    own_transmission: Floats
+    leg: Floats
+    to_laser: Vectors
+    irradiance: Floats
+    onward: Masks
+    onward_direction: Vectors
+    density: Floats
 
 
 class _Connections(NamedTuple):
     """Of every pair: leg x1 to x2 [m], pixel radiance from x2's laser light and from beyond, times the densities; the
     sums of these over each group."""
 
-    leg: Any
-    value: Any
-    onward: Any
-    density: Any
-    onward_density: Any
+    leg: Floats
+    value: Floats
+    onward: Masks
+    density: Floats
+    onward_density: Array
 
 
-def _connect(world: TracedScene, number: Any, chosen: Any, *ends: Any) -> tuple[Any, ...]:
+def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> tuple[Array, ...]:
     """The parts of `_Connections`."""
-    head, tail, _ = _pairs_of(number, chosen)[:3]
+    vertex, suffix, _ = _pairs_of(number, chosen)[:3]
     ends = _Ends(*ends)
-    shared = dr.gather(Bool, ends.shared, tail) & dr.gather(Bool, ends.shares, head)
-    si1 = dr.gather(mi.SurfaceInteraction3f, of_parts(ends.si1), head, shared)
-    si2 = dr.gather(mi.SurfaceInteraction3f, of_parts(ends.si2), tail, shared)
+    reusable = dr.gather(Bool, ends.reusable, suffix) & dr.gather(Bool, ends.allows_reuse, vertex)
+    si1 = dr.gather(mi.SurfaceInteraction3f, interaction_from_parts(ends.si1), vertex, reusable)
+    si2 = dr.gather(mi.SurfaceInteraction3f, interaction_from_parts(ends.si2), suffix, reusable)
     offset = si2.p - si1.p
     distance2 = dr.squared_norm(offset)
     direction = offset * dr.rsqrt(distance2)
-    passed, leg = segment(world, si1, si2.p, shared)
-    # a tail is seen from where it came, whatever rounding says
-    own = head == tail
-    passed = dr.select(own, dr.gather(Float, ends.own_transmission, tail, shared), passed)
-    leg = dr.select(own, dr.gather(Float, ends.leg, tail, shared), leg)
-    active = shared & (passed > 0) & (distance2 > 0)
+    passed, leg = segment(world, si1, si2.p, reusable)
+    # a suffix is seen from where it came, whatever rounding says
+    own = vertex == suffix
+    passed = dr.select(own, dr.gather(Float, ends.own_transmission, suffix, reusable), passed)
+    leg = dr.select(own, dr.gather(Float, ends.leg, suffix, reusable), leg)
+    active = reusable & (passed > 0) & (distance2 > 0)
     context = mi.BSDFContext()
     value1, density1 = si1.bsdf().eval_pdf(context, si1, si1.to_local(direction), active)
     si2.wi = si2.to_local(-direction)
-    to_laser = si2.to_local(_gather_vector(ends.to_laser, tail, active))
+    to_laser = si2.to_local(_gather_vector(ends.to_laser, suffix, active))
     value2 = si2.bsdf().eval(context, si2, to_laser, active)[0]
-    irradiance = dr.gather(Float, ends.irradiance, tail, active)
-    going = active & dr.gather(Bool, ends.onward, tail, active)
-    onward = si2.to_local(_gather_vector(ends.onward_direction, tail, going))
+    irradiance = dr.gather(Float, ends.irradiance, suffix, active)
+    going = active & dr.gather(Bool, ends.onward, suffix, active)
+    onward = si2.to_local(_gather_vector(ends.onward_direction, suffix, going))
     value3, density3 = si2.bsdf().eval_pdf(context, si2, onward, going)
     area = dr.abs(dr.dot(si2.n, direction)) / distance2
-    reach = dr.gather(Float, ends.transmission, head, active) * value1[0] * area * passed
+    reach = dr.gather(Float, ends.transmission, vertex, active) * value1[0] * area * passed
     if ends.density is not None:
-        value2 *= share_by_chance(
-            diffuse_share(world, si1, direction, value1[0], active),
+        value2 *= mis_weight_bsdf(
+            diffuse_fraction(world, si1, direction, value1[0], active),
             dr.dot(si1.sh_frame.n, direction),
             distance2,
             dr.dot(si2.n, direction),
-            dr.gather(Float, ends.density, tail, active),
+            dr.gather(Float, ends.density, suffix, active),
             BLOCK,
         )
     value2 *= mis_weight_camera_path(world, si1, direction, si2, active)
@@ -256,19 +254,19 @@ def _connect(world: TracedScene, number: Any, chosen: Any, *ends: Any) -> tuple[
 class _Weights(NamedTuple):
     """Of every pair: leg from x1 to x2 [m], radiance of x2's laser light, factor of what lies beyond x2."""
 
-    leg: Any
-    first: Any
-    onward: Any
+    leg: Floats
+    first: UInts
+    onward: Masks
 
 
-def _weights(world: TracedScene, traced: PathBatch, pairs: _Pairs) -> _Weights:
-    heads, tails = traced.heads, traced.tails
+def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
+    primary, suffixes = paths.primary, paths.suffixes
     ends = _Ends(
-        parts_of(heads.si),
-        heads.transmission,
-        heads.shares,
-        parts_of(tails.si),
-        *(getattr(tails, name) for name in _Ends._fields[4:]),
+        parts_of(primary.si),
+        primary.transmission,
+        primary.allows_reuse,
+        parts_of(suffixes.si),
+        *(getattr(suffixes, name) for name in _Ends._fields[4:]),
     )
     dr.eval(pairs.number)
     made = _Connections(*world.recordings.call(world, "pairs", _connect, pairs.number, pairs.chosen, *ends))
@@ -277,88 +275,98 @@ def _weights(world: TracedScene, traced: PathBatch, pairs: _Pairs) -> _Weights:
     return _Weights(made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0))
 
 
-def _pair_lanes(world: TracedScene, traced: PathBatch, pairs: _Pairs) -> _Lanes:
-    """Early light that every pixel of a block gets from every tail of the block."""
-    heads, weights = traced.heads, _weights(world, traced, pairs)
+def _pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
+    """Return early light that every pixel of a block gets from every suffix of the block."""
+    primary, weights = paths.primary, _weights(world, paths, pairs)
     return _Lanes(
-        dr.gather(UInt32, heads.receiver, pairs.head),
-        dr.gather(UInt32, traced.batch, pairs.tail),
-        pairs.tail,
-        dr.gather(Float, heads.path, pairs.head),
+        dr.gather(UInt32, primary.receiver, pairs.vertex),
+        dr.gather(UInt32, paths.batch, pairs.suffix),
+        pairs.suffix,
+        dr.gather(Float, primary.path, pairs.vertex),
         weights.leg,
-        dr.gather(Float, heads.early_m, pairs.head),
+        dr.gather(Float, primary.early_m, pairs.vertex),
         weights.first,
         weights.onward,
     )
 
 
-def _own_lanes(traced: PathBatch) -> _Lanes:
+def _own_lanes(paths: PathBatch) -> _Lanes:
     """Light that a pixel gets from its own path alone."""
-    heads, tails = traced.heads, traced.tails
-    tail = dr.arange(UInt32, dr.width(traced.batch))
+    primary, suffixes = paths.primary, paths.suffixes
+    suffix = dr.arange(UInt32, dr.width(paths.batch))
     return _Lanes(
-        heads.receiver, traced.batch, tail, heads.path, tails.leg, heads.early_m, tails.own_value, tails.own_onward
+        primary.receiver,
+        paths.batch,
+        suffix,
+        primary.path,
+        suffixes.leg,
+        primary.early_m,
+        suffixes.own_value,
+        suffixes.own_onward,
     )
 
 
 class _Lanes(NamedTuple):
-    """What lanes add: pixel and batch; tail; paths from camera to x1 and on to x2; one from the laser up to which light
-    is shared; radiance of x2's laser light, factor of light beyond."""
+    """What lanes add: pixel and batch; suffix; paths from camera to x1 and on to x2; one from the laser up to which
+    light is reused; radiance of x2's laser light, factor of light beyond."""
 
-    receiver: Any
-    batch: Any
-    tail: Any
-    path: Any
-    leg: Any
-    early_m: Any
-    first: Any
-    onward: Any
+    receiver: UInts
+    batch: UInts
+    suffix: UInts
+    path: Floats
+    leg: Floats
+    early_m: Floats
+    first: UInts
+    onward: Masks
 
 
 @dr.syntax
 def _add(
     lanes: _Lanes,
-    traced: PathBatch,
+    paths: PathBatch,
     sums: IndirectAccumulator,
-    regions: PathSpaceFilter | None = None,
-    rows: Any = None,
+    path_filter: PathSpaceFilter | None = None,
+    rows: UInts = None,
     *,
     own: bool,
 ) -> None:
-    receiver, batch, tail, path1, leg, early_m, first, onward = lanes
-    joined, tails = traced.joined, traced.tails
-    laser_path, last = (dr.gather(type(c), c, tail) for c in (tails.laser_path, tails.length))
-    stride = dr.opaque(UInt32, dr.width(traced.batch))
-    turn, total = dr.zeros(UInt32, dr.width(tail)), dr.zeros(Float, dr.width(tail))
-    # x2's own light is the loop's first turn: additions before a loop would cost a kernel of their own
-    going, joins = (first > 0) | (onward > 0), UInt32(0)
+    receiver, batch, suffix, path1, leg, early_m, first, onward = lanes
+    connections, suffixes = paths.connections, paths.suffixes
+    laser_path, last = (dr.gather(type(c), c, suffix) for c in (suffixes.laser_path, suffixes.length))
+    stride = dr.opaque(UInt32, dr.width(paths.batch))
+    step, total = dr.zeros(UInt32, dr.width(suffix)), dr.zeros(Float, dr.width(suffix))
+    # x2's own light is the loop's first step: additions before a loop would cost a kernel of their own
+    going, connection_count = (first > 0) | (onward > 0), UInt32(0)
     if dr.hint(own, mode="scalar"):
-        going, joins = Bool(traced.heads.valid), UInt32(len(joined))
+        going, connection_count = Bool(paths.primary.valid), UInt32(len(connections))
     while going:
-        beyond = going & (turn > joins)
-        slot = (turn - 1 - joins) * stride + tail
-        radiance = dr.select(beyond, onward * dr.gather(Float, tails.values, slot, beyond), first)
-        path = leg + dr.select(beyond, dr.gather(Float, tails.paths, slot, beyond), laser_path)
+        beyond = going & (step > connection_count)
+        slot = (step - 1 - connection_count) * stride + suffix
+        radiance = dr.select(beyond, onward * dr.gather(Float, suffixes.values, slot, beyond), first)
+        path = leg + dr.select(beyond, dr.gather(Float, suffixes.paths, slot, beyond), laser_path)
         if dr.hint(own, mode="scalar"):
-            towards, diffuse = tails.direction, tails.diffuse
-            for number, light in enumerate(joined):
-                near = turn == 1 + number
+            towards, diffuse = suffixes.direction, suffixes.diffuse
+            for number, light in enumerate(connections):
+                near = step == 1 + number
                 radiance, path = dr.select(near, light.value, radiance), dr.select(near, light.path, path)
                 towards, diffuse = dr.select(near, light.direction, towards), near | diffuse
-            adding = going & ~((path < early_m) & dr.select(beyond, tails.onward, tails.shared & (turn == 0)))
-            if dr.hint(regions is not None, mode="scalar"):
-                sums.add_plain(receiver, batch, path1 + path, radiance, going)
-                heads, weight = traced.heads, _weight(traced, sums)
-                adding = regions.add(
-                    heads.point, rows, heads.late_m, towards, diffuse, batch, path, radiance, weight, adding
+            adding = going & ~((path < early_m) & dr.select(beyond, suffixes.onward, suffixes.reusable & (step == 0)))
+            if dr.hint(path_filter is not None, mode="scalar"):
+                sums.add_unfiltered(receiver, batch, path1 + path, radiance, going)
+                primary, weight = paths.primary, _weight(paths, sums)
+                adding = path_filter.add(
+                    primary.point,
+                    rows,
+                    ArrivingLight(primary.late_m, towards, diffuse, batch, path, radiance, weight),
+                    adding,
                 )
         else:
             adding = going & (path < early_m)
         total += sums.add(receiver, batch, path1 + path, radiance, adding)
-        going &= (turn < joins) | ((turn < last + joins) & (onward > 0))
-        turn += 1
+        going &= (step < connection_count) | ((step < last + connection_count) & (onward > 0))
+        step += 1
     sums.add_total(receiver, batch, total)
 
 
-def _gather_vector(source: Any, index: Any, active: Any) -> Any:
+def _gather_vector(source: Array, index: UInts, active: Masks) -> Array:
     return mi.Vector3f(*(dr.gather(Float, component, index, active) for component in source))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from render.backend.drjit_types import Array, Floats, Generators, Interactions, Masks, Rays, UInts, Vectors
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi
 
 MAX_LAYERS = 64  # of glass and cut-outs that one ray passes
 
 
-def camera_rays(world: TracedScene, x: Any, y: Any, eye: Any = None) -> tuple[Any, Any]:
-    """Rays from the camera's centre through raster positions, and their camera-frame directions with z = 1; from
+def camera_rays(world: TracedScene, x: Floats, y: Floats, eye: Vectors = None) -> tuple[Array, Array]:
+    """Return rays from the camera's centre through raster positions, and their camera-frame directions with z = 1; from
     another `eye` that looks as the camera does, if there is one."""
     local = mi.Vector3f(
         (x - Float(world.width) / 2) / world.focal_px, (y - Float(world.height) / 2) / world.focal_px, 1
@@ -18,44 +17,45 @@ def camera_rays(world: TracedScene, x: Any, y: Any, eye: Any = None) -> tuple[An
     return mi.Ray3f(mi.Point3f(world.eye if eye is None else eye), dr.normalize(to_world(world, local))), local
 
 
-def to_world(world: TracedScene, local: Any) -> Any:
-    """A camera-frame vector in the world."""
+def to_world(world: TracedScene, local: Vectors) -> Array:
+    """Return a camera-frame vector in the world."""
     right, down, forward = world.axes
     return right * local.x + down * local.y + forward * local.z
 
 
-def to_camera(world: TracedScene, vector: Any) -> Any:
-    """A world vector in the camera's frame."""
+def to_camera(world: TracedScene, vector: Vectors) -> Array:
+    """Return a world vector in the camera's frame."""
     return mi.Vector3f(*(dr.dot(axis, vector) for axis in world.axes))
 
 
-def shape_index(si: Any) -> Any:
+def shape_index(si: Interactions) -> Array:
     return dr.reinterpret_array(UInt32, si.shape)
 
 
 _KEPT = ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index")
 
 
-def parts_of(si: Any) -> tuple[Any, ...]:
-    """What reflectance and rays need of an interaction."""
+def parts_of(si: Interactions) -> tuple[Array, ...]:
+    """Return what reflectance and rays need of an interaction."""
     return tuple(getattr(si, name) for name in _KEPT)
 
 
-def of_parts(parts: tuple[Any, ...]) -> Any:
-    """The interaction with these parts alone."""
+def interaction_from_parts(parts: tuple[Array, ...]) -> Array:
+    """Return the interaction with these parts alone."""
     few = dr.zeros(mi.SurfaceInteraction3f, dr.width(parts[0]))
     for name, part in zip(_KEPT, parts, strict=True):
         setattr(few, name, part)
     return few
 
 
-def kept(si: Any) -> Any:
-    """The interaction with what is needed of it alone: most of a launch's memory is interactions."""
-    return of_parts(parts_of(si))
+def kept(si: Interactions) -> Array:
+    """Return the interaction with what is needed of it alone: most of a launch's memory is interactions."""
+    return interaction_from_parts(parts_of(si))
 
 
-def spawn(si: Any, direction: Any) -> Any:
-    """A ray that leaves a surface from a little off it: a share of its distance to the origin, as float32 rounds.
+def spawn(si: Interactions, direction: Vectors) -> Array:
+    """Return a ray that leaves a surface from a little off it: a share of its distance to the origin, as float32
+    rounds.
 
     Mitsuba's `spawn_ray` keeps off 90 um more, whatever the scene's size: in one of millimetres that is a gap.
     """
@@ -63,8 +63,16 @@ def spawn(si: Any, direction: Any) -> Any:
     return mi.Ray3f(dr.fma(off, si.n, si.p), direction)
 
 
-def first_opaque(world: TracedScene, ray: Any, active: Any, origin: Any = None) -> tuple[Any, Any, Any, Any]:
-    """The first surface that stops light, past glass and the holes of cut-outs, in a straight line.
+def sample_bsdf(si: Interactions, random: Generators, active: Masks) -> tuple[Array, Array]:
+    """Sample a direction of a surface's lobes, and its weight: reflectance times cosine over density."""
+    first, second = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+    return si.bsdf().sample(mi.BSDFContext(), si, first, second, active)
+
+
+def first_opaque(
+    world: TracedScene, ray: Rays, active: Masks, origin: Vectors = None
+) -> tuple[Array, Array, Array, Array]:
+    """Return the first surface that stops light, past glass and the holes of cut-outs, in a straight line.
 
     `origin` is the surface point that the ray was spawned from, a little off its own start; None is the camera.
     Returns the interaction, the transmission of the glass on the way, the optical path (the index of refraction counted
@@ -73,7 +81,7 @@ def first_opaque(world: TracedScene, ray: Any, active: Any, origin: Any = None) 
     says so otherwise.
     """
     if not world.sees_through:
-        si = world.traced.ray_intersect(ray, active)
+        si = world.mi_scene.ray_intersect(ray, active)
         distance = si.t if origin is None else dr.norm(si.p - origin)
         return si, Float(1), distance, distance
     start = ray.o if origin is None else origin
@@ -81,7 +89,9 @@ def first_opaque(world: TracedScene, ray: Any, active: Any, origin: Any = None) 
 
 
 @dr.syntax
-def _pass_layers(world: TracedScene, ray: Any, origin: Any, active: Any, limit: Any, in_air: bool) -> tuple[Any, ...]:
+def _pass_layers(
+    world: TracedScene, ray: Rays, origin: Vectors, active: Masks, limit: Floats, in_air: bool
+) -> tuple[Array, ...]:
     """`first_opaque` with layers, no farther than `limit`; where nothing stops the ray the paths run to the limit.
 
     A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
@@ -101,7 +111,7 @@ def _pass_layers(world: TracedScene, ray: Any, origin: Any, active: Any, limit: 
     while searching:
         ray.maxt = limit - dr.dot(ray.o - start, ray.d)
         # rays from the camera are neighbours of each other: told so, Embree is faster
-        found = world.traced.ray_intersect_preliminary(ray, coherent=in_air, active=searching)
+        found = world.mi_scene.ray_intersect_preliminary(ray, coherent=in_air, active=searching)
         hit = searching & found.is_valid()
         solid = dr.gather(Float, world.solid_ior, shape_index(found), hit)
         thin = dr.gather(Float, world.thin_ior, shape_index(found), hit)
@@ -138,9 +148,10 @@ def _pass_layers(world: TracedScene, ray: Any, origin: Any, active: Any, limit: 
 
 
 def laser_leg(
-    world: TracedScene, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
-) -> tuple[Any, Any, Any, Any]:
-    """What the laser does at a surface: radiance scattered towards `si.wi` [1/(m^2 sr)], and the laser leg's path [m].
+    world: TracedScene, si: Interactions, pixel: UInts, active: Masks, *, seen_by_camera: tuple[Array, Array] | None
+) -> tuple[Array, Array, Array, Array]:
+    """Return what the laser does at a surface: radiance scattered towards `si.wi` [1/(m^2 sr)], and the laser leg's
+    path [m].
 
     L = f(wi, wo) cos I(w) T / d^2. Between them the direction to the laser and the irradiance I(w) T / d^2 across it.
     """
@@ -151,9 +162,10 @@ def laser_leg(
 
 
 def laser_light(
-    world: TracedScene, si: Any, pixel: Any, active: Any, *, seen_by_camera: tuple[Any, Any] | None
-) -> tuple[Any, Any, Any]:
-    """Direction to the laser, irradiance I(w) T / d^2 [1/m^2] across it, and the laser leg's path [m] at a surface.
+    world: TracedScene, si: Interactions, pixel: UInts, active: Masks, *, seen_by_camera: tuple[Array, Array] | None
+) -> tuple[Array, Array, Array]:
+    """Return direction to the laser, irradiance I(w) T / d^2 [1/m^2] across it, and the laser leg's path [m] at a
+    surface.
 
     With `seen_by_camera` = (transmission, optical path) the point was reached by a straight camera ray, along which a
     co-located laser sees it too: no shadow ray is needed. Solid glass on the way shortens d (`spreading`).
@@ -178,8 +190,8 @@ def laser_light(
     return direction, dr.select(lit, intensity * transmission / distance2, 0), path
 
 
-def spreading(distance: Any, shortening: Any) -> Any:
-    """Factor on 1 / distance^2 where solid glass on the way changes how a point's light spreads.
+def spreading(distance: Floats, shortening: Floats) -> Array:
+    """Return factor on 1 / distance^2 where solid glass on the way changes how a point's light spreads.
 
     A thin cone of half angle a around the normal of a slab (thickness t, index n) runs inside it at a/n, and leaves it
     with a radius t a (1 - 1/n) smaller than without: it spreads as if the distance d were d - t (1 - 1/n), whatever the
@@ -189,8 +201,9 @@ def spreading(distance: Any, shortening: Any) -> Any:
     return dr.square(distance / dr.maximum(distance - shortening, 1e-3 * distance))
 
 
-def in_beam(world: TracedScene, point: Any, pixel: Any) -> Any:
-    """Whether the laser shines on a point: in its cone (flood), or in the row (line) or pixel (scan) being measured."""
+def in_beam(world: TracedScene, point: Array, pixel: UInts) -> Array:
+    """Return whether the laser shines on a point: in its cone (flood), or in the row (line) or pixel (scan) being
+    measured."""
     laser = world.scene.laser
     if laser.mode == "flood":
         aim = to_camera(world, mi.Vector3f(point) - world.laser)
@@ -199,25 +212,26 @@ def in_beam(world: TracedScene, point: Any, pixel: Any) -> Any:
     return same & (seen_in == pixel if laser.mode == "scan" else seen_in // world.width == pixel // world.width)
 
 
-def pixel_of(world: TracedScene, point: Any, *, columns: bool = True) -> tuple[Any, Any]:
-    """The flat pixel in whose pyramid a point lies, and whether there is one; not in which of its row's `columns` if
-    these do not matter."""
+def pixel_of(world: TracedScene, point: Array, *, columns: bool = True) -> tuple[Array, Array]:
+    """Return the flat pixel in whose pyramid a point lies, and whether there is one; not in which of its row's
+    `columns` if these do not matter."""
     column, row, seen = raster_of(world, world.eye, point)
     column, row = dr.floor(column) if columns else Float(0), dr.floor(row)
     inside = seen & (row >= 0) & (row < Float(world.height)) & (column >= 0) & (column < Float(world.width))
     return UInt32(dr.select(inside, row, 0)) * world.width + UInt32(dr.select(inside, column, 0)), inside
 
 
-def raster_of(world: TracedScene, eye: Any, point: Any) -> tuple[Any, Any, Any]:
-    """Where an eye that looks as the camera does sees a point: in pixels from the image's corner; and whether it lies
-    before it."""
+def raster_of(world: TracedScene, eye: Vectors, point: Array) -> tuple[Array, Array, Array]:
+    """Return where an eye that looks as the camera does sees a point: in pixels from the image's corner; and whether it
+    lies before it."""
     local = to_camera(world, mi.Vector3f(point) - eye)
     x, y = (local[axis] / local.z * world.focal_px for axis in range(2))
     return x + Float(world.width) / 2, y + Float(world.height) / 2, local.z > 0
 
 
-def segment(world: TracedScene, si: Any, point: Any, active: Any) -> tuple[Any, Any]:
-    """Transmission of the straight way from a surface to a point, 0 where it is blocked, and its optical path [m].
+def segment(world: TracedScene, si: Interactions, point: Array, active: Masks) -> tuple[Array, Array]:
+    """Return transmission of the straight way from a surface to a point, 0 where it is blocked, and its optical path
+    [m].
 
     The transmission includes the glass's `spreading`: it is what f cos I / distance^2 is to be multiplied by.
     """
@@ -227,7 +241,7 @@ def segment(world: TracedScene, si: Any, point: Any, active: Any) -> tuple[Any, 
         way = point - ray.o
         length = dr.norm(way)
         ray = mi.Ray3f(ray.o, way / length, length * (1 - mi.math.ShadowEpsilon), 0, mi.Color0f())
-        return dr.select(world.traced.ray_test(ray, active), Float(0), Float(1)), distance
+        return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), distance
     short = distance * (1 - 1e-4)  # not as far as a surface that the point may lie on
     ray = spawn(si, (point - si.p) / distance)
     transmission, optical, shortening = passage(world, ray, si.p, short, active, in_air=False)
@@ -235,9 +249,10 @@ def segment(world: TracedScene, si: Any, point: Any, active: Any) -> tuple[Any, 
 
 
 def passage(
-    world: TracedScene, ray: Any, origin: Any, limit: Any, active: Any, *, in_air: bool
-) -> tuple[Any, Any, Any]:
-    """Transmission (0: blocked), optical path and shortening (`spreading`) [m] from `origin` along `ray` to `limit`.
+    world: TracedScene, ray: Rays, origin: Vectors, limit: Floats, active: Masks, *, in_air: bool
+) -> tuple[Array, Array, Array]:
+    """Return transmission (0: blocked), optical path and shortening (`spreading`) [m] from `origin` along `ray` to
+    `limit`.
 
     `ray` starts at or a little off `origin`; `in_air` says that it starts outside of all glass, else its first
     interface tells.
@@ -245,6 +260,6 @@ def passage(
     if not world.sees_through:
         ray = mi.Ray3f(ray)
         ray.maxt = limit
-        return dr.select(world.traced.ray_test(ray, active), Float(0), Float(1)), limit, Float(0)
+        return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), limit, Float(0)
     end, transmission, optical, _, shortening = _pass_layers(world, ray, origin, active, limit, in_air)
     return dr.select(end.is_valid(), 0, transmission), optical, shortening

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from render.backend.drjit_types import Array
 from render.backend.llvm import start_mitsuba
 from render.backend.malloc import retain_freed_memory
 from scenes.model import Camera, Material, Scene, Surface, Texture
@@ -24,7 +25,7 @@ retain_freed_memory()
 Float, UInt32, Bool = mi.Float, mi.UInt32, mi.Bool
 ALIGNMENT = 64  # bytes
 OPACITY = "opacity"
-GLINT = 1.0  # 1/sr, three times white paint: direct light is refined at brighter highlights
+MIN_GLINT_RADIANCE = 1.0  # 1/sr, three times white paint: direct light is refined at brighter highlights
 LIGHT_PATH_PEAK = 0.05  # 1/sr: of surfaces with brighter highlights paths may begin at the laser
 FACE_ALBEDO = "face_albedo"
 # u of albedo 0 on a plastic's ramp, and how much more albedo 1 has; the ramp's mean, 1/2 whatever the albedo, only says
@@ -77,20 +78,20 @@ class TracedScene:
         # robust: without it a ray through the shared edge of two triangles can miss both (OptiX is so by itself)
         robust = {"embree_use_robust_intersections": True} if mi.variant().startswith("llvm") else {}
         described = {"type": "scene", **robust, **meshes, **lights}
-        self.traced = mi.load_dict(described, optimize=False)
+        self.mi_scene = mi.load_dict(described, optimize=False)
         self.shape_ids = np.array([int(dr.reinterpret_array(UInt32, mi.ShapePtr(m))[0]) for m in meshes.values()])
         self.solid_ior = self.table([m.ior if m.kind == "dielectric" else 0 for m in materials])
         self.thin_ior = self.table([m.ior if m.kind == "thindielectric" else 0 for m in materials])
         self.has_rough_coats = any(m.kind == "roughplastic" for m in materials)
         self.has_mixed_lobes = any(m.kind not in ("diffuse", "roughdiffuse") for m in materials)
         # paths that meet smooth plastic share none of it (`render.indirect.reuse`)
-        self.shares = self.table([m.kind != "plastic" for m in materials])
+        self.allows_reuse = self.table([m.kind != "plastic" for m in materials])
         self.rough_coats = self.table([m.kind == "roughplastic" for m in materials])
         self.albedo = self.table([_specular_albedo(m) for m in materials])
         # highlights that outshine paint and may be narrower than what a ray stands for (`render.direct.edges`)
         peaks = [_peak(m) for m in materials]
-        self.has_glints = max(peaks, default=0) > GLINT
-        self.peak = self.table([peak if peak > GLINT else 0 for peak in peaks])
+        self.has_glints = max(peaks, default=0) > MIN_GLINT_RADIANCE
+        self.peak = self.table([peak if peak > MIN_GLINT_RADIANCE else 0 for peak in peaks])
         self.has_glossy = max(peaks, default=0) > LIGHT_PATH_PEAK
         self.glossy_materials = self.table([peak > LIGHT_PATH_PEAK for peak in peaks])
         self.roughness = self.table([m.roughness for m in materials])
@@ -100,7 +101,8 @@ class TracedScene:
         self._bind_camera(scene)
 
     def with_camera(self, camera: Camera) -> TracedScene:
-        """The same surfaces and lights before another camera, its laser with it: nothing is built or recorded again."""
+        """Return the same surfaces and lights before another camera, its laser with it: nothing is built or recorded
+        again."""
         other = copy.copy(self)
         other._bind_camera(replace(self.scene, camera=camera))
         return other
@@ -120,7 +122,7 @@ class TracedScene:
         # the corner pixels' rays lie on the rim of the smallest cone
         self.half_angle = dr.opaque(Float, math.acos(scene.laser.cos_half_angle(camera)) * (1 + 1e-5))
 
-    def _reflectance(self, material: Material, masks: str, known: Mapping[tuple, Any]) -> Any:
+    def _reflectance(self, material: Material, masks: str, known: Mapping[tuple, Any]) -> Array:
         """Mitsuba's BSDF of a material, taken from those known if it is a plain, whole plastic that is among them."""
         bsdf = _bsdf(material, _albedo(material))
         if masks == "mitsuba" and _has_cutouts(material):
@@ -131,24 +133,24 @@ class TracedScene:
         self.plastics[key] = self.plastics.get(key) or known.get(key) or mi.load_dict(bsdf)
         return self.plastics[key]
 
-    def table(self, values: list[float]) -> Any:
-        """One value a mesh as an array over registered shapes, to be read at `shape_index`."""
+    def table(self, values: list[float]) -> Array:
+        """Return one value a mesh as an array over registered shapes, to be read at `shape_index`."""
         table = np.zeros(6 * (self.shape_ids.max() // 6 + 1))  # of no launch's size (`footprints`), nor one
         table[self.shape_ids] = values
         return upload(Float, table)
 
     def arrays(self) -> dict[str, Any]:
-        """Everything of the world that lives in Dr.Jit: a recording has to be told its inputs."""
+        """Return everything of the world that lives in Dr.Jit: a recording has to be told its inputs."""
         held = {
             name: value
             for name, value in vars(self).items()
             if dr.is_array_v(value)
             or (isinstance(value, tuple) and value and all(dr.is_array_v(part) for part in value))
         }
-        return {**held, "traced": self.traced}
+        return {**held, "traced": self.mi_scene}
 
     def with_arrays(self, arrays: dict[str, Any]) -> TracedScene:
-        """A copy with other Dr.Jit arrays: a recording refuses those that are not among its arguments."""
+        """Return a copy with other Dr.Jit arrays: a recording refuses those that are not among its arguments."""
         other = copy.copy(self)
         vars(other).update(arrays)
         return other
@@ -169,25 +171,34 @@ class Recordings:
         self.calls: dict[Any, Callable] = {}
         self.world: weakref.ref[TracedScene] | None = None
 
-    def call(self, world: TracedScene, key: Hashable, work: Callable, *arguments: Any) -> Any:
-        """`work(world, *arguments)`, recorded at the first call of `key` for this world's surfaces, then replayed.
+    def call(self, world: TracedScene, key: Hashable, work: Callable, *arguments: Array) -> Array:
+        """Return `work(world, *arguments)`, recorded at the first call of `key` for this world's surfaces, then
+        replayed.
 
         What Python and Dr.Jit need to trace a small launch takes longer than its rays. `arguments` are Dr.Jit arrays.
         """
         if key not in self.calls:
             # weakly: a world held by its own recording would stay among the scenes that Dr.Jit compiles calls for
             owner = weakref.ref(self)
-            self.calls[key] = recorded(lambda arrays, *given: work(owner().world().with_arrays(arrays), *given))
+            self.calls[key] = recorded(lambda arrays, *given: work(_asking(owner).with_arrays(arrays), *given))
         self.world = weakref.ref(world)
         return self.calls[key](world.arrays(), *arguments)
+
+
+def _asking(owner: weakref.ref[Recordings]) -> TracedScene:
+    """Return the world that asks for a recording; it is alive while it asks."""
+    recordings = owner()
+    world = None if recordings is None or recordings.world is None else recordings.world()
+    assert world is not None
+    return world
 
 
 _NUMPY = {Float: np.float32, UInt32: np.uint32, mi.UInt64: np.uint64, Bool: np.bool_, mi.Int32: np.int32}
 
 
-def upload(kind: type, values: np.ndarray, size: int | None = None) -> Any:
-    """Values as a flat Dr.Jit array of `kind` (one of _NUMPY), copied to aligned memory; the last one is repeated up
-    to `size`."""
+def upload(kind: type, values: np.ndarray, size: int | None = None) -> Array:
+    """Return values as a flat Dr.Jit array of `kind` (one of _NUMPY), copied to aligned memory; the last one is
+    repeated up to `size`."""
     count = np.size(values)
     memory = aligned(size or count, _NUMPY[kind])
     memory[:count] = np.ravel(values)
@@ -196,7 +207,7 @@ def upload(kind: type, values: np.ndarray, size: int | None = None) -> Any:
 
 
 def aligned(size: int, dtype: type) -> np.ndarray:
-    """An empty flat array in memory aligned to 64 bytes.
+    """Return an empty flat array in memory aligned to 64 bytes.
 
     On the CPU Dr.Jit uses a numpy array's own memory, and compiles one kernel for aligned and another for unaligned
     input.
@@ -207,7 +218,7 @@ def aligned(size: int, dtype: type) -> np.ndarray:
     return memory[start : start + count].view(dtype)
 
 
-def _opaque(vector: np.ndarray) -> Any:
+def _opaque(vector: np.ndarray) -> Array:
     return mi.Vector3f(*(dr.opaque(Float, float(v)) for v in vector))
 
 
@@ -226,8 +237,8 @@ def _merge_key(surface: Surface) -> tuple:
     """Surfaces with equal keys share a mesh: equal materials but for a plain albedo, which each face keeps."""
     material = surface.material
     kind = "diffuse" if material.kind == "roughdiffuse" else material.kind
-    albedo = id(material.albedo) if isinstance(material.albedo, Texture) else None
-    opacity: float = material.opacity
+    albedo: object = id(material.albedo) if isinstance(material.albedo, Texture) else None
+    opacity: float | Texture = material.opacity
     if isinstance(opacity, Texture):
         opacity, albedo = id(opacity), albedo or material.albedo
     parameters = tuple(getattr(material, name) for name in _PARAMETERS[kind])
@@ -258,7 +269,7 @@ def _peak(material: Material) -> float:
     return mirrored / (4 * math.pi * material.roughness**2)
 
 
-def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: Any, masks: str) -> Any:
+def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: Array, masks: str) -> Array:
     """One mesh of surfaces that share a material; cut-outs by `masks`: none, ours (an attribute), or the BSDF's own."""
     material = surfaces[0].material
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces])
@@ -333,8 +344,9 @@ def _texture(value: float | Texture) -> dict[str, Any]:
 
 
 def _bsdf(material: Material, albedo: dict[str, Any] | None) -> dict[str, Any]:
-    """Mitsuba's name for a material. Glass and cut-outs are the tracer's business, not the BSDF's."""
+    """Describe a material to Mitsuba. Glass and cut-outs are the tracer's business, not the BSDF's."""
     kind = material.kind
+    inner: dict[str, Any]
     if kind in ("diffuse", "roughdiffuse"):
         inner = {"type": "diffuse", "reflectance": albedo}
     elif kind in ("plastic", "roughplastic"):

@@ -10,10 +10,11 @@ Mirrored light: what the camera sees, directly or by way of mirrors, lit by way 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from render.backend.drjit_types import Array, Floats, Masks, Rays, UInts, Vectors
 from render.scene.rays import camera_rays, first_opaque, in_beam, passage, shape_index, spawn, spreading
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, upload
 from render.specular.mirrors import (
@@ -30,7 +31,7 @@ from render.specular.mirrors import (
 )
 from render.transient.samples import Samples, concatenate, merge, no_samples
 
-LANES = 1 << 20
+CELLS_PER_LAUNCH = 1 << 20
 # A glint is a thin cone of rays: on an edge or in the apex of a corner cube, the share of them that comes back counts.
 LOBE_RAYS, LOBE_RAD = 32, 5e-4
 WIDEST_SPREAD = 0.25  # of the path: a footprint that spans more describes no mesh
@@ -44,7 +45,7 @@ class SpecularLight(NamedTuple):
 
 
 def specular_light(world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4) -> SpecularLight:
-    """Deterministic returns by way of smooth plane surfaces, as `Samples` merged within `tolerance_m`.
+    """Return deterministic returns by way of smooth plane surfaces, as `Samples` merged within `tolerance_m`.
 
     Glints: pixel-mean radiance T R_1 ... R_k I(w) / (D^2 Omega), with D the unfolded one-way length laser -> mirrors ->
     camera, Omega the pixel's solid angle, T the transmission of glass on the way; path length D plus glass delay,
@@ -94,7 +95,7 @@ class _Tables:
         self.mirrors = world.table([float(flag) for flag in metal])
 
 
-def _reflectance(tables: _Tables, shape: Any, cosine: Any, active: Any) -> Any:
+def _reflectance(tables: _Tables, shape: Array, cosine: Floats, active: Masks) -> Array:
     """Unpolarised Fresnel reflectance: a metal's, one interface's, or 2F / (1 + F) of a thin pane."""
     kind = dr.gather(Float, tables.kind, shape, active)
     cosine = dr.minimum(dr.abs(cosine), 1)
@@ -109,19 +110,18 @@ def _reflectance(tables: _Tables, shape: Any, cosine: Any, active: Any) -> Any:
 def _connect(
     world: TracedScene,
     tables: _Tables,
-    start: Any,
-    lift: Any,
-    target: Any,
-    sequence: list[Any],
-    active: Any,
+    ends: tuple[Array, Array, Array],
+    sequence: list[Array],
+    active: Masks,
     in_air: bool,
-) -> tuple[Any, Any, Any, Any]:
-    """The way from `start` toward the laser's image `target`, folded by the planes of `sequence`.
+) -> tuple[Array, Array, Array, Array]:
+    """Follow the way from a start toward the laser's image, folded by the planes of `sequence`.
 
     Returns the product of reflectances and transmissions (0: the way does not exist or is blocked), the delay and the
-    shortening of the spreading by glass [m], and the last mirror point, which the laser shines on. Rays start at
-    `start` + `lift`, off the surface.
+    shortening of the spreading by glass [m], and the last mirror point, which the laser shines on. `ends` are
+    the start, how far off its surface rays start, and the image.
     """
+    start, lift, target = ends
     along = target - start
     left = dr.norm(along)
     direction = along / left
@@ -152,7 +152,7 @@ def _connect(
         probe = dr.minimum(1e-4 * scale, 0.3 * step)
         ray = mi.Ray3f(position - probe * direction, direction)
         ray.maxt = 2 * probe
-        si = world.traced.ray_intersect(ray, lit)
+        si = world.mi_scene.ray_intersect(ray, lit)
         shape = dr.gather(UInt32, tables.shape, plane, lit)
         lit &= si.is_valid() & (shape_index(si) == shape)
         if world.has_cutouts:
@@ -188,7 +188,7 @@ def _glints(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.
     target = mi.Point3f(*(upload(Float, axis) for axis in (lanes + world.eye_m).T))
     start = mi.Point3f(world.eye) + dr.zeros(mi.Vector3f, len(lanes))
     active = dr.full(Bool, True, len(lanes))
-    weight, delay, shortening, _ = _connect(world, tables, start, mi.Vector3f(0), target, planes, active, True)
+    weight, delay, shortening, _ = _connect(world, tables, (start, mi.Vector3f(0), target), planes, active, True)
     dr.eval(weight, delay, shortening)
     weight, delay, shortening = (
         np.array(value, dtype=np.float64).reshape(-1, LOBE_RAYS) for value in (weight, delay, shortening)
@@ -229,7 +229,7 @@ def _raster(world: TracedScene, direction: np.ndarray) -> tuple[np.ndarray, np.n
     z = np.where(ahead, z, 1)
     column, row = camera.focal_px * x / z + camera.width / 2, camera.focal_px * y / z + camera.height / 2
     # a direction along the border of two pixels belongs to the later one, whatever rounding says
-    return tuple(np.where(ahead, np.floor(value + 1e-9), -1) for value in (column, row))
+    return np.where(ahead, np.floor(column + 1e-9), -1), np.where(ahead, np.floor(row + 1e-9), -1)
 
 
 def _shines_on(
@@ -267,7 +267,7 @@ def _mirrored(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: n
     target = mi.Point3f(*(dr.opaque(Float, float(v)) for v in image + world.eye_m))
     planes = [dr.opaque(UInt32, int(plane)) for plane in sequence]
     pixels, cells = np.arange(camera.height * camera.width), grid * grid
-    per_chunk = max(1, LANES // cells)
+    per_chunk = max(1, CELLS_PER_LAUNCH // cells)
     parts = []
     for first in range(0, len(pixels), per_chunk):
         chunk = pixels[first : first + per_chunk]
@@ -282,8 +282,8 @@ def _mirrored(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: n
 
 
 def _cells(
-    world: TracedScene, tables: _Tables, first: int, lanes: int, grid: int, target: Any, planes: list[Any]
-) -> tuple[Any, Any, Any, Any]:
+    world: TracedScene, tables: _Tables, first: int, lanes: int, grid: int, target: UInts, planes: list[Array]
+) -> tuple[Array, Array, Array, Array]:
     """Per cell of the pixels from `first` on: path and its half width [m], radiance / cells, mirrors met on the way."""
     side = dr.opaque(UInt32, grid)
     lane = dr.arange(UInt32, lanes)
@@ -301,7 +301,7 @@ def _cells(
     length = dr.norm(along)
     direction = along / length
     lift = si.n * dr.select(dr.dot(si.n, direction) > 0, 1e-5, -1e-5) * (length + dr.norm(si.p - world.eye))
-    passed, delay, shortening, last = _connect(world, tables, si.p, lift, target, planes, active, False)
+    passed, delay, shortening, last = _connect(world, tables, (si.p, lift, target), planes, active, False)
     active &= in_beam(world, last, pixel)
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)[0]
     intensity = dr.gather(Float, world.intensity, pixel, active)
@@ -313,7 +313,7 @@ def _cells(
 
 
 @dr.syntax
-def _seen(world: TracedScene, tables: _Tables, ray: Any, lanes: int) -> tuple[Any, ...]:
+def _seen(world: TracedScene, tables: _Tables, ray: Rays, lanes: int) -> tuple[Array, ...]:
     """The first surface that is no plane mirror: interaction, weight of the way, optical and geometric length [m].
 
     Also the camera's axes as the mirrors show them (the unfolded camera's frame) and the number of mirrors met.
@@ -343,7 +343,9 @@ def _seen(world: TracedScene, tables: _Tables, ray: Any, lanes: int) -> tuple[An
     return si, weight, optical, distance, (right, down, forward), met
 
 
-def _half_width(local: Any, axes: tuple, normal: Any, from_laser: Any, distance: Any, pitch: Any) -> Any:
+def _half_width(
+    local: Vectors, axes: tuple, normal: Vectors, from_laser: Vectors, distance: Floats, pitch: Floats
+) -> Array:
     """Half width [m] of the path lengths over a cell of angular size `pitch`, sqrt(a^2 + b^2), by the tangent plane.
 
     In the unfolded camera's frame the point seen along l = (x, y, 1) lies at rho = const |l| / (n . l), so

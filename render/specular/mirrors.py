@@ -48,8 +48,9 @@ class SlabError(NamedTuple):
 
 
 def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
-    """All plane smooth faces of a scene, and notes that name the smooth surfaces that are curved."""
-    rows, notes, curved = [], [], {}
+    """Return all plane smooth faces of a scene, and notes that name the smooth surfaces that are curved."""
+    rows, notes = [], []
+    curved: dict[str, None] = {}
     for shape, group in zip(world.shape_ids, world.groups, strict=True):
         kind = group[0].material.kind
         if kind not in COATED:
@@ -80,7 +81,7 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
 
 
 def planes_of(surface: Surface, origin: np.ndarray) -> list[tuple] | None:
-    """Planes (normal, offset, low, high) of a mesh relative to `origin`; None for a curved one.
+    """Return planes (normal, offset, low, high) of a mesh relative to `origin`; None for a curved one.
 
     Triangles without area do not count.
     """
@@ -130,13 +131,13 @@ def _add_plane(planes: list[tuple], plane: tuple) -> None:
 
 
 def glint_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
-    """Mirrors in a row, (m, k) plane indices for k = 1, 2, 3. Solid glass, which refracts, stands alone."""
+    """Return mirrors in a row, (m, k) plane indices for k = 1, 2, 3. Solid glass, which refracts, stands alone."""
     found = [np.arange(len(mirrors.offset))[:, None]] if len(mirrors.offset) else []
     return found + _longer(np.flatnonzero(~mirrors.is_solid), MAX_SEQUENCES, notes, "glints")
 
 
 def image_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
-    """Sequences (k,) of metal mirrors that light the scene, the shorter ones first."""
+    """Return sequences (k,) of metal mirrors that light the scene, the shorter ones first."""
     metal = np.flatnonzero(mirrors.is_metal)
     if len(metal) > MAX_IMAGES:
         notes.append(f"mirrors: {len(metal) - MAX_IMAGES} of {len(metal)} planes light no other surface")
@@ -161,7 +162,7 @@ def _longer(planes: np.ndarray, most: int, notes: list[str], what: str) -> list[
 
 
 def image_of(mirrors: Mirrors, sequence: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """S_1 ... S_k x of a point for each row of (m, k) planes, (m, 3)."""
+    """Return S_1 ... S_k x of a point for each row of (m, k) planes, (m, 3)."""
     image = np.tile(point, (len(sequence), 1))
     for plane in sequence.T[::-1]:
         normal = mirrors.normal[plane]
@@ -172,7 +173,8 @@ def image_of(mirrors: Mirrors, sequence: np.ndarray, point: np.ndarray) -> np.nd
 def specular_points(
     mirrors: Mirrors, sequence: np.ndarray, image: np.ndarray, slack_rad: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the way from the camera to an image last leaves a mirror, (m, 3), and whether it may exist at all, (m,)."""
+    """Return where the way from the camera to an image last leaves a mirror, (m, 3), and whether it may exist at all,
+    (m,)."""
     total = np.linalg.norm(image, axis=1)
     direction = image / np.maximum(total, 1e-300)[:, None]
     position, left = np.zeros_like(image), total
@@ -194,7 +196,7 @@ def specular_points(
 
 
 def check_slabs(world: TracedScene) -> list[str]:
-    """Notes on light that a straight line through solid glass puts in a wrong place.
+    """Return notes on light that a straight line through solid glass puts in a wrong place.
 
     Raises InputError where that is more than 10 mm of path beside a displaced laser.
     """
@@ -220,7 +222,7 @@ def _gathered(names: list[str]) -> str:
 
 
 def slab_error_m(world: TracedScene) -> list[SlabError]:
-    """Bounds over the view on the error of a straight line through each solid of glass that the camera faces.
+    """Return bounds over the view on the error of a straight line through each solid of glass that the camera faces.
 
     At incidence a (b inside, sin a = n sin b) a slab of thickness t shifts a ray sideways by
     t sin a (1 - cos a / sqrt(n^2 - sin^2 a)), and a straight line is longer in path by at most

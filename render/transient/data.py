@@ -109,12 +109,12 @@ class Transient:
         return np.repeat(np.arange(self.height * self.width), np.diff(self.offsets))
 
     def total_radiance(self) -> np.ndarray:
-        """Sum of the returns of each pixel [1/(m^2 sr)], (H, W) float64."""
+        """Return the sum of the returns of each pixel [1/(m^2 sr)], (H, W) float64."""
         total = np.bincount(self.return_pixel, weights=self.radiance, minlength=self.height * self.width)
         return total.reshape(self.height, self.width)
 
     def mean_path_m(self) -> np.ndarray:
-        """Radiance-weighted mean optical path length of each pixel [m], (H, W) float64; NaN without returns."""
+        """Return radiance-weighted mean optical path length of each pixel [m], (H, W) float64; NaN without returns."""
         centre = 0.5 * (self.path_near_m.astype(np.float64) + self.path_far_m)
         pixels = self.height * self.width
         moment = np.bincount(self.return_pixel, weights=self.radiance * centre, minlength=pixels)
@@ -129,7 +129,7 @@ class Transient:
         return float(self.radiance[self.bounces > 1].sum(dtype=np.float64)) / total if total > 0 else 0.0
 
     def delayed(self, offset_m: float) -> Transient:
-        """The same scene `offset_m` farther in time alone (a `time` offset): paths + 2 offset, depth + offset.
+        """Return the same scene `offset_m` farther in time alone (a `time` offset): paths + 2 offset, depth + offset.
 
         Raises InputError with a displaced laser, for which a delay is no distance.
         """
@@ -144,7 +144,7 @@ class Transient:
         )
 
     def sha256(self) -> str:
-        """SHA-256 over all arrays, in the order of the fields."""
+        """Return SHA-256 over all arrays, in the order of the fields."""
         sha = hashlib.sha256(f"{self.height}x{self.width}".encode())
         for name in (*RETURN_FIELDS, "offsets", "depth_m", "normal", "albedo", "ambient", "mixed", "error"):
             sha.update(np.ascontiguousarray(getattr(self, name)).tobytes())
@@ -264,7 +264,7 @@ def _assemble(deep: dict[str, np.ndarray], flat: dict[str, np.ndarray]) -> Trans
         height=height,
         width=width,
         offsets=np.concatenate(([0], np.cumsum(sizes))).astype(np.int64),
-        **columns,
+        **columns,  # type: ignore[arg-type]  # names and types of the file's columns, checked above
         depth_m=flat["depth"],
         normal=np.stack([flat[f"normal.{axis}"] for axis in "XYZ"], axis=-1),
         albedo=flat["albedo"],

@@ -26,7 +26,7 @@ from scenes.io.inputs import parse_json
 
 PATH_STEP_M, WIDTH_STEP_M, DEPTH_STEP_M = 2.0**-10, 2.0**-8, 2.0**-12
 RADIANCE_STEPS, AMBIENT_STEPS = 125, 4  # per octave
-FINER = 4  # an EXR file of a set keeps lengths in steps that much smaller
+EXR_STEP_DIVISOR = 4  # an EXR file of a set keeps lengths in steps that much smaller
 OCTAVES = 32  # below and above 1; codes are uint16, 0 is 0
 NO_DEPTH = 0
 PER_VIEW = {"count": np.uint16, "depth": np.int32, "mixed": np.uint8, "albedo": np.uint8, "ambient": np.uint16}
@@ -88,17 +88,17 @@ def _interval(centre: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def rounded(view: Transient) -> Transient:
-    """The transient rounded for a smaller EXR file: lengths in quarter steps of a pack, radiances of 11 bits, ambient
-    light and errors of 8, normals in steps of 1/256."""
+    """Return the transient rounded for a smaller EXR file: lengths in quarter steps of a pack, radiances of 11 bits,
+    ambient light and errors of 8, normals in steps of 1/256."""
 
     def stepped(lengths: np.ndarray, step: float) -> np.ndarray:
         return (np.rint(lengths.astype(np.float64) / step) * step).astype(np.float32)
 
     return replace(
         view,
-        path_near_m=stepped(view.path_near_m, PATH_STEP_M / FINER),
-        path_far_m=stepped(view.path_far_m, PATH_STEP_M / FINER),
-        depth_m=stepped(view.depth_m, DEPTH_STEP_M / FINER),
+        path_near_m=stepped(view.path_near_m, PATH_STEP_M / EXR_STEP_DIVISOR),
+        path_far_m=stepped(view.path_far_m, PATH_STEP_M / EXR_STEP_DIVISOR),
+        depth_m=stepped(view.depth_m, DEPTH_STEP_M / EXR_STEP_DIVISOR),
         normal=(np.rint(view.normal.astype(np.float32) * 256) / 256).astype(np.float16),
         radiance=_short(view.radiance, 11),
         ambient=_short(view.ambient, 8),
@@ -308,8 +308,8 @@ def read_pack(path: Path) -> Pack:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except (OSError, RuntimeError, KeyError, ValueError, IndexError, TypeError, AttributeError, MemoryError) as error:
-        told = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: not a readable pack ({told or type(error).__name__})") from None
+        message = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: not a readable pack ({message or type(error).__name__})") from None
     for array in arrays.values():
         array.setflags(write=False)
     return Pack(arrays, starts, metas)

@@ -25,7 +25,7 @@ COLUMN_TYPES = (np.int32, np.float32, np.float32, np.float32, np.uint8)
 SORTED = 1 << 19  # samples sorted at a time
 
 
-class Growing:
+class SampleBuffer:
     """Samples that come part by part. They are joined one column at a time: no more than one is ever held twice."""
 
     def __init__(self) -> None:
@@ -41,8 +41,8 @@ class Growing:
         self._count += len(part.pixel)
 
     def finished(self, release: Callable[[], None] = lambda: None) -> Samples:
-        """All samples; nothing more can be added. `release` is called before each column is joined: the parts of the
-        last one are free then."""
+        """Return all samples; nothing more can be added. `release` is called before each column is joined: the parts of
+        the last one are free then."""
         joined = []
         while self._columns:
             release()
@@ -61,17 +61,17 @@ class Returns(NamedTuple):
 
 
 def select(samples: Samples, kept: np.ndarray | slice) -> Samples:
-    """The samples where `kept` is true, or those that it numbers; of a slice, views."""
+    """Return the samples where `kept` is true, or those that it numbers; of a slice, views."""
     return Samples(*(column[kept] for column in samples))
 
 
 def select_pixels(samples: Samples, pixels: np.ndarray) -> Samples:
-    """Those of some pixels."""
+    """Return those of some pixels."""
     return select(samples, np.isin(samples.pixel, pixels))
 
 
 def packed(*columns: np.ndarray) -> Samples:
-    """Samples of columns of any type, as `COLUMN_TYPES`."""
+    """Return samples of columns of any type, as `COLUMN_TYPES`."""
     return Samples(*(column.astype(kind, copy=False) for column, kind in zip(columns, COLUMN_TYPES, strict=True)))
 
 
@@ -94,7 +94,7 @@ def merge(samples: Samples, tolerance_m: float) -> Samples:
 
 
 def with_energy(samples: Samples) -> Samples:
-    """Those that carry light."""
+    """Return those that carry light."""
     lit = samples.radiance > 0
     return samples if lit.all() else select(samples, lit)
 
@@ -149,5 +149,5 @@ def to_returns(samples: Samples, pixels: int) -> Returns:
 
 
 def no_samples(room: int = 0) -> Samples:
-    """An empty list of samples, or room for so many."""
+    """Return an empty list of samples, or room for so many."""
     return Samples(*(np.empty(room, kind) for kind in COLUMN_TYPES))

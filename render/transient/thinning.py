@@ -13,7 +13,7 @@ PULSE_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PULSE_SIGMA_S
 
 
 def thinned(view: Transient, error: float) -> Transient:
-    """The transient with neighbouring direct returns of a pixel merged into one uniform return each.
+    """Return the transient with neighbouring direct returns of a pixel merged into one uniform return each.
 
     A group of returns and the uniform one of equal energy, mean and variance differ from the third moment on. After a
     Gaussian pulse of standard deviation s, the first two terms of that difference are the pulse's third derivative

@@ -30,9 +30,9 @@ _BLOCK = 1 << 15  # pixels of fresh counts; a megapixel holds them 32 times, eac
 
 
 def run(command: Any, progress: Progress) -> dict:
-    """Rows of `name`, `seconds`, `cpu_seconds` (of all threads: what one free core takes), `error` (numbers that differ
-    from the interpreted program's) and rates; CSV in `command.out`. `command.quick` leaves out the megapixel frames;
-    `command.only` names programs."""
+    """Run the bench: rows of `name`, `seconds`, `cpu_seconds` (of all threads: what one free core takes), `error`
+    (numbers that differ from the interpreted program's) and rates; CSV in `command.out`. `command.quick` leaves out the
+    megapixel frames; `command.only` names programs."""
     names = list(command.only) or list(PUBLISHED)
     out = command.out
     require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
@@ -67,8 +67,8 @@ def _counts(pixels: int, seed: int) -> np.ndarray:
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(8, pixels)))
     counts = random.poisson((PHOTONS - 50) / TIMESTAMPS, (pixels, TIMESTAMPS)).astype(np.uint8)
     peak = random.integers(1, TIMESTAMPS - 1, pixels)
-    for step, share in ((-1, 0.25), (0, 0.5), (1, 0.25)):
-        counts[np.arange(pixels), peak + step] += random.poisson(50 * share, pixels).astype(np.uint8)
+    for step, fraction in ((-1, 0.25), (0, 0.5), (1, 0.25)):
+        counts[np.arange(pixels), peak + step] += random.poisson(50 * fraction, pixels).astype(np.uint8)
     return counts
 
 

@@ -82,7 +82,8 @@ def run(command: Bench, progress: Progress) -> dict:
 
 
 def photons(rng: np.random.Generator, batch: int, size: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    """Detections of a batch of patches, Poisson with mean PHOTONS a pixel, half of them in a pulse: uint16, int64."""
+    """Return detections of a batch of patches, Poisson with mean PHOTONS a pixel, half of them in a pulse: uint16,
+    int64."""
     pixels, bins = batch * size[1] * size[2], size[0]
     numbers = rng.poisson(PHOTONS, pixels)
     pixel = np.repeat(np.arange(pixels), numbers)
@@ -93,7 +94,7 @@ def photons(rng: np.random.Generator, batch: int, size: tuple[int, int, int]) ->
 
 
 def dense(stamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
-    """(B, 1, T, R, C) float32 counts, each detection scattered into its place: the quickest way found."""
+    """Return (B, 1, T, R, C) float32 counts, each detection scattered into its place: the quickest way found."""
     bins, pixels = size[0], size[1] * size[2]
     images = (len(offsets) - 1) // pixels
     pixel = torch.arange(images * pixels)
@@ -105,13 +106,15 @@ def dense(stamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor
 
 
 def dense_of_sensor(stamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
-    """The same by `formats.histogram`, as a histogram file is read: integer counts pixel by pixel, then time first."""
+    """Return the same by `formats.histogram`, as a histogram file is read: integer counts pixel by pixel, then time
+    first."""
     counts = counts_from_timestamps(stamps.numpy(), offsets.numpy(), size[0])
     return torch.from_numpy(counts).view(-1, 1, *size[1:], size[0]).permute(0, 1, 4, 2, 3).float().contiguous()
 
 
 def convolved(layer: CompressiveLayer, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Codes and back-projection as published: strided convolutions of the constrained weights, transposed ones back."""
+    """Return codes and back-projection as published: strided convolutions of the constrained weights, transposed ones
+    back."""
 
     def normalised(values: Tensor, axis: int) -> Tensor:
         values = values - values.mean(axis, keepdim=True)
@@ -148,7 +151,8 @@ def measure_layer(design: Design, counts: Tensor, rounds: int, seed: int) -> lis
 
 
 def measure_encoding(design: Design, stamps: Tensor, offsets: Tensor, rounds: int, seed: int) -> list[Row]:
-    """Codes from timestamps with fixed weights, as a sensor has them: both routes may prepare the weights before."""
+    """Return codes from timestamps with fixed weights, as a sensor has them: both routes may prepare the weights
+    before."""
     with torch.no_grad():
         layer = CompressiveLayer.of(design, seed=seed)
         weights = layer.weights()
@@ -194,8 +198,8 @@ def _deviation(value: Tensor, exact: Tensor) -> float:
 
 
 def _line(row: Row) -> str:
-    said = f"{row.part:<7} {row.design:<26} {row.name:<32} {1000 * row.seconds:>8.2f} ms"
-    return f"{said} (least {1000 * row.least_seconds:.2f})  error {row.error:.1e}  {row.speedup:.1f}x"
+    message = f"{row.part:<7} {row.design:<26} {row.name:<32} {1000 * row.seconds:>8.2f} ms"
+    return f"{message} (least {1000 * row.least_seconds:.2f})  error {row.error:.1e}  {row.speedup:.1f}x"
 
 
 def _write(rows: list[Row], folder: Path) -> dict[str, str]:

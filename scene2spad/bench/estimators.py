@@ -31,7 +31,7 @@ GROUPS = ("all", "unmixed", "mixed")
 
 
 def middlebury(folder: Path) -> Transient:
-    """One Middlebury RGB-D pair as a transient of 8 x 8 returns a pixel; albedo and ambient light are its luma.
+    """Return one Middlebury RGB-D pair as a transient of 8 x 8 returns a pixel; albedo and ambient light are its luma.
 
     Cut to a whole number of pixels; samples without disparity return nothing.
     """
@@ -54,9 +54,9 @@ def table(
     *,
     methods: Iterable[str] = METHODS,
     seed: int = 0,
-    progress: Callable[[str, float], None] = lambda what, share: None,
+    progress: Callable[[str, float], None] = lambda what, fraction: None,
 ) -> list[dict]:
-    """One row for each scene, level, method and group of pixels: the figures of `depth_errors`."""
+    """Return one row for each scene, level, method and group of pixels: the figures of `depth_errors`."""
     rows, scenes, levels = [], list(scenes), list(levels)
     for number, (name, transient) in enumerate(scenes):
         leave_out = {"all": np.zeros_like(transient.mixed), "unmixed": transient.mixed, "mixed": ~transient.mixed}
@@ -74,7 +74,8 @@ def table(
 
 
 def scenes_of(command: Any) -> list[tuple[str, Transient]]:
-    """Views of the rendered set that is asked for, else the Middlebury images of the data folder; none without both.
+    """Return views of the rendered set that is asked for, else the Middlebury images of the data folder; none without
+    both.
 
     Only the first where it is to be quick. Raises InputError as `read_views` does.
     """
@@ -88,14 +89,14 @@ def scenes_of(command: Any) -> list[tuple[str, Transient]]:
 
 
 def mean_over(rows: list[dict], key: str, **where: object) -> float:
-    """Mean of a figure over the rows that match, each scene and level counting once; NaN for none."""
+    """Return mean of a figure over the rows that match, each scene and level counting once; NaN for none."""
     chosen = [row[key] for row in rows if all(row[name] == value for name, value in where.items())]
     known = [value for value in chosen if not np.isnan(value)]
     return float(np.mean(known)) if known else float("nan")
 
 
 def summary(rows: list[dict]) -> dict:
-    """{method: {group: {mae_mm, rmse_mm, within_10mm}}}, means over scenes and levels."""
+    """Return {method: {group: {mae_mm, rmse_mm, within_10mm}}}, means over scenes and levels."""
     keys = ("mae_mm", "rmse_mm", "within_10mm")
     return {
         method: {group: {key: mean_over(rows, key, method=method, group=group) for key in keys} for group in GROUPS}
@@ -104,7 +105,8 @@ def summary(rows: list[dict]) -> dict:
 
 
 def markdown(rows: list[dict]) -> list[str]:
-    """Two tables: MAE of every estimator at every level, and all figures over all levels; all, unmixed, mixed pixels.
+    """Return two tables: MAE of every estimator at every level, and all figures over all levels; all, unmixed, mixed
+    pixels.
 
     A cell of the first is the mean over scenes; one of the second also over levels.
     """
@@ -126,7 +128,7 @@ def _cell(rows: list[dict], key: str, digits: str, scale: float = 1, **where: ob
 
 
 def draw(rows: list[dict], path: Path) -> Path:
-    """MAE and share within 10 mm of every estimator at every level, unmixed pixels, mean over scenes."""
+    """Draw MAE and share within 10 mm of every estimator at every level, unmixed pixels, mean over scenes."""
     levels = sorted({(row["signal"], row["background"]) for row in rows})
     figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.6), layout="constrained")
     labels = [f"{signal:g} / {background:g}" for signal, background in levels]

@@ -50,7 +50,7 @@ def run(command: Any, progress: Progress) -> dict:
 
 
 def chosen(only: Iterable[str], *, quick: bool = False) -> list[Case]:
-    """The cases of those names, all where none is named; InputError for a name that is not there."""
+    """Return the cases of those names, all where none is named; InputError for a name that is not there."""
     names = [only] if isinstance(only, str) else list(only)
     for name in names:
         require(name in CASES, f"hard case {name!r}: expected one of {', '.join(CASES)}")
@@ -58,7 +58,7 @@ def chosen(only: Iterable[str], *, quick: bool = False) -> list[Case]:
 
 
 def row(case: Case, seed: int) -> dict:
-    """One line of the table. A case that a renderer refuses or breaks on has failed; the others go on."""
+    """Return one line of the table. A case that a renderer refuses or breaks on has failed; the others go on."""
     start = time.perf_counter()
     reason = ""
     try:
@@ -66,10 +66,10 @@ def row(case: Case, seed: int) -> dict:
     except (InputError, ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
         errors, clipped = {"refused": Measured(math.inf, 0)}, 0
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-    quantity, worst = max(errors.items(), key=lambda item: item[1].share)
+    quantity, worst = max(errors.items(), key=lambda item: item[1].fraction)
     return {
         "name": case.name,
-        "passed": bool(worst.share <= 1),
+        "passed": bool(worst.fraction <= 1),
         "quantity": quantity,
         "error": float(worst.error),
         "limit": float(worst.limit),
@@ -90,7 +90,7 @@ def _write(out: Path, rows: list[dict]) -> Path:
         writer.writerow(COLUMNS)
         for one in rows:
             for quantity, (error, limit) in one["quantities"].items():
-                passed = Measured(error, limit).share <= 1
+                passed = Measured(error, limit).fraction <= 1
                 shown = [f"{value:.4g}" for value in (error, limit, one["seconds"])]
                 writer.writerow((one["name"], passed, quantity, *shown, one["clipped"], one["oracle"]))
     return path

@@ -76,7 +76,7 @@ def gmac(network: nn.Module, size: tuple[int, ...] = PATCH) -> float:
 
 
 def seconds_of(work: Callable[[], Any], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Median of warm runs."""
+    """Return median of warm runs."""
     work()
     taken = []
     for _ in range(repeats):
@@ -116,7 +116,7 @@ def run(command: Bench, progress: Progress) -> dict:
 
 
 def measure(name: str, limit_s: float, repeats: int, seed: int) -> Row:
-    """One network behind learned 256x4x4 codes at 128x: its costs, and its error after `limit_s` of training."""
+    """Return one network behind learned 256x4x4 codes at 128x: its costs, and its error after `limit_s` of training."""
     require(name in NETWORKS, f"network {name!r} is unknown")
     config = preset(PRESET, ModelConfig(design=DESIGN, network=name), seed=seed)
     model = DepthModel(config.model, seed)
@@ -136,7 +136,8 @@ def _step_seconds(network: nn.Module, x: Tensor, repeats: int) -> tuple[float, f
 
 
 def train_for(model: DepthModel, limit_s: float, seed: int) -> tuple[int, float, float]:
-    """Steps, seconds and final error [mm] of training on random planes until the time is up, at least one step."""
+    """Return steps, seconds and final error [mm] of training on random planes until the time is up, at least one
+    step."""
     training, rest = split_views(random_planes(SCENES, size=VIEW_PIXELS, seed=seed))
     packed, sensor = packed_views(training), model.config.sensor
     config = preset(PRESET, model.config, seed=seed)
@@ -159,7 +160,7 @@ def train_for(model: DepthModel, limit_s: float, seed: int) -> tuple[int, float,
 
 
 def measure_plain(repeats: int, seed: int) -> Row:
-    """The published layers as they stand, with the same weights as ours."""
+    """Return the published layers as they stand, with the same weights as ours."""
     torch.manual_seed(seed)
     ours, plain = DeepBoosting(can_die=False), PlainDeepBoosting(can_die=False)
     plain.load_state_dict(ours.state_dict())
@@ -175,10 +176,10 @@ def measure_plain(repeats: int, seed: int) -> Row:
 
 
 def _lines(rows: list[Row]) -> list[str]:
-    said = [f"{'network':<24} {'GMAC':>6} {'s / frame':>10} {'s / step':>9} {'CPU s':>6} {'steps':>6} {'error':>9}"]
+    lines = [f"{'network':<24} {'GMAC':>6} {'s / frame':>10} {'s / step':>9} {'CPU s':>6} {'steps':>6} {'error':>9}"]
     for row in rows:
-        said.append(
+        lines.append(
             f"{row.name:<24} {row.gmac:>6.2f} {row.seconds:>10.3f} {row.step_s:>9.3f} {row.step_cpu_s:>6.2f} "
             f"{row.trained_steps:>6} {row.error:>9.3g}"
         )
-    return said
+    return lines

@@ -61,10 +61,10 @@ def run(command: Bench, progress: Progress) -> dict:
     parts = [(case, transport) for case in cases for transport in METHODS]
     for number, (case, transport) in enumerate(parts):
 
-        def say(what: str, share: float, c: Case = case, t: str = transport, n: int = number) -> None:
-            progress(f"{c.name} {c.size} {t}: {what}", (n + share) / len(parts))
+        def report(what: str, fraction: float, c: Case = case, t: str = transport, n: int = number) -> None:
+            progress(f"{c.name} {c.size} {t}: {what}", (n + fraction) / len(parts))
 
-        found, check = _measure(case, transport, command, with_peer, say)
+        found, check = _measure(case, transport, command, with_peer, report)
         rows += found
         checks.append(check)
         log.info("%s", _check_line(check))
@@ -107,11 +107,11 @@ def _cases(command: Bench) -> list[Case]:
     return cases
 
 
-def _measure(case: Case, transport: str, command: Bench, with_peer: bool, say: Progress) -> tuple[list[Row], dict]:
+def _measure(case: Case, transport: str, command: Bench, with_peer: bool, report: Progress) -> tuple[list[Row], dict]:
     """All methods of one case and transport, and what the reference is and how ours agrees with it."""
     methods = [m for m in METHODS[transport] if m.code == "ours" or with_peer]
     world = TracedScene(case.scene)
-    truth = _reference(case, transport, world, command, with_peer, lambda share: say("reference", 0.5 * share))
+    truth = _reference(case, transport, world, command, with_peer, lambda fraction: report("reference", 0.5 * fraction))
     bounces = BOUNCES[transport]
     runners = []
     for method in methods:
@@ -123,7 +123,7 @@ def _measure(case: Case, transport: str, command: Bench, with_peer: bool, say: P
     rows: dict[str, list[Row]] = {m.name: [] for m in methods}
     levels = max(map(len, grades))
     for number in range(levels):
-        say("timing", 0.5 + 0.5 * number / levels)
+        report("timing", 0.5 + 0.5 * number / levels)
         level = [(r, g[number]) for r, g in zip(runners, grades, strict=True) if number < len(g)]
         first = 1 + SEEDS_APART * command.seed
         for runner, quality, values in measure_level(level, truth, command.repeats, command.seeds, first):
@@ -262,11 +262,11 @@ def _table(rows: list[Row]) -> list[str]:
     lines = [head]
     for r in rows:
         case = f"{r.scene} {r.size} {r.transport}"
-        said = f"{case:<18} {r.method:<24} {r.unit:>4} {r.quality:>4} {_seconds(r.seconds):>9}"
-        said += f" {_seconds(r.cold_seconds):>9} {r.nrmse_raw:>8.5f} {r.nrmse_pulse:>8.5f}"
-        said += f" {r.pixel_median:>9.5f} {r.pixel_p95:>8.5f} {r.bias_raw:>8.5f} {r.energy_ratio:>8.5f}"
+        message = f"{case:<18} {r.method:<24} {r.unit:>4} {r.quality:>4} {_seconds(r.seconds):>9}"
+        message += f" {_seconds(r.cold_seconds):>9} {r.nrmse_raw:>8.5f} {r.nrmse_pulse:>8.5f}"
+        message += f" {r.pixel_median:>9.5f} {r.pixel_p95:>8.5f} {r.bias_raw:>8.5f} {r.energy_ratio:>8.5f}"
         below = " below the reference's resolution" if r.nrmse_raw <= r.resolution_raw else ""
-        lines.append(f"{said} {r.slope_raw:>6.2f}{' flattens: bias' if r.flattens else ''}{below}")
+        lines.append(f"{message} {r.slope_raw:>6.2f}{' flattens: bias' if r.flattens else ''}{below}")
     return lines
 
 

@@ -37,7 +37,7 @@ Progress = Callable[[str, float], None]
 
 
 def relief(height: int, width: int) -> Transient:
-    """A smooth procedural relief at 1.4 to 2.6 m with steps, four returns a pixel."""
+    """Return a smooth procedural relief at 1.4 to 2.6 m with steps, four returns a pixel."""
     y, x = np.mgrid[0 : 2 * height, 0 : 2 * width] / 20.0
     depth = 2 + 0.4 * np.sin(x) * np.cos(y / 1.3) + 0.2 * (np.floor(x / 2) % 2)
     albedo = 0.5 + 0.3 * np.cos(x + y)
@@ -45,7 +45,8 @@ def relief(height: int, width: int) -> Transient:
 
 
 def run(command: Any, progress: Progress) -> dict:
-    """Rows of `name`, `seconds`, `error` and what they are compared with; tables and picture in `command.out`.
+    """Run the bench: rows of `name`, `seconds`, `error` and what they are compared with; tables and picture in
+    `command.out`.
 
     `command` has `seed`, `repeats`, `quick` (two levels and one image in the table of estimators), `set`, `data` and
     `out`.
@@ -68,19 +69,19 @@ def run(command: Any, progress: Progress) -> dict:
             sensor_by_name("reference"),
             estimators.QUICK_LEVELS if command.quick else estimators.LEVELS,
             seed=command.seed,
-            progress=lambda what, share: progress(what, 0.3 + 0.7 * share),
+            progress=lambda what, fraction: progress(what, 0.3 + 0.7 * fraction),
         )
-        said = estimators.markdown(table)
-        result["estimators"] = estimators.summary(table) if command.json else said
+        lines = estimators.markdown(table)
+        result["estimators"] = estimators.summary(table) if command.json else lines
         with whole_file(out / "bench-estimators.md") as beside:
-            beside.write_text("\n".join(said) + "\n", encoding="utf-8")
+            beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
         result["table"] = str(write_csv(table, out / "bench-estimators.csv"))
         result["figure"] = str(estimators.draw(table, out / "bench-estimators.png"))
     return result
 
 
 def alternating(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median seconds of each way, warmed up once, run in turn."""
+    """Return median seconds of each way, warmed up once, run in turn."""
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for way in ways.values():
         way()
@@ -93,13 +94,13 @@ def alternating(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str
 
 
 def one_law(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """p-value of the chi-square test that two sets of counts (..., T) have the same distribution over bins."""
+    """Return p-value of the chi-square test that two sets of counts (..., T) have the same distribution over bins."""
     both = np.stack([counts.reshape(-1, counts.shape[-1]).sum(axis=0) for counts in (ours, theirs)])
     return float(stats.chi2_contingency(both[:, both.sum(axis=0) > 10]).pvalue)
 
 
 def against_dense(seed: int, repeats: int) -> list[dict]:
-    """numpy's Poisson draw of every bin from rates that it is given, beside our draws from the returns."""
+    """Return numpy's Poisson draw of every bin from rates that it is given, beside our draws from the returns."""
     transient, sensor, rows = relief(*SIZE), sensor_by_name("reference"), []
     for signal, background in BUDGETS:
         budget = PhotonBudget(signal, background)
@@ -125,7 +126,8 @@ def against_dense(seed: int, repeats: int) -> list[dict]:
 
 
 def first_photons(seed: int, repeats: int) -> list[dict]:
-    """The first-photon law at few and many cycles: at one budget an exposure, and at one flux a cycle (dense)."""
+    """Return the first-photon law at few and many cycles: at one budget an exposure, and at one flux a cycle
+    (dense)."""
     transient, budget = relief(*SIZE), PhotonBudget(10.0, 50.0)
     sensors = {cycles: _with_cycles(cycles) for cycles in CYCLES}
     ways = {
@@ -155,7 +157,7 @@ def _with_cycles(cycles: int) -> Sensor:
 
 
 def training(seed: int, repeats: int) -> dict:
-    """One batch: 4 patches of 32 x 32 x 1024 at two photon levels, from 64 x 64 transients in memory."""
+    """Return one batch: 4 patches of 32 x 32 x 1024 at two photon levels, from 64 x 64 transients in memory."""
     packed = packed_transients([relief(64, 64)] * 4)
     sensor = sensor_by_name("reference")
     patches = [Patch(i, 8 * i, 30 - 8 * i, *PATCHES[i % 2], seed=(seed, i)) for i in range(4)]

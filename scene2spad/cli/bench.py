@@ -10,7 +10,7 @@ from scenes.errors import InputError
 
 
 def run(command: Bench, progress: Progress) -> dict:
-    """One stage of the bench: the module of its name, imported only when it is asked for."""
+    """Run the command: one stage of the bench: the module of its name, imported only when it is asked for."""
     for name, value in (("seeds", command.seeds), ("repeats", command.repeats)):
         if not 1 <= value <= 1000:
             raise InputError(f"bench: {name} {value} is outside 1 to 1000")

@@ -32,7 +32,8 @@ class Calibrate(Common):
 
 
 def run(command: Calibrate, progress: Progress) -> dict:
-    """Captures -> sensor file, its standard errors, and the likelihood of the captures that were held out."""
+    """Run the command: captures -> sensor file, its standard errors, and the likelihood of the captures that were held
+    out."""
     from scene2spad.cli import calibrating
 
     return calibrating.run(command, progress)

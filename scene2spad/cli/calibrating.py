@@ -66,7 +66,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
 
 def calibrated_file(start: SensorFile, fitted: Calibration, name: str, how: str) -> SensorFile:
     """Return the sensor file of a calibration; the sources of what was not fitted are kept."""
-    sources = {key: said for key, said in start.sources.items() if not key.startswith(("pulse.", "jitter."))}
+    sources = {key: source for key, source in start.sources.items() if not key.startswith(("pulse.", "jitter."))}
     keys = ("histogram.bin_width", "pulse.samples", "pulse.step", *(f"zones.{key}" for key in CALIBRATED))
     sources.update(dict.fromkeys(keys, how))
     sensor = replace(fitted.sensor, name=name)
@@ -74,7 +74,7 @@ def calibrated_file(start: SensorFile, fitted: Calibration, name: str, how: str)
 
 
 def mean_deviance(captures: Sequence[ZoneCapture], fitted: Calibration) -> float:
-    """Poisson deviance a bin of captures: about 1 for a true model."""
+    """Return Poisson deviance a bin of captures: about 1 for a true model."""
     expected = [expected_zone_counts(c.returns, fitted.sensor, fitted.zones, c.drift_s) for c in captures]
     total = sum(poisson_deviance(c.counts, one) for c, one in zip(captures, expected, strict=True))
     return total / sum(c.counts.size for c in captures)

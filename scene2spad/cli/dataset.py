@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from render.settings import SHARED_AMBIENT_SPP
+from render.settings import FILTERED_AMBIENT_SPP
 from scene2spad.cli.paths import output_file
 from scene2spad.options.common import Common, Count, File, Number, Offset, Pixels, Positional, Progress, may_stay_open
 from scenes.library.sets import scene_set
@@ -44,7 +44,7 @@ class Dataset(Common):
     """Target of the relative error (default: 0.01 with 1 bounce, 0.03 with more)."""
     ambient: bool = True
     """Render ambient light."""
-    ambient_spp: int = SHARED_AMBIENT_SPP
+    ambient_spp: int = FILTERED_AMBIENT_SPP
     """Paths per pixel of ambient light, which neighbouring pixels share."""
     offset: float = 0.0
     """Move every scene this many metres away."""
@@ -53,7 +53,7 @@ class Dataset(Common):
 
 
 def run(command: Dataset, progress: Progress) -> dict:
-    """A scene set -> a folder of .exr files, and one .h5 of them all."""
+    """Run the command: A scene set -> a folder of .exr files, and one .h5 of them all."""
     from scene2spad.datasets.rendering import Job, make_set, pack_set
 
     of = scene_set(command.set)

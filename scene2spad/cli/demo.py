@@ -33,7 +33,7 @@ class Demo(Common):
 
 
 def run(command: Demo, progress: Progress) -> dict:
-    """Scene -> transient -> histogram -> four depth maps -> one figure."""
+    """Run the command: scene -> transient -> histogram -> four depth maps -> one figure."""
     from render.engine import render
     from render.transient import write_transient
     from scene2spad.plots import figures

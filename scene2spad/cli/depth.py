@@ -63,7 +63,7 @@ class Depth(Common):
 
 
 def run(command: Depth, progress: Progress) -> dict:
-    """Histogram -> depth map, error figures and a picture."""
+    """Run the command: histogram -> depth map, error figures and a picture."""
     from scene2spad.cli.sensing import mean_confidence
     from spad.estimators.depth import depth_errors
 
@@ -73,13 +73,13 @@ def run(command: Depth, progress: Progress) -> dict:
     out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
     histogram = open_histogram(source, command.frame)
     progress(command.method, 0.1)
-    network, share = _network(command), None
+    network, fraction = _network(command), None
     start = time.perf_counter()
     if network is None:
         depth = _chosen_method(command, histogram.sensor)(histogram)
     else:
         rule = command.int8_rule or "calibrated"
-        depth, share, overflows = network.estimate(
+        depth, fraction, overflows = network.estimate(
             histogram, int8=command.int8, int8_rule=rule, decoder=command.decoder
         )
         if overflows:
@@ -92,7 +92,7 @@ def run(command: Depth, progress: Progress) -> dict:
         log.info("%s: holds no true depth, so that no error can be stated", source)
     meta = {"method": label, "histogram_sha256": histogram.sha256()}
     camera = histogram.meta.get("transient", {}).get("camera")
-    write_depth(depth, out, meta | ({"camera": camera} if camera else {}), share)
+    write_depth(depth, out, meta | ({"camera": camera} if camera else {}), fraction)
     result = {
         "seconds": seconds,
         "method": label,
@@ -101,8 +101,8 @@ def run(command: Depth, progress: Progress) -> dict:
         "unmixed": depth_errors(depth, histogram.depth_m, range_m=range_m, exclude=histogram.mixed),
         "out": str(out),
     }
-    if share is not None:
-        result["posterior_within_3_bins"] = float(share.mean())
+    if fraction is not None:
+        result["posterior_within_3_bins"] = float(fraction.mean())
     if command.figure:
         from scene2spad.plots import figures
 

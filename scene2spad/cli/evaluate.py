@@ -11,7 +11,7 @@ PUBLISHED_SET = Path("published")
 
 
 def run(command: Evaluate, progress: Progress) -> dict:
-    """Checkpoints and a set -> errors."""
+    """Run the command: checkpoints and a set -> errors."""
     if command.set == PUBLISHED_SET:
         from scene2spad.datasets import published
 

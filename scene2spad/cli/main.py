@@ -113,7 +113,7 @@ def main(argv: list[str]) -> int:
         print("interrupted; finished files stay, nothing is half-written", file=sys.stderr)
         return 130
     try:
-        print(json.dumps(finite(result), allow_nan=False) if command.json else _prose(result), flush=True)
+        print(json.dumps(finite(result), allow_nan=False) if command.json else _format_result(result), flush=True)
     except BrokenPipeError:
         sys.stdout = None  # the reader has gone: Python must not try to flush again
     except OSError as error:
@@ -152,15 +152,15 @@ def _check_words(argv: list[str]) -> None:
 
 def _parse(argv: list[str]) -> Common:
     _check_words(argv)
-    said = io.StringIO()
+    usage = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(usage):
             return tyro.cli(Command, prog="scene2spad", description=DESCRIPTION, args=argv)
     except SystemExit as stop:
         if stop.code:
-            print(f"scene2spad: {_one_line(said.getvalue())}", file=sys.stderr)
+            print(f"scene2spad: {_one_line(usage.getvalue())}", file=sys.stderr)
             raise SystemExit(2) from None
-        sys.stderr.write(said.getvalue())
+        sys.stderr.write(usage.getvalue())
         raise
 
 
@@ -183,21 +183,21 @@ def _refuse(reason: str) -> int:
     return 2
 
 
-def _prose(result: dict) -> str:
-    return "\n".join(f"{key}: {_spelled(value)}" for key, value in result.items())
+def _format_result(result: dict) -> str:
+    return "\n".join(f"{key}: {_format_value(value)}" for key, value in result.items())
 
 
-def _spelled(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, dict):
         flat = all(isinstance(item, (int, float)) for item in value.values())
-        spelled = [f"{key}: {_spelled(item)}" for key, item in value.items()]
-        return ", ".join(spelled) if flat else "".join(f"\n  {item}".replace("\n", "\n  ") for item in spelled)
+        formatted = [f"{key}: {_format_value(item)}" for key, item in value.items()]
+        return ", ".join(formatted) if flat else "".join(f"\n  {item}".replace("\n", "\n  ") for item in formatted)
     if isinstance(value, (list, tuple)) and all(isinstance(item, (int, float)) for item in value):
-        return " ".join(map(_spelled, value))
+        return " ".join(map(_format_value, value))
     if isinstance(value, (list, tuple)):
-        return "".join(f"\n  {_spelled(item)}" for item in value)
+        return "".join(f"\n  {_format_value(item)}" for item in value)
     return str(value)
 
 
@@ -220,4 +220,4 @@ def _progress() -> Iterator[Progress]:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("start", total=1.0)
-        yield lambda what, share: bar.update(task, description=what, completed=share)
+        yield lambda what, fraction: bar.update(task, description=what, completed=fraction)

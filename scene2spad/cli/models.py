@@ -31,7 +31,8 @@ class Models(Common):
 
 
 def run(command: Models, progress: Progress) -> dict:
-    """Cards of the shipped models, a line each, or one's whole; or a published checkpoint as a model."""
+    """Run the command: cards of the shipped models, a line each, or one's whole; or a published checkpoint as a
+    model."""
     if command.name == IMPORT:
         return _import(command)
     if command.file or command.sensor or command.out:
@@ -46,8 +47,10 @@ def run(command: Models, progress: Progress) -> dict:
     lines = []
     for card in found:
         error = "no error recorded" if card.val_mae_mm is None else f"validation MAE {card.val_mae_mm:.1f} mm"
-        said = f"{card.name}: {card.model}, {card.compression:g}x; {', '.join(card.training)}; {card.levels}; {error}"
-        lines.append(f"{said}; not for {'; '.join(card.not_for)}")
+        message = (
+            f"{card.name}: {card.model}, {card.compression:g}x; {', '.join(card.training)}; {card.levels}; {error}"
+        )
+        lines.append(f"{message}; not for {'; '.join(card.not_for)}")
     return {"models": lines}
 
 

@@ -18,7 +18,7 @@ def input_file(path: Path) -> Path:
 
 
 def output_file(path: Path, suffix: str, kind: str) -> Path:
-    """An output path that can be written later, with its picture: checked before the work, not after it.
+    """Return an output path that can be written later, with its picture: checked before the work, not after it.
 
     Results of the same kind may be written again; any other file is not overwritten.
     """
@@ -49,5 +49,5 @@ def _holds(path: Path, words: bytes) -> bool:
 
 
 def picture(path: Path, kind: str) -> Path:
-    """The picture's name beside a result: its own kind, so that it meets no texture and no other picture."""
+    """Return the picture's name beside a result: its own kind, so that it meets no texture and no other picture."""
     return path.with_name(f"{path.stem}.{kind}.png")

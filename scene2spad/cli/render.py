@@ -108,7 +108,7 @@ class Render(Common):
 
 
 def run(command: Render, progress: Progress) -> dict:
-    """Scene -> .exr and a picture of its layers."""
+    """Run the command: scene -> .exr and a picture of its layers."""
     from render.engine import render
     from render.transient import write_transient
     from scene2spad.plots import figures

@@ -7,7 +7,7 @@ from scene2spad.options.experiments import Report
 
 
 def run(command: Report, progress: Progress) -> dict:
-    """Results -> one page."""
+    """Run the command: results -> one page."""
     from scene2spad.report import page as report
 
     return report.run(command, progress)

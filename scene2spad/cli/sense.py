@@ -87,7 +87,7 @@ class Sense(Common):
 
 
 def run(command: Sense, progress: Progress) -> dict:
-    """Transient -> .h5, a picture of its counts, and with --export the .mat layout."""
+    """Run the command: transient -> .h5, a picture of its counts, and with --export the .mat layout."""
     from scene2spad.cli import sensing
 
     return sensing.run(command, progress)

@@ -102,13 +102,13 @@ def optics_of(command: Sense) -> Optics | None:
 
 
 def budget_of(command: Sense) -> PhotonBudget:
-    """The budget by means that the options ask for."""
+    """Return the budget by means that the options ask for."""
     asked = (DEFAULT_PHOTONS if value is None else value for value in (command.signal, command.background))
     return PhotonBudget(*asked)
 
 
 def run(command: Sense, progress: Progress) -> dict:
-    """Transient -> histogram, its picture, and the .mat layout where asked."""
+    """Run the command: transient -> histogram, its picture, and the .mat layout where asked."""
     zones = load_sensor(command.sensor).zones
     if zones is not None:
         return _run_zones(command, zones)
@@ -203,11 +203,11 @@ def _dark_map(path: Path | None, transient: Transient) -> np.ndarray | None:
 
 
 def mean_confidence(histogram: Histogram, depth_m: np.ndarray) -> float:
-    """Mean probability that an estimate is no chance peak, over the pixels that have one; NaN with a baseline.
+    """Return mean probability that an estimate is no chance peak, over the pixels that have one; NaN with a baseline.
 
     There the distance is not the arrival time that the probability is of.
     """
     if any(laser_baseline_m(histogram)) or np.isnan(depth_m).all():
         return math.nan
-    share = confidence(torch.from_numpy(histogram.counts), torch.from_numpy(depth_m), histogram.sensor)
-    return float(share.nanmean())
+    fraction = confidence(torch.from_numpy(histogram.counts), torch.from_numpy(depth_m), histogram.sensor)
+    return float(fraction.nanmean())

@@ -11,10 +11,11 @@ from scenes.errors import InputError
 
 
 def run(command: Study, progress: Progress) -> dict:
-    """One study: the module of its name, imported only when it is asked for."""
+    """Run the command: one study: the module of its name, imported only when it is asked for."""
     if command.out.is_file():
         raise InputError(f"{command.out}: is a file, expected a folder for the figures")
     name = "ablations" if command.name in ABLATIONS else command.name.replace("-", "_")
     room = f"scene2spad.studies.{name}"
-    module = room if find_spec(room).submodule_search_locations is None else f"{room}.study"
+    spec = find_spec(room)
+    module = room if spec is None or spec.submodule_search_locations is None else f"{room}.study"
     return importlib.import_module(module).run(command, progress)

@@ -41,7 +41,7 @@ class Ultraphase(Common):
 
 
 def run(command: Ultraphase, progress: Progress) -> dict:
-    """The emulated in-pixel processor."""
+    """Run the command: the emulated in-pixel processor."""
     from scene2spad.cli import ultraphase_actions
 
     return ultraphase_actions.run(command, progress)

@@ -26,7 +26,7 @@ _MAX_WATCHED = 100
 
 
 def run(command: Ultraphase, progress: Progress) -> dict:
-    """One action; see `Ultraphase`."""
+    """Run the command: one action; see `Ultraphase`."""
     actions = {"table": _table, "run": _run, "asm": _asm, "list": _list, "verify": _verify, "sweep": _sweep}
     actions["compile"] = _compile
     needs = command.action in ("compile", "run", "asm", "list", "verify")
@@ -41,7 +41,7 @@ def _arity(action: str, needs: bool) -> str:
 
 
 def load(command: Ultraphase) -> tuple[Program, Method | None]:
-    """The program of a name or of a source file."""
+    """Return the program of a name or of a source file."""
     if not command.program.endswith(".s"):
         require(not command.define, "constants by --define are for source files")
         chosen = method(command.program)

@@ -22,17 +22,17 @@ DEPTH_SHOWN_M = (0.5, 7.0)
 
 def draw_sheet(scenes: Sequence[Scene], path: Path, *, columns: int = 8, progress: Progress | None = None) -> Path:
     """Render every scene's direct light, coarsely, and draw photograph above depth (0.5 to 7 m) for each."""
-    say = progress or (lambda what, share: None)
+    report = progress or (lambda what, fraction: None)
     views = []
     for i, scene in enumerate(scenes):
-        say(scene.name, i / len(scenes))
+        report(scene.name, i / len(scenes))
         with quiet():
             views.append(render(scene.without_lights(), DRAFT))
     return draw_views(views, path, columns=columns)
 
 
 def draw_views(views: Sequence[Transient], path: Path, *, columns: int = 8) -> Path:
-    """The sheet of views that are rendered already."""
+    """Draw the sheet of views that are rendered already."""
     columns = min(columns, len(views))
     rows = math.ceil(len(views) / columns)
     shape = views[0].height / views[0].width
@@ -54,5 +54,5 @@ def draw_views(views: Sequence[Transient], path: Path, *, columns: int = 8) -> P
 
 
 def photograph(view: Transient) -> np.ndarray:
-    """(H, W) in [0, 1] for looking: the laser's light without its fall-off with distance."""
+    """Return (H, W) in [0, 1] for looking: the laser's light without its fall-off with distance."""
     return display(view.total_radiance() * np.nan_to_num(view.depth_m) ** 1.5)

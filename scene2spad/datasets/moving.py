@@ -12,7 +12,8 @@ from scenes.offsets import moved_away, pushed_along_rays
 
 
 def moved(scene: Scene, metres: float, mode: str) -> Scene:
-    """The scene `metres` away by `ray` or `rigid` (`time` is a delay of what is rendered: `Transient.delayed`)."""
+    """Return the scene `metres` away by `ray` or `rigid` (`time` is a delay of what is rendered:
+    `Transient.delayed`)."""
     if mode == "ray":
         return pushed_along_rays(scene, metres)
     if mode != "rigid":

@@ -29,18 +29,18 @@ class Plane(NamedTuple):
     albedo: float
 
     def facing(self, rays: np.ndarray) -> np.ndarray:
-        """Cosine of incidence, negative from behind."""
+        """Return cosine of incidence, negative from behind."""
         return -(rays @ self.normal)
 
     def distance_m(self, rays: np.ndarray) -> np.ndarray:
-        """Along unit rays; infinite where the plane is not met before BEYOND_M."""
+        """Return along unit rays; infinite where the plane is not met before BEYOND_M."""
         facing = self.facing(rays)
         distance = self.height_m / np.maximum(facing, 1e-6)
         return np.where((facing > 0) & (distance < BEYOND_M), distance, np.inf)
 
 
 def random_planes(count: int, *, size: int = 64, seed: int = 0) -> Views:
-    """`count` scenes of two random planes, size x size pixels. Raises InputError for a count or size below 1."""
+    """Return `count` scenes of two random planes, size x size pixels. Raises InputError for a count or size below 1."""
     require(count >= 1 and size >= 1, f"planes: {count} scenes of {size} pixels, expected 1 or more")
     scenes = [
         _scene(size, np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_PLANES, number))))
@@ -106,7 +106,7 @@ def _transient(depth: np.ndarray, spread: np.ndarray, radiance: np.ndarray, albe
 
 
 def wall(depth_m: float, size: int = 32) -> Transient:
-    """A wall of `size` x `size` pixels all of which are `depth_m` away: one return a pixel, of one length."""
+    """Return a wall of `size` x `size` pixels all of which are `depth_m` away: one return a pixel, of one length."""
     require(depth_m > 0 and size >= 1, f"wall: {size} pixels at {depth_m:g} m, expected positive numbers")
     even = np.ones((size, size))
     return _transient(depth_m * even, 0 * even, even, 0.5 * even)

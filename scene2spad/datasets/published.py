@@ -113,7 +113,7 @@ PUBLISHED: dict[tuple[str, tuple[int, int, int]], dict[int, Published]] = {
 
 
 def printed(wanted: ModelSpec) -> Published | None:
-    """What was published of that design at that compression, if it was."""
+    """Return what was published of that design at that compression, if it was."""
     design = f"{'full ' if wanted.full else ''}{wanted.design}"
     if not wanted.coded:
         return PUBLISHED[design, (1, 1, 1)][1]
@@ -134,7 +134,7 @@ class Pair:
 
 
 def pairs(count: int | None = None) -> list[Pair]:
-    """The pairs found beside the project, at most `count`. Raises InputError where there are none."""
+    """Return the pairs found beside the project, at most `count`. Raises InputError where there are none."""
     return [_pair(middlebury_folder(name)) for name in middlebury_names()[:count]]
 
 
@@ -174,16 +174,17 @@ def errors_of(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[dict[str, object]]:
-    """A row of every model, pair and level: MAE and RMSE [mm] against the published label and against the arrival.
+    """Return a row of every model, pair and level: MAE and RMSE [mm] against the published label and against the
+    arrival.
 
     The published label is the pulse's fullest bin, from 0; a depth of ours, centred on bins, is taken half a bin less
     against it. `arrival` is the centroid of the published pulse, which lies before that bin: what our models were
     trained to find. Both in the published speed of light.
     """
-    say, rows = progress or (lambda what, share: None), []
+    report, rows = progress or (lambda what, fraction: None), []
     for number, pair in enumerate(photographs):
         for level in levels:
-            say(f"{pair.name}, {level[0]:g} + {level[1]:g}, {offset_m:g} m", number / len(photographs))
+            report(f"{pair.name}, {level[0]:g} + {level[1]:g}, {offset_m:g} m", number / len(photographs))
             key = {"pair": pair.digest, "level": list(level), "offset_m": offset_m, "seed": seed}
             missing = [one for one in subjects if store.get(one.digest, **key) is None]
             if missing:
@@ -191,8 +192,8 @@ def errors_of(
                 for one in missing:
                     store.put(one.digest, _errors(one, histogram), **key)
             for one in subjects:
-                told = {"model": one.name, "pair": pair.name, "offset_m": offset_m}
-                rows.append({**told, "signal": level[0], "background": level[1], **store.get(one.digest, **key)})
+                common = {"model": one.name, "pair": pair.name, "offset_m": offset_m}
+                rows.append({**common, "signal": level[0], "background": level[1], **store.get(one.digest, **key)})
     return rows
 
 
@@ -250,39 +251,39 @@ def evaluate_as_published(
                 reference = "label" if model.config.grid == "published" else "arrival"
                 for decoder in DECODERS:
                     errors = errors_as_published(model, histogram, decoder)
-                    told = {"model": name, "pair": pair.name, "signal": level[0], "background": level[1]}
-                    told |= {"decoder": decoder, "reference": reference}
+                    common = {"model": name, "pair": pair.name, "signal": level[0], "background": level[1]}
+                    common |= {"decoder": decoder, "reference": reference}
                     kept = {figure: errors[f"{figure}_{reference}"] for figure in ("mae_mm", "rmse_mm", "within_10mm")}
-                    rows.append({**told, **kept, "mae_mm_label": errors["mae_mm_label"]})
+                    rows.append({**common, **kept, "mae_mm_label": errors["mae_mm_label"]})
     return rows
 
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
-    """Networks on the paper's pairs in its own simulation, by both decoders: a table (.csv), and the means."""
+    """Return networks on the paper's pairs in its own simulation, by both decoders: a table (.csv), and the means."""
     named = {str(path): load_model(checkpoint_of(path))[0] for path in command.checkpoints}
     require(bool(named), "evaluate: give at least one checkpoint")
     require(not command.levels, "evaluate: --levels does not go with --set published, whose 16 levels are the paper's")
     rows = evaluate_as_published(named, seed=command.seed, offset_m=command.offset, progress=progress)
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(rows, command.out / "evaluation-published.csv")
-    return {"means": told_as_published(rows), "csv": str(table)} | ({"rows": rows} if command.json else {})
+    return {"means": format_published(rows), "csv": str(table)} | ({"rows": rows} if command.json else {})
 
 
-def told_as_published(rows: Sequence[Mapping[str, object]]) -> list[str]:
+def format_published(rows: Sequence[Mapping[str, object]]) -> list[str]:
     """Say the means over pairs and levels of `evaluate_as_published`, a line a model and decoder."""
-    said = []
+    lines = []
     for name, decoder in dict.fromkeys((row["model"], row["decoder"]) for row in rows):
         mine = [row for row in rows if (row["model"], row["decoder"]) == (name, decoder)]
         means = {figure: float(np.mean([row[figure] for row in mine])) for figure in ("mae_mm", "rmse_mm")}
-        said.append(
+        lines.append(
             f"{name}, {decoder}: MAE {means['mae_mm']:.2f} mm, RMSE {means['rmse_mm']:.2f} mm against the "
             f"{mine[0]['reference']}"
         )
-    return said
+    return lines
 
 
 def available(count: int | None) -> tuple[list[Pair], str]:
-    """The pairs, and why there are none."""
+    """Return the pairs, and why there are none."""
     try:
         return pairs(count), ""
     except InputError as error:
@@ -290,7 +291,8 @@ def available(count: int | None) -> tuple[list[Pair], str]:
 
 
 def beside_ours(rows: Sequence[dict], wanted: Sequence[ModelSpec], offsets_m: Sequence[float]) -> list[dict]:
-    """Our models on the photographs beside what was published, near and far [mm]; `of`: how much of the test set."""
+    """Return our models on the photographs beside what was published, near and far [mm]; `of`: how much of the test
+    set."""
     found = []
     scenes, levels = len({row["pair"] for row in rows}), len({(row["signal"], row["background"]) for row in rows})
     for one in wanted:
@@ -316,7 +318,7 @@ def compared(
     seed: int,
     progress: Progress,
 ) -> list[dict]:
-    """`beside_ours` of models on the pairs found, at most `count`; empty, and said so, where there are none."""
+    """Return `beside_ours` of models on the pairs found, at most `count`; empty, and said so, where there are none."""
     photographs, missing = available(count)
     if missing:
         log.warning("the published convention is left out: %s", missing)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from render.settings import MIN_PIXEL_BYTES, SHARED_AMBIENT_SPP, Plan, RenderSettings
+from render.settings import FILTERED_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
 from scene2spad.datasets.set_folder import Done, Folder, file_name
 from scene2spad.datasets.workers import Run, check_workers, executor
 from scenes.errors import InputError, require
@@ -72,9 +72,9 @@ class Job:
     offset_m: float = 0.0
     offset_mode: OffsetMode = "time"
     ambient: bool = True
-    ambient_spp: int = SHARED_AMBIENT_SPP
+    ambient_spp: int = FILTERED_AMBIENT_SPP
     merging: float = 1.0
-    least_share: float | None = None
+    edge_threshold: float | None = None
     filter: bool = False
 
     def __post_init__(self) -> None:
@@ -88,19 +88,25 @@ class Job:
             spp=self.spp,
             filter=self.filter,
             grid=self.grid,
-            least_share=self.least_share,
+            edge_threshold=self.edge_threshold,
             error=self.error,
-            aim=AIM if self.bounces == 1 else INDIRECT_AIM,
+            target_fraction=AIM if self.bounces == 1 else INDIRECT_AIM,
             ambient_spp=self.ambient_spp,
-            ambient_shared=True,
+            ambient_filtered=True,
             direct_tolerance_m=self.merging * DIRECT_TOLERANCE_M,
             indirect_tolerance_m=self.merging * INDIRECT_TOLERANCE_M,
             indirect_growth=self.merging * INDIRECT_GROWTH,
         )
 
     def made(self) -> dict:
-        """All that decides the bytes of its views, this version's choices included."""
-        tolerances = [DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH, THINNED, self.settings().aim]
+        """Return all that decides the bytes of its views, this version's choices included."""
+        tolerances = [
+            DIRECT_TOLERANCE_M,
+            INDIRECT_TOLERANCE_M,
+            INDIRECT_GROWTH,
+            THINNED,
+            self.settings().target_fraction,
+        ]
         return asdict(self) | {"schema": 7, "tolerances": tolerances}
 
 
@@ -115,15 +121,15 @@ def render_view(job: Job, view: int, again: int = 0) -> Done:
         try:
             record, exr = _rendered(job, view, again)
         except Exception as error:  # one odd scene of thousands must not end the run
-            told = " ".join(str(error).split()) or type(error).__name__
+            message = " ".join(str(error).split()) or type(error).__name__
             name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-            record, exr = {"view": view, "failed": f"{name}{told}"[:500]}, None
+            record, exr = {"view": view, "failed": f"{name}{message}"[:500]}, None
             _forget()  # what was recorded may be half done
     return Done(record, exr, time.perf_counter() - start, where)
 
 
 def render_views(job: Job, views: Sequence[int]) -> list[Done]:
-    """Views that one process renders in a row, since they show one place."""
+    """Return views that one process renders in a row, since they show one place."""
     return [render_view(job, view) for view in views]
 
 
@@ -193,7 +199,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         "file": file_name(view),
         "bytes": len(exr),
         "seed": seed,
-        "plan": {key: plan[key] for key in ("bounces", "spp", "grid", "least_share", "ambient")},
+        "plan": {key: plan[key] for key in ("bounces", "spp", "grid", "edge_threshold", "ambient")},
         "error": transient.meta["relative_error"]["total"],
         "target": plan["target"],
         "target_met": transient.meta["target_met"],
@@ -269,29 +275,30 @@ def _check_asked(job: Job, count: int, workers: int) -> None:
         require(1 <= side <= MAX_IMAGE_SIDE, f"image side {side} is outside 1 to {MAX_IMAGE_SIDE} pixels")
     if sides:
         width, height = sides[0], sides[-1]
-        told = f"views of {width} x {height} pixels on {workers} process{'es' * (workers > 1)}"
-        require_memory(workers * MIN_PIXEL_BYTES * width * height, told)
+        message = f"views of {width} x {height} pixels on {workers} process{'es' * (workers > 1)}"
+        require_memory(workers * MIN_PIXEL_BYTES * width * height, message)
 
 
-def _with_grid(job: Job, folder: Folder, run: Run, say: Progress) -> Job:
+def _with_grid(job: Job, folder: Folder, run: Run, report: Progress) -> Job:
     """The job with as many rays for all views, by the errors of some of the first places', however many are asked."""
     from render.planning import rays_for_all
 
     path = folder.path / "grid.json"
     if not path.is_file():
-        say("plan", 0.0)
+        report("plan", 0.0)
         each = scene_set(job.set).views_per_place
         some = range(0, each, -(-each // OF_A_PLACE))
         places = [tuple(place * each + view for view in some) for place in range(PLANNED_PLACES)]
         found = run(partial(_direct_errors, job), places, lambda view, why: math.nan)
         errors = sorted(error for error in found if math.isfinite(error))
         # None: each place by itself
-        grid, least_share = rays_for_all(errors, job.settings()) if errors else (None, None)
+        grid, edge_threshold = rays_for_all(errors, job.settings()) if errors else (None, None)
         with whole_file(path) as beside:
-            beside.write_text(json.dumps({"grid": grid, "least_share": least_share, "errors": errors}) + "\n")
+            beside.write_text(json.dumps({"grid": grid, "edge_threshold": edge_threshold, "errors": errors}) + "\n")
     try:
         planned = read_json_object(path)
-        return replace(job, grid=planned["grid"], least_share=planned["least_share"])
+        threshold = planned["edge_threshold"] if "edge_threshold" in planned else planned["least_share"]  # its old name
+        return replace(job, grid=planned["grid"], edge_threshold=threshold)
     except (InputError, KeyError, TypeError):
         raise InputError(f"{path}: is damaged; delete it, and it is made again") from None
 
@@ -308,16 +315,16 @@ def make_set(
     folder = Folder(out, job.made())
     missing = count - sum(view < count for view in folder.records)
     todo = (view for view in range(count) if view not in folder.records)
-    say = progress or (lambda what, share: None)
+    report = progress or (lambda what, fraction: None)
     start = time.perf_counter()
     with executor(workers if missing else 1, scheduler if missing else None) as run:
         endless = scene_set(job.set).size is None
-        job = _with_grid(job, folder, run, say) if missing and endless and job.grid is None else job
+        job = _with_grid(job, folder, run, report) if missing and endless and job.grid is None else job
         for number, done in enumerate(run(partial(render_views, job), _runs(job, todo), _lost), 1):
             folder.add(done)
             if "failed" in done.record:
                 log.warning("view %d failed: %s", done.record["view"], done.record["failed"])
-            say(f"view {count - missing + number} of {count}", (count - missing + number) / count)
+            report(f"view {count - missing + number} of {count}", (count - missing + number) / count)
     folder.close()
     seconds = time.perf_counter() - start
     records = [folder.records[view] for view in range(count)]
@@ -349,16 +356,16 @@ def make_set(
 
 
 def pack_set(folder: Path, path: Path, progress: Progress | None = None) -> int:
-    """All finished views of a set's folder as one file (`render.transient.packs`); returns its size in bytes."""
+    """Return all finished views of a set's folder as one file (`render.transient.packs`); returns its size in bytes."""
     from render.transient import read_transient
     from render.transient.packs import write_pack
 
     records = read_set_index(folder)
-    say = progress or (lambda what, share: None)
+    report = progress or (lambda what, fraction: None)
 
     def views() -> Iterator[tuple]:
         for i, record in enumerate(records):
-            say("pack", i / len(records))
+            report("pack", i / len(records))
             transient = read_transient(folder / record["file"])
             kept = {key: transient.meta[key] for key in ("camera", "laser", "scene_sha256")}
             yield transient, record | kept | {"time_offset_m": transient.meta.get("time_offset_m", 0.0)}

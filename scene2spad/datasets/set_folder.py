@@ -71,7 +71,7 @@ class Folder:
         return path.is_file() and path.stat().st_size == record.get("bytes")
 
     def add(self, done: Done) -> None:
-        """The file first, then the line that vouches for it."""
+        """Write the file first, then the line that vouches for it."""
         view = done.record["view"]
         if done.exr is not None:
             with whole_file(self.path / file_name(view)) as beside:
@@ -82,7 +82,7 @@ class Folder:
         append_line(self.path / "timings.jsonl", json.dumps(timing, sort_keys=True))
 
     def close(self) -> None:
-        """The index in the order of the views, then no journal."""
+        """Write the index in the order of the views, then no journal."""
         with whole_file(self.path / "index.jsonl") as beside:
             lines = (json.dumps(self.records[view], sort_keys=True) + "\n" for view in sorted(self.records))
             beside.write_text("".join(lines))

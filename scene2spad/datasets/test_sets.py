@@ -44,11 +44,11 @@ class TestSet:
         return tuple(transient.sha256()[:32] for transient in self.views.transients)
 
     def first(self, count: int | None) -> TestSet:
-        """Its first views."""
+        """Return its first views."""
         return TestSet(self.name, Views(*(part[:count] for part in self.views)), self.offset_m, self.mode)
 
     def truth_m(self, view: int, delay_m: float) -> np.ndarray:
-        """Depth of a view as it is evaluated, cut to TILE."""
+        """Return depth of a view as it is evaluated, cut to TILE."""
         depth = self.views.transients[view].depth_m
         rows, columns = (side // part * part for side, part in zip(depth.shape, TILE, strict=True))
         return depth[:rows, :columns] + np.float32(delay_m)
@@ -65,7 +65,8 @@ def rendered(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> TestSet:
-    """A finite set with direct light alone, rendered into `folder` where it is not there; `size` is (width, height).
+    """Return a finite set with direct light alone, rendered into `folder` where it is not there; `size` is (width,
+    height).
 
     Raises InputError where a view cannot be rendered.
     """
@@ -75,13 +76,13 @@ def rendered(
     moved = f"-{mode}-{offset_m:g}m" if offset_m else ""
     path = folder / f"{name.replace('/', '-')}{moved}"
     folder.mkdir(parents=True, exist_ok=True)
-    said = make_set(job, of.size if count is None else count, path, progress=progress)
-    require(not said["failed"], f"{path}: views {said['failed']} could not be rendered")
+    result = make_set(job, of.size if count is None else count, path, progress=progress)
+    require(not result["failed"], f"{path}: views {result['failed']} could not be rendered")
     return TestSet(name, read_views(path), offset_m, mode).first(count)
 
 
 def rooms(folder: Path, progress: Progress) -> Path:
-    """The pack of ROOMS views of rooms, direct light alone, made where it is not there."""
+    """Return the pack of ROOMS views of rooms, direct light alone, made where it is not there."""
     pack = folder / "rooms.h5"
     if not pack.is_file():
         folder.mkdir(parents=True, exist_ok=True)
@@ -102,16 +103,17 @@ def evaluated(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Row]:
-    """Rows of every model, view and level; what the store has is not computed again, the rest sees the same photons.
+    """Return rows of every model, view and level; what the store has is not computed again, the rest sees the same
+    photons.
 
     `delay_m` moves the views in time alone, with the counts of every pixel as they were. Of the views in `maps` the
     depth maps are kept as well (`depth_map`).
     """
-    say, rows = progress or (lambda what, share: None), []
+    report, rows = progress or (lambda what, fraction: None), []
     total = len(test.views.transients) * len(levels)
     for view, scene in enumerate(test.views.scenes):
         for number, level in enumerate(levels):
-            say(f"{scene}, {level[0]:g} + {level[1]:g}, {delay_m:g} m", (view * len(levels) + number) / total)
+            report(f"{scene}, {level[0]:g} + {level[1]:g}, {delay_m:g} m", (view * len(levels) + number) / total)
             key = _key(test, view, level, delay_m, seed)
             missing = [one for one in subjects if not _has(store, one, key, view in maps)]
             if missing:
@@ -131,7 +133,7 @@ def depth_map(
     delay_m: float,
     seed: int,
 ) -> np.ndarray:
-    """(H, W) depth [m] that `evaluated` kept."""
+    """Return (H, W) depth [m] that `evaluated` kept."""
     return np.load(store.map_file(subject.digest, **_key(test, view, level, delay_m, seed)))
 
 

@@ -40,7 +40,8 @@ def check_workers(number: int, least: int = 1) -> None:
 
 @contextmanager
 def executor(workers: int, scheduler: str | None) -> Iterator[Run]:
-    """Something that does runs and gives their results, in whatever order; InputError if a scheduler is not there.
+    """Yield something that does runs and gives their results, in whatever order; InputError if a scheduler is not
+    there.
 
     Runs are taken one by one, as they can be done. At the end what is still under way is given up, not waited for.
     """
@@ -134,8 +135,8 @@ def _dask_client(address: str) -> Iterator[Any]:
         try:
             client = Client(address, timeout=CONNECT_S)
         except (OSError, ValueError, TypeError) as error:
-            told = " ".join(str(error).split())[:120]
-            raise InputError(f"scheduler {address}: cannot be reached ({told or type(error).__name__})") from None
+            message = " ".join(str(error).split())[:120]
+            raise InputError(f"scheduler {address}: cannot be reached ({message or type(error).__name__})") from None
         try:
             yield client
         finally:
@@ -166,7 +167,7 @@ def _on_dask(client: Any, work: Work, runs: Iterable[Numbers], lost: Lost) -> It
     from distributed import as_completed
 
     waiting = iter(runs)
-    with _told_if_gone(client):
+    with _explain_lost_scheduler(client):
         workers = client.scheduler_info(n_workers=-1)["workers"]
     if not workers:
         log.warning("scheduler %s has no workers yet: waiting for some", client.scheduler.address)
@@ -175,7 +176,7 @@ def _on_dask(client: Any, work: Work, runs: Iterable[Numbers], lost: Lost) -> It
     pending = as_completed()
     while True:
         for run in islice(waiting, 3 * lanes - len(submitted)):
-            with _told_if_gone(client):
+            with _explain_lost_scheduler(client):
                 future = client.submit(work, run, pure=False, retries=TRIES)
             submitted[future] = run
             pending.add(future)
@@ -184,7 +185,7 @@ def _on_dask(client: Any, work: Work, runs: Iterable[Numbers], lost: Lost) -> It
         future = next(pending)
         run = submitted.pop(future)
         failed = future.status == "error"
-        with _told_if_gone(client):
+        with _explain_lost_scheduler(client):
             found = future.exception() if failed else future.result()
         future.release()
         if not failed:
@@ -196,7 +197,7 @@ def _on_dask(client: Any, work: Work, runs: Iterable[Numbers], lost: Lost) -> It
 
 
 @contextmanager
-def _told_if_gone(client: Any) -> Iterator[None]:
+def _explain_lost_scheduler(client: Any) -> Iterator[None]:
     """InputError in one line where the scheduler does not answer any more; it is told by errors of several types."""
     try:
         yield
@@ -204,5 +205,5 @@ def _told_if_gone(client: Any) -> Iterator[None]:
         cancelled = isinstance(error, (CancelledError, asyncio.CancelledError))
         if client.status == "running" and not cancelled:
             raise
-        told = f"scheduler {client.scheduler.address}: has gone away; what is finished stays"
-        raise InputError(f"{told}, and the same command goes on from it") from None
+        message = f"scheduler {client.scheduler.address}: has gone away; what is finished stays"
+        raise InputError(f"{message}, and the same command goes on from it") from None

@@ -96,7 +96,7 @@ def _drift_bins(reference: np.ndarray) -> np.ndarray:
 def plane_scene(
     distance_m: float, zones: ZoneArray, tilt_rad: tuple[float, float] = (0.0, 0.0), pixels: int = PIXELS
 ) -> Scene:
-    """A white plane that a sensor at the origin, looking along z, sees; `distance_m` along its axis.
+    """Return a white plane that a sensor at the origin, looking along z, sees; `distance_m` along its axis.
 
     tilt_rad: the plane turned about the sensor's y axis (its right side farther), then about its x axis (lower side
     farther). The image holds all zones.

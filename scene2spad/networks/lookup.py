@@ -34,7 +34,8 @@ class ModelLookup(NamedTuple):
 
 
 def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> ModelLookup:
-    """Models of --models (else of --out), then of the package; with --retrain, and in `smoke`, all trained there.
+    """Return models of --models (else of --out), then of the package; with --retrain, and in `smoke`, all trained
+    there.
 
     Absent ones are named, with the command that makes each. Raises InputError where none is found, and for a model of
     another configuration under a wanted name.
@@ -46,15 +47,15 @@ def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> M
         library.train(wanted, command.preset, training, progress)
     found = library.gather(wanted)
     if not found:
-        said = f"holds none of the {len(wanted)} models, nor does the package; give --models FOLDER or --retrain"
-        raise InputError(f"{library.folder}: {said}")
+        message = f"holds none of the {len(wanted)} models, nor does the package; give --models FOLDER or --retrain"
+        raise InputError(f"{library.folder}: {message}")
     absent = [one for one in wanted if one not in found]
     if absent and training is None:
         training = Path("rooms.h5")
         log.warning("%s below: scene2spad dataset rooms --count 2000 --bounces 1 --pack %s", training, training)
     for one in absent:
         log.warning("absent: %s; made by: %s", one.name, one.spelled(command.preset, training, library.folder))
-    _say_if_unlike(found.values())
+    _warn_if_unlike(found.values())
     return ModelLookup(found, absent)
 
 
@@ -73,7 +74,7 @@ def _library(command: Study) -> ModelRegistry:
     return ModelRegistry(command.models or command.out / command.preset / "models", None if retrain else WEIGHTS)
 
 
-def _say_if_unlike(found: Iterable[Trained]) -> None:
+def _warn_if_unlike(found: Iterable[Trained]) -> None:
     """Say so where models are compared that were not trained alike."""
     kinds = set()
     for one in found:

@@ -72,7 +72,7 @@ class ModelSpec:
         return "-".join([*parts, f"s{self.seed}"])
 
     def command(self, preset: str, training: Path, folder: Path) -> Train:
-        """The `train` command that makes it in `folder/name`."""
+        """Return the `train` command that makes it in `folder/name`."""
         return Train(
             design=self.design,
             block=self.block,
@@ -86,7 +86,7 @@ class ModelSpec:
         )
 
     def spelled(self, preset: str, training: Path, folder: Path) -> str:
-        """The same as one types it."""
+        """Return the same as one types it."""
         coded = f" --block {' '.join(map(str, self.block))} --compression {self.compression}" if self.coded else ""
         more = f"{' --full' if self.full else ''}"
         more += f" --time-offset {self.time_offset_m:g}" if self.time_offset_m else ""
@@ -127,7 +127,7 @@ class Trained:
         return self.path.stem not in RUN_WEIGHTS
 
     def table(self, kind: str) -> list[dict[str, float]]:
-        """`log.csv` or `energy.csv` of its training; empty where there is none."""
+        """Return `log.csv` or `energy.csv` of its training; empty where there is none."""
         path = beside(self.path, kind)
         if not path.is_file():
             return []
@@ -149,13 +149,14 @@ class Trained:
 
 
 def check(config: TrainConfig, wanted: ModelSpec, path: Path) -> None:
-    """InputError in one line for a checkpoint that is not what is wanted: other design, seed, sensor, time offsets."""
+    """Raise InputError in one line for a checkpoint that is not what is wanted: other design, seed, sensor, time
+    offsets."""
     expected = config_of(wanted.command("laptop", Path("planes"), Path()))
     pairs = {
         "random time offsets [m]": (config.time_offset_m, wanted.time_offset_m),
         "seed": (config.seed, wanted.seed),
         "front": (config.model.front, expected.model.front),
-        "design": (_told(config.model.design), _told(expected.model.design)),
+        "design": (_design_name(config.model.design), _design_name(expected.model.design)),
         "layer": (config.model.layer, expected.model.layer),
         "sensor": (_sensor(config.model), _sensor(expected.model)),
     }
@@ -163,7 +164,7 @@ def check(config: TrainConfig, wanted: ModelSpec, path: Path) -> None:
     require(not wrong, f"{path}: is not the model {wanted.name}: {'; '.join(wrong)}")
 
 
-def _told(design: Design | None) -> str:
+def _design_name(design: Design | None) -> str:
     return "none" if design is None else f"{design.name}{'' if design.zero_mean else ' without zero mean'}"
 
 
@@ -181,7 +182,8 @@ class ModelRegistry:
     shipped: Path | None = WEIGHTS
 
     def find(self, wanted: ModelSpec) -> Trained | None:
-        """The model if it is there and its training came to its end. Raises InputError for another under its name."""
+        """Return the model if it is there and its training came to its end. Raises InputError for another under its
+        name."""
         run = self.folder / wanted.name / "model.safetensors"
         if run.is_file():
             found = _loaded(wanted, run)
@@ -193,7 +195,7 @@ class ModelRegistry:
         return _loaded(wanted, packaged) if packaged is not None and packaged.is_file() else None
 
     def gather(self, wanted: Sequence[ModelSpec]) -> dict[ModelSpec, Trained]:
-        """Those that are there, in the order asked for."""
+        """Return those that are there, in the order asked for."""
         found = {one: self.find(one) for one in wanted}
         return {one: model for one, model in found.items() if model is not None}
 
@@ -208,12 +210,12 @@ class ModelRegistry:
             result = run_train(command, _share(progress, one.name, number, len(todo)))
             taken = time.perf_counter() - start
             rest = taken / (number + 1) * (len(todo) - number - 1)
-            said = "%s: validation RMSE %.1f mm; %.0f s so far, about %.0f s to go"
-            log.info(said, one.name, result["val_rmse_mm"], taken, rest)
+            message = "%s: validation RMSE %.1f mm; %.0f s so far, about %.0f s to go"
+            log.info(message, one.name, result["val_rmse_mm"], taken, rest)
 
 
 def _share(progress: Progress, name: str, number: int, of: int) -> Progress:
-    return lambda what, share: progress(f"{name}: {what}", (number + share) / of)
+    return lambda what, fraction: progress(f"{name}: {what}", (number + fraction) / of)
 
 
 def _loaded(wanted: ModelSpec, path: Path) -> Trained:

@@ -39,7 +39,7 @@ SMOKE_PIXELS = 32
 
 
 def config_of(command: Train) -> TrainConfig:
-    """The preset with what the command line changes. Raises InputError for options that do not fit together."""
+    """Return the preset with what the command line changes. Raises InputError for options that do not fit together."""
     sensor = sensor_by_name(command.sensor)
     network = command.network or ("published" if command.preset == "paper" else "compact")
     # the published network finds the pulse in the counts by itself; ours, of few layers, is given them matched
@@ -85,15 +85,15 @@ def config_of(command: Train) -> TrainConfig:
 
 
 def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, Any]]:
-    """Training and validation views of every set, and the words that say which they are."""
+    """Return training and validation views of every set, and the words that say which they are."""
     sets = [_views_of_set(path, command) for path in command.set]
-    said = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
+    common = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
     if command.validation:
         training, validation = sets, [read_views(path) for path in command.validation]
     else:
         parts = [split_views(views) for views in sets]
         training, validation = [first for first, _ in parts], [second for _, second in parts]
-    return training, validation, {**said, "training_reach_m": max(map(training_reach_m, training))}
+    return training, validation, {**common, "training_reach_m": max(map(training_reach_m, training))}
 
 
 def _views_of_set(path: Path, command: Train) -> Views:
@@ -105,12 +105,12 @@ def _views_of_set(path: Path, command: Train) -> Views:
 
 def _paths(paths: Sequence[Path]) -> str | list[str]:
     """A set's path as it was given; a list of several."""
-    said = [str(path) for path in paths]
-    return said if len(said) > 1 else "".join(said)
+    lines = [str(path) for path in paths]
+    return lines if len(lines) > 1 else "".join(lines)
 
 
 def training_reach_m(views: Views) -> float:
-    """The depth that 99.9 % of the views' pixels do not pass [m]."""
+    """Return the depth that 99.9 % of the views' pixels do not pass [m]."""
     depth = np.concatenate([t.depth_m[np.isfinite(t.depth_m)] for t in views.transients] or [np.zeros(0)])
     return round(float(np.quantile(depth, 0.999)), 3) if depth.size else 0.0
 
@@ -123,15 +123,15 @@ def run_train(command: Train, progress: Progress) -> dict:
     check_workers(command.workers, least=0)
     from csph.training.loop import train  # and Lightning, which takes seconds to import
 
-    training, validation, said = views_of(command)
+    training, validation, data = views_of(command)
     init = None
     if command.init is not None:
         init = load_model(checkpoint_of(command.init))[0]
-        said["init"] = Path(command.init).name
+        data["init"] = Path(command.init).name
     name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
     folder = command.out or Path("out/train") / name
     result = train(
-        replace(config, data=said),
+        replace(config, data=data),
         training,
         validation,
         folder,
@@ -144,7 +144,7 @@ def run_train(command: Train, progress: Progress) -> dict:
 
 
 def network_method(model: DepthEstimator, *, overflows: list[int] | None = None, **reading: Any) -> Method:
-    """Depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`.
+    """Return depth of a histogram by a network; 16-bit sums that wrapped are appended to `overflows`.
 
     `reading` is passed on to `DepthModel.depth_of`: int8, int8_rule, decoder.
     """
@@ -159,7 +159,7 @@ def network_method(model: DepthEstimator, *, overflows: list[int] | None = None,
 
 
 def classical(name: str) -> Callable[[Tensor, Sensor], Tensor]:
-    """Depth [m] from counts (..., T) of a sensor without a network: by one of `METHODS`, or by CODE-K
+    """Return depth [m] from counts (..., T) of a sensor without a network: by one of `METHODS`, or by CODE-K
     decoded by correlation, as in "fourier-8"."""
     if name in METHODS:
         return lambda counts, sensor: estimate_depth(counts, sensor, name)
@@ -180,14 +180,14 @@ def _coding(code: str, number: int, sensor: Sensor) -> CodingTensor:
 
 
 def common_tile(models: Sequence[DepthModel]) -> tuple[int, int]:
-    """Rows and columns of the smallest tile that the blocks of all networks tile; 1 x 1 of none."""
+    """Return rows and columns of the smallest tile that the blocks of all networks tile; 1 x 1 of none."""
     blocks = [(1, 1), *(model.config.block[1:] for model in models)]
     rows, columns = (math.lcm(*sides) for sides in zip(*blocks, strict=True))
     return rows, columns
 
 
 def baseline(name: str) -> Method:
-    """A method without a network, by the names of `classical`."""
+    """Return a method without a network, by the names of `classical`."""
     depth_of = classical(name)
     return lambda histogram: histogram_depth_m(histogram, depth_of)
 
@@ -207,7 +207,7 @@ def photon_levels(said: Sequence[str]) -> tuple[tuple[float, float], ...]:
 
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
-    """Networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
+    """Return networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
     models = [load_model(checkpoint_of(path))[0] for path in command.checkpoints]
     require(bool(models), "evaluate: give at least one checkpoint")
     require(command.int8 or command.int8_rule is None, "evaluate: --int8-rule goes with --int8")
@@ -271,7 +271,7 @@ def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> lis
 
 
 def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> dict[str, Any]:
-    """Headline figures of the `first` group, every group by levels, paired differences of MAE from the first."""
+    """Return headline figures of the `first` group, every group by levels, paired differences of MAE from the first."""
     summaries = {name: found.summary(members) for name, members in groups.items()}
     everything = summaries[first]["all"]["all"]
     head = {key: everything[key] for key in ("mae_mm", "rmse_mm", "within_10mm", "ssim", "mae_interval_mm")}
@@ -292,7 +292,7 @@ def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: b
 
 
 def _lines(summaries: dict[str, dict]) -> list[str]:
-    said = [
+    lines = [
         f"{'method':<40} {'MAE mm':>8} {'SBR > 0.1':>10} {'SBR <= 0.1':>11} {'mixed':>8} {'< 10 mm':>8} {'SSIM':>6}"
     ]
     for name, s in summaries.items():
@@ -300,8 +300,8 @@ def _lines(summaries: dict[str, dict]) -> list[str]:
         mae = (every, s["high_sbr"]["all"], s["low_sbr"]["all"], s["all"]["mixed"])
         cells = [_cell(line["mae_mm"], f"{width}.1f") for line, width in zip(mae, (8, 10, 11, 8), strict=True)]
         cells += [_cell(every["within_10mm"], "8.1%"), _cell(every["ssim"], "6.3f")]
-        said.append(f"{name[-40:]:<40} {' '.join(cells)}")
-    return said
+        lines.append(f"{name[-40:]:<40} {' '.join(cells)}")
+    return lines
 
 
 def _cell(value: float | None, form: str) -> str:

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from tyro.conf import Positional as Positional
 
-Positional = tyro.conf.Positional
 Progress = Callable[[str, float], None]
 
 
 def may_stay_open(metavar: str) -> object:
-    """An option that may stay open: its help says itself what happens then."""
+    """Return an option that may stay open: its help says itself what happens then."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 

@@ -37,7 +37,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def plain_log(axes: Axes) -> None:
-    """A logarithmic y axis with plain numbers; over less than three decades at 2 and 5 of each decade too."""
+    """Make the y axis logarithmic, with plain numbers; over less than three decades at 2 and 5 of each decade too."""
 
     def label(value: float, _: int) -> str:
         low, high = axes.get_ylim()
@@ -62,7 +62,7 @@ def _image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: obje
 
 
 def display(radiance: np.ndarray, white: float = 0.99) -> np.ndarray:
-    """Radiance for looking: relative to the quantile `white` of what is lit, display gamma."""
+    """Return radiance for looking: relative to the quantile `white` of what is lit, display gamma."""
     top = np.quantile(radiance[radiance > 0], white) if (radiance > 0).any() else 1.0
     return np.clip(radiance / top, 0, 1) ** (1 / 2.2)
 
@@ -87,13 +87,13 @@ def depth_limits(depth_m: np.ndarray) -> dict[str, float]:
 
 
 def draw_transient(transient: Transient, path: Path) -> Path:
-    """Intensity, indirect share, depth, normals, ambient light, and the image's mean transient."""
+    """Draw intensity, indirect share, depth, normals, ambient light, and the image's mean transient."""
     figure, axes = plt.subplots(2, 3, figsize=(13, 7), layout="constrained")
     total = transient.total_radiance()
     later = transient.bounces > 1
     pixel = transient.return_pixel[later]
     indirect = np.bincount(pixel, weights=transient.radiance[later], minlength=total.size).reshape(total.shape)
-    share = np.divide(indirect, total, out=np.full(total.shape, np.nan), where=total > 0)
+    fraction = np.divide(indirect, total, out=np.full(total.shape, np.nan), where=total > 0)
     _image(axes[0, 0], display(total), "laser light, all paths", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
     _image(
         axes[0, 1],
@@ -103,7 +103,7 @@ def draw_transient(transient: Transient, path: Path) -> Path:
         cmap=DEPTH_COLOURS,
         **depth_limits(transient.depth_m),
     )
-    _image(axes[0, 2], 100 * share, "indirect share of the laser light", "%", cmap=ERROR_COLOURS, vmin=0)
+    _image(axes[0, 2], 100 * fraction, "indirect share of the laser light", "%", cmap=ERROR_COLOURS, vmin=0)
     axes[1, 0].imshow(np.abs(transient.normal.astype(float)))
     axes[1, 0].set(title="|normal|, world x y z as red green blue", xticks=[], yticks=[])
     axes[1, 0].title.set_fontsize(10)
@@ -164,8 +164,8 @@ def draw_histogram(
 
 
 def shown_pixels(histogram: Histogram) -> dict[str, tuple[int, int]]:
-    """Row and column of the pixels at SHOWN_RANKS of expected signal, among those of one surface of known depth (all
-    where there is none)."""
+    """Return row and column of the pixels at SHOWN_RANKS of expected signal, among those of one surface of known depth
+    (all where there is none)."""
     candidates = np.flatnonzero(np.isfinite(histogram.depth_m) & ~histogram.mixed & (histogram.expected_signal > 0))
     if not candidates.size:
         candidates = np.arange(histogram.depth_m.size)
@@ -195,7 +195,7 @@ def _pixel_counts(
 
 
 def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: dict, path: Path) -> Path:
-    """Truth, estimate and absolute error; the estimate alone where no truth is known."""
+    """Draw truth, estimate and absolute error; the estimate alone where no truth is known."""
     if np.isnan(histogram.depth_m).all():
         figure, axes = plt.subplots(figsize=(6, 5), layout="constrained")
         _image(axes, depth_m, f"{method}, no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
@@ -266,7 +266,7 @@ def draw_pulse(sensor: Sensor, path: Path) -> Path:
 def draw_demo(
     transient: Transient, histogram: Histogram, depths: dict[str, np.ndarray], errors: dict[str, dict], path: Path
 ) -> Path:
-    """Intensity, true depth, every estimate with its error, and one pixel from returns to detections."""
+    """Draw intensity, true depth, every estimate with its error, and one pixel from returns to detections."""
     figure = plt.figure(figsize=(14, 11.5), layout="constrained")
     panels = figure.subplot_mosaic("ABC;DEF;GGG;HHH", height_ratios=(1, 1, 0.45, 0.6))
     limits = depth_limits(histogram.depth_m)
@@ -274,8 +274,8 @@ def draw_demo(
            vmax=np.quantile(histogram.expected_signal, 0.98))  # fmt: skip
     _image(panels["B"], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     for key, (name, depth) in zip("CDEF", depths.items(), strict=True):
-        said = f"{name}: MAE {errors[name]['mae_mm']:.0f} mm, {errors[name]['within_10mm']:.0%} within 10 mm"
-        _image(panels[key], depth, said, "m", cmap=DEPTH_COLOURS, **limits)
+        message = f"{name}: MAE {errors[name]['mae_mm']:.0f} mm, {errors[name]['within_10mm']:.0%} within 10 mm"
+        _image(panels[key], depth, message, "m", cmap=DEPTH_COLOURS, **limits)
     row, column = _telling_pixel(transient)
     for key in "ABCDEF":
         panels[key].plot(column, row, "o", mfc="none", mec="red", ms=9)
@@ -294,11 +294,11 @@ def _telling_pixel(transient: Transient) -> tuple[int, int]:
     total = transient.total_radiance()
     later = transient.bounces > 1
     indirect = np.bincount(transient.return_pixel[later], weights=transient.radiance[later], minlength=total.size)
-    share = indirect / np.maximum(total.ravel(), 1e-30)
+    fraction = indirect / np.maximum(total.ravel(), 1e-30)
     known = np.isfinite(transient.depth_m) if np.isfinite(transient.depth_m).any() else total > 0
     bright = known & (total >= np.median(total[known])) & ~transient.mixed
     candidates = np.flatnonzero(bright if bright.any() else known)
-    ranked = candidates[np.argsort(share[candidates], kind="stable")]
+    ranked = candidates[np.argsort(fraction[candidates], kind="stable")]
     return np.unravel_index(int(ranked[int(0.9 * (len(ranked) - 1))]), total.shape)
 
 
@@ -308,15 +308,20 @@ def _one_pixel(above: Axes, below: Axes, transient: Transient, histogram: Histog
     pixel = row * transient.width + column
     mine = slice(int(transient.offsets[pixel]), int(transient.offsets[pixel + 1]))
     centre = 0.5 * (transient.path_near_m + transient.path_far_m)[mine] / SPEED_OF_LIGHT_M_PER_S * ns
-    share = transient.radiance[mine] / transient.radiance[mine].sum()
+    fraction = transient.radiance[mine] / transient.radiance[mine].sum()
     for name, colour, kept in (
         ("direct", "tab:green", transient.bounces[mine] == 1),
         ("indirect", "tab:red", transient.bounces[mine] > 1),
     ):
         if kept.any():
-            above.vlines(centre[kept], 0, share[kept], color=colour, lw=1)
+            above.vlines(centre[kept], 0, fraction[kept], color=colour, lw=1)
             above.plot(
-                centre[kept], share[kept], "o", color=colour, ms=3, label=f"{name} returns ({share[kept].sum():.0%})"
+                centre[kept],
+                fraction[kept],
+                "o",
+                color=colour,
+                ms=3,
+                label=f"{name} returns ({fraction[kept].sum():.0%})",
             )
     above.set_yscale("log")
     above.set_ylabel("share of the\npixel's radiance")

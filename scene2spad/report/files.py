@@ -51,24 +51,24 @@ class Found:
     tables: int = 0
 
     def newest(self, name: str) -> Path | None:
-        """The file of that name; all of them count as used."""
+        """Return the file of that name; all of them count as used."""
         paths = self.files.get(name, [])
         self.used.update(paths)
         return paths[0] if paths else None
 
-    def told(self, path: Path) -> str:
-        """Its place in the folder and its day, and how many older ones of its name were passed over."""
+    def caption(self, path: Path) -> str:
+        """Return its place in the folder and its day, and how many older ones of its name were passed over."""
         day = time.strftime("%Y-%m-%d", time.gmtime(path.stat().st_mtime))
         older = len(self.files.get(path.name, [])) - 1
         return f"{path.relative_to(self.root)}, {day}{f'; {older} older of that name not shown' if older > 0 else ''}"
 
     def read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
-        """What a reader makes of a file; None, and a problem, where it cannot."""
+        """Return what a reader makes of a file; None, and a problem, where it cannot."""
         try:
             return reader(path)
         except UNREADABLE as error:
-            said = " ".join(str(error).split())[:120]
-            self.problem(f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {said})")
+            message = " ".join(str(error).split())[:120]
+            self.problem(f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {message})")
             return None
 
     def problem(self, line: str) -> None:
@@ -78,7 +78,7 @@ class Found:
 
 
 def gather(root: Path) -> Found:
-    """All pictures, tables and configurations in a folder. Raises InputError where there is none."""
+    """Return all pictures, tables and configurations in a folder. Raises InputError where there is none."""
     require(root.is_dir(), f"{root}: no folder of results; benches and studies fill one")
     files: dict[str, list[Path]] = {}
     configurations: dict[str, list[Path]] = {name: [] for name in CONFIGURATIONS}
@@ -116,7 +116,7 @@ def _is_smoke(path: Path) -> bool:
 
 
 def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
-    """A PNG's bytes and size; ValueError or OSError where it is none or cut."""
+    """Return a PNG's bytes and size; ValueError or OSError where it is none or cut."""
     data = path.read_bytes()
     with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
         image.verify()
@@ -127,7 +127,7 @@ def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of a table; ValueError where lines are cut."""
+    """Return rows of a table; ValueError where lines are cut."""
     with path.open(newline="", encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines, strict=True))
     if any(None in row or None in row.values() for row in rows):

@@ -62,13 +62,13 @@ Entry = tuple[str, str, Sequence[tuple[str, str]]]  # anchor, title, and those b
 
 
 def page(title: str, lead: Iterable[str], contents: Sequence[Entry], body: Iterable[str]) -> str:
-    """A whole document: title, what comes first, a table of contents, sections."""
+    """Return a whole document: title, what comes first, a table of contents, sections."""
     head = (
         f'<meta charset="utf-8">\n<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n{GENERATOR}\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<link rel="icon" href="data:,">\n'
         f"<title>{escape(title)}</title>\n<style>{STYLE}</style>"
     )
-    items = "".join(f"<li>{link(anchor, told)}{_beneath(below)}</li>\n" for anchor, told, below in contents)
+    items = "".join(f"<li>{link(anchor, text)}{_beneath(below)}</li>\n" for anchor, text, below in contents)
     toc = f'<nav aria-label="Contents"><ol>\n{items}</ol></nav>'
     parts = "\n".join([f"<header>\n<h1>{escape(title)}</h1>", *lead, "</header>", toc, "<main>", *body, "</main>"])
     return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n{parts}\n</body>\n</html>\n'
@@ -78,12 +78,12 @@ def _beneath(below: Sequence[tuple[str, str]]) -> str:
     return f"<ol>{''.join(f'<li>{link(*one)}</li>' for one in below)}</ol>" if below else ""
 
 
-def link(anchor: str, told: str) -> str:
-    return f'<a href="#{escape(anchor)}">{escape(told)}</a>'
+def link(anchor: str, text: str) -> str:
+    return f'<a href="#{escape(anchor)}">{escape(text)}</a>'
 
 
 def section(anchor: str, title: str, body: Iterable[str], level: int = 2) -> str:
-    """A section under a heading of that level; its body is HTML."""
+    """Return a section under a heading of that level; its body is HTML."""
     return f'<section id="{escape(anchor)}">\n<h{level}>{escape(title)}</h{level}>\n' + "\n".join(body) + "\n</section>"
 
 
@@ -93,7 +93,7 @@ def paragraph(text: str, kind: str = "") -> str:
 
 
 def bullets(items: Iterable[str]) -> str:
-    """A list of HTML items."""
+    """Return a list of HTML items."""
     return f"<ul>{''.join(f'<li>{item}</li>' for item in items)}</ul>"
 
 
@@ -102,7 +102,7 @@ def code(text: str) -> str:
 
 
 def picture(anchor: str, png: bytes, size: tuple[int, int], alt: str, caption: str) -> str:
-    """A PNG within the page, as it is."""
+    """Return a PNG within the page, as it is."""
     data = base64.b64encode(png).decode("ascii")
     shape = f'width="{size[0]}" height="{size[1]}"'
     image = f'<img src="data:image/png;base64,{data}" {shape} alt="{escape(alt)}">'
@@ -110,7 +110,7 @@ def picture(anchor: str, png: bytes, size: tuple[int, int], alt: str, caption: s
 
 
 def table(rows: Sequence[Mapping[str, Any]], caption: str, most: int = 60) -> str:
-    """Rows of any keys, the union of them as columns; at most `most`, and what is left out is said."""
+    """Return rows of any keys, the union of them as columns; at most `most`, and what is left out is said."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     head = "".join(f'<th scope="col">{escape(name.replace("_", " "))}</th>' for name in columns)
     lines = "".join(f"<tr>{''.join(_cell(row.get(name)) for name in columns)}</tr>\n" for row in rows[:most])
@@ -129,7 +129,7 @@ def _cell(value: Any) -> str:
 
 
 def spelled(value: Any) -> str:
-    """Four digits of a number, yes or no, a dash for none; lists and dictionaries in a line."""
+    """Return four digits of a number, yes or no, a dash for none; lists and dictionaries in a line."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None or value == "":

@@ -47,12 +47,12 @@ def run(command: Report, progress: Progress) -> dict:
     missing: list[Any] = [{"command": made, "files": names} for made, names in found.missing.items()]
     if not command.json:
         missing = [f"{made}: {', '.join(names)}" for made, names in found.missing.items()]
-    told = {"bytes": out.stat().st_size, "figures": len(found.shown), "tables": found.tables}
-    return {"out": str(out), **told, "problems": found.problems, "missing": missing}
+    common = {"bytes": out.stat().st_size, "figures": len(found.shown), "tables": found.tables}
+    return {"out": str(out), **common, "problems": found.problems, "missing": missing}
 
 
 def compose(found: Found) -> str:
-    """The page."""
+    """Return the page."""
     body, contents = [], []
     for part in SECTIONS:
         items = [(item, text) for item in part.items if (text := _item(item, found))]
@@ -95,8 +95,8 @@ def _item(item: Item, found: Found) -> str:
     measured = [part for part in parts if part]
     if not measured:
         return ""
-    told = [html.paragraph(text) for text in (item.text, *_notes(item, found)) if text]
-    return html.section(item.anchor, item.title, [*told, *measured], level=3)
+    lines = [html.paragraph(text) for text in (item.text, *_notes(item, found)) if text]
+    return html.section(item.anchor, item.title, [*lines, *measured], level=3)
 
 
 def _notes(item: Item, found: Found) -> Iterator[str]:
@@ -127,7 +127,7 @@ def _picture(one: Picture, item: Item, found: Found, absent: dict[str, list[str]
     read = None if path is None else found.read(path, read_png)
     if read is None:
         return _absent(one.file, one.command or item.command, path, absent)
-    return _figure(read, f"{one.shows}.", f"{one.shows}. ({found.told(path)})", found)
+    return _figure(read, f"{one.shows}.", f"{one.shows}. ({found.caption(path)})", found)
 
 
 def _figure(read: tuple[bytes, tuple[int, int]], alt: str, caption: str, found: Found) -> str:
@@ -158,9 +158,9 @@ def _table(one: Table, item: Item, found: Found, absent: dict[str, list[str]]) -
     if path is None or rows is None:
         return _absent(one.file, item.command, path, absent)
     if not rows:
-        return html.paragraph(f"{one.shows}: none in {found.told(path)}.")
+        return html.paragraph(f"{one.shows}: none in {found.caption(path)}.")
     found.tables += 1
-    return html.table(rows, f"{one.shows} ({found.told(path)})")
+    return html.table(rows, f"{one.shows} ({found.caption(path)})")
 
 
 def _named(name: str, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
@@ -169,7 +169,7 @@ def _named(name: str, item: Item, found: Found, absent: dict[str, list[str]]) ->
     rows = None if path is None else found.read(path, read_rows)
     if rows is None:
         return _absent(name, item.command, path, absent)
-    return f"<p>In full: {html.code(found.told(path))}, {len(rows)} rows.</p>"
+    return f"<p>In full: {html.code(found.caption(path))}, {len(rows)} rows.</p>"
 
 
 # The rest
@@ -185,9 +185,9 @@ def _others(found: Found) -> list[str]:
             read = found.read(path, read_png)
             if read is not None:
                 shows = path.stem.replace("-", " ").replace(".", ", ")
-                parts.append(_figure(read, f"{shows}.", found.told(path), found))
+                parts.append(_figure(read, f"{shows}.", found.caption(path), found))
         else:
-            names.append(html.code(found.told(path)))
+            names.append(html.code(found.caption(path)))
     return [*parts, *([html.paragraph("Named alone:"), html.bullets(names)] if names else [])]
 
 
@@ -195,13 +195,13 @@ def _smoke(found: Found) -> list[str]:
     """Pictures of smoke runs, and the names of their tables: never beside printed numbers."""
     if not found.smoke:
         return []
-    said = "Made with --preset smoke, in a minute, to see that all runs. These numbers say nothing of the methods."
-    parts, names = [html.paragraph(said, "problem")], []
+    summary = "Made with --preset smoke, in a minute, to see that all runs. These numbers say nothing of the methods."
+    parts, names = [html.paragraph(summary, "problem")], []
     for path in found.smoke:
-        told = f"smoke: {path.relative_to(found.root)}"
+        message = f"smoke: {path.relative_to(found.root)}"
         read = found.read(path, read_png) if path.suffix == ".png" else None
         if read is not None:
-            parts.append(_figure(read, f"{told}.", told, found))
+            parts.append(_figure(read, f"{message}.", message, found))
         elif path.suffix != ".png":
             names.append(html.code(str(path.relative_to(found.root))))
     return [*parts, html.bullets(names)] if names else parts
@@ -298,5 +298,5 @@ def _undecided(found: Found) -> Iterator[str]:
         for one in rows_in((numbers or {}).get("conclusions")):
             whole = "ranking" not in one or one.get("levels") == "all"
             if whole and "not decided" in (one.get("verdict"), one.get("ranking")):
-                told = one.get("claim") or f"ranking of codes, {one.get('laser')} laser, step {one.get('step')}"
-                yield f"{Path(name).stem}: {told}{f' ({why})' if (why := one.get('why')) else ''}"
+                message = one.get("claim") or f"ranking of codes, {one.get('laser')} laser, step {one.get('step')}"
+                yield f"{Path(name).stem}: {message}{f' ({why})' if (why := one.get('why')) else ''}"

@@ -22,7 +22,8 @@ POWER_COLUMNS = ("clocks", "bytes_per_pixel", "rate_kb_per_s", "processing_uw", 
 
 
 def published_tables(which: str, rows_of: RowsOf) -> list[str]:
-    """The tables of an item, by what its `published` says; `rows_of` gives a result's rows by its file's name."""
+    """Return the tables of an item, by what its `published` says; `rows_of` gives a result's rows by its file's
+    name."""
     if not which:
         return []
     if which == "power":
@@ -48,7 +49,7 @@ def _wanted(study: str, figure: str) -> list[ModelSpec]:
 
 
 def error_rows(wanted: Iterable[ModelSpec], measured: Sequence[dict], far: bool) -> list[dict[str, object]]:
-    """A row a measured model: published and ours, as they are and with `far` 7 m farther too."""
+    """Return a row a measured model: published and ours, as they are and with `far` 7 m farther too."""
     ours, rows = {row.get("model"): row for row in measured}, []
     for one in wanted:
         print_, mine = printed(one), ours.get(one.name)
@@ -71,7 +72,7 @@ def _ratio(found: float | None, published: float | None) -> str:
 
 
 def power_rows(measured: Sequence[dict]) -> list[dict[str, object]]:
-    """A row a measured program: every published number, and the emulated one."""
+    """Return a row a measured program: every published number, and the emulated one."""
     ours, rows = {row.get("name"): row for row in measured}, []
     for name, published in PUBLISHED.items():
         mine, row = ours.get(name), {"program": name}

@@ -84,7 +84,8 @@ class _Truth(NamedTuple):
 def decoded_table(
     histograms: Iterable[Histogram], codes: tuple[str, ...] = CODES, numbers: tuple[int, ...] = NUMBERS
 ) -> list[Row]:
-    """Rows of every code and K, and of the uncompressed histogram, for each of the histograms, all of one sensor.
+    """Return rows of every code and K, and of the uncompressed histogram, for each of the histograms, all of one
+    sensor.
 
     A K that does not fit a code is left out. The histograms may come one by one: their codes are kept, not they.
     """
@@ -155,15 +156,15 @@ def _row(method: str, codes: int, truth: _Truth, depth_m: Tensor, sensor: Sensor
 
 
 def sensed(transient: Transient, sensor: Sensor, seed: int, progress: Progress) -> Iterator[Histogram]:
-    """The transient at each of the paper's 16 photon levels."""
+    """Yield the transient at each of the paper's 16 photon levels."""
     for number, level in enumerate(LEVELS):
         progress(f"{level[0]} + {level[1]} photons", number / len(LEVELS))
         yield sense(transient, sensor, PhotonBudget(*level), seed=seed)
 
 
 def by_group(rows: list[Row]) -> list[dict]:
-    """Means over the photon levels of each of the paper's groups (SBR at most 0.1, above) and over all, a row a code
-    and K."""
+    """Return means over the photon levels of each of the paper's groups (SBR at most 0.1, above) and over all, a row a
+    code and K."""
     found = []
     for method, codes in dict.fromkeys((row.method, row.codes) for row in rows):
         mine = [row for row in rows if (row.method, row.codes) == (method, codes)]
@@ -206,18 +207,18 @@ def run(command: Study, progress: Progress) -> dict:
 
 def _lines(groups: list[dict]) -> list[str]:
     heads = ("MAE mm, all", "SBR > 0.1", "SBR <= 0.1", "median |error|", "within 10 mm")
-    said = [" ".join([f"{'method':<12} {'K':>4}", *(f"{head:>14}" for head in heads)])]
+    lines = [" ".join([f"{'method':<12} {'K':>4}", *(f"{head:>14}" for head in heads)])]
     for g in groups:
         values = (*(g[f"mae_mm_{group}"] for group in GROUPS), g["median_abs_mm_all"])
         numbers = " ".join(f"{value:>14.1f}" for value in values)
-        said.append(f"{g['method']:<12} {g['codes'] or '-':>4} {numbers} {g['within_10mm_all']:>14.1%}")
+        lines.append(f"{g['method']:<12} {g['codes'] or '-':>4} {numbers} {g['within_10mm_all']:>14.1%}")
     bounds = " ".join(f"{groups[0][f'bound_mm_{group}']:>14.1f}" for group in GROUPS)
-    said.append(f"{'Cramer-Rao':<12} {'-':>4} {bounds}")
-    return said
+    lines.append(f"{'Cramer-Rao':<12} {'-':>4} {bounds}")
+    return lines
 
 
 def draw(groups: list[dict], scene: str, path: Path) -> Path:
-    """MAE and median error against K, a column a group of photon levels; the uncompressed histogram as lines."""
+    """Draw MAE and median error against K, a column a group of photon levels; the uncompressed histogram as lines."""
     figure, panels = plt.subplots(2, 2, figsize=(12, 8), layout="constrained", sharex=True, sharey="row")
     titles = {"high_sbr": "signal / background above 0.1 (9 levels)", "low_sbr": "at most 0.1 (7 levels)"}
     kinds = {"mae_mm": "mean absolute depth error [mm]", "median_abs_mm": "median absolute depth error [mm]"}

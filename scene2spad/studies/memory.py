@@ -30,7 +30,7 @@ NAMED_BLOCKS = ((256, 4, 4), (1024, 4, 4), (256, 8, 8), (256, 2, 2), (64, 4, 4))
 
 
 def run(command: Study, progress: Progress) -> dict:
-    """Both figures; their numbers, by K and then by N and B; the section's statements."""
+    """Run the study: both figures; their numbers, by K and then by N and B; the section's statements."""
     command.out.mkdir(parents=True, exist_ok=True)
     tables, drawn = {}, []
     for name, factor, title in (
@@ -47,7 +47,8 @@ def run(command: Study, progress: Progress) -> dict:
 
 
 def ratios(factor: float) -> dict[int, dict[str, np.ndarray]]:
-    """{K: {in-sensor storage, data transfer: compression ratios (N, B)}} for coding tensors of M / factor numbers."""
+    """Return {K: {in-sensor storage, data transfer: compression ratios (N, B)}} for coding tensors of M / factor
+    numbers."""
     counts, blocks = COUNTS[:, None], BLOCKS[None, :]
     return {
         codes: {
@@ -59,7 +60,7 @@ def ratios(factor: float) -> dict[int, dict[str, np.ndarray]]:
 
 
 def statements() -> list[dict[str, object]]:
-    """What S.6 says, what is printed there, and the same from the equations of Table 1."""
+    """Return what S.6 says, what is printed there, and the same from the equations of Table 1."""
     blocks = {" x ".join(map(str, block)): block for block in NAMED_BLOCKS}
     sizes = {name: float(Design("learned", block, 64).parameters // 64) for name, block in blocks.items()}
     factors = {name: separable_factor(*block) for name, block in blocks.items()}
@@ -106,8 +107,8 @@ def statements() -> list[dict[str, object]]:
     ]
 
 
-def _statement(said: str, verdict: str, recomputed: dict[str, float]) -> dict[str, object]:
-    return {"said": said, "verdict": verdict, "recomputed": recomputed}
+def _statement(claim: str, verdict: str, recomputed: dict[str, float]) -> dict[str, object]:
+    return {"said": claim, "verdict": verdict, "recomputed": recomputed}
 
 
 def _draw(table: dict[int, dict[str, np.ndarray]], title: str, path: Path) -> Path:
@@ -124,7 +125,7 @@ def _heatmap(axes: Axes, values: np.ndarray, title: str) -> None:
     shown = axes.imshow(np.log10(values), cmap="RdBu", norm=TwoSlopeNorm(0, -3, 7), aspect="auto", origin="lower")
     for (row, column), value in np.ndenumerate(values):
         dark = not -1.5 < np.log10(value) < 4
-        axes.text(column, row, _spelled(value), ha="center", va="center", fontsize=7, color="w" if dark else "k")
+        axes.text(column, row, _format_value(value), ha="center", va="center", fontsize=7, color="w" if dark else "k")
     axes.set_title(title, fontsize=10)
     axes.set_xticks(range(len(BLOCKS)), [f"$10^{i}$" for i in range(len(BLOCKS))])
     axes.set_yticks(range(len(COUNTS)), [f"$10^{int(np.log10(n))}$" for n in COUNTS])
@@ -132,5 +133,5 @@ def _heatmap(axes: Axes, values: np.ndarray, title: str) -> None:
     axes.figure.colorbar(shown, ax=axes, pad=0.01).set_label("log$_{10}$ ratio", fontsize=8)
 
 
-def _spelled(value: float) -> str:
+def _format_value(value: float) -> str:
     return f"{value:,.0f}" if 100 <= value < 1e5 else f"{value:.2g}"

@@ -133,7 +133,7 @@ def _view(job: Job, view: int, again: int, cache: Path, progress: Progress) -> T
 
 
 def measured_error(found: Sequence[Transient], a: Sequence[Transient], b: Sequence[Transient]) -> float:
-    """Mean over views of the nRMSE against two fine renders of each; a squared error below 0 counts as 0."""
+    """Return mean over views of the nRMSE against two fine renders of each; a squared error below 0 counts as 0."""
     return statistics.fmean(_nrmse(*three) for three in zip(found, a, b, strict=True))
 
 
@@ -155,7 +155,7 @@ def _expected(transient: Transient) -> Iterator[np.ndarray]:
 def errors_of(
     methods: Mapping[str, Method], views: Views, sensor: Sensor, tile: tuple[int, int], seed: int
 ) -> dict[str, tuple[float, float]]:
-    """{method: (MAE [mm], its standard error from the draws of photons)}, the mean over views and levels."""
+    """Return {method: (MAE [mm], its standard error from the draws of photons)}, the mean over views and levels."""
     draws: dict[str, list[float]] = {name: [] for name in methods}
     for draw in range(DRAWS):
         found = evaluate(methods, views, sensor, levels=LEVELS, tile=tile, seed=seed + draw)
@@ -167,9 +167,9 @@ def errors_of(
 
 
 def _lines(rows: Sequence[Row], methods: Sequence[str]) -> list[str]:
-    said = [f"{'grid':>4} {'paths':>6} {'run':>3} {'error':>8} {'measured':>8}  MAE [mm] of {', '.join(methods)}"]
+    lines = [f"{'grid':>4} {'paths':>6} {'run':>3} {'error':>8} {'measured':>8}  MAE [mm] of {', '.join(methods)}"]
     for first in range(0, len(rows), len(methods)):
         row, *_ = group = rows[first : first + len(methods)]
         errors = "  ".join(f"{r.mae_mm:8.2f} +- {r.mae_std_mm:.2f}" for r in group)
-        said.append(f"{row.grid:>4} {row.spp:>6} {row.run:>3} {row.error:>8.2%} {row.measured:>8.2%}  {errors}")
-    return said
+        lines.append(f"{row.grid:>4} {row.spp:>6} {row.run:>3} {row.error:>8.2%} {row.measured:>8.2%}  {errors}")
+    return lines

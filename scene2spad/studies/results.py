@@ -24,7 +24,7 @@ class Store:
         self._known: dict[str, dict[str, Any]] = {}
 
     def get(self, digest: str, **key: object) -> Any:
-        """The value, or None."""
+        """Return the value, or None."""
         return self._of(digest).get(_text(key))
 
     def put(self, digest: str, value: Any, **key: object) -> None:
@@ -34,9 +34,9 @@ class Store:
         known[_text(key)] = value
 
     def map_file(self, digest: str, **key: object) -> Path:
-        """Where a depth map of that key lies, if it does."""
-        told = "-".join(f"{value:g}" if isinstance(value, float) else str(value) for value in key.values())
-        return self.folder / "maps" / f"{digest[:16]}-{told}.npy"
+        """Return where a depth map of that key lies, if it does."""
+        message = "-".join(f"{value:g}" if isinstance(value, float) else str(value) for value in key.values())
+        return self.folder / "maps" / f"{digest[:16]}-{message}.npy"
 
     def put_map(self, depth_m: np.ndarray, digest: str, **key: object) -> None:
         path = self.map_file(digest, **key)

@@ -48,8 +48,8 @@ def run(command: Study, progress: Progress) -> dict:
     for number, (name, codings) in enumerate(sheets.items()):
         progress(name, number / len(sheets))
         drawn.append(str(draw(codings, command.out / f"{name}.png")))
-    told = {name: [described(coding) for coding in codings] for name, codings in sheets.items()}
-    return {"figures": drawn, "tensors": told}
+    common = {name: [described(coding) for coding in codings] for name, codings in sheets.items()}
+    return {"figures": drawn, "tensors": common}
 
 
 def _start(design: Design, seed: int) -> CodingTensor:
@@ -61,7 +61,7 @@ def _start(design: Design, seed: int) -> CodingTensor:
 
 
 def coding_of(path: Path) -> CodingTensor:
-    """The coding tensor in a file: a checkpoint whose state holds `temporal` and maybe `spatial` (of one layer,
+    """Return the coding tensor in a file: a checkpoint whose state holds `temporal` and maybe `spatial` (of one layer,
     under any prefix), or a .npy array (K, Mt) or (K, Mt, Mr, Mc). Raises InputError in one line.
     """
     regular_file(path)
@@ -83,19 +83,20 @@ def coding_of(path: Path) -> CodingTensor:
 
 
 def temporal_matrix(coding: CodingTensor) -> Tensor:
-    """(K, Mt): the temporal part; of a full tensor that of the block's first pixel."""
+    """Return (K, Mt): the temporal part; of a full tensor that of the block's first pixel."""
     return coding.temporal if coding.temporal.ndim == 2 else coding.temporal[:, :, 0, 0]
 
 
 def row_scaled(matrix: Tensor) -> Tensor:
-    """Every row stretched to -1 .. 1 between its least and largest value, as in the paper's figures; flat rows 0."""
+    """Return every row stretched to -1 .. 1 between its least and largest value, as in the paper's figures; flat rows
+    0."""
     low, high = matrix.amin(1, keepdim=True), matrix.amax(1, keepdim=True)
     return torch.where(high > low, (2 * matrix - low - high) / (high - low).clamp(min=1e-30), 0.0)
 
 
 def described(coding: CodingTensor) -> dict[str, object]:
-    """Size and cost, the share of the codes' energy in the later half of Mt (S.1: near nothing where training scenes
-    had no such depths), and each row's strongest harmonic."""
+    """Return size and cost, the share of the codes' energy in the later half of Mt (S.1: near nothing where training
+    scenes had no such depths), and each row's strongest harmonic."""
     matrix = temporal_matrix(coding).double()
     centred = matrix - matrix.mean(1, keepdim=True)
     energy = centred.square().sum(0)
@@ -113,7 +114,7 @@ def described(coding: CodingTensor) -> dict[str, object]:
 
 
 def draw(codings: list[CodingTensor], path: Path) -> Path:
-    """One column a tensor: its matrix, rows scaled to +-1, and some of its rows as functions of time."""
+    """Draw one column a tensor: its matrix, rows scaled to +-1, and some of its rows as functions of time."""
     figure = plt.figure(figsize=(max(6.5, 4.2 * len(codings)), 7), layout="constrained")
     parts = figure.subfigures(1, len(codings), squeeze=False)[0]
     for part, coding in zip(parts, codings, strict=True):

@@ -19,11 +19,11 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from scenes.errors import require
+from scenes.errors import InputError, require
 from scenes.limits import require_memory
 
 if TYPE_CHECKING:
@@ -47,10 +47,19 @@ class Sink(io.RawIOBase):
     """
 
     def __init__(self, file: io.FileIO) -> None:
-        self._file, self._error = file, None
-        self.seek, self.tell, self.readinto = file.seek, file.tell, file.readinto
+        self._file = file
+        self._error: OSError | None = None
 
-    def write(self, data: bytes) -> int:
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        return self._file.readinto(buffer)
+
+    def write(self, data: Any, /) -> int:
         left = memoryview(data).cast("B")
         while self._error is None and len(left):
             try:
@@ -94,7 +103,7 @@ def add_checksum(path: Path) -> None:
         file.write(line.ljust(USER_BLOCK, b"\0"))
 
 
-def _digest(file: object) -> str:
+def _digest(file: IO[bytes]) -> str:
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
         return hashlib.sha256(memoryview(contents)[USER_BLOCK:]).hexdigest()
 
@@ -216,7 +225,8 @@ def read_dataset(file: h5py.File, name: str) -> np.ndarray:
 
     inside = isinstance(file.get(name, getlink=True), h5py.HardLink)
     dataset = file[name] if inside else None
-    require(isinstance(dataset, h5py.Dataset), f"{name} is no dataset of this file")
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError(f"{name} is no dataset of this file")
     require(dataset.dtype.kind in "biuf" and dataset.shape is not None, f"{name} holds no numbers")
     require(not dataset.is_virtual and not dataset.external, f"{name} lies in another file")
     size = dataset.dtype.itemsize

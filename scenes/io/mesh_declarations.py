@@ -57,12 +57,13 @@ class _Property(NamedTuple):
 
 class _Element(NamedTuple):
     name: str
-    count: int
+    rows: int
     properties: list[_Property]
 
 
 def check_ply(content: bytes) -> None:
-    """InputError unless a PLY holds as many values as its header says, no more and no fewer, all of them numbers."""
+    """Raise InputError unless a PLY holds as many values as its header says, no more and no fewer, all of them
+    numbers."""
     elements, order, start = _ply_header(content)
     if order is None:
         _check_ply_text(content[start:], elements)
@@ -75,12 +76,13 @@ def check_ply(content: bytes) -> None:
 def _ply_header(content: bytes) -> tuple[list[_Element], str | None, int]:
     """Elements, byte order (None: text), and where the data begins."""
     end = re.search(rb"^[ \t]*end_header[ \t]*\r?\n?", content, re.MULTILINE)
-    require(end is not None, "its header has no end_header")
+    if end is None:
+        raise InputError("its header has no end_header")
     lines = [line.split() for line in content[: end.start()].decode("latin-1").splitlines()]
     formats = [line[1] for line in lines if len(line) > 1 and line[0] == "format"]
     orders = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-    said = f"format {' '.join(formats) or '(none)'}, expected {', '.join(orders)}"
-    require(len(formats) == 1 and formats[0] in orders, said)
+    message = f"format {' '.join(formats) or '(none)'}, expected {', '.join(orders)}"
+    require(len(formats) == 1 and formats[0] in orders, message)
     elements: list[_Element] = []
     for line in lines:
         match line:
@@ -105,31 +107,31 @@ def _check_ply_text(body: bytes, elements: list[_Element]) -> None:
         lines = body.decode("utf-8").rstrip().splitlines()
     except UnicodeDecodeError:
         raise InputError("its data are no text") from None
-    expected = sum(element.count for element in elements)
+    expected = sum(element.rows for element in elements)
     require(len(lines) == expected, f"cut short or damaged: {len(lines)} lines of data, its header says {expected}")
     at = 0
     for element in elements:
-        rows, at = lines[at : at + element.count], at + element.count
+        rows, at = lines[at : at + element.rows], at + element.rows
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of what is no number, and ends there
             values = np.fromstring(" ".join(rows), sep=" ")
         end = _end_of_text(values, element)
-        said = f"cut short or damaged: {len(values)} numbers for {element.count} elements {element.name!r}"
-        require(end == len(values), f"{said}, expected {end}")
+        message = f"cut short or damaged: {len(values)} numbers for {element.rows} elements {element.name!r}"
+        require(end == len(values), f"{message}, expected {end}")
 
 
 def _end_of_text(values: np.ndarray, element: _Element) -> int:
     """How many numbers the element has by its properties and the lengths of its lists."""
     if all(one.count_type is None for one in element.properties):
-        return element.count * len(element.properties)
+        return element.rows * len(element.properties)
     width, places = _text_row(values, 0, element)
-    end = element.count * width
+    end = element.rows * width
     if end <= len(values):
-        rows = values[:end].reshape(element.count, width)
+        rows = values[:end].reshape(element.rows, width)
         if all((rows[:, place] == rows[0, place]).all() for place in places):
             return end
     end = 0
-    for _ in range(element.count):
+    for _ in range(element.rows):
         end += _text_row(values, end, element)[0]
     return end
 
@@ -149,12 +151,12 @@ def _text_row(values: np.ndarray, start: int, element: _Element) -> tuple[int, l
 
 def _end_of_binary(content: bytes, start: int, element: _Element, order: str) -> int:
     """Where the element's rows end. InputError for rows that are not all there, or lists of different lengths."""
-    if element.count == 0:
+    if element.rows == 0:
         return start
     fields: list[tuple] = []
     size = 0
     for number, one in enumerate(element.properties):
-        length = ()
+        length: tuple[int, ...] = ()
         if one.count_type is not None:
             kind = np.dtype(order + one.count_type)
             first = content[start + size : start + size + kind.itemsize]
@@ -165,11 +167,11 @@ def _end_of_binary(content: bytes, start: int, element: _Element, order: str) ->
             size += kind.itemsize
         fields.append((f"value{number}", order + one.type, length))
         size += np.dtype(one.type).itemsize * (length[0] if length else 1)
-    end = start + element.count * size
-    said = f"cut short or damaged: {element.count} elements {element.name!r} take {end - start} bytes"
-    require(end <= len(content), f"{said}, {len(content) - start} are there")
+    end = start + element.rows * size
+    message = f"cut short or damaged: {element.rows} elements {element.name!r} take {end - start} bytes"
+    require(end <= len(content), f"{message}, {len(content) - start} are there")
     if any(one.count_type for one in element.properties):
-        rows = np.frombuffer(content, np.dtype(fields), element.count, start)
+        rows = np.frombuffer(content, np.dtype(fields), element.rows, start)
         lists = [rows[name] for name, *_ in fields if name.startswith("count")]
         even = all((counts == counts[0]).all() for counts in lists)
         require(even, f"elements {element.name!r} have lists of different lengths, which is read from text alone")
@@ -187,8 +189,8 @@ def check_stl(content: bytes) -> int:
         if len(content) == expected:
             return count
         text = content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
-        said = f"cut short or damaged: its header says {count} triangles in {expected} bytes"
-        require(text, f"{said}, it has {len(content)}")
+        message = f"cut short or damaged: its header says {count} triangles in {expected} bytes"
+        require(text, f"{message}, it has {len(content)}")
     return _check_stl_text(content.lower())
 
 
@@ -205,7 +207,7 @@ def _check_stl_text(text: bytes) -> int:
 
 
 def check_glb(content: bytes, read: ReadImage) -> None:
-    """InputError unless a GLB is whole, its indices and counts are possible, and the textures it uses are there.
+    """Raise InputError unless a GLB is whole, its indices and counts are possible, and the textures it uses are there.
 
     `read` gives the bytes of a file that the GLB names.
     """
@@ -267,8 +269,8 @@ def _check_accessors(header: dict, size: int) -> None:
     read = {number for numbers in used for number in numbers}
     for number, accessor in enumerate(accessors):
         held = "bufferView" in accessor and "sparse" not in accessor
-        said = f"accessor {number} is sparse or compressed, which is not read; export it uncompressed"
-        require(held or number not in read, said)
+        message = f"accessor {number} is sparse or compressed, which is not read; export it uncompressed"
+        require(held or number not in read, message)
         fits = held or accessor["count"] <= size
         require(fits, f"accessor {number} declares {accessor['count']} elements in a file of {size} bytes")
 

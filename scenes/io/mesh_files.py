@@ -49,7 +49,11 @@ def load_trimesh(path: Path, kind: str, **options: Any) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             loaded = trimesh.load_scene(
-                io.BytesIO(content), file_type=kind[1:], resolver=beside, process=False, **options
+                io.BytesIO(content),
+                file_type=kind[1:],
+                resolver=beside,
+                process=False,
+                **options,  # type: ignore[arg-type]
             )
         if triangles is not None:
             found = sum(len(getattr(mesh, "faces", ())) for mesh in loaded.geometry.values())
@@ -60,8 +64,8 @@ def load_trimesh(path: Path, kind: str, **options: Any) -> Any:
     except Exception as error:  # every format of trimesh has its own exceptions
         reason = (str(error).splitlines() or [""])[0]
         # a missing import is how trimesh says that it cannot even guess the text encoding
-        told = reason[:200] if reason and not isinstance(error, ImportError) else "content not understood"
-        raise InputError(f"{path}: broken {kind} file ({told})") from None
+        message = reason[:200] if reason and not isinstance(error, ImportError) else "content not understood"
+        raise InputError(f"{path}: broken {kind} file ({message})") from None
     return loaded
 
 
@@ -94,9 +98,9 @@ def _check_size(loaded: Any) -> None:
 
 
 def check_vertices(vertices: np.ndarray, name: str) -> None:
-    """InputError unless all coordinates are finite and of a size that can be computed with."""
+    """Raise InputError unless all coordinates are finite and of a size that can be computed with."""
     bad = int((~np.isfinite(vertices).all(axis=1)).sum())
     require(not bad, f"{bad} of {len(vertices)} vertices of {name} are NaN or infinite")
     largest = float(np.abs(vertices).max(initial=0.0))
-    said = f"a coordinate of {name} is {largest:g}, expected {MAX_COORDINATE:g} at the most"
-    require(largest <= MAX_COORDINATE, said)
+    message = f"a coordinate of {name} is {largest:g}, expected {MAX_COORDINATE:g} at the most"
+    require(largest <= MAX_COORDINATE, message)

@@ -56,7 +56,7 @@ class _Part:
 
 
 def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placing = AS_IT_IS) -> Scene:
-    """The scene of one mesh file, metres, y up: floor at y = 0, wall behind, camera before the model's +z side.
+    """Return the scene of one mesh file, metres, y up: floor at y = 0, wall behind, camera before the model's +z side.
 
     The model keeps its size if its largest extent is 0.2 to 2.5 m. Otherwise the unit that the file names is taken (a
     comment or header such as "units: mm"), else millimetres or inches where these make 0.2 to 2.5 m of it, else it is
@@ -102,7 +102,8 @@ def _camera(centre: np.ndarray, radius: float, width: int, height: int) -> Camer
 
 
 def backdrop(camera: Camera, wall_z: float, least_m: float = 4.0) -> list[Surface]:
-    """A floor at y = 0 and a wall at z = `wall_z`, both as large as the whole image needs and `least_m` at least.
+    """Return a floor at y = 0 and a wall at z = `wall_z`, both as large as the whole image needs and `least_m` at
+    least.
 
     The camera is above the floor, before the wall, and its top row looks towards the wall (not steeper than upright).
     """
@@ -223,9 +224,9 @@ def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
     with path.open("rb") as file:
         header = file.read(HEADER_BYTES).decode("latin-1")
     names = "|".join(sorted(UNITS_M, key=len, reverse=True))
-    told = re.search(rf"\bunits?\b[^a-z0-9\n]{{0,9}}(?:are |in )?({names})", header, re.IGNORECASE)
-    if told is not None and path.suffix.lower() != ".glb":
-        unit = told[1].lower()
+    stated = re.search(rf"\bunits?\b[^a-z0-9\n]{{0,9}}(?:are |in )?({names})", header, re.IGNORECASE)
+    if stated is not None and path.suffix.lower() != ".glb":
+        unit = stated[1].lower()
         return UNITS_M[unit], [f"warning: unit {unit!r} taken from the file's own words"]
     if low <= extent <= high:
         return 1.0, []

@@ -71,7 +71,7 @@ class Materials:
         self._default = Look(Material("diffuse", albedo=0.5, name="default"))
 
     def of_shape(self, shape: Plugin) -> Look:
-        """The look of a shape; without a bsdf it is diffuse grey as in Mitsuba."""
+        """Return the look of a shape; without a bsdf it is diffuse grey as in Mitsuba."""
         bsdfs = shape.nested("bsdf")
         if len(bsdfs) > 1:
             raise shape.fail(f"has {len(bsdfs)} bsdfs, expected one")
@@ -132,7 +132,7 @@ class Materials:
     def fraction(
         self, plugin: Plugin, name: str, default: float, uv: _Uv, *, channel: str = "luminance"
     ) -> float | Texture:
-        """A reflectance or opacity: a number or a texture, clipped at 1 with a note."""
+        """Return a reflectance or opacity: a number or a texture, clipped at 1 with a note."""
         nested = plugin.nested_as(name)
         if nested is None:
             return _clipped(plugin, name, plugin.colour(name, default))
@@ -144,7 +144,7 @@ class Materials:
         return texture
 
     def mean(self, plugin: Plugin, name: str, default: float) -> float:
-        """A number, or the mean of a texture where the model has no room for one."""
+        """Return a number, or the mean of a texture where the model has no room for one."""
         nested = plugin.nested_as(name)
         if nested is None:
             return plugin.colour(name, default)
@@ -152,7 +152,7 @@ class Materials:
         return float(self.texture(nested)[0].image.mean(dtype=np.float64))
 
     def texture(self, plugin: Plugin, channel: str = "luminance") -> tuple[Texture, np.ndarray]:
-        """A texture and its uv transform (3x3, Mitsuba's v)."""
+        """Return a texture and its uv transform (3x3, Mitsuba's v)."""
         if plugin.tag != "texture":
             raise plugin.fail("expected a texture here")
         if plugin.type == "bitmap":
@@ -181,7 +181,7 @@ class Materials:
         return self.image(path, linear, channel)
 
     def image(self, path: Path, linear: bool, channel: str) -> Texture:
-        """A texture file, read once."""
+        """Return a texture file, read once."""
         key = (path.resolve(), linear, channel)
         if key not in self._images:
             self._images[key] = load_texture(path, linear=linear, channel=channel)
@@ -324,13 +324,13 @@ def _phong(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
     exponent = materials.mean(plugin, "exponent", 30.0)
     if exponent < 0:
         raise plugin.fail(f"exponent {exponent:g} is negative")
-    share = materials.mean(plugin, "specular_reflectance", 0.2)
+    fraction = materials.mean(plugin, "specular_reflectance", 0.2)
     fresnel = ((INDICES["polypropylene"] - 1) / (INDICES["polypropylene"] + 1)) ** 2
     plugin.note("phong is taken as rough plastic of the same width, whose highlight grows towards grazing angles")
     return {
         "kind": "roughplastic",
         "albedo": materials.fraction(plugin, "diffuse_reflectance", 0.5, uv),
-        "specular": min(share / fresnel, 1.0),
+        "specular": min(fraction / fresnel, 1.0),
         "ior": INDICES["polypropylene"],
         "roughness": min(max(math.sqrt(2 / (exponent + 2)), 1e-3), 1.0),
         "distribution": "beckmann",

@@ -143,32 +143,32 @@ class Document:
         self._ids[name] = target
 
     def need(self, element: ElementTree.Element, attribute: str) -> str:
-        """An attribute that must be there."""
+        """Return an attribute that must be there."""
         value = element.get(attribute)
         if value is None:
             raise self.error(element, f'lacks {attribute}="..."')
         return value
 
     def error(self, element: ElementTree.Element, message: str) -> LocatedError:
-        """The one-line error about an element, with its file."""
+        """Return the one-line error about an element, with its file."""
         shown = " ".join(f'{key}="{element.get(key)}"' for key in ("type", "id", "name") if element.get(key))
         label = f"<{element.tag} {shown}>" if shown else f"<{element.tag}>"
         return LocatedError(f"{self._sources.get(element, self.path)}: {label}: {message}")
 
     def target(self, element: ElementTree.Element, name: str) -> ElementTree.Element:
-        """The element that carries an id."""
+        """Return the element that carries an id."""
         if name not in self._ids:
             raise self.error(element, f"unknown id {name!r}, known: {listed(sorted(self._ids)) or 'none'}")
         return self._ids[name]
 
     def shared(self, element: ElementTree.Element, make: Callable[[], Made]) -> Made:
-        """What `make` makes of an element, once: all references to it share the one object."""
+        """Return what `make` makes of an element, once: all references to it share the one object."""
         if element not in self._made:
             self._made[element] = make()
-        return self._made[element]
+        return self._made[element]  # type: ignore[return-value]  # what `make` made
 
     def file(self, element: ElementTree.Element, name: str, what: str) -> Path:
-        """A file inside the scene's folder; anything else is refused, symbolic links followed."""
+        """Return a file inside the scene's folder; anything else is refused, symbolic links followed."""
         try:
             return file_inside(self.path.parent, name, what, "the scene's folder")
         except InputError as error:

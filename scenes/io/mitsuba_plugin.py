@@ -33,7 +33,7 @@ class Plugin:
 
     @classmethod
     def of(cls, document: Document, element: Element) -> Plugin:
-        """The one Plugin object of an element, so that references share it."""
+        """Return the one Plugin object of an element, so that references share it."""
         return document.shared(element, lambda: cls(element, document))
 
     def __init__(self, element: Element, document: Document) -> None:
@@ -83,11 +83,11 @@ class Plugin:
         self.document.notes.add(text, self.name)
 
     def nested(self, *tags: str) -> list[Plugin]:
-        """Nested plugins of these tags, references followed."""
+        """Return nested plugins of these tags, references followed."""
         return [self._inner(element) for _, element in self._nested if element.tag in tags]
 
     def nested_as(self, name: str) -> Plugin | None:
-        """The nested plugin given as the parameter `name`."""
+        """Return the nested plugin given as the parameter `name`."""
         found = [element for key, element in self._nested if key == name]
         return self._inner(found[0]) if found else None
 
@@ -97,7 +97,7 @@ class Plugin:
         return plugin
 
     def refuse(self, *tags: str) -> None:
-        """One line about the first nested plugin that this project has no model for."""
+        """Raise one line about the first nested plugin that this project has no model for."""
         for plugin in self.nested(*tags):
             raise self.fail(f'<{plugin.tag} type="{plugin.type}"> is not supported, remove it')
 
@@ -130,7 +130,7 @@ class Plugin:
 
     def number(self, name: str, default: float | None = None) -> float:
         text = self._text(name, ("float", "integer"), default)
-        return float(default) if text is None else self.numbers(text, name, 1)[0]
+        return float(default or 0) if text is None else self.numbers(text, name, 1)[0]
 
     def integer(self, name: str, default: int | None = None) -> int:
         value = self.number(name, default)
@@ -155,7 +155,7 @@ class Plugin:
         return np.array(default, dtype=float) if element is None else self._xyz(element, 0.0)
 
     def colour(self, name: str, default: float | None = None) -> float:
-        """The luminance of a number or colour, linear."""
+        """Return the luminance of a number or colour, linear."""
         element = self.value(name)
         if element is None:
             if default is None:
@@ -178,9 +178,8 @@ class Plugin:
             return float(np.trapezoid(value, wavelength) / span if span > 0 else value.mean())
         if element.tag in ("rgb", "srgb"):
             encoded = element.tag == "srgb" or text.startswith("#")
-            rgb = self._hex(name, text) if text.startswith("#") else self.numbers(text, name, 1, 3)
-            rgb = np.broadcast_to(srgb_to_linear(np.array(rgb)) if encoded else np.array(rgb), 3)
-            return float(luminance(rgb))
+            values = np.array(self._hex(name, text) if text.startswith("#") else self.numbers(text, name, 1, 3))
+            return float(luminance(np.broadcast_to(srgb_to_linear(values) if encoded else values, 3)))
         return self.numbers(text, name, 1)[0]
 
     def _blackbody(self, name: str, element: Element) -> float:
@@ -200,7 +199,7 @@ class Plugin:
         return [int(text[i : i + 2], 16) / 255 for i in (1, 3, 5)]
 
     def numbers(self, text: str, what: str, *counts: int) -> list[float]:
-        """Finite numbers separated by blanks or commas, as many as one of `counts`."""
+        """Return finite numbers separated by blanks or commas, as many as one of `counts`."""
         parts = [part for part in re.split(r"[\s,]+", text) if part]
         try:
             values = [float(part) for part in parts]
@@ -222,7 +221,7 @@ class Plugin:
         )
 
     def transform(self, name: str) -> np.ndarray:
-        """A 4x4 affine matrix; the steps of a <transform> apply from the first to the last."""
+        """Return a 4x4 affine matrix; the steps of a <transform> apply from the first to the last."""
         element = self.value(name)
         matrix = np.eye(4)
         if element is None:
@@ -289,7 +288,7 @@ class Plugin:
 
 
 def snake_case(name: str) -> str:
-    """Mitsuba 0.6's camelCase names as Mitsuba 3's: toWorld, intIOR -> to_world, int_ior."""
+    """Return Mitsuba 0.6's camelCase names as Mitsuba 3's: toWorld, intIOR -> to_world, int_ior."""
     return re.sub(r"(?<=[a-z0-9])([A-Z]+)", r"_\1", name).lower()
 
 

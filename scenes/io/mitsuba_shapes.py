@@ -68,7 +68,7 @@ class Shapes:
         self._materials.check(plugin)
 
     def surface(self, plugin: Plugin) -> Surface:
-        """The surface of a <shape>, in the world, with its material and its light."""
+        """Return the surface of a <shape>, in the world, with its material and its light."""
         name = plugin.id or Path(plugin.string("filename", plugin.type).replace("\\", "/")).stem
         mesh = _placed(_BUILDERS[plugin.type](self, plugin), plugin)
         look = self._materials.of_shape(plugin)
@@ -96,7 +96,7 @@ class Shapes:
         return radiance
 
     def file(self, plugin: Plugin, kind: str) -> Mesh:
-        """A mesh file with the uv and vertex normals that it carries, v as the file has it."""
+        """Return a mesh file with the uv and vertex normals that it carries, v as the file has it."""
         filename = plugin.string("filename")
         path = self._document.file(plugin.element, filename, "mesh")
         index = plugin.integer("shape_index", 0) if kind == "serialized" else 0

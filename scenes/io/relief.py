@@ -73,7 +73,7 @@ def relief(
     height: int | None = None,
     notes: tuple[str, ...] = (),
 ) -> Scene:
-    """The relief of a depth image (h, w) along the camera's axis [m], all finite; the camera is its own.
+    """Return the relief of a depth image (h, w) along the camera's axis [m], all finite; the camera is its own.
 
     focal_px belongs to the depth image's pixels; half_level_m is what quantisation may have moved a depth by.
     cosine False: a photograph's colours hold its own shading, so shading normals face the camera and the laser's light
@@ -101,9 +101,9 @@ def relief(
     mesh = Surface(vertices, faces, material, uv=np.concatenate((uv, flap_uv)), normals=normals, name="relief")
     fov = math.degrees(2 * math.atan(columns / 2 / focal_px))
     camera = Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=fov, width=columns, height=rows)
-    said = f"relief: {int(apart.sum())} of {apart.size} cells cut at depth edges"
+    message = f"relief: {int(apart.sum())} of {apart.size} cells cut at depth edges"
     shading = f"shading: cosine {'applied' if cosine else 'not applied, the photograph holds its own'}"
-    return Scene(name, (mesh,), camera.resized(width, height), notes=(*notes, said, shading))
+    return Scene(name, (mesh,), camera.resized(width, height), notes=(*notes, message, shading))
 
 
 def _cuts(depth: np.ndarray, focal_px: float, level: np.ndarray) -> np.ndarray:
@@ -150,8 +150,8 @@ def _flaps(
 
 
 def filled(levels: np.ndarray, known: np.ndarray, *, near_is_high: bool) -> np.ndarray:
-    """Unknown pixels from the known ones left and right of them: the farther of the two, since what a second camera
-    did not see lies behind; rows without a known pixel from the nearest row. InputError if nothing is known."""
+    """Return unknown pixels from the known ones left and right of them: the farther of the two, since what a second
+    camera did not see lies behind; rows without a known pixel from the nearest row. InputError if nothing is known."""
     require(bool(known.any()), "depth image holds no known pixel")
     order = levels.astype(np.float64) * (1 if near_is_high else -1)
     rows = np.flatnonzero(known.any(axis=1))
@@ -167,7 +167,7 @@ def filled(levels: np.ndarray, known: np.ndarray, *, near_is_high: bool) -> np.n
 
 
 def dequantised(levels: np.ndarray) -> np.ndarray:
-    """Whole levels made smooth: straight lines through the steps, never half a level from the given value.
+    """Return whole levels made smooth: straight lines through the steps, never half a level from the given value.
 
     Each pass replaces a pixel by the mean of what lies opposite each other, `span` pixels to both sides along rows or
     columns, where both are within the span's slope of the pixel (no edge between), and clips to MAX_LEVEL from the
@@ -197,14 +197,16 @@ def _opposite(image: np.ndarray, span: int, axis: int) -> tuple[np.ndarray, np.n
     """Inner pixels and their neighbours `span` before and after, along an axis."""
     turned = np.moveaxis(image, axis, 0)
     parts = turned[span:-span], turned[: -2 * span], turned[2 * span :]
-    return tuple(np.moveaxis(part, 0, axis) for part in parts)
+    here, before, after = (np.moveaxis(part, 0, axis) for part in parts)
+    return here, before, after
 
 
 # --- Files -----------------------------------------------------------------------------------------------------------
 
 
 def middlebury_folder(name: str) -> Path:
-    """Where the scenes of Middlebury 2006 lie: $SCENE2SPAD_DATA/middlebury, else shared/data beside the project."""
+    """Return where the scenes of Middlebury 2006 lie: $SCENE2SPAD_DATA/middlebury, else shared/data beside the
+    project."""
     data = Path(os.environ.get(DATA_VARIABLE) or Path(__file__).parents[3] / "shared" / "data")
     folder = data / "middlebury" / name
     require(
@@ -214,13 +216,13 @@ def middlebury_folder(name: str) -> Path:
 
 
 def middlebury_names() -> list[str]:
-    """The Middlebury scenes that are there, sorted."""
+    """Return the Middlebury scenes that are there, sorted."""
     parent = middlebury_folder("")
     return sorted(path.name for path in parent.iterdir() if (path / "disp1.png").is_file())
 
 
 def middlebury(folder: Path, *, cosine: bool = False, width: int | None = None, height: int | None = None) -> Scene:
-    """A scene of Middlebury 2006 at half size: view1.png, disp1.png (0 = unknown) and dmin.txt in one folder.
+    """Return a scene of Middlebury 2006 at half size: view1.png, disp1.png (0 = unknown) and dmin.txt in one folder.
 
     Depth along the axis = 3740 px 0.16 m / (disp1 + dmin), focal length 1870 px.
     """
@@ -251,7 +253,7 @@ def middlebury(folder: Path, *, cosine: bool = False, width: int | None = None, 
 
 
 def rgbd(files: RgbdFiles, *, width: int | None = None, height: int | None = None) -> Scene:
-    """A user's RGB-D pair; 0, NaN and infinite depths are holes."""
+    """Return a user's RGB-D pair; 0, NaN and infinite depths are holes."""
     path = Path(files.depth)
     integer = path.suffix.lower() == ".png"
     raw = read_levels(path) if integer else _exr_depth(path)
@@ -294,7 +296,7 @@ def _albedo(path: Path, shape: tuple[int, int]) -> Texture:
 
 
 def read_levels(path: Path) -> np.ndarray:
-    """A single-channel 8- or 16-bit image as whole numbers (h, w) float64, whatever its mode."""
+    """Return a single-channel 8- or 16-bit image as whole numbers (h, w) float64, whatever its mode."""
     with opened_image(path, "depth image") as image:
         values = np.asarray(image)
     if values.ndim == 3 and (values[..., :1] == values[..., :3]).all():
@@ -308,5 +310,6 @@ def _exr_depth(path: Path) -> np.ndarray:
     """Channel Z, or Y, or the only one."""
     pixels = exr_channels(path, "depth image")
     name = next((n for n in ("Z", "depth", "Y") if n in pixels), next(iter(pixels)) if len(pixels) == 1 else None)
-    require(name is not None, f"{path}: channels {', '.join(sorted(pixels))}, expected Z or Y")
+    if name is None:
+        raise InputError(f"{path}: channels {', '.join(sorted(pixels))}, expected Z or Y")
     return pixels[name]

@@ -23,13 +23,13 @@ MAX_EXR_VALUES = 1 << 27  # of all channels: 8192 x 4096 RGBA, 1 GiB as float64
 
 
 def luminance(rgb: np.ndarray) -> np.ndarray:
-    """Rec. 709 luminance of linear RGB (..., 3): the one number this project keeps of a colour."""
+    """Return Rec. 709 luminance of linear RGB (..., 3): the one number this project keeps of a colour."""
     rgb = np.asarray(rgb)[..., :3]
     return rgb @ np.array([0.2126, 0.7152, 0.0722], dtype=np.result_type(rgb, np.float32))
 
 
 def srgb_to_linear(value: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB-encoded values in [0, 1] (IEC 61966-2-1)."""
+    """Return linear light of sRGB-encoded values in [0, 1] (IEC 61966-2-1)."""
     value = np.asarray(value, dtype=np.float64)
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
@@ -71,7 +71,7 @@ def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
 
 @contextmanager
 def opened_image(path: Path, what: str = "image file") -> Iterator[Image.Image]:
-    """An image through Pillow, its declared size checked before any pixel is decoded.
+    """Open an image through Pillow, its declared size checked before any pixel is decoded.
 
     What goes wrong while its pixels are taken is an InputError too, in one line that names the file.
     """
@@ -93,7 +93,7 @@ def opened_image(path: Path, what: str = "image file") -> Iterator[Image.Image]:
 
 
 def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:
-    """The channels of a flat EXR, float64, by name, its declared size checked before any pixel is decoded."""
+    """Return the channels of a flat EXR, float64, by name, its declared size checked before any pixel is decoded."""
     import OpenEXR
 
     path = regular_file(path, what)
@@ -105,8 +105,8 @@ def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:
             wide, tall = (high - low + 1).tolist()
             require(wide > 0 and tall > 0, f"data window of {wide} x {tall} pixels")
             values = wide * tall * channels
-            said = f"{wide} x {tall} pixels of {channels} channels are over the limit of {MAX_EXR_VALUES} values"
-            require(values <= MAX_EXR_VALUES, said)
+            message = f"{wide} x {tall} pixels of {channels} channels are over the limit of {MAX_EXR_VALUES} values"
+            require(values <= MAX_EXR_VALUES, message)
             with OpenEXR.File(str(path), separate_channels=True) as file:
                 return {name: np.asarray(part.pixels, np.float64) for name, part in file.channels().items()}
     except InputError as error:

@@ -39,7 +39,7 @@ def load_scene(
     height: int | None = None,
     placing: Placing = AS_IT_IS,
 ) -> Scene:
-    """The scene of that name, or in that file (.obj .ply .stl .glb, or Mitsuba .xml).
+    """Return the scene of that name, or in that file (.obj .ply .stl .glb, or Mitsuba .xml).
 
     Names: a key of SCENES, `wall@METRES` (a frontal wall there, as `plane`), `hard-cases/NAME`, `tabletop/NAME`,
     `middlebury/NAME`, `rooms/SPLIT/NUMBER`, `clutter/SPLIT/NUMBER`; a folder with view1.png, disp1.png and dmin.txt is

@@ -25,8 +25,8 @@ FOV_DEG = (36.0, 66.0)
 BACK_M = (1.3, 13.0)  # camera to the wall that it faces
 TOWARDS_NEAR = 1.5  # exponent of a uniform number, then between the logarithms of BACK_M: median 2.9 m
 NEAREST_M = 0.3
-NEAR_SHARE = (0.18, 0.6)  # nearest thing over the back wall's distance
-RARELY_NEAR, RARE_SHARE = 0.1, (0.06, 0.18)  # in a tenth of the views
+NEAR_FRACTION = (0.18, 0.6)  # nearest thing over the back wall's distance
+RARELY_NEAR, RARE_FRACTION = 0.1, (0.06, 0.18)  # in a tenth of the views
 COUNT = (5, 40)
 ANGLE_DEG = (3.0, 30.0)  # half the angle that a thing takes
 CLEAR_M = 0.02  # between a thing and a wall
@@ -103,8 +103,8 @@ def _lights(palette: Palette, rng: Random, low: np.ndarray, high: np.ndarray) ->
 def _things(palette: Palette, rng: Random, camera: Camera, low: np.ndarray, high: np.ndarray) -> list[Surface]:
     """Scatter things over the view, from the nearest distance to the wall, evenly in the logarithm of distance."""
     back = -low[2]
-    share = RARE_SHARE if rng.random() < RARELY_NEAR else NEAR_SHARE
-    nearest = max(NEAREST_M, back * math.exp(rng.uniform(*np.log(share))))
+    fraction = RARE_FRACTION if rng.random() < RARELY_NEAR else NEAR_FRACTION
+    nearest = max(NEAREST_M, back * math.exp(rng.uniform(*np.log(fraction))))
     tangent = math.tan(math.radians(camera.fov_deg / 2))
     surfaces = []
     for _ in range(round(math.exp(rng.uniform(*np.log(COUNT))))):

@@ -40,7 +40,7 @@ _BODIES: tuple[tuple[str, float, tuple[float, float, float], float, Callable[[np
 
 
 def gallery(*, width: int, height: int) -> Scene:
-    """Six bodies of 20,480 faces each, on the floor and hanging, in a closed room of albedo 0.3 to 0.7."""
+    """Return six bodies of 20,480 faces each, on the floor and hanging, in a closed room of albedo 0.3 to 0.7."""
     surfaces = list(_walls())
     directions, faces, uv = shapes.sphere(subdivisions=SUBDIVISIONS)
     for name, albedo, centre, radius, profile in _BODIES:

@@ -39,7 +39,7 @@ def quad(corners: list[tuple[float, float, float]], material: Material, name: st
 
 
 def wall(distance_m: float, albedo: float, *, tilt_deg: float = 0.0, half_size_m: float = 1.0) -> Surface:
-    """A square through (0, 0, -distance), facing +z, turned about the vertical by `tilt_deg`."""
+    """Return a square through (0, 0, -distance), facing +z, turned about the vertical by `tilt_deg`."""
     c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
     h = half_size_m
     corners = [(-h * c, -h, -distance_m + h * s), (h * c, -h, -distance_m - h * s)]
@@ -48,17 +48,18 @@ def wall(distance_m: float, albedo: float, *, tilt_deg: float = 0.0, half_size_m
 
 
 def camera(width: int = 32, height: int = 24, fov_deg: float = 34.0) -> Camera:
-    """At the origin, looking along -z."""
+    """Return at the origin, looking along -z."""
     return Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=fov_deg, width=width, height=height)
 
 
 def plane(distance_m: float, *, albedo: float = ALBEDO, fov_deg: float = 34.0) -> Scene:
-    """A frontal wall that fills the image."""
+    """Return a frontal wall that fills the image."""
     return Scene("plane", (wall(distance_m, albedo, half_size_m=2 * distance_m),), camera(16, 12, fov_deg))
 
 
 def grazing(incidence_deg: float) -> Scene:
-    """A wall 3 m away that every pixel sees near grazing: the image spans half the angle left to 90 on each side."""
+    """Return a wall 3 m away that every pixel sees near grazing: the image spans half the angle left to 90 on each
+    side."""
     left = 90 - incidence_deg
     return Scene(
         "grazing", (wall(WALL_M, ALBEDO, tilt_deg=incidence_deg, half_size_m=20),), camera(16, 12, fov_deg=left)
@@ -66,19 +67,20 @@ def grazing(incidence_deg: float) -> Scene:
 
 
 def horizon() -> Scene:
-    """A wall at 89 degrees seen past its far edge, 5 m on: its last pixels look along it."""
+    """Return a wall at 89 degrees seen past its far edge, 5 m on: its last pixels look along it."""
     return Scene("horizon", (wall(WALL_M, ALBEDO, tilt_deg=89, half_size_m=5),), camera(16, 12, 10.0))
 
 
 def ball() -> Scene:
-    """A ball of 330,000 triangles before nothing: its silhouette."""
+    """Return a ball of 330,000 triangles before nothing: its silhouette."""
     vertices, faces, _ = shapes.sphere(BALL_RADIUS_M, 7)
     surface = Surface(vertices + (0, 0, -BALL_M), faces, Material(albedo=0.7), name="ball")
     return Scene("ball", (surface,), camera(48, 36, 30.0))
 
 
 def glint() -> Scene:
-    """A polished steel ball before nothing: its highlight is a fortieth of a pixel wide and most of its light."""
+    """Return a polished steel ball before nothing: its highlight is a fortieth of a pixel wide and most of its
+    light."""
     vertices, faces, _ = shapes.sphere(GLINT_RADIUS_M, 6)
     steel = Material("roughconductor", roughness=GLINT_ROUGHNESS, eta=GLINT_ETA, k=GLINT_K)
     normals = vertices / GLINT_RADIUS_M
@@ -87,7 +89,7 @@ def glint() -> Scene:
 
 
 def wire() -> Scene:
-    """An upright wire, 2 mm thick, in pixels 38 mm wide at its distance, before a wall."""
+    """Return an upright wire, 2 mm thick, in pixels 38 mm wide at its distance, before a wall."""
     ends = ((WIRE_X_M, -3, -WIRE_M), (WIRE_X_M, 3, -WIRE_M))
     vertices, faces, _ = shapes.cylinder(*ends, WIRE_RADIUS_M, segments=64)
     thin = Surface(vertices, faces, Material(albedo=0.8), name="wire")
@@ -95,7 +97,7 @@ def wire() -> Scene:
 
 
 def groove(opening_deg: float = 90.0, *, scale: float = 1.0) -> Scene:
-    """Two squares that meet in an upright edge, open toward the camera and all in view."""
+    """Return two squares that meet in an upright edge, open toward the camera and all in view."""
     return groove_of(16, 12, albedo=GROOVE_ALBEDO, opening_deg=opening_deg, scale=scale)
 
 
@@ -109,7 +111,8 @@ def groove_of(
     scale: float = 1.0,
     laser: Laser | None = None,
 ) -> Scene:
-    """Two squares of that size at the opening angle, meeting in the line x = 0, z = -3 m, everything times `scale`."""
+    """Return two squares of that size at the opening angle, meeting in the line x = 0, z = -3 m, everything times
+    `scale`."""
     half = math.radians(opening_deg) / 2
     x, z = size_m * math.sin(half), size_m * math.cos(half) - GROOVE_M
     e = -GROOVE_M
@@ -117,19 +120,19 @@ def groove_of(
     right = [(0, -0.5, e), (x, -0.5, z), (x, 0.5, z), (0, 0.5, e)]
     material = Material(albedo=albedo)
     walls = [quad(corners, material, name) for corners, name in ((left, "left"), (right, "right"))]
-    walls = tuple(replace(one, vertices=scale * one.vertices) for one in walls)
-    return Scene("groove", walls, camera(width, height, 36.0), laser or Laser("flood"))
+    scaled = tuple(replace(one, vertices=scale * one.vertices) for one in walls)
+    return Scene("groove", scaled, camera(width, height, 36.0), laser or Laser("flood"))
 
 
 def furnace(albedo: float) -> Scene:
-    """The inside of a cube whose walls emit and reflect: the same radiance everywhere."""
+    """Return the inside of a cube whose walls emit and reflect: the same radiance everywhere."""
     vertices, faces, uv = shapes.box((4, 4, 4))
     walls = Surface(vertices, faces[:, ::-1], Material(albedo=albedo), uv=uv, emission=FURNACE_EMISSION, name="walls")
     return Scene("furnace", (walls,), camera(16, 12, 60.0))
 
 
 def integrating_sphere(albedo: float, *, width: int = 16, height: int = 12) -> Scene:
-    """The inside of a diffuse sphere, an isotropic laser at its centre, the camera off it: even light."""
+    """Return the inside of a diffuse sphere, an isotropic laser at its centre, the camera off it: even light."""
     vertices, faces, _ = shapes.sphere(SPHERE_RADIUS_M, 6)
     shell = Surface(vertices - (0, 0, SPHERE_OFFSET_M), faces[:, ::-1], Material(albedo=albedo), name="shell")
     laser = Laser("flood", (0.0, 0.0, SPHERE_OFFSET_M), 360.0)
@@ -137,16 +140,16 @@ def integrating_sphere(albedo: float, *, width: int = 16, height: int = 12) -> S
 
 
 def mirror() -> Scene:
-    """A flat mirror turned by 3 degrees: one pixel, off the centre, sees the laser in it."""
+    """Return a flat mirror turned by 3 degrees: one pixel, off the centre, sees the laser in it."""
     material = Material("conductor", eta=0.0, k=1.0, specular=MIRROR_REFLECTANCE, name="mirror")
     square = wall(MIRROR_M, ALBEDO, tilt_deg=MIRROR_TILT_DEG, half_size_m=1.0)
     return Scene("mirror", (replace(square, material=material),), camera(15, 11, 20.0))
 
 
 def caustic() -> Scene:
-    """A wall, and beside it a polished panel, at a right angle to it, that mirrors the flash onto it."""
+    """Return a wall, and beside it a polished panel, at a right angle to it, that mirrors the flash onto it."""
     near, far = CAUSTIC_DEPTHS_M
-    corners = [(CAUSTIC_PANEL_M, y, -z) for y, z in ((-2, near), (-2, far), (2, far), (2, near))]
+    corners = [(CAUSTIC_PANEL_M, float(y), -z) for y, z in ((-2, near), (-2, far), (2, far), (2, near))]
     panel = Material(
         "roughconductor", roughness=CAUSTIC_ROUGHNESS, eta=0.0, k=1.0, specular=MIRROR_REFLECTANCE, name="panel"
     )
@@ -155,7 +158,7 @@ def caustic() -> Scene:
 
 
 def corner_cube() -> Scene:
-    """Three mirrors at right angles, 5 cm large, their apex 2 m away, turned a little out of symmetry."""
+    """Return three mirrors at right angles, 5 cm large, their apex 2 m away, turned a little out of symmetry."""
     material = Material("conductor", eta=0.0, k=1.0, specular=MIRROR_REFLECTANCE, name="mirror")
     diagonal = shapes.axis_frame(np.ones(3) / math.sqrt(3))
     turn = math.radians(5)
@@ -170,20 +173,20 @@ def corner_cube() -> Scene:
 
 
 def window() -> Scene:
-    """A thin pane of glass before a wall."""
+    """Return a thin pane of glass before a wall."""
     pane = replace(wall(PANE_M, 0.0, half_size_m=3), material=Material("thindielectric", ior=GLASS_IOR), name="pane")
     return Scene("window", (wall(WALL_M, ALBEDO, half_size_m=20), pane), camera(15, 11, 34.0))
 
 
 def slab() -> Scene:
-    """A thick slab of glass before a wall, seen head on."""
+    """Return a thick slab of glass before a wall, seen head on."""
     vertices, faces, uv = shapes.box((2, 2, SLAB_THICKNESS_M))
     glass = Surface(vertices - (0, 0, SLAB_M), faces, Material("dielectric", ior=GLASS_IOR), uv=uv, name="slab")
     return Scene("slab", (wall(WALL_M, ALBEDO, half_size_m=20), glass), camera(9, 7, 2.0))
 
 
 def leaf() -> Scene:
-    """A round leaf cut out of a square by its opacity, before a wall."""
+    """Return a round leaf cut out of a square by its opacity, before a wall."""
     side = 512
     texel = np.abs((np.arange(side) + 0.5) / side - 0.5) * LEAF_SIZE_M
     radius = np.hypot(texel[:, None], texel)
@@ -197,7 +200,7 @@ def leaf() -> Scene:
 
 
 def baseline_shadow() -> Scene:
-    """A laser 10 cm to the right of the camera, and a post that throws its shadow on a wall."""
+    """Return a laser 10 cm to the right of the camera, and a post that throws its shadow on a wall."""
     (low, high), z = POST_X_M, -POST_M
     post = quad([(low, -1, z), (high, -1, z), (high, 1, z), (low, 1, z)], Material(albedo=0.8), "post")
     laser = Laser("flood", BASELINE_M, 100.0)
@@ -205,7 +208,8 @@ def baseline_shadow() -> Scene:
 
 
 def clean_groove() -> Scene:
-    """The groove under a displaced laser, so that shadow rays are traced: what the odd meshes below must equal."""
+    """Return the groove under a displaced laser, so that shadow rays are traced: what the odd meshes below must
+    equal."""
     return groove_of(16, 12, albedo=GROOVE_ALBEDO, laser=Laser("flood", BASELINE_M, 60.0))
 
 
@@ -215,12 +219,12 @@ def _altered(name: str, alter: Callable[[Surface], Surface]) -> Scene:
 
 
 def duplicated_faces() -> Scene:
-    """Every triangle twice, the second time with its back to the front."""
+    """Return every triangle twice, the second time with its back to the front."""
     return _altered("duplicated", lambda s: replace(s, faces=np.concatenate((s.faces, s.faces[:, ::-1]))))
 
 
 def coplanar_faces() -> Scene:
-    """Every square once more, cut along its other diagonal and a little smaller, in the same plane."""
+    """Return every square once more, cut along its other diagonal and a little smaller, in the same plane."""
 
     def with_patch(surface: Surface) -> Surface:
         middle = surface.vertices.mean(axis=0)
@@ -232,7 +236,7 @@ def coplanar_faces() -> Scene:
 
 
 def degenerate_triangles() -> Scene:
-    """Triangles without area among the others: points, doubled corners and three corners in a line."""
+    """Return triangles without area among the others: points, doubled corners and three corners in a line."""
 
     def with_slivers(surface: Surface) -> Surface:
         middle = surface.vertices[[0, 2]].mean(axis=0, keepdims=True)
@@ -243,7 +247,7 @@ def degenerate_triangles() -> Scene:
 
 
 def inverted_normals() -> Scene:
-    """The second wall's triangles, and half of the first one's, wound the other way round."""
+    """Return the second wall's triangles, and half of the first one's, wound the other way round."""
 
     def turned(surface: Surface) -> Surface:
         faces = surface.faces[:, ::-1].copy() if surface.name == "right" else surface.faces.copy()
@@ -255,7 +259,7 @@ def inverted_normals() -> Scene:
 
 
 def million_triangles(side: int = MILLION_SIDE) -> Scene:
-    """A flat wall of side x side x 2 triangles."""
+    """Return a flat wall of side x side x 2 triangles."""
     line = np.linspace(-2, 2, side + 1)
     x, y = np.meshgrid(line, line)
     corner = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel()
@@ -266,12 +270,12 @@ def million_triangles(side: int = MILLION_SIDE) -> Scene:
 
 
 def nothing_in_view() -> Scene:
-    """A wall behind the camera."""
+    """Return a wall behind the camera."""
     return Scene("nothing", (wall(-WALL_M, ALBEDO),), camera(16, 12))
 
 
 def empty_sky() -> Scene:
-    """Nothing in view but ambient light."""
+    """Return nothing in view but ambient light."""
     return replace(nothing_in_view(), name="sky", ambient=Ambient(0.7))
 
 
@@ -316,5 +320,5 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def hard_case(name: str) -> Scene:
-    """The scene of that name, called `hard-cases/NAME`."""
+    """Return the scene of that name, called `hard-cases/NAME`."""
     return replace(SCENES[name](), name=f"hard-cases/{name}")

@@ -50,7 +50,7 @@ class Place:
 
 
 def set_down(piece: Piece, x: float, z: float, *, y: float = 0.0, turn_deg: float = 0.0, margin: float = 0.0) -> Place:
-    """The piece there; its plan is its bounding rectangle and a margin around it."""
+    """Return the piece there; its plan is its bounding rectangle and a margin around it."""
     low, high = piece.low, piece.high
     x0, z0, x1, z1 = low[0] - margin, low[2] - margin, high[0] + margin, high[2] + margin
     corners = np.array(((x0, z0), (x1, z0), (x1, z1), (x0, z1)))
@@ -71,7 +71,7 @@ def _onward(polygon: np.ndarray) -> np.ndarray:
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two convex polygons (n, 2) share more than a border: no edge of either separates them."""
+    """Return whether two convex polygons (n, 2) share more than a border: no edge of either separates them."""
     if (a.max(axis=0) <= b.min(axis=0)).any() or (b.max(axis=0) <= a.min(axis=0)).any():
         return False
     for polygon in (a, b):
@@ -95,7 +95,7 @@ class Floor:
         return self.outline, _onward(self.outline)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Whether each point (n, 2) lies inside the outline (even-odd rule)."""
+        """Return whether each point (n, 2) lies inside the outline (even-odd rule)."""
         (ax, az), (bx, bz) = (corners.T for corners in self.edges)
         x, z = points[:, :1], points[:, 1:]
         crosses = (az > z) != (bz > z)
@@ -104,19 +104,19 @@ class Floor:
         return (crosses & (x < at)).sum(axis=1) % 2 == 1
 
     def distances(self, points: np.ndarray) -> np.ndarray:
-        """From each point (n, 2) to the outline."""
+        """Return from each point (n, 2) to the outline."""
         a, b = self.edges
         along, to = b - a, points[:, None] - a
         t = np.clip((to * along).sum(axis=2) / (along**2).sum(axis=1), 0, 1)
         return np.linalg.norm(t[..., None] * along - to, axis=2).min(axis=1)
 
     def holds(self, points: np.ndarray, slack: float = 1e-3) -> bool:
-        """Whether all points lie inside the outline, or within `slack` of it."""
+        """Return whether all points lie inside the outline, or within `slack` of it."""
         out = ~self.inside(points)
         return not out.any() or bool((self.distances(points[out]) <= slack).all())
 
     def fits(self, place: Place) -> bool:
-        """Inside, and clear of everything that stands at the same height."""
+        """Return inside, and clear of everything that stands at the same height."""
         if any(in_each_other(place, other) for other in self.places):
             return False
         corners_in = self.holds(np.concatenate((place.plan, place.plan.mean(axis=0, keepdims=True))))
@@ -125,7 +125,7 @@ class Floor:
     def try_at_wall(
         self, piece: Piece, rng: Random, tries: int = 12, gap: float = 0.01, margin: float = 0.03
     ) -> Place | None:
-        """The piece somewhere along a wall that is long enough, its back to it."""
+        """Return the piece somewhere along a wall that is long enough, its back to it."""
         a, b = self.edges
         low, high = piece.low, piece.high
         long = np.linalg.norm(b - a, axis=1)
@@ -147,7 +147,7 @@ class Floor:
     def try_free(
         self, piece: Piece, rng: Random, tries: int = 12, margin: float = 0.05, turn_deg: float | None = None
     ) -> Place | None:
-        """The piece anywhere on the floor, turned at random."""
+        """Return the piece anywhere on the floor, turned at random."""
         low, high = self.outline.min(axis=0), self.outline.max(axis=0)
         for _ in range(tries):
             turn = rng.uniform(0, 360) if turn_deg is None else turn_deg
@@ -160,7 +160,7 @@ class Floor:
 
 
 def in_each_other(a: Place, b: Place) -> bool:
-    """Whether two places share heights and ground."""
+    """Return whether two places share heights and ground."""
     if a.low >= b.high or b.low >= a.high:
         return False
     (x0, z0, x1, z1), (u0, w0, u1, w1) = a.extent, b.extent
@@ -176,7 +176,7 @@ def _inside_any(polygon: np.ndarray, points: np.ndarray) -> bool:
 
 
 def to_shell(floor: Floor, ceiling: float, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Distance along unit rays (n, 3) to walls, floor and ceiling."""
+    """Return distance along unit rays (n, 3) to walls, floor and ceiling."""
     with np.errstate(divide="ignore", invalid="ignore"):
         to_level = np.where(rays[:, 1] < 0, -origin[1] / rays[:, 1], (ceiling - origin[1]) / rays[:, 1])
         nearest = np.where(np.abs(rays[:, 1]) < 1e-9, np.inf, to_level)
@@ -196,7 +196,7 @@ class Boxes:
         self.extent = np.array([place.extent for place in places]).reshape(-1, 4)
 
     def meet_head(self, points: np.ndarray, half: float, y: np.ndarray, over: float) -> np.ndarray:
-        """Whether anything that reaches half the height y is in the square column around each point (n, 2).
+        """Return whether anything that reaches half the height y is in the square column around each point (n, 2).
 
         The column's sides are 2 `half` and along the axes; it goes from the floor to `over` above y.
         """
@@ -210,7 +210,7 @@ class Boxes:
         return meets.any(axis=1)
 
     def distance(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """Distance along unit rays (n, 3) to each box, (n, boxes), inf where it is missed: three slabs a box."""
+        """Return distance along unit rays (n, 3) to each box, (n, boxes), inf where it is missed: three slabs a box."""
         ground, flat = origin[[0, 2]], rays[:, [0, 2]]
         with np.errstate(divide="ignore", invalid="ignore"):
             enter, leave = _sorted((self.low - origin[1]) / rays[:, 1:2], (self.high - origin[1]) / rays[:, 1:2])

@@ -31,7 +31,7 @@ LAMP_RADIANCE = 0.02
 
 
 def living_room(seed: int = 0, *, width: int = 128, height: int = 96) -> Scene:
-    """A closed, furnished room of 3.9 x 6.2 x 2.5 m seen from 1.4 m above its floor, depths 0.8 to 6.2 m.
+    """Return a closed, furnished room of 3.9 x 6.2 x 2.5 m seen from 1.4 m above its floor, depths 0.8 to 6.2 m.
 
     The seed moves and colours the furniture and shapes the sculpture; equal seeds give equal scenes, byte for byte.
     """
@@ -52,7 +52,7 @@ def _streams(seed: int) -> Callable[[str], Random]:
 
 
 def room(palette: Palette) -> list[Surface]:
-    """Floor, ceiling and four walls, all facing inwards."""
+    """Return floor, ceiling and four walls, all facing inwards."""
     x, y, z = np.diag((HIGH - LOW) / 2)
     centre = (LOW + HIGH) / 2
     walls = ((-z, x), (z, -x), (-x, -z), (x, z))
@@ -64,7 +64,7 @@ def room(palette: Palette) -> list[Surface]:
 
 
 def window(palette: Palette, width: float = 1.3, height: float = 1.15) -> list[Surface]:
-    """A window on the far wall: an emitting pane behind a painted frame with a cross of bars and a sill."""
+    """Return a window on the far wall: an emitting pane behind a painted frame with a cross of bars and a sill."""
     left, right, bottom, top = -0.45 - width / 2, -0.45 + width / 2, 0.95, 0.95 + height
     x, y, z, bar = (left + right) / 2, (bottom + top) / 2, LOW[2], 0.05
     frame = (
@@ -89,7 +89,7 @@ def window(palette: Palette, width: float = 1.3, height: float = 1.15) -> list[S
 
 
 def furniture(palette: Palette, places: Random, books: Random, form: Random) -> list[Surface]:
-    """Everything that stands in the room, each piece moved and turned a little by the seed."""
+    """Return everything that stands in the room, each piece moved and turned a little by the seed."""
 
     def near(value: float, spread: float) -> float:
         return value + places.uniform(-spread, spread)
@@ -111,7 +111,7 @@ def furniture(palette: Palette, places: Random, books: Random, form: Random) -> 
 
 
 def table(palette: Palette, top: float, width: float = 1.05, depth: float = 0.75) -> list[Surface]:
-    """A varnished board with an apron on four square legs."""
+    """Return a varnished board with an apron on four square legs."""
     x, z, leg, board = width / 2 - 0.07, depth / 2 - 0.07, 0.0275, top - 0.03
     plate = box((-width / 2, board, -depth / 2), (width / 2, top, depth / 2))
     legs = [post(sx, sz, leg, 0, board) for sx in (-x, x) for sz in (-z, z)]
@@ -123,7 +123,7 @@ def table(palette: Palette, top: float, width: float = 1.05, depth: float = 0.75
 
 
 def chair(palette: Palette, seat: float = 0.45, top: float = 1.0) -> list[Surface]:
-    """A wooden chair whose back (at -z) has upright slats between two rails."""
+    """Return a wooden chair whose back (at -z) has upright slats between two rails."""
     half, post = 0.21, 0.032
     inner = half - post
     posts = [box((-half, 0, -half), (-inner, top, -inner)), box((inner, 0, -half), (half, top, -inner))]
@@ -141,7 +141,7 @@ def chair(palette: Palette, seat: float = 0.45, top: float = 1.0) -> list[Surfac
 
 
 def sofa(palette: Palette, width: float, cover: Material, depth: float = 0.82) -> list[Surface]:
-    """A sofa with as many seats as its width has room for, its back at z = 0; a narrow one is an armchair."""
+    """Return a sofa with as many seats as its width has room for, its back at z = 0; a narrow one is an armchair."""
     seats = max(1, round((width - 0.4) / 0.65))
     name = "sofa" if seats > 1 else "armchair"
     x, arm, foot, base, seat = width / 2, 0.18, 0.09, 0.28, 0.44
@@ -162,7 +162,7 @@ def sofa(palette: Palette, width: float, cover: Material, depth: float = 0.82) -
 
 
 def bookshelf(palette: Palette, rng: Random, width: float = 1.5, height: float = 2.0) -> list[Surface]:
-    """A painted case, its back on z = 0, whose five compartments are more or less full of upright books."""
+    """Return a painted case, its back on z = 0, whose five compartments are more or less full of upright books."""
     depth, board, x = 0.28, 0.025, width / 2
     floors = np.linspace(0.06, height - board, 6)
     case = [
@@ -185,7 +185,7 @@ def bookshelf(palette: Palette, rng: Random, width: float = 1.5, height: float =
 
 
 def floor_lamp(palette: Palette) -> list[Surface]:
-    """A round foot, an 18 mm stand, and a cloth shade on a crossbar that glows on its outside."""
+    """Return a round foot, an 18 mm stand, and a cloth shade on a crossbar that glows on its outside."""
     wall, faces, uv = shapes.cylinder((0, 1.36, 0), (0, 1.66, 0), 1.0)
     wall[:, ::2] *= np.interp(wall[:, 1:2], (1.36, 1.66), (0.2, 0.12))
     foot = shapes.cylinder((0, 0, 0), (0, 0.025, 0), 0.14, caps=True)
@@ -199,7 +199,7 @@ def floor_lamp(palette: Palette) -> list[Surface]:
 
 
 def picture(palette: Palette, width: float = 0.9, height: float = 0.62, bar: float = 0.035) -> list[Surface]:
-    """A framed painting whose back is on z = 0 and whose lower edge is on y = 0."""
+    """Return a framed painting whose back is on z = 0 and whose lower edge is on y = 0."""
     x, board = width / 2, 0.015
     frame = (
         *(box((-x, y, 0), (x, y + bar, 0.03)) for y in (0, height - bar)),
@@ -224,7 +224,8 @@ def ball(palette: Palette, radius: float) -> list[Surface]:
 
 
 def sculpture(palette: Palette, rng: Random, height: float = 0.4) -> list[Surface]:
-    """A smooth lump of clay: a sphere swollen and dented by a few soft random waves, twisted, with a flat foot."""
+    """Return a smooth lump of clay: a sphere swollen and dented by a few soft random waves, twisted, with a flat
+    foot."""
     directions, faces, uv = shapes.sphere(1.0, subdivisions=5)
     swell = np.zeros(len(directions))
     for _ in range(7):

@@ -43,7 +43,7 @@ class Room:
 
 
 def room_view(index: int, split: str = "train", *, seed: int = 0, width: int = 64, height: int = 64) -> Scene:
-    """View `index` of a split: room `index // VIEWS_PER_ROOM`; equal arguments give equal scenes, byte for byte.
+    """Return view `index` of a split: room `index // VIEWS_PER_ROOM`; equal arguments give equal scenes, byte for byte.
 
     Splits draw from streams of their own and share no room. The last rooms are kept: their other views cost nothing.
     """
@@ -55,7 +55,7 @@ def room_view(index: int, split: str = "train", *, seed: int = 0, width: int = 6
 
 
 def room_name(index: int, split: str) -> str:
-    """The room that a view shows."""
+    """Return the room that a view shows."""
     return f"rooms/{split}/room {index // VIEWS_PER_ROOM}"
 
 
@@ -85,7 +85,7 @@ def _attempt(rng: Random) -> Room | None:
 
 
 def one_of_each(palette: Palette, y: float = -0.5) -> list[Surface]:
-    """A millimetre of every kind of material under the floor, where no light comes.
+    """Return a millimetre of every kind of material under the floor, where no light comes.
 
     A renderer compiles its kernels for the kinds of material that are there: so all views of a set have the same.
     """
@@ -190,7 +190,7 @@ def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: flo
 
 
 def furnish(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> None:
-    """Windows and a door, then large things along the walls, then the middle, then what is small."""
+    """Place windows and a door, then large things along the walls, then the middle, then what is small."""
     for kind, count in (("window", int(rng.integers(1, 3))), ("door", int(rng.random() < 0.7))):
         for _ in range(count):
             make = fittings.wall_window if kind == "window" else fittings.door
@@ -237,7 +237,7 @@ def _chairs_around(palette: Palette, rng: Random, floor: Floor, table: Place) ->
 
 
 def litter(palette: Palette, rng: Random, floor: Floor, top: np.ndarray, most: int = 9) -> None:
-    """Small things on a level place: as many as fit of a random few, and now and then one on top of another."""
+    """Place small things on a level place: as many as fit of a random few, and now and then one on top of another."""
     x, z, turn, half_x, half_z, y = top
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
     taken: list[Place] = []
@@ -346,7 +346,7 @@ def _camera(x: float, z: float, y: float, heading: float, pitch: float, roll: fl
 
 
 def pieces(scene: Scene) -> set[str]:
-    """Kinds of things in a scene: what stands before the colon in its surfaces' names."""
+    """Return kinds of things in a scene: what stands before the colon in its surfaces' names."""
     return {surface.name.split(":")[0] for surface in scene.surfaces if ":" in surface.name}
 
 

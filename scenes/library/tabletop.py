@@ -41,7 +41,7 @@ STAGE = np.array(((-0.7, -2.55), (0.7, -2.55), (0.36, -1.3), (-0.36, -1.3)))  # 
 
 
 def spikes(palette: Palette, rng: Random) -> Piece:
-    """A board bristling with cones and nails."""
+    """Return a board bristling with cones and nails."""
     parts = [box((-0.16, 0, -0.12), (0.16, 0.02, 0.12))]
     for x in np.linspace(-0.14, 0.14, 8):
         for z in np.linspace(-0.1, 0.1, 6):
@@ -51,7 +51,7 @@ def spikes(palette: Palette, rng: Random) -> Piece:
 
 
 def skittle(palette: Palette, rng: Random) -> Piece:
-    """A bowling pin, upright or lying."""
+    """Return a bowling pin, upright or lying."""
     heights = np.array((0, 0.02, 0.1, 0.2, 0.3, 0.42, 0.55, 0.68, 0.8, 0.92, 0.98, 1.0)) * 0.36
     radii = np.array((0.6, 0.75, 0.95, 1.0, 0.93, 0.7, 0.45, 0.36, 0.4, 0.36, 0.2, 0.0)) * 0.06
     body = lathe(list(zip(radii, heights, strict=True)), 28)
@@ -77,7 +77,7 @@ def sticks(palette: Palette, rng: Random) -> Piece:
 
 
 def reeds(palette: Palette, rng: Random) -> Piece:
-    """Upright grass or wires in a foot: fans of 2 to 5 mm."""
+    """Return upright grass or wires in a foot: fans of 2 to 5 mm."""
     foot = lathe([(0.0, 0.0), (0.06, 0.0), (0.04, 0.05), (0.0, 0.05)], 24)
     stems = []
     for _ in range(int(rng.integers(12, 26))):
@@ -95,7 +95,7 @@ def reeds(palette: Palette, rng: Random) -> Piece:
 
 
 def rings(palette: Palette, rng: Random) -> Piece:
-    """Standing and lying hoops."""
+    """Return standing and lying hoops."""
     parts = []
     for _ in range(int(rng.integers(2, 5))):
         radius, a = rng.uniform(0.04, 0.11), np.linspace(0, 2 * np.pi, 37)
@@ -112,7 +112,7 @@ def figure(palette: Palette, rng: Random) -> Piece:
 
 
 def crate(palette: Palette, rng: Random) -> Piece:
-    """A slatted box one can look through."""
+    """Return a slatted box one can look through."""
     w, h, d = rng.uniform((0.1, 0.12, 0.08), (0.2, 0.3, 0.14))
     parts = [box((sx - 0.008, 0, sz - 0.008), (sx + 0.008, h, sz + 0.008)) for sx in (-w, w) for sz in (-d, d)]
     for y in np.linspace(0.01, h - 0.03, max(3, int(h / 0.05))):
@@ -138,7 +138,7 @@ SCENES = tuple(RECIPES)
 
 
 def tabletop(name: str, *, width: int = 88, height: int = 72) -> Scene:
-    """The still life of that name (one of SCENES); the same bytes for the same name."""
+    """Return the still life of that name (one of SCENES); the same bytes for the same name."""
     require(name in SCENES, f"tabletop scene {name!r}, expected one of {', '.join(SCENES)}")
     rng = np.random.default_rng(np.random.SeedSequence(SCENES.index(name), spawn_key=(2006,)))
     palette = make_palette(rng)

@@ -15,7 +15,7 @@ from render.transient import Transient
 from scenes.errors import InputError
 from spad.detection.exposure import Exposure, Progress, counts_of, timestamps_of
 from spad.detection.flux import expected_counts, rates_for
-from spad.detection.glints import glint_warning, signal_shares
+from spad.detection.glints import glint_warning, signal_fractions
 from spad.detection.laws import LOW_FLUX
 from spad.detection.photons import expected_signal, light_of
 from spad.formats.histogram import Histogram
@@ -67,7 +67,8 @@ def sense_timestamps(
     dark_map_hz: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> Timestamps:
-    """The same exposure as `sense`, detection for detection, as timestamps: no histogram where photons are few."""
+    """Return the same exposure as `sense`, detection for detection, as timestamps: no histogram where photons are
+    few."""
     exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
     return timestamps_of(exposure, truth["meta"], progress)
 
@@ -82,7 +83,7 @@ def stream_timestamps(
     model: Model = "auto",
     dark_map_hz: np.ndarray | None = None,
 ) -> Iterator[Timestamps]:
-    """One exposure in `parts` equal parts, one after the other, for exposures larger than memory.
+    """Yield one exposure in `parts` equal parts, one after the other, for exposures larger than memory.
 
     `Timestamps.merged` of all is one draw of `sense_timestamps` (another one for each number of parts). A dead time
     that lasts from one part into the next is carried over. Raises InputError for fewer cycles than parts.
@@ -98,7 +99,7 @@ def stream_timestamps(
 def expected_in_pixel(
     transient: Transient, sensor: Sensor, budget: PhotonBudget, row: int, column: int, *, seed: int = 0
 ) -> np.ndarray:
-    """Expected primary detections per bin of one pixel, (T,) float64: the rates that `sense` draws from."""
+    """Return expected primary detections per bin of one pixel, (T,) float64: the rates that `sense` draws from."""
     pixel = row * transient.width + column
     rates = rates_for(transient, sensor, budget, seed=seed)
     rate, _ = expected_counts(transient, sensor, rates, slice(pixel, pixel + 1))
@@ -130,11 +131,13 @@ def _planned(
     reasons = [*rates.reasons, reason]
     if sensor.crosstalk:
         reasons.append(f"crosstalk: a detection fires each of its neighbours with probability {sensor.crosstalk:.3%}")
-    share = wrapped / (budget.signal * signal.size) if wrapped > 0 else 0.0
+    fraction = wrapped / (budget.signal * signal.size) if wrapped > 0 else 0.0
     if wrapped > 0:
-        reasons.append(f"wrap: {share:.3%} of the signal arrives after the period of {sensor.range_m:.3f} m and wraps")
-    shares = signal_shares(signal)
-    warning = glint_warning(shares)
+        reasons.append(
+            f"wrap: {fraction:.3%} of the signal arrives after the period of {sensor.range_m:.3f} m and wraps"
+        )
+    fractions = signal_fractions(signal)
+    warning = glint_warning(fractions)
     if warning is not None:
         reasons.append(warning)
     meta = {
@@ -142,11 +145,11 @@ def _planned(
         "model": chosen,
         "plan": reasons,
         "pile_up": pile_up,
-        "wrapped": share,
-        "dark_share": rates.dark_share,
-        "brightest_pixel": shares.brightest_pixel,
-        "brightest_thousandth": shares.brightest_thousandth,
-        "median_signal": shares.median,
+        "wrapped": fraction,
+        "dark_share": rates.dark_fraction,
+        "brightest_pixel": fractions.brightest_pixel,
+        "brightest_thousandth": fractions.brightest_thousandth,
+        "median_signal": fractions.median,
         "transient": {**transient.meta, "sha256": _sha256(transient)},
         "versions": _versions(),
     }
@@ -184,21 +187,24 @@ def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
             f"model first-photon: the dead time of {sensor.dead_time_s:g} s is longer than the period of "
             f"{sensor.period_s:g} s, the detector is not armed at every cycle; use free-running"
         )
-    said = f"{pile_up:.2%} primary detections a cycle in the brightest pixel ({sensor.cycles:,.0f} cycles)"
+    message = f"{pile_up:.2%} primary detections a cycle in the brightest pixel ({sensor.cycles:,.0f} cycles)"
     blind = pile_up * max(1.0, sensor.dead_time_s / sensor.period_s)
     if outlasts:
-        said += f", {blind:.2%} a dead time"
+        message += f", {blind:.2%} a dead time"
     if asked != "auto":
         left_out = ": pile-up and dead time, which matter from 1 %, are left out"
-        return asked, f"model: {asked} as asked, at {said}{left_out if asked == 'poisson' and blind > LOW_FLUX else ''}"
+        return (
+            asked,
+            f"model: {asked} as asked, at {message}{left_out if asked == 'poisson' and blind > LOW_FLUX else ''}",
+        )
     if blind <= LOW_FLUX:
-        return "poisson", f"model: independent Poisson, {said}"
+        return "poisson", f"model: independent Poisson, {message}"
     if sensor.reset == "synchronous" and not outlasts:
-        return "first-photon", f"model: first photon of each cycle (pile-up), {said}, armed at every cycle"
+        return "first-photon", f"model: first photon of each cycle (pile-up), {message}, armed at every cycle"
     if sensor.dead_time_s == 0:
         return (
             "poisson",
-            f"model: independent Poisson, {said}, but a free-running detector without dead time loses none",
+            f"model: independent Poisson, {message}, but a free-running detector without dead time loses none",
         )
     why = "which outlasts the period" if outlasts else "free-running"
-    return "free-running", f"model: event by event (pile-up), {said}, dead time {sensor.dead_time_s:g} s, {why}"
+    return "free-running", f"model: event by event (pile-up), {message}, dead time {sensor.dead_time_s:g} s, {why}"

@@ -59,7 +59,7 @@ class Exposure:
         return total * self.part // self.parts, total * (self.part + 1) // self.parts
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         first, last = self.cycles
         return (last - first) / round(self.sensor.cycles)
 
@@ -79,7 +79,7 @@ class Exposure:
 
 
 def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
-    """(H, W, T) int32."""
+    """Return (H, W, T) int32."""
     height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
     require_memory(4 * height * width * bins, f"a histogram of {width} x {height} pixels and {bins} bins")
     counts = np.zeros((height * width, bins), dtype=np.int32)
@@ -147,11 +147,11 @@ def _block(exposure: Exposure, block: slice, ready: np.ndarray) -> np.ndarray:
     if exposure.model == "free-running":
         places = [_places(part, sensor) for part in _free_running(exposure, light, rng, ready)]
         return np.concatenate(places)
-    primaries = float(light.signal.sum() + light.background.sum()) * exposure.share
+    primaries = float(light.signal.sum() + light.background.sum()) * exposure.fraction
     if primaries > DENSE_FROM * sensor.bins * light.pixels:
         return _dense(exposure, block, rng)
     if exposure.model == "poisson":
-        return _places(draw_primaries(light, sensor, rng, share=exposure.share), sensor)
+        return _places(draw_primaries(light, sensor, rng, fraction=exposure.fraction), sensor)
     return _places(_first_photons(exposure, light, rng), sensor)
 
 
@@ -159,7 +159,7 @@ def _dense(exposure: Exposure, block: slice, rng: np.random.Generator) -> np.nda
     """Every bin drawn from its rate, (P, T)."""
     rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()
     if exposure.model == "poisson":
-        return rng.poisson(rate * exposure.share)
+        return rng.poisson(rate * exposure.fraction)
     first, last = exposure.cycles
     return first_photon_counts(rate / round(exposure.sensor.cycles), last - first, rng)
 
@@ -171,7 +171,7 @@ def _places(detected: Detections | PhotonEvents, sensor: Sensor) -> np.ndarray:
 def _first_photons(
     exposure: Exposure, light: PixelFlux, rng: np.random.Generator, events: tuple | None = None
 ) -> Detections:
-    events = events or draw_primaries(light, exposure.sensor, rng, share=exposure.share)
+    events = events or draw_primaries(light, exposure.sensor, rng, fraction=exposure.fraction)
     cycle = rng.integers(*exposure.cycles, len(events.pixel))
     return first_of_each_cycle(Detections(events.pixel, cycle, events.position), exposure.sensor)
 
@@ -181,12 +181,12 @@ def _free_running(
 ) -> Iterator[Detections]:
     """Detections in turn of as many cycles as memory allows; `ready` (P,) in bins is carried on."""
     sensor, (first, last) = exposure.sensor, exposure.cycles
-    primaries = float(light.signal.sum() + light.background.sum()) * exposure.share
+    primaries = float(light.signal.sum() + light.background.sum()) * exposure.fraction
     pieces = min(max(1, math.ceil(primaries / MAX_EVENTS)), last - first)
     edges = [first + (last - first) * piece // pieces for piece in range(pieces + 1)]
     for start, stop in pairwise(edges):
-        share = (stop - start) / round(sensor.cycles)
-        events = draw_primaries(light, sensor, rng, share=share, fractional=True)
+        fraction = (stop - start) / round(sensor.cycles)
+        events = draw_primaries(light, sensor, rng, fraction=fraction, fractional=True)
         primary = Detections(events.pixel, rng.integers(start, stop, len(events.pixel)), events.position)
         yield _alive(primary, sensor, ready)
 

@@ -31,7 +31,7 @@ class Rates(NamedTuple):
 
     signal_scale: float
     background: np.ndarray
-    dark_share: float
+    dark_fraction: float
     reasons: tuple[str, ...]
     alive: np.ndarray
 
@@ -44,7 +44,7 @@ def rates_for(
     dark_map_hz: np.ndarray | None = None,
     seed: int = 0,
 ) -> Rates:
-    """Scale a transient to a photon budget by means.
+    """Return scale a transient to a photon budget by means.
 
     Signal: all returns times one factor, so that their mean over the image is `budget.signal`. Background: dark counts
     are what the sensor says (or a measured map (H, W) in Hz, NaN in dead pixels), ambient light fills the mean up to
@@ -60,13 +60,13 @@ def rates_for(
     dark_hz, dead = detector_maps(sensor, shape, dark_map_hz, seed)
     filled = fill_background(transient.ambient, dark_hz * sensor.exposure_s, budget.background)
     reasons = (filled.reason, *_odd_pixels(sensor, dead))
-    return Rates(scale, np.where(dead, 0.0, filled.background), filled.dark_share, reasons, np.where(dead, 0.0, 1.0))
+    return Rates(scale, np.where(dead, 0.0, filled.background), filled.dark_fraction, reasons, np.where(dead, 0.0, 1.0))
 
 
 def detector_maps(
     sensor: Sensor, shape: tuple[int, int], dark_map_hz: np.ndarray | None, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Dark counts per second (H, W) and dead pixels (H, W) bool: a measured map's, or the sensor's."""
+    """Return dark counts per second (H, W) and dead pixels (H, W) bool: a measured map's, or the sensor's."""
     if dark_map_hz is None:
         return sensor.dark_rate_map_hz(*shape, seed), sensor.dead_pixels(*shape, seed)
     measured = np.asarray(dark_map_hz, dtype=np.float64)
@@ -83,12 +83,13 @@ class Filled(NamedTuple):
     """Background detections of every pixel (H, W), how much of their mean is dark counts, and why."""
 
     background: np.ndarray
-    dark_share: float
+    dark_fraction: float
     reason: str
 
 
 def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Filled:
-    """Dark counts (H, W) as they are and ambient light (H, W, any scale) up to the asked mean; uniform without any.
+    """Return dark counts (H, W) as they are and ambient light (H, W, any scale) up to the asked mean; uniform without
+    any.
 
     Dark counts whose mean is above the asked one are scaled down to it, and their share is 1.
     """
@@ -97,9 +98,9 @@ def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Fill
         reason = f"background: {counted:g} dark counts a pixel exceed the asked {asked:g}, scaled down to it"
         _, dark_scale = background_scales(1.0, counted, asked)
         return Filled(dark * dark_scale, 1.0 if asked > 0 else 0.0, reason)
-    share = counted / asked if asked > 0 else 0.0
+    fraction = counted / asked if asked > 0 else 0.0
     if counted > 0:
-        reason = f"background: {share:.1%} dark counts ({counted:g} a pixel), the rest ambient light"
+        reason = f"background: {fraction:.1%} dark counts ({counted:g} a pixel), the rest ambient light"
     elif ambient.sum() > 0:
         reason = "background: the scene's ambient light"
     else:
@@ -107,11 +108,12 @@ def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Fill
     if ambient.sum() <= 0:
         ambient = np.ones_like(ambient)
     ambient_scale, _ = background_scales(float(ambient.mean()), counted, asked)
-    return Filled(dark + ambient * ambient_scale, share, reason)
+    return Filled(dark + ambient * ambient_scale, fraction, reason)
 
 
 def background_scales(ambient_mean: float, dark_mean: float, asked: float) -> tuple[float, float]:
-    """Factors of ambient light and of dark counts, whose means are given, that bring their sum to the asked mean."""
+    """Return factors of ambient light and of dark counts, whose means are given, that bring their sum to the asked
+    mean."""
     if dark_mean > asked:
         return 0.0, asked / dark_mean
     return (asked - dark_mean) / ambient_mean, 1.0
@@ -123,7 +125,8 @@ def _odd_pixels(sensor: Sensor, dead: np.ndarray) -> tuple[str, ...]:
 
 
 def interval_cdf(pulse: AnyPulse, after_near: Tensor, length: Tensor) -> Tensor:
-    """Share of a return that has arrived: its pulse averaged over arrivals in [0, length], `after_near` later [s].
+    """Return share of a return that has arrived: its pulse averaged over arrivals in [0, length], `after_near` later
+    [s].
 
     G(t) = (H(t) - H(t - length)) / length, H the integral of the pulse's CDF F; F(t - length / 2) for a point return.
     """
@@ -134,7 +137,7 @@ def interval_cdf(pulse: AnyPulse, after_near: Tensor, length: Tensor) -> Tensor:
 
 
 def signal_per_bin(transient: Transient, sensor: Sensor, pixels: slice, device: str = "cpu") -> tuple[Tensor, float]:
-    """Expected signal per unit scale in every bin of some pixels, (len, T) float64, and how much of it wrapped.
+    """Return expected signal per unit scale in every bin of some pixels, (len, T) float64, and how much of it wrapped.
 
     Each return's pulse is integrated over bins exactly and keeps its energy exactly. Time wraps at the period; what
     falls into the part of the period that has no bins is not detected. Wrapped is the radiance that arrived later than
@@ -177,7 +180,8 @@ def signal_per_bin(transient: Transient, sensor: Sensor, pixels: slice, device: 
 def expected_counts(
     transient: Transient, sensor: Sensor, rates: Rates, pixels: slice, device: str = "cpu"
 ) -> tuple[Tensor, float]:
-    """Expected detections per bin of some pixels, (len, T) float64, and how many of their signal detections wrapped.
+    """Return expected detections per bin of some pixels, (len, T) float64, and how many of their signal detections
+    wrapped.
 
     lambda_i = scale x signal_i + background / bins per period.
     """

@@ -26,7 +26,7 @@ class SignalShares(NamedTuple):
     mean: float
 
 
-def signal_shares(signal: np.ndarray) -> SignalShares:
+def signal_fractions(signal: np.ndarray) -> SignalShares:
     """Measure how much of the expected signal (H, W) the brightest pixels hold; 0 without any signal.
 
     The others' mean says what a glint costs: with one bright pixel of four alike ones it is the asked mean, however
@@ -37,16 +37,17 @@ def signal_shares(signal: np.ndarray) -> SignalShares:
     if total <= 0:
         return SignalShares(0.0, 0.0, few, 0.0, 0.0, 0.0)
     others = float(flat[:-few].mean()) if few < flat.size else total / flat.size
-    shares = float(flat[-1]) / total, float(flat[-few:].sum()) / total
-    return SignalShares(*shares, few, others, float(np.median(flat)), total / flat.size)
+    fractions = float(flat[-1]) / total, float(flat[-few:].sum()) / total
+    return SignalShares(*fractions, few, others, float(np.median(flat)), total / flat.size)
 
 
-def glint_warning(shares: SignalShares) -> str | None:
+def glint_warning(fractions: SignalShares) -> str | None:
     """Return one line where the few brightest pixels leave the others less than 90 % of the mean, else None."""
-    if shares.mean_of_others >= MATTERS_BELOW * shares.mean:
+    if fractions.mean_of_others >= MATTERS_BELOW * fractions.mean:
         return None
-    pixels = "pixel holds" if shares.few == 1 else f"{shares.few} pixels hold"
+    pixels = "pixel holds" if fractions.few == 1 else f"{fractions.few} pixels hold"
     return (
-        f"warning: the brightest {pixels} {shares.brightest_thousandth:.1%} of the signal: of {shares.mean:.4g} asked "
-        f"photons the other pixels get {shares.mean_of_others:.4g} on average, the median pixel {shares.median:.4g}"
+        f"warning: the brightest {pixels} {fractions.brightest_thousandth:.1%} of the signal: of {fractions.mean:.4g} "
+        f"asked photons the other pixels get {fractions.mean_of_others:.4g} on average, the median pixel "
+        f"{fractions.median:.4g}"
     )

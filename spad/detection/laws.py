@@ -20,23 +20,23 @@ from spad.sensor.model import Sensor
 LOW_FLUX = 0.01
 
 
-def first_photon_shares(flux: np.ndarray) -> np.ndarray:
-    """p_k, the share of cycles whose first photon falls into bin k, and last the share without one.
+def first_photon_masses(flux: np.ndarray) -> np.ndarray:
+    """Return p_k, the share of cycles whose first photon falls into bin k, and last the share without one.
 
     flux (P, T) expected primary detections per cycle and bin -> (P, T + 1) float64, rows sum to 1.
     """
     before = np.cumsum(flux, axis=-1)
-    shares = np.empty((len(flux), flux.shape[1] + 1))
-    np.exp(-before, out=shares[:, 1:])
-    shares[:, -1] = np.exp(-before[:, -1])
-    np.exp(flux - before, out=shares[:, :-1])
-    shares[:, :-1] *= -np.expm1(-flux)
-    return shares / shares.sum(axis=-1, keepdims=True)  # a multinomial refuses a sum 1e-12 above 1
+    fractions = np.empty((len(flux), flux.shape[1] + 1))
+    np.exp(-before, out=fractions[:, 1:])
+    fractions[:, -1] = np.exp(-before[:, -1])
+    np.exp(flux - before, out=fractions[:, :-1])
+    fractions[:, :-1] *= -np.expm1(-flux)
+    return fractions / fractions.sum(axis=-1, keepdims=True)  # a multinomial refuses a sum 1e-12 above 1
 
 
 def first_photon_counts(flux: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
-    """Counts of a synchronous detector, (n_1 .. n_T, none) ~ Multinomial(cycles, p): (P, T) int64."""
-    return rng.multinomial(cycles, first_photon_shares(flux))[:, :-1]
+    """Return counts of a synchronous detector, (n_1 .. n_T, none) ~ Multinomial(cycles, p): (P, T) int64."""
+    return rng.multinomial(cycles, first_photon_masses(flux))[:, :-1]
 
 
 class Detections(NamedTuple):
@@ -48,7 +48,7 @@ class Detections(NamedTuple):
 
 
 def first_of_each_cycle(events: Detections, sensor: Sensor) -> Detections:
-    """Those that are the first in their pixel and cycle, by pixel and cycle; positions are whole bins."""
+    """Return those that are the first in their pixel and cycle, by pixel and cycle; positions are whole bins."""
     cycles, bins = int(events.cycle.max(initial=0)) + 1, sensor.bins
     place = np.sort((events.pixel.astype(np.int64) * cycles + events.cycle) * bins + events.position)
     group = place // bins
@@ -58,7 +58,7 @@ def first_of_each_cycle(events: Detections, sensor: Sensor) -> Detections:
 
 
 def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.ndarray) -> np.ndarray:
-    """Indices of the detections of a free-running detector with a non-paralysable dead time, by pixel and time.
+    """Return indices of the detections of a free-running detector with a non-paralysable dead time, by pixel and time.
 
     A photon is detected unless one was detected less than `dead` before; photons in the dead time do not prolong it.
     pixel, time (M,) of the primary detections in any order, time and dead in one unit; ready (P,) is when each pixel
@@ -95,14 +95,15 @@ def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.
 NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
-def crosstalk_events(pixel: np.ndarray, share: float, height: int, width: int, rng: np.random.Generator) -> tuple:
-    """Detections that others fire in their neighbours: (index of the cause, pixel), each (M',) int64.
+def crosstalk_events(pixel: np.ndarray, fraction: float, height: int, width: int, rng: np.random.Generator) -> tuple:
+    """Return detections that others fire in their neighbours: (index of the cause, pixel), each (M',) int64.
 
-    Every detection fires each of its neighbours with probability `share`, independently; none beyond the array's edge.
+    Every detection fires each of its neighbours with probability `fraction`, independently; none beyond the array's
+    edge.
     """
     causes, pixels = [], []
     for down, right in NEIGHBOURS:
-        cause = np.flatnonzero(rng.random(len(pixel)) < share)
+        cause = np.flatnonzero(rng.random(len(pixel)) < fraction)
         row, column = pixel[cause] // width + down, pixel[cause] % width + right
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         causes.append(cause[inside])
@@ -110,12 +111,13 @@ def crosstalk_events(pixel: np.ndarray, share: float, height: int, width: int, r
     return np.concatenate(causes), np.concatenate(pixels)
 
 
-def add_crosstalk(counts: np.ndarray, share: float, rng: np.random.Generator) -> None:
-    """The same for counts (H, W, T), in place: Binomial(n, share) detections in the same bin of each neighbour."""
+def add_crosstalk(counts: np.ndarray, fraction: float, rng: np.random.Generator) -> None:
+    """Add crosstalk to counts (H, W, T), in place: Binomial(n, fraction) detections in the same bin of each
+    neighbour."""
     rows, columns, bins = np.nonzero(counts)
     number = counts[rows, columns, bins]
     for down, right in NEIGHBOURS:
-        fired = rng.binomial(number, share)
+        fired = rng.binomial(number, fraction)
         row, column = rows + down, columns + right
         inside = (fired > 0) & (row >= 0) & (row < counts.shape[0]) & (column >= 0) & (column < counts.shape[1])
         counts[row[inside], column[inside], bins[inside]] += fired[inside].astype(counts.dtype)
@@ -125,7 +127,7 @@ def add_crosstalk(counts: np.ndarray, share: float, rng: np.random.Generator) ->
 
 
 def coates(counts: Tensor, cycles: float) -> Tensor:
-    """Flux per cycle from a synchronous detector's counts (Coates 1968), the maximum-likelihood estimate:
+    """Return flux per cycle from a synchronous detector's counts (Coates 1968), the maximum-likelihood estimate:
 
     mu_k = ln[(N - sum_(j<k) n_j) / (N - sum_(j<=k) n_j)], (..., T) -> (..., T) float64. Where no cycle is left after
     bin k, its count is taken half a count lower; where none is left before, nothing is known and mu_k is 0. Raises
@@ -143,7 +145,8 @@ def coates(counts: Tensor, cycles: float) -> Tensor:
 
 
 def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
-    """Flux per cycle from a free-running detector's counts: each bin's count over the cycles that were live in it.
+    """Return flux per cycle from a free-running detector's counts: each bin's count over the cycles that were live in
+    it.
 
     In the steady state the detector is blind in bin k of those cycles in which it detected something less than a dead
     time earlier: blind_k = sum_j a_j n_(k-j) over the bins of one dead time before, whole periods of it counting
@@ -178,7 +181,8 @@ def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
 
 
 def linearised(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Counts as they would be without pile-up, (..., T) float64: `coates`, or `free_running_flux`, times the cycles.
+    """Return counts as they would be without pile-up, (..., T) float64: `coates`, or `free_running_flux`, times the
+    cycles.
 
     Pixels with at most 1 % detections per cycle (or dead time, if longer) keep their counts: what would change is a
     hundredth of one, which does nothing but decide between equal maxima.

@@ -34,7 +34,7 @@ class PixelFlux(NamedTuple):
         return len(self.background)
 
     def signal_per_pixel(self) -> np.ndarray:
-        """(P,) float64, what wraps included."""
+        """Return (P,) float64, what wraps included."""
         return np.bincount(self.owner, self.signal, minlength=self.pixels)
 
 
@@ -46,14 +46,14 @@ class PhotonEvents(NamedTuple):
 
 
 def paths_in_bins(near_m: np.ndarray, far_m: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """First arrival and length of returns, float64 in bins, of their nearest and farthest path [m]."""
+    """Return first arrival and length of returns, float64 in bins, of their nearest and farthest path [m]."""
     near = near_m.astype(np.float64)
     per_bin = SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s
     return near / per_bin, (far_m - near) / per_bin
 
 
 def light_of(transient: Transient, sensor: Sensor, rates: Rates, pixels: slice) -> PixelFlux:
-    """The returns of some pixels at a budget's rates; pixels are counted from the slice's first."""
+    """Return the returns of some pixels at a budget's rates; pixels are counted from the slice's first."""
     first, last = int(transient.offsets[pixels.start]), int(transient.offsets[pixels.stop])
     sizes = np.diff(transient.offsets[pixels.start : pixels.stop + 1])
     owner = np.repeat(np.arange(pixels.stop - pixels.start, dtype=np.int32), sizes)
@@ -69,14 +69,14 @@ def light_of(transient: Transient, sensor: Sensor, rates: Rates, pixels: slice) 
 
 
 def draw_primaries(
-    light: PixelFlux, sensor: Sensor, rng: np.random.Generator, *, share: float = 1.0, fractional: bool = False
+    light: PixelFlux, sensor: Sensor, rng: np.random.Generator, *, fraction: float = 1.0, fractional: bool = False
 ) -> PhotonEvents:
-    """Primary detections within the sensor's bins in a share of the exposure.
+    """Draw primary detections within the sensor's bins in a share of the exposure.
 
     Whole bins (int64), or positions within them (float64) where a dead time needs to know.
     """
     period = sensor.bins_per_period
-    number = rng.poisson(light.signal * share)
+    number = rng.poisson(light.signal * fraction)
     position = np.repeat(light.start, number)  # which is grouped, and then costs less than a look-up per detection
     total = len(position)
     if light.length.any():
@@ -88,7 +88,7 @@ def draw_primaries(
             delay = kernel.draw(rng, total)
             delay *= np.float32(1 / sensor.bin_width_s)
             position += delay
-    steady = rng.poisson(light.background * share)
+    steady = rng.poisson(light.background * fraction)
     owner = np.concatenate((light.owner, np.arange(light.pixels, dtype=np.int32)))
     pixel = np.repeat(owner, np.concatenate((number, steady)))
     rest = len(pixel) - total
@@ -123,7 +123,8 @@ def _uniform_bins(rng: np.random.Generator, period: int, size: int) -> np.ndarra
 
 
 def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: PixelFlux) -> tuple[np.ndarray, float]:
-    """Expected primary signal detections within the bins of every pixel, (H, W), and how much of the light wrapped."""
+    """Return expected primary signal detections within the bins of every pixel, (H, W), and how much of the light
+    wrapped."""
     shape = (transient.height, transient.width)
     if sensor.bins == sensor.bins_per_period:
         return light.signal_per_pixel().reshape(shape), _wrapped(light, sensor)

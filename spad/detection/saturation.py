@@ -16,12 +16,13 @@ import numpy as np
 
 
 def armed_fraction(flux: np.ndarray, trials: np.ndarray, recovery: float) -> np.ndarray:
-    """Share of trials whose detector is armed when they begin: flux (Z, T) detections a histogram -> (Z,)."""
+    """Return share of trials whose detector is armed when they begin: flux (Z, T) detections a histogram -> (Z,)."""
     return 1 / (1 - recovery * np.expm1(-flux.sum(axis=-1) / trials))
 
 
 def saturated(flux: np.ndarray, trials: np.ndarray, recovery: float, compression: float = 0.0) -> np.ndarray:
-    """Expected counts (Z, T) of a flux (Z, T) of primary detections a histogram; `trials` (Z,), infinite for none lost.
+    """Return expected counts (Z, T) of a flux (Z, T) of primary detections a histogram; `trials` (Z,), infinite for
+    none lost.
 
     n_k = trials x armed x exp(-sum_(j<k) mu_j) (1 - exp(-mu_k)), mu the flux of one trial; then the compression.
     """
@@ -37,7 +38,7 @@ def saturated(flux: np.ndarray, trials: np.ndarray, recovery: float, compression
 def draw_saturated(
     flux: np.ndarray, trials: np.ndarray, recovery: float, rng: np.random.Generator, compression: float = 0.0
 ) -> np.ndarray:
-    """Counts (Z, T) int64 of one exposure.
+    """Draw counts (Z, T) int64 of one exposure.
 
     Without saturation Poisson. With it the number of detections is drawn from the renewal process in its central limit
     (mean N a q, variance N a^3 q (1 - q), a the armed share), and their bins from the law's shares, exactly; what the
@@ -60,7 +61,8 @@ def draw_saturated(
 def saturated_jacobian(
     flux: np.ndarray, jacobian: np.ndarray, trials: np.ndarray, recovery: float, compression: float = 0.0
 ) -> np.ndarray:
-    """Chain rule through `saturated`: flux (Z, T), its derivatives (Z, T, P) -> derivatives of the counts (Z, T, P)."""
+    """Return chain rule through `saturated`: flux (Z, T), its derivatives (Z, T, P) -> derivatives of the counts (Z, T,
+    P)."""
     mu, dmu = flux / trials[:, None], jacobian / trials[:, None, None]
     after, dafter = np.cumsum(mu, axis=1), np.cumsum(dmu, axis=1)
     before, dbefore = after - mu, dafter - dmu

@@ -69,7 +69,7 @@ class PackedTransients:
 
 
 def packed_transients(transients: Iterable[Transient]) -> PackedTransients:
-    """Transients of one size in one; InputError for none, or of different sizes."""
+    """Return transients of one size in one; InputError for none, or of different sizes."""
     transients = list(transients)
     sizes = {(transient.height, transient.width) for transient in transients}
     if len(sizes) != 1:
@@ -116,7 +116,7 @@ def sense_patches(
     size: tuple[int, int],
     device: str | torch.device = "cpu",
 ) -> Batch:
-    """Counts and labels of patches (h, w) of stored transients.
+    """Return counts and labels of patches (h, w) of stored transients.
 
     Mean signal and background are fixed on the scene's full frame before the crop, by means as in `flux.rates_for`.
     Labels stay continuous. Raises InputError for a patch outside its scene, and a scene without light to scale.

@@ -77,7 +77,7 @@ METHODS: tuple[str, ...] = tuple(ESTIMATORS)
 
 
 def checked_histogram(counts: Tensor, bins: int) -> Tensor:
-    """The counts as (P, T) rows, or an InputError: last axis, negative or non-finite counts."""
+    """Return the counts as (P, T) rows, or an InputError: last axis, negative or non-finite counts."""
     if counts.ndim < 1 or counts.shape[-1] != bins:
         raise InputError(f"histogram of shape {tuple(counts.shape)}: the last axis must be the sensor's {bins} bins")
     if counts.numel():
@@ -88,7 +88,7 @@ def checked_histogram(counts: Tensor, bins: int) -> Tensor:
 
 
 def by_pixels(function: Callable[[Tensor], Tensor], rows: Tensor, per_pixel: int = 0) -> Tensor:
-    """`function` (P, T) -> (P, ...) over chunks of pixels, so that memory does not grow with the image.
+    """Return `function` (P, T) -> (P, ...) over chunks of pixels, so that memory does not grow with the image.
 
     `per_pixel` is the size of its largest intermediate tensor for one pixel, where that exceeds T."""
     size = max(1, _CHUNK.get(rows.device.type, _CHUNK["cuda"]) // max(1, rows.shape[-1], per_pixel))
@@ -96,7 +96,7 @@ def by_pixels(function: Callable[[Tensor], Tensor], rows: Tensor, per_pixel: int
 
 
 def depth_in_range(depth_m: Tensor, sensor: Sensor) -> Tensor:
-    """Float32 depth in [0, range): wrapped where the bins cover the period, else clamped to the bins."""
+    """Return float32 depth in [0, range): wrapped where the bins cover the period, else clamped to the bins."""
     if is_circular(sensor):
         depth_m = torch.remainder(depth_m, sensor.range_m)
     else:
@@ -115,7 +115,8 @@ def _raw_depth(rows: Tensor, sensor: Sensor, method: str) -> Tensor:
 
 
 def noise_free_bias_m(estimator: str | Callable[[Tensor], Tensor], sensor: Sensor) -> float:
-    """Mean over sub-bin phases of estimate - truth [m] for the expected counts of a lone pulse without background.
+    """Return mean over sub-bin phases of estimate - truth [m] for the expected counts of a lone pulse without
+    background.
 
     `estimator` is one of METHODS, before the subtraction (computed once a sensor), or any function of counts (P, T)
     that gives depth (P,) in metres.
@@ -160,7 +161,8 @@ def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched") 
 
 
 def confidence(counts: Tensor, depth_m: Tensor, sensor: Sensor) -> Tensor:
-    """Probability that an estimated depth is the pulse's and not a chance peak, (..., T), (...,) -> (...,) float32.
+    """Return probability that an estimated depth is the pulse's and not a chance peak, (..., T), (...,) -> (...,)
+    float32.
 
     The posterior share of arrivals within two pulse widths (the window that holds 95 % of a Gaussian) of the estimate,
     with every bin as likely before as any other: softmax of the log-likelihood over bins, S and B as `log-matched`
@@ -185,12 +187,12 @@ def confidence(counts: Tensor, depth_m: Tensor, sensor: Sensor) -> Tensor:
         # no bin twice, where the window is as wide as the period
         return (posterior.gather(-1, index.remainder(sensor.bins)) * inside).sum(-1).clamp(max=1)
 
-    share = by_pixels(near, torch.cat([rows.double(), estimate], dim=-1)).float()
-    return torch.where(depth_m.isnan(), math.nan, share.reshape(depth_m.shape))
+    fraction = by_pixels(near, torch.cat([rows.double(), estimate], dim=-1)).float()
+    return torch.where(depth_m.isnan(), math.nan, fraction.reshape(depth_m.shape))
 
 
 def cramer_rao_m(arrival_s: Tensor, signal: Tensor, background_per_bin: Tensor, sensor: Sensor) -> Tensor:
-    """Lowest standard deviation of an unbiased depth estimate [m], (...,) float64, S and B known:
+    """Return lowest standard deviation of an unbiased depth estimate [m], (...,) float64, S and B known:
 
     c/2 [sum_i (S dh_i/dtau)^2 / (S h_i + B)]^(-1/2), with the exact derivative of the binned pulse. All three inputs
     broadcast: arrival [s], signal detections S, background detections B per bin. Infinite where S = 0.
@@ -203,7 +205,8 @@ def cramer_rao_m(arrival_s: Tensor, signal: Tensor, background_per_bin: Tensor, 
 
 
 def radial_depth_m(half_path_m: np.ndarray, directions: np.ndarray, baseline_m: Iterable[float]) -> np.ndarray:
-    """Distance from the camera, given half the optical path from a displaced laser to the surface to the camera [m].
+    """Return distance from the camera, given half the optical path from a displaced laser to the surface to the camera
+    [m].
 
     With p the path, b the laser's place relative to the camera and r the unit ray: the ellipsoid
     d = (p^2 - |b|^2) / (2 (p - r.b)). half_path_m (...,), directions (..., 3) and b in one frame -> (...,) float32.
@@ -254,7 +257,7 @@ def depth_errors(
     range_m: float,
     exclude: Tensor | np.ndarray | None = None,
 ) -> dict[str, float | int]:
-    """Error figures of a depth map against the truth [m], both of one shape, over the pixels not in `exclude`.
+    """Return error figures of a depth map against the truth [m], both of one shape, over the pixels not in `exclude`.
 
     mae_mm, rmse_mm, median_mm (signed) and within_10mm (share strictly under 10 mm) over `pixels` pixels; left out and
     counted: empty (truth NaN), beyond_range (truth at the range or beyond), missing (estimate NaN).

@@ -19,8 +19,8 @@ def is_circular(sensor: Sensor) -> bool:
 
 
 def correlate(counts: Tensor, weights: Tensor, first: int, sensor: Sensor) -> Tensor:
-    """sum_l weights[., l] counts[., j + first + l] for every bin j: (P, T), (P or 1, L) -> (P, T), circular if the
-    sensor is. By direct sums, whose rounding does not depend on where a pixel's counts lie, unless L is large."""
+    """Return sum_l weights[., l] counts[., j + first + l] for every bin j: (P, T), (P or 1, L) -> (P, T), circular if
+    the sensor is. By direct sums, whose rounding does not depend on where a pixel's counts lie, unless L is large."""
     bins, taps = counts.shape[-1], weights.shape[-1]
     before, after = -first, taps - 1 + first
     if is_circular(sensor):
@@ -51,8 +51,8 @@ def _around(counts: Tensor, peak: Tensor, shifts: Tensor, sensor: Sensor) -> tup
 
 
 def grid_peak(scores: Tensor) -> Tensor:
-    """Position of the maximum of (..., G) scores in grid steps, (...,) float64: a parabola through the largest score
-    and its neighbours; the middle of the first and last of equal maxima, where scores are flat."""
+    """Return position of the maximum of (..., G) scores in grid steps, (...,) float64: a parabola through the largest
+    score and its neighbours; the middle of the first and last of equal maxima, where scores are flat."""
     size = scores.shape[-1]
     first = scores.argmax(-1)
     last = size - 1 - scores.flip(-1).argmax(-1)
@@ -74,8 +74,9 @@ def _matched_peak(counts: Tensor, sensor: Sensor, taps: Taps) -> Tensor:
 
 
 def matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Peak of <n - mean n, h(tau)> / |h(tau) - mean h|: the mean takes a uniform background out, the norm makes the
-    noise-free pulse score highest at its true arrival (Cauchy-Schwarz) also where |h| depends on the sub-bin phase."""
+    """Return peak of <n - mean n, h(tau)> / |h(tau) - mean h|: the mean takes a uniform background out, the norm makes
+    the noise-free pulse score highest at its true arrival (Cauchy-Schwarz) also where |h| depends on the sub-bin
+    phase."""
     taps = pulse_taps(sensor, str(counts.device))
     peak = _matched_peak(counts, sensor, taps)
     near, _ = _around(counts, peak, taps.shifts, sensor)
@@ -111,16 +112,18 @@ def _signal_and_background(near: Tensor, exists: Tensor, total: Tensor, sensor: 
     or without signal finite: at B = 0 a single stray count would otherwise have likelihood zero.
     """
     inside = (near * taps.window).sum(-1)
-    share = (exists * taps.window * taps.centred).sum(-1)
+    fraction = (exists * taps.window * taps.centred).sum(-1)
     width = (exists * taps.window).sum(-1)
     whole = exists @ taps.centred
-    background = (share * total - whole * inside) / (share * sensor.bins - whole * width).clamp(min=1e-6 * sensor.bins)
+    background = (fraction * total - whole * inside) / (fraction * sensor.bins - whole * width).clamp(
+        min=1e-6 * sensor.bins
+    )
     background = background.clamp(min=0.5 / sensor.bins)
     return (total - sensor.bins * background).clamp(min=0.5) / whole, background
 
 
 def likelihood(counts: Tensor, sensor: Sensor) -> Tensor:
-    """log-likelihood of an arrival in the centre of each bin, up to a constant of the pixel, (P, T) -> (P, T).
+    """Return log-likelihood of an arrival in the centre of each bin, up to a constant of the pixel, (P, T) -> (P, T).
 
     S and B are those at the matched filter's peak. The weights depend on S / B through a logarithm, so rough estimates
     serve: with the true S and B the share of outliers changes by less than 0.3 % of the pixels and the others' rms by
@@ -145,7 +148,7 @@ def likelihood(counts: Tensor, sensor: Sensor) -> Tensor:
 
 
 def log_matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Poisson maximum likelihood over all bin centres, then around the best on a grid of eighths of a bin."""
+    """Return Poisson maximum likelihood over all bin centres, then around the best on a grid of eighths of a bin."""
     taps = pulse_taps(sensor, str(counts.device))
     total = counts.sum(-1).double()
     peak = likelihood(counts, sensor).argmax(-1)
@@ -164,7 +167,7 @@ def log_matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
 
 
 def published_log_matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
-    """argmax_j sum_l n_(j + l) log(1 + h_l), h the unit-sum pulse, whole bins: the filter of the ICCV 2023 code.
+    """Return argmax_j sum_l n_(j + l) log(1 + h_l), h the unit-sum pulse, whole bins: the filter of the ICCV 2023 code.
 
     It knows neither S nor B. Answered at the bin's centre; the published answer is a bin more, by two indices from 1.
     """
@@ -174,7 +177,7 @@ def published_log_matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
 
 
 def correlation(counts: Tensor, sensor: Sensor) -> Tensor:
-    """<n - mean n, h(tau) - mean h> for the pulse h in the centre of each bin, (P, T) -> (P, T)."""
+    """Return <n - mean n, h(tau) - mean h> for the pulse h in the centre of each bin, (P, T) -> (P, T)."""
     taps = pulse_taps(sensor, str(counts.device))
     mean = (taps.centred.sum() / sensor.bins).to(counts.dtype)
     scores = correlate(counts, taps.centred.to(counts.dtype).unsqueeze(0), int(taps.shifts[0]), sensor)
@@ -182,8 +185,8 @@ def correlation(counts: Tensor, sensor: Sensor) -> Tensor:
 
 
 def normalised_correlation(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Zero-normalised cross-correlation (ZNCC) with the pulse in the centre of each bin, in [-1, 1], (B, T, P) ->
-    (B, T, P); 0 where all bins of a pixel hold the same."""
+    """Return zero-normalised cross-correlation (ZNCC) with the pulse in the centre of each bin, in [-1, 1], (B, T, P)
+    -> (B, T, P); 0 where all bins of a pixel hold the same."""
     taps = pulse_taps(sensor, str(counts.device))
     pulse, mean = taps.centred, counts.mean(1, keepdim=True)
     norm = ((pulse**2).sum() - pulse.sum() ** 2 / sensor.bins).sqrt().to(counts.dtype)
@@ -208,8 +211,8 @@ def _correlate_all(counts: Tensor, weights: Tensor, first: int, sensor: Sensor) 
 
 
 def correlation_bins(counts: Tensor, sensor: Sensor) -> Tensor:
-    """Peak over whole bins of the zero-normalised cross-correlation (ZNCC) with the pulse in a bin's centre, and a
-    parabola through its neighbours. `matched_bins` knows the pulse at every place within a bin, this one does not."""
+    """Return peak over whole bins of the zero-normalised cross-correlation (ZNCC) with the pulse in a bin's centre, and
+    a parabola through its neighbours. `matched_bins` knows the pulse at every place within a bin, this one does not."""
     taps = pulse_taps(sensor, str(counts.device))
     best = correlation(counts, sensor).argmax(-1)  # the counts' own norm is the same for every bin
     near, _ = _around(counts, best, taps.shifts, sensor)

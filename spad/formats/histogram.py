@@ -109,11 +109,12 @@ class Histogram:
         )
 
     def timestamps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Sparse form: time bin of every detection (uint16, ascending in a pixel), and (H*W + 1,) int64 offsets."""
+        """Return sparse form: time bin of every detection (uint16, ascending in a pixel), and (H*W + 1,) int64
+        offsets."""
         return timestamps_from_counts(self.counts)
 
     def sha256(self) -> str:
-        """SHA-256 over counts and truth."""
+        """Return SHA-256 over counts and truth."""
         sha = hashlib.sha256(str(self.counts.shape).encode())
         for array in (self.counts, *(getattr(self, name) for name in TRUTH)):
             sha.update(np.ascontiguousarray(array).tobytes())
@@ -182,4 +183,4 @@ def _assemble(meta: dict, data: dict[str, np.ndarray]) -> Histogram:
     if counts is None:
         flat = counts_from_timestamps(data["timestamps"], data["offsets"], sensor.bins)
         counts = flat.reshape(*data["depth_m"].shape, sensor.bins)
-    return Histogram(counts, sensor, budget, **{name: data[name] for name in TRUTH})
+    return Histogram(counts, sensor, budget, **{name: data[name] for name in TRUTH})  # type: ignore[arg-type]

@@ -40,7 +40,7 @@ class Capture:
 
 
 def capture_of(detections: Timestamps, image: np.ndarray | None = None) -> Capture:
-    """A square image's detections as a frame of the layout; InputError for an image that is none."""
+    """Return a square image's detections as a frame of the layout; InputError for an image that is none."""
     side = detections.height
     require(side == detections.width, f"image of {detections.width} x {side} pixels: the layout's images are square")
     row, column = np.divmod(np.repeat(np.arange(side * side), np.diff(detections.offsets)), side)
@@ -51,7 +51,7 @@ def capture_of(detections: Timestamps, image: np.ndarray | None = None) -> Captu
 
 
 def write_linospad(captures: Sequence[Capture], path: Path) -> None:
-    """Frames as a version 5 .mat file, whole or not at all. Frames without an image get one that is black."""
+    """Write frames as a version 5 .mat file, whole or not at all. Frames without an image get one that is black."""
     path = Path(path)
     require(path.suffix == ".mat", f"{path}: the output must end in .mat")
     require(len(captures) > 0, f"{path}: no frame to write")
@@ -63,7 +63,7 @@ def write_linospad(captures: Sequence[Capture], path: Path) -> None:
 
 
 def read_linospad(path: Path, frame: int = 0, *, bins: int = BINS) -> Capture:
-    """One frame of a file, from 0. A file of a single sparse matrix, without a cell, is one frame.
+    """Return one frame of a file, from 0. A file of a single sparse matrix, without a cell, is one frame.
 
     Raises InputError in one line for a file that is missing, damaged, of MATLAB's version 7.3 or of another layout,
     a frame that is not there, images that are not square, and counts that are negative or not finite.
@@ -80,7 +80,7 @@ def frame_of(contents: Mapping[str, Any], path: Path, frame: int, *, bins: int =
     images = _entries(contents[IMAGES]) if IMAGES in contents else []
     image = np.asarray(images[frame]) if frame < len(images) else None
     usable = image is not None and image.ndim in (2, 3) and image.size > 0 and image.dtype.kind in "uif"
-    if not usable:
+    if image is None or not usable:
         return Capture(counts)
     return Capture(counts, image.astype(np.float32).mean(axis=tuple(range(2, image.ndim))))
 
@@ -90,13 +90,13 @@ def _entries(cell: object) -> list:
     return list(cell.ravel()) if isinstance(cell, np.ndarray) and cell.dtype == object else [cell]
 
 
-def _checked(counts: object, where: str, bins: int) -> scipy.sparse.csc_matrix:
+def _checked(counts: Any, where: str, bins: int) -> scipy.sparse.csc_matrix:
     numeric = scipy.sparse.issparse(counts) or isinstance(counts, np.ndarray)
     require(numeric and counts.ndim == 2 and counts.dtype.kind in "buif", f"{where}: holds no matrix of counts")
     found = scipy.sparse.csc_matrix(counts, dtype=np.float64)
     pixels = found.shape[1]
-    said = f"{where}: counts of shape {found.shape[0]} x {pixels}, expected {bins} bins x a square number of pixels"
-    require(found.shape[0] == bins and pixels > 0 and math.isqrt(pixels) ** 2 == pixels, said)
+    message = f"{where}: counts of shape {found.shape[0]} x {pixels}, expected {bins} bins x a square number of pixels"
+    require(found.shape[0] == bins and pixels > 0 and math.isqrt(pixels) ** 2 == pixels, message)
     good = bool(np.isfinite(found.data).all() and (found.data >= 0).all())
     require(good, f"{where}: holds counts that are negative or not finite")
     return found
@@ -122,7 +122,8 @@ def capture_histogram(capture: Capture, sensor: Sensor | None = None) -> Histogr
 
 
 def rebinning(bins: int, new_bins: int) -> scipy.sparse.csr_matrix:
-    """R (new_bins, bins): the share of each bin that lies in each new one, both dividing one and the same period.
+    """Return R (new_bins, bins): the share of each bin that lies in each new one, both dividing one and the same
+    period.
 
     Counts taken as spread evenly over their bin. Every column sums to 1, no entry is negative, and the cumulative
     counts at every edge that both divisions have stay exactly what they were.
@@ -130,12 +131,13 @@ def rebinning(bins: int, new_bins: int) -> scipy.sparse.csr_matrix:
     require(min(bins, new_bins) >= 1, f"bins {bins} to {new_bins}: expected 1 or more")
     # edges in units of 1 / (bins * new_bins) of the period are whole numbers
     edges = np.union1d(np.arange(bins + 1) * new_bins, np.arange(new_bins + 1) * bins)
-    share = np.diff(edges) / new_bins
-    return scipy.sparse.csr_matrix((share, (edges[:-1] // bins, edges[:-1] // new_bins)), (new_bins, bins))
+    fraction = np.diff(edges) / new_bins
+    return scipy.sparse.csr_matrix((fraction, (edges[:-1] // bins, edges[:-1] // new_bins)), (new_bins, bins))
 
 
 def pooling(side: int, factor: int) -> scipy.sparse.csc_matrix:
-    """P (side * side, pixels): sums of factor x factor pixels, down the columns first before, row after row after."""
+    """Return P (side * side, pixels): sums of factor x factor pixels, down the columns first before, row after row
+    after."""
     require(factor >= 1 and side % factor == 0, f"image of {side} x {side} pixels is not tiled by {factor} x {factor}")
     column, row = np.divmod(np.arange(side * side), side)
     to = row // factor * (side // factor) + column // factor
@@ -144,7 +146,8 @@ def pooling(side: int, factor: int) -> scipy.sparse.csc_matrix:
 
 
 def resampled(capture: Capture, bins: int = 1024, factor: int = 2) -> np.ndarray:
-    """R counts P: `bins` bins over the same period, sums of factor x factor pixels, (side / factor, ..., bins) float32.
+    """Return R counts P: `bins` bins over the same period, sums of factor x factor pixels, (side / factor, ..., bins)
+    float32.
 
     No negative count and no ringing, as resampling by Fourier transform gives; no photon lost, as decimation does.
     """
@@ -154,6 +157,6 @@ def resampled(capture: Capture, bins: int = 1024, factor: int = 2) -> np.ndarray
 
 
 def resampled_sensor(sensor: Sensor, bins: int = 1024) -> Sensor:
-    """The sensor whose bins the counts are in afterwards: the same pulse and period."""
+    """Return the sensor whose bins the counts are in afterwards: the same pulse and period."""
     width = sensor.bins * sensor.bin_width_s / bins
     return replace(sensor, name=f"{sensor.name}-{bins}", bins=bins, bin_width_s=width, period_s=None)

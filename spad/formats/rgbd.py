@@ -38,7 +38,7 @@ class Expected(NamedTuple):
     range_bin: np.ndarray
     signal: np.ndarray
     background: np.ndarray
-    dark_share: float
+    dark_fraction: float
 
 
 def from_rgbd(
@@ -52,7 +52,7 @@ def from_rgbd(
     fov_deg: float | None = None,
     block: int = 1,
 ) -> Expected:
-    """Expected counts of an RGB-D image: radial depth [m], albedo and ambient light of any scale, (H, W) each.
+    """Return expected counts of an RGB-D image: radial depth [m], albedo and ambient light of any scale, (H, W) each.
 
     ours        as `transient_from_rgbd` says (which takes `fov_deg` and `block`), signal and background by means
     published   beta = round(2 d / (c Delta)) modulo T, 1 or more; S = signal a / d^2 over its mean; A = dark counts +
@@ -66,7 +66,8 @@ def from_rgbd(
         return _ours(depth_m, albedo, ambient, sensor, budget, fov_deg, block)
     require(convention == "published", f"convention {convention!r} is unknown, expected ours or published")
     require(block == 1, "the published convention takes one depth a pixel, block must be 1")
-    return _published(*_alike(depth_m, albedo, ambient), sensor, budget)
+    depth, white, light = _alike(depth_m, albedo, ambient)
+    return _published(depth, white, light, sensor, budget)
 
 
 def _alike(*images: np.ndarray) -> list[np.ndarray]:
@@ -103,7 +104,7 @@ def _ours(
         range_bin=np.where(known, np.floor(position).astype(np.int64) % sensor.bins_per_period + 1, 0),
         signal=np.clip(counts.sum(axis=1).reshape(shape) - background, 0, None),
         background=background,
-        dark_share=rates.dark_share,
+        dark_fraction=rates.dark_fraction,
     )
 
 
@@ -116,7 +117,8 @@ def transient_from_rgbd(
     block: int = 1,
     meta: dict | None = None,
 ) -> Transient:
-    """RGB-D images as a transient of point returns at path 2 d, lit by a radiant intensity of 1 W/sr at the camera.
+    """Return RGB-D images as a transient of point returns at path 2 d, lit by a radiant intensity of 1 W/sr at the
+    camera.
 
     With `block` b the images are b times finer than the sensor: a pixel sees the returns of its b x b samples, each
     1 / b^2 of its footprint, so that an edge gives two returns and no depth in between; labels are those of the sample
@@ -167,7 +169,7 @@ def transient_from_rgbd(
 
 
 def cosine_of_incidence(depth_m: np.ndarray, fov_deg: float) -> np.ndarray:
-    """|normal . ray| of the surface through the points depth x ray of a pinhole camera, (H, W); 1 where unknown.
+    """Return |normal . ray| of the surface through the points depth x ray of a pinhole camera, (H, W); 1 where unknown.
 
     Tangents are the shorter of the differences to both neighbours, so that an edge does not count as a slope.
     """
@@ -214,15 +216,15 @@ def _published(
     rates = np.repeat((both * scale / bins)[..., None], bins, axis=2)
     rows, columns = np.indices(depth.shape)
     peak = int(taps.argmax())
-    for tap, share in enumerate(taps):  # no two taps in one bin, as there are fewer than bins
-        rates[rows, columns, (beta - 1 + tap - peak) % bins] += signal * share
+    for tap, fraction in enumerate(taps):  # no two taps in one bin, as there are fewer than bins
+        rates[rows, columns, (beta - 1 + tap - peak) % bins] += signal * fraction
     label = (beta - 1) * (speed * sensor.bin_width_s / 2)
-    dark_share = float(dark.mean() / both.mean()) if both.any() else 0.0
-    return Expected(rates, label, beta, signal, both * scale, dark_share)
+    dark_fraction = float(dark.mean() / both.mean()) if both.any() else 0.0
+    return Expected(rates, label, beta, signal, both * scale, dark_fraction)
 
 
 def published_taps(sensor: Sensor) -> np.ndarray:
-    """The pulse as the published code has it, one sample a bin and unit sum: (L,) float64.
+    """Return the pulse as the published code has it, one sample a bin and unit sum: (L,) float64.
 
     Measured samples in steps of a bin are taken as they are. A Gaussian of L = 2 sigma bins is sampled at
     i = 1 .. floor(8 L) around (8 L - 1) / 2 with sigma = L / 2: at 270 ps and 97.66 ps bins its centroid is 0.44 bins
@@ -232,10 +234,8 @@ def published_taps(sensor: Sensor) -> np.ndarray:
     if isinstance(pulse, SampledPulse) and math.isclose(pulse.sample_s, width, rel_tol=1e-9):
         taps = np.asarray(pulse.samples)
     else:
-        require(
-            isinstance(pulse, Pulse) and pulse.tail_s == 0 and sensor.jitter is None,
-            "published convention: the pulse must be Gaussian, or measured in steps of a bin",
-        )
+        if not isinstance(pulse, Pulse) or pulse.tail_s or sensor.jitter is not None:
+            raise InputError("published convention: the pulse must be Gaussian, or measured in steps of a bin")
         length = 2 * pulse.sigma_s / width
         sample = np.arange(1, math.floor(8 * length) + 1)
         require(len(sample) > 0, f"published convention: a pulse of {length / 2:g} bins has no sample")

@@ -47,19 +47,19 @@ class Timestamps:
         return max(1, (self.bins - 1).bit_length())
 
     def counts(self) -> np.ndarray:
-        """The dense form, (H, W, T) int32."""
+        """Return the dense form, (H, W, T) int32."""
         return counts_from_timestamps(self.stamps, self.offsets, self.bins).reshape(self.height, self.width, self.bins)
 
     @classmethod
     def of_counts(cls, counts: np.ndarray, meta: dict | None = None) -> Timestamps:
-        """The sparse form of counts (H, W, T)."""
+        """Return the sparse form of counts (H, W, T)."""
         height, width, bins = counts.shape
         stamps, offsets = timestamps_from_counts(counts)
         return cls(height, width, bins, stamps, offsets, meta or {})
 
     @classmethod
     def merged(cls, parts: Iterable[Timestamps]) -> Timestamps:
-        """One exposure of several: the detections of all, ascending again in every pixel."""
+        """Return one exposure of several: the detections of all, ascending again in every pixel."""
         parts = list(parts)
         first = parts[0]
         if any((p.height, p.width, p.bins) != (first.height, first.width, first.bins) for p in parts):
@@ -68,23 +68,23 @@ class Timestamps:
         return cls.of_places(places, first.height, first.width, first.bins, first.meta)
 
     def places(self) -> np.ndarray:
-        """Pixel x T + bin of every detection, (N,) int64: its index in the flat dense form."""
+        """Return pixel x T + bin of every detection, (N,) int64: its index in the flat dense form."""
         pixel = np.repeat(np.arange(self.height * self.width), np.diff(self.offsets))
         return pixel * self.bins + self.stamps
 
     @classmethod
     def of_places(cls, places: np.ndarray, height: int, width: int, bins: int, meta: dict) -> Timestamps:
-        """From ascending indices in the flat dense form."""
+        """Return from ascending indices in the flat dense form."""
         offsets = np.searchsorted(places, np.arange(height * width + 1) * bins)
         return cls(height, width, bins, (places % bins).astype(np.uint16), offsets.astype(np.int64), meta)
 
     def packed(self) -> np.ndarray:
-        """All stamps as one stream of `bits` bits each, most significant first, (ceil(N bits / 8),) uint8."""
+        """Return all stamps as one stream of `bits` bits each, most significant first, (ceil(N bits / 8),) uint8."""
         shifts = np.arange(self.bits - 1, -1, -1, dtype=np.uint16)
         return np.packbits(((self.stamps[:, None] >> shifts) & 1).astype(np.uint8))
 
     def unpacked(self, stream: np.ndarray) -> Timestamps:
-        """These offsets with the stamps of a stream that `packed` made; InputError if it is too short."""
+        """Return these offsets with the stamps of a stream that `packed` made; InputError if it is too short."""
         count = int(self.offsets[-1])
         if len(stream) * 8 < count * self.bits:
             raise InputError(f"{len(stream)} bytes hold fewer than {count} stamps of {self.bits} bits")
@@ -94,14 +94,15 @@ class Timestamps:
 
 
 def counts_from_timestamps(stamps: np.ndarray, offsets: np.ndarray, bins: int) -> np.ndarray:
-    """Dense (pixels, T) int32 counts of sparse detections; the inverse of `timestamps_from_counts`."""
+    """Return dense (pixels, T) int32 counts of sparse detections; the inverse of `timestamps_from_counts`."""
     pixels = len(offsets) - 1
     owner = np.repeat(np.arange(pixels), np.diff(offsets))
     return np.bincount(owner * bins + stamps, minlength=pixels * bins).reshape(pixels, bins).astype(np.int32)
 
 
 def timestamps_from_counts(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Time bin of every detection of counts (..., T): (N,) uint16, ascending in a pixel, and (P + 1,) int64 offsets."""
+    """Return time bin of every detection of counts (..., T): (N,) uint16, ascending in a pixel, and (P + 1,) int64
+    offsets."""
     flat = counts.reshape(-1, counts.shape[-1])
     pixel, time_bin = np.nonzero(flat)
     stamps = np.repeat(time_bin.astype(np.uint16), flat[pixel, time_bin])

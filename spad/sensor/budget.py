@@ -68,17 +68,19 @@ class Optics:
         return self.wavelength_m / (PLANCK_J_S * SPEED_OF_LIGHT_M_PER_S)
 
     def detections_per_radiance(self, sensor: Sensor) -> float:
-        """Primary detections of a pixel per J/(m^2 sr) that comes to it: A Omega transmission PDE lambda / (h c)."""
+        """Return primary detections of a pixel per J/(m^2 sr) that comes to it: A Omega transmission PDE lambda / (h
+        c)."""
         return self.aperture_m2 * self.pixel_sr * self.transmission * sensor.pde * self.photons_per_joule
 
     def signal_scale(self, sensor: Sensor) -> float:
-        """Expected signal detections per exposure and unit of a transient's radiance (which is per joule emitted)."""
+        """Return expected signal detections per exposure and unit of a transient's radiance (which is per joule
+        emitted)."""
         return self.pulse_energy_j * self.detections_per_radiance(sensor) * sensor.cycles
 
     def budget(
         self, transient: Transient, sensor: Sensor, *, seed: int = 0, dark_map_hz: np.ndarray | None = None
     ) -> PhotonBudget:
-        """Mean signal and mean background of a scene: the budget by means that gives these very expected counts.
+        """Return mean signal and mean background of a scene: the budget by means that gives these very expected counts.
 
         Background is ambient light through the filter and dark counts, the sensor's or a measured map's. Raises
         InputError where the mean ambient radiance is above a bright sky's: then a scene file's lights are in units of

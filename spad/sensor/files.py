@@ -201,7 +201,7 @@ def _table(contents: Mapping[str, object], name: str) -> dict[str, object]:
     table, keys = contents[name], TABLES[name]
     require(isinstance(table, dict), f"{name}: expected a table [{name}]")
     _check_keys(table, tuple(keys), f"{name}.")
-    missing = [key for key, told in keys.items() if told.required and key not in table]
+    missing = [key for key, key_spec in keys.items() if key_spec.required and key not in table]
     require(not missing, f"{name}.{listed(missing)} is missing")
     return {keys[key].field: _field(value, keys[key], f"{name}.{key}") for key, value in table.items()}
 

@@ -41,7 +41,7 @@ class Sensor:
     bins: int = REFERENCE_BINS
     bin_width_s: float = REFERENCE_PERIOD_S / REFERENCE_BINS
     pulse: AnyPulse = field(default_factory=Pulse)
-    period_s: float | None = None
+    period_s: float = None  # type: ignore[assignment]  # None becomes bins x bin_width_s
     exposure_s: float = 1 / 30
     dark_count_rate_hz: float | tuple[float, ...] = 0.0
     jitter: AnyPulse | None = None
@@ -74,15 +74,16 @@ class Sensor:
 
     def _check_detector(self, where: str) -> None:
         if isinstance(self.dark_count_rate_hz, Iterable):
-            object.__setattr__(self, "dark_count_rate_hz", tuple(map(float, self.dark_count_rate_hz)))
-            require(len(self.dark_count_rate_hz) > 0, f"{where}: dark count rates of no row")
+            rows = tuple(map(float, self.dark_count_rate_hz))
+            object.__setattr__(self, "dark_count_rate_hz", rows)
+            require(len(rows) > 0, f"{where}: dark count rates of no row")
         for rate in (*self._dark_rows, self.hot_rate_hz):
             require(
                 math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite"
             )
         for label in ("hot_share", "dead_share"):
-            share = getattr(self, label)
-            require(0 <= share <= 1, f"{where}: {label} {share:g} is outside 0 to 1")
+            fraction = getattr(self, label)
+            require(0 <= fraction <= 1, f"{where}: {label} {fraction:g} is outside 0 to 1")
         require(0 < self.pde <= 1, f"{where}: PDE {self.pde:g} is outside (0, 1]")
         require(0 <= self.crosstalk < 0.25, f"{where}: crosstalk {self.crosstalk:g} is outside [0, 0.25)")
         require(self.reset in ("synchronous", "free-running"), f"{where}: reset {self.reset!r} is unknown")
@@ -124,22 +125,22 @@ class Sensor:
         return max(1, (self.bins - 1).bit_length())
 
     def dark_rate_map_hz(self, height: int, width: int, seed: int = 0) -> np.ndarray:
-        """Dark counts per second of every pixel, (H, W) float64: rows, then hot pixels at random by the seed."""
+        """Return dark counts per second of every pixel, (H, W) float64: rows, then hot pixels at random by the seed."""
         rows = np.resize(np.asarray(self._dark_rows, dtype=np.float64), height)
         rate = np.repeat(rows[:, None], width, axis=1)
         rate[self._chosen(self.hot_share, height, width, seed, 0)] = self.hot_rate_hz
         return rate
 
     def dead_pixels(self, height: int, width: int, seed: int = 0) -> np.ndarray:
-        """Pixels that detect nothing, (H, W) bool, at random by the seed."""
+        """Return pixels that detect nothing, (H, W) bool, at random by the seed."""
         return self._chosen(self.dead_share, height, width, seed, 1)
 
     @staticmethod
-    def _chosen(share: float, height: int, width: int, seed: int, what: int) -> np.ndarray:
+    def _chosen(fraction: float, height: int, width: int, seed: int, what: int) -> np.ndarray:
         chosen = np.zeros(height * width, dtype=bool)
-        if share > 0:
+        if fraction > 0:
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_PIXELS, what, 0)))
-            chosen[rng.choice(chosen.size, round(share * chosen.size), replace=False)] = True
+            chosen[rng.choice(chosen.size, round(fraction * chosen.size), replace=False)] = True
         return chosen.reshape(height, width)
 
     def to_dict(self) -> dict:
@@ -166,7 +167,7 @@ PRESETS: dict[str, Sensor] = {
 
 
 def sensor_by_name(name: str) -> Sensor:
-    """The preset of that name, or an InputError that lists the names."""
+    """Return the preset of that name, or an InputError that lists the names."""
     require(
         name in PRESETS,
         f"sensor {name!r} is unknown{did_you_mean(name, PRESETS)}, expected one of {', '.join(PRESETS)}",

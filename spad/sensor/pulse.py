@@ -57,19 +57,20 @@ class Pulse:
         return math.hypot(self.sigma_s, self.tail_s)
 
     def window_s(self, sigmas: float) -> tuple[float, float]:
-        """Time before and after the centroid outside which lies about what a Gaussian has beyond `sigmas`."""
+        """Return time before and after the centroid outside which lies about what a Gaussian has beyond `sigmas`."""
         decay = self.tail_s * sigmas**2 / 2  # exp(-sigmas^2 / 2) is left
         return sigmas * self.sigma_s + self.tail_s, sigmas * self.sigma_s + decay
 
     def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Delays of `size` detections after their arrival [s], (size,) float32: 1e-7 of the pulse's width is enough."""
+        """Draw delays of `size` detections after their arrival [s], (size,) float32: 1e-7 of the pulse's width is
+        enough."""
         delay = rng.standard_normal(size, dtype=np.float32) * np.float32(self.sigma_s)
         if self.tail_s:
             delay += (rng.standard_exponential(size, dtype=np.float32) - 1) * np.float32(self.tail_s)
         return delay
 
-    def shares(self, edges_s: np.ndarray) -> np.ndarray:
-        """Share of the pulse between neighbouring edges: (n + 1,) -> (n,) float64."""
+    def bin_masses(self, edges_s: np.ndarray) -> np.ndarray:
+        """Return share of the pulse between neighbouring edges: (n + 1,) -> (n,) float64."""
         x = edges_s + self.tail_s
         arrived = ndtr(x / self.sigma_s)
         if self.tail_s:
@@ -106,7 +107,7 @@ class SampledPulse:
         object.__setattr__(self, "_hash", hash((self.samples, self.sample_s)))
 
     def __hash__(self) -> int:  # computed once: a sensor is looked up in a cache by every estimator
-        return self._hash
+        return int(self.__dict__["_hash"])
 
     @property
     def reach_s(self) -> float:
@@ -117,10 +118,10 @@ class SampledPulse:
     def std_s(self) -> float:
         table = pulse_table(self)
         centres = (table.edges_s[1:] + table.edges_s[:-1]) / 2
-        return math.sqrt(float(table.share @ centres**2) + self.sample_s**2 / 12)
+        return math.sqrt(float(table.mass @ centres**2) + self.sample_s**2 / 12)
 
     def window_s(self, sigmas: float) -> tuple[float, float]:
-        """Time before and after the centroid outside which lies at most what a Gaussian has beyond `sigmas`."""
+        """Return time before and after the centroid outside which lies at most what a Gaussian has beyond `sigmas`."""
         table = pulse_table(self)
         outside = float(ndtr(-sigmas))
         first = int(np.searchsorted(table.arrived, outside, side="right")) - 1
@@ -128,12 +129,12 @@ class SampledPulse:
         return max(0.0, -float(table.edges_s[first])), max(0.0, float(table.edges_s[min(last, len(self.samples))]))
 
     def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
-        """Delays of `size` detections after their arrival [s], (size,) float32, by the inverse of the CDF."""
+        """Draw delays of `size` detections after their arrival [s], (size,) float32, by the inverse of the CDF."""
         table = pulse_table(self)
         return np.interp(rng.random(size), table.arrived, table.edges_s).astype(np.float32)
 
-    def shares(self, edges_s: np.ndarray) -> np.ndarray:
-        """Share of the pulse between neighbouring edges: (n + 1,) -> (n,) float64."""
+    def bin_masses(self, edges_s: np.ndarray) -> np.ndarray:
+        """Return share of the pulse between neighbouring edges: (n + 1,) -> (n,) float64."""
         table = pulse_table(self)
         return np.diff(np.interp(edges_s, table.edges_s, table.arrived))
 
@@ -145,27 +146,27 @@ class PulseTable(NamedTuple):
     """A measured pulse centred and integrated: n steps between n + 1 edges."""
 
     edges_s: np.ndarray  # (n + 1,) after the centroid
-    share: np.ndarray  # (n,) of each step, sums to 1
+    mass: np.ndarray  # (n,) of each step, sums to 1
     arrived: np.ndarray  # (n + 1,) CDF at the edges, 0 to 1
     integral_s: np.ndarray  # (n + 1,) the CDF's integral up to the edges
 
 
 @lru_cache(maxsize=64)
 def pulse_table(pulse: SampledPulse) -> PulseTable:
-    """Centred edges, shares, CDF (linear within a step) and its integral (quadratic within a step)."""
-    share = np.asarray(pulse.samples)
-    share = share / share.sum()
-    centroid = float(share @ (np.arange(len(share)) + 0.5))
-    edges = (np.arange(len(share) + 1) - centroid) * pulse.sample_s
-    arrived = np.concatenate(([0.0], np.cumsum(share)))
+    """Return centred edges, shares, CDF (linear within a step) and its integral (quadratic within a step)."""
+    mass = np.asarray(pulse.samples)
+    mass = mass / mass.sum()
+    centroid = float(mass @ (np.arange(len(mass)) + 0.5))
+    edges = (np.arange(len(mass) + 1) - centroid) * pulse.sample_s
+    arrived = np.concatenate(([0.0], np.cumsum(mass)))
     arrived /= arrived[-1]
     steps = (arrived[1:] + arrived[:-1]) / 2 * pulse.sample_s
-    return PulseTable(edges, share, arrived, np.concatenate(([0.0], np.cumsum(steps))))
+    return PulseTable(edges, mass, arrived, np.concatenate(([0.0], np.cumsum(steps))))
 
 
 @lru_cache(maxsize=64)
 def convolved(pulse: AnyPulse, kernel: AnyPulse | None) -> AnyPulse:
-    """The pulse blurred by a second kernel (timing jitter): exactly where both are Gaussian or one has a tail.
+    """Return the pulse blurred by a second kernel (timing jitter): exactly where both are Gaussian or one has a tail.
 
     Otherwise as a table in steps of a sixteenth of the narrower one's standard deviation. Raises InputError where
     that takes more than 65,536 steps.
@@ -180,21 +181,22 @@ def convolved(pulse: AnyPulse, kernel: AnyPulse | None) -> AnyPulse:
         before, after = part.window_s(_TABLE_SIGMAS)
         count = math.ceil(before / step) + math.ceil(after / step)
         require(count <= MAX_SAMPLES, f"pulse and jitter differ too much in width ({part.std_s:g} s and the other)")
-        tables.append(part.shares((np.arange(count + 1) - math.ceil(before / step)) * step))
-    both = np.convolve(*tables)
+        tables.append(part.bin_masses((np.arange(count + 1) - math.ceil(before / step)) * step))
+    both = np.convolve(tables[0], tables[1])
     require(len(both) <= MAX_SAMPLES, f"pulse and jitter together take {len(both)} steps of {step:g} s")
     return SampledPulse(tuple(np.clip(both, 0, None).tolist()), step)
 
 
 def pulse_from_dict(values: dict | None) -> AnyPulse | None:
-    """The pulse that `dataclasses.asdict` made."""
+    """Return the pulse that `dataclasses.asdict` made."""
     if values is None:
         return None
     return SampledPulse(**values) if "samples" in values else Pulse(**values)
 
 
 def read_pulse(path: Path, sample_s: float) -> SampledPulse:
-    """A measured pulse from a .npy file of samples, one dimension, in steps of `sample_s`. InputError in one line.
+    """Return a measured pulse from a .npy file of samples, one dimension, in steps of `sample_s`. InputError in one
+    line.
 
     A peak in the first or last hundredth of the samples means that they were recorded around a laser period: they are
     rolled until their circular centroid is in the middle.

@@ -28,14 +28,16 @@ def parse_quantity(value: object, dimension: str, where: str, *, signed: bool = 
     sign), and for a unit that is missing or of another dimension.
     """
     if not dimension:
-        number = not isinstance(value, bool) and isinstance(value, (int, float))
-        require(number, f"{where}: {value!r} is no number")
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InputError(f"{where}: {value!r} is no number")
         return _checked(float(value), value, where, signed)
     units = UNITS[dimension]
     example = f'a {dimension} in {", ".join(units)}, as "1 {next(iter(units))}"'
-    require(isinstance(value, str), f"{where}: {value!r} has no unit, expected {example}")
+    if not isinstance(value, str):
+        raise InputError(f"{where}: {value!r} has no unit, expected {example}")
     found = _QUANTITY.fullmatch(value)
-    require(found is not None, f"{where}: {value!r} is no number with a unit, expected {example}")
+    if found is None:
+        raise InputError(f"{where}: {value!r} is no number with a unit, expected {example}")
     number, unit = found.groups()
     meant = "".join(f"; did you mean '{known}'?" for known in units if known.lower() == unit.lower())
     named = f"the unit {unit}" if unit else "no unit"
@@ -58,6 +60,6 @@ def format_quantity(value: float, dimension: str) -> str:
     units = UNITS[dimension]
     exact = Decimal(repr(float(value)))
     fitting = [unit for unit, power in units.items() if exact and abs(exact) >= Decimal(1).scaleb(power)]
-    largest = max(fitting, key=units.get) if fitting else next(iter(units))
+    largest = max(fitting, key=lambda unit: units[unit]) if fitting else next(iter(units))
     number = exact.scaleb(-units[largest]).normalize()
     return f"{number:f} {largest}" if abs(number.adjusted()) < 12 else f"{number} {largest}"

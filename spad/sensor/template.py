@@ -7,7 +7,10 @@ exponentially modified Gaussian, x = t + tau its time after the Gaussian's centr
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -47,13 +50,13 @@ def _steps_of(pulse: SampledPulse, t: Tensor) -> tuple[tuple[Tensor, ...], Tenso
     table = pulse_table(pulse)
     columns = tuple(torch.from_numpy(column).to(t.device) for column in table)
     position = (t.double() - float(table.edges_s[0])) / pulse.sample_s
-    step = position.floor().clamp(0, len(table.share) - 1)
-    inside = (position >= 0) & (position < len(table.share))
+    step = position.floor().clamp(0, len(table.mass) - 1)
+    inside = (position >= 0) & (position < len(table.mass))
     return columns, step.long(), (position - step).clamp(0, 1), inside
 
 
 def pulse_density(pulse: AnyPulse, t: Tensor) -> Tensor:
-    """f(t) [1/s], any shape: phi(t / s) / s; E(x) / tau; a step's share over its length."""
+    """Return f(t) [1/s], any shape: phi(t / s) / s; E(x) / tau; a step's share over its length."""
     t = t.double()
     if isinstance(pulse, SampledPulse):
         columns, step, _, inside = _steps_of(pulse, t)
@@ -65,11 +68,12 @@ def pulse_density(pulse: AnyPulse, t: Tensor) -> Tensor:
 
 
 def pulse_cdf(pulse: AnyPulse, t: Tensor) -> Tensor:
-    """F(t), the share of the pulse that has arrived by t, any shape: Phi(t / s); Phi(x / s) - E(x); linear in steps."""
+    """Return F(t), the share of the pulse that has arrived by t, any shape: Phi(t / s); Phi(x / s) - E(x); linear in
+    steps."""
     t = t.double()
     if isinstance(pulse, SampledPulse):
-        (_, share, arrived, _), step, part, _ = _steps_of(pulse, t)
-        return arrived[step] + share[step] * part
+        (_, fraction, arrived, _), step, part, _ = _steps_of(pulse, t)
+        return arrived[step] + fraction[step] * part
     if pulse.tail_s:
         x = t + pulse.tail_s
         return (_normal_cdf(x / pulse.sigma_s) - _decayed(pulse, x)).clamp(0, 1)
@@ -77,14 +81,14 @@ def pulse_cdf(pulse: AnyPulse, t: Tensor) -> Tensor:
 
 
 def pulse_cdf_integral(pulse: AnyPulse, t: Tensor) -> Tensor:
-    """H(t) = integral of F from -infinity to t [s], any shape; never negative, and t itself far after the pulse.
+    """Return H(t) = integral of F from -infinity to t [s], any shape; never negative, and t itself far after the pulse.
 
     Gaussian: t Phi(t / s) + s phi(t / s). With a tail: that at x, minus tau F. Steps: quadratic in each.
     """
     t = t.double()
     if isinstance(pulse, SampledPulse):
-        (_, share, arrived, integral), step, part, _ = _steps_of(pulse, t)
-        within = integral[step] + pulse.sample_s * (arrived[step] * part + share[step] * part**2 / 2)
+        (_, fraction, arrived, integral), step, part, _ = _steps_of(pulse, t)
+        within = integral[step] + pulse.sample_s * (arrived[step] * part + fraction[step] * part**2 / 2)
         return torch.where(t >= float(pulse_table(pulse).edges_s[-1]), t, within)
     gaussian = _gaussian_cdf_integral(pulse.sigma_s, t + pulse.tail_s)
     return (gaussian - pulse.tail_s * pulse_cdf(pulse, t)).clamp(min=0) if pulse.tail_s else gaussian
@@ -103,7 +107,7 @@ def _gaussian_cdf_integral(sigma_s: float, t: Tensor) -> Tensor:
 
 
 def pulse_mass(pulse: AnyPulse, centre: Tensor, width_s: float) -> Tensor:
-    """F(centre + width/2) - F(centre - width/2), the pulse's share in an interval; any shape, >= 0.
+    """Return F(centre + width/2) - F(centre - width/2), the pulse's share in an interval; any shape, >= 0.
 
     A Gaussian, which is even, is taken on the left flank for either sign: the right tail is then a difference of
     small numbers and not of numbers near one, so that it keeps its digits and a logarithm of it is sound.
@@ -115,26 +119,31 @@ def pulse_mass(pulse: AnyPulse, centre: Tensor, width_s: float) -> Tensor:
 
 
 def pulse_mass_slope(pulse: AnyPulse, centre: Tensor, width_s: float) -> Tensor:
-    """d/d tau of `pulse_mass` for an arrival at tau, centre = bin centre - tau: f(start) - f(stop) [1/s]."""
+    """Return d/d tau of `pulse_mass` for an arrival at tau, centre = bin centre - tau: f(start) - f(stop) [1/s]."""
     centre = centre.double()
     return pulse_density(pulse, centre - width_s / 2) - pulse_density(pulse, centre + width_s / 2)
 
 
 def wraps(sensor: Sensor) -> range:
-    """The periods m for which a pulse m periods away still reaches a bin within half a period of its arrival."""
+    """Return the periods m for which a pulse m periods away still reaches a bin within half a period of its arrival."""
     reach = (max(sensor.response.window_s(_REACH_SIGMAS)) + sensor.bin_width_s) / sensor.period_s
     count = max(0, math.ceil(reach - 0.5))
     return range(-count, count + 1)
 
 
+def _total(parts: Iterable[Tensor]) -> Tensor:
+    return functools.reduce(operator.add, parts)
+
+
 def wrapped_mass(offset_s: Tensor, sensor: Sensor) -> Tensor:
-    """Share of a periodic pulse in a bin whose centre lies `offset_s` after the arrival (half a period either side)."""
+    """Return share of a periodic pulse in a bin whose centre lies `offset_s` after the arrival (half a period either
+    side)."""
     pulse, width, period = sensor.response, sensor.bin_width_s, sensor.period_s
-    return sum(pulse_mass(pulse, offset_s + m * period, width) for m in wraps(sensor))
+    return _total(pulse_mass(pulse, offset_s + m * period, width) for m in wraps(sensor))
 
 
 def bin_offsets(arrival_s: Tensor, sensor: Sensor) -> Tensor:
-    """Bin centre minus arrival, (...,) -> (..., T) [s], folded into half a period (and a bin) either side.
+    """Return bin centre minus arrival, (...,) -> (..., T) [s], folded into half a period (and a bin) either side.
 
     Split into whole bins and a rest that all bins share: neighbouring bins then meet at one and the same edge, to
     rounding near the arrival and not of the whole period, and a pulse of a hundredth of a bin keeps its total.
@@ -148,7 +157,8 @@ def bin_offsets(arrival_s: Tensor, sensor: Sensor) -> Tensor:
 
 
 def binned_pulse(arrival_s: Tensor, sensor: Sensor) -> Tensor:
-    """h_i(tau): expected counts per bin of one detection that arrives at `arrival_s`, (...,) -> (..., T) float64.
+    """Return h_i(tau): expected counts per bin of one detection that arrives at `arrival_s`, (...,) -> (..., T)
+    float64.
 
     h_i(tau) = sum over m of F(t_(i+1) - tau - m P) - F(t_i - tau - m P), t_i = i bin widths, P the period. Sums to one
     over a period; a sensor whose bins do not cover the period loses what falls outside them.
@@ -157,10 +167,10 @@ def binned_pulse(arrival_s: Tensor, sensor: Sensor) -> Tensor:
 
 
 def binned_pulse_slope(arrival_s: Tensor, sensor: Sensor) -> Tensor:
-    """d h_i / d tau [1/s], (...,) -> (..., T) float64: the exact derivative of `binned_pulse`."""
+    """Return d h_i / d tau [1/s], (...,) -> (..., T) float64: the exact derivative of `binned_pulse`."""
     pulse, width, period = sensor.response, sensor.bin_width_s, sensor.period_s
     offsets = bin_offsets(arrival_s, sensor)
-    return sum(pulse_mass_slope(pulse, offsets + m * period, width) for m in wraps(sensor))
+    return _total(pulse_mass_slope(pulse, offsets + m * period, width) for m in wraps(sensor))
 
 
 class Taps(NamedTuple):
@@ -181,7 +191,7 @@ class Taps(NamedTuple):
 
 @lru_cache(maxsize=16)
 def pulse_taps(sensor: Sensor, device: str) -> Taps:
-    """The taps of a sensor, computed once a device."""
+    """Return the taps of a sensor, computed once a device."""
     period = sensor.bins_per_period
 
     def shifts_within(sigmas: float, margin_bins: float) -> tuple[int, int]:

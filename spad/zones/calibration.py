@@ -86,7 +86,7 @@ class ZoneModel:
         self.basis, self.bins, self.zones, self.reference = basis, bins, zones, reference
 
     def own(self, values: Values, capture: ZoneCapture, zone: int) -> np.ndarray:
-        """Expected signal (T,) of one zone without crosstalk."""
+        """Return expected signal (T,) of one zone without crosstalk."""
         first, mass = self._mass(values, capture, zone)
         # a pulse step's counts in a bin are the sum of FINE neighbouring masses
         full = np.convolve(mass, self.basis.matrix @ values["pulse"])
@@ -95,7 +95,7 @@ class ZoneModel:
         return np.where(inside, full[np.clip(at, 0, len(full) - 1)], 0.0) * values["gain"][zone]
 
     def responses(self, values: Values, capture: ZoneCapture, zone: int) -> np.ndarray:
-        """Derivative of `own` with respect to the pulse, (T, K)."""
+        """Return derivative of `own` with respect to the pulse, (T, K)."""
         first, mass = self._mass(values, capture, zone)
         steps = np.arange(len(self.basis.matrix))
         at = np.arange(self.bins)[:, None] * FINE + FINE - 1 - (steps + self.basis.first)[None, :] - first
@@ -123,7 +123,7 @@ class ZoneModel:
         return own + values["crosstalk"][0] * own.sum(axis=0) + values["background"][:, None]
 
     def expected(self, values: Values, capture: ZoneCapture) -> np.ndarray:
-        """Expected counts (Z, T)."""
+        """Return expected counts (Z, T)."""
         return self._saturated(values, self.flux(values, capture))
 
     def _saturated(self, values: Values, flux: np.ndarray) -> np.ndarray:
@@ -133,7 +133,7 @@ class ZoneModel:
     def jacobian(
         self, values: Values, capture: ZoneCapture, names: Sequence[tuple[str, int]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Expected counts (Z, T) and their derivatives (Z, T, P) with respect to the named numbers."""
+        """Return expected counts (Z, T) and their derivatives (Z, T, P) with respect to the named numbers."""
         own = np.zeros((self.zones, self.bins))
         slope = np.zeros((self.zones, self.bins, len(names)))
         pulse = [column for column, (name, _) in enumerate(names) if name == "pulse"]
@@ -259,7 +259,7 @@ def _moved(values: Values, names: Sequence[tuple[str, int]], step: np.ndarray) -
 
 
 def natural(model: ZoneModel, values: Values) -> dict[str, np.ndarray]:
-    """The sensor's own parameters: seconds, detections, and delays that include the pulse's centroid."""
+    """Return the sensor's own parameters: seconds, detections, and delays that include the pulse's centroid."""
     width, pulse = values["bin_width"][0], model.basis.matrix @ values["pulse"]
     centroid = model.basis.first + pulse @ (np.arange(len(pulse)) + 0.5) / pulse.sum()
     return {
@@ -278,7 +278,7 @@ def natural(model: ZoneModel, values: Values) -> dict[str, np.ndarray]:
 def standard_errors(
     model: ZoneModel, values: Values, information: np.ndarray, names: Sequence[tuple[str, int]]
 ) -> dict[str, np.ndarray]:
-    """Standard errors of the natural parameters, by the inverse Fisher information and the delta method."""
+    """Return standard errors of the natural parameters, by the inverse Fisher information and the delta method."""
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     system = information * scale[:, None] * scale + _RIDGE * np.eye(len(scale))
     covariance = scale[:, None] * scale * np.linalg.inv(system)
@@ -316,7 +316,8 @@ def as_sensor(model: ZoneModel, values: Values, sensor: Sensor, zones: ZoneArray
 
 
 def poisson_deviance(counts: np.ndarray, expected: np.ndarray) -> float:
-    """Twice the log-likelihood ratio of counts to the saturated model, summed: about one a bin for a true model."""
+    """Return twice the log-likelihood ratio of counts to the saturated model, summed: about one a bin for a true
+    model."""
     ratio = np.where(counts > 0, counts, 1) / np.maximum(expected, 1e-9)
     return float(2 * (np.where(counts > 0, counts * np.log(ratio), 0) - counts + expected).sum())
 
@@ -327,7 +328,8 @@ def poisson_deviance(counts: np.ndarray, expected: np.ndarray) -> float:
 def starting_values(
     captures: Sequence[ZoneCapture], sensor: Sensor, zones: int, first_bin: int, basis: PulseBasis, reference: int
 ) -> Values:
-    """Rough values from the captures themselves: pulse from the middle capture, gains and delays from its zones."""
+    """Return rough values from the captures themselves: pulse from the middle capture, gains and delays from its
+    zones."""
     middle = captures[len(captures) // 2]
     counts = middle.counts.astype(np.float64)
     background = np.maximum(np.median(counts, axis=1), 1.0)

@@ -15,7 +15,7 @@ from spad.zones.sensor import ZoneArray, draw_zone_counts, zone_returns, zone_si
 
 
 def zone_grid(zones: ZoneArray) -> tuple[int, int, np.ndarray]:
-    """Rows, columns, and the zone at each place from top left; one row where the centres form no grid."""
+    """Return rows, columns, and the zone at each place from top left; one row where the centres form no grid."""
     x, y = np.asarray(zones.centre_x).round(9), np.asarray(zones.centre_y).round(9)
     rows, columns = len(np.unique(y)), len(np.unique(x))
     if rows * columns != zones.count:
@@ -24,7 +24,7 @@ def zone_grid(zones: ZoneArray) -> tuple[int, int, np.ndarray]:
 
 
 def with_budget(zones: ZoneArray, transient: Transient, sensor: Sensor, budget: PhotonBudget) -> ZoneArray:
-    """Scale gains and set backgrounds so that their means over the zones are the budget's, before saturation.
+    """Return scale gains and set backgrounds so that their means over the zones are the budget's, before saturation.
 
     Raises InputError where no light reaches a zone.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -104,7 +104,7 @@ class ZoneArray:
     def without(self, effect: str) -> ZoneArray:
         """Return the array with one of EFFECTS off; delays and clocks become their mean over the zones."""
         even = self.count
-        off = {
+        off: dict[str, dict[str, Any]] = {
             "parallax": {"baseline_m": (0.0, 0.0, 0.0)},
             "aperture": {"aperture_m": 0.0},
             "illumination": {"curvature_x": 0.0, "curvature_y": 0.0},
@@ -194,7 +194,8 @@ def _ramp(at: np.ndarray, blur: np.ndarray) -> np.ndarray:
 
 
 def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0) -> np.ndarray:
-    """Expected primary signal detections (Z, T) float64: pulses integrated over each zone's own bins, crosstalk added.
+    """Return expected primary signal detections (Z, T) float64: pulses integrated over each zone's own bins, crosstalk
+    added.
 
     What arrives outside of the bins is not counted: the period of such a sensor is longer than its histogram.
     `drift_s` delays all zones, as a laser that warms up does.
@@ -214,14 +215,14 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
 
 
 def zone_flux(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0) -> np.ndarray:
-    """Expected primary detections (Z, T) float64: signal and background."""
+    """Return expected primary detections (Z, T) float64: signal and background."""
     return zone_signal(returns, sensor, zones, drift_s) + np.asarray(zones.background)[:, None]
 
 
 def expected_zone_counts(
     returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0
 ) -> np.ndarray:
-    """Expected counts (Z, T) float64 of one exposure, after saturation."""
+    """Return expected counts (Z, T) float64 of one exposure, after saturation."""
     flux = zone_flux(returns, sensor, zones, drift_s)
     return saturated(flux, np.asarray(zones.trials), zones.recovery, zones.compression)
 
@@ -229,7 +230,7 @@ def expected_zone_counts(
 def draw_zone_counts(
     returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, *, seed: int = 0, drift_s: float = 0.0
 ) -> np.ndarray:
-    """Counts (Z, T) int64 of one exposure; the same seed gives the same counts."""
+    """Draw counts (Z, T) int64 of one exposure; the same seed gives the same counts."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_ZONES, 0, 0)))
     flux = zone_flux(returns, sensor, zones, drift_s)
     return draw_saturated(flux, np.asarray(zones.trials), zones.recovery, rng, zones.compression)

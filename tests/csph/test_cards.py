@@ -59,6 +59,6 @@ def test_training_needs_no_renderer_and_no_command_line():
         "from csph.weights.cards import shipped_model\n"
         "print(load_model(shipped_model('none-s0'))[0].parameters_count)\n"
     )
-    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert said.returncode == 0, said.stderr
-    assert int(said.stdout) > 100_000
+    message = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert message.returncode == 0, message.stderr
+    assert int(message.stdout) > 100_000

@@ -146,7 +146,7 @@ def test_random_codes_follow_their_seed_and_range():
 
 
 @pytest.mark.parametrize(
-    ("name", "codes", "bins", "said"),
+    ("name", "codes", "bins", "message"),
     [
         ("coarse", 3, 64, "3 gates do not divide 64 bins"),
         ("coarse", 128, 64, "128 gates"),
@@ -159,8 +159,8 @@ def test_random_codes_follow_their_seed_and_range():
         ("haar", 4, 64, "'haar' is unknown"),
     ],
 )
-def test_codes_that_do_not_fit_end_in_one_line(name, codes, bins, said):
-    with pytest.raises(InputError, match=said) as caught:
+def test_codes_that_do_not_fit_end_in_one_line(name, codes, bins, message):
+    with pytest.raises(InputError, match=message) as caught:
         temporal_code(name, codes, bins, REFERENCE)
     assert "\n" not in str(caught.value)
 
@@ -176,7 +176,7 @@ def test_gray_fourier_takes_any_pulse():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: ModelConfig(design=Design("learned", (256, 1, 1), 1)), "leaves zeros"),
         (lambda: Design("furier", (256, 1, 1), 4), "did you mean 'fourier'"),
@@ -184,8 +184,8 @@ def test_gray_fourier_takes_any_pulse():
         (lambda: temporal_code("hadamrd", 4, 256, Sensor()), "did you mean 'hadamard'"),
     ],
 )
-def test_designs_that_are_none_are_told_what_would_be_one(make, said):
-    with pytest.raises(InputError, match=said):
+def test_designs_that_are_none_are_told_what_would_be_one(make, message):
+    with pytest.raises(InputError, match=message):
         make()
 
 

@@ -78,7 +78,7 @@ def test_names_and_learned_parts():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: codes_for((256, 4, 4), 100), "100 does not divide the 4096"),
         (lambda: codes_for((16, 1, 1), 32), "32 does not divide the 16"),
@@ -95,7 +95,7 @@ def test_names_and_learned_parts():
         (lambda: make_coding(Design("coarse", (64, 1, 1), 5)), "5 gates do not divide"),
     ],
 )
-def test_designs_that_cannot_be_end_in_one_line(make, said):
-    with pytest.raises(InputError, match=said) as caught:
+def test_designs_that_cannot_be_end_in_one_line(make, message):
+    with pytest.raises(InputError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)

@@ -322,7 +322,7 @@ def test_the_layers_tensor_comes_back_out_of_it():
 
 
 @pytest.mark.parametrize(
-    ("counts", "said"),
+    ("counts", "message"),
     [
         (torch.zeros(1, 1, 33, 8, 8), "33 x 8 x 8 .* is not tiled by blocks of 16 x 2 x 2"),
         (torch.zeros(1, 1, 32, 7, 8), "32 x 7 x 8"),
@@ -333,8 +333,8 @@ def test_the_layers_tensor_comes_back_out_of_it():
         (torch.zeros(1, 1, 32, 8, 8, dtype=torch.bool), "torch.bool"),
     ],
 )
-def test_wrong_histograms_end_in_one_line(counts, said):
-    with pytest.raises(InputError, match=said) as caught:
+def test_wrong_histograms_end_in_one_line(counts, message):
+    with pytest.raises(InputError, match=message) as caught:
         CompressiveLayer.of(DESIGNS["learned 16x2x2 K8"])(counts)
     assert "\n" not in str(caught.value)
 
@@ -344,14 +344,14 @@ def test_wrong_codes_timestamps_and_parts_end_in_one_line():
     with pytest.raises(InputError, match=r"expected \(batch, 8, time, rows, columns\)"):
         layer.decode(torch.zeros(1, 4, 2, 4, 4))
     stamps, offsets = photons_of(counts_from(1))
-    for bad, starts, size, said in (
+    for bad, starts, size, message in (
         (stamps, offsets, (33, 8, 8), "not tiled"),
         (stamps, offsets, (32, 8, 6), "no images of 8 x 6"),
         (stamps, offsets, (16, 8, 8), "outside the bins 0 to 15"),
         (stamps.float(), offsets, SIZE, "expected integers"),
         (stamps[:-1], offsets, SIZE, "must rise from 0"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             layer.encode_timestamps(bad, starts, size)
     with pytest.raises(InputError, match="no part spatial"):
         CompressiveLayer(CodingTensor("one", torch.ones(2, 4)), learned=("spatial",))

@@ -34,8 +34,8 @@ def test_errors_by_hand():
     absolute = np.array([3, 10, 0, 50, 0.5])
     assert errors["mae_mm"] == pytest.approx(absolute.mean())
     assert errors["rmse_mm"] == pytest.approx(np.sqrt((absolute**2).mean()))
-    shares = [errors[f"within_{t}mm"] for t in (1, 5, 20)]
-    assert shares == pytest.approx([0.4, 0.6, 0.8])
+    fractions = [errors[f"within_{t}mm"] for t in (1, 5, 20)]
+    assert fractions == pytest.approx([0.4, 0.6, 0.8])
     # 10 mm to within rounding: strictly under it or not, no other pixel is near
     assert errors["within_10mm"] in (0.6, 0.8)
 

@@ -27,17 +27,17 @@ SMALL = Sensor(name="small", bins=64, bin_width_s=1e-10, pulse=Pulse(1.4e-10))
 def plain_median(posterior: np.ndarray) -> float:
     """Go through the bins until half of the probability is reached, and a part of the last one."""
     gone = 0.0
-    for number, share in enumerate(posterior):
-        if gone + share >= 0.5:
-            return number + (0.5 - gone) / share
-        gone += share
+    for number, fraction in enumerate(posterior):
+        if gone + fraction >= 0.5:
+            return number + (0.5 - gone) / fraction
+        gone += fraction
     raise AssertionError
 
 
 def plain_confidence(posterior: np.ndarray, position: float, within: float) -> float:
     """What part of every bin lies in the interval."""
     low, high = position - within, position + within
-    return sum(share * max(0.0, min(high, i + 1) - max(low, i)) for i, share in enumerate(posterior))
+    return sum(fraction * max(0.0, min(high, i + 1) - max(low, i)) for i, fraction in enumerate(posterior))
 
 
 def logits_of(*posteriors: list[float]) -> torch.Tensor:
@@ -54,9 +54,9 @@ def test_median_and_confidence_are_their_plain_twins():
     median = posterior_median(logits)
     sure = confidence(logits, median, 3.0)
     flat = logits.double().softmax(1).permute(0, 2, 3, 1).reshape(-1, 50).numpy()
-    for one, position, share in zip(flat, median.flatten().tolist(), sure.flatten().tolist(), strict=True):
+    for one, position, fraction in zip(flat, median.flatten().tolist(), sure.flatten().tolist(), strict=True):
         assert position == pytest.approx(plain_median(one), abs=1e-4)
-        assert share == pytest.approx(plain_confidence(one, position, 3.0), abs=1e-5)
+        assert fraction == pytest.approx(plain_confidence(one, position, 3.0), abs=1e-5)
     assert decoded(logits, "median").equal(median)
 
 

@@ -95,8 +95,8 @@ def test_an_imported_model_finds_the_depths_of_the_one_that_was_trained(design, 
     assert logits.std() > 0.1
     # the published decoding: weights i / 1023 of the range, and half a bin for the centre of the bin that it names
     weights = torch.linspace(0, 1, 1024, dtype=torch.float64).view(1, -1, 1, 1)
-    share = (logits.double().softmax(1) * weights).sum(1)[0]
-    expected = (1024 * share + 0.5) * TRAIN.bin_depth_m
+    fraction = (logits.double().softmax(1) * weights).sum(1)[0]
+    expected = (1024 * fraction + 0.5) * TRAIN.bin_depth_m
     # to a hundredth of a bin: convolutions in float32 depend on how the counts lie in memory
     np.testing.assert_allclose(loaded.depth_of(histogram)[0], expected, atol=TRAIN.bin_depth_m / 100)
     ours = soft_argmax(logits)[0] * TRAIN.bin_depth_m
@@ -177,7 +177,7 @@ NAN, WHOLE = torch.full((8, 1, 256, 1, 1), torch.nan), torch.zeros(8, 1, 256, 1,
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"backbone_net.part0": None}, "143 tensors backbone_net.*, the published network has 144"),
         ({"backbone_net.theta": torch.zeros(3)}, "145 tensors backbone_net.*, the published network has 144"),
@@ -194,10 +194,10 @@ NAN, WHOLE = torch.full((8, 1, 256, 1, 1), torch.nan), torch.zeros(8, 1, 256, 1,
         ({TEMPORAL: torch.zeros(1).expand(8, 1, 2**30, 1, 1)}, "more than the file of"),
     ],
 )
-def test_other_checkpoints_are_refused_in_one_line(changes, said, tmp_path):
+def test_other_checkpoints_are_refused_in_one_line(changes, message, tmp_path):
     weights = renamed(direct(DESIGNS[0])) | changes
     kept = {name: value for name, value in weights.items() if value is not None}
-    assert said in refusal(checkpoint(tmp_path / "other.ckpt", kept), tmp_path / "model")
+    assert message in refusal(checkpoint(tmp_path / "other.ckpt", kept), tmp_path / "model")
 
 
 def test_nothing_is_overwritten_and_other_files_are_named(tmp_path):

@@ -40,8 +40,8 @@ def test_levels_are_drawn_over_the_whole_range_of_the_tests():
     # the harder half of the backgrounds' logarithms: 1 - 0.5^(1 / 0.6) of the draws, within five sigma
     bright = signal > 20
     hard = np.log(background[bright]) > np.log(BACKGROUND).mean()
-    share = 1 - 0.5 ** (1 / 0.6)
-    assert abs(hard.mean() - share) < 5 * math.sqrt(share * (1 - share) / hard.size)
+    fraction = 1 - 0.5 ** (1 / 0.6)
+    assert abs(hard.mean() - fraction) < 5 * math.sqrt(fraction * (1 - fraction) / hard.size)
     assert {draw_level(rng, TRAIN_LEVELS) for _ in range(200)} == set(TRAIN_LEVELS)
 
 
@@ -144,7 +144,7 @@ def test_the_average_is_what_is_kept_and_resumes_exactly(tmp_path):
     config = preset("smoke", model, **FEW, weights=(1.0, 2.0), coherence=0.1)
     train(config, training, validation, tmp_path / "whole")
 
-    def stop(what: str, share: float) -> None:
+    def stop(what: str, fraction: float) -> None:
         if what == "step 5 of 9":
             raise Stopped
 

@@ -59,9 +59,9 @@ def test_shipped_is_small_whole_and_tells_no_folder(trained, tmp_path):
     assert path.stat().st_size < 0.55 * (trained / "model.safetensors").stat().st_size
     assert beside(path, "log.csv").read_bytes() == (trained / "log.csv").read_bytes()
     assert beside(path, "energy.csv").read_bytes() == beside(trained / "model.safetensors", "energy.csv").read_bytes()
-    told = json.loads((tmp_path / "some-name.json").read_text())
+    message = json.loads((tmp_path / "some-name.json").read_text())
     model, config, state = load_model(path)
-    assert json.loads(json.dumps(config.to_dict())) == told["config"] and state == told["state"]
+    assert json.loads(json.dumps(config.to_dict())) == message["config"] and state == message["state"]
     assert config.seed == 0 and len(config.data["training_sha256"]) == 64
     for name, value in load_model(trained)[0].state_dict().items():
         kept = model.state_dict()[name]

@@ -53,11 +53,11 @@ def test_the_target_is_the_sensor_pulse(sensor):
     depth[:3] = torch.tensor([0.0, 0.4 * sensor.bin_depth_m, sensor.range_m * (1 - 1e-7)])
     depth = depth[depth * 2 / SPEED < sensor.bins * sensor.bin_width_s]
     target = pulse_target(depth, sensor)
-    dense = torch.zeros(len(depth), sensor.bins).scatter_add_(1, target.bins, target.share)
+    dense = torch.zeros(len(depth), sensor.bins).scatter_add_(1, target.bins, target.mass)
     expected = binned_pulse(depth.double() * 2 / SPEED, sensor)
     expected = expected / expected.sum(-1, keepdim=True)
     assert float((dense - expected).abs().max()) < 1e-5  # float32 depths of 15 m: a third of a thousandth of a bin
-    torch.testing.assert_close(target.share.sum(-1), torch.ones(len(depth)))
+    torch.testing.assert_close(target.mass.sum(-1), torch.ones(len(depth)))
 
 
 def test_kl_divergence_is_its_definition():
@@ -141,7 +141,7 @@ class Stopped(Exception):
 
 
 def test_interruption_is_passed_on(tmp_path):
-    def stop(what: str, share: float) -> None:
+    def stop(what: str, fraction: float) -> None:
         raise KeyboardInterrupt
 
     handler = signal.getsignal(signal.SIGINT)
@@ -170,7 +170,7 @@ def test_a_run_that_stops_goes_on_to_the_same_weights(tmp_path):
     whole = train(config, *views, tmp_path / "whole")
     assert whole["steps"] == 9
 
-    def stop(what: str, share: float) -> None:
+    def stop(what: str, fraction: float) -> None:
         if what == "step 5 of 9":
             raise Stopped
 
@@ -288,7 +288,7 @@ def test_damaged_and_foreign_checkpoints(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"crop": 5}, "not tiled by blocks of 2 x 2"),
         ({"crop": 32}, "do not fit views of 16"),
@@ -299,8 +299,8 @@ def test_damaged_and_foreign_checkpoints(tmp_path):
         ({"levels": ()}, "no photon level"),
     ],
 )
-def test_bad_configurations(change, said, tmp_path):
-    with pytest.raises(InputError, match=said):
+def test_bad_configurations(change, message, tmp_path):
+    with pytest.raises(InputError, match=message):
         train(
             preset("smoke", MODEL, **{**FEW, **change}), *split_views(near_planes(3)), tmp_path / "x", accelerator="cpu"
         )
@@ -329,9 +329,9 @@ def test_freed_memory_is_kept():
         "retain_freed_memory()\n"
         "print(faults(), faults())\n"
     )
-    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    message = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
     pages = (8 << 21) // 4096
-    first, later = map(int, said.split())
+    first, later = map(int, message.split())
     assert first < 2 * pages and later < pages / 4  # once, not twenty times
 
 

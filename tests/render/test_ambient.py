@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from render.ambient import ambient_light, shared
+from render.ambient import ambient_light, bilateral_filter
 from render.direct.integrator import Layers, centre_layers
 from render.scene.traced_scene import TracedScene, mi
 from scene2spad.bench.hard import oracles
@@ -40,7 +40,7 @@ def mitsuba(world: TracedScene, spp: int, bounces: int, seed: int) -> float:
     view = {"type": "perspective", "fov": camera.fov_deg, "fov_axis": "x", "near_clip": 1e-4}
     sensor = mi.load_dict(view | {"to_world": mi.ScalarTransform4f(turned), "film": film})
     integrator = mi.load_dict({"type": "path", "max_depth": bounces})
-    return float(np.array(mi.render(world.traced, sensor=sensor, integrator=integrator, spp=spp, seed=seed)).mean())
+    return float(np.array(mi.render(world.mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)).mean())
 
 
 def test_light_through_panes_is_what_mitsuba_finds_by_chance():
@@ -107,12 +107,12 @@ def test_neighbours_share_irradiance_whatever_their_albedo_and_not_past_edges():
     layers = Layers(depth, np.broadcast_to(-view.rotation[:, 2], (24, 32, 3)).astype(np.float16), board)
     albedo = board.astype(np.float32).astype(np.float64)
     even = albedo * np.where(near, 5.0, 1.0)
-    assert np.allclose(shared(even, layers, view), even, rtol=1e-5)
+    assert np.allclose(bilateral_filter(even, layers, view), even, rtol=1e-5)
     noise = np.random.default_rng(1).normal(size=(64, 24, 32)) * albedo
-    left = (shared(noise, layers, view) / albedo)[:, 8:-8, 6:10].std()
+    left = (bilateral_filter(noise, layers, view) / albedo)[:, 8:-8, 6:10].std()
     assert left < 0.25  # of about 4 pi sigma^2 pixels, of which the brighter half counts more
     nothing = layers._replace(depth_m=np.full((24, 32), np.nan))
-    assert (shared(even, nothing, view) == even).all()
+    assert (bilateral_filter(even, nothing, view) == even).all()
 
 
 def test_shared_light_keeps_what_is_seen_directly_and_its_mean():

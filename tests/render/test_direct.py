@@ -37,7 +37,7 @@ def camera(width: int, height: int, fov_deg: float) -> Camera:
 
 def direct(scene: Scene, grid: int = 2, **options) -> DirectLight:
     view = scene.camera
-    options = {"least_share": 0.04, **options}
+    options = {"edge_threshold": 0.04, **options}
     return direct_light(TracedScene(scene), np.arange(view.width * view.height), grid, **options)
 
 
@@ -150,7 +150,7 @@ def test_sphere_limb():
 
     side = 128
     expected = quadrature(scene, ball, (np.arange(side) + 0.5) / side, np.full(side, 1 / side))
-    light = direct(scene, least_share=0)
+    light = direct(scene, edge_threshold=0)
     got = moments(scene, light)
     limb = light.mixed.reshape(got.total.shape) & (expected.total > 0.02 * expected.total.max())
     assert 12 < limb.sum() < 60
@@ -201,7 +201,7 @@ def test_an_edge_along_columns_of_cells_is_found_to_a_part_of_a_cell(covered):
     view = camera(8, 8, 10)
     edge = 2 * (5 + covered - 4) / view.focal_px
     near = quad([(-5, -5, -2), (edge, -5, -2), (edge, 5, -2), (-5, 5, -2)])
-    light = direct(Scene("edge", (wall(-3.0), near), view), refine=4, least_share=0)
+    light = direct(Scene("edge", (wall(-3.0), near), view), refine=4, edge_threshold=0)
     front = light.samples.path_m < 5
     column = np.bincount(light.samples.pixel[front] % 8, weights=light.samples.radiance[front])
     assert abs(column[5] / column[4] - covered) < 1 / 64 / 3
@@ -226,7 +226,7 @@ def test_shadow_edge_of_a_displaced_laser():
     post = quad([(-0.1, -1, -1), (0, -1, -1), (0, 1, -1), (-0.1, 1, -1)])
     bare = moments(Scene("bare", (back,), view, laser), direct(Scene("bare", (back,), view, laser)))
     scene = Scene("post", (back, post), view, laser)
-    light = direct(scene, least_share=0)
+    light = direct(scene, edge_threshold=0)
     got = moments(scene, light)
     edge = -0.3 / 2 * view.focal_px + 20
     assert np.abs(got.total[:, int(edge)] / bare.total[:, int(edge)] - edge % 1).max() < 0.02
@@ -247,7 +247,7 @@ def test_edges_of_paint_are_followed_and_are_no_silhouettes(baseline_m):
     scene = Scene("painted", painted, view, laser)
     white = Scene("white", (wall(-2.0, 3.0, Material(albedo=1.0)),), view, laser)
     column = border_m / 2 * view.focal_px + 12
-    followed, left = direct(scene, least_share=0.01), direct(scene, refine=0)
+    followed, left = direct(scene, edge_threshold=0.01), direct(scene, refine=0)
     whole = moments(white, direct(white)).total[:, int(column)]
     off, off_before = (
         np.abs(moments(scene, light).total[:, int(column)] / whole - (1 - column % 1)).max()
@@ -275,7 +275,7 @@ def test_refined_cells_agree_with_a_fine_grid(material, mode, baseline_m):
     ball = Surface(vertices + [0.1, 0, -2], faces, material)
     scene = Scene("ball", (wall(-3.0, material=material), ball), camera(12, 10, 34), Laser(mode, baseline_m))
     got, fine = moments(scene, direct(scene)), moments(scene, direct(scene, 32, refine=0))
-    # cells at silhouettes end where less than `least_share` is left, the fine grid nowhere
+    # cells at silhouettes end where less than `edge_threshold` is left, the fine grid nowhere
     tolerance = {"diffuse": 8e-3, "roughplastic": 1e-2, "roughconductor": 2e-2}[material.kind]
     assert np.linalg.norm(got.total - fine.total) < tolerance * np.linalg.norm(fine.total)
     bright = fine.total > 0.05 * fine.total.max()

@@ -85,8 +85,8 @@ def index_of(x: int, y: int) -> int:
 def test_first_cells_are_compared_with_their_neighbours(seed: int, whole: bool, glossy: bool) -> None:
     cells = cells_of(seed, glossy=glossy)
     draw = np.random.default_rng(100 + seed)
-    spans = [draw.uniform(low, high, COUNT).astype(np.float32) for low, high in ((4, 5), (0, 0.1), (0, 0.05))]
-    bits, path, half, minor = first_edges(cells, spans, GRID, WIDTH if whole else 0, LEAST)
+    filter_octaves = [draw.uniform(low, high, COUNT).astype(np.float32) for low, high in ((4, 5), (0, 0.1), (0, 0.05))]
+    bits, path, half, minor = first_edges(cells, filter_octaves, GRID, WIDTH if whole else 0, LEAST)
     cut, mixed, shining = (cells.flags & LARGE) != 0, np.zeros(COUNT, bool), np.zeros(COUNT, bool)
     followed = 0
     for y, x in np.ndindex(HEIGHT * GRID, WIDTH * GRID):
@@ -108,7 +108,7 @@ def test_first_cells_are_compared_with_their_neighbours(seed: int, whole: bool, 
                 shining[here] |= glint / GRID**2 >= LEAST
                 if joined:
                     steps.append(float(cells.distance_m[pair[1]]) - float(cells.distance_m[pair[0]]))
-                    paths.append(float(spans[0][pair[1]]) - float(spans[0][pair[0]]))
+                    paths.append(float(filter_octaves[0][pair[1]]) - float(filter_octaves[0][pair[0]]))
                     gains.append(float(cells.radiance[pair[1]]) - float(cells.radiance[pair[0]]))
             if not steps:
                 follows = False
@@ -123,10 +123,10 @@ def test_first_cells_are_compared_with_their_neighbours(seed: int, whole: bool, 
             halves.append(abs(slope) / 2)
             variances.append(slope**2 / 4 + curve**2 / 240)
         follows &= cells.flags[here] & (HIT | LARGE) == HIT and cells.radiance[here] > 0
-        expected = [span[here] for span in spans]
+        expected = [span[here] for span in filter_octaves]
         if follows:
             followed += 1
-            expected = [spans[0][here] + sum(means), math.sqrt(sum(variances)), min(halves)]
+            expected = [filter_octaves[0][here] + sum(means), math.sqrt(sum(variances)), min(halves)]
         assert np.allclose([path[here], half[here], minor[here]], expected, rtol=1e-5, atol=1e-6)
     assert np.array_equal((bits & CUT) != 0, cut) and np.array_equal((bits & MIXED) != 0, mixed)
     assert np.array_equal((bits & GLINT) != 0, shining) and (0 < shining.sum() < COUNT) == glossy

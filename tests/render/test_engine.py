@@ -10,7 +10,7 @@ import pytest
 from render import engine
 from render import pipeline as tracing
 from render.engine import render
-from render.error import BIN_M, PULSE_POWER, SIGMA_M, estimate, response, target_verdict, worst_share_of
+from render.error import BIN_M, PULSE_POWER, SIGMA_M, estimate, response, target_verdict, worst_fraction_of
 from render.planning import _bounces, make_plan, rays_for_all
 from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
@@ -56,14 +56,14 @@ def test_bounces_follow_a_geometric_series_and_not_one_bright_path():
 def test_many_views_get_the_rays_that_their_mean_squared_error_asks_for():
     """Errors fall with at least the power 1.3 of the grid, 0.7 of the edges; direct light alone has all that is aimed
     at."""
-    alone = RenderSettings(bounces=1, error=0.01, aim=1.0)
+    alone = RenderSettings(bounces=1, error=0.01, target_fraction=1.0)
     for errors in ([0.01], [0.0, 0.01 * 2**0.5]):
         assert rays_for_all(errors, alone) == pytest.approx((4, 0.5), abs=1e-5)
     assert rays_for_all([0.0101 * 2**1.3], alone)[0] == 8
     assert rays_for_all([0.0], alone)[0] == 2 and rays_for_all([1.0], alone)[0] == 16
-    grid, share = rays_for_all([0.012], alone)
-    assert grid == 4 and 0.012 * (share / 0.5) ** 0.7 == pytest.approx(0.01)
-    assert rays_for_all([0.01], RenderSettings(error=0.01, aim=1.0))[0] > 4
+    grid, fraction = rays_for_all([0.012], alone)
+    assert grid == 4 and 0.012 * (fraction / 0.5) ** 0.7 == pytest.approx(0.01)
+    assert rays_for_all([0.01], RenderSettings(error=0.01, target_fraction=1.0))[0] > 4
 
 
 def test_plan_gives_a_reason_for_every_choice_and_can_be_forced():
@@ -130,7 +130,7 @@ def test_a_missed_target_is_made_good():
     error = engine._estimated(world, plan, settings, first, pixels)
     more = engine._additional_schedule(world, plan, settings, first, error)
     assert error.total > 0.02 and more is not None
-    both = tracing.add_samples(world, plan, settings, first, more, 1, pixels, lambda what, share: None)
+    both = tracing.add_samples(world, plan, settings, first, more, 1, pixels, lambda what, fraction: None)
     assert both.spp > first.spp
 
     def true(traced: tracing.LightSamples) -> float:
@@ -229,9 +229,13 @@ def test_odd_meshes_do_no_harm():
 
 
 def test_progress_is_told():
-    told = []
-    render(room(width=8, height=6), RenderSettings(bounces=2, spp=32), progress=lambda what, share: told.append(share))
-    assert told == sorted(told) and told[-1] == 1.0 and len(told) >= 4
+    lines = []
+    render(
+        room(width=8, height=6),
+        RenderSettings(bounces=2, spp=32),
+        progress=lambda what, fraction: lines.append(fraction),
+    )
+    assert lines == sorted(lines) and lines[-1] == 1.0 and len(lines) >= 4
 
 
 @pytest.mark.parametrize(
@@ -299,11 +303,13 @@ def test_one_firefly_misses_the_target_and_is_named():
     noise = light.std(axis=1, ddof=1) / np.sqrt(batches)
     mean = response(of_batch(light.mean(axis=1)), np.arange(pixels))
     stated = estimate(0 * mean, 0 * mean, mean, noise**2 * PULSE_POWER)
-    stated = replace(stated, worst_share=worst_share_of(noise, stated))
+    stated = replace(stated, worst_share=worst_fraction_of(noise, stated))
     assert stated.total > 0.9 and stated.pixel_median < 0.03 and stated.worst_share > 0.99
-    told = target_verdict(stated, 0.05, pixels)
-    assert "MISSES the target of 0.05" in told and "100% of its square lies in the worst 16 of 3072 pixels" in told
-    even = replace(stated, worst_share=worst_share_of(np.ones(pixels), stated))
+    message = target_verdict(stated, 0.05, pixels)
+    assert (
+        "MISSES the target of 0.05" in message and "100% of its square lies in the worst 16 of 3072 pixels" in message
+    )
+    even = replace(stated, worst_share=worst_fraction_of(np.ones(pixels), stated))
     assert even.worst_share == pytest.approx(16 / 3072, rel=0.01) and "fireflies" not in target_verdict(
         even, 0.05, pixels
     )

@@ -50,7 +50,7 @@ def room(polished: Material, laser: Laser, *, smooth: bool = False) -> Scene:
 
 
 def light(scene: Scene, spp: int, seed: int, *, bounces: int = 3, filtered: bool = False) -> LightSamples:
-    forced = {"bounces": bounces, "spp": spp, "grid": 2, "filter": filtered, "least_share": 1.0}
+    forced = {"bounces": bounces, "spp": spp, "grid": 2, "filter": filtered, "edge_threshold": 1.0}
     settings = RenderSettings(**forced, direct_tolerance_m=1e-3)
     plan = Plan(**forced, direct_tolerance_m=1e-3, ambient=False, reasons=())
     return trace(TracedScene(scene), plan, settings, seed=seed, checked=np.arange(0, WIDTH * HEIGHT, 3))
@@ -62,7 +62,7 @@ def totals(traced: LightSamples) -> np.ndarray:
 
 
 @pytest.fixture
-def by_chance(monkeypatch):
+def mis_weight_sampled(monkeypatch):
     """Turns the paths that begin on polished surfaces off."""
 
     def off() -> None:
@@ -75,12 +75,12 @@ def by_chance(monkeypatch):
 @pytest.mark.parametrize("smooth", [False, True], ids=["facets", "smooth"])
 @pytest.mark.parametrize("laser", LASERS)
 @pytest.mark.parametrize("material", [METAL, GLOSS], ids=["metal", "gloss"])
-def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, by_chance):
+def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, mis_weight_sampled):
     scene = room(material, LASERS[laser], smooth=smooth)
     assert glossy_of(TracedScene(scene)) is not None
     seeds = range(8)
     both = np.array([totals(light(scene, 256, seed)) for seed in seeds])
-    by_chance()
+    mis_weight_sampled()
     alone = np.array([totals(light(scene, 1024, 100 + seed)) for seed in seeds])
     noise = np.hypot(*(runs.sum(axis=1).std(ddof=1) / len(seeds) ** 0.5 for runs in (both, alone)))
     off = both.sum(axis=1).mean() - alone.sum(axis=1).mean()
@@ -88,7 +88,7 @@ def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, by_cha
     assert noise < 0.1 * alone.sum() / len(seeds)
 
 
-def test_a_caustic_is_even_where_paths_by_chance_find_sparks(by_chance):
+def test_a_caustic_is_even_where_paths_by_chance_find_sparks(mis_weight_sampled):
     scene = hard_case("caustic")
 
     def scatter() -> float:
@@ -97,7 +97,7 @@ def test_a_caustic_is_even_where_paths_by_chance_find_sparks(by_chance):
         return float(np.sqrt(np.var(runs, axis=0, ddof=1).sum()) / np.mean(runs, axis=0).sum())
 
     even = scatter()
-    by_chance()
+    mis_weight_sampled()
     assert even < 0.1 * scatter()
 
 
@@ -113,9 +113,9 @@ def test_stated_noise_is_that_of_other_seeds():
 def test_watched_pixels_have_the_same_light(filtered):
     scene = room(replace(METAL, roughness=0.02), LASERS["flash"])
     traced = light(scene, 64, 3, filtered=filtered)
-    watched = traced.indirect.watched
-    share = watched.radiance.mean(axis=1).sum() / totals(traced)[watched.pixels].sum()
-    assert share == pytest.approx(1, rel=1e-5 if not filtered else 1e-3)
+    probed = traced.indirect.probed
+    fraction = probed.radiance.mean(axis=1).sum() / totals(traced)[probed.pixels].sum()
+    assert fraction == pytest.approx(1, rel=1e-5 if not filtered else 1e-3)
 
 
 def test_same_seed_same_light():
@@ -127,7 +127,7 @@ def test_same_seed_same_light():
 def test_paths_begin_where_something_shines_and_a_few_elsewhere():
     world = TracedScene(room(METAL, LASERS["flash"]))
     glossy = glossy_of(world)
-    assert set(glossy.shares) == {0.0, ELSEWHERE, 1.0}
+    assert set(glossy.sampling_density) == {0.0, ELSEWHERE, 1.0}
     found = list(trace_light_paths(world, 64, BATCHES, 3, 1))
     assert all(part.radiance.min() > 0 and part.pixel.max() < WIDTH * HEIGHT for part in found)
     assert np.bincount(np.concatenate([part.batch for part in found])).min() > 0

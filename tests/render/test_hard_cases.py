@@ -23,7 +23,7 @@ def test_case(case):
         warnings.simplefilter("error", RuntimeWarning)
         errors, clipped = case.measure(1)
     assert errors and clipped >= 0
-    failed = {name: tuple(measured) for name, measured in errors.items() if not measured.share <= 1}
+    failed = {name: tuple(measured) for name, measured in errors.items() if not measured.fraction <= 1}
     assert not failed, f"{case.name}: (error, limit) of {failed}; oracle: {case.oracle}"
 
 
@@ -35,18 +35,18 @@ def test_hard_cases_are_scenes_by_name(name):
 
 
 def test_the_table_is_printed_and_written(tmp_path):
-    told = []
+    messages = []
     command = SimpleNamespace(seed=1, out=tmp_path / "bench", only=("near-5cm", "wraps-14.995m", "nothing-in-view"))
-    result = run(command, lambda what, share: told.append(share))
+    result = run(command, lambda what, fraction: messages.append(fraction))
     assert [r["name"] for r in result["rows"]] == list(command.only) and result["passed"] == 3
     assert json.loads(json.dumps(result)) == result
     assert all(r["error"] <= r["limit"] and r["seconds"] > 0 and r["clipped"] == 0 for r in result["rows"])
-    assert told[-1] == 1.0
+    assert messages[-1] == 1.0
     with Path(result["out"]).open(newline="") as file:
         lines = list(csv.DictReader(file))
     assert {line["name"] for line in lines} == set(command.only) and len(lines) == 2 + 6 + 3
     with pytest.raises(InputError, match="hard case 'far'"):
-        run(SimpleNamespace(seed=1, only=("far",)), lambda what, share: None)
+        run(SimpleNamespace(seed=1, only=("far",)), lambda what, fraction: None)
 
 
 def test_a_case_that_breaks_is_a_row_that_failed():
@@ -55,4 +55,4 @@ def test_a_case_that_breaks_is_a_row_that_failed():
 
     failed = row(Case("broken", "none", broken), 0)
     assert not failed["passed"] and failed["reason"] == "RuntimeError: no luck"
-    assert Measured(float("nan"), 1.0).share > 1 and Measured(0.0, 0.0).share <= 1 < Measured(1e-9, 0.0).share
+    assert Measured(float("nan"), 1.0).fraction > 1 and Measured(0.0, 0.0).fraction <= 1 < Measured(1e-9, 0.0).fraction

@@ -7,7 +7,7 @@ import pytest
 
 from render.direct.footprints import trace
 from render.engine import render
-from render.indirect.camera_paths import trace_paths
+from render.indirect.camera_paths import PathTask, trace_paths
 from render.indirect.launch_layout import BLOCK, block_order, make_launch
 from render.scene.traced_scene import TracedScene, dr
 from render.settings import RenderSettings
@@ -103,11 +103,11 @@ def test_launches_of_paths_are_recorded_once_and_replayed_as_they_would_be_trace
         block = np.arange(blocks)
         turns = make_launch(block, block, np.full(blocks, rounds), 2)
         ours, new = (
-            trace_paths(w, pixels[: blocks * BLOCK], turns, 4, 3, 2, shared=False) for w in (world, TracedScene(scene))
+            trace_paths(PathTask(w, pixels[: blocks * BLOCK], turns, 4, 3, 2)) for w in (world, TracedScene(scene))
         )
         for name in ("own_value", "own_onward", "values", "paths", "soonest_m"):
-            assert np.array_equal(getattr(ours.tails, name).numpy(), getattr(new.tails, name).numpy()), name
-        assert np.count_nonzero(ours.tails.values.numpy()) > 0
+            assert np.array_equal(getattr(ours.suffixes, name).numpy(), getattr(new.suffixes, name).numpy()), name
+        assert np.count_nonzero(ours.suffixes.values.numpy()) > 0
     recorded = {key: call.n_recordings for key, call in world.recordings.calls.items()}
     assert len(recorded) == 3 and set(recorded.values()) == {1}, recorded
 

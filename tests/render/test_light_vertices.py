@@ -8,7 +8,7 @@ import pytest
 from render.indirect import camera_paths as paths
 from render.indirect import light_vertices as lit
 from render.indirect import reuse as sharing
-from render.indirect.camera_paths import trace_paths
+from render.indirect.camera_paths import PathTask, trace_paths
 from render.indirect.launch_layout import BLOCK, block_order, make_launch
 from render.scene.rays import laser_light
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr
@@ -45,7 +45,7 @@ class Sum:
         self.lanes = total.numpy().astype(np.float64)
 
 
-def totals(scene: Scene, seed: int, *, shared: bool, rounds: int = 64, from_m: float | None = None) -> np.ndarray:
+def totals(scene: Scene, seed: int, *, reuses_paths: bool, rounds: int = 64, from_m: float | None = None) -> np.ndarray:
     """Radiance of indirect light in a view's blocks by every round: (rounds, blocks).
 
     Blocks share all of it, none, or what comes less than `from_m` behind direct light.
@@ -55,15 +55,15 @@ def totals(scene: Scene, seed: int, *, shared: bool, rounds: int = 64, from_m: f
     count = len(blocks) // BLOCK
     turns = make_launch(np.arange(count), np.arange(count), np.full(count, rounds))
     start = None if from_m is None else dr.opaque(Float, from_m)
-    traced = trace_paths(world, blocks, turns, 4, seed, 1, shared=shared, from_m=start)
+    traced = trace_paths(PathTask(world, blocks, turns, 4, seed, reuses_paths=reuses_paths, from_m=start))
     own = Sum()
     sharing._add(sharing._own_lanes(traced), traced, own, own=True)
     found = own.lanes.reshape(-1, BLOCK).sum(axis=1)
-    pairs = sharing._pairs(traced, shared=shared, early=from_m is not None)
+    pairs = sharing._pairs(traced, reuses_paths=reuses_paths, early=from_m is not None)
     if pairs is not None:
         of_pairs = Sum()
         sharing._add(sharing._pair_lanes(world, traced, pairs), traced, of_pairs, own=False)
-        np.add.at(found, pairs.head.numpy() // BLOCK, of_pairs.lanes)
+        np.add.at(found, pairs.vertex.numpy() // BLOCK, of_pairs.lanes)
     return found.reshape(count, rounds).T
 
 
@@ -99,14 +99,14 @@ def test_lit_points_carry_the_lasers_light():
     assert not np.array_equal(directions[0], directions[1])
 
 
-@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("reuses_paths", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
-def test_joined_paths_carry_the_same_light_with_less_noise(kind, shared, monkeypatch):
+def test_joined_paths_carry_the_same_light_with_less_noise(kind, reuses_paths, monkeypatch):
     """Against paths by chance alone, over all blocks; a lamp close to a wall is what chance misses."""
     scene = room(kind)
-    joined = totals(scene, 1, shared=shared)
-    monkeypatch.setattr(paths, "connections_per_vertex", lambda world, shared: 0)
-    plain = totals(scene, 2, shared=shared, rounds=128)
+    joined = totals(scene, 1, reuses_paths=reuses_paths)
+    monkeypatch.setattr(paths, "connections_per_vertex", lambda world, reuses_paths: 0)
+    plain = totals(scene, 2, reuses_paths=reuses_paths, rounds=128)
     means, errors = zip(*((t.sum(1).mean(), t.sum(1).std() / np.sqrt(len(t))) for t in (joined, plain)), strict=True)
     assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
     assert joined.var(axis=0).sum() < plain.var(axis=0).sum() / 1.5
@@ -123,9 +123,9 @@ def test_shared_paths_carry_the_light_of_own_ones(kind):
         corners = np.array([(-1, -0.6, -1.5), (1, -0.6, -1.5), (1, -0.6, -3), (-1, -0.6, -3)])
         coated = Material("roughplastic", albedo=0.5, roughness=0.3)
         scene = replace(scene, surfaces=(scene.surfaces[0], Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), coated)))
-    own, shared = (totals(scene, 1, shared=shared, rounds=512).sum(axis=1) for shared in (False, True))
-    error = np.hypot(own.std(), shared.std()) / np.sqrt(512)
-    assert abs(own.mean() - shared.mean()) < 4 * error and error < 0.004 * own.mean()
+    own, split = (totals(scene, 1, reuses_paths=reused, rounds=512).sum(axis=1) for reused in (False, True))
+    error = np.hypot(own.std(), split.std()) / np.sqrt(512)
+    assert abs(own.mean() - split.mean()) < 4 * error and error < 0.004 * own.mean()
 
 
 @pytest.mark.parametrize("from_m", [0.05, 0.5, 100.0])
@@ -133,7 +133,9 @@ def test_shared_paths_carry_the_light_of_own_ones(kind):
 def test_early_light_may_be_shared_alone(kind, from_m):
     """Under a flash, what comes soon after direct light by the block's paths, the rest by the pixel's own."""
     scene = room(kind, Laser("flood"))
-    own, split = (totals(scene, 1, shared=False, rounds=512, from_m=start).sum(axis=1) for start in (None, from_m))
+    own, split = (
+        totals(scene, 1, reuses_paths=False, rounds=512, from_m=start).sum(axis=1) for start in (None, from_m)
+    )
     error = np.hypot(own.std(), split.std()) / np.sqrt(512)
     assert abs(own.mean() - split.mean()) < 4 * error and error < 0.01 * own.mean()
 
@@ -142,9 +144,9 @@ def test_early_light_may_be_shared_alone(kind, from_m):
 def test_any_cone_and_a_displaced_laser(cone_deg, monkeypatch):
     scene = room("roughplastic", Laser("flood", cone_deg=cone_deg, baseline_m=(0.3, 0.1, 0)))
     monkeypatch.setattr(lit, "NARROW_JOINS", (2, 2))
-    joined = totals(scene, 1, shared=True)
-    monkeypatch.setattr(paths, "connections_per_vertex", lambda world, shared: 0)
-    plain = totals(scene, 2, shared=True, rounds=128)
+    joined = totals(scene, 1, reuses_paths=True)
+    monkeypatch.setattr(paths, "connections_per_vertex", lambda world, reuses_paths: 0)
+    plain = totals(scene, 2, reuses_paths=True, rounds=128)
     means, errors = zip(*((t.sum(1).mean(), t.sum(1).std() / np.sqrt(len(t))) for t in (joined, plain)), strict=True)
     assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
 
@@ -152,9 +154,13 @@ def test_any_cone_and_a_displaced_laser(cone_deg, monkeypatch):
 @pytest.mark.parametrize("mode", ["scan", "line"])
 def test_a_laser_that_moves_has_no_lit_points(mode):
     world = TracedScene(room(laser=Laser(mode)))
-    assert lit.connections_per_vertex(world, shared=True) == lit.connections_per_vertex(world, shared=False) == 0
+    assert (
+        lit.connections_per_vertex(world, reuses_paths=True)
+        == lit.connections_per_vertex(world, reuses_paths=False)
+        == 0
+    )
     wide, narrow = TracedScene(room()), TracedScene(replace(room(), laser=Laser("flood", cone_deg=60)))
-    assert lit.connections_per_vertex(wide, shared=False) > lit.connections_per_vertex(narrow, shared=False)
+    assert lit.connections_per_vertex(wide, reuses_paths=False) > lit.connections_per_vertex(narrow, reuses_paths=False)
 
 
 def test_shares_are_whole_and_stay_finite():
@@ -168,7 +174,7 @@ def test_shares_are_whole_and_stay_finite():
     ):
         values = (Float(float(value)) for value in (cosine, distance2, far, density))
         lobes, both = lit.densities(*values, 4)
-        kept = lit.share_by_chance(1, Float(float(cosine)), Float(float(distance2)), Float(float(far)),
+        kept = lit.mis_weight_bsdf(1, Float(float(cosine)), Float(float(distance2)), Float(float(far)),
                                    Float(float(density)), 4)  # fmt: skip
         assert 0 <= kept[0] <= 1 and np.isfinite(kept[0])
         if both[0] > 0:

@@ -123,7 +123,7 @@ def test_energy_equals_mitsuba_steady_render(bounces):
 def steady_by_mitsuba(scene: Scene, light: dict, *, max_depth: int, spp: int, seed: int) -> np.ndarray:
     from render.scene.traced_scene import TracedScene, mi
 
-    objects = {f"shape{i}": shape for i, shape in enumerate(TracedScene(scene).traced.shapes())}
+    objects = {f"shape{i}": shape for i, shape in enumerate(TracedScene(scene).mi_scene.shapes())}
     traced = mi.load_dict({"type": "scene", "light": light, **objects})
     view = scene.camera
     sensor = mi.load_dict(

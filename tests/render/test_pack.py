@@ -12,7 +12,7 @@ from render.transient import Transient
 from render.transient.packs import (
     AMBIENT_STEPS,
     DEPTH_STEP_M,
-    FINER,
+    EXR_STEP_DIVISOR,
     PATH_STEP_M,
     RADIANCE_STEPS,
     WIDTH_STEP_M,
@@ -87,14 +87,14 @@ def test_rounding_changes_little_and_only_once():
     once = rounded(VIEWS[0])
     assert rounded(once).sha256() == once.sha256()
     assert once.radiance == pytest.approx(VIEWS[0].radiance, rel=2**-11)
-    assert once.path_near_m == pytest.approx(VIEWS[0].path_near_m, abs=0.51 * PATH_STEP_M / FINER)
+    assert once.path_near_m == pytest.approx(VIEWS[0].path_near_m, abs=0.51 * PATH_STEP_M / EXR_STEP_DIVISOR)
 
 
 def test_a_pack_is_read_without_renderer_exr_or_command_line(packed):
     program = f"import sys; from render.transient.packs import read_pack; print(len(read_pack({str(packed)!r})),"
     program += " [m for m in ('mitsuba', 'drjit', 'OpenEXR', 'tyro', 'torch') if m in sys.modules])"
-    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert said.strip() == f"{len(VIEWS)} []"
+    message = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert message.strip() == f"{len(VIEWS)} []"
 
 
 def test_damage_is_refused_in_one_line(packed, tmp_path):

@@ -47,12 +47,14 @@ def samples_of(transient, least_bounces: int = 1) -> Samples:
 
 def test_octaves_cover_every_path_and_narrow_with_more_paths():
     for paths in (1, 16, 4096):
-        spans = octaves(paths, 0.05, 3.0, 40.0, 0.03, 0.05)
-        assert np.allclose(np.diff(np.log2(spans.size_m)), 1) and spans.size_m[0] == 0.05
-        assert spans.size_m[-1] < 3.0 and np.allclose(spans.size_m / spans.from_m, spans.size_m[0] / spans.from_m[0])
+        filter_octaves = octaves(paths, 0.05, 3.0, 40.0, 0.03, 0.05)
+        assert np.allclose(np.diff(np.log2(filter_octaves.size_m)), 1) and filter_octaves.size_m[0] == 0.05
+        assert filter_octaves.size_m[-1] < 3.0 and np.allclose(
+            filter_octaves.size_m / filter_octaves.from_m, filter_octaves.size_m[0] / filter_octaves.from_m[0]
+        )
     few, many = (octaves(paths, 0.05, 3.0, 40.0, 0.03, 0.05) for paths in (16, 256))
     assert few.size_m[0] / few.from_m[0] == pytest.approx(16**SHRINKING * many.size_m[0] / many.from_m[0])
-    assert many.count < few.count
+    assert many.size < few.size
 
 
 @pytest.mark.parametrize("albedo", [0.5, 0.99])

@@ -313,7 +313,7 @@ def test_bench_beside_mitransient_estimates_the_same_quantity(capfd, tmp_path, f
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "message"),
     [
         (["--sizes", "0"], "size 0"),
         (["--seeds", "0"], "seeds 0"),
@@ -322,9 +322,9 @@ def test_bench_beside_mitransient_estimates_the_same_quantity(capfd, tmp_path, f
         (["--scenes", "castle"], "castle"),
     ],
 )
-def test_mistakes_end_in_one_line(capfd, tmp_path, argv, said):
+def test_mistakes_end_in_one_line(capfd, tmp_path, argv, message):
     status, _, err = bench(capfd, tmp_path, *argv)
-    assert status == 2 and said in err and "Traceback" not in err
+    assert status == 2 and message in err and "Traceback" not in err
 
 
 def test_absent_mitransient_ends_in_one_line(capfd, tmp_path, monkeypatch):

@@ -47,9 +47,9 @@ def test_sense_takes_the_calibrated_sensor(calibrated, capfd, tmp_path, monkeypa
     write_transient(render_plane(0.25, zones), tmp_path / "plane.exr")
     options = ["sense", "plane.exr", "--sensor", str(calibrated), "--json"]
     assert main(options) == 0
-    said = json.loads(capfd.readouterr().out.splitlines()[-1])
+    message = json.loads(capfd.readouterr().out.splitlines()[-1])
     histogram = read_histogram(tmp_path / "plane.h5")
-    assert histogram.counts.shape == (3, 3, 128) and said["model"] == "zones" and said["mean_signal"] > 1e5
+    assert histogram.counts.shape == (3, 3, 128) and message["model"] == "zones" and message["mean_signal"] > 1e5
     light = zone_returns(render_plane(0.25, zones), zones)
     assert len(light) == 9
     assert main([*options, "--signal", "500", "--background", "100"]) == 0

@@ -68,9 +68,9 @@ def test_every_shipped_model_compiles_or_is_refused_with_its_bytes():
             compile_model(load_model(path)[0], path.stem)
             fits.add(path.stem)
         except InputError as refused:
-            said = str(refused)
+            message = str(refused)
             coded = not path.stem.startswith(("none", "peak"))
-            assert "bytes of RAM a core" in said and "512 are there" in said if coded else "no codes" in said
+            assert "bytes of RAM a core" in message and "512 are there" in message if coded else "no codes" in message
     assert fits >= set(FITS) and all(name.rsplit("-", 1)[0] in {f.rsplit("-", 1)[0] for f in FITS} for name in fits)
 
 
@@ -143,12 +143,12 @@ def test_compile_from_the_command_line(capfd, tmp_path):
     result = json.loads(capfd.readouterr().out)
     assert result["differs_from_torch"] == 0 and result["ram_bytes"] == 137 and result["bytes_per_pixel"] == 16
     assert result["clocks_per_photon"] == 141 and "table weight of core (1, 1)" in out.read_text()
-    for model, said in (
+    for model, message in (
         ("learned-256x2x2-128x-s0", "needs 2,121 bytes of RAM a core"),
         ("none-s0", "has no codes"),
         ("missing", "unknown"),
     ):
         assert main(["ultraphase", "compile", model]) == 2
         out, err = capfd.readouterr()
-        assert out == "" and len(err.splitlines()) == 1 and said in err
+        assert out == "" and len(err.splitlines()) == 1 and message in err
     assert main(["ultraphase", "compile"]) == 2 and "which model?" in capfd.readouterr().err

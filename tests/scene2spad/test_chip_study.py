@@ -64,7 +64,7 @@ def test_published_points_have_the_printed_power_of_a_pixel():
 def test_busy_cores_of_every_design_lose_what_the_closed_form_says(tmp_path):
     found, absent = designs_of(tmp_path)
     assert {one.codes for one in found} >= {8, 16, 256} and all("64x" in name for name in absent)
-    for row in loss_rows(found, 0, lambda what, share: None):
+    for row in loss_rows(found, 0, lambda what, fraction: None):
         for spads in ("one_spad", "16_spads"):
             expected = row[f"closed_form_{spads}"]
             spread = 2 * np.sqrt(expected / row[f"arrived_{spads}"])

@@ -121,7 +121,7 @@ def test_help_needs_neither_torch_nor_mitsuba():
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "message"),
     [
         (["bogus"], "bogus"),
         (["render", "--widht", "3"], "--widht"),
@@ -153,8 +153,8 @@ def test_help_needs_neither_torch_nor_mitsuba():
         (["demo", "--seed", "-1", "--width", "8", "--height", "6"], "seed -1"),
     ],
 )
-def test_mistakes_end_in_one_line(capfd, folder, argv, said):
-    assert said in refused(capfd, *argv)
+def test_mistakes_end_in_one_line(capfd, folder, argv, message):
+    assert message in refused(capfd, *argv)
     assert list(folder.iterdir()) == []
 
 
@@ -169,7 +169,7 @@ def test_bad_files_end_in_one_line_and_leave_nothing(capfd, folder):
     (folder / "words.exr").write_text("no image")
     (folder / "text.h5").write_text("no histogram")
     before = sorted(path.name for path in folder.iterdir())
-    for argv, said in (
+    for argv, message in (
         (["render", "empty.obj"], "empty.obj"),
         (["render", "points.obj"], "points.obj"),
         (["render", "nan.obj"], "nan.obj"),
@@ -180,7 +180,7 @@ def test_bad_files_end_in_one_line_and_leave_nothing(capfd, folder):
         (["depth", "text.h5"], "text.h5"),
         (["depth", "words.exr"], "words.exr"),
     ):
-        assert said in refused(capfd, *argv)
+        assert message in refused(capfd, *argv)
     assert sorted(path.name for path in folder.iterdir()) == before
 
 

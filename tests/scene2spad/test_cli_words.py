@@ -87,8 +87,8 @@ def test_reprs_are_one_line_with_shapes_and_units(tmp_path):
         (read_transient(tmp_path / "t.exr"), ("4 x 6 pixels", "returns", " m")),
         (read_histogram(tmp_path / "h.h5"), ("4 x 6 pixels", "64 bins", "ps", "detections")),
     ):
-        told = repr(thing)
-        assert len(told) < 250 and "\n" not in told and all(word in told for word in words), told
+        message = repr(thing)
+        assert len(message) < 250 and "\n" not in message and all(word in message for word in words), message
 
 
 def test_codes_take_numpy_arrays():

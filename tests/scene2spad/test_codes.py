@@ -125,10 +125,10 @@ def test_study_memory_draws_figures_15_and_16(capfd, tmp_path, monkeypatch):
     assert full[3, 4] == pytest.approx(n / (64 * (b + n / b)))
     thin = np.array(result["ratios"]["memory-separable"]["512"]["in-sensor storage"])
     assert thin[3, 4] == pytest.approx(n / (512 * (b + n / b / 16)))
-    said = {line["said"]: line for line in memory.statements()}
-    assert sum(line["verdict"].startswith("off") for line in said.values()) == 2
+    common = {line["said"]: line for line in memory.statements()}
+    assert sum(line["verdict"].startswith("off") for line in common.values()) == 2
     worst = [
-        v for line in said.values() for key, v in line["recomputed"].items() if "1e+06" in key and "x 4 x 4" in key
+        v for line in common.values() for key, v in line["recomputed"].items() if "1e+06" in key and "x 4 x 4" in key
     ]
     assert len(worst) == 2 and min(worst) > 1
 
@@ -174,7 +174,7 @@ def test_rows_are_scaled_between_their_extremes():
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "message"),
     [
         (["study", "tensors", "--design", "haar"], "'haar' is unknown"),
         (["study", "tensors", "--design", "fourier"], "no spatial part"),
@@ -189,13 +189,13 @@ def test_rows_are_scaled_between_their_extremes():
         (["bench", "encode", "--repeats", "0"], "repeats 0"),
     ],
 )
-def test_mistakes_end_in_one_line(capfd, tmp_path, monkeypatch, argv, said):
+def test_mistakes_end_in_one_line(capfd, tmp_path, monkeypatch, argv, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "words.ckpt").write_text("no tensors")
     torch.save({"weight": torch.ones(2)}, tmp_path / "empty.ckpt")
     np.save(tmp_path / "line.npy", np.ones(4))
     status, _, err = run(capfd, *argv)
-    assert status == 2 and said in err and len(err.strip().splitlines()) == 1
+    assert status == 2 and message in err and len(err.strip().splitlines()) == 1
     assert {path.name for path in tmp_path.iterdir()} == {"words.ckpt", "empty.ckpt", "line.npy"}
 
 

@@ -172,7 +172,7 @@ def test_places_that_cannot_be_planned_are_left_out_of_the_plan(tmp_path, monkey
     result = make_set(job, 1, tmp_path)
     planned = json.loads((tmp_path / "grid.json").read_text())
     assert result["scenes"] == 1 and planned["errors"] == [0.02]
-    assert planned["grid"] == 4 and planned["least_share"] < 0.5
+    assert planned["grid"] == 4 and planned["edge_threshold"] < 0.5
 
 
 def test_a_view_is_the_same_where_files_have_names(tmp_path, monkeypatch):
@@ -198,8 +198,13 @@ def test_the_command_line_packs(whole, tmp_path, capsys):
     out, pack = tmp_path / "set", tmp_path / "set.h5"
     make_set(CLI_JOB, 3, out)
     assert main([*ARGUMENTS, "--count", "3", "--out", str(out), "--pack", str(pack), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert said["scenes"] == 3 and said["failed"] == [] and said["bytes_per_scene"] > 0 and "scenes_per_second" in said
+    message = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (
+        message["scenes"] == 3
+        and message["failed"] == []
+        and message["bytes_per_scene"] > 0
+        and "scenes_per_second" in message
+    )
     views = read_pack(pack)
     for i, record in enumerate(read_set_index(out)):
         transient = read_transient(out / record["file"])
@@ -212,8 +217,8 @@ def test_the_command_line_packs(whole, tmp_path, capsys):
 def test_views_above_their_error_target_are_one_line_on_the_screen(tmp_path, capsys):
     argv = ["dataset", "hard-cases", "--width", "12", "--height", "9", "--bounces", "1", "--grid", "2"]
     assert main([*argv, "--error", "1e-4", "--count", "3", "--out", str(tmp_path / "set")]) == 0
-    told = capsys.readouterr().err
-    assert "views end above their error target" in told and told.count("\n") == 1
+    message = capsys.readouterr().err
+    assert "views end above their error target" in message and message.count("\n") == 1
 
 
 def test_views_above_their_error_target_are_counted(tmp_path, caplog, monkeypatch):
@@ -245,8 +250,8 @@ def test_views_above_their_error_target_are_counted(tmp_path, caplog, monkeypatc
 )
 def test_bad_options_are_one_line(tmp_path, capsys, options, why):
     assert main([*ARGUMENTS, "--out", str(tmp_path / "set"), *options]) == 2
-    said = capsys.readouterr().err
-    assert why in said and said.count("\n") == 1
+    message = capsys.readouterr().err
+    assert why in message and message.count("\n") == 1
     assert main(["dataset", "kitchens"]) == 2 and "expected one of rooms/train" in capsys.readouterr().err
 
 
@@ -311,8 +316,8 @@ def test_a_dask_cluster_gives_the_same_bytes_and_survives_a_dead_worker(whole, t
         victims = [worker.pid for worker in cluster.workers.values()]
         killed = []
 
-        def progress(what: str, share: float) -> None:
-            if kill and share > 0.3 and not killed:
+        def progress(what: str, fraction: float) -> None:
+            if kill and fraction > 0.3 and not killed:
                 killed.append(victims[0])
                 os.kill(victims[0], signal.SIGKILL)
 

@@ -215,13 +215,13 @@ def test_evaluate_on_the_published_pairs_reads_both_decoders(tmp_path, monkeypat
     monkeypatch.setattr(published, "PHOTON_LEVELS", ((50.0, 50.0),))
     name = "learned-256x4x4-128x-s0"
     assert main(["evaluate", name, "--set", "published", "--out", str(tmp_path), "--json"]) == 0
-    told = json.loads(capfd.readouterr().out.splitlines()[-1])
-    soft, median = told["rows"]
+    message = json.loads(capfd.readouterr().out.splitlines()[-1])
+    soft, median = message["rows"]
     assert (soft["decoder"], median["decoder"]) == ("soft-argmax", "median") and soft["reference"] == "arrival"
     model = load_model(shipped_model(name))[0]
     drawn = published._drawn(pair, (50.0, 50.0), 0.0, (0, 0, 0))
     assert soft["mae_mm"] == published.errors_as_published(model, drawn, "soft-argmax")["mae_mm_arrival"]
-    assert len(told["means"]) == 2 and (tmp_path / "evaluation-published.csv").is_file()
+    assert len(message["means"]) == 2 and (tmp_path / "evaluation-published.csv").is_file()
     assert 0 < median["mae_mm"] < 100
 
 
@@ -237,12 +237,12 @@ def test_training_depths_are_the_models_own_or_those_of_the_set_given(tmp_path):
     views = random_planes(4, size=16, seed=6)
     write_pack(((t, {"scene": s}) for t, s in zip(views.transients, views.scenes, strict=True)), packed)
     silent = SimpleNamespace(config=SimpleNamespace(data={}))
-    told = SimpleNamespace(config=SimpleNamespace(data={"training_reach_m": 6.5}))
+    message = SimpleNamespace(config=SimpleNamespace(data={"training_reach_m": 6.5}))
     options = (plans.SMOKE, Store(tmp_path / "r"), tmp_path, 0, None)
     session = depth_offset.Session(options[0], {ModelSpec(): silent}, *options[1:], packed)
     depth = np.concatenate([t.depth_m[np.isfinite(t.depth_m)] for t in views.transients[:3]])
     assert session.reach_m == pytest.approx(float(np.quantile(depth, 0.999)), abs=0.5)
-    session = depth_offset.Session(options[0], {ModelSpec(): silent, ModelSpec(seed=1): told}, *options[1:], packed)
+    session = depth_offset.Session(options[0], {ModelSpec(): silent, ModelSpec(seed=1): message}, *options[1:], packed)
     assert session.reach_m == 6.5
     assert depth_offset.Session(options[0], {ModelSpec(): silent}, *options[1:]).reach_m is None
 
@@ -254,15 +254,15 @@ def test_interrupted_and_resumed_repeats_nothing(capfd, tmp_path, monkeypatch):
     monkeypatch.setenv("SCENE2SPAD_DATA", str(tmp_path))
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     assert run(tmp_path / "whole") == 0
-    told = json.loads(capfd.readouterr().out)
-    assert len(told["figures"]) == 8 and all(Path(name).is_file() for name in told["figures"])
-    assert told["absent"] == [] and told["published"] == [] and told["relief"] == []
+    message = json.loads(capfd.readouterr().out)
+    assert len(message["figures"]) == 8 and all(Path(name).is_file() for name in message["figures"])
+    assert message["absent"] == [] and message["published"] == [] and message["relief"] == []
     assert {row["mode"] for row in csv.DictReader((tmp_path / "whole/depth-offset.csv").open())} == {
         "time", "ray", "rigid",
     }  # fmt: skip
 
     counts = {"put": 0, "stop": 0}
-    put, share = Store.put, ModelRegistry.train
+    put, fraction = Store.put, ModelRegistry.train
 
     def counted(self, *values, **key):
         counts["put"] += 1
@@ -271,14 +271,14 @@ def test_interrupted_and_resumed_repeats_nothing(capfd, tmp_path, monkeypatch):
         put(self, *values, **key)
 
     def stopped(self, wanted, preset, training, progress):
-        share(self, wanted[:1], preset, training, progress)
+        fraction(self, wanted[:1], preset, training, progress)
         raise KeyboardInterrupt
 
     results = tmp_path / "whole/smoke/results"
     whole = sum(len(path.read_text().splitlines()) for path in results.glob("*.jsonl"))
     monkeypatch.setattr(ModelRegistry, "train", stopped)
     assert run(tmp_path / "cut") == 130
-    monkeypatch.setattr(ModelRegistry, "train", share)
+    monkeypatch.setattr(ModelRegistry, "train", fraction)
     monkeypatch.setattr(Store, "put", counted)
     for stop in (3, 8, whole):
         counts["stop"] = stop

@@ -40,8 +40,8 @@ def test_absurd_sizes_are_refused_before_any_work(tmp_path, capsys, monkeypatch,
     monkeypatch.setattr("scene2spad.networks.training.views_of", work)
     monkeypatch.setattr("scene2spad.datasets.rendering.Folder", work)
     assert main([*argv, "--out", str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert why in told and told.count("\n") == 1 and not (tmp_path / "out").exists()
+    message = capsys.readouterr().err
+    assert why in message and message.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
 def test_a_set_of_a_million_views_is_listed_as_it_is_rendered(tmp_path, monkeypatch):

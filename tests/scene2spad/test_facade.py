@@ -62,7 +62,7 @@ def test_optics_compute_the_photon_budget():
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda h: s2s.render("plane", eror=0.1), "setting 'eror' is unknown; did you mean 'error'"),
         (lambda h: s2s.render(s2s.load_scene("plane"), width=8), "own camera"),
@@ -72,7 +72,7 @@ def test_optics_compute_the_photon_budget():
         (lambda h: s2s.coding_tensor("furier", 8), "furier"),
     ],
 )
-def test_mistakes_are_one_line(histogram, call, said):
-    with pytest.raises(s2s.InputError, match=said) as caught:
+def test_mistakes_are_one_line(histogram, call, message):
+    with pytest.raises(s2s.InputError, match=message) as caught:
         call(histogram)
     assert "\n" not in str(caught.value)

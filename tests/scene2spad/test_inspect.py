@@ -24,14 +24,14 @@ def files(tmp_path_factory) -> Path:
     return folder
 
 
-def told(capfd: pytest.CaptureFixture, *argv: object) -> dict:
+def message(capfd: pytest.CaptureFixture, *argv: object) -> dict:
     capfd.readouterr()
     assert main(["inspect", *map(str, argv), "--json"]) == 0
     return json.loads(capfd.readouterr().out)
 
 
 def test_a_transient_and_the_returns_of_a_pixel(files, capfd):
-    found, transient = told(capfd, files / "gallery.exr", "--pixel", 5, 7), read_transient(files / "gallery.exr")
+    found, transient = message(capfd, files / "gallery.exr", "--pixel", 5, 7), read_transient(files / "gallery.exr")
     assert found["kind"] == "transient" and (found["rows"], found["columns"]) == (12, 16)
     assert found["returns"] == transient.returns and found["depth_m"][0] == pytest.approx(np.nanmin(transient.depth_m))
     mine = slice(*transient.offsets[5 * 16 + 7 :][:2])
@@ -39,7 +39,7 @@ def test_a_transient_and_the_returns_of_a_pixel(files, capfd):
 
 
 def test_a_histogram_and_the_counts_of_a_pixel(files, capfd):
-    found, histogram = told(capfd, files / "gallery.h5", "--pixel", 5, 7), read_histogram(files / "gallery.h5")
+    found, histogram = message(capfd, files / "gallery.h5", "--pixel", 5, 7), read_histogram(files / "gallery.h5")
     assert (found["kind"], found["bins"], found["sensor"]) == ("histogram", 1024, "reference")
     counts = np.zeros(1024, int)
     for one in found["pixel"]["counts"]:
@@ -48,7 +48,7 @@ def test_a_histogram_and_the_counts_of_a_pixel(files, capfd):
 
 
 def test_a_pack_shows_the_view_asked_for(files, capfd):
-    assert told(capfd, files / "set.h5", "--view", 2)["views"] == 3
+    assert message(capfd, files / "set.h5", "--view", 2)["views"] == 3
     assert main(["inspect", str(files / "set.h5"), "--view", "3"]) == 2
     assert "no view 3, there are 0 to 2" in capfd.readouterr().err
 

@@ -198,10 +198,10 @@ def test_imports_that_cannot_be_end_in_one_line(capfd, folder):
     assert "none.ckpt: checkpoint not found" in refused(capfd, "models", "import", "none.ckpt")
     assert "go with import" in refused(capfd, "models", "--out", "x")
     torch.save({"state_dict": {"layer.weight": torch.zeros(3)}}, "other.ckpt")
-    said = refused(capfd, "models", "import", "other.ckpt")
-    assert "other.ckpt: tensor layer.weight is of no published compressive model" in said
+    message = refused(capfd, "models", "import", "other.ckpt")
+    assert "other.ckpt: tensor layer.weight is of no published compressive model" in message
     published_checkpoint(Path("good.ckpt"))
     assert "sensor 'guess' is unknown" in refused(capfd, "models", "import", "good.ckpt", "--sensor", "guess")
-    said = refused(capfd, "models", "import", "good.ckpt", "--sensor", "linospad")
-    assert "good.ckpt: blocks of 1024 bins do not divide the sensor's 1536" in said
+    message = refused(capfd, "models", "import", "good.ckpt", "--sensor", "linospad")
+    assert "good.ckpt: blocks of 1024 bins do not divide the sensor's 1536" in message
     assert not Path("out").exists()

@@ -36,10 +36,10 @@ def test_conclusions_count_scenes_and_find_the_least_background():
     assert {(m["method"], m["background"]): m["mae_mm"] for m in means} == {
         (FILTER, 50.0): 20, (FILTER, 1.0): 10, ("net", 50.0): 15, ("net", 1.0): 50
     }  # fmt: skip
-    (told,) = multipath.conclusions(means, scenes)
-    assert (told["network"], told["mae_mm"], told["filter_mae_mm"]) == ("net", 15, 20)
-    assert (told["filter_better_in"], told["scenes"]) == (1, 2)
-    assert (told["least_background"], told["mae_mm_at_least_background"]) == (1.0, 50)
+    (message,) = multipath.conclusions(means, scenes)
+    assert (message["network"], message["mae_mm"], message["filter_mae_mm"]) == ("net", 15, 20)
+    assert (message["filter_better_in"], message["scenes"]) == (1, 2)
+    assert (message["least_background"], message["mae_mm_at_least_background"]) == (1.0, 50)
 
 
 def test_direct_light_alone_of_direct_light_is_the_same():

@@ -85,7 +85,7 @@ def test_rendered_captures_show_the_prototypes_rows_sun_and_counts(folder):
     one, settings = real_data.SIMULATED[0], real_data.PRESETS["smoke"]
     scene = real_data.scene_of(one, settings.side, 0)
     assert scene.laser.mode == "line" and scene.ambient.environment is not None
-    path, truth = real_data.make_capture(one, scene, settings, folder, 0, lambda what, share: None)
+    path, truth = real_data.make_capture(one, scene, settings, folder, 0, lambda what, fraction: None)
     capture = read_linospad(path)
     assert capture.image.shape == (32, 32) and capture.image.max() > 100
     total = np.asarray(capture.counts.sum(axis=0)).reshape(32, 32).T  # pixels run down the columns

@@ -60,8 +60,8 @@ def test_table(capfd, tmp_path, monkeypatch):
     assert main(["train", *arguments]) == 0
     given = ["--width", "16", "--height", "12", "--views", "1", "--cache", str(tmp_path / "cache")]
     given += ["--out", str(tmp_path / "out"), "--checkpoints", str(trained)]
-    status, found, said = run(capfd, *given)
-    assert status == 0, said
+    status, found, message = run(capfd, *given)
+    assert status == 0, message
     rows = found["rows"]
     assert len(rows) == 5 * 2 and {row["method"] for row in rows} == {"log-matched", str(trained)}
     assert rows[-1]["measured"] is None and all(row["mae_mm"] > 0 for row in rows)
@@ -79,10 +79,10 @@ def test_table(capfd, tmp_path, monkeypatch):
 
 def test_mistakes_end_in_one_line(capfd, tmp_path):
     out = ["--out", str(tmp_path)]
-    for given, told in (
+    for given, output in (
         (("--views", "9"), "views 9 is outside 1 to 8 of set tabletop"),
         (("--scene-set", "nowhere"), "scene set 'nowhere'"),
         (("--checkpoints", str(tmp_path / "none")), "file not found"),
     ):
-        status, _, said = run(capfd, *given, *out)
-        assert status == 2 and told in said and len(said.strip().splitlines()) == 1
+        status, _, message = run(capfd, *given, *out)
+        assert status == 2 and output in message and len(message.strip().splitlines()) == 1

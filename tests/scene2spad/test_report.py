@@ -118,9 +118,9 @@ def tree(tmp_path) -> Path:
 def made(tree: Path, capfd) -> tuple[dict, str]:
     out = tree / "report.html"
     assert main(["report", "--results", str(tree), "--out", str(out), "--json"]) == 0
-    told = json.loads(capfd.readouterr().out)
-    assert told["out"] == str(out) and told["bytes"] == out.stat().st_size
-    return told, out.read_text(encoding="utf-8")
+    message = json.loads(capfd.readouterr().out)
+    assert message["out"] == str(out) and message["bytes"] == out.stat().st_size
+    return message, out.read_text(encoding="utf-8")
 
 
 def test_every_section_is_there_and_every_link_leads_somewhere(tree, capfd):
@@ -153,10 +153,10 @@ def test_the_page_loads_nothing(tree, capfd):
 
 
 def test_pictures_are_whole_in_it_once_and_told(tree, capfd):
-    told, text = made(tree, capfd)
+    message, text = made(tree, capfd)
     images = Page(text).of("img")
     embedded = [base64.b64decode(one["src"].removeprefix("data:image/png;base64,")) for one in images]
-    assert embedded == [png(1), png(2), png(3)] and told["figures"] == 3  # no older, inner, broken or second one
+    assert embedded == [png(1), png(2), png(3)] and message["figures"] == 3  # no older, inner, broken or second one
     assert all(one["alt"] and (one["width"], one["height"]) == ("9", "7") for one in images)
     words = Page(text).words
     assert "1 older of that name not shown" in words and "shown above" in words
@@ -170,13 +170,13 @@ def test_text_of_results_is_text(tree, capfd):
 
 
 def test_what_is_missing_or_broken_is_named_with_its_command(tree, capfd):
-    told, text = made(tree, capfd)
-    missing = {one["command"]: one["files"] for one in told["missing"]}
+    message, text = made(tree, capfd)
+    missing = {one["command"]: one["files"] for one in message["missing"]}
     assert missing["scene2spad bench encode"] == ["bench-encode.png", "bench-encode.csv"]
     assert "scene2spad bench render" not in missing or missing["scene2spad bench render"] == ["bench-render.csv"]
     assert missing["scene2spad study fourier --full"] == ["fourier-11-64x.png"]
     assert "codes.png" not in missing.get("scene2spad study codes", [])  # there, but broken
-    broken = {line.split(":")[0] for line in told["problems"]}
+    broken = {line.split(":")[0] for line in message["problems"]}
     assert broken == {"study/codes.png", "bench/bench-sense.csv", "study/power.json", "study/depth-offset.json"}
     end = text[text.index('id="not-measured"') :]
     for command, files in missing.items():
@@ -188,8 +188,15 @@ def test_what_is_missing_or_broken_is_named_with_its_command(tree, capfd):
 def test_configurations_and_versions(tree, capfd):
     _, text = made(tree, capfd)
     words = Page(text[text.index('id="configurations"') :]).words
-    for told in ("scene2spad", "torch", "study/smoke/sets/tabletop", "study/smoke/models/m", "mitsuba: 3.9", "planes"):
-        assert told in words
+    for message in (
+        "scene2spad",
+        "torch",
+        "study/smoke/sets/tabletop",
+        "study/smoke/models/m",
+        "mitsuba: 3.9",
+        "planes",
+    ):
+        assert message in words
     assert "abababababab" in words and "ab" * 7 not in words
 
 
@@ -200,10 +207,10 @@ def test_sets_with_views_above_their_error_target_are_marked(tree, capfd):
     put(folder / "view.exr", b"")
     put(tree / "study/smoke/sets/rooms/set.json", {"set": "rooms"})
     put(tree / "study/smoke/sets/rooms/index.jsonl", "{cut")
-    told, text = made(tree, capfd)
+    message, text = made(tree, capfd)
     words = Page(text[text.index('id="configurations"') :]).words
     assert "above the error target" in words and "2 (!)" in words
-    assert any("rooms/index.jsonl: cannot be read" in line for line in told["problems"])
+    assert any("rooms/index.jsonl: cannot be read" in line for line in message["problems"])
 
 
 def test_only_the_chief_ratios_are_shown(tree, capfd):
@@ -222,8 +229,8 @@ def test_measured_things_come_first_and_missing_ones_in_one_list_at_the_end(tree
 
 def test_smoke_results_stand_apart_and_never_beside_print(tree, capfd):
     numbers = json.loads((tree / "study/fourier.json").read_text())
-    for told in ({"preset": "smoke"}, {"models": [{**numbers["models"][0], "preset": "smoke"}]}):
-        put(tree / "study/fourier.json", {**numbers, **told})
+    for message in ({"preset": "smoke"}, {"models": [{**numbers["models"][0], "preset": "smoke"}]}):
+        put(tree / "study/fourier.json", {**numbers, **message})
         _, text = made(tree, capfd)
         page = Page(text)
         ids = [attrs["id"] for _, attrs in page.seen if "id" in attrs]
@@ -235,11 +242,11 @@ def test_smoke_results_stand_apart_and_never_beside_print(tree, capfd):
 
 def test_an_empty_folder_makes_a_page_of_what_is_missing(tmp_path, capfd):
     (tmp_path / "results").mkdir()
-    told, text = made(tmp_path / "results", capfd)
+    message, text = made(tmp_path / "results", capfd)
     page = Page(text)
-    assert not page.wrong and not page.open and told["figures"] == 0
+    assert not page.wrong and not page.open and message["figures"] == 0
     expected = {name.file for part in SECTIONS for item in part.items for name in (*item.pictures, *item.tables)}
-    assert expected <= {name for one in told["missing"] for name in one["files"]}
+    assert expected <= {name for one in message["missing"] for name in one["files"]}
     assert not page.of("img") and page.words.count("Not found, and the command that makes it") == 1
 
 
@@ -249,15 +256,15 @@ def test_the_same_results_give_the_same_page(tree, capfd):
 
 def test_mistakes_end_in_one_line(tree, tmp_path, capfd):
     put(tmp_path / "mine.html", "<p>my own page</p>")
-    for given, told in (
+    for given, output in (
         (("--results", str(tmp_path / "none")), "no folder of results"),
         (("--results", str(tree), "--out", str(tmp_path / "page.txt")), "must end in .html"),
         (("--results", str(tree), "--out", str(tmp_path / "mine.html")), "choose another --out"),
         (("--results", str(tree), "--out", str(tmp_path / "no/page.html")), "does not exist"),
     ):
         assert main(["report", *given]) == 2
-        said = capfd.readouterr().err
-        assert told in said and len(said.strip().splitlines()) == 1
+        message = capfd.readouterr().err
+        assert output in message and len(message.strip().splitlines()) == 1
     assert (tmp_path / "mine.html").read_text() == "<p>my own page</p>"
 
 

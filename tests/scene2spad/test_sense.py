@@ -40,9 +40,9 @@ def run(capfd, *argv: str) -> tuple[int, dict, str]:
 
 
 def test_laws_and_inverses_by_command(scene, capfd):
-    status, said, err = run(capfd, "sense", "s.exr", "--signal", "4e5", "--background", "4e5")
-    assert status == 0 and said["model"] == "first-photon" and said["pile_up"] > 0.5 and "pile-up" in err
-    assert said["mean_counts"] < 0.95 * 8e5
+    status, message, err = run(capfd, "sense", "s.exr", "--signal", "4e5", "--background", "4e5")
+    assert status == 0 and message["model"] == "first-photon" and message["pile_up"] > 0.5 and "pile-up" in err
+    assert message["mean_counts"] < 0.95 * 8e5
     errors = {}
     for method in ("log-matched", "coates", "lmf-published", "correlation"):
         status, depth, _ = run(capfd, "depth", "s.h5", "--method", method)
@@ -50,23 +50,23 @@ def test_laws_and_inverses_by_command(scene, capfd):
         errors[method] = depth["mae_mm"]
     assert errors["coates"] < 0.5 < errors["log-matched"]
     options = ("--model", "free-running", "--dead-time", "3e-7", "--exposure", "1e-3")
-    status, said, _ = run(capfd, "sense", "s.exr", "--signal", "1e3", "--background", "1e3", *options)
-    assert status == 0 and said["model"] == "free-running" and said["mean_counts"] < 1e-3 / 3e-7 + 1
+    status, message, _ = run(capfd, "sense", "s.exr", "--signal", "1e3", "--background", "1e3", *options)
+    assert status == 0 and message["model"] == "free-running" and message["mean_counts"] < 1e-3 / 3e-7 + 1
 
 
 def test_detector_options_reach_the_sensor(scene, capfd, tmp_path):
     np.save(tmp_path / "p.npy", np.exp(-np.arange(40) / 8))
     np.save(tmp_path / "d.npy", np.full((8, 10), 90.0))
     options = "--jitter 5e-11 --jitter-tail 1e-10 --pde 0.3 --crosstalk 0.002 --dead-pixels 0.1 --hot-pixels 0.05"
-    status, said, err = run(
+    status, message, err = run(
         capfd, "sense", "s.exr", *options.split(), "--pulse", "p.npy", "--pulse-step", "2e-11", "--sensor", "linospad"
     )
     sensor = read_histogram(tmp_path / "s.h5").sensor
-    assert status == 0 and said["mean_signal"] == pytest.approx(45, rel=0.05) and "crosstalk" in err
+    assert status == 0 and message["mean_signal"] == pytest.approx(45, rel=0.05) and "crosstalk" in err
     assert (sensor.name, sensor.bins, sensor.pde, sensor.crosstalk) == ("linospad", 1536, 0.3, 0.002)
     assert sensor.jitter.tail_s == 1e-10 and len(sensor.pulse.samples) == 40 and sensor.hot_rate_hz == 1e4
-    status, said, _ = run(capfd, "sense", "s.exr", "--dark-map", "d.npy")
-    assert status == 0 and said["dark_share"] == pytest.approx(3 / 50)
+    status, message, _ = run(capfd, "sense", "s.exr", "--dark-map", "d.npy")
+    assert status == 0 and message["dark_share"] == pytest.approx(3 / 50)
 
 
 def test_a_sensor_file_is_the_sensor_and_options_change_it(scene, capfd, tmp_path):
@@ -87,17 +87,17 @@ def test_a_sensor_file_is_the_sensor_and_options_change_it(scene, capfd, tmp_pat
 
 
 def test_radiometric_budget_by_command(scene, capfd):
-    status, said, _ = run(capfd, "sense", "s.exr", "--radiometric", "--pde", "0.2", "--pulse-energy", "1e-9")
-    assert status == 0 and said["mean_signal"] > 0 and said["mean_background"] > 0
+    status, message, _ = run(capfd, "sense", "s.exr", "--radiometric", "--pde", "0.2", "--pulse-energy", "1e-9")
+    assert status == 0 and message["mean_signal"] > 0 and message["mean_background"] > 0
     _, twice, _ = run(capfd, "sense", "s.exr", "--radiometric", "--pde", "0.4", "--pulse-energy", "1e-9")
-    assert twice["mean_signal"] == pytest.approx(2 * said["mean_signal"], rel=1e-5)
+    assert twice["mean_signal"] == pytest.approx(2 * message["mean_signal"], rel=1e-5)
 
 
 def test_export_by_command(scene, capfd, tmp_path):
-    status, said, _ = run(capfd, "sense", "s.exr", "--export", "mat")
-    assert status == 0 and (tmp_path / "s.mat").is_file() and said["export"] == "s.mat"
+    status, message, _ = run(capfd, "sense", "s.exr", "--export", "mat")
+    assert status == 0 and (tmp_path / "s.mat").is_file() and message["export"] == "s.mat"
     assert (read_mat(tmp_path / "s.mat").counts == read_histogram(tmp_path / "s.h5").counts).all()
-    assert scipy.io.loadmat(said["pulse_file"])["PSF_img"].shape[:2] == (8, 10)
+    assert scipy.io.loadmat(message["pulse_file"])["PSF_img"].shape[:2] == (8, 10)
 
 
 @pytest.mark.parametrize(
@@ -132,8 +132,12 @@ def test_table_of_estimators():
     for group in ("unmixed", "mixed"):
         assert sum(row["pixels"] for row in rows if row["group"] == group) <= 6 * 42
     assert len(set(estimators.LEVELS)) == 16
-    said = estimators.markdown(rows)
-    assert said[2].startswith("| 30 / 300 | ") and said[-1].startswith("| coates | ") and len(said) == 3 + 1 + 2 + 6
+    message = estimators.markdown(rows)
+    assert (
+        message[2].startswith("| 30 / 300 | ")
+        and message[-1].startswith("| coates | ")
+        and len(message) == 3 + 1 + 2 + 6
+    )
 
 
 def test_middlebury_pairs_become_transients(shared_data):
@@ -154,13 +158,13 @@ def test_measuring_tools():
 
 @pytest.mark.slow
 def test_bench_sense(tmp_path, capfd):
-    status, said, _ = run(capfd, "bench", "sense", "--quick", "--out", str(tmp_path / "b"), "--data", str(tmp_path))
-    assert status == 0 and "estimators" not in said
-    names = [row["name"] for row in said["rows"]]
+    status, message, _ = run(capfd, "bench", "sense", "--quick", "--out", str(tmp_path / "b"), "--data", str(tmp_path))
+    assert status == 0 and "estimators" not in message
+    names = [row["name"] for row in message["rows"]]
     assert sum("numpy" in name for name in names) == 2 and any("training batch" in name for name in names)
-    assert all(row["same_law_p"] is None or row["same_law_p"] > 1e-4 for row in said["rows"])
+    assert all(row["same_law_p"] is None or row["same_law_p"] > 1e-4 for row in message["rows"])
     with (tmp_path / "b" / "bench-sense.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == len(said["rows"])
+        assert len(list(csv.DictReader(file))) == len(message["rows"])
 
 
 def test_the_figure_shows_pixels_by_a_stated_rule_with_their_rates_over_the_counts(scene, tmp_path, monkeypatch):

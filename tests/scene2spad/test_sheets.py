@@ -12,8 +12,8 @@ from scene2spad.cli import main
 def test_a_sheet_of_rooms_is_drawn(tmp_path, capsys):
     sheet = tmp_path / "sheet.png"
     assert main(["scenes", "rooms/val", "--sheet", str(sheet), "--count", "2", "--width", "20", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert said["scenes"] == ["rooms/val/0", "rooms/val/1"]
+    message = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert message["scenes"] == ["rooms/val/0", "rooms/val/1"]
     assert Image.open(sheet).width > 100
 
 
@@ -39,6 +39,6 @@ def test_an_rgbd_pair_is_rendered_and_moved(tmp_path, capsys):
     capsys.readouterr()
     for missing in (known[:2], known[2:]):
         assert main([*pair, *missing, "--out", str(tmp_path / "no.exr")]) == 2
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1 and "scale" in said + "scale" * ("--focal" in said)
+        message = capsys.readouterr().err
+        assert message.count("\n") == 1 and "scale" in message + "scale" * ("--focal" in message)
     assert not (tmp_path / "no.exr").exists()

@@ -21,7 +21,7 @@ from scenes import InputError
 LEARNED = ModelSpec("learned", (256, 4, 4), 128, 1)
 
 
-def quietly(what: str, share: float) -> None:
+def quietly(what: str, fraction: float) -> None:
     pass
 
 
@@ -117,7 +117,7 @@ def test_unfinished_runs_are_left_out(folder, tmp_path, caplog):
 
 def test_other_models_under_its_name_are_refused_in_one_line(folder, tmp_path):
     model, config, state = load_model(folder / LEARNED.name)
-    for changes, said in (
+    for changes, message in (
         ({"time_offset_m": 8.0, "window": 0}, r"random time offsets \[m\] 8.0, expected 0.0"),
         ({"seed": 5}, "seed 5, expected 1"),
         ({"model": replace(config.model, layer={"keep_mean": True})}, "layer"),
@@ -125,7 +125,7 @@ def test_other_models_under_its_name_are_refused_in_one_line(folder, tmp_path):
         run = tmp_path / LEARNED.name
         run.mkdir(exist_ok=True)
         save_model(model, replace(config, **changes), state, run / "model.safetensors")
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             ModelRegistry(tmp_path).find(LEARNED)
     with pytest.raises(InputError, match="design learned 256x4x4 K32, expected learned 1024x4x4 K128"):
         check(config, ModelSpec("learned", (1024, 4, 4), 128, 1), Path("x"))

@@ -142,9 +142,9 @@ def test_equal_renders_give_equal_counts():
     ],
 )
 def test_a_plan_is_judged_by_its_interval(full, planned, expected):
-    share, wide = transport_planned.compared(np.array(full), np.array(planned))
-    assert share == pytest.approx(np.mean(planned) / np.mean(full) - 1)
-    assert transport_planned.within(share, wide) == expected
+    fraction, wide = transport_planned.compared(np.array(full), np.array(planned))
+    assert fraction == pytest.approx(np.mean(planned) / np.mean(full) - 1)
+    assert transport_planned.within(fraction, wide) == expected
 
 
 def test_photons_are_drawn_until_a_scene_is_decided(monkeypatch):
@@ -160,7 +160,7 @@ def test_photons_are_drawn_until_a_scene_is_decided(monkeypatch):
     places = [transport_planned.Place(name, "set", "flood", None, None) for name in ("noisy", "clear")]
     one = transport_planned.Contender(None, "likelihood", 1)
     monkeypatch.setattr(transport_planned.Contender, "name", "log-matched")
-    rows = transport_planned.planned_rows(places, [one], (8, 512), None, 0, lambda what, share: None)
+    rows = transport_planned.planned_rows(places, [one], (8, 512), None, 0, lambda what, fraction: None)
     assert [row["draws"] for row in rows] == [512, 8]
     assert {row["verdict"] for row in rows} == {"holds"} and rows[0]["difference"] == pytest.approx(0.01, abs=0.004)
 
@@ -218,17 +218,17 @@ def contenders() -> list[transport_tables.Contender]:
 
 def test_a_pair_that_turns_is_found_where_it_turns():
     found = transport_tables.conclusions(transport_tables.ranking(made_up_rows("indirect"), contenders()))
-    told = {(one["laser"], one["step"], one["levels"]): one for one in found}
-    assert len(told) == 2 * 4 * 3
+    common = {(one["laser"], one["step"], one["levels"]): one for one in found}
+    assert len(common) == 2 * 4 * 3
     for step, expected in (
         ("cosine", "does not change"),
         ("footprint", "does not change"),
         ("indirect", "changes"),
         ("ambient", "changes"),
     ):
-        assert told["flood", step, "all"]["ranking"] == expected
-        assert told["scan", step, "all"]["ranking"] == "does not change"
-    turned = told["flood", "indirect", "all"]
+        assert common["flood", step, "all"]["ranking"] == expected
+        assert common["scan", step, "all"]["ranking"] == "does not change"
+    turned = common["flood", "indirect", "all"]
     assert turned["reversed"] == 1 and turned["kept"] == 2 and "fourier-8 - gray-8" in turned["turned"][0]
     assert turned["gap_moved"] == 2  # fourier-8 against both others
 
@@ -264,16 +264,16 @@ def test_every_model_tiles_the_images(preset):
 @pytest.mark.slow
 def test_a_small_run_ends_and_again_without_work(capfd, tmp_path, monkeypatch):
     one = ModelSpec("fourier", (1024, 1, 1))
-    run_train(one.command("smoke", Path("planes"), tmp_path / "models"), lambda what, share: None)
+    run_train(one.command("smoke", Path("planes"), tmp_path / "models"), lambda what, fraction: None)
     capfd.readouterr()
     command = ["study", "transport", "--preset", "smoke", "--out", str(tmp_path / "out"), "--json"]
     command += ["--models", str(tmp_path / "models")]
     assert main(command) == 0
-    printed, said = capfd.readouterr()
+    printed, message = capfd.readouterr()
     first = json.loads(printed)
     assert all(Path(path).is_file() for path in (*first["figures"], *first["csv"], first["numbers"]))
     assert one.name in {line["design"] for line in first["summary"]}
-    assert len(first["scenes"]) == 4 and said.count("rays saved;") == 4
+    assert len(first["scenes"]) == 4 and message.count("rays saved;") == 4
     assert {c["verdict"] for c in first["planned_conclusions"]} <= {"holds", "does not hold", "not decided"}
     assert all(math.isfinite(line["mae_mm"]) for line in first["summary"])
     # RGB-D rates know no laser

@@ -87,7 +87,7 @@ def test_sweep_refuses_what_does_not_fit_and_goes_on(capfd, folder):
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "message"),
     [
         (["run"], "which program"),
         (["table", "fourier-8"], "takes no program"),
@@ -111,9 +111,9 @@ def test_sweep_refuses_what_does_not_fit_and_goes_on(capfd, folder):
         (["table", "--out", "nowhere/t.csv"], "nowhere"),
     ],
 )
-def test_mistakes_end_in_one_line(capfd, folder, argv, said):
+def test_mistakes_end_in_one_line(capfd, folder, argv, message):
     (folder / "bad.s").write_text("HALT\n  ADD r1\n".replace("ADD r1", "JMP 3"))
-    assert said in refused(capfd, "ultraphase", *argv)
+    assert message in refused(capfd, "ultraphase", *argv)
     assert [path.name for path in folder.iterdir()] == ["bad.s"]
 
 

@@ -111,8 +111,8 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, case, capsys):
     message = str(caught.value)
     assert "\n" not in message and str(tmp_path) in message and len(message) < 600
     assert main(["render", str(path), "--out", str(tmp_path / "o.exr")]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.count("\n") == 1 and "Traceback" not in said.err
+    output = capsys.readouterr()
+    assert output.out == "" and output.err.count("\n") == 1 and "Traceback" not in output.err
     assert not (tmp_path / "o.exr").exists()
 
 

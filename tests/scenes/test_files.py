@@ -176,5 +176,5 @@ for extra in ("unknown", "counts"):
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-    told = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(told) == 2 and "unknown" in told[0] and "states 3600000000 bytes" in told[1]
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(lines) == 2 and "unknown" in lines[0] and "states 3600000000 bytes" in lines[1]

@@ -311,11 +311,11 @@ def test_refuses_bad_content_in_one_line(tmp_path, name, text, words):
 
 
 @pytest.mark.parametrize("kind", ["ply", "stl", "glb"])
-@pytest.mark.parametrize("share", [0.3, 0.7, 0.95])
-def test_refuses_a_truncated_file(tmp_path, kind, share):
+@pytest.mark.parametrize("fraction", [0.3, 0.7, 0.95])
+def test_refuses_a_truncated_file(tmp_path, kind, fraction):
     path = cube(tmp_path / f"cut.{kind}")
     content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
     refusal(path)
 
 

@@ -91,8 +91,8 @@ def test_metals_reflect_as_metals_do(tmp_path: Path, metal: str, reflectance: fl
 @pytest.mark.parametrize("kind", ["roughplastic", "roughconductor"])
 def test_microfacets_are_what_the_file_says(tmp_path: Path, kind: str) -> None:
     """Beckmann, where nothing is said too: that is the format's default."""
-    for said, expected in (("", "beckmann"), ("beckmann", "beckmann"), ("ggx", "ggx")):
-        line = f'<string name="distribution" value="{said}"/>' if said else ""
+    for message, expected in (("", "beckmann"), ("beckmann", "beckmann"), ("ggx", "ggx")):
+        line = f'<string name="distribution" value="{message}"/>' if message else ""
         found = material(tmp_path, f'<bsdf type="{kind}">{line}<float name="alpha" value="0.3"/></bsdf>')
         assert (found.kind, found.roughness, found.distribution) == (kind, 0.3, expected)
 

@@ -137,7 +137,7 @@ def test_phong_becomes_plastic_of_the_same_width(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "message"),
     [
         ('<shape type="rectangle"><bsdf type="roughdielectric"/></shape>', "write dielectric"),
         ('<shape type="rectangle"><bsdf type="twosided"><bsdf type="principled"/></bsdf></shape>', "roughplastic or"),
@@ -146,11 +146,11 @@ def test_phong_becomes_plastic_of_the_same_width(tmp_path):
         ('<shape type="hair"/>', "expected one of obj"),
     ],
 )
-def test_refusals_name_the_way_round_before_meshes_are_read(tmp_path, body, said):
+def test_refusals_name_the_way_round_before_meshes_are_read(tmp_path, body, message):
     """The mesh before it is broken and would be refused first if it were read first."""
     (tmp_path / "broken.obj").write_text("v 0 0\n")
     first = '<shape type="obj"><string name="filename" value="broken.obj"/></shape>'
-    assert said in xml_files.refusal(tmp_path, first + body)
+    assert message in xml_files.refusal(tmp_path, first + body)
 
 
 # The command line

@@ -74,14 +74,14 @@ def test_a_file_cut_short_is_refused_in_one_line(tmp_path, cut):
 
 
 @pytest.mark.parametrize(
-    ("vertices", "triangles", "said"),
+    ("vertices", "triangles", "message"),
     [(1 << 40, 2, "vertices"), (4, 1 << 40, "triangles"), (40_000_000, 2, "cut short"), (4, 20_000_000, "cut short")],
 )
-def test_declared_numbers_are_not_believed(tmp_path, vertices, triangles, said):
+def test_declared_numbers_are_not_believed(tmp_path, vertices, triangles, message):
     """A few bytes that promise gigabytes: refused before they are allocated."""
     body = zlib.compress(struct.pack("<I", serialized.SINGLE) + b"\0" + struct.pack("<QQ", vertices, triangles))
     path = file(tmp_path / "a.serialized", [struct.pack("<HH", serialized.MAGIC, 4) + body], 4)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         serialized.read_serialized(path)
 
 

@@ -106,7 +106,7 @@ def repeated(repetitions: int) -> dict[str, float]:
             used = errors[name] > 0  # the gauge has none
             off = np.abs(numbers[name] - right[name])[used] / errors[name][used]
             inside.setdefault(name, []).append(float((off < 1.96).mean()))
-    return {name: float(np.mean(shares)) for name, shares in inside.items()}
+    return {name: float(np.mean(fractions)) for name, fractions in inside.items()}
 
 
 def test_a_calibration_of_simulated_captures_is_near_the_truth():
@@ -117,7 +117,7 @@ def test_a_calibration_of_simulated_captures_is_near_the_truth():
 def test_standard_errors_cover_the_truth():
     """200 repetitions. Saturation spreads counts a little less than Poisson does: intervals cover a little more."""
     covered = repeated(200)
-    assert all(0.90 <= share <= 0.985 for share in covered.values()), covered
+    assert all(0.90 <= fraction <= 0.985 for fraction in covered.values()), covered
     assert 0.90 <= np.mean([*covered.values()]) <= 0.98
 
 

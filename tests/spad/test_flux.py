@@ -108,15 +108,15 @@ def test_mean_signal_and_background_are_what_was_asked():
 
 def test_no_ambient_light_gives_a_uniform_background_and_says_so():
     rates = rates_for(transient_of([(2, 2, 1.0)], [(2, 2, 1.0)]), REFERENCE, PhotonBudget(1, 8))
-    assert rates.background.tolist() == [[8, 8]] and "uniform" in rates.reasons[0] and rates.dark_share == 0
+    assert rates.background.tolist() == [[8, 8]] and "uniform" in rates.reasons[0] and rates.dark_fraction == 0
 
 
-@pytest.mark.parametrize(("dark_counts", "share"), [(2.0, 0.25), (8.0, 1.0), (100.0, 1.0)])
-def test_dark_counts_come_first_and_never_exceed_the_background(dark_counts, share):
+@pytest.mark.parametrize(("dark_counts", "fraction"), [(2.0, 0.25), (8.0, 1.0), (100.0, 1.0)])
+def test_dark_counts_come_first_and_never_exceed_the_background(dark_counts, fraction):
     sensor = replace(REFERENCE, dark_count_rate_hz=dark_counts * 30)
     rates = rates_for(transient_of([(2, 2, 1.0)], [(2, 2, 1.0)], ambient=[1.0, 3.0]), sensor, PhotonBudget(1, 8))
-    assert rates.dark_share == pytest.approx(share) and rates.background.mean() == pytest.approx(8)
-    assert np.ptp(rates.background) == pytest.approx(8 * (1 - share))
+    assert rates.dark_fraction == pytest.approx(fraction) and rates.background.mean() == pytest.approx(8)
+    assert np.ptp(rates.background) == pytest.approx(8 * (1 - fraction))
 
 
 def test_nothing_to_scale_is_refused_in_one_line():

@@ -8,7 +8,7 @@ from test_flux import transient_of
 
 from scene2spad.cli.sensing import summary
 from spad.detection.detect import sense
-from spad.detection.glints import glint_warning, signal_shares
+from spad.detection.glints import glint_warning, signal_fractions
 from spad.sensor.model import PhotonBudget, Sensor
 
 SENSOR = Sensor()
@@ -33,10 +33,10 @@ def test_a_glint_that_takes_the_photon_budget_is_told():
     histogram = sense(transient, SENSOR, PhotonBudget(50, 50), seed=1)
     assert histogram.meta["brightest_pixel"] == pytest.approx(0.58, abs=1e-3)
     assert histogram.meta["median_signal"] == pytest.approx(21, abs=0.1)
-    (told,) = warnings(histogram)
-    assert "pixel holds 58.0% of the signal" in told and "of 50 asked photons the other pixels get 21.0" in told
-    said = summary(histogram)
-    assert said["brightest_pixel"] == said["brightest_thousandth"] == histogram.meta["brightest_pixel"]
+    (output,) = warnings(histogram)
+    assert "pixel holds 58.0% of the signal" in output and "of 50 asked photons the other pixels get 21.0" in output
+    message = summary(histogram)
+    assert message["brightest_pixel"] == message["brightest_thousandth"] == histogram.meta["brightest_pixel"]
 
 
 def test_no_glint_no_word():
@@ -48,31 +48,31 @@ def test_no_glint_no_word():
 
 @pytest.mark.parametrize("pixels", [1, 2, 4, 1000, 4096])
 def test_alike_pixels_lose_nothing_to_one_another_however_few(pixels):
-    shares = signal_shares(np.full(pixels, 3.0))
-    assert shares.mean_of_others == pytest.approx(3) and glint_warning(shares) is None
+    fractions = signal_fractions(np.full(pixels, 3.0))
+    assert fractions.mean_of_others == pytest.approx(3) and glint_warning(fractions) is None
 
 
 def test_a_bright_wall_over_a_tenth_of_the_image_is_no_glint():
     signal = np.ones((64, 64))
     signal[:7] = 50.0
-    assert glint_warning(signal_shares(signal)) is None
+    assert glint_warning(signal_fractions(signal)) is None
 
 
 def test_it_matters_from_a_tenth_of_the_others_photons_on():
-    for share, told in ((0.08, False), (0.12, True)):
+    for fraction, message in ((0.08, False), (0.12, True)):
         signal = np.ones(4096)
-        signal[:4] = share / (1 - share) * 4092 / 4
-        shares = signal_shares(signal)
-        assert shares.brightest_thousandth == pytest.approx(share) and shares.few == 4
-        assert (glint_warning(shares) is not None) == told
+        signal[:4] = fraction / (1 - fraction) * 4092 / 4
+        fractions = signal_fractions(signal)
+        assert fractions.brightest_thousandth == pytest.approx(fraction) and fractions.few == 4
+        assert (glint_warning(fractions) is not None) == message
 
 
 def test_dark_images_and_pile_up_of_primaries():
-    assert glint_warning(signal_shares(np.zeros((2, 2)))) is None
+    assert glint_warning(signal_fractions(np.zeros((2, 2)))) is None
     blind = replace(SENSOR, reset="free-running", dead_time_s=1e-6, exposure_s=1e-3)
     histogram = sense(wall(4), blind, PhotonBudget(5e3, 5e3), seed=1)
-    said = summary(histogram)
+    message = summary(histogram)
     # 1 primary a cycle of 100 ns; blind for ten cycles after each detection, it counts one in eleven
-    assert said["pile_up"] == pytest.approx(1.0)
-    assert said["detections_per_cycle"] == pytest.approx(1 / 11, rel=0.05)
+    assert message["pile_up"] == pytest.approx(1.0)
+    assert message["detections_per_cycle"] == pytest.approx(1 / 11, rel=0.05)
     assert "100.00% primary detections a cycle" in " ".join(histogram.meta["plan"])

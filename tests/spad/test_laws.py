@@ -17,7 +17,7 @@ from spad.detection.laws import (
     crosstalk_events,
     first_of_each_cycle,
     first_photon_counts,
-    first_photon_shares,
+    first_photon_masses,
     free_running_flux,
     linearised,
     live_detections,
@@ -98,14 +98,14 @@ def test_first_photon_is_the_event_by_event_simulation(mean: float) -> None:
     rng = np.random.default_rng(5)
     simulated = by_hand(flux, cycles, rng)
     counts = first_photon_counts(flux[None], cycles, rng)[0]
-    shares = first_photon_shares(flux[None])[0]
-    assert shares.sum() == pytest.approx(1, abs=1e-12) and shares[-1] == pytest.approx(np.exp(-mean), rel=1e-12)
+    fractions = first_photon_masses(flux[None])[0]
+    assert fractions.sum() == pytest.approx(1, abs=1e-12) and fractions[-1] == pytest.approx(np.exp(-mean), rel=1e-12)
     for drawn in (simulated, counts):
         seen = np.append(drawn, cycles - drawn.sum())
-        assert stats.chisquare(seen, cycles * shares).pvalue > 1e-3
+        assert stats.chisquare(seen, cycles * fractions).pvalue > 1e-3
     # the joint law is multinomial: a bin's variance over pixels is N p (1 - p), no Poisson variance
     many = first_photon_counts(np.repeat(flux[None], 4000, axis=0), 200, rng)
-    variance = (200 * shares * (1 - shares))[:-1]
+    variance = (200 * fractions * (1 - fractions))[:-1]
     # a sample variance of n pixels has standard error sqrt((2 + kurtosis) / n), the bin's excess kurtosis 1 / (N p)
     error = variance * np.sqrt((2 + 1 / np.maximum(variance, 1e-12)) / 4000)
     assert (np.abs(many.var(axis=0) - variance) < stats.norm.isf(sidak(1e-3, 64) / 2) * error).all()
@@ -119,12 +119,12 @@ def test_sense_draws_first_photons_by_either_route(dense_from: float, monkeypatc
     scene, budget = same(600, (0.6, 0.7, 1.0)), PhotonBudget(600, 300)  # 1.8 detections a cycle
     histogram = sense(scene, sensor, budget, seed=9)
     assert histogram.meta["model"] == "first-photon" and "pile-up" in " ".join(histogram.meta["plan"])
-    shares = first_photon_shares(expected_in_pixel(scene, sensor, budget, 0, 0)[None] / cycles)[0]
+    fractions = first_photon_masses(expected_in_pixel(scene, sensor, budget, 0, 0)[None] / cycles)[0]
     counts = histogram.counts[0]
     assert counts.sum(axis=1).max() <= cycles
     totals = np.append(counts.sum(axis=0), 600 * cycles - counts.sum())
-    assert stats.chisquare(totals, 600 * cycles * shares / shares.sum()).pvalue > 1e-3
-    detected = 1 - shares[-1]
+    assert stats.chisquare(totals, 600 * cycles * fractions / fractions.sum()).pvalue > 1e-3
+    detected = 1 - fractions[-1]
     # binomial over cycles, not Poisson: the relative error of a variance over 600 pixels is sqrt(2 / 600)
     assert counts.sum(axis=1).var() == pytest.approx(cycles * detected * (1 - detected), rel=4.5 * np.sqrt(2 / 600))
 
@@ -240,12 +240,12 @@ def test_free_running_correction_recovers_the_flux(tau_periods: float) -> None:
 
 def test_crosstalk_rate_and_where_it_goes() -> None:
     rng = np.random.default_rng(1)
-    share, height, width = 0.02, 40, 50
+    fraction, height, width = 0.02, 40, 50
     pixel = rng.integers(0, height * width, 200000)
-    cause, fired = crosstalk_events(pixel, share, height, width, rng)
+    cause, fired = crosstalk_events(pixel, fraction, height, width, rng)
     rows, columns = np.divmod(pixel, width)
     neighbours = 4 - (rows == 0) - (rows == height - 1) - (columns == 0) - (columns == width - 1)
-    expected = share * neighbours.sum()
+    expected = fraction * neighbours.sum()
     assert abs(len(fired) - expected) < 4 * np.sqrt(expected)
     apart = np.abs(np.stack(np.divmod(fired, width)) - np.stack(np.divmod(pixel[cause], width))).sum(axis=0)
     assert (apart == 1).all()
@@ -253,8 +253,8 @@ def test_crosstalk_rate_and_where_it_goes() -> None:
 
 @pytest.mark.parametrize("model", ["poisson", "first-photon", "free-running"])
 def test_crosstalk_correlates_neighbours_only(model: str) -> None:
-    share, cycles = 0.05, 2000
-    sensor = Sensor(bins=4, bin_width_s=1e-9, crosstalk=share, exposure_s=cycles * 4e-9, dead_time_s=1e-9)
+    fraction, cycles = 0.05, 2000
+    sensor = Sensor(bins=4, bin_width_s=1e-9, crosstalk=fraction, exposure_s=cycles * 4e-9, dead_time_s=1e-9)
     side = 64
     flat = replace(
         same(side * side, (0.3, 0.3, 1.0)),
@@ -274,13 +274,13 @@ def test_crosstalk_correlates_neighbours_only(model: str) -> None:
     )
     counts = sense(flat, sensor, PhotonBudget(0, 20), seed=3, model=model).counts.sum(axis=2).astype(float)
     inner = counts[1:-1, 1:-1]
-    mean = 20 * (1 + 4 * share)
-    assert inner.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(mean * (1 + 8 * share) / inner.size) + 0.15)
+    mean = 20 * (1 + 4 * fraction)
+    assert inner.mean() == pytest.approx(mean, abs=4.5 * np.sqrt(mean * (1 + 8 * fraction) / inner.size) + 0.15)
     spread = counts - counts.mean()
     near, far = (spread[:, :-1] * spread[:, 1:]).mean(), (spread[:, :-5] * spread[:, 5:]).mean()
     # each detection adds p to either neighbour: covariance 2 p n to first order
     error = 4.5 * mean / np.sqrt(counts.size)
-    assert near == pytest.approx(2 * share * 20, abs=error + 0.2) and abs(far) < error and near > error
+    assert near == pytest.approx(2 * fraction * 20, abs=error + 0.2) and abs(far) < error and near > error
 
 
 def test_crosstalk_of_counts_is_binomial() -> None:
@@ -348,7 +348,7 @@ def test_a_dead_time_of_seconds_takes_no_more_memory_than_one_of_nanoseconds():
     within = torch.where(
         far <= dead - 1, 1.0, torch.where(far <= dead, 1 - (1 - dead + far) ** 2 / 2, (1 + dead - far) ** 2 / 2)
     )
-    blind = sum(share * counts.roll(int(d), -1) for share, d in zip(within, far, strict=True))
+    blind = sum(fraction * counts.roll(int(d), -1) for fraction, d in zip(within, far, strict=True))
     plain = -torch.log1p(-counts / (short.cycles - blind))
     assert torch.allclose(free_running_flux(counts, short.cycles, short), plain, rtol=1e-9)
 

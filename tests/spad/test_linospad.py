@@ -128,9 +128,9 @@ def bad_files(folder):
         "words": (np.array(["a", "b"]), "holds no matrix of counts"),
         "cube": (np.zeros((2, 2, 2)), "holds no matrix of counts"),
     }
-    for name, (value, said) in cases.items():
+    for name, (value, message) in cases.items():
         scipy.io.savemat(folder / f"{name}.mat", {"spad_processed_data": value})
-        yield folder / f"{name}.mat", said
+        yield folder / f"{name}.mat", message
     scipy.io.savemat(folder / "other.mat", {"spad": good})
     yield folder / "other.mat", "holds no spad_processed_data"
     (folder / "noise.mat").write_bytes(bytes(range(256)) * 9)
@@ -152,8 +152,8 @@ def bad_files(folder):
 
 
 def test_bad_files_are_refused_in_one_line(tmp_path):
-    for path, said in bad_files(tmp_path):
-        with pytest.raises(InputError, match=said) as caught:
+    for path, message in bad_files(tmp_path):
+        with pytest.raises(InputError, match=message) as caught:
             read_linospad(path)
         assert "\n" not in str(caught.value) and path.name in str(caught.value)
 

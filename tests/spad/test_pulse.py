@@ -63,8 +63,8 @@ def test_bins_hold_one_detection_for_any_width(pulse, scale) -> None:
         pulse = Pulse(pulse.sigma_s * factor, pulse.tail_s * factor)
     else:
         pulse = replace(pulse, sample_s=pulse.sample_s * factor)
-    share = binned_pulse(torch.linspace(0, 1, 7, dtype=torch.float64) * 99e-9, Sensor(pulse=pulse))
-    assert share.min() >= 0 and (share.sum(-1) - 1).abs().max() < 1e-9
+    fraction = binned_pulse(torch.linspace(0, 1, 7, dtype=torch.float64) * 99e-9, Sensor(pulse=pulse))
+    assert fraction.min() >= 0 and (fraction.sum(-1) - 1).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("kernel", [Pulse(50e-12), Pulse(40e-12, 90e-12), SampledPulse((1.0, 2.0, 4.0, 1.0), 40e-12)])
@@ -75,9 +75,9 @@ def test_jitter_is_a_second_kernel(pulse, kernel) -> None:
     assert both.std_s == pytest.approx(math.hypot(pulse.std_s, kernel.std_s), rel=2e-3)
     before, after = kernel.window_s(8)
     edges = np.linspace(-before, after, 40001)
-    shares, middle = kernel.shares(edges), (edges[1:] + edges[:-1]) / 2
+    masses, middle = kernel.bin_masses(edges), (edges[1:] + edges[:-1]) / 2
     for point in np.linspace(-1.5, 2.5, 9) * both.std_s:
-        expected = shares @ pulse_cdf(pulse, torch.from_numpy(point - middle)).numpy()
+        expected = masses @ pulse_cdf(pulse, torch.from_numpy(point - middle)).numpy()
         assert float(pulse_cdf(both, torch.tensor(point))) == pytest.approx(expected, abs=3e-3)
 
 

@@ -6,7 +6,7 @@ from scipy import stats
 from test_flux import transient_of
 
 from spad.detection.detect import sense
-from spad.detection.laws import first_photon_shares
+from spad.detection.laws import first_photon_masses
 from spad.formats.histogram import Histogram
 from spad.reference import arrivals, detect_free_running, detect_synchronous
 from spad.sensor.model import PhotonBudget, Sensor
@@ -23,7 +23,7 @@ def test_first_photons_of_a_synchronous_detector_follow_the_multinomial():
     rng = np.random.default_rng(1)
     flux = rng.uniform(0.02, 0.4, BINS)
     counts = detect_synchronous(arrivals(flux, CYCLES, rng), BINS)
-    expected = first_photon_shares(flux[None])[0] * CYCLES
+    expected = first_photon_masses(flux[None])[0] * CYCLES
     assert stats.chisquare([*counts, CYCLES - counts.sum()], expected).pvalue > 1e-4
 
 

@@ -54,11 +54,11 @@ def test_published_is_the_definition() -> None:
     for row, column in np.ndindex(depth.shape):
         beta = max(1, round(2 * depth[row, column] / (LIGHT * Sensor().bin_width_s)) % 1024)
         rate = np.full(1024, 60 * ambient[row, column] / ambient.mean() / 1024)
-        for tap, share in enumerate(taps):
-            rate[(beta - 1 + tap - 10) % 1024] += 30 * falloff[row, column] / falloff.mean() * share
+        for tap, fraction in enumerate(taps):
+            rate[(beta - 1 + tap - 10) % 1024] += 30 * falloff[row, column] / falloff.mean() * fraction
         assert np.allclose(expected.rates[row, column], rate, rtol=1e-12)
         assert expected.range_bin[row, column] == beta
-    assert expected.rates.sum(axis=-1).mean() == pytest.approx(90) and expected.dark_share == 0
+    assert expected.rates.sum(axis=-1).mean() == pytest.approx(90) and expected.dark_fraction == 0
 
 
 def test_published_pulses() -> None:
@@ -73,11 +73,11 @@ def test_published_pulses() -> None:
         published_taps(Sensor(pulse=Pulse(1e-10, 1e-10)))
 
 
-@pytest.mark.parametrize(("background", "share"), [(2, 0.94), (10, 0.76), (50, 0.39)])
-def test_published_dark_share(background: float, share: float) -> None:
+@pytest.mark.parametrize(("background", "fraction"), [(2, 0.94), (10, 0.76), (50, 0.39)])
+def test_published_dark_share(background: float, fraction: float) -> None:
     flat = np.ones((64, 64))
     expected = from_rgbd(flat, flat, flat, TRAIN, PhotonBudget(10, background), convention="published")
-    assert expected.dark_share == pytest.approx(share, abs=0.005)
+    assert expected.dark_fraction == pytest.approx(fraction, abs=0.005)
     assert expected.background.mean() == pytest.approx(background)
 
 
@@ -154,8 +154,8 @@ def test_nyuv2_frames_and_their_bins(frame: str, level: tuple, shared_data: Path
     assert (expected.rates.argmax(axis=-1) == raw["rates"].argmax(axis=-1)).all()
     # pixels are column-major: their photons lie where the bins are
     near = np.abs(np.arange(1024) + 1 - raw["bin"][..., None].astype(int) - 0.77) < 6
-    share = histogram.counts[near].sum() / histogram.counts.sum()
-    assert share > 0.9 * (level[0] + sum(level) * 12 / 1024) / sum(level) * 0.9
+    fraction = histogram.counts[near].sum() / histogram.counts.sum()
+    assert fraction > 0.9 * (level[0] + sum(level) * 12 / 1024) / sum(level) * 0.9
 
 
 # The newer layout
@@ -278,7 +278,7 @@ def test_worked_example_number_by_number() -> None:
     budget = EXAMPLE.budget(target(), SENSOR)
     assert budget.signal == pytest.approx(per_pulse * cycles, rel=1e-5)
     assert budget.background == pytest.approx(background + 125 / 30, rel=1e-3)
-    said = {
+    common = {
         "photon energy": photon,
         "aperture area": aperture,
         "pixel solid angle": pixel,
@@ -295,19 +295,19 @@ def test_worked_example_number_by_number() -> None:
         "detections per cycle": (per_pulse * cycles + background + 125 / 30) / cycles,
     }
     c4, pupil = 10 ** (0.002 * (850 - 700)), math.pi / 4 * 0.007**2 / (0.1**2 * CONE_SR)
-    said |= {
+    common |= {
         "class-1 mean power": 3.9e-4 * c4,
         "share through the pupil": pupil,
         "mean power through the pupil": 1e-9 / 100e-9 * pupil,
         "class-1 energy within 5 us": 7.7e-8 * c4,
         "energy through the pupil within 5 us": 5e-6 / 100e-9 * 1e-9 * pupil,
     }
-    assert said["mean power through the pupil"] / said["class-1 mean power"] == pytest.approx(0.41, abs=0.005)
+    assert common["mean power through the pupil"] / common["class-1 mean power"] == pytest.approx(0.41, abs=0.005)
     # the standard's three branches meet: at 10 s to its two digits, at 5 us to its rounding
     middle_w, middle_j = 7e-4 * 10**0.75 / 10, 7e-4 * 5e-6**0.75
     assert middle_w == pytest.approx(3.9e-4, rel=0.02) and middle_j == pytest.approx(7.7e-8, rel=0.05)
     text = DOCUMENT.read_text(encoding="utf-8")
-    for name, value in said.items():
+    for name, value in common.items():
         row = re.search(rf"^\| {re.escape(name)} \|.*\| ([-+.\de]+) [^|]*\|$", text, re.MULTILINE)
         assert row, f"docs/radiometric.md has no row {name!r}"
         assert float(row[1]) == pytest.approx(value, rel=6e-3), name

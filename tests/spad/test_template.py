@@ -28,14 +28,14 @@ WIDE = Sensor(name="wide", pulse=Pulse(30 * WIDTH))
 def test_binned_pulse_holds_one_detection_a_period_at_its_centroid(sigma_bins: float) -> None:
     sensor = Sensor(pulse=Pulse(sigma_bins * WIDTH))
     arrival = torch.linspace(-1.3, 2.7, 41, dtype=torch.float64) * sensor.period_s
-    share = binned_pulse(arrival, sensor)
-    assert share.shape == (41, 1024) and share.min() >= 0
-    assert (share.sum(-1) - 1).abs().max() < 1e-12
+    fraction = binned_pulse(arrival, sensor)
+    assert fraction.shape == (41, 1024) and fraction.min() >= 0
+    assert (fraction.sum(-1) - 1).abs().max() < 1e-12
     # The first circular moment of a wrapped Gaussian is exp(-(2 pi sigma / P)^2 / 2) at the arrival's phase; the bins
     # multiply it by sin(x) / x, x = pi / T. Aliases are below 1e-9 for a pulse over a bin wide.
     if sigma_bins > 1:
         centres = (torch.arange(1024, dtype=torch.float64) + 0.5) / 1024 * 2 * math.pi
-        moment = (share * torch.exp(1j * centres)).sum(-1)
+        moment = (fraction * torch.exp(1j * centres)).sum(-1)
         sinc = math.sin(math.pi / 1024) / (math.pi / 1024)
         expected = math.exp(-0.5 * (2 * math.pi * sigma_bins / 1024) ** 2) * sinc
         phase = torch.exp(2j * math.pi * arrival / sensor.period_s)

@@ -96,9 +96,9 @@ def _read_some(reader: str, folder: Path, good: Path, listing: Path, count: int)
             line = process.stdout.readline()
             if not line:
                 break
-            told = json.loads(line)
-            if "ready" not in told:
-                found.append(Verdict(**told))
+            message = json.loads(line)
+            if "ready" not in message:
+                found.append(Verdict(**message))
     return found, f"death by status {process.returncode}"
 
 

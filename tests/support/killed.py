@@ -231,12 +231,12 @@ class Killed:
         for made in (folder, tmpdir):
             made.mkdir(parents=True, exist_ok=True)
 
-    def kill(self, times: int, moments: random.Random, share: float = 0.6) -> None:
+    def kill(self, times: int, moments: random.Random, fraction: float = 0.6) -> None:
         """SIGKILL after random times up to a share of the whole; a run that has ended by then begins anew."""
         killed = 0
         while killed < times:
             child = self.start()
-            status = self.warm.wait(child, moments.uniform(0, share) * self.cpu_s)
+            status = self.warm.wait(child, moments.uniform(0, fraction) * self.cpu_s)
             if status is None:
                 self.warm.kill(child)
                 killed += 1
@@ -258,8 +258,8 @@ class Killed:
 
     def check_end(self, status: int | None) -> None:
         """The same bytes as the whole run's, nothing else, and no traceback in what was printed until now."""
-        told = self.output.read_text()
-        assert status == 0 and "Traceback" not in told, told[-3000:]
+        message = self.output.read_text()
+        assert status == 0 and "Traceback" not in message, message[-3000:]
         found, expected = (contents(f / "out", self.run.unlike) for f in (self.folder, self.whole))
         assert sorted(found) == sorted(expected), {*found} ^ {*expected}
         other = [name for name in found if found[name] != expected[name]]

@@ -120,7 +120,7 @@ def test_given_constants_win():
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "message"),
     [
         ("MOV r1, #1\n  ADD r1, r16, #1", "2:11: 'r16' is no register"),
         ("NOP", "1:1: unknown instruction 'NOP'"),
@@ -156,10 +156,10 @@ def test_given_constants_win():
         ("MOV r1, #99999999999999999999", "does not fit into 32 bits"),
     ],
 )
-def test_mistakes_are_refused_with_line_and_column(source, said):
+def test_mistakes_are_refused_with_line_and_column(source, message):
     with pytest.raises(InputError) as refused:
         assemble(source, name="p.s")
-    assert said in str(refused.value) and "p.s" in str(refused.value) and "\n" not in str(refused.value)
+    assert message in str(refused.value) and "p.s" in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_files_that_are_missing_or_no_text(tmp_path):
@@ -217,7 +217,7 @@ def test_names_that_are_no_program(name):
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "message"),
     [
         (".for h in 1..2000000000\n.end\nHALT\n", "p.s:1:1: loops repeat 2000000000 lines"),
         (".for h in 1..2000000000\nHALT\n.end\n", "p.s:1:1: loops repeat"),
@@ -229,10 +229,10 @@ def test_names_that_are_no_program(name):
         (f".equ A, {'9' * 5000}\n", "does not fit into 32 bits"),
     ],
 )
-def test_loops_and_nesting_without_end_are_refused_at_once(source, said):
+def test_loops_and_nesting_without_end_are_refused_at_once(source, message):
     with pytest.raises(InputError) as refused:
         assemble(source, name="p.s")
-    assert said in str(refused.value) and "\n" not in str(refused.value)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_a_source_includes_regular_files_of_its_folder_alone(tmp_path):
@@ -242,9 +242,9 @@ def test_a_source_includes_regular_files_of_its_folder_alone(tmp_path):
     (folder / "link.s").symlink_to(tmp_path / "out.s")
     os.mkfifo(folder / "pipe.s")
     named = (("/dev/zero", "outside"), ("../out.s", "outside"), ("link.s", "outside"), ("pipe.s", "not a regular file"))
-    for name, said in named:
+    for name, message in named:
         (folder / "a.s").write_text(f'.include "{name}"\nHALT\n')
-        with pytest.raises(InputError, match=rf"a\.s:1:11: included file .*{said}"):
+        with pytest.raises(InputError, match=rf"a\.s:1:11: included file .*{message}"):
             assemble_file(folder / "a.s")
     with pytest.raises(InputError, match=r"pipe\.s: is a device, pipe or socket"):
         assemble_file(folder / "pipe.s")

@@ -118,7 +118,7 @@ def test_the_fastest_loop_that_the_store_holds_is_taken():
 
 
 @pytest.mark.parametrize(
-    ("code", "said"),
+    ("code", "message"),
     [
         (
             learned(8, 256, (2, 2)),
@@ -132,8 +132,8 @@ def test_the_fastest_loop_that_the_store_holds_is_taken():
         (learned(2, 48), r"blocks of 48 bins, expected a power of two"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_what_would(code, said):
-    with pytest.raises(InputError, match=said) as refusal:
+def test_what_does_not_fit_is_refused_with_what_would(code, message):
+    with pytest.raises(InputError, match=message) as refusal:
         compile_code(code)
     assert "\n" not in str(refusal.value)
 

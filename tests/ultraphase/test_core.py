@@ -186,7 +186,7 @@ def test_watch_shows_each_change():
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "message"),
     [
         ("MOV r1, #64\nLDB r2, [r1]\nHALT", "RAM address 64 is outside the declared 0 to 63"),
         ("MOV r1, #-1\nSTB [r1 + 0], r2\nHALT", "RAM address -1"),
@@ -199,7 +199,7 @@ def test_watch_shows_each_change():
         ("a: BNT a\nHALT", "no progress"),
     ],
 )
-def test_core_and_array_refuse_alike(source, said):
+def test_core_and_array_refuse_alike(source, message):
     code = assemble(".space data, u8, 64\n" + source, name="p")
     stream = [] if source.startswith("a:") else [1]
     for run in (
@@ -208,7 +208,7 @@ def test_core_and_array_refuse_alike(source, said):
     ):
         with pytest.raises(InputError) as refused:
             run()
-        line = said.replace("2, word 1", "3, word 1")
+        line = message.replace("2, word 1", "3, word 1")
         assert line in str(refused.value)
 
 
@@ -223,7 +223,7 @@ def test_limits_of_the_chip_are_the_specs():
 
 
 @pytest.mark.parametrize(
-    ("tables", "said"),
+    ("tables", "message"),
     [
         ({}, "table t has no contents"),
         ({"t": np.arange(3)}, r"shape \(3,\)"),
@@ -232,9 +232,9 @@ def test_limits_of_the_chip_are_the_specs():
         ({"t": np.arange(4), "u": np.arange(4)}, "no table u"),
     ],
 )
-def test_tables_are_checked(tables, said):
+def test_tables_are_checked(tables, message):
     code = assemble(".table t, u8, 4\n.space s, u8, 4\nHALT")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         Core(code, tables)
 
 
@@ -277,7 +277,7 @@ def test_a_full_link_holds_the_sender():
 
 
 @pytest.mark.parametrize(
-    ("source", "shape", "said"),
+    ("source", "shape", "message"),
     [
         ("RECV r1, east\nHALT", (1, 2), "core (0, 1) has no east neighbour"),
         ("ID r1\nBBS r1, #0, b\nRECV r2, east\nHALT\nb: HALT", (1, 2),
@@ -287,10 +287,10 @@ def test_a_full_link_holds_the_sender():
          "to take a word, which has halted"),
     ],
 )  # fmt: skip
-def test_blocked_cores_are_explained(source, shape, said):
+def test_blocked_cores_are_explained(source, shape, message):
     with pytest.raises(InputError) as refused:
         CoreArray(assemble(source, name="p"), shape).frame(np.zeros(0, int), np.zeros(shape[0] * shape[1] + 1, int))
-    assert said in str(refused.value)
+    assert message in str(refused.value)
 
 
 def test_a_core_alone_has_no_links():

@@ -233,7 +233,7 @@ ADAPTIVE = ".space sum, s16, 2\nloop: BNT idle\nRDT r1\n{body}\nJMP loop\nidle: 
 
 
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "message"),
     [
         ("LDH r2, [sum]\nBBS r2, #3, skip\nADDM [sum], r1\nskip:", "how long timestamp"),
         ("LDH r2, [sum]\nMUL r2, r2, #3\nSTH [sum], r2", "is not additive"),
@@ -243,8 +243,8 @@ ADAPTIVE = ".space sum, s16, 2\nloop: BNT idle\nRDT r1\n{body}\nJMP loop\nidle: 
         ("OUTH r1", "words leave the sensor"),
     ],
 )
-def test_programs_that_are_not_additive_are_refused(body, said):
-    with pytest.raises(InputError, match=said):
+def test_programs_that_are_not_additive_are_refused(body, message):
+    with pytest.raises(InputError, match=message):
         verify(assemble(ADAPTIVE.format(body=body), name="adaptive"))
 
 

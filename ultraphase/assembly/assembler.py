@@ -49,7 +49,7 @@ def assemble(
     chip: ChipSpec | None = None,
     read: Reader | None = None,
 ) -> Program:
-    """Source to program, checked against the chip.
+    """Return source to program, checked against the chip.
 
     name        what messages call the source
     constants   values that win over the source's `.equ`
@@ -69,7 +69,8 @@ def assemble_file(
     chip: ChipSpec | None = None,
     name: str | None = None,
 ) -> Program:
-    """`assemble` of a file, called by its own name or by `name`; files that it includes are looked for beside it."""
+    """Return `assemble` of a file, called by its own name or by `name`; files that it includes are looked for beside
+    it."""
     path = Path(path)
 
     def read(name: str) -> str:
@@ -246,7 +247,7 @@ class _Assembly:
             if number:
                 cursor.expect(",")
             self._operand(cursor, kind, fields, targets)
-        self.pending.append((cursor, Instruction(name, **fields), targets))
+        self.pending.append((cursor, Instruction(name, **fields), targets))  # type: ignore[arg-type]
 
     def _operand(self, cursor: Cursor, kind: str, fields: dict, targets: dict[str, Token]) -> None:
         if kind in "dt":

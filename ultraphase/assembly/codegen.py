@@ -9,8 +9,8 @@ from ultraphase.integer_code import IntegerCode
 
 
 def turns_of(code: IntegerCode) -> Iterator[int]:
-    """How often the photon's loop over harmonics may turn, fewest first; 1: there is none. A loop needs consecutive
-    harmonics, and an even number of them a turn, as odd and even ones are stepped to differently."""
+    """Yield how often the photon's loop over harmonics may turn, fewest first; 1: there is none. A loop needs
+    consecutive harmonics, and an even number of them a turn, as odd and even ones are stepped to differently."""
     yield 1
     count = len(code.harmonics)
     if code.harmonics == tuple(range(1, count + 1)):
@@ -18,7 +18,7 @@ def turns_of(code: IntegerCode) -> Iterator[int]:
 
 
 def loop_order(code: IntegerCode, turns: int) -> str:
-    """How a photon goes through the codes, in words."""
+    """Return how a photon goes through the codes, in words."""
     if not code.harmonics:
         return f"{code.codes} codes one after the other, code-major table of {code.codes} x {code.bins} bytes"
     count, table = len(code.harmonics), f"quarter wave of {code.bins // 4} bytes for all of them"
@@ -31,7 +31,7 @@ _REGISTERS = {"p": 1, "t": 2, "u": 3, "c": 4, "i": 5, "a": 6, "b": 7, "last": 9}
 
 
 def source_of(code: IntegerCode, chip: ChipSpec, turns: int) -> str:
-    """Assembler text: RAM with the sums in front, what a photon does, and the frame's end."""
+    """Return assembler text: RAM with the sums in front, what a photon does, and the frame's end."""
     blocks, many = chip.timestamps // code.bins, code.block != (1, 1)
     moving = blocks > 1 or turns > 1 or many
     lines = [

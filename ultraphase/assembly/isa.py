@@ -129,7 +129,7 @@ class Instruction:
 
 
 def encode(instruction: Instruction) -> int:
-    """The 32-bit word."""
+    """Return the 32-bit word."""
     takes = instruction.op.takes
     value = instruction.bit << _TARGET_BITS | instruction.target if "l" in takes else instruction.value
     low = value & (1 << VALUE_BITS) - 1
@@ -138,7 +138,7 @@ def encode(instruction: Instruction) -> int:
 
 
 def decode(word: int) -> Instruction:
-    """The instruction of a word. Raises InputError for a word that no instruction has."""
+    """Return the instruction of a word. Raises InputError for a word that no instruction has."""
     code, rd, rs = word >> 26, word >> 22 & 15, word >> 18 & 15
     require(0 <= word < 1 << 32 and code < len(OPS), f"word {word:#010x}: no such opcode")
     constant, low = bool(word >> VALUE_BITS & 1), word & (1 << VALUE_BITS) - 1
@@ -170,7 +170,7 @@ def _plain(instruction: Instruction) -> bool:
 
 
 def spelled(instruction: Instruction, label: Callable[[int], str] = str) -> str:
-    """As the assembler reads it; `label` names the target of a branch."""
+    """Return as the assembler reads it; `label` names the target of a branch."""
     i = instruction
     base = "" if i.constant else f"r{i.rs} + "
     words = {

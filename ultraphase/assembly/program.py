@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from scenes.errors import require
 from ultraphase.assembly.isa import Instruction, decode, encode, spelled
 from ultraphase.chip import ChipSpec
 
-KINDS = {"u8": np.dtype("u1"), "s8": np.dtype("i1"), "s16": np.dtype("<i2")}
+KINDS: dict[str, np.dtype[Any]] = {"u8": np.dtype("u1"), "s8": np.dtype("i1"), "s16": np.dtype("<i2")}
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Program:
         return max((region.end for region in self.regions), default=0)
 
     def region(self, name: str) -> Region:
-        """The region of that name, or an InputError that lists the names."""
+        """Return the region of that name, or an InputError that lists the names."""
         found = [region for region in self.regions if region.name == name]
         names = ", ".join(region.name for region in self.regions)
         require(bool(found), f"program {self.name}: no region {name!r} in RAM, there are {names or 'none'}")
@@ -81,7 +82,7 @@ class Program:
         return tuple(region for region in self.regions if not region.table)
 
     def where(self, word: int) -> str:
-        """A word as a message names it: place in the source, and the instruction."""
+        """Return a word as a message names it: place in the source, and the instruction."""
         file, line = self.lines[word]
         return f"{file}:{line}, word {word} ({spelled(self.instructions[word], self._label)})"
 
@@ -89,7 +90,7 @@ class Program:
         return next((name for name, target in self.labels.items() if target == word), str(word))
 
     def check(self, chip: ChipSpec) -> None:
-        """InputError, with what is over, unless the program fits the chip."""
+        """Raise InputError, with what is over, unless the program fits the chip."""
         over = len(self.instructions) - chip.program_words
         require(
             over <= 0,
@@ -110,7 +111,7 @@ class Program:
                 require(inside, f"{self.where(word)}: branches to word {instruction.target}, behind the program")
 
     def image(self, tables: Mapping[str, np.ndarray], lanes: int = 1) -> np.ndarray:
-        """RAM before the first frame, (lanes, bytes up to the last region's end) uint8.
+        """Return RAM before the first frame, (lanes, bytes up to the last region's end) uint8.
 
         tables   contents by region name, (count,) for all cores alike or (lanes, count). Raises InputError for a table
                  without contents, contents of the wrong length or values, and names that are not tables.
@@ -140,14 +141,14 @@ class Program:
 
 
 def listing(program: Program, chip: ChipSpec | None = None) -> str:
-    """Address, word, clocks and source of every instruction, under the RAM map and the totals."""
+    """Return address, word, clocks and source of every instruction, under the RAM map and the totals."""
     chip = chip or ChipSpec()
     lines = [f"; {program.name}: {len(program.instructions)} of {chip.program_words} words, "]
     lines[0] += f"{program.ram_bits} of {chip.ram_bits} bits of RAM"
     for r in program.regions:
         what = "table" if r.table else "space"
         lines.append(f"; RAM {r.address:3d} .. {r.end - 1:3d}  {what} {r.name}: {r.count} x {r.kind}, {r.bits} bits")
-    names = {}
+    names: dict[int, list[str]] = {}
     for name, target in program.labels.items():
         names.setdefault(target, []).append(name)
     for address, instruction in enumerate(program.instructions):
@@ -161,7 +162,8 @@ def listing(program: Program, chip: ChipSpec | None = None) -> str:
 
 
 def disassemble(words: tuple[int, ...], regions: tuple[Region, ...] = ()) -> str:
-    """Source that assembles to the same words and regions. Raises InputError for a word that is no instruction."""
+    """Return source that assembles to the same words and regions. Raises InputError for a word that is no
+    instruction."""
     instructions = [decode(word) for word in words]
     targets = sorted({i.target for i in instructions if "l" in i.op.takes})
     lines = []

@@ -37,6 +37,7 @@ def source_lines(file: str, text: str) -> list[Line]:
     for number, raw in enumerate(text.splitlines(), start=1):
         code = raw.split(";", 1)[0].rstrip()
         line = Line(file, number, code, ())
+        tokens: tuple[Token, ...]
         included = re.match(r'\s*\.include\s+"([^"]*)"\Z', code)
         if included:
             at = included.start(1) + 1
@@ -55,8 +56,8 @@ def _tokens(line: Line) -> Iterator[Token]:
         if not found:
             column = at + len(line.text[at:]) - len(line.text[at:].lstrip()) + 1
             raise line.fail(column, f"unexpected {line.text[column - 1]!r}")
-        kind = ("number", "name", "mark")[found.lastindex - 1]
-        yield Token(found[found.lastindex], kind, found.start(found.lastindex) + 1)
+        group = found.lastindex or 0  # one of the three, each of which is one token
+        yield Token(found[group], ("number", "name", "mark")[group - 1], found.start(group) + 1)
         at = found.end()
 
 

@@ -24,12 +24,13 @@ _TESTS = {
 
 
 def may_part(one: Instruction) -> bool:
-    """Whether it ends a stretch: it branches, or a core that was taken over stops in front of it."""
+    """Return whether it ends a stretch: it branches, or a core that was taken over stops in front of it."""
     return "l" in one.op.takes or one.name in SHARED
 
 
 def source(program: Program, first: int, *, single: bool = False) -> tuple[str, int]:
-    """Statements from a word on to the first one that may part (or of that word alone), and the last word done."""
+    """Return statements from a word on to the first one that may part (or of that word alone), and the last word
+    done."""
     found: list[str] = []
     for word in range(first, len(program.instructions)):
         one = program.instructions[word]
@@ -40,7 +41,7 @@ def source(program: Program, first: int, *, single: bool = False) -> tuple[str, 
 
 
 def statements(one: Instruction, word: int, ram_bytes: int) -> list[str]:
-    """One instruction, without what follows it."""
+    """Return one instruction, without what follows it."""
     if one.name in ALU_SPELLED:
         value = _value(one)
         spelled = re.sub(r"\b[ab]\b", lambda name: f"r[{one.rs}]" if name[0] == "a" else value, ALU_SPELLED[one.name])

@@ -29,7 +29,7 @@ class Measured(NamedTuple):
     limit: float
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Error in units of its limit; a limit of 0 allows no error at all."""
         if not math.isfinite(self.error):
             return math.inf
@@ -54,13 +54,14 @@ class Case:
 
 
 def clipped(*transients: Transient) -> int:
-    """Everything that the renders say they clipped or could not hold."""
+    """Return everything that the renders say they clipped or could not hold."""
     counters = ("clipped_footprints", "overflowed", "clipped_samples")
     return sum(int(transient.meta.get(name, 0)) for transient in transients for name in counters)
 
 
 def moments_of(transient: Transient, kept: np.ndarray | None = None) -> Moments:
-    """Per pixel: total radiance, mean path and the path's standard deviation (intervals included) of kept returns."""
+    """Return per pixel: total radiance, mean path and the path's standard deviation (intervals included) of kept
+    returns."""
     kept = np.ones(transient.returns, bool) if kept is None else kept
     pixel, shape = transient.return_pixel[kept], (transient.height, transient.width)
     near, far = transient.path_near_m[kept].astype(float), transient.path_far_m[kept].astype(float)
@@ -74,17 +75,17 @@ def moments_of(transient: Transient, kept: np.ndarray | None = None) -> Moments:
 
 
 def centre_path_m(transient: Transient) -> np.ndarray:
-    """The middle of every return's path interval [m], float64."""
+    """Return the middle of every return's path interval [m], float64."""
     return (transient.path_near_m.astype(float) + transient.path_far_m) / 2
 
 
 def worst(got: np.ndarray, expected: np.ndarray) -> float:
-    """Largest relative difference; infinite where something is missing."""
+    """Return largest relative difference; infinite where something is missing."""
     return float(np.nan_to_num(np.abs(got / expected - 1), nan=np.inf).max())
 
 
 def farthest_m(got: np.ndarray, expected: np.ndarray) -> float:
-    """Largest difference; infinite where something is missing."""
+    """Return largest difference; infinite where something is missing."""
     return float(np.nan_to_num(np.abs(got - expected), nan=np.inf).max())
 
 
@@ -97,7 +98,7 @@ def relative(got: float, expected: float) -> float:
 
 
 def over_renders(values: list[float], bias: float = 0.0) -> Measured:
-    """The mean of an error that independent renders measured, against what its scatter allows.
+    """Return the mean of an error that independent renders measured, against what its scatter allows.
 
     The limit is Student's t with n - 1 degrees of freedom at a two-sided FALSE_ALARM, times the standard error of the
     mean, and what the comparison itself is off by.
@@ -107,6 +108,6 @@ def over_renders(values: list[float], bias: float = 0.0) -> Measured:
 
 
 def independent(scene: Scene, settings: RenderSettings, seed: int) -> list[Transient]:
-    """RENDERS renders whose seeds follow from one."""
+    """Return RENDERS renders whose seeds follow from one."""
     seeds = np.random.SeedSequence(seed).generate_state(RENDERS)
     return [render(scene, settings, seed=int(one)) for one in seeds]

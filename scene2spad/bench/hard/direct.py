@@ -33,7 +33,7 @@ from spad.sensor.model import PhotonBudget, sensor_by_name
 
 SMOOTH = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
 FINE = RenderSettings(bounces=1, grid=8, direct_tolerance_m=1e-4)
-EDGES = RenderSettings(bounces=1, grid=16, least_share=0, direct_tolerance_m=1e-4)
+EDGES = RenderSettings(bounces=1, grid=16, edge_threshold=0, direct_tolerance_m=1e-4)
 # A cell's radiance is its centre's: with 16 x 4 cells over 34 degrees cos^4 is off by 4/24 (0.0096)^2 = 2e-5.
 CELL_ENERGY = 5e-5
 FLOAT32 = float(np.finfo(np.float32).eps)
@@ -60,12 +60,12 @@ def _on_sensor(name: str, distance_m: float, seed: int) -> Outcome:
     counts, wrapped = expected_counts(transient, sensor, rates_for(transient, sensor, budget), slice(0, pixels))
     expected = wall_on_sensor(scene, sensor, distance_m=distance_m)
     histogram = counts.sum(dim=0).numpy() / (budget.signal * pixels)
-    said = sense(transient, sensor, budget, seed=seed).meta["wrapped"]
+    reported = sense(transient, sensor, budget, seed=seed).meta["wrapped"]
     outcome.errors.update(
         {
             "counts": Measured(nrmse(histogram, expected.histogram), 1e-3),
             "wrapped share [1]": Measured(abs(wrapped / (budget.signal * pixels) - expected.wrapped), 1e-4),
-            "wrapped as reported [1]": Measured(abs(said - expected.wrapped), 1e-4),
+            "wrapped as reported [1]": Measured(abs(reported - expected.wrapped), 1e-4),
             "brightest bin [bins]": Measured(abs(int(histogram.argmax()) - int(expected.histogram.argmax())), 0),
         }
     )

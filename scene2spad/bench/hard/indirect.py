@@ -123,8 +123,8 @@ def _dark_sphere(seed: int) -> Outcome:
     longest = 2 * scenes.SPHERE_RADIUS_M + 0.05
     two = {"radius_m": scenes.SPHERE_RADIUS_M, "offset_m": scenes.SPHERE_OFFSET_M, "albedo": albedo, "bounces": 2}
     legs = integrating_sphere(scene, **two).mean_path_m.ravel() - 4 * scenes.SPHERE_RADIUS_M / 3
-    share = two_chords_longer_than(longest, scenes.SPHERE_RADIUS_M)
-    expected = share * albedo**3 / (4 * np.pi**2 * scenes.SPHERE_RADIUS_M**2)
+    fraction = two_chords_longer_than(longest, scenes.SPHERE_RADIUS_M)
+    expected = fraction * albedo**3 / (4 * np.pi**2 * scenes.SPHERE_RADIUS_M**2)
     third = []
     for transient in renders:
         late = centre_path_m(transient) - legs[transient.return_pixel] > longest

@@ -34,7 +34,7 @@ from scenes.library.hard_cases import hard_case
 from scenes.model import Scene
 
 SMOOTH = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
-EDGES = RenderSettings(bounces=1, grid=16, least_share=0, direct_tolerance_m=1e-4)
+EDGES = RenderSettings(bounces=1, grid=16, edge_threshold=0, direct_tolerance_m=1e-4)
 CAUSTIC = RenderSettings(bounces=2, grid=4, spp=256, indirect_tolerance_m=1e-2, indirect_growth=0)
 # A specular return is one number per pixel, in float32 from a handful of operations.
 SPECULAR_ENERGY, SPECULAR_PATH_M = 1e-4, 1e-5

@@ -39,13 +39,14 @@ class Moments(NamedTuple):
 
 
 def pixel_samples(view: Camera, per_side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre rays of every pixel: unit directions (H, W, n, 3) and weights (n,) that sum to 1."""
+    """Return Gauss-Legendre rays of every pixel: unit directions (H, W, n, 3) and weights (n,) that sum to 1."""
     node, weight = np.polynomial.legendre.leggauss(per_side)
     return _directions(view, (node + 1) / 2), np.outer(weight / 2, weight / 2).ravel()
 
 
 def midpoint_samples(view: Camera, per_side: int, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Equally spaced rays, for what is not smooth: of every pixel, or (P, n, 3) of the P that a (H, W) mask chooses."""
+    """Return equally spaced rays, for what is not smooth: of every pixel, or (P, n, 3) of the P that a (H, W) mask
+    chooses."""
     return _directions(view, (np.arange(per_side) + 0.5) / per_side, pixels), np.full(per_side**2, per_side**-2.0)
 
 
@@ -58,7 +59,7 @@ def _directions(view: Camera, node: np.ndarray, pixels: np.ndarray | None = None
 
 
 def moments(radiance: np.ndarray, path: np.ndarray, weight: np.ndarray) -> Moments:
-    """Moments of (H, W, n) samples of weights (n,)."""
+    """Return moments of (H, W, n) samples of weights (n,)."""
     total = (radiance * weight).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = (radiance * path * weight).sum(-1) / total
@@ -75,7 +76,7 @@ def plane_moments(
     per_side: int = 6,
     transmission: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Moments:
-    """Moments of an unbounded Lambertian plane through (0, 0, -distance) under a laser at the camera.
+    """Return moments of an unbounded Lambertian plane through (0, 0, -distance) under a laser at the camera.
 
     L = albedo / pi I cos / d^2 along the ray at distance d = n.p0 / n.r, path 2 d; times `transmission`, there and
     back, as a function of the cosine between ray and camera axis.
@@ -94,7 +95,7 @@ def plane_moments(
 def bounded_plane_moments(
     scene: Scene, *, distance_m: float, tilt_deg: float, half_size_m: float, albedo: float, per_side: int = 64
 ) -> Moments:
-    """`plane_moments` of a square of that half size (in `wall`'s frame), nothing beside it."""
+    """Return `plane_moments` of a square of that half size (in `wall`'s frame), nothing beside it."""
     directions, weight = midpoint_samples(scene.camera, per_side)
     c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
     cosine = -(directions @ np.array([s, 0, c]))
@@ -116,7 +117,7 @@ def sphere_moments(
     per_side: int = 48,
     pixels: np.ndarray | None = None,
 ) -> Moments:
-    """Moments of a sphere centred at (0, 0, -distance); midpoint rule, since the limb is not smooth.
+    """Return moments of a sphere centred at (0, 0, -distance); midpoint rule, since the limb is not smooth.
 
     `reflected(cosine)` is f cos of light that goes back where it came from, at this cosine to the normal.
     """
@@ -132,12 +133,12 @@ def sphere_moments(
 
 
 def paint(cosine: np.ndarray, *, albedo: float) -> np.ndarray:
-    """f cos of a Lambertian surface."""
+    """Return f cos of a Lambertian surface."""
     return albedo / np.pi * cosine
 
 
 def metal(cosine: np.ndarray, *, roughness: float, eta: float, k: float) -> np.ndarray:
-    """f cos of a rough conductor whose light goes back where it came from: F_0 D G_1^2 / (4 cos).
+    """Return f cos of a rough conductor whose light goes back where it came from: F_0 D G_1^2 / (4 cos).
 
     GGX (Walter et al. 2007, eqs. 33 and 34), Fresnel's reflectance at normal incidence on its facets; the two ways are
     masked independently.
@@ -151,7 +152,7 @@ def metal(cosine: np.ndarray, *, roughness: float, eta: float, k: float) -> np.n
 
 
 def sphere_coverage(view: Camera, *, distance_m: float, radius_m: float, per_side: int = 48) -> np.ndarray:
-    """Share of each pixel that a sphere at (0, 0, -distance) covers."""
+    """Return share of each pixel that a sphere at (0, 0, -distance) covers."""
     directions, weight = midpoint_samples(view, per_side)
     return ((radius_m**2 - distance_m**2 + (directions[..., 2] * distance_m) ** 2 > 0) * weight).sum(-1)
 
@@ -167,7 +168,7 @@ class Wire(NamedTuple):
 def upright_wire(
     scene: Scene, *, distance_m: float, x_m: float, radius_m: float, albedo: float, nodes: int = 8
 ) -> Wire:
-    """A round wire (x, y, -distance), thin against D = hypot(x, distance), under a laser at the camera.
+    """Return a round wire (x, y, -distance), thin against D = hypot(x, distance), under a laser at the camera.
 
     Its image is 2 r f D / distance^2 pixels wide. At height y, rho^2 = D^2 + y^2, a strip at the angle phi around it
     has radiance albedo/pi I cos(phi) (D / rho) / rho^2 and projected width r cos(phi) dphi: the mean over the width is
@@ -207,7 +208,7 @@ def shadowed_wall(
     post_albedo: float,
     per_side: int = 48,
 ) -> Shadowed:
-    """A frontal wall behind an upright frontal post that is taller than the image, under a displaced laser.
+    """Return a frontal wall behind an upright frontal post that is taller than the image, under a displaced laser.
 
     L = albedo/pi I cos_L / |x - L|^2 at path |x - C| + |x - L| where the segment from x to the laser misses the post.
     """
@@ -230,12 +231,12 @@ def shadowed_wall(
     post = (x_post > low) & (x_post < high)
     radiance = np.where(post, on_post, np.where(dark, 0, on_wall))
     seen = moments(radiance, np.where(post, post_path, wall_path), weight)
-    shares = ((covered * weight).sum(-1) for covered in (post, dark & ~post))
+    fractions = ((covered * weight).sum(-1) for covered in (post, dark & ~post))
     camera_x = [x / post_m for x in post_x_m]  # the edges in camera rays' x / z
     camera_x += [(laser[0] + (x - laser[0]) * wall_m / post_m) / wall_m for x in post_x_m]
     columns = np.floor(np.array(camera_x) * scene.camera.focal_px + scene.camera.width / 2)
     return Shadowed(
-        seen, (on_wall * weight).sum(-1), np.maximum(radiance, on_wall).max(-1), *shares, columns.astype(int)
+        seen, (on_wall * weight).sum(-1), np.maximum(radiance, on_wall).max(-1), *fractions, columns.astype(int)
     )
 
 
@@ -256,7 +257,7 @@ def disk_before_wall(
     wall_albedo: float,
     per_side: int = 64,
 ) -> Leaf:
-    """A frontal disk around the axis before a frontal wall, laser at the camera: L = albedo/pi I cos^3 / z^2."""
+    """Return a frontal disk around the axis before a frontal wall, laser at the camera: L = albedo/pi I cos^3 / z^2."""
     directions, weight = midpoint_samples(scene.camera, per_side)
     cosine = -directions[..., 2]
     on_disk = disk_m * np.sqrt(1 - cosine**2) / cosine < radius_m
@@ -274,7 +275,7 @@ def groove_interreflection(
     opening_deg: float = 90.0,
     nodes: int = 56,
 ) -> np.ndarray:
-    """Image mean of light that meets both walls of `groove_of` once, per path-length bin: float64 quadrature.
+    """Return image mean of light that meets both walls of `groove_of` once, per path-length bin: float64 quadrature.
 
     L_2 = (albedo/pi)^2 I / d_2^2 cos_L cos_1 cos_2 / r^2 dA_2 at path |C x_1| + r + |x_2 C|. The kernel peaks where the
     walls meet, so nodes across the walls are graded toward that line (u = v^3) and nodes along it toward the other

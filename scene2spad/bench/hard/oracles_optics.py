@@ -15,7 +15,7 @@ from spad.sensor.model import Sensor
 
 
 def fresnel(cosine: np.ndarray | float, ior: float) -> np.ndarray:
-    """Unpolarised reflectance of an interface from air to glass: the mean of both polarisations' squares."""
+    """Return unpolarised reflectance of an interface from air to glass: the mean of both polarisations' squares."""
     cosine = np.asarray(cosine, float)
     inside = np.sqrt(1 - (1 - cosine**2) / ior**2)
     across = (cosine - ior * inside) / (cosine + ior * inside)
@@ -24,7 +24,8 @@ def fresnel(cosine: np.ndarray | float, ior: float) -> np.ndarray:
 
 
 def pane_transmission(cosine: np.ndarray | float, ior: float) -> np.ndarray:
-    """A thin pane with all its inner reflections lets (1 - F) / (1 + F) through; the rest, 2 F / (1 + F), returns."""
+    """Return a thin pane with all its inner reflections lets (1 - F) / (1 + F) through; the rest, 2 F / (1 + F),
+    returns."""
     reflectance = fresnel(cosine, ior)
     return (1 - reflectance) / (1 + reflectance)
 
@@ -32,7 +33,7 @@ def pane_transmission(cosine: np.ndarray | float, ior: float) -> np.ndarray:
 def mirror_return(
     view: Camera, laser: Laser, toward: np.ndarray, reflectance: float, one_way_m: float
 ) -> tuple[tuple[int, int], float]:
-    """Pixel (row, column) that looks `toward` a laser's mirror image, and its pixel-mean radiance [1/(m^2 sr)].
+    """Return pixel (row, column) that looks `toward` a laser's mirror image, and its pixel-mean radiance [1/(m^2 sr)].
 
     The image at unfolded distance D sends the irradiance R I / D^2 from one direction: radiance R I / (D^2 Omega).
     """
@@ -46,7 +47,8 @@ def mirror_return(
 def caustic_moments(
     scene: Scene, *, wall_m: float, panel_m: float, depths_m: tuple[float, float], reflectance: float, albedo: float
 ) -> Moments:
-    """What a polished panel at x = panel, upright and along the axis, throws from a laser at the camera on the wall.
+    """Return what a polished panel at x = panel, upright and along the axis, throws from a laser at the camera on the
+    wall.
 
     The laser's mirror image at (2 panel, 0, 0) lights the wall with I R cos / D^2, D the unfolded distance:
     L = albedo/pi R I cos / D^2 at path D + |x|. NaN where the panel does not mirror all of a pixel.
@@ -68,7 +70,7 @@ def caustic_moments(
 def slab_moments(
     scene: Scene, *, wall_m: float, thickness_m: float, ior: float, albedo: float, per_side: int = 4
 ) -> Moments:
-    """A frontal wall seen through a frontal slab of glass, laser at the camera, every ray refracted.
+    """Return a frontal wall seen through a frontal slab of glass, laser at the camera, every ray refracted.
 
     A ray at the angle theta meets the wall at h = (d - t) tan(theta) + t tan(theta'), sin(theta) = n sin(theta'). The
     cone between theta and theta + dtheta lights the ring 2 pi h dh: E = I (1 - F)^2 sin(theta) / (h dh/dtheta), at
@@ -89,7 +91,7 @@ def slab_moments(
 
 
 def geometric_sum(albedo: float, first: int, last: int) -> float:
-    """albedo^first + ... + albedo^last."""
+    """Return albedo^first + ... + albedo^last."""
     return math.fsum(albedo**k for k in range(first, last + 1))
 
 
@@ -103,7 +105,7 @@ class SphereLight(NamedTuple):
 
 
 def integrating_sphere(scene: Scene, *, radius_m: float, offset_m: float, albedo: float, bounces: int) -> SphereLight:
-    """A Lambertian sphere around an isotropic laser, the camera at the offset from the centre on its own axis.
+    """Return a Lambertian sphere around an isotropic laser, the camera at the offset from the centre on its own axis.
 
     The form factor between any two points is dA / (4 pi r^2), and so is what the laser sends: every surface is lit
     evenly, the k-th by albedo^(k-1) / (4 pi r^2), so that L_k = albedo^k / (4 pi^2 r^2). Each of the k - 1 legs between
@@ -116,9 +118,11 @@ def integrating_sphere(scene: Scene, *, radius_m: float, offset_m: float, albedo
     cosine = -directions[..., 2]
     last = offset_m * cosine + np.sqrt(radius_m**2 - offset_m**2 * (1 - cosine**2))
     last_mean = (last * weight).sum(-1)
-    share = energy / energy.sum()
-    chords = (share * (orders - 1)).sum()
-    chord_variance = (share * (orders - 1 - chords) ** 2).sum() * (4 * radius_m / 3) ** 2 + chords * 2 * radius_m**2 / 9
+    fraction = energy / energy.sum()
+    chords = (fraction * (orders - 1)).sum()
+    chord_variance = (fraction * (orders - 1 - chords) ** 2).sum() * (
+        4 * radius_m / 3
+    ) ** 2 + chords * 2 * radius_m**2 / 9
     return SphereLight(
         math.fsum(energy) / (4 * np.pi**2 * radius_m**2),
         radius_m + chords * 4 * radius_m / 3 + last_mean,
@@ -127,7 +131,8 @@ def integrating_sphere(scene: Scene, *, radius_m: float, offset_m: float, albedo
 
 
 def two_chords_longer_than(length_m: float, radius_m: float) -> float:
-    """Probability that two independent chords of a sphere, each of density c / (2 r^2) up to 2 r, sum to more."""
+    """Return probability that two independent chords of a sphere, each of density c / (2 r^2) up to 2 r, sum to
+    more."""
     node, weight = np.polynomial.legendre.leggauss(64)
     low = max(0.0, length_m - 2 * radius_m)
     first = low + (2 * radius_m - low) * (node + 1) / 2
@@ -144,19 +149,20 @@ class WallCounts(NamedTuple):
 
 
 def wall_on_sensor(scene: Scene, sensor: Sensor, *, distance_m: float, per_side: int = 6) -> WallCounts:
-    """A frontal wall on a sensor with a Gaussian pulse: the pulse's integral over bins of time, wrapped at the period.
+    """Return a frontal wall on a sensor with a Gaussian pulse: the pulse's integral over bins of time, wrapped at the
+    period.
 
     A ray at the cosine c from the axis has weight c^3 and path 2 d / c.
     """
     directions, weight = pixel_samples(scene.camera, per_side)
     cosine = -directions[..., 2]
     time = (2 * distance_m / cosine / SPEED_OF_LIGHT_M_PER_S).ravel()
-    share = (cosine**3 * weight).ravel() / (cosine**3 * weight).sum()
+    fraction = (cosine**3 * weight).ravel() / (cosine**3 * weight).sum()
     period = sensor.bins_per_period
     first = math.floor((time.min() - sensor.pulse.reach_s) / sensor.bin_width_s)
     last = math.ceil((time.max() + sensor.pulse.reach_s) / sensor.bin_width_s)
     edges = np.arange(first, last + 1)
-    arrived = ndtr((edges[:, None] * sensor.bin_width_s - time) / sensor.pulse.sigma_s) @ share
+    arrived = ndtr((edges[:, None] * sensor.bin_width_s - time) / sensor.pulse.sigma_s) @ fraction
     mass = np.diff(arrived)
     histogram = np.zeros(period)
     np.add.at(histogram, edges[:-1] % period, mass)

@@ -11,7 +11,7 @@ from render.transient.samples import Samples
 
 
 def binned(samples: Samples, pixels: int, bins: int, bin_m: float) -> np.ndarray:
-    """Radiance per pixel and bin, (pixels, bins) float32; bin i covers path lengths [i, i + 1) * bin_m.
+    """Return radiance per pixel and bin, (pixels, bins) float32; bin i covers path lengths [i, i + 1) * bin_m.
 
     A sample is uniform over path +- half width (a point where that is 0) and gives each bin its share of the interval;
     what lies outside [0, bins * bin_m) is dropped. Scattered by as many threads as the peer scatters with.
@@ -37,7 +37,7 @@ def _scattered(pixel: Any, near: Any, far: Any, radiance: Any, bins: Any, size: 
     density = dr.select(point, radiance, radiance / (far - near))
     while place <= last:
         overlap = dr.minimum(far, Float(place) + 1) - dr.maximum(near, Float(place))
-        share = dr.select(point, 1, overlap)
-        dr.scatter_reduce(dr.ReduceOp.Add, out, density * share, pixel * bins + UInt32(place))
+        fraction = dr.select(point, 1, overlap)
+        dr.scatter_reduce(dr.ReduceOp.Add, out, density * fraction, pixel * bins + UInt32(place))
         place += 1
     return out

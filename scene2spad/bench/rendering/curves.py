@@ -34,7 +34,8 @@ class Reached:
 
 
 def front(points: list[Point]) -> list[Point]:
-    """The points that no cheaper point beats, by rising seconds and falling error; errors of 0 are below resolution."""
+    """Return the points that no cheaper point beats, by rising seconds and falling error; errors of 0 are below
+    resolution."""
     kept: list[Point] = []
     for point in sorted(points, key=lambda p: (p.seconds, p.error)):
         if point.error > 0 and math.isfinite(point.error) and (not kept or point.error < kept[-1].error):
@@ -43,7 +44,7 @@ def front(points: list[Point]) -> list[Point]:
 
 
 def slopes(points: list[Point]) -> list[float]:
-    """d log(error) / d log(seconds) between consecutive qualities, in the order given; NaN where undefined."""
+    """Return d log(error) / d log(seconds) between consecutive qualities, in the order given; NaN where undefined."""
     found = []
     for left, right in pairwise(points):
         run = math.log(right.seconds / left.seconds)
@@ -53,13 +54,13 @@ def slopes(points: list[Point]) -> list[float]:
 
 
 def flattens(points: list[Point]) -> bool:
-    """The last step, to a dearer quality, no longer lowers the error as Monte Carlo would."""
+    """Return the last step, to a dearer quality, no longer lowers the error as Monte Carlo would."""
     last = slopes(points)[-1:]
     return bool(last) and points[-1].seconds > points[-2].seconds and last[0] > FLATTENED
 
 
 def seconds_at(points: list[Point], error: float, *, kindly: bool = False) -> Reached:
-    """Seconds that a method needs for an error. `points` in the order of their quality.
+    """Return seconds that a method needs for an error. `points` in the order of their quality.
 
     Beyond the best point error ~ seconds^-1/2 goes on, or the curve's own last slope where that is flatter; `kindly`,
     where that is steeper (stratified samples converge faster than plain ones), but no steeper than -1. Not farther than
@@ -72,8 +73,8 @@ def seconds_at(points: list[Point], error: float, *, kindly: bool = False) -> Re
         return Reached(curve[0].seconds, "cheapest")
     for left, right in pairwise(curve):
         if right.error <= error:
-            share = math.log(left.error / error) / math.log(left.error / right.error)
-            return Reached(left.seconds * (right.seconds / left.seconds) ** share, "interpolated")
+            fraction = math.log(left.error / error) / math.log(left.error / right.error)
+            return Reached(left.seconds * (right.seconds / left.seconds) ** fraction, "interpolated")
     if flattens(points):
         return Reached(math.inf, "flattened")
     own = slopes(curve[-2:]) or [MONTE_CARLO]
@@ -102,7 +103,8 @@ class Ratio:
 
 
 def ratio_at(ours: list[Point], theirs: list[Point], error: float) -> Ratio:
-    """Time ratio at equal error; 0 where ours does not reach it, NaN where neither does, inf where only ours does.
+    """Return time ratio at equal error; 0 where ours does not reach it, NaN where neither does, inf where only ours
+    does.
 
     Where a curve must be carried on, the doubt is theirs to gain.
     """

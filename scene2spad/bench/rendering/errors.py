@@ -19,7 +19,8 @@ KINDS = ("raw", "pulse")
 
 
 def pulse_kernel(sigma_bins: float = PULSE_SIGMA_BINS) -> np.ndarray:
-    """Weights of bins 0, 1, 2, ... away from a pulse at a bin's centre: Phi over each bin; both sides sum to 1."""
+    """Return weights of bins 0, 1, 2, ... away from a pulse at a bin's centre: Phi over each bin; both sides sum to
+    1."""
     edge = np.arange(math.ceil(5 * sigma_bins) + 2) - 0.5
     weight = np.diff(0.5 * (1 + erf(edge / (sigma_bins * math.sqrt(2)))))
     return weight / (weight[0] + 2 * weight[1:].sum())
@@ -35,7 +36,7 @@ def _band() -> tuple[int, np.ndarray]:
 
 
 def pulsed(histogram: np.ndarray) -> np.ndarray:
-    """(pixels, bins) after the Gaussian pulse; what it pushes past the first and last bin is dropped."""
+    """Return (pixels, bins) after the Gaussian pulse; what it pushes past the first and last bin is dropped."""
     reach, band = _band()
     pixels, bins = histogram.shape
     padded = np.zeros((pixels, bins + 2 * reach), np.float32)
@@ -104,7 +105,7 @@ class Reference:
         return int((~self.kept).sum())
 
     def energy(self) -> float:
-        """Sum of the mean of the halves over all judged pixels and bins [1/(m^2 sr)]."""
+        """Return the sum of the mean of the halves over all judged pixels and bins [1/(m^2 sr)]."""
         return (radiance(self.a, self.kept) + radiance(self.b, self.kept)) / 2
 
 
@@ -157,9 +158,10 @@ class Judge:
         self.runs += 1
 
     def errors(self) -> Errors:
+        assert self.total is not None, "errors of no run"
         whole = self.reference.power.sum(axis=1)
         square = self.squared.sum(axis=1) / self.runs
-        nrmse = tuple(_root(s, w) for s, w in zip(square, whole, strict=True))
+        nrmse = _root(square[0], whole[0]), _root(square[1], whole[1])
         bias = (math.nan, math.nan)
         n = np.float32(self.runs)
         if self.runs > 1:
@@ -167,11 +169,13 @@ class Judge:
             pairs = self.reference.kept * (together - self.squared) / (self.runs * (self.runs - 1))
             # without a bias every pixel's sum has mean 0, and its square is its variance
             clear = pairs.sum(axis=1) > 2 * np.sqrt((pairs**2).sum(axis=1))
-            bias = tuple(_root(s, w) for s, w in zip(np.where(clear, pairs.sum(axis=1), 0), whole, strict=True))
+            square = np.where(clear, pairs.sum(axis=1), 0)
+            bias = _root(square[0], whole[0]), _root(square[1], whole[1])
         power = self.reference.power[1]
         lit = power > 0
         relative = np.sqrt(np.maximum(self.squared[1][lit] / self.runs, 0) / power[lit])
-        pixel = tuple(float(v) for v in np.quantile(relative, (0.5, 0.95))) if lit.any() else (math.nan, math.nan)
+        middle, high = np.quantile(relative, (0.5, 0.95)) if lit.any() else (math.nan, math.nan)
+        pixel = float(middle), float(high)
         energy = radiance(self.total, self.reference.kept) / self.runs / max(self.reference.energy(), 1e-300)
         return Errors(nrmse, bias, pixel, energy)
 

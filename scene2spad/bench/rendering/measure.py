@@ -101,7 +101,7 @@ def peer_runner(peer: Peer, method: Method) -> Runner:
 def measure_level(
     level: list[tuple[Runner, int]], reference: Reference, repeats: int, seeds: int, first_seed: int = 1
 ) -> Iterator[tuple[Runner, int, dict]]:
-    """Time and judge each (runner, quality): `repeats` warm runs of different seeds, `seeds` of them judged.
+    """Yield time and judge each (runner, quality): `repeats` warm runs of different seeds, `seeds` of them judged.
 
     The same method runs once untimed before every timed run, so that none pays for the memory that another left.
     """
@@ -143,7 +143,7 @@ def measure_level(
 
 
 def with_slopes(rows: list[Row]) -> list[Row]:
-    """The rows of one method, cheapest quality first, with the slopes between them."""
+    """Return the rows of one method, cheapest quality first, with the slopes between them."""
     columns = {}
     for kind in ("raw", "pulse"):
         points = curve(rows, kind)
@@ -157,7 +157,7 @@ def with_slopes(rows: list[Row]) -> list[Row]:
 
 
 def curve(rows: list[Row], kind: str) -> list[Point]:
-    """The rows of one method as points; kind is raw or pulse. What the reference cannot resolve has error 0."""
+    """Return the rows of one method as points; kind is raw or pulse. What the reference cannot resolve has error 0."""
     points = []
     for row in rows:
         error, resolution = getattr(row, f"nrmse_{kind}"), getattr(row, f"resolution_{kind}")

@@ -18,7 +18,8 @@ SIZE, SPP = 256, 64
 
 
 def run(command: Bench, progress: Progress) -> dict:
-    """One process a method, 256 x 256 pixels (or the first of --sizes), 64 samples a pixel, full transport."""
+    """Run the bench: one process a method, 256 x 256 pixels (or the first of --sizes), 64 samples a pixel, full
+    transport."""
     scene, size = (command.scenes or ("flash",))[0], (command.sizes or (SIZE,))[0]
     methods = list(METHODS["full"])
     if command.peer == "none" or not peers.available():
@@ -41,7 +42,7 @@ def run(command: Bench, progress: Progress) -> dict:
 
 
 def measure(name: str, scene_name: str, size: int, data: Path | None) -> float:
-    """Peak resident memory of loading the scene and rendering it, above the process as it is now [MB].
+    """Return peak resident memory of loading the scene and rendering it, above the process as it is now [MB].
 
     Ours ends at its samples, since nothing of ours needs bins; mitransient has nothing but the dense tensor.
     """
@@ -71,7 +72,7 @@ def reset_peak_mb() -> float:
 
 
 def peak_mb() -> float:
-    """Peak resident memory since the process's start or the last reset [MB]; NaN where it cannot be told."""
+    """Return peak resident memory since the process's start or the last reset [MB]; NaN where it cannot be told."""
     return _status_mb("VmHWM")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from render.direct.integrator import least_share_of
+from render.direct.integrator import default_edge_threshold
 from render.pipeline import trace as trace_light
 from render.scene.traced_scene import TracedScene
 from render.settings import Plan, RenderSettings
@@ -13,10 +13,10 @@ MERGED_M = 0.0  # nothing is merged: a histogram follows at once
 
 
 def trace(world: TracedScene, method: Method, bounces: int, quality: int, seed: int) -> Samples:
-    """Merged samples of all pixels, nothing planned or estimated: every setting is forced."""
+    """Return merged samples of all pixels, nothing planned or estimated: every setting is forced."""
     grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality), quality)
     forced = {"bounces": bounces, "spp": spp, "grid": grid, "filter": method.filter}
-    exact = {"least_share": least_share_of(grid), "direct_tolerance_m": MERGED_M}
+    exact = {"edge_threshold": default_edge_threshold(grid), "direct_tolerance_m": MERGED_M}
     settings = RenderSettings(**forced, **exact)
     plan = Plan(**forced, **exact, ambient=False, reasons=())
     return trace_light(world, plan, settings, seed=seed).samples

@@ -61,21 +61,21 @@ class Peer:
             "sampler": {"type": sampler, "sample_count": 16},
             "film": film,
         }
-        meshes = {f"mesh{i}": shape for i, shape in enumerate(world.traced.shapes())}
+        meshes = {f"mesh{i}": shape for i, shape in enumerate(world.mi_scene.shapes())}
         described = {"type": "scene", "embree_use_robust_intersections": True, "sensor": sensor, "laser": _laser(scene)}
         self.scene = mi.load_dict({**described, **meshes}, optimize=False)
         self.integrator = mi.load_dict({"type": "transient_path", "max_depth": bounces + 1})
         self.shape = (camera.height * camera.width, bins)
 
     def render(self, spp: int, seed: int) -> Any:
-        """The evaluated tensor, (H, W, bins, 1): radiance per pixel and bin."""
+        """Return the evaluated tensor, (H, W, bins, 1): radiance per pixel and bin."""
         _, tensor = mi.render(self.scene, integrator=self.integrator, spp=spp, seed=seed)
         dr.eval(tensor)
         dr.sync_thread()
         return tensor
 
     def histogram(self, tensor: Any) -> np.ndarray:
-        """The tensor's own memory as (pixels, bins) float32."""
+        """Return the tensor's own memory as (pixels, bins) float32."""
         return np.array(tensor.array, copy=False).reshape(self.shape)
 
 

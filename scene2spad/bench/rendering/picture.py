@@ -66,8 +66,8 @@ def _panel(axes: Axes, rows: list[Row], kind: str, lines: dict[str, object]) -> 
                 ls="-" if full else ":",
                 mfc=colour if full else "white",
             )
-            said = "full transport" if full else "direct light"
-            lines.setdefault(f"{method}, {said}" if method != settings.OURS_DIRECT.name else method, line)
+            message = "full transport" if full else "direct light"
+            lines.setdefault(f"{method}, {message}" if method != settings.OURS_DIRECT.name else method, line)
     first = rows[0]
     axes.set(xscale="log", yscale="log")
     axes.set_title(f"{first.scene}, {first.size} x {first.size}", fontsize=10)

@@ -8,6 +8,7 @@ import logging
 import os
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ def default_folder() -> Path:
 
 
 def key_of(parts: dict) -> str:
-    """A hash of everything that decides a reference (plain JSON values)."""
+    """Return a hash of everything that decides a reference (plain JSON values)."""
     return hashlib.sha256(json.dumps({**parts, "format": FORMAT}, sort_keys=True).encode()).hexdigest()[:20]
 
 
@@ -36,9 +37,9 @@ def reference(
     passes: int,
     make: Callable[[int], np.ndarray],
     maker: str,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> Reference:
-    """Both halves, from the folder or made now: `make(seed)` is one pass, (pixels, bins) float32.
+    """Return both halves, from the folder or made now: `make(seed)` is one pass, (pixels, bins) float32.
 
     After every pass the half is saved, so that a stopped run goes on where it was.
     """
@@ -47,15 +48,20 @@ def reference(
     for half in range(2):
         path = folder / f"{name}-{key_of({**parts, 'passes': passes})}-{'AB'[half]}.npz"
         first = FIRST_SEED * (half + 1)
-        halves.append(_half(path, passes, first, make, lambda done, h=half: progress((h + done / passes) / 2)))
-    return Reference(*halves, maker)
+        report = partial(_report_half, progress, half, passes)
+        halves.append(_half(path, passes, first, make, report))
+    return Reference(halves[0], halves[1], maker)
+
+
+def _report_half(progress: Callable[[float], None], half: int, passes: int, done: int) -> None:
+    progress((half + done / passes) / 2)
 
 
 def _half(
     path: Path, passes: int, first: int, make: Callable[[int], np.ndarray], progress: Callable[[int], None]
 ) -> np.ndarray:
     mean, done = _load(path)
-    if done >= passes:
+    if mean is not None and done >= passes:
         return mean
     total = None if mean is None else mean.astype(np.float64) * done
     for number in range(done, passes):
@@ -65,6 +71,7 @@ def _half(
         mean = (total / (number + 1)).astype(np.float32)
         with whole_file(path) as beside:
             np.savez_compressed(beside, mean=mean, passes=number + 1)
+    assert mean is not None, "a reference of no pass"
     return mean
 
 

@@ -59,7 +59,7 @@ METHODS = {
 
 
 def qualities(method: Method, transport: str, size: int, quick: bool) -> tuple[int, ...]:
-    """The qualities measured, by rising cost. Larger images get fewer."""
+    """Return the qualities measured, by rising cost. Larger images get fewer."""
     if method is OURS_DIRECT:
         return (1, 2, 3, 5, 8, 12) if size <= 128 else (1, 2, 3, 5)
     if method is INDEPENDENT:  # plain Monte Carlo: its slope is known
@@ -76,12 +76,13 @@ def qualities(method: Method, transport: str, size: int, quick: bool) -> tuple[i
 
 
 def grid_beside(spp: int) -> int:
-    """Direct rays a pixel side that go with indirect `spp`, so that direct light costs least error for its time."""
+    """Return direct rays a pixel side that go with indirect `spp`, so that direct light costs least error for its
+    time."""
     return 4 if spp < 16 else 5 if spp < 64 else 7 if spp < 256 else 9
 
 
 def reference_passes(transport: str, size: int) -> tuple[int, int]:
-    """(passes, samples a pixel in each) of one half of the reference, multijittered.
+    """Return (passes, samples a pixel in each) of one half of the reference, multijittered.
 
     The larger the image, the fewer: crosswise, noise that is independent in N bins cancels as 1/sqrt(N).
     """
@@ -92,12 +93,13 @@ def reference_passes(transport: str, size: int) -> tuple[int, int]:
 
 
 def data_folder(given: Path | None) -> Path:
-    """Where the data for checks lies: the option, SCENE2SPAD_DATA, or ../shared/data beside the working folder."""
+    """Return where the data for checks lies: the option, SCENE2SPAD_DATA, or ../shared/data beside the working
+    folder."""
     return given or Path(os.environ.get("SCENE2SPAD_DATA", "../shared/data"))
 
 
 def bench_scene(name: str, size: int, data: Path | None = None) -> Scene:
-    """One of SCENES, `size` x `size` pixels. Raises InputError where the artist's file is absent."""
+    """Return one of SCENES, `size` x `size` pixels. Raises InputError where the artist's file is absent."""
     if name == "artist":
         path = data_folder(data) / ARTIST_FILE
         if not path.is_file():
@@ -113,7 +115,7 @@ def bench_scene(name: str, size: int, data: Path | None = None) -> Scene:
 
 
 def comparable(scene: Scene) -> Scene:
-    """The scene without what the two codes do not share, so that both estimate one quantity.
+    """Return the scene without what the two codes do not share, so that both estimate one quantity.
 
     Steady light goes (only the laser is compared). A delta light lights nothing through glass or cut-outs in
     mitransient, and nothing in perfect mirrors in either's shadow rays: glass goes, cut-outs are solid, mirrors grey.

@@ -20,7 +20,7 @@ WIDTH = 0.36  # of a model's cloud of points
 
 
 def label_of(trained: Trained) -> str:
-    """Design, block and parameters, as in the paper: Fourier codes by the quarter wave that generates them."""
+    """Return design, block and parameters, as in the paper: Fourier codes by the quarter wave that generates them."""
     design = trained.config.model.design
     kind = design.name.rsplit(" ", 2)[0]
     mark = GENERATED if design.computed is not None else ""
@@ -35,8 +35,8 @@ def draw(
     lines: Sequence[tuple[str, np.ndarray, Sequence[np.ndarray]]],
     path: Path,
 ) -> Path:
-    """Above, MAE of every image, coloured by SBR, with median, mean, quartiles and 1.5 times their range; below, a line
-    of depth images a photon level, the truth first."""
+    """Draw above, MAE of every image, coloured by SBR, with median, mean, quartiles and 1.5 times their range; below, a
+    line of depth images a photon level, the truth first."""
     count = len(labels)
     figure = plt.figure(figsize=(max(6.5, 2.0 * (count + 1) + 1.2), 4.2 + 1.75 * len(lines)), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(4.2, 1.75 * len(lines)))
@@ -47,7 +47,7 @@ def draw(
     points = panel.collections[-1]
     above.colorbar(points, ax=panel, pad=0.01).set_label("signal / background", fontsize=8)
     axes = below.subplots(len(lines), count + 1, squeeze=False)
-    for row, (told, truth, maps) in zip(axes, lines, strict=True):
+    for row, (title, truth, maps) in zip(axes, lines, strict=True):
         known = truth[np.isfinite(truth)]
         margin = 0.5 * known.std()
         colours = {"cmap": DEPTH_COLOURS, "vmin": known.min() - margin, "vmax": known.max() + margin}
@@ -56,7 +56,7 @@ def draw(
             one.set(xticks=[], yticks=[])
             error = 1e3 * np.nanmean(np.abs(depth - truth))
             one.set_title("truth" if depth is truth else f"MAE {error:,.1f} mm", fontsize=7.5)
-        row[0].set_ylabel(told, fontsize=8)
+        row[0].set_ylabel(title, fontsize=8)
         bar = below.colorbar(shown, ax=row[-1], fraction=0.06, pad=0.03)
         bar.set_label("depth [m]", fontsize=7)
         bar.ax.tick_params(labelsize=7)

@@ -101,7 +101,7 @@ _SMOKE = {
 
 
 def sheets_of(study: str, preset: str, full: bool) -> tuple[Sheet, ...]:
-    """The figures of a study: at 128x, with `full` at every compression of the paper; `smoke` has two models."""
+    """Return the figures of a study: at 128x, with `full` at every compression of the paper; `smoke` has two models."""
     make, compressions = _SHEETS[study]
     if preset == "smoke":
         (first, *_) = make(128, preset)

@@ -67,22 +67,22 @@ def run(command: Study, progress: Progress) -> dict:
     with whole_file(path) as beside:
         beside.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
     files = {"figures": [str(each) for each in drawn], "csv": [str(each) for each in made], "numbers": str(path)}
-    return {**(numbers if command.json else _told(numbers)), **files, "shipped": shipped}
+    return {**(numbers if command.json else _summary(numbers)), **files, "shipped": shipped}
 
 
 def decided(claim: Claim, rows: Sequence[Row], models: Mapping[ModelSpec, Trained]) -> dict[str, Any]:
-    """A conclusion with its numbers: holds, does not hold, or not decided.
+    """Return a conclusion with its numbers: holds, does not hold, or not decided.
 
     The paired difference of MAE over scenes and levels decides, by its 95 % interval: `better` holds where it lies
     below 0 and does not where it lies above; `comparable` holds where it lies within ALIKE_WITHIN of the second's MAE,
     and does not where it lies outside. Where models were trained by several seeds it is of their means, and the means
     of every seed of one and every seed of the other have to say the same.
     """
-    told = {"claim": claim.text, "says": f"{claim.first.name} {claim.relation} {claim.second.name}"}
+    common = {"claim": claim.text, "says": f"{claim.first.name} {claim.relation} {claim.second.name}"}
     seeds = [[one.name for one in models if replace(one, seed=of.seed) == of] for of in (claim.first, claim.second)]
     missing = [one.name for one, names in zip((claim.first, claim.second), seeds, strict=True) if not names]
     if missing:
-        return {**told, "levels": claim.levels, "verdict": "not decided", "why": f"absent: {', '.join(missing)}"}
+        return {**common, "levels": claim.levels, "verdict": "not decided", "why": f"absent: {', '.join(missing)}"}
     evaluation = Evaluation(list(rows))
     first, second = (evaluation.interval(names, levels=claim.levels).mean for names in seeds)
     apart = evaluation.difference(*seeds, claim.levels)
@@ -93,11 +93,11 @@ def decided(claim: Claim, rows: Sequence[Row], models: Mapping[ModelSpec, Traine
     pairs = [(a - b, a - b, a - b) for a in each[0] for b in each[1]]
     if any(verdict(claim.relation, pair, second) != found for pair in pairs):
         found = "not decided"
-    return {**told, "levels": claim.levels, **numbers, "verdict": found}
+    return {**common, "levels": claim.levels, **numbers, "verdict": found}
 
 
 def verdict(relation: str, apart: Sequence[float], second_mm: float) -> str:
-    """What an interval (mean, low, high) of first - second says of a relation."""
+    """Return what an interval (mean, low, high) of first - second says of a relation."""
     _, low, high = apart
     if not (np.isfinite(low) and np.isfinite(high)):
         return "not decided"
@@ -129,7 +129,7 @@ def _drawn(
     return figures.draw(title, labels, [one.name for one in mine], rows, lines, path)
 
 
-def _told(numbers: dict[str, Any]) -> dict[str, list[str]]:
+def _summary(numbers: dict[str, Any]) -> dict[str, list[str]]:
     """What the terminal shows: conclusions, MAE of every model, and the published numbers beside ours."""
     conclusions = []
     for one in numbers["conclusions"]:

@@ -34,19 +34,20 @@ class ChipFrame:
 
 
 def core_tables(compiled: Compiled, row: int = 0, column: int = 0) -> dict[str, np.ndarray]:
-    """Tables of one core of a block."""
+    """Return tables of one core of a block."""
     tables = compiled.tables(compiled.block)
     return {name: values if values.ndim == 1 else values[row, column] for name, values in tables.items()}
 
 
 def measured(compiled: Compiled) -> Cost:
-    """Clocks and bits of a compiled code on emulated cores."""
+    """Return clocks and bits of a compiled code on emulated cores."""
     tables = compiled.tables(compiled.block)
     return cost_of(compiled.program, compiled.block, core_tables(compiled), tables, compiled.chip)
 
 
 def interpret(counts: np.ndarray, compiled: Compiled) -> ChipFrame:
-    """One frame of a view, every photon a timestamp that a core's program works on. counts (H, W, 1024) integers."""
+    """Return one frame of a view, every photon a timestamp that a core's program works on. counts (H, W, 1024)
+    integers."""
     height, width = counts.shape[:2]
     rows = max(_CORES // width // compiled.block[0], 1) * compiled.block[0]
     parts, total = [], None
@@ -84,7 +85,7 @@ class FastCores:
         return cls(compiled, tuple(tuple(found[r, c] for c in range(columns)) for r in range(rows)))
 
     def frame(self, counts: np.ndarray) -> tuple[np.ndarray, int]:
-        """Codes (H / Mr, W / Mc, numbers) of counts (H, W, 1024), and how many of the cores' sums do not fit."""
+        """Return codes (H / Mr, W / Mc, numbers) of counts (H, W, 1024), and how many of the cores' sums do not fit."""
         rows, columns = self.compiled.block
         tiled = counts.shape[0] % rows == 0 and counts.shape[1] % columns == 0
         size = f"image of {counts.shape[1]} x {counts.shape[0]} pixels"
@@ -101,7 +102,8 @@ class FastCores:
 
 
 def trial(compiled: Compiled, seed: int) -> dict[str, int]:
-    """One block of cores, 550 photons each, 50 of them in one return: numbers that differ from the torch path's."""
+    """Return one block of cores, 550 photons each, 50 of them in one return: numbers that differ from the torch
+    path's."""
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(9,)))
     rows, columns = compiled.block
     counts = random.poisson((_TRIAL_PHOTONS - 50) / TIMESTAMPS, (rows, columns, TIMESTAMPS)).astype(np.int32)
@@ -117,7 +119,7 @@ def trial(compiled: Compiled, seed: int) -> dict[str, int]:
 
 @torch.no_grad()
 def network_depth(chip: ChipModel, codes: np.ndarray, decoder: Decoder | None = None) -> np.ndarray:
-    """Depth (H, W) float32 [m] that the model's own network finds from what left the sensor.
+    """Return depth (H, W) float32 [m] that the model's own network finds from what left the sensor.
 
     The integers are scaled to the model's codes, zero-normalised, and back-projected with the chip's tensor.
     """
@@ -145,7 +147,7 @@ class ChipDepth:
         int8_rule: Int8Rule = "calibrated",
         decoder: Decoder | None = None,
     ) -> tuple[np.ndarray, int]:
-        """Depth map (H, W) float32 [m], and how many of the cores' sums wrapped; always in 8 bits.
+        """Return depth map (H, W) float32 [m], and how many of the cores' sums wrapped; always in 8 bits.
 
         Raises InputError for another sensor's histogram, and an image that blocks do not tile.
         """

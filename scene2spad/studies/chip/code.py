@@ -81,7 +81,7 @@ def _is_histogram(design: Design, coding: CodingTensor) -> bool:
 
 
 def harmonics_of(design: Design, temporal: np.ndarray, sensor: Sensor) -> tuple[int, ...]:
-    """Harmonics of a Fourier code that one quarter wave gives back within a step of its phase; none of another.
+    """Return harmonics of a Fourier code that one quarter wave gives back within a step of its phase; none of another.
 
     Codes that hold the pulse have waves of different heights: they are a table.
     """
@@ -100,8 +100,8 @@ def harmonics_of(design: Design, temporal: np.ndarray, sensor: Sensor) -> tuple[
 
 
 def codes_by_torch(counts: np.ndarray, compiled: Compiled) -> np.ndarray:
-    """Integers that leave the sensor, without a program: strided products with the int8 tensor (`encode_blocks`), in
-    the chip's number formats. counts (H, W, 1024) -> (H / Mr, W / Mc, numbers) int64.
+    """Return integers that leave the sensor, without a program: strided products with the int8 tensor
+    (`encode_blocks`), in the chip's number formats. counts (H, W, 1024) -> (H / Mr, W / Mc, numbers) int64.
 
     Every core's sums are exact in float64, then wrap at 16 bits (8-bit counters saturate).
     """
@@ -118,7 +118,8 @@ def codes_by_torch(counts: np.ndarray, compiled: Compiled) -> np.ndarray:
 
 
 def leave_sensor(sums: np.ndarray, compiled: Compiled) -> np.ndarray:
-    """What a frame's end makes of the exact sums of every core: (H, W, numbers) -> (H / Mr, W / Mc, numbers) int64."""
+    """Return what a frame's end makes of the exact sums of every core: (H, W, numbers) -> (H / Mr, W / Mc, numbers)
+    int64."""
     if compiled.code.counters:
         return np.minimum(sums, COUNTER_LIMIT)
     held = (sums + HALF) % (2 * HALF) - HALF
@@ -133,7 +134,8 @@ def leave_sensor(sums: np.ndarray, compiled: Compiled) -> np.ndarray:
 
 
 def listing_with_tables(compiled: Compiled) -> str:
-    """The program's listing, then the contents of its tables, those of each core of a block one after the other."""
+    """Return the program's listing, then the contents of its tables, those of each core of a block one after the
+    other."""
     lines = [listing(compiled.program, compiled.chip)]
     rows, columns = compiled.block
     for name, values in compiled.tables(compiled.block).items():

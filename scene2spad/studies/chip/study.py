@@ -104,14 +104,14 @@ def _by_pair(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, np.ndarra
 def compared_rows(
     name: str, models: Sequence[str], values: Mapping[str, Mapping[str, np.ndarray]]
 ) -> list[dict[str, Any]]:
-    """A row a model: MAE of both, and the paired difference as a share of the float model's with its 95 % interval
-    (bootstrap over scenes and levels). `holds` where the whole interval is within WITHIN."""
+    """Return a row a model: MAE of both, and the paired difference as a share of the float model's with its 95 %
+    interval (bootstrap over scenes and levels). `holds` where the whole interval is within WITHIN."""
     rows = []
     for model in models:
         plain, chip = values[model], values[f"{model}{_CHIP}"]
         mae, mae_chip = (float(np.mean([np.nanmean(v) for v in of.values()])) for of in (plain, chip))
         apart = paired_difference(chip, plain)
-        share, low, high = (part / mae for part in apart)
+        fraction, low, high = (part / mae for part in apart)
         rows.append(
             {
                 "set": name,
@@ -120,10 +120,10 @@ def compared_rows(
                 "levels": int(next(iter(plain.values())).size),
                 "float_mae_mm": mae,
                 "chip_mae_mm": mae_chip,
-                "difference": share,
+                "difference": fraction,
                 "low": low,
                 "high": high,
-                "holds": bool(-WITHIN <= share <= WITHIN and high <= WITHIN) if np.isfinite(high) else None,
+                "holds": bool(-WITHIN <= fraction <= WITHIN and high <= WITHIN) if np.isfinite(high) else None,
             }
         )
     return rows
@@ -152,9 +152,9 @@ def _interpreted(one: ModelSpec, chip: ChipDepth, test: TestSet, seed: int) -> d
 def _in_words(numbers: dict[str, Any]) -> dict[str, Any]:
     lines = []
     for row in numbers["compared"]:
-        said = f"{row['float_mae_mm']:.1f} mm in float, {row['chip_mae_mm']:.1f} on the chip"
+        message = f"{row['float_mae_mm']:.1f} mm in float, {row['chip_mae_mm']:.1f} on the chip"
         apart = f"{row['difference']:+.2%} ({row['low']:+.2%} to {row['high']:+.2%})"
-        lines.append(f"{row['set']}, {row['model']}: {said}, {apart}")
+        lines.append(f"{row['set']}, {row['model']}: {message}, {apart}")
     emulated = [
         f"{row['model']}: {row['photons']:,} photons interpreted, {row['wraps']} wraps, {row['differs_from_torch']} "
         f"integers differ from torch, {row['differs_from_fast']} from the fast array"

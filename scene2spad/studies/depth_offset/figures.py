@@ -39,7 +39,7 @@ def colour_of(label: str) -> str:
 
 
 def tensors(models: Sequence[Trained], compressions: Sequence[int], out: Path) -> list[Path]:
-    """Figures 1 and 17: trained codes of seed 0 beside the fixed ones, at each compression."""
+    """Return figures 1 and 17: trained codes of seed 0 beside the fixed ones, at each compression."""
     drawn = []
     for ratio in compressions:
         fixed = [Design.named(code, (1024, 1, 1), compression=ratio) for code in ("fourier", "gray") if ratio <= 256]
@@ -55,7 +55,7 @@ def tensors(models: Sequence[Trained], compressions: Sequence[int], out: Path) -
 
 
 def every_seed(ratios: Sequence[dict], bars: Sequence[dict], path: Path) -> Path:
-    """Far error over near error of every seed, the geometric means that the bars are about, and the bars."""
+    """Return far error over near error of every seed, the geometric means that the bars are about, and the bars."""
     labels = list(dict.fromkeys(row["design"] for row in ratios))
     figure, panel = plt.subplots(figsize=(max(5.0, 1.6 * len(labels) + 1.5), 4.6), layout="constrained")
     for at, label in enumerate(labels):
@@ -73,10 +73,10 @@ def every_seed(ratios: Sequence[dict], bars: Sequence[dict], path: Path) -> Path
     plain_log(panel)
     panel.set_xticks(range(len(labels)), [label.replace(" ", "\n", 1) for label in labels], fontsize=8.5)
     panel.set_ylabel("MAE 7 m farther in time / MAE as it is")
-    told = (
+    message = (
         "Every seed: circles 128x (and without codes), squares 64x\nlines: geometric means, dotted: bars set beforehand"
     )
-    panel.set_title(told, fontsize=9)
+    panel.set_title(message, fontsize=9)
     panel.grid(alpha=0.3, axis="y", which="both")
     return save(figure, path)
 
@@ -89,7 +89,8 @@ def _on_cpu(coding: CodingTensor) -> CodingTensor:
 def against_compression(
     summary: Sequence[dict], levels: Sequence[tuple[float, float]], offset_m: float, path: Path
 ) -> Path:
-    """Figure 2: MAE and share within 10 mm against compression, a row for the set as it is and one for it far away."""
+    """Return figure 2: MAE and share within 10 mm against compression, a row for the set as it is and one for it far
+    away."""
     figure, axes = plt.subplots(2, 4, figsize=(15, 7.5), layout="constrained", sharex=True, sharey="col")
     groups = {"low_sbr": "SBR <= 0.1", "high_sbr": "SBR > 0.1"}
     names = {g: [f"[{s:g}, {b:g}]" for s, b in levels if is_low_sbr(s, b) == (g == "low_sbr")] for g in groups}
@@ -136,12 +137,12 @@ def _lines(panel: Axes, rows: Sequence[dict], figure_of: str, compressions: Sequ
 def depth_images(
     lines: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]], compression: int, path: Path
 ) -> Path:
-    """Figure 3: a line for each scene, offset and level: truth and estimates on the truth's colours, half a standard
-    deviation of the truth wider than its depths."""
+    """Return figure 3: a line for each scene, offset and level: truth and estimates on the truth's colours, half a
+    standard deviation of the truth wider than its depths."""
     designs = list(lines[0][2])
     size = (2.1 * (len(designs) + 1) + 1.4, 1.75 * len(lines) + 0.6)
     figure, axes = plt.subplots(len(lines), len(designs) + 1, figsize=size, layout="constrained", squeeze=False)
-    for row, (told, truth, maps) in zip(axes, lines, strict=True):
+    for row, (message, truth, maps) in zip(axes, lines, strict=True):
         known = truth[np.isfinite(truth)]
         margin = 0.5 * known.std()
         colours = {"cmap": DEPTH_COLOURS, "vmin": known.min() - margin, "vmax": known.max() + margin}
@@ -150,18 +151,18 @@ def depth_images(
             panel.set(xticks=[], yticks=[])
             error = 1e3 * np.nanmean(np.abs(depth - truth))
             panel.set_title(name if name == "truth" else f"{name}\nMAE {error:,.0f} mm", fontsize=7.5)
-        row[0].set_ylabel(told, fontsize=8)
+        row[0].set_ylabel(message, fontsize=8)
         bar = figure.colorbar(shown, ax=row[-1], fraction=0.06, pad=0.03)
         bar.set_label("depth [m]", fontsize=7)
         bar.ax.tick_params(labelsize=7)
     gap = "\n" if len(designs) < 3 else ", "
-    told = f"Depth at {compression}x: as it is{gap}and 7 m farther in time{gap}[signal, background] photons"
-    figure.suptitle(told, fontsize=11)
+    message = f"Depth at {compression}x: as it is{gap}and 7 m farther in time{gap}[signal, background] photons"
+    figure.suptitle(message, fontsize=11)
     return save(figure, path)
 
 
 def sweep(found: dict, path: Path) -> Path:
-    """MAE against a delay in metres; the band is where the test set's depths leave those of training."""
+    """Return MAE against a delay in metres; the band is where the test set's depths leave those of training."""
     figure, panel = plt.subplots(figsize=(8.5, 5.5), layout="constrained")
     for curve in found["curves"]:
         cured = NO_OFFSETS in curve["label"]
@@ -171,8 +172,8 @@ def sweep(found: dict, path: Path) -> Path:
     if reach is not None:
         panel.axvspan(reach - high, reach - low, color="0.9", zorder=0)
         panel.axvline(reach - middle, color="0.5", lw=1, zorder=0)
-        said = f"test depths leave the training's 99.9 % ({reach:.1f} m):\nband all pixels, line their median"
-        panel.plot([], [], color="0.5", lw=1, label=said)
+        message = f"test depths leave the training's 99.9 % ({reach:.1f} m):\nband all pixels, line their median"
+        panel.plot([], [], color="0.5", lw=1, label=message)
     plain_log(panel)
     panel.set_xlim(found["offsets_m"][0] - 0.2, found["offsets_m"][-1] + 0.2)
     levels = _levels([found])
@@ -185,7 +186,8 @@ def sweep(found: dict, path: Path) -> Path:
 
 
 def range_end(found: dict, path: Path) -> Path:
-    """Up to the end of the range: MAE of truncated Fourier by what is changed (where measured), and bias at a wall."""
+    """Return up to the end of the range: MAE of truncated Fourier by what is changed (where measured), and bias at a
+    wall."""
     count = 2 if found["arms"] else 1
     figure, panels = plt.subplots(1, count, figsize=(7 * count, 5.5), layout="constrained", squeeze=False)
     left, right = panels[0][0], panels[0][-1]
@@ -224,7 +226,8 @@ def _model_colour(name: str) -> str:
 
 
 def bars_of(cure: Sequence[dict], swap: Sequence[dict], offset_m: float, path: Path) -> Path:
-    """Left, cures: random time offsets in training, and short blocks. Right, the cause: codes and networks swapped."""
+    """Return left, cures: random time offsets in training, and short blocks. Right, the cause: codes and networks
+    swapped."""
     widths = [max(len(rows), 1) for rows in (cure, swap)]
     figure, axes = plt.subplots(1, 2, figsize=(14, 5.5), layout="constrained", sharey=True, width_ratios=widths)
     names = [row["model"].removesuffix("-s0").replace("-128x", "").replace("learned-", "") for row in cure]
@@ -238,8 +241,8 @@ def bars_of(cure: Sequence[dict], swap: Sequence[dict], offset_m: float, path: P
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(low / 2, 3 * high)
     axes[0].legend(fontsize=8, loc="upper left", ncols=2)
-    told = "b: biased, trained as published; t8: trained with random time offsets to 8 m"
-    figure.suptitle(f"Cure and cause at 128x, seed 0; {told}", fontsize=11)
+    message = "b: biased, trained as published; t8: trained with random time offsets to 8 m"
+    figure.suptitle(f"Cure and cause at 128x, seed 0; {message}", fontsize=11)
     return save(figure, path)
 
 
@@ -258,7 +261,8 @@ def _pairs(panel: Axes, names: Sequence[str], rows: Sequence[dict], offset_m: fl
 
 
 def energy(models: Mapping[ModelSpec, Trained], ratios: Sequence[dict], path: Path) -> Path:
-    """Above, energy of a long code by depth and training step, one panel a design; below, the ratio against step."""
+    """Return above, energy of a long code by depth and training step, one panel a design; below, the ratio against
+    step."""
     first = [w for w in models if w.seed == 0 and w.compression == 128]
     shown = first or [*models][:1]
     figure = plt.figure(figsize=(max(8.0, 3.9 * len(shown)), 8), layout="constrained")

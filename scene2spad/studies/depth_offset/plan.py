@@ -93,7 +93,7 @@ SMOKE = Plan(
 
 
 def plan_of(preset: str, full: bool) -> Plan:
-    """The plan of a preset; `full`: all 16 levels, 32x and 256x too, and the whole test set in the sweep."""
+    """Return the plan of a preset; `full`: all 16 levels, 32x and 256x too, and the whole test set in the sweep."""
     if preset == "smoke":
         return SMOKE
     if not full:

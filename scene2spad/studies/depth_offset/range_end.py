@@ -89,7 +89,7 @@ class Correlated:
 
 
 def arm(trained: Trained, name: str, offset_m: float = 0.0) -> EvaluatedModel:
-    """The model with one thing changed, by its key in ARMS; `offset_m` is how far inputs are moved back."""
+    """Return the model with one thing changed, by its key in ARMS; `offset_m` is how far inputs are moved back."""
     bins = round(offset_m / trained.config.model.sensor.bin_depth_m)
     layer, network = trained.model.layer, trained.model.network
     if name == "correlation":
@@ -112,12 +112,12 @@ def _digest(trained: Trained, how: str) -> str:
 
 
 def arm_rows(errors: Mapping[tuple[str, float], Sequence[float]]) -> list[dict[str, Any]]:
-    """A row an arm and offset from the MAE [mm] of every seed: mean, least and largest."""
+    """Return a row an arm and offset from the MAE [mm] of every seed: mean, least and largest."""
     return [{"arm": name, "offset_m": metres, **_over_seeds(values)} for (name, metres), values in errors.items()]
 
 
 def seed_rows(rows: Mapping[float, Sequence[Row]], wanted: Iterable[ModelSpec]) -> list[dict[str, Any]]:
-    """A row a design and offset: MAE [mm] over its seeds, from rows by offset."""
+    """Return a row a design and offset: MAE [mm] over its seeds, from rows by offset."""
     designs = by_design(wanted)
     return [
         {"design": label, "compression": ratio, "offset_m": metres}
@@ -136,7 +136,7 @@ def _over_seeds(values: Sequence[float]) -> dict[str, Any]:
 def wall_errors(
     store: Store, subject: EvaluatedModel, depths_m: Sequence[float], level: tuple[float, float], seed: int
 ) -> list[dict[str, float]]:
-    """Bias and MAE [mm] of a model before a wall at each depth, every pixel equally far; kept in the store."""
+    """Return bias and MAE [mm] of a model before a wall at each depth, every pixel equally far; kept in the store."""
     found = []
     for number, depth_m in enumerate(depths_m):
         key = {"wall_m": float(depth_m), "signal": level[0], "background": level[1], "seed": seed}
@@ -153,13 +153,13 @@ def wall_errors(
 
 def observation(arms: Sequence[Mapping[str, Any]], factor: float) -> list[str]:
     """Say of every arm how far its largest error lies over that at no offset; `factor` times is called a failure."""
-    said = []
+    lines = []
     for name in dict.fromkeys(row["arm"] for row in arms):
         mine = [row for row in arms if row["arm"] == name]
         near, worst = mine[0], max(mine, key=lambda row: row["mae_mm"])
         verdict = "fails" if worst["mae_mm"] > factor * near["mae_mm"] else "holds to the end of the range"
-        said.append(
+        lines.append(
             f"{name} ({ARMS[name]}): {near['mae_mm']:,.0f} mm as it is, at most {worst['mae_mm']:,.0f} mm "
             f"({worst['least_mm']:,.0f} to {worst['largest_mm']:,.0f} by seed) at +{worst['offset_m']:g} m: {verdict}"
         )
-    return said
+    return lines

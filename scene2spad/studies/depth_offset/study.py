@@ -59,21 +59,21 @@ class Session:
     rows: list[dict] = field(default_factory=list)
 
     def named(self, wanted: Iterable[ModelSpec]) -> list[EvaluatedModel]:
-        """Those of them that were found."""
+        """Return those of them that were found."""
         return [self.models[one].subject for one in wanted if one in self.models]
 
     def one_seed(self) -> list[ModelSpec]:
-        """Seed 0 of every design at 128x."""
+        """Return seed 0 of every design at 128x."""
         return [w for w in self.plan.headline if w.coded and w.seed == 0 and w.compression == 128]
 
     @cached_property
     def reach_m(self) -> float | None:
         """The 99.9 % depth of the training sets, the largest where they differ; None where it is not told."""
         data = [t.config.data for w, t in self.models.items() if not w.time_offset_m]
-        told = [float(d["training_reach_m"]) for d in data if "training_reach_m" in d]
-        if not told and self.trained_on not in (None, Path(PLANES)):
-            told = [training_reach_m(split_views(read_views(self.trained_on))[0])]
-        return max(told, default=None)
+        lines = [float(d["training_reach_m"]) for d in data if "training_reach_m" in d]
+        if not lines and self.trained_on not in (None, Path(PLANES)):
+            lines = [training_reach_m(split_views(read_views(self.trained_on))[0])]
+        return max(lines, default=None)
 
     def measure(
         self,
@@ -84,12 +84,12 @@ class Session:
         delay_m: float = 0.0,
         maps: Sequence[int] = (),
     ) -> list[Row]:
-        """Rows of a part of the study, kept for the table too."""
+        """Return rows of a part of the study, kept for the table too."""
         found = evaluated(
             self.store, subjects, test, levels, delay_m=delay_m, maps=maps, seed=self.seed, progress=self.progress
         )
-        told = {"part": part, "set": test.name, "mode": test.mode, "offset_m": delay_m or test.offset_m}
-        self.rows += [{**told, **row} for row in as_dicts(found)]
+        common = {"part": part, "set": test.name, "mode": test.mode, "offset_m": delay_m or test.offset_m}
+        self.rows += [{**common, **row} for row in as_dicts(found)]
         return found
 
     def rendered(self, name: str, offset_m: float = 0.0, mode: str = "time") -> TestSet:
@@ -112,7 +112,7 @@ def run(command: Study, progress: Progress) -> dict:
     made = [write_csv(rows, command.out / f"depth-offset{name}.csv") for name, rows in written.items() if rows]
     with whole_file(command.out / "depth-offset.json") as beside:
         beside.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
-    shown = numbers if command.json else _told(numbers)
+    shown = numbers if command.json else _summary(numbers)
     files = {"figures": [str(path) for path in drawn], "csv": [str(path) for path in made]}
     return {**shown, **files, "numbers": str(command.out / "depth-offset.json"), "shipped": shipped}
 
@@ -167,9 +167,9 @@ def _modes(study: Session, near: Sequence[Row], far: Sequence[Row]) -> list[dict
     for mode in ("ray", "rigid") if subjects else ():
         moved = study.rendered(TEST_SET, OFFSET_M, mode)
         found[mode] = study.measure("space", subjects, moved, plan.space_levels)
-    told = {"levels": [list(level) for level in levels]}
+    common = {"levels": [list(level) for level in levels]}
     return [
-        {"model": s.name, **{mode: tables.mean_error(rows, s.name, levels) for mode, rows in found.items()}, **told}
+        {"model": s.name, **{mode: tables.mean_error(rows, s.name, levels) for mode, rows in found.items()}, **common}
         for s in subjects
     ]
 
@@ -204,11 +204,11 @@ def _sweep(study: Session, base: TestSet) -> dict[str, Any]:
         curves.append({"model": one.name, "label": one.label, "mae_mm": errors, "breaks_at_m": broken})
     depth = sorted(float(d) for t in test.views.transients for d in t.depth_m.ravel() if d == d)
     reach, span = study.reach_m, [depth[0], depth[len(depth) // 2], depth[-1]]
-    told = {"levels": [list(level) for level in plan.sweep_levels], "scenes": len(test.views.scenes)}
+    common = {"levels": [list(level) for level in plan.sweep_levels], "scenes": len(test.views.scenes)}
     # nearest, median and farthest pixel: the offset at which it leaves the training depths
     leaves = None if reach is None else [reach - depth_m for depth_m in span]
     ends = {"training_reach_m": reach, "test_depths_m": span, "leaves_training_at_m": leaves}
-    return {"offsets_m": [*plan.sweep_m], "curves": curves, **ends, **told}
+    return {"offsets_m": [*plan.sweep_m], "curves": curves, **ends, **common}
 
 
 def _range_end(study: Session, base: TestSet) -> dict[str, Any]:
@@ -292,7 +292,7 @@ def _swap(study: Session, base: TestSet) -> list[dict]:
 
 
 def swapped(codes: Trained, network: Trained) -> EvaluatedModel:
-    """A model of one's codes and the other's network. InputError where the designs differ."""
+    """Return a model of one's codes and the other's network. InputError where the designs differ."""
     alike = codes.config.model == network.config.model
     require(alike, f"{codes.wanted.name} and {network.wanted.name} are of different designs: nothing to swap")
     model = DepthModel(codes.config.model)
@@ -315,8 +315,8 @@ def _energies(study: Session) -> list[dict]:
         energy = tables.energy_of(trained, reach)
         if energy is not None:
             bar = None if one.time_offset_m else energy.trained < tables.ENERGY_BAR
-            told = {"model": one.name, "training_reach_m": reach, "at_start": energy.start}
-            found.append({**told, "trained": energy.trained, "under_half": bar})
+            common = {"model": one.name, "training_reach_m": reach, "at_start": energy.start}
+            found.append({**common, "trained": energy.trained, "under_half": bar})
     return found
 
 
@@ -345,13 +345,13 @@ def _depth_images(study: Session, base: TestSet, shown: Sequence[int], out: Path
                         w.label: depth_map(study.store, study.models[w].subject, base, view, level, delay, study.seed)
                         for w in mine
                     }
-                    told = f"{base.views.scenes[view].split('/')[-1]}\n{'+7 m' if delay else 'as it is'}\n"
-                    lines.append((f"{told}[{level[0]:g}, {level[1]:g}]", base.truth_m(view, delay), maps))
+                    message = f"{base.views.scenes[view].split('/')[-1]}\n{'+7 m' if delay else 'as it is'}\n"
+                    lines.append((f"{message}[{level[0]:g}, {level[1]:g}]", base.truth_m(view, delay), maps))
         drawn.append(figures.depth_images(lines, ratio, out / f"depth-offset-3-{ratio}x.png"))
     return drawn
 
 
-def _told(numbers: dict[str, Any]) -> dict[str, list[str]]:
+def _summary(numbers: dict[str, Any]) -> dict[str, list[str]]:
     """What the terminal shows: the bars, every seed's ratio, the energies, where designs break, what fails far out."""
     holds = {True: "holds", False: "does not hold", None: "not decided"}
     bars = [f"{b['design']}: {b['geometric_mean']:.2f}, {b['bar']}: {holds[b['holds']]}" for b in numbers["bars"]]

@@ -41,7 +41,7 @@ class Energy(NamedTuple):
 def mean_error(
     rows: Iterable[Row], name: str, levels: Sequence[tuple[float, float]] | None = None, figure: str = "mae_mm"
 ) -> float:
-    """Mean over scenes and levels of a figure of one model, all pixels; NaN where it was not measured."""
+    """Return mean over scenes and levels of a figure of one model, all pixels; NaN where it was not measured."""
     found = [
         getattr(row, figure)
         for row in rows
@@ -55,17 +55,17 @@ def geometric_mean(values: Sequence[float]) -> float:
 
 
 def ratio_rows(near: Sequence[Row], far: Sequence[Row], wanted: Sequence[ModelSpec]) -> list[dict]:
-    """MAE [mm] near and far of every model and seed at RATIO_LEVELS, and far over near."""
+    """Return MAE [mm] near and far of every model and seed at RATIO_LEVELS, and far over near."""
     rows = []
     for one in wanted:
         errors = [mean_error(part, one.name, RATIO_LEVELS) for part in (near, far)]
-        told = {"model": one.name, "design": one.label, "compression": one.compression, "seed": one.seed}
-        rows.append({**told, "near_mm": errors[0], "far_mm": errors[1], "ratio": errors[1] / errors[0]})
+        common = {"model": one.name, "design": one.label, "compression": one.compression, "seed": one.seed}
+        rows.append({**common, "near_mm": errors[0], "far_mm": errors[1], "ratio": errors[1] / errors[0]})
     return rows
 
 
 def verdicts(ratios: Sequence[dict], wanted: Sequence[ModelSpec]) -> list[dict]:
-    """Each bar: the geometric mean over seeds at each compression, then over compressions, and whether it holds.
+    """Return each bar: the geometric mean over seeds at each compression, then over compressions, and whether it holds.
 
     `holds` is None where no model of the design was found.
     """
@@ -80,18 +80,19 @@ def verdicts(ratios: Sequence[dict], wanted: Sequence[ModelSpec]) -> list[dict]:
         mean = geometric_mean([geometric_mean(values) for values in each.values() if values])
         holds = None if math.isnan(mean) else mean >= limit if sense == LEAST else mean < limit
         label = ModelSpec(design, block).label
-        told = {f"{ratio}x": values for ratio, values in each.items()}
-        found.append({"design": label, "bar": f"{sense} {limit:g}", "geometric_mean": mean, "holds": holds, **told})
+        common = {f"{ratio}x": values for ratio, values in each.items()}
+        found.append({"design": label, "bar": f"{sense} {limit:g}", "geometric_mean": mean, "holds": holds, **common})
     return found
 
 
-def summary_rows(rows: Sequence[Row], wanted: Sequence[ModelSpec], told: Mapping[str, object]) -> list[dict]:
-    """Per design and compression, seeds together: mean and 95 % interval over scenes and seeds, by level group."""
+def summary_rows(rows: Sequence[Row], wanted: Sequence[ModelSpec], common: Mapping[str, object]) -> list[dict]:
+    """Return per design and compression, seeds together: mean and 95 % interval over scenes and seeds, by level
+    group."""
     evaluation, found = Evaluation(list(rows)), []
     for (label, ratio), members in by_design(wanted).items():
         names = [one.name for one in members]
         for levels in LEVEL_GROUPS:
-            line = {"design": label, "compression": ratio, "seeds": len(names), **told, "levels": levels}
+            line = {"design": label, "compression": ratio, "seeds": len(names), **common, "levels": levels}
             for figure in ("mae_mm", "rmse_mm", "within_10mm"):
                 interval = evaluation.interval(names, levels=levels, figure=figure)
                 mean, low, high = interval or (math.nan,) * 3
@@ -101,7 +102,7 @@ def summary_rows(rows: Sequence[Row], wanted: Sequence[ModelSpec], told: Mapping
 
 
 def by_design(wanted: Iterable[ModelSpec]) -> dict[tuple[str, int], list[ModelSpec]]:
-    """Trainings of one design at one compression by different seeds; without codes the compression is 1."""
+    """Return trainings of one design at one compression by different seeds; without codes the compression is 1."""
     found: dict[tuple[str, int], list[ModelSpec]] = {}
     for one in wanted:
         found.setdefault((one.label, one.compression if one.coded else 1), []).append(one)
@@ -109,21 +110,22 @@ def by_design(wanted: Iterable[ModelSpec]) -> dict[tuple[str, int], list[ModelSp
 
 
 def boundary_bin(reach_m: float, sensor: Sensor) -> int:
-    """The first bin that no return from up to `reach_m` and none of its pulse falls into."""
+    """Return the first bin that no return from up to `reach_m` and none of its pulse falls into."""
     after_m = sensor.response.window_s(PULSE_SIGMAS)[1] * sensor.bin_depth_m / sensor.bin_width_s
     return math.ceil((reach_m + after_m) / sensor.bin_depth_m)
 
 
 def energy_ratio(energy: np.ndarray, bins: int, boundary: int) -> float:
-    """Mean energy per bin beyond the boundary over that before it; `energy` (G,) over G equal groups of `bins` bins."""
+    """Return mean energy per bin beyond the boundary over that before it; `energy` (G,) over G equal groups of `bins`
+    bins."""
     edges = np.linspace(0, bins, len(energy) + 1)
     inside = np.clip((boundary - edges[:-1]) / np.diff(edges), 0, 1)
     return float(np.average(energy, weights=1 - inside) / np.average(energy, weights=inside))
 
 
 def energy_of(trained: Trained, reach_m: float) -> Energy | None:
-    """The code's energy ratio as trained and at its random start; None unless a temporal code over all bins is learned,
-    and the training depths leave bins free."""
+    """Return the code's energy ratio as trained and at its random start; None unless a temporal code over all bins is
+    learned, and the training depths leave bins free."""
     design, sensor = trained.config.model.design, trained.config.model.sensor
     if design is None or "temporal" not in design.learned or design.block[0] != sensor.bins:
         return None
@@ -136,7 +138,8 @@ def energy_of(trained: Trained, reach_m: float) -> Energy | None:
 
 
 def energy_history(trained: Trained) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (S,) and energies (S, G) of the code over its training; start and end alone where no log was kept."""
+    """Return steps (S,) and energies (S, G) of the code over its training; start and end alone where no log was
+    kept."""
     rows = trained.table("energy.csv")
     if rows:
         return np.array([row["step"] for row in rows]), np.array([[*row.values()][1:] for row in rows])
@@ -147,11 +150,11 @@ def energy_history(trained: Trained) -> tuple[np.ndarray, np.ndarray]:
 
 
 def break_m(offsets_m: Sequence[float], errors_mm: Sequence[float]) -> float | None:
-    """The least offset at which the error passes BREAKS_AT times that of offset 0, by straight lines between offsets;
-    None where it does not."""
+    """Return the least offset at which the error passes BREAKS_AT times that of offset 0, by straight lines between
+    offsets; None where it does not."""
     limit = BREAKS_AT * errors_mm[0]
     for i in range(1, len(errors_mm)):
         if errors_mm[i] > limit:
-            share = (limit - errors_mm[i - 1]) / (errors_mm[i] - errors_mm[i - 1])
-            return float(offsets_m[i - 1] + max(share, 0.0) * (offsets_m[i] - offsets_m[i - 1]))
+            fraction = (limit - errors_mm[i - 1]) / (errors_mm[i] - errors_mm[i - 1])
+            return float(offsets_m[i - 1] + max(fraction, 0.0) * (offsets_m[i] - offsets_m[i - 1]))
     return None

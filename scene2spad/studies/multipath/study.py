@@ -72,12 +72,12 @@ def run(command: Study, progress: Progress) -> dict:
     with whole_file(path) as beside:
         beside.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
     figure = draw(numbers["summary"], len(names), command.out / "multipath.png")
-    shown = numbers if command.json else _told(numbers)
+    shown = numbers if command.json else _summary(numbers)
     return {**shown, "figures": [str(figure)], "csv": [str(table)], "numbers": str(path)}
 
 
 def rendered_rooms(plan: Plan, folder: Path, progress: Progress) -> tuple[Transient, ...]:
-    """Every scene under a flood laser at the camera, rendered into the folder where it is not there."""
+    """Return every scene under a flood laser at the camera, rendered into the folder where it is not there."""
     found = []
     for number, (name, seed) in enumerate(plan.scenes):
         progress(name, number / len(plan.scenes))
@@ -93,20 +93,20 @@ def _described(name: str, transient: Transient) -> dict[str, Any]:
 
 
 def summary(rows: Mapping[str, Sequence[Row]], subjects: Sequence[EvaluatedModel], levels: Sequence) -> list[dict]:
-    """MAE [mm] and share within 10 mm of every method, light and level: means over scenes, all pixels."""
+    """Return MAE [mm] and share within 10 mm of every method, light and level: means over scenes, all pixels."""
     found = []
     for light, some in rows.items():
         for subject in subjects:
             for level in levels:
                 mine = _of(some, subject.name, level)
                 means = {name: float(np.mean([getattr(r, name) for r in mine])) for name in ("mae_mm", "within_10mm")}
-                told = {"light": light, "method": subject.name, "signal": level[0], "background": level[1]}
-                found.append({**told, **means})
+                common = {"light": light, "method": subject.name, "signal": level[0], "background": level[1]}
+                found.append({**common, **means})
     return found
 
 
 def by_scene(rows: Mapping[str, Sequence[Row]], subjects: Sequence[EvaluatedModel], names: Sequence[str]) -> list[dict]:
-    """MAE [mm] at HEADLINE, a row a scene and light."""
+    """Return MAE [mm] at HEADLINE, a row a scene and light."""
     return [
         {
             "scene": name,
@@ -123,8 +123,8 @@ def _of(rows: Sequence[Row], method: str, level: tuple[float, float]) -> list[Ro
 
 
 def conclusions(means: Sequence[Mapping], scenes: Sequence[Mapping]) -> list[dict]:
-    """Of every network and light: MAE beside the filter's at HEADLINE, in how many scenes the filter is better, and
-    what the least background does to it."""
+    """Return of every network and light: MAE beside the filter's at HEADLINE, in how many scenes the filter is better,
+    and what the least background does to it."""
     found = []
     methods = [name for name in dict.fromkeys(line["method"] for line in means) if name not in (FILTER, PEAK)]
     for light in dict.fromkeys(line["light"] for line in means):
@@ -148,9 +148,9 @@ def conclusions(means: Sequence[Mapping], scenes: Sequence[Mapping]) -> list[dic
     return found
 
 
-def _told(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
+def _summary(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
     """What the terminal shows."""
-    said = [
+    lines = [
         f"{LIGHTS[c['light']]}, {c['network']}: {c['mae_mm']:.0f} mm at 50 + 50 photons, {FILTER} "
         f"{c['filter_mae_mm']:.0f} mm, the filter better in {c['filter_better_in']} of {c['scenes']} scenes; at 50 + "
         f"{c['least_background']:g} {c['mae_mm_at_least_background']:.0f} and "
@@ -158,11 +158,11 @@ def _told(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
         for c in numbers["conclusions"]
     ]
     scenes = [f"{s['scene']}: {s['indirect_share']:.0%} of the light is indirect" for s in numbers["scenes"]]
-    return {"conclusions": said, "scenes": scenes, "absent": numbers["absent"] or ["none"]}
+    return {"conclusions": lines, "scenes": scenes, "absent": numbers["absent"] or ["none"]}
 
 
 def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
-    """MAE under all light against the background, a panel a signal. Networks trained on direct light alone are dashed
+    """Draw MAE under all light against the background, a panel a signal. Networks trained on direct light alone are dashed
     where the same design trained with indirect light is there."""
     mine = [line for line in means if line["light"] == "flood"]
     signals, methods = ([*dict.fromkeys(line[key] for line in mine)] for key in ("signal", "method"))

@@ -39,7 +39,7 @@ class Emulated:
 
 
 def emulate(counts: np.ndarray, method: Method, spatial: np.ndarray | None = None) -> Emulated:
-    """One frame of an image, every photon a timestamp that a core's program works on.
+    """Return one frame of an image, every photon a timestamp that a core's program works on.
 
     counts   (H, W, 1024) integers; H and W are multiples of the method's block
     spatial  (rows, columns, K) int8 weights of one block of cores, else `fixed_spatial`
@@ -63,7 +63,8 @@ def emulate(counts: np.ndarray, method: Method, spatial: np.ndarray | None = Non
 
 
 def timestamps_of(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Timestamps of every core, core after core, and where each core's begin: counts (H, W, T) -> (N,), (H W + 1,)."""
+    """Return timestamps of every core, core after core, and where each core's begin: counts (H, W, T) -> (N,), (H W +
+    1,)."""
     flat = counts.reshape(-1, counts.shape[-1])
     core, time_bin = np.nonzero(flat)
     number = flat[core, time_bin]
@@ -80,7 +81,8 @@ def _blocks_fit(counts: np.ndarray, method: Method) -> tuple[int, int]:
 
 
 def by_torch(counts: np.ndarray, method: Method, spatial: np.ndarray | None = None) -> np.ndarray:
-    """The same numbers without a program: csph's `encode` with the int8 tensor, and the limits of the number format.
+    """Return the same numbers without a program: csph's `encode` with the int8 tensor, and the limits of the number
+    format.
 
     Raises InputError where a sum is so large that float32 does not hold it exactly.
     """
@@ -103,7 +105,7 @@ def by_torch(counts: np.ndarray, method: Method, spatial: np.ndarray | None = No
 
 
 def decode(codes: np.ndarray, method: Method, sensor: Sensor, spatial: np.ndarray | None = None) -> np.ndarray:
-    """Depth [m] of every pixel from what the cores put out, (H, W) float32, by csph's correlation decoder.
+    """Return depth [m] of every pixel from what the cores put out, (H, W) float32, by csph's correlation decoder.
 
     The codes of a block answer to a pulse in its pixel p with w[p, k] C[k, t]: that matrix is pixel p's coding tensor.
     """
@@ -127,7 +129,7 @@ def decode(codes: np.ndarray, method: Method, sensor: Sensor, spatial: np.ndarra
 
 
 def shared_core_depths(histogram: Histogram, codes: int = 8) -> dict[str, np.ndarray]:
-    """Depth (H, W) of 4 x 4 SPADs that share a core, whose timestamps have lost their address (S.2) or kept it.
+    """Return depth (H, W) of 4 x 4 SPADs that share a core, whose timestamps have lost their address (S.2) or kept it.
 
     Without addresses one set of codes describes the whole group, and all its pixels get one depth; with them the core
     keeps a set for every SPAD. Raises InputError for an image that does not divide into groups.

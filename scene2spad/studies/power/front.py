@@ -61,14 +61,15 @@ class Design:
     coarse: Method | None = None
 
     def depth_m(self, histogram: Histogram) -> np.ndarray:
-        """Depth (H, W) [m] from the integers that leave the sensor."""
+        """Return depth (H, W) [m] from the integers that leave the sensor."""
         if self.chip is not None:
             return self.chip.depth_of(histogram)[0]
         return decode(by_torch(histogram.counts, self.coarse), self.coarse, histogram.sensor)
 
 
 def designs(folder: Path) -> tuple[list[Design], list[str]]:
-    """Trained designs of a folder of runs, else of the package, and coarse histograms; and the names of absent ones."""
+    """Return trained designs of a folder of runs, else of the package, and coarse histograms; and the names of absent
+    ones."""
     library, found, absent = ModelRegistry(folder, WEIGHTS), [], []
     for wanted in (*MAIN, *OTHERS):
         trained = library.find(wanted)
@@ -89,7 +90,8 @@ def designs(folder: Path) -> tuple[list[Design], list[str]]:
 
 
 def front_rows(found: list[Design], transient: Transient, seed: int, progress: Progress) -> list[dict[str, Any]]:
-    """A row for every design, number of photons and frame rate: error, power of a pixel, bytes, clocks, lost photons.
+    """Return a row for every design, number of photons and frame rate: error, power of a pixel, bytes, clocks, lost
+    photons.
 
     The error is that of a frame whose photons are all read; `keeps_up` says where that is so.
     """
@@ -101,8 +103,8 @@ def front_rows(found: list[Design], transient: Transient, seed: int, progress: P
             depth = one.depth_m(histogram)
             errors = depth_errors(depth, histogram.depth_m, range_m=histogram.sensor.range_m)
             median = float(1e3 * np.nanmedian(np.abs(depth - histogram.depth_m)))
-            told = {"name": one.name, "photons": photons, "mae_mm": errors["mae_mm"], "median_mm": median}
-            rows += [{**told, **_costs(one, photons, rate)} for rate in FRAME_RATES]
+            common = {"name": one.name, "photons": photons, "mae_mm": errors["mae_mm"], "median_mm": median}
+            rows += [{**common, **_costs(one, photons, rate)} for rate in FRAME_RATES]
     return rows
 
 
@@ -124,12 +126,12 @@ def _costs(one: Design, photons: float, frames_per_s: float) -> dict[str, float]
 
 
 def lost(clocks: np.ndarray, photons_per_s: float) -> float:
-    """Share of a core's photons that come while it is busy, by the closed form."""
+    """Return share of a core's photons that come while it is busy, by the closed form."""
     return lost_fraction(photons_per_s * ChipSpec().clock_s, clocks)
 
 
 def most_photons_per_s(clocks: np.ndarray, limit: float = LOST_LIMIT) -> float:
-    """The photon rate of a core at which it loses `limit` of them, by bisection of the closed form."""
+    """Return the photon rate of a core at which it loses `limit` of them, by bisection of the closed form."""
     low, high = 1.0, 1e9
     for _ in range(60):
         middle = (low * high) ** 0.5
@@ -138,8 +140,8 @@ def most_photons_per_s(clocks: np.ndarray, limit: float = LOST_LIMIT) -> float:
 
 
 def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[dict[str, Any]]:
-    """Photons lost at S.2's photons and frame rate, a SPAD a core and 16, emulated with arrival times and in closed
-    form; and the rates at which LOST_LIMIT of them are lost."""
+    """Return photons lost at S.2's photons and frame rate, a SPAD a core and 16, emulated with arrival times and in
+    closed form; and the rates at which LOST_LIMIT of them are lost."""
     rows, chip = [], ChipSpec()
     photons, frames_per_s = HEADLINE
     for number, one in enumerate(found):
@@ -162,7 +164,7 @@ def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[dict[s
 
 
 def printed_rows() -> list[dict[str, Any]]:
-    """The published points: power from printed clocks, and the MAE that was printed for the design (8 pairs, 16
+    """Return the published points: power from printed clocks, and the MAE that was printed for the design (8 pairs, 16
     levels, without the chip's 8 bits)."""
     rows = []
     for name, (design, block, compression) in _PRINTED.items():

@@ -24,7 +24,7 @@ def draw_front(
     printed: Sequence[dict[str, Any]],
     path: Path,
 ) -> Path:
-    """Six panels: MAE against both readings of power, bytes a pixel, clocks a photon and photons; lost photons."""
+    """Draw six panels: MAE against both readings of power, bytes a pixel, clocks a photon and photons; lost photons."""
     figure, axes = plt.subplots(2, 3, figsize=(17, 10.5), layout="constrained")
     at = [row for row in rows if (row["photons"], row["frames_per_s"]) == HEADLINE]
     styles = {one.name: {"color": f"C{n}", "marker": _MARKERS[n]} for n, one in enumerate(found)}
@@ -84,7 +84,7 @@ def _plain(axes: Axes) -> None:
 
 
 def front(places: np.ndarray) -> np.ndarray:
-    """Points (n, 2) that no other is below in both, by rising first coordinate."""
+    """Return points (n, 2) that no other is below in both, by rising first coordinate."""
     order = places[np.lexsort((places[:, 1], places[:, 0]))]
     lowest = np.minimum.accumulate(np.concatenate([[np.inf], order[:-1, 1]]))
     return order[order[:, 1] < lowest]
@@ -106,9 +106,9 @@ def _losses(axes: Axes, found: Sequence[Design], losses: Sequence[dict], styles:
         colour = styles[one.name]["color"]
         axes.plot(photons, [lost(one.clocks, n * rate) for n in photons], color=colour)
         for spads, name in ((1, "one_spad"), (SPADS, "16_spads")):
-            share = row[f"emulated_{name}"]
-            if share > 0:
-                axes.plot(HEADLINE[0] * spads, share, linestyle="", markersize=7, **styles[one.name])
+            fraction = row[f"emulated_{name}"]
+            if fraction > 0:
+                axes.plot(HEADLINE[0] * spads, fraction, linestyle="", markersize=7, **styles[one.name])
     axes.axhline(LOST_LIMIT, color="0.6", linestyle="--")
     for spads, text in ((1, "S.2: one SPAD"), (SPADS, "S.2: 4 x 4 SPADs")):
         axes.axvline(HEADLINE[0] * spads, color="0.8", zorder=0)

@@ -21,13 +21,13 @@ def int8_temporal(method: Method) -> np.ndarray | None:
 
 
 def fixed_spatial(method: Method) -> np.ndarray | None:
-    """Spatial weights (rows, columns, K) in int8 steps that stand in for learned ones where none are given: all pixels
-    of a block alike. None for a method without a block."""
+    """Return spatial weights (rows, columns, K) in int8 steps that stand in for learned ones where none are given: all
+    pixels of a block alike. None for a method without a block."""
     return None if method.block == (1, 1) else np.full((*method.block, method.codes), INT8_SCALE, np.int64)
 
 
 def verified(method: Method) -> dict:
-    """Proof of one program against its integer matrix, as numbers for a table."""
+    """Return proof of one program against its integer matrix, as numbers for a table."""
     temporal = int8_temporal(method)
     program = method.program()
     proof = verify(program, method.matrix(temporal), method.tables(temporal))
@@ -45,7 +45,7 @@ def verified(method: Method) -> dict:
 
 
 def all_costs(progress: Progress, methods: list[Method] | None = None) -> dict[str, Cost]:
-    """Emulated cost of every method by its name."""
+    """Return emulated cost of every method by its name."""
     chosen = methods or [method(name) for name in PUBLISHED]
     costs = {}
     for number, one in enumerate(chosen):

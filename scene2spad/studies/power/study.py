@@ -36,26 +36,27 @@ from ultraphase.power import READINGS, Cost, Load, as_csv, power, reference_bits
 
 log = logging.getLogger("scene2spad")
 
-SHARED_BUDGET = PhotonBudget(10.0, 10.0)  # a SPAD: sixteen of them stay within 16 bits
+ONE_BUDGET = PhotonBudget(10.0, 10.0)  # a SPAD: sixteen of them stay within 16 bits
 SPATIAL = "all four pixels alike, standing in for learned weights"
 
 
 def run(command: Study, progress: Progress) -> dict:
-    """The table, its bars, and the depth that each program's codes give; figures and a CSV in `command.out`."""
+    """Run the study: the table, its bars, and the depth that each program's codes give; figures and a CSV in
+    `command.out`."""
     out = command.out
     require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
     for name, size in (("width", command.width), ("height", command.height)):
         require(size > 0 and size % 4 == 0, f"{name} {size}: expected a multiple of 4, as 4 x 4 pixels share a core")
     budget, sensor = PhotonBudget(command.signal, command.background), sensor_by_name("reference")
     scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
-    transient = render(scene, seed=command.seed, progress=lambda what, share: progress(what, 0.1 * share))
+    transient = render(scene, seed=command.seed, progress=lambda what, fraction: progress(what, 0.1 * fraction))
     histogram = sense(transient, sensor, budget, seed=command.seed)
     out.mkdir(parents=True, exist_ok=True)
     depths, rows = _depths(histogram, out, progress)
-    dim = sense(transient, sensor, SHARED_BUDGET, seed=command.seed)
+    dim = sense(transient, sensor, ONE_BUDGET, seed=command.seed)
     progress("4 x 4 SPADs a core", 0.9)
     shared = shared_core_depths(dim)
-    costs = all_costs(lambda what, share: progress(what, 0.9 + 0.1 * share))
+    costs = all_costs(lambda what, fraction: progress(what, 0.9 + 0.1 * fraction))
     printed = table(costs)
     with whole_file(out / "ultraphase.csv") as beside:
         beside.write_text(as_csv(printed))
@@ -142,8 +143,8 @@ def _emulated(histogram: Histogram, chosen: Method, out: Path) -> Emulated:
 
 
 def draw_power(costs: dict[str, Cost], path: Path) -> Path:
-    """Supplementary Figure 4a: processing and readout power of 2 x 2 cores at 30 fps and 550 photons, in both readings,
-    from printed and from emulated clocks, with the two uncompressed readouts beside them."""
+    """Draw Supplementary Figure 4a: processing and readout power of 2 x 2 cores at 30 fps and 550 photons, in both
+    readings, from printed and from emulated clocks, with the two uncompressed readouts beside them."""
     load = Load()
     printed = {name: power(Cost(row.clocks, 0, 8 * row.bytes_per_pixel), load) for name, row in PUBLISHED.items()}
     ours = {name: power(cost, load) for name, cost in costs.items()}
@@ -180,7 +181,7 @@ def _bars(axes: Axes, groups: dict[str, dict], field: str, title: str) -> None:
 
 
 def draw_depths(histogram: Histogram, depths: dict[str, np.ndarray], rows: list[dict], path: Path) -> Path:
-    """Supplementary Figure 4b: the truth and the depth from every program's codes, on one scale."""
+    """Draw Supplementary Figure 4b: the truth and the depth from every program's codes, on one scale."""
     errors = {row["name"]: row for row in rows}
     titles = {
         name: f"{name}: {errors[name]['bytes_per_pixel']:.0f} B a pixel\n"

@@ -41,7 +41,7 @@ Depths = dict[tuple[str, str], np.ndarray]
 
 
 def directions(height: int, width: int, fov_deg: float) -> np.ndarray:
-    """Unit vectors of the pixels of a pinhole camera, (H, W, 3): x right, y down, z forward."""
+    """Return unit vectors of the pixels of a pinhole camera, (H, W, 3): x right, y down, z forward."""
     focal = width / 2 / np.tan(np.radians(fov_deg) / 2)
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([x / focal, y / focal, np.ones_like(x)], axis=-1)
@@ -49,7 +49,7 @@ def directions(height: int, width: int, fov_deg: float) -> np.ndarray:
 
 
 def raw_cloud(view: View) -> np.ndarray:
-    """Points (N, 3) [m] of the histogram itself: bins that stand out of their pixel's mean count."""
+    """Return points (N, 3) [m] of the histogram itself: bins that stand out of their pixel's mean count."""
     height, width, _ = view.counts.shape
     mean = view.counts.mean(axis=-1, keepdims=True)
     row, column, time_bin = np.nonzero(view.counts > mean + STRONG * np.sqrt(mean) + 1)
@@ -58,7 +58,7 @@ def raw_cloud(view: View) -> np.ndarray:
 
 
 def limits(view: View, depths: Depths) -> tuple[float, float]:
-    """Colour scale: where 96 % of the truth lies, or of the matched filter's depths where there is none."""
+    """Return colour scale: where 96 % of the truth lies, or of the matched filter's depths where there is none."""
     shown = depths[view.name, "log-matched"] if view.depth_m is None else view.depth_m
     known = shown[np.isfinite(shown)]
     if not known.size:
@@ -69,7 +69,8 @@ def limits(view: View, depths: Depths) -> tuple[float, float]:
 
 
 def draw(views: list[View], labels: list[str], depths: Depths, title: str, path: Path) -> Path:
-    """A row a capture: intensity, the raw histogram as a cloud, the truth where it is known, depth by every method."""
+    """Draw a row a capture: intensity, the raw histogram as a cloud, the truth where it is known, depth by every
+    method."""
     truth = any(view.depth_m is not None for view in views)
     columns = 2 + truth + len(labels)
     size = (2.7 * columns, 3.0 * len(views) + 0.7)
@@ -92,7 +93,7 @@ def draw(views: list[View], labels: list[str], depths: Depths, title: str, path:
 
 
 def draw_clouds(views: list[View], labels: list[str], depths: Depths, title: str, path: Path) -> Path:
-    """Point clouds: the truth where it is known, then every method's depth."""
+    """Draw point clouds: the truth where it is known, then every method's depth."""
     truth = any(view.depth_m is not None for view in views)
     columns = truth + len(labels)
     size = (2.9 * columns, 3.1 * len(views) + 0.7)
@@ -120,7 +121,7 @@ def _points(view: View, depth: np.ndarray | None) -> np.ndarray:
 
 
 def projected(points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of the camera's frame turned to the viewer, (N, 3) [m]: across, upwards, away."""
+    """Return points (N, 3) of the camera's frame turned to the viewer, (N, 3) [m]: across, upwards, away."""
     yaw, pitch = np.radians(YAW_DEG), np.radians(PITCH_DEG)
     x, up, z = points[:, 0], -points[:, 1], points[:, 2]
     across, behind = x * np.cos(yaw) - z * np.sin(yaw), x * np.sin(yaw) + z * np.cos(yaw)
@@ -187,9 +188,9 @@ def _cloud(
 
 
 def lines(rows: list[dict]) -> list[str]:
-    """The table in words."""
-    said = [f"{'capture':<12} {'method':<44} {'MAE mm':>8} {'median mm':>10} {'< 10 mm':>8} {'pixels':>7}"]
+    """Return the table in words."""
+    messages = [f"{'capture':<12} {'method':<44} {'MAE mm':>8} {'median mm':>10} {'< 10 mm':>8} {'pixels':>7}"]
     for row in rows:
         numbers = f"{row['mae_mm']:>8.1f} {row['median_mm']:>+10.1f} {row['within_10mm']:>8.1%} {row['pixels']:>7}"
-        said.append(f"{row['capture'][:12]:<12} {row['method'][-44:]:<44} {numbers}")
-    return said
+        messages.append(f"{row['capture'][:12]:<12} {row['method'][-44:]:<44} {numbers}")
+    return messages

@@ -50,7 +50,8 @@ CODES = {256: ("fourier-4", "gray-4"), 128: ("fourier-8", "gray-8", "coarse-8")}
 
 
 def prototype() -> Sensor:
-    """The `linospad` preset with the prototype's measured pulse and the dark counts of its rows, some of them hot."""
+    """Return the `linospad` preset with the prototype's measured pulse and the dark counts of its rows, some of them
+    hot."""
     measured = sensor_by_name("iccv2023-train")
     return replace(
         sensor_by_name("linospad"),
@@ -92,7 +93,8 @@ Method = Callable[[torch.Tensor, Sensor], torch.Tensor]
 
 
 def run(command: Study, progress: Progress) -> dict:
-    """Depth images and point clouds of every capture by every method; figures and a table in `command.out`."""
+    """Run the study: depth images and point clouds of every capture by every method; figures and a table in
+    `command.out`."""
     networks = [(path, load_model(path)[0]) for path in command.checkpoints]
     for path, model in networks:
         bins = model.config.sensor.bins
@@ -122,7 +124,7 @@ def run(command: Study, progress: Progress) -> dict:
     drawn.append(figures.draw_clouds(views, [*methods], depths, f"Point clouds. {note}", command.out / "clouds.png"))
     return {
         "note": note,
-        "other_sensor": [_said(path, model) for path, model in networks],
+        "other_sensor": [_describe(path, model) for path, model in networks],
         "table": figures.lines(rows),
         "rows": rows if command.json else len(rows),
         "csv": str(table),
@@ -137,10 +139,10 @@ def _rendered(command: Study, progress: Progress) -> list[View]:
     """Scenes of ours as captures: made once a configuration, in `captures` of the folder, and read back as files."""
     preset, views = PRESETS[command.preset], []
     for number, one in enumerate(SIMULATED):
-        share = 0.6 / len(SIMULATED)
+        fraction = 0.6 / len(SIMULATED)
 
-        def step(what: str, done: float, first: float = number * share, name: str = one.name) -> None:
-            progress(f"{name}: {what}", first + share * done)  # noqa: B023 (called in this turn of the loop)
+        def step(what: str, done: float, first: float = number * fraction, name: str = one.name) -> None:
+            progress(f"{name}: {what}", first + fraction * done)  # noqa: B023 (called in this turn of the loop)
 
         scene = scene_of(one, preset.side, command.seed)
         path, transient = make_capture(one, scene, preset, command.out / "captures", command.seed, step)
@@ -149,7 +151,7 @@ def _rendered(command: Study, progress: Progress) -> list[View]:
 
 
 def scene_of(one: Simulated, side: int, seed: int) -> Scene:
-    """The scene with a line laser, square, and where asked under sun and sky instead of its lamps."""
+    """Return the scene with a line laser, square, and where asked under sun and sky instead of its lamps."""
     scene = load_scene(one.scene, seed=seed, width=side, height=side)
     if one.sun:
         scene = replace(scene.without_lights(), ambient=Ambient(environment=sun_and_sky()))
@@ -157,7 +159,8 @@ def scene_of(one: Simulated, side: int, seed: int) -> Scene:
 
 
 def sun_and_sky() -> Texture:
-    """A sky of one unit with a sun 31 degrees high behind the camera's left shoulder, 3 times the sky's irradiance."""
+    """Return a sky of one unit with a sun 31 degrees high behind the camera's left shoulder, 3 times the sky's
+    irradiance."""
     image = np.full((32, 64), 1.0, np.float32)
     image[17:] = 0.2  # the ground
     row, column = 10, 26
@@ -203,7 +206,8 @@ def _view(capture: Capture, name: str, fov_deg: float = FOV_DEG, truth: Transien
 
 
 def pooled_truth(transient: Transient) -> tuple[np.ndarray, np.ndarray]:
-    """Mean depth of the pixels that are summed [m], NaN where one has none, and where they are no single depth."""
+    """Return mean depth of the pixels that are summed [m], NaN where one has none, and where they are no single
+    depth."""
     side = transient.height // POOL
     depth = transient.depth_m.reshape(side, POOL, side, POOL).swapaxes(1, 2).reshape(side, side, -1)
     mixed = transient.mixed.reshape(side, POOL, side, POOL).any(axis=(1, 3))
@@ -214,7 +218,7 @@ def pooled_truth(transient: Transient) -> tuple[np.ndarray, np.ndarray]:
 
 
 def methods_of(models: list[DepthModel]) -> dict[int, dict[str, Method]]:
-    """By compression ratio, 1 for what sees all counts: label and function. Models of one name are numbered."""
+    """Return by compression ratio, 1 for what sees all counts: label and function. Models of one name are numbered."""
     found: dict[int, dict[str, Method]] = {1: {name: classical(name) for name in BASELINES}}
     found |= {ratio: {name: classical(name) for name in names} for ratio, names in CODES.items()}
     for model in models:
@@ -227,7 +231,7 @@ def methods_of(models: list[DepthModel]) -> dict[int, dict[str, Method]]:
 
 
 def network(model: DepthModel) -> Method:
-    """Depth by a trained network, whose bins stand for the capture's: what it learned of a pulse was in bins.
+    """Return depth by a trained network, whose bins stand for the capture's: what it learned of a pulse was in bins.
 
     Tile by tile, each with `MARGIN` pixels around it, so that an image needs no more memory than a tile.
     """
@@ -251,7 +255,7 @@ def network(model: DepthModel) -> Method:
     return depth_of
 
 
-def _said(path: Path, model: DepthModel) -> str:
+def _describe(path: Path, model: DepthModel) -> str:
     own, here = model.config.sensor, resampled_sensor(prototype(), BINS)
     widths = f"bins of {own.bin_width_s * 1e12:.1f} ps in training, {here.bin_width_s * 1e12:.1f} ps here"
     return f"{path}: {model.config.name}, {widths}"

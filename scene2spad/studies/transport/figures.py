@@ -21,7 +21,7 @@ MAX_PAIRS = 24  # of a panel
 
 
 def draw_steps(summary: Sequence[Mapping[str, Any]], rows: Mapping[tuple[str, str], Sequence[Row]], path: Path) -> Path:
-    """MAE of every design at each step, a row a laser and a column a photon level; bars: 95 % over scenes."""
+    """Draw MAE of every design at each step, a row a laser and a column a photon level; bars: 95 % over scenes."""
     designs = list(dict.fromkeys(line["design"] for line in summary))
     figure, panels = plt.subplots(
         len(LASERS), len(LEVELS), figsize=(5.2 * len(LEVELS), 4.2 * len(LASERS)), layout="constrained", squeeze=False,
@@ -59,7 +59,7 @@ def _curve(axes: Axes, intervals: Sequence[tuple[float, float, float]], number: 
 
 
 def draw_ranking(ranked: Sequence[Mapping[str, Any]], path: Path) -> Path:
-    """Gap of each pair of codes with RGB-D rates (hollow) and at each later step (filled), all levels together."""
+    """Draw gap of each pair of codes with RGB-D rates (hollow) and at each later step (filled), all levels together."""
     mine = [r for r in ranked if r["levels"] == "all"]
     pairs = list(dict.fromkeys((r["first"], r["second"]) for r in mine))[:MAX_PAIRS]
     size = (3.4 * len(LATER) + 1.5, len(LASERS) * (1.6 + 0.34 * len(pairs)))
@@ -98,7 +98,7 @@ def _gap(axes: Axes, r: Mapping[str, Any], place: int) -> None:
 
 
 def draw_planned(planned: Sequence[Mapping[str, Any]], scenes: Sequence[Mapping[str, Any]], path: Path) -> Path:
-    """Relative difference of the MAE on planned renders from that on full ones, and the rays that plans saved."""
+    """Draw relative difference of the MAE on planned renders from that on full ones, and the rays that plans saved."""
     names = [(one["scene"], one["laser"]) for one in scenes]
     designs = list(dict.fromkeys(row["design"] for row in planned))
     figure, (left, right) = plt.subplots(
@@ -111,8 +111,8 @@ def draw_planned(planned: Sequence[Mapping[str, Any]], scenes: Sequence[Mapping[
         place = np.array([names.index((row["scene"], row["laser"])) for row in mine])
         off = place + 0.5 * ((number + 0.5) / len(designs) - 0.5)
         reach = np.nan_to_num([row["uncertain"] for row in mine])
-        share = [row["difference"] for row in mine]
-        left.errorbar(share, off, xerr=reach, fmt=MARKS[number], ms=4, lw=1, capsize=2, label=design)
+        fraction = [row["difference"] for row in mine]
+        left.errorbar(fraction, off, xerr=reach, fmt=MARKS[number], ms=4, lw=1, capsize=2, label=design)
     left.set_yticks(range(len(names)), [f"{scene}, {laser}" for scene, laser in names], fontsize=8)
     left.invert_yaxis()
     left.set_xlabel("MAE on the planned render over that on the full one, - 1")

@@ -68,7 +68,7 @@ class Plan:
 
 def _full(bounces: int, grid: int, spp: int, ambient_spp: int) -> RenderSettings:
     return RenderSettings(
-        bounces=bounces, grid=grid, spp=spp, adaptive=False, least_share=0.0, ambient=True, ambient_spp=ambient_spp
+        bounces=bounces, grid=grid, spp=spp, adaptive=False, edge_threshold=0.0, ambient=True, ambient_spp=ambient_spp
     )
 
 

@@ -52,7 +52,7 @@ def expected(transient: Transient, sensor: Sensor, budget: PhotonBudget) -> Expe
 def coupled(
     first: Expected, second: Expected, sensor: Sensor, budget: PhotonBudget, rng: np.random.Generator
 ) -> tuple[Histogram, Histogram]:
-    """Counts of two transients, each Poisson with its own rates a and b, that share the photons of min(a, b).
+    """Return counts of two transients, each Poisson with its own rates a and b, that share the photons of min(a, b).
 
     Poisson(min) + Poisson(a - min) is Poisson(a): the difference of two errors is then free of most of what photons
     do to both.
@@ -76,7 +76,8 @@ def planned_rows(
     seed: int,
     progress: Progress,
 ) -> list[dict[str, Any]]:
-    """A row of every scene, laser and design: MAE [mm] on both renders, their relative difference and its interval.
+    """Return a row of every scene, laser and design: MAE [mm] on both renders, their relative difference and its
+    interval.
 
     `draws` of photons are made, by rising number, until every design of a scene is decided.
     """
@@ -97,10 +98,10 @@ def planned_rows(
 def _row(place: Place, one: Contender, errors: np.ndarray) -> dict[str, Any]:
     """What (levels, draws, full and planned) errors [mm] of a design say."""
     full, planned = errors[..., 0].mean(0), errors[..., 1].mean(0)
-    share, wide = compared(full, planned)
-    told = {"scene": place.name, "set": place.set, "laser": place.laser, "design": one.name, "draws": len(full)}
-    numbers = {"full_mm": float(full.mean()), "planned_mm": float(planned.mean()), "difference": share}
-    return {**told, **numbers, "uncertain": wide, "verdict": within(share, wide)}
+    fraction, wide = compared(full, planned)
+    common = {"scene": place.name, "set": place.set, "laser": place.laser, "design": one.name, "draws": len(full)}
+    numbers = {"full_mm": float(full.mean()), "planned_mm": float(planned.mean()), "difference": fraction}
+    return {**common, **numbers, "uncertain": wide, "verdict": within(fraction, wide)}
 
 
 def _both(
@@ -125,27 +126,28 @@ def _both(
 
 
 def compared(full: np.ndarray, planned: np.ndarray) -> tuple[float, float]:
-    """mean(planned) / mean(full) - 1 over draws of photons, and the half width of its 95 % interval by Student's t."""
+    """Return mean(planned) / mean(full) - 1 over draws of photons, and the half width of its 95 % interval by Student's
+    t."""
     each = (planned - full) / full.mean()
     wide = float(stats.t.ppf(0.975, len(each) - 1) * stats.sem(each)) if len(each) > 1 else math.nan
     return float(each.mean()), wide
 
 
-def within(share: float, wide: float) -> str:
-    """Whether a relative difference is under LIMIT, as far as its interval tells."""
-    if abs(share) + wide < LIMIT:
+def within(fraction: float, wide: float) -> str:
+    """Return whether a relative difference is under LIMIT, as far as its interval tells."""
+    if abs(fraction) + wide < LIMIT:
         return HOLDS
-    return FAILS if abs(share) - wide > LIMIT else OPEN
+    return FAILS if abs(fraction) - wide > LIMIT else OPEN
 
 
 def planned_conclusions(planned: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """By scene and laser: the largest difference of a design; under LIMIT where that is so of every design."""
+    """Return by scene and laser: the largest difference of a design; under LIMIT where that is so of every design."""
     found = []
     for scene, laser in dict.fromkeys((row["scene"], row["laser"]) for row in planned):
         mine = [row for row in planned if (row["scene"], row["laser"]) == (scene, laser)]
         verdicts = {row["verdict"] for row in mine}
         verdict = FAILS if FAILS in verdicts else OPEN if OPEN in verdicts else HOLDS
         largest = max(mine, key=lambda row: abs(row["difference"]))
-        told = {"scene": scene, "laser": laser, "limit": LIMIT, "verdict": verdict}
-        found.append({**told, **{name: largest[name] for name in ("design", "difference", "uncertain", "draws")}})
+        common = {"scene": scene, "laser": laser, "limit": LIMIT, "verdict": verdict}
+        found.append({**common, **{name: largest[name] for name in ("design", "difference", "uncertain", "draws")}})
     return found

@@ -64,7 +64,7 @@ class WithoutNetwork:
 
 
 def without_network(name: str) -> EvaluatedModel:
-    """A method without a network, whose results are kept by its name."""
+    """Return a method without a network, whose results are kept by its name."""
     return EvaluatedModel(name, WithoutNetwork(name), hashlib.sha256(f"{name} {FORMAT}".encode()).hexdigest())
 
 
@@ -90,7 +90,7 @@ def run(command: Study, progress: Progress) -> dict:
         "ranking": ranked,
         "planned": planned,
     }
-    _say_saved(numbers["scenes"], _seconds(folder))
+    _log_saved(numbers["scenes"], _seconds(folder))
     every = [{"laser": laser, "step": step, **row} for (laser, step), some in rows.items() for row in as_dicts(some)]
     tables = {"": every, **{f"-{name}": numbers[name] for name in ("summary", "ranking", "planned", "scenes")}}
     made = [write_csv(table, command.out / f"transport{name}.csv") for name, table in tables.items() if table]
@@ -103,7 +103,7 @@ def run(command: Study, progress: Progress) -> dict:
         figures.draw_planned(planned, numbers["scenes"], command.out / "transport-planned.png"),
     ]
     files = {"figures": [str(each) for each in drawn], "csv": [str(each) for each in made], "numbers": str(path)}
-    return {**(numbers if command.json else _told(numbers)), **files}
+    return {**(numbers if command.json else _summary(numbers)), **files}
 
 
 # Designs
@@ -122,7 +122,7 @@ def _models(command: Study, progress: Progress) -> ModelLookup:
 
 
 def contenders_of(plan: Plan, models: ModelLookup) -> list[Contender]:
-    """The uncompressed estimator, codes decoded by correlation, and the networks that were found."""
+    """Return the uncompressed estimator, codes decoded by correlation, and the networks that were found."""
     found = []
     for name in (UNCOMPRESSED, *plan.codes):
         ratio = 1 if name == UNCOMPRESSED else Sensor().bins // int(name.rpartition("-")[2])
@@ -143,8 +143,8 @@ def _scenes(plan: Plan, seed: int) -> Iterator[tuple[str, str, Scene]]:
         of = scene_set(some.set)
         for number in range(some.count):
             scene = of.view(number * of.views_per_place, seed=seed, width=width, height=height)
-            told = f"scene {scene.name}: its laser is not at the camera, depth is not half the path"
-            require(scene.laser.is_colocated, told)
+            message = f"scene {scene.name}: its laser is not at the camera, depth is not half the path"
+            require(scene.laser.is_colocated, message)
             if some.sun:
                 scene = replace(scene.without_lights(), ambient=Ambient(environment=sun_and_sky()))
             for laser in LASERS:
@@ -162,7 +162,7 @@ def _place(name: str, laser: str, scene: Scene, plan: Plan, seed: int, folder: P
 def rendered_once(
     scene: Scene, settings: RenderSettings, seed: int, kind: str, folder: Path, progress: Progress
 ) -> Transient:
-    """From the folder or made now; seconds go to timings.jsonl beside the results."""
+    """Return from the folder or made now; seconds go to timings.jsonl beside the results."""
     key = key_of({"scene": scene.digest(), "laser": scene.laser.mode, "settings": asdict(settings), "seed": seed})
     path = folder / "renders" / f"{scene.name.replace('/', '-')}-{scene.laser.mode}-{kind}-{key}.exr"
     if path.is_file():
@@ -173,14 +173,15 @@ def rendered_once(
     path.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     transient = render(scene, settings, seed=seed, progress=progress)
-    told = {"scene": scene.name, "laser": scene.laser.mode, "kind": kind, "seconds": time.perf_counter() - start}
+    common = {"scene": scene.name, "laser": scene.laser.mode, "kind": kind, "seconds": time.perf_counter() - start}
     write_transient(transient, path)
-    append_line(folder / "timings.jsonl", json.dumps(told))
+    append_line(folder / "timings.jsonl", json.dumps(common))
     return read_transient(path)
 
 
 def steps_of(full: Transient) -> dict[str, Transient]:
-    """What a sensor would see at each step, by the names of STEPS; truth and mixed pixels are the render's in all.
+    """Return what a sensor would see at each step, by the names of STEPS; truth and mixed pixels are the render's in
+    all.
 
     rgbd        one return a pixel at 2 d, radiance albedo / (pi d^2); ambient light is the albedo
     cosine      times the cosine of incidence, from the depth image
@@ -200,7 +201,7 @@ def steps_of(full: Transient) -> dict[str, Transient]:
 
 
 def direct_alone(transient: Transient) -> Transient:
-    """Its returns that met one surface."""
+    """Return its returns that met one surface."""
     kept = transient.bounces == 1
     before = np.concatenate(([0], np.cumsum(kept))).astype(np.int64)
     names = ("path_near_m", "path_far_m", "radiance", "bounces")
@@ -246,22 +247,22 @@ def _described(place: Place) -> dict[str, Any]:
 def _seconds(folder: Path) -> dict[tuple[str, str], dict[str, float]]:
     """{(scene, laser): {full, planned: seconds}}, the latest where something was rendered again."""
     found: dict[tuple[str, str], dict[str, float]] = {}
-    for told in read_whole_lines(folder / "timings.jsonl"):
-        match told:
+    for line in read_whole_lines(folder / "timings.jsonl"):
+        match line:
             case {"scene": str(scene), "laser": str(laser), "kind": str(kind), "seconds": float(seconds)}:
                 found.setdefault((scene, laser), {})[kind] = seconds
     return found
 
 
-def _say_saved(scenes: Sequence[dict], seconds: Mapping[tuple[str, str], Mapping[str, float]]) -> None:
+def _log_saved(scenes: Sequence[dict], seconds: Mapping[tuple[str, str], Mapping[str, float]]) -> None:
     for one in scenes:
         taken = seconds.get((one["scene"], one["laser"]), {})
-        said = "{planned:.1f} s instead of {full:.1f} s".format(**taken) if len(taken) == 2 else "seconds not known"
+        message = "{planned:.1f} s instead of {full:.1f} s".format(**taken) if len(taken) == 2 else "seconds not known"
         rays = f"{one['rays_saved']:.1%} of {one['full_rays']:.3g} rays saved"
-        log.info("%s, %s: the plan: %s; %s", one["scene"], one["laser"], rays, said)
+        log.info("%s, %s: the plan: %s; %s", one["scene"], one["laser"], rays, message)
 
 
-def _told(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
+def _summary(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
     """What the terminal shows."""
     changes = [
         f"{c['laser']}, {STEPS[c['step']]}: {c['ranking']} ({c['kept']} of {c['pairs']} pairs kept, {c['reversed']} "

@@ -32,12 +32,12 @@ class Contender:
 
 
 def order(interval: Interval) -> int | None:
-    """-1 where the first is better, 1 where the second is, None where the interval holds 0 or is not known."""
+    """Return -1 where the first is better, 1 where the second is, None where the interval holds 0 or is not known."""
     return -1 if interval.high < 0 else 1 if interval.low > 0 else None
 
 
 def judged(before: Interval, after: Interval) -> str:
-    """Whether two codes stay in order from one step to another."""
+    """Return whether two codes stay in order from one step to another."""
     first, second = order(before), order(after)
     if first is None or second is None:
         return OPEN
@@ -49,8 +49,9 @@ def _mine(rows: Sequence[Row], name: str, levels: str) -> dict[str, np.ndarray]:
 
 
 def ranking(rows: Rows, contenders: Sequence[Contender]) -> list[dict[str, Any]]:
-    """Every pair of codes of one decoder and compression: the paired difference of MAE [mm], first - second, with RGB-D
-    rates and at each later step, how far it moved, and whether the two stay in order; 95 % intervals over scenes."""
+    """Return every pair of codes of one decoder and compression: the paired difference of MAE [mm], first - second,
+    with RGB-D rates and at each later step, how far it moved, and whether the two stay in order; 95 % intervals over
+    scenes."""
     coded = [c for c in contenders if c.compression > 1]
     kinds = groupby(sorted(coded, key=_kind), key=_kind)
     pairs = [pair for _, members in kinds for pair in combinations(members, 2)]
@@ -61,9 +62,9 @@ def ranking(rows: Rows, contenders: Sequence[Contender]) -> list[dict[str, Any]]
                 continue
             values = {(step, c.name): _mine(rows[laser, step], c.name, levels) for step in STEPS for c in coded}
             for first, second in pairs:
-                told = {"laser": laser, "levels": levels, "decoder": first.decoder, "compression": first.compression}
-                told |= {"first": first.name, "second": second.name}
-                found += [{**told, **one} for one in _pair(values, first.name, second.name)]
+                common = {"laser": laser, "levels": levels, "decoder": first.decoder, "compression": first.compression}
+                common |= {"first": first.name, "second": second.name}
+                found += [{**common, **one} for one in _pair(values, first.name, second.name)]
     return found
 
 
@@ -80,14 +81,14 @@ def _pair(values: Mapping[tuple[str, str], dict[str, np.ndarray]], first: str, s
     before = paired_difference(gaps[FIRST], nothing)
     for step in LATER:
         after, moved = paired_difference(gaps[step], nothing), paired_difference(gaps[step], gaps[FIRST])
-        told = {"step": step, "verdict": judged(before, after)}
+        common = {"step": step, "verdict": judged(before, after)}
         for name, interval in (("rgbd", before), ("here", after), ("moved", moved)):
-            told |= {f"{name}_mm": interval.mean, f"{name}_low": interval.low, f"{name}_high": interval.high}
-        yield told
+            common |= {f"{name}_mm": interval.mean, f"{name}_low": interval.low, f"{name}_high": interval.high}
+        yield common
 
 
 def conclusions(ranked: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """By laser, step and photon levels: whether what was added up to there changes the ranking of codes.
+    """Return by laser, step and photon levels: whether what was added up to there changes the ranking of codes.
 
     It does where one pair is decidedly reversed, it does not where all are decidedly kept, and is else not decided.
     The intervals are of each pair by itself: of many pairs some are wrong by chance.
@@ -97,11 +98,11 @@ def conclusions(ranked: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         mine = [r for r in ranked if (r["laser"], r["step"], r["levels"]) == (laser, step, levels)]
         count = {verdict: sum(r["verdict"] == verdict for r in mine) for verdict in (KEPT, REVERSED, OPEN)}
         changes = "changes" if count[REVERSED] else "does not change" if count[KEPT] == len(mine) else OPEN
-        told = {"laser": laser, "step": step, "levels": levels, "ranking": changes, "pairs": len(mine)}
+        common = {"laser": laser, "step": step, "levels": levels, "ranking": changes, "pairs": len(mine)}
         moved = sum(order(Interval(r["moved_mm"], r["moved_low"], r["moved_high"])) is not None for r in mine)
         turned = [_reversal(r) for r in mine if r["verdict"] == REVERSED]
         counted = {verdict.replace(" ", "_"): number for verdict, number in count.items()}
-        found.append({**told, **counted, "gap_moved": moved, "turned": turned})
+        found.append({**common, **counted, "gap_moved": moved, "turned": turned})
     return found
 
 
@@ -112,16 +113,17 @@ def _reversal(r: Mapping[str, Any]) -> str:
 
 
 def summary(rows: Rows, contenders: Sequence[Contender]) -> list[dict[str, Any]]:
-    """MAE [mm] of every design at each laser and step with its interval over scenes, and its change by that step."""
+    """Return MAE [mm] of every design at each laser and step with its interval over scenes, and its change by that
+    step."""
     found = []
     for laser in LASERS:
         before: Sequence[Row] | None = None
         for step in STEPS:
             here = rows[laser, step]
             for one in contenders:
-                told = {"laser": laser, "step": step, "design": one.name, "decoder": one.decoder,
+                common = {"laser": laser, "step": step, "design": one.name, "decoder": one.decoder,
                         "compression": one.compression}  # fmt: skip
-                found += [{**told, **line} for line in _lines(here, before, one.name)]
+                found += [{**common, **line} for line in _lines(here, before, one.name)]
             before = here
     return found
 

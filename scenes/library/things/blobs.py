@@ -13,7 +13,8 @@ REACH = 1.8  # there a ball's field is 1e-4
 
 
 def blend(points: np.ndarray, radii: np.ndarray, cells: int = CELLS) -> shapes.Shape:
-    """The surface f(x) = sum_i exp(4 (1 - |x - c_i|^2 / r_i^2)) = 1: balls that melt into each other where they meet.
+    """Return the surface f(x) = sum_i exp(4 (1 - |x - c_i|^2 / r_i^2)) = 1: balls that melt into each other where they
+    meet.
 
     points (n, 3), radii (n,). A lone ball keeps its radius. Faces look outwards; texture coordinates are the longitude
     and height. Shading normals are left to the caller: vertices are shared, so means over faces are smooth.
@@ -43,7 +44,7 @@ def _falls(away: np.ndarray, radius: np.ndarray, step: float) -> np.ndarray:
 
 
 def standing(shape: shapes.Shape, height: float) -> shapes.Shape:
-    """A shape scaled to that height, on y = 0, its middle at x = z = 0."""
+    """Return a shape scaled to that height, on y = 0, its middle at x = z = 0."""
     vertices, faces, uv = shape
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     base = np.array(((low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2))
@@ -51,10 +52,10 @@ def standing(shape: shapes.Shape, height: float) -> shapes.Shape:
 
 
 def toy(rng: Random, height: float) -> shapes.Shape:
-    """A sitting soft animal: belly, head, ears, arms and legs."""
+    """Return a sitting soft animal: belly, head, ears, arms and legs."""
     ear = rng.uniform(0.1, 0.2)
     apart = rng.uniform(0.16, 0.26)
-    balls = [(0, 0.32, 0, 0.3), (0, 0.75, 0.02, 0.22), (0, 0.7, 0.2, 0.1)]
+    balls: list[tuple[float, float, float, float]] = [(0, 0.32, 0, 0.3), (0, 0.75, 0.02, 0.22), (0, 0.7, 0.2, 0.1)]
     for side in (-1, 1):
         balls += [(side * apart, 0.95 + rng.uniform(0, 0.12), 0, ear), (side * 0.3, 0.42, 0.12, 0.12)]
         balls += [(side * 0.36, 0.33, 0.24, 0.1), (side * 0.2, 0.1, 0.3, 0.14), (side * 0.24, 0.1, 0.46, 0.12)]
@@ -63,14 +64,14 @@ def toy(rng: Random, height: float) -> shapes.Shape:
 
 
 def bag(rng: Random, height: float) -> shapes.Shape:
-    """A sack, cushion or heap of clothes: a few balls side by side."""
+    """Return a sack, cushion or heap of clothes: a few balls side by side."""
     count = int(rng.integers(5, 9))
     points = rng.uniform((-0.5, 0, -0.35), (0.5, 0.5, 0.35), (count, 3))
     return standing(blend(points, rng.uniform(0.25, 0.42, count), 22), height)
 
 
 def stone(rng: Random, height: float) -> shapes.Shape:
-    """A lump or a modern sculpture: balls in a winding column."""
+    """Return a lump or a modern sculpture: balls in a winding column."""
     count = int(rng.integers(4, 9))
     turn = rng.uniform(0, 2 * np.pi) + np.arange(count) * rng.uniform(0.5, 1.6)
     sway = rng.uniform(0.05, 0.35)
@@ -79,7 +80,7 @@ def stone(rng: Random, height: float) -> shapes.Shape:
 
 
 def branching(rng: Random, height: float, tines: int = 5, thick: float = 0.05) -> shapes.Shape:
-    """An antler or a root: a bent beam with tines, ever thinner, of overlapping balls."""
+    """Return an antler or a root: a bent beam with tines, ever thinner, of overlapping balls."""
     t = np.linspace(0, 1, 60)
     bend = rng.uniform(0.25, 0.5)
     beam = np.column_stack((bend * t**2, t, 0.2 * np.sin(2.5 * t) * rng.uniform(-1, 1)))
@@ -97,7 +98,8 @@ def branching(rng: Random, height: float, tines: int = 5, thick: float = 0.05) -
 def rounded_box(
     size: np.ndarray | tuple[float, float, float], power: float = 4.0, subdivisions: int = 3
 ) -> shapes.Shape:
-    """A superellipsoid |x/a|^p + |y/b|^p + |z/c|^p = 1 with edges `size`, standing on y = 0: pillows, cushions."""
+    """Return a superellipsoid |x/a|^p + |y/b|^p + |z/c|^p = 1 with edges `size`, standing on y = 0: pillows,
+    cushions."""
     directions, faces, uv = shapes.sphere(1.0, subdivisions)
     radius = (np.abs(directions) ** power).sum(axis=1, keepdims=True) ** (-1 / power)
     half = np.asarray(size, float) / 2

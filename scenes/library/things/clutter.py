@@ -15,7 +15,7 @@ from scenes.library.things.parts import Palette, Piece, Random, box, joined, lat
 
 
 def bowl(palette: Palette, rng: Random) -> Piece:
-    """A bowl, often with fruit."""
+    """Return a bowl, often with fruit."""
     radius, tall = rng.uniform(0.08, 0.16), rng.uniform(0.05, 0.1)
     t = np.linspace(0, 1, 9)
     outside = [(radius * (0.4 + 0.6 * math.sqrt(s)), tall * s) for s in t]
@@ -47,7 +47,7 @@ def mug(palette: Palette, rng: Random) -> Piece:
 
 
 def bottle(palette: Palette, rng: Random) -> Piece:
-    """A bottle or a drinking glass, of glass or opaque."""
+    """Return a bottle or a drinking glass, of glass or opaque."""
     tall, radius = rng.uniform(0.18, 0.33), rng.uniform(0.028, 0.042)
     if rng.random() < 0.35:
         profile = [(0.0, 0.0), (0.8 * radius, 0.0), (radius, 0.45 * tall)]
@@ -67,7 +67,7 @@ def bottle(palette: Palette, rng: Random) -> Piece:
 
 
 def pot(palette: Palette, rng: Random) -> Piece:
-    """A cooking pot or pan with handles, of metal."""
+    """Return a cooking pot or pan with handles, of metal."""
     radius, tall = rng.uniform(0.08, 0.14), rng.uniform(0.04, 0.16)
     body = lathe(
         [(0.0, 0.0), (radius, 0.0), (radius, tall), (0.96 * radius, tall), (0.95 * radius, 0.01), (0.0, 0.01)], 32
@@ -86,7 +86,7 @@ def pot(palette: Palette, rng: Random) -> Piece:
 
 
 def book_stack(palette: Palette, rng: Random) -> Piece:
-    """Books lying on each other, each turned a little."""
+    """Return books lying on each other, each turned a little."""
     y, surfaces = 0.0, []
     for _ in range(int(rng.integers(2, 8))):
         wide, thick, deep = rng.uniform((0.13, 0.012, 0.18), (0.22, 0.05, 0.3))
@@ -99,7 +99,7 @@ def book_stack(palette: Palette, rng: Random) -> Piece:
 
 
 def book_row(palette: Palette, rng: Random) -> Piece:
-    """Upright books, the last one leaning."""
+    """Return upright books, the last one leaning."""
     x, surfaces = 0.0, []
     count = int(rng.integers(3, 10))
     for i in range(count):
@@ -113,7 +113,7 @@ def book_row(palette: Palette, rng: Random) -> Piece:
 
 
 def box_stack(palette: Palette, rng: Random) -> Piece:
-    """Cardboard boxes stacked carelessly; the top one may stand open."""
+    """Return cardboard boxes stacked carelessly; the top one may stand open."""
     y, surfaces, size = 0.0, [], rng.uniform((0.3, 0.2, 0.25), (0.55, 0.4, 0.45))
     count = int(rng.integers(1, 4))
     for i in range(count):
@@ -174,7 +174,7 @@ def table_lamp(palette: Palette, rng: Random) -> Piece:
 
 
 def pencils(palette: Palette, rng: Random) -> Piece:
-    """A cup with pencils, brushes or cooking spoons."""
+    """Return a cup with pencils, brushes or cooking spoons."""
     tall = rng.uniform(0.08, 0.14)
     cup = lathe([(0.0, 0.0), (0.04, 0.0), (0.042, tall), (0.039, tall), (0.038, 0.004), (0.0, 0.004)], 20)
     sticks = []
@@ -191,7 +191,7 @@ def pencils(palette: Palette, rng: Random) -> Piece:
 
 
 def cable(palette: Palette, rng: Random) -> Piece:
-    """A cable in loose loops."""
+    """Return a cable in loose loops."""
     t = np.linspace(0, 1, 70)
     turns, radius = rng.uniform(1.2, 3.0), rng.uniform(0.06, 0.2)
     r = radius * (0.6 + 0.4 * np.sin(3.1 * t + rng.uniform(0, 6)))
@@ -201,7 +201,7 @@ def cable(palette: Palette, rng: Random) -> Piece:
 
 
 def basket(palette: Palette, rng: Random) -> Piece:
-    """A basket of thin wires, sometimes with a bundle in it."""
+    """Return a basket of thin wires, sometimes with a bundle in it."""
     radius, tall = rng.uniform(0.1, 0.2), rng.uniform(0.15, 0.35)
     a = np.linspace(0, 2 * np.pi, 29)
     rings = [
@@ -248,7 +248,7 @@ def bin_(palette: Palette, rng: Random) -> Piece:
 
 
 def toy_bricks(palette: Palette, rng: Random) -> Piece:
-    """A few wooden bricks, cones and balls."""
+    """Return a few wooden bricks, cones and balls."""
     surfaces = []
     for _ in range(int(rng.integers(4, 9))):
         at, size = rng.uniform(-0.14, 0.14, 2), rng.uniform(0.025, 0.06)
@@ -264,7 +264,7 @@ def toy_bricks(palette: Palette, rng: Random) -> Piece:
 
 
 def shoes(palette: Palette, rng: Random) -> Piece:
-    """A pair of shoes: rounded lumps with an open top."""
+    """Return a pair of shoes: rounded lumps with an open top."""
     parts = []
     for x in (-0.07, 0.07):
         s = np.linspace(0, 1, 9)
@@ -279,7 +279,7 @@ def shoes(palette: Palette, rng: Random) -> Piece:
 
 
 def globe(palette: Palette, rng: Random) -> Piece:
-    """A ball on a stand: a globe, or a football on the floor."""
+    """Return a ball on a stand: a globe, or a football on the floor."""
     radius = rng.uniform(0.1, 0.16)
     if rng.random() < 0.5:
         return Piece(
@@ -296,7 +296,7 @@ def globe(palette: Palette, rng: Random) -> Piece:
 
 
 def parcel(palette: Palette, rng: Random) -> Piece:
-    """A box of any proportions: a loudspeaker, a carton, a radio."""
+    """Return a box of any proportions: a loudspeaker, a carton, a radio."""
     w, h, d = rng.uniform((0.08, 0.06, 0.06), (0.3, 0.3, 0.22))
     surfaces = [
         joined(
@@ -314,7 +314,7 @@ def parcel(palette: Palette, rng: Random) -> Piece:
 
 
 def broom(palette: Palette, rng: Random) -> Piece:
-    """A broom, a rake or skis: a long stick that leans back towards a wall at -z."""
+    """Return a broom, a rake or skis: a long stick that leans back towards a wall at -z."""
     long, lean = rng.uniform(1.3, 1.8), rng.uniform(8, 14)
     sticks = [
         shapes.cylinder((x, 0.02, 0), (x, long, 0), 0.012, segments=10)

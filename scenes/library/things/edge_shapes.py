@@ -43,7 +43,7 @@ def points_in_ball(rng: Random, count: int) -> np.ndarray:
 
 
 def leaf(rng: Random, length: float) -> shapes.Shape:
-    """A pointed leaf along +x that bends down, with its two halves folded upwards."""
+    """Return a pointed leaf along +x that bends down, with its two halves folded upwards."""
     s, t = np.linspace(0, 1, 7)[:, None], np.array((-1.0, 0.0, 1.0))
     half = rng.uniform(0.1, 0.35) * np.sin(np.pi * np.clip(s, 0.02, 0.98)) ** rng.uniform(0.6, 1.4)
     height = rng.uniform(-0.5, 0.3) * s**2 + rng.uniform(0.0, 0.5) * half * np.abs(t)
@@ -51,7 +51,7 @@ def leaf(rng: Random, length: float) -> shapes.Shape:
 
 
 def foliage(rng: Random) -> shapes.Shape:
-    """Leaves scattered in a ball: from a few large ones to a bush."""
+    """Return leaves scattered in a ball: from a few large ones to a bush."""
     count = int(np.exp(rng.uniform(np.log(4), np.log(70))))
     length = rng.uniform(0.8, 1.6) * count ** (-1 / 3)
     leaves = [rotated(leaf(rng, length * rng.uniform(0.6, 1.3)), random_rotation(rng)) for _ in range(count)]
@@ -59,7 +59,7 @@ def foliage(rng: Random) -> shapes.Shape:
 
 
 def branch(rng: Random) -> shapes.Shape:
-    """Bent twigs from one foot, with leaves along them."""
+    """Return bent twigs from one foot, with leaves along them."""
     parts = []
     for _ in range(int(rng.integers(2, 6))):
         tip, s = points_in_ball(rng, 1)[0] + (0, 0.6, 0), np.linspace(0, 1, 9)[:, None]
@@ -71,7 +71,7 @@ def branch(rng: Random) -> shapes.Shape:
 
 
 def rods(rng: Random) -> shapes.Shape:
-    """Straight rods of any direction, from wires to poles; parallel ones now and then."""
+    """Return straight rods of any direction, from wires to poles; parallel ones now and then."""
     count, radius = int(rng.integers(2, 14)), np.exp(rng.uniform(np.log(0.008), np.log(0.08)))
     common = random_rotation(rng)[0] if rng.random() < 0.4 else None
     parts = []
@@ -83,7 +83,7 @@ def rods(rng: Random) -> shapes.Shape:
 
 
 def rings(rng: Random) -> shapes.Shape:
-    """Hoops of any size, through each other."""
+    """Return hoops of any size, through each other."""
     parts, angle = [], np.linspace(0, 2 * np.pi, 37)
     for _ in range(int(rng.integers(1, 6))):
         radius = rng.uniform(0.3, 0.9)
@@ -94,7 +94,7 @@ def rings(rng: Random) -> shapes.Shape:
 
 
 def lattice(rng: Random) -> shapes.Shape:
-    """A fence or grid of bars, some of them missing."""
+    """Return a fence or grid of bars, some of them missing."""
     columns, rows = (int(n) for n in rng.integers(2, 11, 2))
     thick = rng.uniform(0.1, 0.5) / max(columns, rows)
     upright = [box((x - thick, -1, -thick), (x + thick, 1, thick)) for x in np.linspace(-1, 1, columns)]
@@ -114,7 +114,7 @@ def wires(rng: Random) -> shapes.Shape:
 
 
 def silhouette(rng: Random) -> shapes.Shape:
-    """A flat or slightly bent cut-out with a ragged outline: a torn sheet, a rock face, a crown of leaves."""
+    """Return a flat or slightly bent cut-out with a ragged outline: a torn sheet, a rock face, a crown of leaves."""
     count, centre = int(rng.integers(24, 120)), np.zeros((1, 2))
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     radius = 0.75 + sum(
@@ -130,7 +130,7 @@ def silhouette(rng: Random) -> shapes.Shape:
 
 
 def bumps(rng: Random) -> shapes.Shape:
-    """A lump: a sphere whose radius is a sum of random waves over it."""
+    """Return a lump: a sphere whose radius is a sum of random waves over it."""
     vertices, faces, uv = shapes.sphere(1.0, 4)
     waves = sum(
         rng.normal(0, 0.25) / (1 + k) * np.cos(vertices @ rng.normal(0, 2.0 + k, 3) + rng.uniform(0, 6.3))
@@ -141,7 +141,7 @@ def bumps(rng: Random) -> shapes.Shape:
 
 
 def drapery(rng: Random) -> shapes.Shape:
-    """A wavy sheet with folds, as a curtain or crumpled paper."""
+    """Return a wavy sheet with folds, as a curtain or crumpled paper."""
     u = np.linspace(-1, 1, 33)
     x, y = np.meshgrid(u, u)
     folds = sum(
@@ -154,7 +154,7 @@ def drapery(rng: Random) -> shapes.Shape:
 
 
 def steps(rng: Random) -> shapes.Shape:
-    """Boxes side by side at depths that differ by a few per cent to half of their size."""
+    """Return boxes side by side at depths that differ by a few per cent to half of their size."""
     edges = np.unique(np.round(np.concatenate(([-1, 1], rng.uniform(-1, 1, int(rng.integers(1, 7))))), 3))
     rise = np.exp(rng.uniform(np.log(0.03), np.log(0.5)))
     parts = [
@@ -165,7 +165,7 @@ def steps(rng: Random) -> shapes.Shape:
 
 
 def blocks(rng: Random) -> shapes.Shape:
-    """Boxes of any proportion, tumbled."""
+    """Return boxes of any proportion, tumbled."""
     parts = []
     for at in 0.6 * points_in_ball(rng, int(rng.integers(1, 8))):
         half = np.exp(rng.uniform(np.log(0.05), np.log(0.5), 3))

@@ -22,7 +22,8 @@ def radiator(palette: Palette, rng: Random) -> Piece:
 
 
 def wall_window(palette: Palette, rng: Random) -> Piece:
-    """A bright window: an emitting pane behind a frame and a pane of glass, a sill, and often curtains or a blind."""
+    """Return a bright window: an emitting pane behind a frame and a pane of glass, a sill, and often curtains or a
+    blind."""
     wide, tall, sill = rng.uniform(0.8, 2.0), rng.uniform(0.9, 1.4), rng.uniform(0.7, 1.0)
     x, bar = wide / 2, 0.05
     bars = [
@@ -71,7 +72,7 @@ def _curtain(rng: Random, x: float, width: float, low: float, high: float) -> sh
 
 
 def door(palette: Palette, rng: Random) -> Piece:
-    """A door in its frame, shut or a little open, with a handle."""
+    """Return a door in its frame, shut or a little open, with a handle."""
     wide, tall = rng.uniform(0.8, 0.95), rng.uniform(2.0, 2.1)
     x = wide / 2
     frame = [box((s - 0.05, 0, 0), (s + 0.05, tall + 0.05, 0.05)) for s in (-x - 0.05, x + 0.05)]
@@ -94,7 +95,7 @@ def door(palette: Palette, rng: Random) -> Piece:
 
 
 def coats(palette: Palette, rng: Random) -> Piece:
-    """A board with hooks and coats that hang from them, at breast height."""
+    """Return a board with hooks and coats that hang from them, at breast height."""
     count = int(rng.integers(2, 5))
     x = (np.arange(count) - (count - 1) / 2) * 0.24
     board = box((x[0] - 0.15, 1.6, 0), (x[-1] + 0.15, 1.7, 0.025))
@@ -116,7 +117,7 @@ def coats(palette: Palette, rng: Random) -> Piece:
 
 
 def hanging_picture(palette: Palette, rng: Random) -> Piece:
-    """A framed picture or a poster at eye level."""
+    """Return a framed picture or a poster at eye level."""
     wide, tall = rng.uniform((0.3, 0.3), (1.1, 0.8))
     own = repainted(palette, rng) | {"painting": pick(palette, rng, "print" if rng.random() < 0.4 else "painting")}
     y = rng.uniform(1.55, 1.7) - tall / 2
@@ -125,7 +126,7 @@ def hanging_picture(palette: Palette, rng: Random) -> Piece:
 
 
 def shelf(palette: Palette, rng: Random) -> Piece:
-    """One or two boards on the wall, with brackets."""
+    """Return one or two boards on the wall, with brackets."""
     wide, y = rng.uniform(0.5, 1.2), rng.uniform(1.25, 1.5)
     heights = (y, y + 0.34) if rng.random() < 0.5 else (y,)
     boards = [box((-wide / 2, h, 0), (wide / 2, h + 0.022, 0.22)) for h in heights]
@@ -153,7 +154,7 @@ def clock(palette: Palette, rng: Random) -> Piece:
 
 
 def pendant(palette: Palette, rng: Random, height: float) -> Piece:
-    """A lamp on a wire from the ceiling at `height`."""
+    """Return a lamp on a wire from the ceiling at `height`."""
     drop, radius = rng.uniform(0.4, 1.0), rng.uniform(0.12, 0.28)
     y = height - drop
     profile = ((radius, y), (0.8 * radius, y + 0.12), (0.25 * radius, y + 0.2), (0.02, y + 0.22))

@@ -22,7 +22,7 @@ from scenes.model import Surface
 
 
 def sofa(palette: Palette, rng: Random) -> Piece:
-    """A sofa for two or three, sometimes with a cushion, a blanket or a bag on it."""
+    """Return a sofa for two or three, sometimes with a cushion, a blanket or a bag on it."""
     width = rng.uniform(1.4, 2.3)
     own = repainted(palette, rng)
     surfaces = living.sofa(own, width, own["sofa cloth"], depth=rng.uniform(0.75, 0.95))
@@ -44,7 +44,7 @@ def bookshelf(palette: Palette, rng: Random) -> Piece:
 
 
 def drawers(palette: Palette, rng: Random) -> Piece:
-    """A chest of drawers, a sideboard, a filing cabinet or a nightstand: a body, fronts with gaps, and handles."""
+    """Draw a chest of drawers, a sideboard, a filing cabinet or a nightstand: a body, fronts with gaps, and handles."""
     wide, tall, deep = rng.uniform((0.4, 0.5, 0.35), (1.6, 1.2, 0.5))
     columns, rows = max(1, round(wide / 0.55)), max(2, round(tall / 0.25))
     body, front = pick(palette, rng, "wood"), pick(palette, rng, "satin" if rng.random() < 0.5 else "paint")
@@ -87,7 +87,7 @@ def wardrobe(palette: Palette, rng: Random) -> Piece:
 
 
 def desk(palette: Palette, rng: Random) -> Piece:
-    """A board on legs or trestles, with a block of drawers or a back panel."""
+    """Return a board on legs or trestles, with a block of drawers or a back panel."""
     wide, deep, top = rng.uniform((1.0, 0.55, 0.7), (1.8, 0.85, 0.78))
     x = wide / 2 - 0.06
     legs = [post(sx, sz, 0.022, 0, top - 0.03) for sx in (-x, x) for sz in (0.06, deep - 0.06)]
@@ -102,7 +102,7 @@ def desk(palette: Palette, rng: Random) -> Piece:
 
 
 def bed(palette: Palette, rng: Random) -> Piece:
-    """A bed whose head is at the wall: frame, mattress, a wavy blanket that hangs over the sides, pillows."""
+    """Return a bed whose head is at the wall: frame, mattress, a wavy blanket that hangs over the sides, pillows."""
     wide, long = rng.uniform(0.9, 1.8), rng.uniform(1.9, 2.1)
     half = wide / 2
     frame = box((-half - 0.03, 0.12, 0.02), (half + 0.03, 0.3, long + 0.05))
@@ -128,7 +128,7 @@ def bed(palette: Palette, rng: Random) -> Piece:
 
 
 def television(palette: Palette, rng: Random) -> Piece:
-    """A flat screen on a low board."""
+    """Return a flat screen on a low board."""
     base = drawers(palette, rng)
     _, z, half, _, _ = base.tops[0]
     scale = 0.55 / base.high[1]
@@ -181,7 +181,7 @@ def chair(palette: Palette, rng: Random) -> Piece:
 
 
 def office_chair(palette: Palette, rng: Random) -> Piece:
-    """Five feet on castors, a gas spring, a seat and a curved back."""
+    """Return five feet on castors, a gas spring, a seat and a curved back."""
     seat = rng.uniform(0.43, 0.52)
     arms = [turned(box((0, 0.06, -0.02), (0.3, 0.09, 0.02)), "y", 72 * i + 10) for i in range(5)]
     wheels = [
@@ -209,7 +209,7 @@ def office_chair(palette: Palette, rng: Random) -> Piece:
 
 
 def stool(palette: Palette, rng: Random) -> Piece:
-    """A round seat on three or four slanted legs."""
+    """Return a round seat on three or four slanted legs."""
     high, radius, count = rng.uniform(0.42, 0.7), rng.uniform(0.15, 0.2), int(rng.integers(3, 5))
     seat = lathe(((0.0, high - 0.03), (radius, high - 0.03), (radius, high), (0.0, high)), 28)
     angles = 2 * np.pi * np.arange(count) / count + 0.4
@@ -234,7 +234,7 @@ def floor_lamp(palette: Palette, rng: Random) -> Piece:
 
 
 def clothes_horse(palette: Palette, rng: Random) -> Piece:
-    """A folding rack of 8 mm rods with some washing on it."""
+    """Return a folding rack of 8 mm rods with some washing on it."""
     wide, high, spread = rng.uniform(0.9, 1.3), rng.uniform(0.85, 1.05), rng.uniform(0.25, 0.35)
     legs = [
         shapes.cylinder((x, 0, -side * spread), (x, high, side * spread), 0.008, segments=8)
@@ -257,7 +257,7 @@ def clothes_horse(palette: Palette, rng: Random) -> Piece:
 
 
 def heap(palette: Palette, rng: Random) -> Piece:
-    """A bean bag, a sack or a heap of laundry."""
+    """Return a bean bag, a sack or a heap of laundry."""
     return Piece((joined("heap: cloth", pick(palette, rng, "cloth"), bag(rng, rng.uniform(0.25, 0.6))),))
 
 

@@ -14,7 +14,7 @@ from scenes.library.things.parts import Palette, Piece, Random, joined, lathe, m
 
 
 def vase_profile(rng: Random, height: float, radius: float) -> list[tuple[float, float]]:
-    """A random vase: foot, belly, neck and lip."""
+    """Return a random vase: foot, belly, neck and lip."""
     belly, neck = rng.uniform(0.25, 0.6), rng.uniform(0.3, 0.8)
     t = np.linspace(0, 1, 14)
     r = (
@@ -32,7 +32,7 @@ def vase(palette: Palette, rng: Random) -> Piece:
 
 
 def flowers(palette: Palette, rng: Random) -> Piece:
-    """A vase with dry twigs or tall flowers in it."""
+    """Return a vase with dry twigs or tall flowers in it."""
     base = vase(palette, rng)
     high = float(base.high[1])
     stems, heads = [], []
@@ -63,7 +63,7 @@ def _leaf(rng: Random, long: float, wide: float) -> shapes.Shape:
 
 
 def plant(palette: Palette, rng: Random) -> Piece:
-    """A pot plant: leaves on stems that fan out, from a hand's to a man's height."""
+    """Return a pot plant: leaves on stems that fan out, from a hand's to a man's height."""
     high = rng.uniform(0.2, 1.5) ** 1.2
     radius = 0.05 + 0.09 * high
     pot_high = 0.09 + 0.16 * high
@@ -112,7 +112,7 @@ def plant(palette: Palette, rng: Random) -> Piece:
 
 
 def candles(palette: Palette, rng: Random) -> Piece:
-    """Candles, or rods in a stand: thin upright things of different heights."""
+    """Return candles, or rods in a stand: thin upright things of different heights."""
     sticks = [
         shapes.cylinder(
             (x, 0, z), (x + rng.normal(0, 0.004), rng.uniform(0.1, 0.3), z), rng.uniform(0.004, 0.012), segments=10
@@ -145,5 +145,5 @@ def sculpture(palette: Palette, rng: Random) -> Piece:
 
 
 def root(palette: Palette, rng: Random) -> Piece:
-    """A branch or an antler, standing."""
+    """Return a branch or an antler, standing."""
     return Piece((joined("root: wood", pick(palette, rng, "wood"), branching(rng, rng.uniform(0.2, 0.5))),))

@@ -19,11 +19,10 @@ from scenes.library.things.patterns import (
 from scenes.model import Material, Texture
 
 DARKEST, BRIGHTEST = 0.03, 0.95
-GLOSS = {"kind": "roughplastic", "ior": 1.5}
 
 
 def make_palette(rng: Random) -> Palette:
-    """A random palette. Whatever the seed, its materials differ from those of another one in albedos alone.
+    """Return a random palette. Whatever the seed, its materials differ from those of another one in albedos alone.
 
     Kinds: diffuse (plain, or one of at most eleven textures), two roughnesses of coated plastic, one metal, one thin
     glass. So the renderer's kernels are the same for every scene that is made of such palettes.
@@ -73,25 +72,26 @@ def make_palette(rng: Random) -> Palette:
     albedos |= {f"leaf {i}": plain(0.1, 0.4) for i in range(2)}
     albedos |= {f"book cover {i}": plain(0.04, 0.85) for i in range(6)}
     made = {name: Material(albedo=albedo, name=name) for name, albedo in albedos.items()}
-    satin = {
-        f"satin {i}": Material(albedo=plain(0.06, 0.7), roughness=0.3, name=f"satin {i}", **GLOSS) for i in range(4)
-    }
-    gloss = {
-        f"gloss {i}": Material(albedo=plain(0.1, 0.9), roughness=0.15, name=f"gloss {i}", **GLOSS) for i in range(4)
-    }
-    gloss["gloss dark"] = Material(albedo=DARKEST, roughness=0.15, name="gloss dark", **GLOSS)
+
+    def coated(name: str, albedo: float, roughness: float) -> Material:
+        return Material("roughplastic", albedo=albedo, roughness=roughness, ior=1.5, name=name)
+
+    satin = {f"satin {i}": coated(f"satin {i}", plain(0.06, 0.7), 0.3) for i in range(4)}
+    gloss = {f"gloss {i}": coated(f"gloss {i}", plain(0.1, 0.9), 0.15) for i in range(4)}
+    gloss["gloss dark"] = coated("gloss dark", DARKEST, 0.15)
     steel = Material("roughconductor", roughness=0.3, eta=2.9, k=3.1, name="steel")
     return made | satin | gloss | {"steel": steel, "glass": Material("thindielectric", ior=1.5, name="glass")}
 
 
 def pick(palette: Palette, rng: Random, family: str) -> Material:
-    """One of the palette's materials named `family` and a number or word."""
+    """Return one of the palette's materials named `family` and a number or word."""
     names = [name for name in palette if name.startswith(f"{family} ")]
     return palette[names[int(rng.integers(len(names)))]]
 
 
 def repainted(palette: Palette, rng: Random) -> Palette:
-    """The palette with other woods, cloths and paints under the names that the demo room's furniture asks for."""
+    """Return the palette with other woods, cloths and paints under the names that the demo room's furniture asks
+    for."""
     varied = {"wood": "wood", "varnished wood": "satin", "white paint": "paint", "sofa cloth": "cloth"}
     varied |= {"cushion cloth": "cloth", "leather": "dark", "rubber": "satin", "clay": "clay"}
     return {**palette, **{name: pick(palette, rng, family) for name, family in varied.items()}}

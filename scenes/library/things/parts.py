@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from scenes.library.things import shapes
 from scenes.model import Material, Surface
 
 Random = np.random.Generator
-Vector = Sequence[float]
+Vector: TypeAlias = Sequence[float] | np.ndarray
 Palette = dict[str, Material]  # one object per paint, cloth or wood, shared by all that is made of it
 
 
@@ -40,19 +41,19 @@ class Piece:
 
 
 def box(low: Vector, high: Vector) -> shapes.Shape:
-    """An axis-aligned box between two corners."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    vertices, faces, uv = shapes.box(high - low)
-    return vertices + (low + high) / 2, faces, uv
+    """Return an axis-aligned box between two corners."""
+    ends = np.asarray(low, float), np.asarray(high, float)
+    vertices, faces, uv = shapes.box(ends[1] - ends[0])
+    return vertices + (ends[0] + ends[1]) / 2, faces, uv
 
 
 def post(x: float, z: float, half: float, bottom: float, top: float) -> shapes.Shape:
-    """An upright square post around (x, z)."""
+    """Return an upright square post around (x, z)."""
     return box((x - half, bottom, z - half), (x + half, top, z + half))
 
 
 def panel(centre: Vector, half_right: Vector, half_up: Vector, tile_m: float | None = None) -> shapes.Shape:
-    """A rectangle seen from the side where its first half edge points right and its second up.
+    """Return a rectangle seen from the side where its first half edge points right and its second up.
 
     Its texture fills it once, or repeats every `tile_m` metres.
     """
@@ -64,7 +65,7 @@ def panel(centre: Vector, half_right: Vector, half_up: Vector, tile_m: float | N
 
 
 def joined(name: str, material: Material, *parts: shapes.Shape, emission: float = 0.0) -> Surface:
-    """Several shapes as one surface."""
+    """Return several shapes as one surface."""
     starts = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts[:-1]])
     return Surface(
         np.concatenate([vertices for vertices, _, _ in parts]),
@@ -77,7 +78,7 @@ def joined(name: str, material: Material, *parts: shapes.Shape, emission: float 
 
 
 def placed(surfaces: list[Surface], x: float, z: float, *, y: float = 0.0, turn_deg: float = 0.0) -> list[Surface]:
-    """A piece of furniture turned about the vertical (positive: its front from +z towards +x) and set down."""
+    """Return a piece of furniture turned about the vertical (positive: its front from +z towards +x) and set down."""
     c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
     pose = np.array(((c, 0, s, x), (0, 1, 0, y), (-s, 0, c, z), (0, 0, 0, 1)))
     moved = []
@@ -88,7 +89,8 @@ def placed(surfaces: list[Surface], x: float, z: float, *, y: float = 0.0, turn_
 
 
 def smooth_normals(points: np.ndarray, key: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted normals per vertex; vertices of equal `key` (the doubled seam of a sphere) share one normal."""
+    """Return area-weighted normals per vertex; vertices of equal `key` (the doubled seam of a sphere) share one
+    normal."""
     _, same = np.unique(np.round(key, 9) + 0.0, axis=0, return_inverse=True)
     a, b, c = points[faces].transpose(1, 0, 2)
     across = np.cross(b - a, c - a)
@@ -100,7 +102,8 @@ def smooth_normals(points: np.ndarray, key: np.ndarray, faces: np.ndarray) -> np
 
 
 def lathe(profile: Sequence[Vector], segments: int = 24) -> shapes.Shape:
-    """The surface that a profile of (radius, height) points sweeps around the y axis; u around, v along the profile.
+    """Return the surface that a profile of (radius, height) points sweeps around the y axis; u around, v along the
+    profile.
 
     A profile that rises has its outside outside. Points lie on the true surface of revolution.
     """
@@ -116,7 +119,8 @@ def lathe(profile: Sequence[Vector], segments: int = 24) -> shapes.Shape:
 
 
 def tube(points: np.ndarray, radius: float, segments: int = 8) -> shapes.Shape:
-    """A round wire of that radius along a polyline (n, 3), without caps; its frame is carried along without twist."""
+    """Return a round wire of that radius along a polyline (n, 3), without caps; its frame is carried along without
+    twist."""
     points = np.asarray(points, float)
     along = np.gradient(points, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -137,21 +141,22 @@ def tube(points: np.ndarray, radius: float, segments: int = 8) -> shapes.Shape:
 
 
 def sheet(points: np.ndarray) -> shapes.Shape:
-    """A grid of points (rows, columns, 3) as triangles, seen from where columns run right and rows run up."""
+    """Return a grid of points (rows, columns, 3) as triangles, seen from where columns run right and rows run up."""
     rows, columns = points.shape[:2]
     v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
     return points.reshape(-1, 3).astype(float), grid_faces(rows, columns), np.column_stack((u.ravel(), v.ravel()))
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Two triangles a cell of a grid of rows x columns vertices, counterclockwise with columns right and rows up."""
+    """Return two triangles a cell of a grid of rows x columns vertices, counterclockwise with columns right and rows
+    up."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     right, up = corner + 1, corner + columns
     return np.stack((corner, right, up + 1, corner, up + 1, up), axis=-1).reshape(-1, 3)
 
 
 def turned(shape: shapes.Shape, axis: str, degrees: float, by: Vector = (0.0, 0.0, 0.0)) -> shapes.Shape:
-    """A shape turned about an axis through the origin (right-handed), then moved."""
+    """Return a shape turned about an axis through the origin (right-handed), then moved."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     rotation = np.eye(3)
@@ -165,7 +170,8 @@ def moved(shape: shapes.Shape, by: Vector) -> shapes.Shape:
 
 
 def with_normals(surfaces: Sequence[Surface], brightness: float = 1.0) -> list[Surface]:
-    """The surfaces with shading normals, area-weighted means over the faces that share a vertex; their emission scaled.
+    """Return the surfaces with shading normals, area-weighted means over the faces that share a vertex; their emission
+    scaled.
 
     Where corners have vertices of their own, as on a box, that is the face's own normal. Surfaces that have normals
     keep them. All are worked on at once: a room has a hundred small ones.

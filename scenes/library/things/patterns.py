@@ -9,11 +9,12 @@ from itertools import pairwise
 import numpy as np
 
 from scenes.library.things.parts import Random
-from scenes.model import Surface, Texture
+from scenes.model import Material, Surface, Texture
 
 
 def soft_noise(rng: Random, shape: tuple[int, int], size_px: tuple[float, float]) -> np.ndarray:
-    """Gaussian noise of unit variance blurred to blobs of `size_px` (rows, columns); periodic, so that it tiles."""
+    """Return Gaussian noise of unit variance blurred to blobs of `size_px` (rows, columns); periodic, so that it
+    tiles."""
     from scipy import fft  # 0.2 s of CPU, which a list of scenes need not wait for
 
     rows, columns = (
@@ -26,18 +27,18 @@ def soft_noise(rng: Random, shape: tuple[int, int], size_px: tuple[float, float]
 
 
 def mottled(rng: Random, mean: float, spread: float, size_px: float, side: int = 256) -> np.ndarray:
-    """An even paint or cloth with soft spots."""
+    """Return an even paint or cloth with soft spots."""
     return np.clip(mean + spread * soft_noise(rng, (side, side), (size_px, size_px)), 0.05, 0.9)
 
 
 def grain(rng: Random, mean: float, side: int = 256) -> np.ndarray:
-    """Wood grain along the columns of the image."""
+    """Return wood grain along the columns of the image."""
     streaks = soft_noise(rng, (side, side), (40, 1)) + 0.6 * soft_noise(rng, (side, side), (60, 5))
     return np.clip(mean * (1 + 0.16 * streaks), 0.05, 0.9)
 
 
 def planks(rng: Random, mean: float, side: int = 512, across: int = 14) -> np.ndarray:
-    """Floor boards running up the image: each has its own brightness and joints, dark gaps between them."""
+    """Return floor boards running up the image: each has its own brightness and joints, dark gaps between them."""
     image = grain(rng, mean, side)
     edges = np.round(np.linspace(0, side, across + 1)).astype(int)
     for left, right in pairwise(edges):
@@ -53,7 +54,7 @@ def planks(rng: Random, mean: float, side: int = 512, across: int = 14) -> np.nd
 
 
 def rug_pattern(rng: Random, side: int = 256) -> np.ndarray:
-    """A border of bands around a field of diamonds, with the nap of wool."""
+    """Return a border of bands around a field of diamonds, with the nap of wool."""
     centred = np.abs(np.linspace(-1, 1, side))
     rows, columns = centred[:, None], centred[None]
     inset = 1 - np.maximum(rows, columns)
@@ -66,7 +67,7 @@ def rug_pattern(rng: Random, side: int = 256) -> np.ndarray:
 
 
 def landscape(rng: Random, height: int = 192, width: int = 288) -> np.ndarray:
-    """A painting: a sun in a sky that pales towards the horizon, before it ever darker ranges of hills."""
+    """Return a painting: a sun in a sky that pales towards the horizon, before it ever darker ranges of hills."""
     y, x = np.linspace(1, 0, height)[:, None], np.linspace(0, 1.5, width)[None]
     image = 0.75 - 0.3 * y + 0 * x
     sun_x, sun_y = rng.uniform(0.3, 1.2), rng.uniform(0.7, 0.85)
@@ -78,7 +79,7 @@ def landscape(rng: Random, height: int = 192, width: int = 288) -> np.ndarray:
 
 
 def tiles(rng: Random, mean: float, side: int = 256, across: int = 8) -> np.ndarray:
-    """Square floor tiles of slightly different brightness, or a chequerboard, with joints between them."""
+    """Return square floor tiles of slightly different brightness, or a chequerboard, with joints between them."""
     cell = np.arange(side) * across // side
     each = rng.uniform(0.9, 1.1, (across, across))
     if rng.random() < 0.4:
@@ -91,7 +92,7 @@ def tiles(rng: Random, mean: float, side: int = 256, across: int = 8) -> np.ndar
 
 
 def stripes(rng: Random, side: int = 128) -> np.ndarray:
-    """Woven stripes or checks of three albedos."""
+    """Return woven stripes or checks of three albedos."""
     colours = rng.uniform(0.05, 0.9, 3)
     bands = np.sort(rng.integers(0, side, 2 * rng.integers(2, 7)))
     row = colours[np.searchsorted(bands, np.arange(side)) % 3]
@@ -102,7 +103,7 @@ def stripes(rng: Random, side: int = 128) -> np.ndarray:
 
 
 def print_page(rng: Random, side: int = 128) -> np.ndarray:
-    """A poster or a screen: blocks of dark or light lines and a few filled shapes on an even ground."""
+    """Return a poster or a screen: blocks of dark or light lines and a few filled shapes on an even ground."""
     ground, ink = (0.85, 0.05) if rng.random() < 0.6 else (0.05, 0.7)
     image = np.full((side, side), ground)
     y = int(rng.integers(4, 20))
@@ -117,7 +118,7 @@ def print_page(rng: Random, side: int = 128) -> np.ndarray:
 
 
 def spines(rng: Random, side: int = 128) -> np.ndarray:
-    """Upright book spines with titles."""
+    """Return upright book spines with titles."""
     edges = np.unique(np.concatenate(([0], rng.integers(0, side, 14), [side])))
     image = np.empty((side, side))
     for left, right in pairwise(edges):
@@ -134,7 +135,7 @@ UNIT = 128
 
 
 def on_one_sheet(surfaces: Sequence[Surface]) -> list[Surface]:
-    """The surfaces with all their textures moved onto one image, which therefore has one size whatever is in it.
+    """Return the surfaces with all their textures moved onto one image, which therefore has one size whatever is in it.
 
     The largest texture goes to the largest free cell and is repeated or cropped to fill it; texture coordinates must
     lie in [0, 1]. A renderer compiles one kernel for one textured material: every scene of a set then has the same.
@@ -156,11 +157,11 @@ def on_one_sheet(surfaces: Sequence[Surface]) -> list[Surface]:
         ]
         place[id(texture)] = row, column, side
     sheet_texture = Texture(whole, "textures of the scene")
-    materials: dict[int, object] = {}
+    materials: dict[int, Material] = {}
     moved = []
     for surface in surfaces:
         material = surface.material
-        if id(material.albedo) not in place:
+        if surface.uv is None or id(material.albedo) not in place:
             moved.append(surface)
             continue
         row, column, side = place[id(material.albedo)]

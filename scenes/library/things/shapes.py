@@ -16,14 +16,14 @@ Shape = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def rectangle() -> Shape:
-    """The square [-1, 1]^2 at z = 0, facing +z."""
+    """Return the square [-1, 1]^2 at z = 0, facing +z."""
     vertices = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], dtype=np.float64)
     faces = np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int64)
     return vertices, faces, (vertices[:, :2] + 1) / 2
 
 
 def box(size: Iterable[float] = (2.0, 2.0, 2.0)) -> Shape:
-    """A box centred on the origin with edges `size` (x, y, z).
+    """Return a box centred on the origin with edges `size` (x, y, z).
 
     Each side has its own four vertices and uv 0 to 1, upright along +y on the walls.
     """
@@ -43,7 +43,7 @@ def _unit_box() -> Shape:
 
 
 def disk(radius: float = 1.0, segments: int = 64) -> Shape:
-    """A disk at z = 0 facing +z; u runs from the centre to the rim, v backwards around it (1 at +x).
+    """Return a disk at z = 0 facing +z; u runs from the centre to the rim, v backwards around it (1 at +x).
 
     Its area is too small by 1 - sin(a)/a with a = 2 pi/segments: 1.6e-3 at 64 segments, 4e-4 at 128.
     """
@@ -65,7 +65,8 @@ def disk(radius: float = 1.0, segments: int = 64) -> Shape:
 def cylinder(
     p0: Iterable[float], p1: Iterable[float], radius: float, *, segments: int = 64, caps: bool = False
 ) -> Shape:
-    """The wall of a round cylinder from p0 to p1 and, asked for, its two caps; u around, v from p1 (0) to p0 (1).
+    """Return the wall of a round cylinder from p0 to p1 and, asked for, its two caps; u around, v from p1 (0) to p0
+    (1).
 
     The wall's area is too small by 1 - sin(a)/a with a = pi/segments: 4e-4 at 64 segments.
     """
@@ -92,7 +93,8 @@ def cylinder(
 
 
 def sphere(radius: float = 1.0, subdivisions: int = 5) -> Shape:
-    """A sphere from a repeatedly divided icosahedron; z is the polar axis, u the longitude, v from -z (0) to +z (1).
+    """Return a sphere from a repeatedly divided icosahedron; z is the polar axis, u the longitude, v from -z (0) to +z
+    (1).
 
     Vertices are doubled along the seam u = 0 and at the poles. With 5 subdivisions (20,480 faces) the area is too
     small by 3.0e-4, the volume by 5.4e-4, and no point of a face lies deeper than 2.9e-4 radii under the true sphere.
@@ -121,7 +123,8 @@ def _unit_sphere(subdivisions: int) -> Shape:
 
 
 def axis_frame(direction: np.ndarray) -> np.ndarray:
-    """Rotation whose third column is the unit vector `direction`, the others as in Duff et al. 2017, JCGT 6(1)."""
+    """Return rotation whose third column is the unit vector `direction`, the others as in Duff et al. 2017, JCGT
+    6(1)."""
     x, y, z = direction
     sign = math.copysign(1.0, z)
     a = -1 / (sign + z)
@@ -130,13 +133,13 @@ def axis_frame(direction: np.ndarray) -> np.ndarray:
 
 
 def transform(vertices: np.ndarray, matrix4: np.ndarray) -> np.ndarray:
-    """Points moved by an affine 4x4 matrix."""
+    """Return points moved by an affine 4x4 matrix."""
     matrix4 = np.asarray(matrix4, dtype=np.float64)
     return np.asarray(vertices, dtype=np.float64) @ matrix4[:3, :3].T + matrix4[:3, 3]
 
 
 def transform_normals(normals: np.ndarray, matrix4: np.ndarray) -> np.ndarray:
-    """Normals moved by the inverse transpose of a 4x4 matrix, at unit length (a zero normal stays zero)."""
+    """Return normals moved by the inverse transpose of a 4x4 matrix, at unit length (a zero normal stays zero)."""
     moved = np.asarray(normals, dtype=np.float64) @ np.linalg.inv(np.asarray(matrix4, dtype=np.float64)[:3, :3])
     length = np.linalg.norm(moved, axis=1, keepdims=True)
     return moved / np.where(length > 0, length, 1)
