@@ -14,8 +14,8 @@ MAX_CELLS = 64
 GLINT_LEVELS = 2
 # A wire that runs through the image is followed by at most this many launches.
 MAX_LAUNCHES = 256
-# Passes end when there is less to cut than least_share times this share of what the first one cut: a pass takes as long
-# as ten thousand rays, and the last few edges are worth less (measured in rooms: 4 % more error, 26 % less time).
+# Passes end when there is less to cut than edge_threshold times this share of what the first one cut: a pass takes as
+# long as ten thousand rays, and the last few edges are worth less (measured in rooms: 4 % more error, 26 % less time).
 LAST_FRACTION = 1 / 32
 
 _TYPES = dict.fromkeys(("rank", "column", "row", "level", "child"), np.int32)

@@ -33,7 +33,7 @@ class Compare(Common):
 
 
 def run(command: Compare, progress: Progress) -> dict:
-    """One histogram -> depth by every method, a table and a figure."""
+    """Run the command: one histogram -> depth by every method, a table and a figure."""
     from scene2spad.methods import depth_method
     from scene2spad.plots.figures import draw_comparison
     from scenes.files import write_csv

@@ -84,8 +84,8 @@ def _points(command: Export, kind: str) -> int:
     require(points is not None, f"{command.file}: does not say which camera it was seen with, so there are no points")
     known = np.isfinite(depth_m)
     top = float(np.quantile(intensity[known], 0.995)) if known.any() else 1.0
-    share = np.clip(intensity[known] / (top or 1.0), 0, 1)
-    write_ply(points[known], command.out, intensity=share, confidence=confidence[known])
+    fraction = np.clip(intensity[known] / (top or 1.0), 0, 1)
+    write_ply(points[known], command.out, intensity=fraction, confidence=confidence[known])
     return int(known.sum())
 
 

@@ -58,7 +58,7 @@ class Job:
     """Everything that decides the bytes of a set's views, but for their number.
 
     merging     how much of a set's merging of returns is done: 1 as sets are written, 0.1 for references
-    least_share as of `RenderSettings`; what `grid.json` says, where a set plans its rays
+    edge_threshold as of `RenderSettings`; what `grid.json` says, where a set plans its rays
     """
 
     set: str

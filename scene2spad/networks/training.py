@@ -192,10 +192,11 @@ def baseline(name: str) -> Method:
     return lambda histogram: histogram_depth_m(histogram, depth_of)
 
 
-def photon_levels(said: Sequence[str]) -> tuple[tuple[float, float], ...]:
-    """Mean (signal, background) photons of levels such as "1+100"; the paper's 16 of none. InputError for others."""
+def photon_levels(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
+    """Return mean (signal, background) photons of levels such as "1+100"; the paper's 16 of none. InputError for
+    others."""
     found = []
-    for one in said:
+    for one in texts:
         try:
             signal, background = map(float, one.split("+"))
         except ValueError:
@@ -252,7 +253,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
 
 
 def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[dict[str, Any]]:
-    """Mean MAE [mm] and share within 10 mm of every level and group; as lines unless `full`."""
+    """Return mean MAE [mm] and share within 10 mm of every level and group; as lines unless `full`."""
     rows = [row for row in found.rows if row.group == "all"]
     lines: list[dict[str, Any]] = []
     for signal, background in dict.fromkeys((row.signal, row.background) for row in rows):

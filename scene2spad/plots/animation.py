@@ -52,10 +52,10 @@ def _lit(values: np.ndarray) -> tuple[int, int]:
     return (int(max(lit[0] - 2, 0)), int(lit[-1])) if lit.size else (0, values.shape[2] - 1)
 
 
-def _picture(share: np.ndarray, at_ns: float, side: int) -> Image.Image:
+def _picture(fraction: np.ndarray, at_ns: float, side: int) -> Image.Image:
     """One frame (H, W) in [0, 1], enlarged by a whole factor, with its time and the depth seen then."""
-    factor = max(1, side // max(share.shape))
-    rgb = np.rint(255 * matplotlib.colormaps["inferno"](share ** (1 / 2.2))[..., :3]).astype(np.uint8)
+    factor = max(1, side // max(fraction.shape))
+    rgb = np.rint(255 * matplotlib.colormaps["inferno"](fraction ** (1 / 2.2))[..., :3]).astype(np.uint8)
     image = Image.fromarray(rgb.repeat(factor, axis=0).repeat(factor, axis=1))
     if image.width >= 160:  # else there is no room for words
         ImageDraw.Draw(image).text(

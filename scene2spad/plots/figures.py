@@ -211,7 +211,7 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
 
 
 def draw_depth_map(depth_m: np.ndarray, confidence: np.ndarray | None, title: str, path: Path) -> Path:
-    """A depth map on its own, and the confidence where a network stated one."""
+    """Draw a depth map on its own, and the confidence where a network stated one."""
     columns = 1 if confidence is None else 2
     figure, axes = plt.subplots(1, columns, figsize=(6 * columns, 4.8), layout="constrained", squeeze=False)
     _image(axes[0, 0], depth_m, title, "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
@@ -223,7 +223,7 @@ def draw_depth_map(depth_m: np.ndarray, confidence: np.ndarray | None, title: st
 def draw_comparison(
     histogram: Histogram, depths: dict[str, np.ndarray], errors: dict[str, dict], path: Path, *, columns: int = 4
 ) -> Path:
-    """Depth of every method above its absolute error, on one scale; depth alone where no truth is known."""
+    """Draw depth of every method above its absolute error, on one scale; depth alone where no truth is known."""
     known = bool(np.isfinite(histogram.depth_m).any())
     panels = {"true depth": histogram.depth_m, **depths} if known else depths
     across = min(columns, len(panels))
@@ -237,10 +237,10 @@ def draw_comparison(
         band, column = divmod(number, across)
         above = axes[rows * band, column]
         above.set_axis_on()
-        told = errors.get(name)
-        said = f"{name}\nMAE {told['mae_mm']:.0f} mm" if told and known else name
-        _image(above, depth, said, "m", cmap=DEPTH_COLOURS, **limits)
-        if known and told:
+        figures = errors.get(name)
+        message = f"{name}\nMAE {figures['mae_mm']:.0f} mm" if figures and known else name
+        _image(above, depth, message, "m", cmap=DEPTH_COLOURS, **limits)
+        if known and figures:
             below = axes[rows * band + 1, column]
             below.set_axis_on()
             error_mm = 1000 * np.abs(depth - histogram.depth_m)
@@ -249,11 +249,11 @@ def draw_comparison(
 
 
 def draw_pulse(sensor: Sensor, path: Path) -> Path:
-    """The pulse of a sensor with its jitter: what one photon's arrival time becomes, and the bins beneath."""
+    """Draw the pulse of a sensor with its jitter: what one photon's arrival time becomes, and the bins beneath."""
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     before, after = sensor.response.window_s(4)
     edges_s = np.linspace(-before, after, 401)
-    density = sensor.response.shares(edges_s) / np.diff(edges_s)
+    density = sensor.response.bin_masses(edges_s) / np.diff(edges_s)
     axes.stairs(1e-9 * density, 1e9 * edges_s)
     width_ns = 1e9 * sensor.bin_width_s
     for edge in np.arange(np.ceil(-1e9 * before / width_ns), 1e9 * after / width_ns):

@@ -96,7 +96,7 @@ def cube_payload(cube: Cube) -> dict[str, Any]:
             values = np.concatenate([values, np.zeros((*values.shape[:2], 1), values.dtype)], axis=2)
         values, summed = values[..., ::2] + values[..., 1::2], 2 * summed
     top = float(values.max(initial=0))
-    told = {
+    common = {
         "name": cube.name,
         "unit": cube.unit,
         "drawn": cube.drawn,
@@ -108,7 +108,7 @@ def cube_payload(cube: Cube) -> dict[str, Any]:
     }
     if values.dtype.kind in "iu":
         kind = np.uint8 if top <= 255 else np.uint16 if top <= 65535 else np.uint32
-        return {**told, "type": np.dtype(kind).name, "data": packed(values.astype(kind))}
+        return {**common, "type": np.dtype(kind).name, "data": packed(values.astype(kind))}
     # steps of the square root: each is the same share of a rate's shot noise
     levels = np.rint(LEVELS * np.sqrt(values / (top or 1.0)))
-    return {**told, "type": "uint8", "rooted": True, "data": packed(levels.astype(np.uint8))}
+    return {**common, "type": "uint8", "rooted": True, "data": packed(levels.astype(np.uint8))}

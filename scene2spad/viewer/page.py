@@ -90,16 +90,16 @@ def _marks(content: Content) -> str:
 
 def _precision(content: Content, cubes: list[dict[str, Any]]) -> str:
     """What the page rounds, in words."""
-    said = []
-    for told in cubes:
-        summed = f", {told['summed']} bins summed" if told["summed"] > 1 else ""
-        rounded = ", rounded to 255 steps of its square root" if "rooted" in told else ""
-        said.append(f"{told['name']}: {told['unit']}{summed}{rounded}")
+    lines = []
+    for part in cubes:
+        summed = f", {part['summed']} bins summed" if part["summed"] > 1 else ""
+        rounded = ", rounded to 255 steps of its square root" if "rooted" in part else ""
+        lines.append(f"{part['name']}: {part['unit']}{summed}{rounded}")
     if content.returns is not None:
-        said.append(f"returns on a logarithmic scale of four decades, {content.returns.note}")
+        lines.append(f"returns on a logarithmic scale of four decades, {content.returns.note}")
     if any(layer.palette == "depth" for layer in content.layers):
-        said.append("dotted: depth")
-    return "; ".join(said) + "."
+        lines.append("dotted: depth")
+    return "; ".join(lines) + "."
 
 
 def _payload(content: Content) -> dict[str, Any]:

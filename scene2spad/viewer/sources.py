@@ -29,11 +29,11 @@ def transient_content(transient: Transient, title: str) -> Content:
     total = transient.total_radiance()
     direct = transient.bounces == 1
     late = np.bincount(transient.return_pixel[~direct], transient.radiance[~direct], total.size).reshape(total.shape)
-    share = np.divide(late, total, out=np.zeros_like(total), where=total > 0)
+    fraction = np.divide(late, total, out=np.zeros_like(total), where=total > 0)
     layers = (
         grey_layer("laser light", "1/(m² sr)", total),
         depth_layer("depth", transient.depth_m),
-        Layer("indirect share", "", share, "error", 0.0, float(share.max(initial=0)) or 1.0),
+        Layer("indirect share", "", fraction, "error", 0.0, float(fraction.max(initial=0)) or 1.0),
         grey_layer("ambient light", "W/(m² sr nm)", transient.ambient),
         Layer("two surfaces", "", transient.mixed, "gray", MIXED_LOW, MIXED_HIGH),
     )
@@ -94,7 +94,7 @@ def depth_layer(name: str, depth_m: np.ndarray) -> Layer:
 
 
 def surface(depth_m: np.ndarray, camera: Mapping[str, Any] | None, value: np.ndarray | None) -> dict[str, Any]:
-    """Points (N, 3) in the camera's frame and their brightness; nothing where the field of view is unknown."""
+    """Return points (N, 3) in the camera's frame and their brightness; nothing where the field of view is unknown."""
     points = camera_points(depth_m, camera)
     if points is None:
         return {}
@@ -107,7 +107,8 @@ def surface(depth_m: np.ndarray, camera: Mapping[str, Any] | None, value: np.nda
 
 
 def camera_points(depth_m: np.ndarray, camera: Mapping[str, Any] | None) -> np.ndarray | None:
-    """Points (H, W, 3) [m] of radial depths (H, W), x right, y down, z forward; None without a camera of this size."""
+    """Return points (H, W, 3) [m] of radial depths (H, W), x right, y down, z forward; None without a camera of this
+    size."""
     height, width = depth_m.shape
     if not camera or (camera.get("height"), camera.get("width")) != (height, width):
         return None
@@ -115,7 +116,8 @@ def camera_points(depth_m: np.ndarray, camera: Mapping[str, Any] | None) -> np.n
 
 
 def light_over_path(transient: Transient) -> Cube:
-    """Radiance of every pixel over FRAMES equal steps of path length, each return spread evenly over its interval."""
+    """Return radiance of every pixel over FRAMES equal steps of path length, each return spread evenly over its
+    interval."""
     near, far = transient.path_near_m.astype(float), transient.path_far_m.astype(float)
     low, high = _span(near, far, transient.radiance)
     step = (high - low) / FRAMES
@@ -188,7 +190,7 @@ def expected_cube(transient: Transient, sensor: Sensor, rates: Rates) -> np.ndar
     fine = period * FINER
     per_cell = SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s / FINER
     edges_s = (np.arange(fine + 1) - fine // 2 - 0.5) * sensor.bin_width_s / FINER
-    pulse = np.fft.rfft(np.roll(sensor.response.shares(edges_s), -(fine // 2)))
+    pulse = np.fft.rfft(np.roll(sensor.response.bin_masses(edges_s), -(fine // 2)))
     pixels = transient.height * transient.width
     found = np.empty((pixels, sensor.bins), np.float32)
     alive = rates.signal_scale * rates.alive.reshape(-1)

@@ -44,7 +44,7 @@ def rates_for(
     dark_map_hz: np.ndarray | None = None,
     seed: int = 0,
 ) -> Rates:
-    """Return scale a transient to a photon budget by means.
+    """Scale a transient to a photon budget by means.
 
     Signal: all returns times one factor, so that their mean over the image is `budget.signal`. Background: dark counts
     are what the sensor says (or a measured map (H, W) in Hz, NaN in dead pixels), ambient light fills the mean up to

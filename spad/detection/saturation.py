@@ -61,8 +61,8 @@ def draw_saturated(
 def saturated_jacobian(
     flux: np.ndarray, jacobian: np.ndarray, trials: np.ndarray, recovery: float, compression: float = 0.0
 ) -> np.ndarray:
-    """Return chain rule through `saturated`: flux (Z, T), its derivatives (Z, T, P) -> derivatives of the counts (Z, T,
-    P)."""
+    """Apply the chain rule through `saturated`: flux (Z, T), its derivatives (Z, T, P) -> derivatives of the counts (Z,
+    T, P)."""
     mu, dmu = flux / trials[:, None], jacobian / trials[:, None, None]
     after, dafter = np.cumsum(mu, axis=1), np.cumsum(dmu, axis=1)
     before, dbefore = after - mu, dafter - dmu

@@ -90,7 +90,7 @@ def _hdf5(arrays: dict[str, np.ndarray], layout: Layout) -> bytes:
         file.attrs["axes"] = "row, column, time" if layout == "hwt" else "time, row, column"
         for name, values in arrays.items():
             packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1} if values.ndim else {}
-            unit, told = RADIANCE if name == "data" and values.dtype.kind == "f" else UNITS[name]
+            unit, note = RADIANCE if name == "data" and values.dtype.kind == "f" else UNITS[name]
             dataset = file.create_dataset(name, data=values, **packed)
-            dataset.attrs["unit"], dataset.attrs["description"] = unit, told
+            dataset.attrs["unit"], dataset.attrs["description"] = unit, note
     return buffer.getvalue()

@@ -24,7 +24,7 @@ def zone_grid(zones: ZoneArray) -> tuple[int, int, np.ndarray]:
 
 
 def with_budget(zones: ZoneArray, transient: Transient, sensor: Sensor, budget: PhotonBudget) -> ZoneArray:
-    """Return scale gains and set backgrounds so that their means over the zones are the budget's, before saturation.
+    """Scale gains and set backgrounds so that their means over the zones are the budget's, before saturation.
 
     Raises InputError where no light reaches a zone.
     """

@@ -162,8 +162,8 @@ def _summary(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
 
 
 def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
-    """Draw MAE under all light against the background, a panel a signal. Networks trained on direct light alone are dashed
-    where the same design trained with indirect light is there."""
+    """Draw MAE under all light against the background, a panel a signal. Networks trained on direct light alone are
+    dashed where the same design trained with indirect light is there."""
     mine = [line for line in means if line["light"] == "flood"]
     signals, methods = ([*dict.fromkeys(line[key] for line in mine)] for key in ("signal", "method"))
     figure, panels = plt.subplots(
