@@ -17,14 +17,15 @@ class Bench(Common):
 
     stage: Positional[Literal["render", "sense", "encode", "network", "emulate", "hard-cases"]] = "render"
     """What is measured."""
-    scenes: tuple[Literal["flash", "lamp", "artist", "gallery", "groove"], ...] = ()
+    scenes: tuple[Literal["flash", "lamp", "artist", "gallery", "groove", "hall", "hall-lamp", "washroom"], ...] = ()
     """Scenes of `bench render` (default: all)."""
     sizes: tuple[int, ...] = ()
-    """Image sides, pixels (default: 64 128 256 of flash and lamp, and gallery, 64 128 of artist and groove)."""
+    """Image sides, pixels (default: 64 128 256 of flash, lamp and gallery, 64 128 of artist and groove, 64 256 of
+    hall and hall-lamp, 64 of washroom)."""
     only: tuple[str, ...] = ()
     """Cases of `bench hard-cases` (default: all)."""
     quick: bool = False
-    """No 256 pixels, and artist and groove at 64 alone; no slow hard cases."""
+    """No 256 pixels, and flash and lamp alone at 128; no slow hard cases."""
     peer: Literal["mitransient", "none"] = "mitransient"
     """The renderer beside ours; none measures ours alone, against its own finer results."""
     repeats: int = 3

@@ -12,8 +12,10 @@ from scenes.errors import InputError, did_you_mean
 from scenes.io.meshes import EXTENSIONS as MESH_EXTENSIONS
 from scenes.io.meshes import load_mesh
 from scenes.library.gallery import gallery
+from scenes.library.hall import hall
 from scenes.library.living_room import living_room
 from scenes.library.things import shapes
+from scenes.library.washroom import washroom
 from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing, placed
 
@@ -23,7 +25,10 @@ SCENES: dict[str, str] = {
     "sphere": "a Lambertian sphere of radius 0.5 m whose centre is 3 m away, albedo 0.5, nothing behind it",
     "corner": "a V-groove: two walls of 2 x 4 m, albedo 0.5, that meet at 90 degrees on an upright edge 3 m away",
     "gallery": "a bare closed room with six finely meshed bodies, 123,000 triangles",
+    "hall": "a varnished stairwell: coated wood, lacquer, tiles and rough metal of alpha 0.05 to 0.3",
+    "washroom": "chrome, a mirror, lamps in bulbs of thin and of thick glass, a glass door, glossy tiles",
 }
+WHOLE = {"gallery": gallery, "hall": hall, "washroom": washroom}  # scenes with cameras of their own, without a seed
 EXTENSIONS = (*MESH_EXTENSIONS, ".xml")
 HARD = "hard-cases/"
 WALL = "wall@"
@@ -82,8 +87,8 @@ def _loaded(spec: str, seed: int, width: int | None, height: int | None) -> Scen
     size = _looking_ahead(WIDTH, HEIGHT).resized(width, height)
     if spec == "living-room":
         return living_room(seed, width=size.width, height=size.height)
-    if spec == "gallery":
-        return gallery(width=size.width, height=size.height)
+    if spec in WHOLE:
+        return WHOLE[spec](width=size.width, height=size.height)
     make = {"plane": _plane, "sphere": _sphere, "corner": _corner}[spec]
     return Scene(spec, make(), size)
 

@@ -1,5 +1,7 @@
 """The integrators against their plain twins (`render.reference`): energy in coarse intervals of path length."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,19 +25,24 @@ def small(name: str) -> Scene:
     return load_scene(name, width=16, height=12, seed=1)
 
 
-@pytest.mark.parametrize("name", ["living-room", "gallery"])
+@pytest.mark.parametrize("name", ["living-room", "gallery", "hall", "washroom"])
 def test_direct_light_is_that_of_a_grid_of_rays(name):
-    scene = small(name)
+    # mirrors and panes show images of the laser, which no grid of rays finds; chrome shows some narrower than cells
+    polished = ("conductor", "roughconductor", "dielectric", "thindielectric")
+    scene, grid = small(name), 8
+    if name == "washroom":
+        grid = 16  # joints between tiles are a sixth of a cell wide at 8
+        scene = replace(scene, surfaces=tuple(s for s in scene.surfaces if s.material.kind not in polished))
     edges_m = np.linspace(0, 30, 11)
     plain = ray_grid(scene, edges_m, grid=24).sum((0, 1))
-    ours = by_interval(render(scene, RenderSettings(bounces=1, grid=8), seed=1), edges_m)
+    ours = by_interval(render(scene, RenderSettings(bounces=1, grid=grid), seed=1), edges_m)
     # silhouettes: a grid of 24 knows a pixel's coverage to about 1 / 24^1.5 on each edge, 192 pixels together
     assert np.abs(ours - plain).max() < 0.01 * plain.sum()
     assert abs(ours.sum() - plain.sum()) < 5e-3 * plain.sum()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["living-room", "gallery", "corner"])
+@pytest.mark.parametrize("name", ["living-room", "gallery", "corner", "hall"])
 def test_indirect_light_is_that_of_plain_paths(name):
     """Mean of ten renders and of ten plain path traces: within 4.5 standard errors in each of ten intervals."""
     scene = small(name)

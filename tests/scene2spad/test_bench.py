@@ -253,12 +253,12 @@ def test_references_are_kept_by_hash_and_go_on_where_they_stopped(tmp_path):
 
 
 def test_scenes_hold_only_what_both_codes_share():
-    for name in ("flash", "lamp", "groove"):
+    for name in ("flash", "lamp", "groove", "hall", "hall-lamp", "washroom"):
         scene = settings.bench_scene(name, 8)
         assert not scene.has_ambient and (scene.camera.width, scene.camera.height) == (8, 8)
         assert not any(s.material.lets_light_through or s.material.kind == "conductor" for s in scene.surfaces)
-        assert (scene.laser.cone_deg == 360) == (name == "lamp")
-        assert (scene.camera.fov_deg == settings.FLASH_FOV_DEG) == (name != "lamp")
+        assert (scene.laser.cone_deg == 360) == name.endswith("lamp")
+        assert (scene.camera.fov_deg == settings.FLASH_FOV_DEG) == (not name.endswith("lamp"))
 
 
 def bench(capfd, tmp_path, *argv: str) -> tuple[int, dict, str]:

@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from triangles import hit_distances
 
 from scenes import InputError, Scene, Texture
 from scenes.library.living_room import HIGH, LOW, RUG_M, living_room
@@ -15,24 +16,6 @@ SEEDS = (0, 1, 2, 3)
 @cache
 def room(seed: int) -> Scene:
     return living_room(seed)
-
-
-def hit_distances(scene: Scene, rays: np.ndarray) -> np.ndarray:
-    """Distance from the camera to the first triangle along each ray (n, 3), inf for none (Moeller and Trumbore)."""
-    a, b, c = np.concatenate([s.vertices[s.faces] for s in scene.surfaces]).transpose(1, 0, 2)
-    side, other, start = b - a, c - a, scene.camera.origin - a
-    # every triple product as a ray times one vector per triangle
-    to_det, to_u, to_v = (-np.cross(side, other), np.cross(other, start), np.cross(start, side))
-    along = (other * to_v).sum(axis=1)
-    nearest = []
-    for some in np.array_split(rays, max(1, len(rays) // 32)):
-        det = some @ to_det.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v, t = some @ to_u.T / det, some @ to_v.T / det, along / det
-            # a hair of slack: a ray through the edge that two walls share must not slip between them
-            hit = (np.abs(det) > 1e-12) & (u > -1e-9) & (v > -1e-9) & (u + v < 1 + 1e-9) & (t > 1e-6)
-        nearest.append(np.where(hit, t, np.inf).min(axis=1))
-    return np.concatenate(nearest)
 
 
 def test_distance_helper_agrees_with_a_known_wall():

@@ -21,6 +21,9 @@ SCENES = {
     "artist": "an artist's living room (Mitsuba XML), 34 degrees, lit by the same flash",
     "gallery": "a bare room with six finely meshed bodies, 60 degrees, lit by an isotropic lamp at the camera",
     "groove": "a 90-degree V-groove, 34 degrees, lit by the same flash",
+    "hall": "a varnished stairwell, 34 degrees, lit by the same flash",
+    "hall-lamp": "the same with its own camera, lit by an isotropic lamp there",
+    "washroom": "chrome and glossy tiles, 34 degrees, lit by the same flash; its glass is left out, mirrors are grey",
 }
 SIZES = {
     "flash": (64, 128, 256),
@@ -28,10 +31,13 @@ SIZES = {
     "artist": (64, 128),
     "gallery": (64, 128, 256),
     "groove": (64, 128),
+    "hall": (64, 256),
+    "hall-lamp": (64, 256),
+    "washroom": (64,),
 }
-QUICK_SIZES = {"flash": (64, 128), "lamp": (64, 128), "artist": (64,), "gallery": (64,), "groove": (64,)}
-LAMPS = ("lamp", "gallery")
-_BUILT_IN = {"groove": "corner", "gallery": "gallery"}
+QUICK_SIZES = dict.fromkeys(SCENES, (64,)) | {"flash": (64, 128), "lamp": (64, 128)}
+LAMPS = ("lamp", "gallery", "hall-lamp")
+_BUILT_IN = {"groove": "corner", "flash": "living-room", "lamp": "living-room", "hall-lamp": "hall"}
 ARTIST_FILE = Path("scenes/living-room/scene.xml")  # below the data folder
 MIRROR_ALBEDO = 0.5
 
@@ -106,7 +112,7 @@ def bench_scene(name: str, size: int, data: Path | None = None) -> Scene:
             raise InputError(f"{path}: file not found (--data or SCENE2SPAD_DATA tell the folder)")
         scene = load_scene(str(path), width=size, height=size)
     else:
-        scene = load_scene(_BUILT_IN.get(name, "living-room"), width=size, height=size)
+        scene = load_scene(_BUILT_IN.get(name, name), width=size, height=size)
     if name in LAMPS:
         scene = replace(scene, laser=Laser("flood", cone_deg=360))
     else:

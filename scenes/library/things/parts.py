@@ -118,6 +118,20 @@ def lathe(profile: Sequence[Vector], segments: int = 24) -> shapes.Shape:
     return vertices, grid_faces(len(points), segments + 1), np.column_stack((u.ravel(), v.ravel()))
 
 
+def creased(profile: Sequence[Vector], sharpest_deg: float = 35.0) -> list[Vector]:
+    """A profile for `lathe` whose sharp corners are there twice, so that each side has shading normals of its own."""
+    points = np.asarray(profile, float)
+    along = np.arctan2(*np.diff(points, axis=0).T[::-1])
+    bend = np.abs((np.diff(along) + np.pi) % (2 * np.pi) - np.pi)
+    twice = np.concatenate(([False], bend > math.radians(sharpest_deg), [False]))
+    return [tuple(point) for point in np.repeat(points, 1 + twice, axis=0)]
+
+
+def solid(profile: Sequence[Vector], segments: int = 24) -> shapes.Shape:
+    """`lathe` with creases: a turned body, closed where its profile begins and ends on the axis."""
+    return lathe(creased(profile), segments)
+
+
 def tube(points: np.ndarray, radius: float, segments: int = 8) -> shapes.Shape:
     """Return a round wire of that radius along a polyline (n, 3), without caps; its frame is carried along without
     twist."""
@@ -138,6 +152,36 @@ def tube(points: np.ndarray, radius: float, segments: int = 8) -> shapes.Shape:
     )
     v, u = np.meshgrid(np.linspace(0, 1, len(points)), np.linspace(0, 1, segments + 1), indexing="ij")
     return rings.reshape(-1, 3), grid_faces(len(points), segments + 1), np.column_stack((u.ravel(), v.ravel()))
+
+
+def rod(points: np.ndarray, radius: float, segments: int = 12) -> shapes.Shape:
+    """`tube` with flat caps: a closed body."""
+    vertices, faces, uv = tube(points, radius, segments)
+    ends = np.asarray(points, float)[[0, -1]]
+    first, last = np.arange(segments + 1), np.arange(-segments - 1, 0) + len(vertices)
+    start = len(vertices)
+    rims = np.concatenate((vertices[first], vertices[last], ends))
+    around, middle = np.arange(segments), 2 * (segments + 1)
+    low = np.column_stack((around + 1, around, np.full(segments, middle)))
+    high = np.column_stack((around, around + 1, np.full(segments, middle + 1))) + (segments + 1, segments + 1, 0)
+    caps = np.concatenate((low, high)) + start
+    return (
+        np.concatenate((vertices, rims)),
+        np.concatenate((faces, caps)),
+        np.concatenate((uv, np.zeros((len(rims), 2)))),
+    )
+
+
+def cloth(points: np.ndarray, thickness: Vector) -> shapes.Shape:
+    """A `sheet` seen from its front, its back moved by `thickness`, and the seams between them: a closed body."""
+    front = np.asarray(points, float)
+    back = front + np.asarray(thickness, float)
+    around = np.concatenate((front, back[::-1], front[:1]))
+    sides = (np.stack((back[:, 0], front[:, 0]), axis=1), np.stack((front[:, -1], back[:, -1]), axis=1))
+    parts = [sheet(around), *map(sheet, sides)]
+    starts = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts[:-1]])
+    faces = [faces + start for start, (_, faces, _) in zip(starts, parts, strict=True)]
+    return np.concatenate([p[0] for p in parts]), np.concatenate(faces), np.concatenate([p[2] for p in parts])
 
 
 def sheet(points: np.ndarray) -> shapes.Shape:
