@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from scenes.errors import InputError, require
-from ultraphase.assembly.isa import REGISTERS, Instruction, spelled
+from ultraphase.assembly.isa import REGISTERS, Instruction, format_instruction
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.assembly.translate import source
 from ultraphase.chip import ChipSpec
@@ -66,7 +66,7 @@ class Step:
         return changed + [f"[{n}]: {old} -> {new}" for n, (old, new) in enumerate(ram) if old != new]
 
     def __str__(self) -> str:
-        return f"{self.before.word:4d}  {spelled(self.instruction):28s} {', '.join(self.changes())}".rstrip()
+        return f"{self.before.word:4d}  {format_instruction(self.instruction):28s} {', '.join(self.changes())}".rstrip()
 
 
 @dataclass

@@ -13,6 +13,36 @@ import numpy as np
 
 from ultraphase.assembly.isa import Instruction
 
+COMPUTES = ("ADD", "SUB", "MUL", "AND", "OR", "XOR", "MIN", "MAX", "MOV", "SHL", "SHR", "SAR")
+
+
+def _computed(one: Instruction, a: np.int32, other: np.int32) -> np.int32:
+    """Return what an instruction of COMPUTES makes of its two operands; overflow wraps."""
+    shift = np.int32(one.value)
+    match one.name:
+        case "ADD" | "SUB" | "MUL":
+            arithmetic = {"ADD": np.add, "SUB": np.subtract, "MUL": np.multiply}[one.name]
+            return np.int32(arithmetic(a, other, dtype=np.int32))
+        case "AND" | "OR" | "XOR":
+            bitwise = {"AND": np.bitwise_and, "OR": np.bitwise_or, "XOR": np.bitwise_xor}[one.name]
+            return np.int32(bitwise(a, other))
+        case "MIN" | "MAX":
+            return min(a, other) if one.name == "MIN" else max(a, other)
+        case "SHL":
+            return np.int32(np.left_shift(a, shift))
+        case "SHR":
+            return (np.array([a], np.int32).view(np.uint32) >> np.uint32(one.value)).view(np.int32)[0]
+        case "SAR":
+            return np.int32(np.right_shift(a, shift))
+    return other  # MOV
+
+
+def _is_taken(one: Instruction, a: int, b: int, empty: bool) -> bool:
+    """Return whether a branch is taken; `empty`: no photon waits at the port."""
+    bit = a >> one.bit & 1
+    taken = {"BNT": empty, "BFE": empty, "JMP": True, "BZ": a == 0, "BNZ": a != 0, "BLT": a < b}
+    return (taken | {"BBS": bit == 1, "BBC": bit == 0})[one.name]
+
 
 def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ram_bytes: int) -> dict[str, Any]:
     """Run a program until it halts.
@@ -40,33 +70,16 @@ def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ra
             match one.name:
                 case "HALT":
                     return {"r": r.tolist(), "ram": ram.tolist(), "out": out, "n": done, "w": wraps, "s": saturations}
-                case "ADD" | "SUB" | "MUL":
-                    arithmetic = {"ADD": np.add, "SUB": np.subtract, "MUL": np.multiply}[one.name]
-                    r[one.rd] = arithmetic(r[one.rs], other, dtype=np.int32)
-                case "AND" | "OR" | "XOR":
-                    bitwise = {"AND": np.bitwise_and, "OR": np.bitwise_or, "XOR": np.bitwise_xor}[one.name]
-                    r[one.rd] = bitwise(r[one.rs], other)
-                case "MIN" | "MAX":
-                    r[one.rd] = {"MIN": np.minimum, "MAX": np.maximum}[one.name](r[one.rs], other)
-                case "MOV":
-                    r[one.rd] = other
-                case "SHL":
-                    r[one.rd] = np.left_shift(r[one.rs], np.int32(one.value))
-                case "SHR":
-                    r[one.rd] = (r[one.rs : one.rs + 1].view(np.uint32) >> np.uint32(one.value)).view(np.int32)[0]
-                case "SAR":
-                    r[one.rd] = np.right_shift(r[one.rs], np.int32(one.value))
+                case name if name in COMPUTES:
+                    r[one.rd] = _computed(one, r[one.rs], other)
                 case "SATB" | "SATH":
                     info = np.iinfo(np.uint8 if one.name == "SATB" else np.int16)
                     held = np.clip(r[one.rs], info.min, info.max)
                     saturations += int(held != r[one.rs])
                     r[one.rd] = held
-                case "LDB":
-                    r[one.rd] = ram[cell]
-                case "LDBS":
-                    r[one.rd] = ram.view(np.int8)[cell]
-                case "LDH":
-                    r[one.rd] = halves[cell // 2]
+                case "LDB" | "LDBS" | "LDH":
+                    memory = {"LDB": ram, "LDBS": ram.view(np.int8), "LDH": halves}[one.name]
+                    r[one.rd] = memory[cell // memory.itemsize]
                 case "STB":
                     value = int(r[one.rd])
                     ram[cell] = value & 255
@@ -88,12 +101,7 @@ def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ra
                 case "ID":
                     r[one.rd] = 0
                 case _:
-                    a, b = int(r[one.rs]), int(r[one.rd])
-                    bit = a >> one.bit & 1
-                    taken = {
-                        "BNT": not port, "BFE": not port, "JMP": True, "BZ": a == 0, "BNZ": a != 0, "BLT": a < b,
-                        "BBS": bit == 1, "BBC": bit == 0,
-                    }[one.name]  # fmt: skip
+                    taken = _is_taken(one, int(r[one.rs]), int(r[one.rd]), not port)
                     at = one.target if taken else at
 
 

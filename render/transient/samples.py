@@ -119,11 +119,11 @@ def merge_by(samples: Samples, key: np.ndarray, base: np.ndarray) -> Samples:
     total, mean, square = np.add.reduceat(moments.take(order, axis=1), first, axis=1)
     mean /= total
     variance = np.maximum(square / total - mean**2, 0)
-    heads = order[first]
-    bounces = samples.bounces[heads]
+    leading = order[first]
+    bounces = samples.bounces[leading]
     if samples.bounces.max() > 1:
         bounces = np.minimum.reduceat(samples.bounces[order], first)
-    return packed(samples.pixel[heads], base[heads] + mean, np.sqrt(3 * variance), total, bounces)
+    return packed(samples.pixel[leading], base[leading] + mean, np.sqrt(3 * variance), total, bounces)
 
 
 def to_returns(samples: Samples, pixels: int) -> Returns:

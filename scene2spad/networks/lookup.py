@@ -54,7 +54,7 @@ def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> M
         training = Path("rooms.h5")
         log.warning("%s below: scene2spad dataset rooms --count 2000 --bounces 1 --pack %s", training, training)
     for one in absent:
-        log.warning("absent: %s; made by: %s", one.name, one.spelled(command.preset, training, library.folder))
+        log.warning("absent: %s; made by: %s", one.name, one.training_command(command.preset, training, library.folder))
     _warn_if_unlike(found.values())
     return ModelLookup(found, absent)
 

@@ -85,7 +85,7 @@ class ModelSpec:
             out=folder / self.name,
         )
 
-    def spelled(self, preset: str, training: Path, folder: Path) -> str:
+    def training_command(self, preset: str, training: Path, folder: Path) -> str:
         """Return the same as one types it."""
         coded = f" --block {' '.join(map(str, self.block))} --compression {self.compression}" if self.coded else ""
         more = f"{' --full' if self.full else ''}"

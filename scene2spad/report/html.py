@@ -125,10 +125,10 @@ def table(rows: Sequence[Mapping[str, Any]], caption: str, most: int = 60) -> st
 def _cell(value: Any) -> str:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     kind = ' class="n"' if number else ""
-    return f"<td{kind}>{escape(spelled(value))}</td>"
+    return f"<td{kind}>{escape(format_value(value))}</td>"
 
 
-def spelled(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Return four digits of a number, yes or no, a dash for none; lists and dictionaries in a line."""
     if isinstance(value, bool):
         return "yes" if value else "no"
@@ -137,7 +137,7 @@ def spelled(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if math.isfinite(value) else "–"
     if isinstance(value, Mapping):
-        return "; ".join(f"{key}: {spelled(one)}" for key, one in value.items())
+        return "; ".join(f"{key}: {format_value(one)}" for key, one in value.items())
     if isinstance(value, (list, tuple)):
-        return ", ".join(map(spelled, value)) or "–"
+        return ", ".join(map(format_value, value)) or "–"
     return str(value)

@@ -109,7 +109,7 @@ def _notes(item: Item, found: Found) -> Iterator[str]:
         if kinds:
             yield f"{len(models)} trained models: {'; '.join(kinds)}."
         if (numbers or {}).get("absent"):
-            yield f"Models that were absent: {html.spelled(numbers['absent'])}."
+            yield f"Models that were absent: {html.format_value(numbers['absent'])}."
 
 
 def _absent(file: str, command: str, path: Path | None, absent: dict[str, list[str]]) -> str:
@@ -220,7 +220,7 @@ def _configurations(found: Found) -> Iterator[str]:
         path = found.newest(name)
         machine = ((found.read(path, read_json_object) if path else None) or {}).get("machine")
         if machine:
-            yield html.paragraph(f"{name} was measured on: {html.spelled(machine)}.")
+            yield html.paragraph(f"{name} was measured on: {html.format_value(machine)}.")
     models = list(_models(found))
     if models:
         found.tables += 1

@@ -318,7 +318,7 @@ def test_published_numbers_stand_beside_ours():
     ],
 )
 def test_cells(value, text):
-    assert report_html.spelled(value) == text
+    assert report_html.format_value(value) == text
 
 
 def test_gathering_wants_a_folder(tmp_path):

@@ -64,7 +64,7 @@ def test_names_and_labels():
     ids=lambda one: one.name,
 )
 def test_spelled_command_is_the_command(wanted):
-    spelled = shlex.split(wanted.spelled("laptop", Path("rooms.h5"), Path("runs")))
+    spelled = shlex.split(wanted.training_command("laptop", Path("rooms.h5"), Path("runs")))
     parsed = tyro.cli(Command, args=spelled[1:])
     assert parsed.out == Path("runs") / wanted.name
     assert config_of(parsed) == config_of(wanted.command("laptop", Path("rooms.h5"), Path("runs")))

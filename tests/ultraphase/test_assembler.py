@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from scenes.errors import InputError
 from ultraphase import ChipSpec, assemble, assemble_file, disassemble, listing, method
-from ultraphase.assembly.isa import DIRECTIONS, OPS, Instruction, decode, encode, spelled
+from ultraphase.assembly.isa import DIRECTIONS, OPS, Instruction, decode, encode, format_instruction
 from ultraphase.catalog import FOLDER, PUBLISHED
 
 DEFAULT = settings(deadline=None, derandomize=True, max_examples=80)
@@ -78,7 +78,7 @@ def test_listing_has_every_word_with_its_source_line():
         line = next(line for line in text.splitlines() if line.startswith(f"  {address:3d}  {word:08x}  3  "))
         assert line.endswith(f"; {file}:{number}")
         source = (FOLDER / file).read_text().splitlines()[number - 1].split(";")[0]
-        assert spelled(program.instructions[address]).split()[0] in source
+        assert format_instruction(program.instructions[address]).split()[0] in source
     assert "2176 of 4096 bits" in text and "table quarter: 256 x u8, 2048 bits" in text
 
 

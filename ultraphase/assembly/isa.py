@@ -101,8 +101,8 @@ WRAPPING = ("ADD", "SUB", "MUL", "SHL", "SHR")
 WORD_LIMITS = (-_HALF, _HALF - 1)
 WRAP = f"({{}} + {_HALF} & {_MASK}) - {_HALF}"
 ALU: dict[str, Callable[[Any, Any], Any]] = {
-    name: eval("lambda a, b: " + (WRAP.format(f"({spelled})") if name in WRAPPING else spelled))
-    for name, spelled in ALU_SPELLED.items()
+    name: eval("lambda a, b: " + (WRAP.format(f"({expression})") if name in WRAPPING else expression))
+    for name, expression in ALU_SPELLED.items()
 }
 
 
@@ -169,7 +169,7 @@ def _plain(instruction: Instruction) -> bool:
     return all(checks)
 
 
-def spelled(instruction: Instruction, label: Callable[[int], str] = str) -> str:
+def format_instruction(instruction: Instruction, label: Callable[[int], str] = str) -> str:
     """Return as the assembler reads it; `label` names the target of a branch."""
     i = instruction
     base = "" if i.constant else f"r{i.rs} + "

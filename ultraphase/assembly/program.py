@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from scenes.errors import require
-from ultraphase.assembly.isa import Instruction, decode, encode, spelled
+from ultraphase.assembly.isa import Instruction, decode, encode, format_instruction
 from ultraphase.chip import ChipSpec
 
 KINDS: dict[str, np.dtype[Any]] = {"u8": np.dtype("u1"), "s8": np.dtype("i1"), "s16": np.dtype("<i2")}
@@ -84,7 +84,7 @@ class Program:
     def where(self, word: int) -> str:
         """Return a word as a message names it: place in the source, and the instruction."""
         file, line = self.lines[word]
-        return f"{file}:{line}, word {word} ({spelled(self.instructions[word], self._label)})"
+        return f"{file}:{line}, word {word} ({format_instruction(self.instructions[word], self._label)})"
 
     def _label(self, word: int) -> str:
         return next((name for name, target in self.labels.items() if target == word), str(word))
@@ -153,7 +153,7 @@ def listing(program: Program, chip: ChipSpec | None = None) -> str:
         names.setdefault(target, []).append(name)
     for address, instruction in enumerate(program.instructions):
         lines += [f"{name}:" for name in names.get(address, ())]
-        text = spelled(instruction, program._label)
+        text = format_instruction(instruction, program._label)
         file, line = program.lines[address]
         clocks = chip.clocks_per_instruction
         lines.append(f"  {address:3d}  {encode(instruction):08x}  {clocks}  {text:32s}; {file}:{line}")
@@ -173,6 +173,6 @@ def disassemble(words: tuple[int, ...], regions: tuple[Region, ...] = ()) -> str
     for address, instruction in enumerate(instructions):
         if address in targets:
             lines.append(f"L{address}:")
-        lines.append(f"        {spelled(instruction, lambda target: f'L{target}')}")
+        lines.append(f"        {format_instruction(instruction, lambda target: f'L{target}')}")
     lines += [f"L{target}:" for target in targets if target == len(instructions)]
     return "\n".join(lines) + "\n"

@@ -44,12 +44,14 @@ def statements(one: Instruction, word: int, ram_bytes: int) -> list[str]:
     """Return one instruction, without what follows it."""
     if one.name in ALU_SPELLED:
         value = _value(one)
-        spelled = re.sub(r"\b[ab]\b", lambda name: f"r[{one.rs}]" if name[0] == "a" else value, ALU_SPELLED[one.name])
+        expression = re.sub(
+            r"\b[ab]\b", lambda name: f"r[{one.rs}]" if name[0] == "a" else value, ALU_SPELLED[one.name]
+        )
         if one.name not in WRAPPING:
-            return [f"r[{one.rd}] = {spelled}"]
+            return [f"r[{one.rd}] = {expression}"]
         # nearly always in range, and then Python's numbers stay short
         low, high = WORD_LIMITS
-        return [f"v = {spelled}", f"r[{one.rd}] = v if {low} <= v <= {high} else {WRAP.format('v')}"]
+        return [f"v = {expression}", f"r[{one.rd}] = v if {low} <= v <= {high} else {WRAP.format('v')}"]
     if "m" in one.op.takes:
         return _memory(one, word, ram_bytes)
     if "l" in one.op.takes:

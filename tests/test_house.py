@@ -1,0 +1,131 @@
+"""Rules of the house that a linter does not know: sizes, names, and how docstrings begin."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("scenes", "render", "spad", "csph", "ultraphase", "scene2spad")
+FILES = {path: ast.parse(path.read_text(encoding="utf-8")) for one in PACKAGES for path in (ROOT / one).rglob("*.py")}
+MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_MODULES = 400, 60, 7, 14
+# What is larger still, at its size: it may shrink, not grow, and nothing may join it.
+LARGER = {
+    "spad/zones/calibration.py": 419,
+    "csph/training/loop.py train": 67,
+    "scene2spad/cli": 25,
+}
+MORE_PARAMETERS = {
+    "csph/evaluation/methods.py evaluate": 8,
+    "csph/training/loop.py train": 8,
+    "scene2spad/datasets/test_sets.py _evaluate": 8,
+    "scene2spad/datasets/test_sets.py evaluated": 8,
+    "scene2spad/datasets/test_sets.py rendered": 8,
+    "scenes/io/relief.py relief": 9,
+    "spad/formats/rgbd.py from_rgbd": 8,
+    "spad/zones/calibration.py fit": 8,
+}
+MAX_ANY = 190  # in signatures; Dr.Jit's types have names of their own (`render.backend.drjit_types`)
+# Private words for which the field has terms.
+NOT_OURS = {"told", "said", "whys", "share", "shares", "tails", "watched", "thrown", "spelled", "least_share"}
+CONSTANT = re.compile(r"(MOST|LEAST)_")
+# First words of docstrings that are nouns, pronouns or another mood.
+NO_IMPERATIVE = re.compile(
+    r"(The|A|An|One|What|Whether|Where|How|All|Every|Both|Those|These|Its|Some|Two|Returns|Raises|Reads|Writes|Makes|Gives"
+    r"|Mean|Depth|Radiance|Expected|Rows|Points|Counts|Codes|Numbers|Samples|InputError)\b"
+)
+
+
+def of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def functions() -> list[tuple[str, ast.FunctionDef]]:
+    found = []
+    for path, tree in FILES.items():
+        found += [(f"{of(path)} {n.name}", n) for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
+    return found
+
+
+def exceeding(sizes: dict[str, int], limit: int, known: dict[str, int]) -> dict[str, int]:
+    return {name: size for name, size in sizes.items() if size > known.get(name, limit)}
+
+
+def annotations(node: ast.FunctionDef) -> list[ast.expr]:
+    args = node.args
+    every = [*args.posonlyargs, *args.args, *args.kwonlyargs, args.vararg, args.kwarg]
+    return [one for one in (*(arg.annotation for arg in every if arg is not None), node.returns) if one is not None]
+
+
+def test_sizes():
+    assert len(FILES) > 250
+    lines = {of(path): len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
+    assert not exceeding(lines, MAX_LINES, LARGER)
+    lengths = {name: (node.end_lineno or 0) - node.lineno + 1 for name, node in functions()}
+    assert not exceeding(lengths, MAX_FUNCTION_LINES, LARGER)
+    folders: dict[str, int] = {}
+    for path in FILES:
+        if path.name != "__init__.py":
+            folders[of(path.parent)] = folders.get(of(path.parent), 0) + 1
+    assert not exceeding(folders, MAX_MODULES, LARGER)
+
+
+def test_parameters():
+    counts = {}
+    for name, node in functions():
+        args = node.args
+        count = len(args.posonlyargs) + len(args.args) + len(args.kwonlyargs) + bool(args.vararg) + bool(args.kwarg)
+        counts[name] = count - bool(args.args and args.args[0].arg in ("self", "cls"))
+    assert not exceeding(counts, MAX_PARAMETERS, MORE_PARAMETERS)
+
+
+def test_what_is_larger_is_still_there():
+    """An exception that nothing needs any more goes."""
+    names = {name for name, _ in functions()} | {of(path) for path in FILES} | {of(path.parent) for path in FILES}
+    assert names >= LARGER.keys() | MORE_PARAMETERS.keys()
+
+
+def test_any_in_signatures():
+    found = [one for _, node in functions() for one in annotations(node) if "Any" in ast.unparse(one)]
+    assert len(found) <= MAX_ANY
+
+
+def test_names_are_the_fields():
+    bad = []
+    for path, tree in FILES.items():
+        for node in ast.walk(tree):
+            name = getattr(node, "id", None) or getattr(node, "attr", None) or getattr(node, "arg", None)
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+                name = node.name
+            if isinstance(name, str) and (name in NOT_OURS or CONSTANT.match(name)):
+                bad.append(f"{of(path)}:{getattr(node, 'lineno', 0)} {name}")
+    assert not bad
+
+
+def public_functions(body: list[ast.stmt]) -> list[ast.FunctionDef]:
+    found = []
+    for node in body:
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            found += public_functions(node.body)
+        elif isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            found.append(node)
+    return found
+
+
+def test_docstrings_begin_with_an_imperative():
+    """Of public functions; properties are nouns."""
+    bad = []
+    for path, tree in FILES.items():
+        for node in public_functions(tree.body):
+            text = ast.get_docstring(node)
+            if text is None or any("property" in ast.unparse(one) for one in node.decorator_list):
+                continue
+            if NO_IMPERATIVE.match(text) or not text[0].isupper():
+                bad.append(f"{of(path)}:{node.lineno} {node.name}: {text.splitlines()[0]}")
+    assert not bad
+
+
+@pytest.mark.parametrize("name", ["The mean of x.", "Returns x.", "x of y"])
+def test_the_rule_of_docstrings_knows_what_is_none(name):
+    assert NO_IMPERATIVE.match(name) or not name[0].isupper()
