@@ -16,13 +16,18 @@ from contextlib import contextmanager, redirect_stdout
 from functools import lru_cache
 from pathlib import Path
 from tokenize import TokenError
+from typing import BinaryIO
+from zipfile import ZipFile
 
 import numpy as np
 
-from scenes.errors import InputError
-from scenes.io.inputs import parse_json
+from scenes.errors import InputError, require
+from scenes.io.inputs import parse_json, regular_file
+from scenes.limits import require_memory
 
 ATTRIBUTE = "scene2spad"
+# numpy's header is Python, and so are the errors of a damaged one
+_NPY_ERRORS = (OSError, ValueError, KeyError, EOFError, SyntaxError, TypeError, RecursionError, TokenError, MemoryError)
 SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 2, "network": 1}
 
 
@@ -115,28 +120,52 @@ def _flush_to_disk(path: Path) -> None:
 def read_array(path: Path) -> np.ndarray:
     """Read one array of numbers from a .npy file.
 
-    Raises InputError in one line that names the file: missing, no .npy file, cut short, of objects, or with a stated
-    shape that is not that of its bytes.
+    Raises InputError in one line that names the file: missing, no .npy file, cut short, of objects, with a stated
+    shape that is not that of its bytes, or larger than the memory limit.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: file not found")
+    path = regular_file(Path(path), "array file")
     try:
+        size = path.stat().st_size
+        require_memory(2 * size, "its array")
         with path.open("rb") as file:
-            version = np.lib.format.read_magic(file)
-            header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-            shape, columns_first, dtype = header[version](file)
-            if dtype.kind not in "biuf":
-                raise InputError(f"{path}: holds {dtype}, expected numbers")
-            left = path.stat().st_size - file.tell()
-            if math.prod(shape) * dtype.itemsize != left:
-                raise InputError(f"{path}: states shape {shape} of {dtype}, {left} bytes follow")
-            values = np.fromfile(file, dtype)
-    except InputError:
-        raise
-    # numpy's header is Python, and so are the errors of a damaged one
-    except (OSError, ValueError, KeyError, EOFError, SyntaxError, TypeError, RecursionError, TokenError) as error:
+            return _array(file, size)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except _NPY_ERRORS as error:
         raise InputError(f"{path}: not a readable .npy file ({' '.join(str(error).split())[:80]})") from None
+
+
+def read_arrays(path: Path, what: str = "array file") -> dict[str, np.ndarray]:
+    """Read arrays of numbers from a .npz file, by name. `what` the file is called where it is not found.
+
+    Raises InputError in one line that names the file: as `read_array` does, and where a checksum does not fit.
+    """
+    path = regular_file(Path(path), what)
+    found = {}
+    try:
+        with ZipFile(path) as archive:
+            entries = archive.infolist()
+            require_memory(2 * sum(entry.file_size for entry in entries), "its arrays")
+            for entry in entries:
+                with archive.open(entry) as file:
+                    found[entry.filename.removesuffix(".npy")] = _array(file, entry.file_size)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except Exception as error:  # what zipfile raises for damaged directories is of many types
+        raise InputError(f"{path}: not a readable .npz file ({' '.join(str(error).split())[:80]})") from None
+    return found
+
+
+def _array(file: BinaryIO, size: int) -> np.ndarray:
+    """Read one array from a file of .npy format with so many bytes; nothing is allocated before shapes are checked."""
+    version = np.lib.format.read_magic(file)
+    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, columns_first, dtype = header[version](file)
+    require(dtype.kind in "biuf", f"holds {dtype}, expected numbers")
+    left = size - file.tell()
+    fits = min(shape, default=0) >= 0 and math.prod(shape) * dtype.itemsize == left
+    require(fits, f"states shape {shape} of {dtype}, {left} bytes follow")
+    values = np.frombuffer(bytearray(file.read(left)), dtype)
     return values.reshape(shape, order="F" if columns_first else "C")
 
 

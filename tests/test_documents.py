@@ -2,11 +2,11 @@
 
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from processes import run_process
 
 from scene2spad.cli.main import RUNNERS, main
 from spad.sensor.files import read_sensor
@@ -75,7 +75,7 @@ def test_the_worked_example_of_the_photon_budget_runs(tmp_path, monkeypatch, cap
 @pytest.mark.slow
 def test_the_python_example_of_the_front_page_runs(tmp_path):
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
-    done = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = run_process([sys.executable, "-c", block], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "mae_mm" in done.stdout
 

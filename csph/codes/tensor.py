@@ -42,13 +42,13 @@ class CodingTensor:
             part = getattr(self, label)
             if part is None and label == "spatial":
                 continue
-            part = as_tensor(part)
+            part = as_tensor(part).detach().float()  # which may end in infinity
             shape = tuple(part.shape)
             if part.ndim not in ranks or 0 in shape or not bool(part.isfinite().all()):
                 raise InputError(
                     f"coding tensor {self.name}: {label} part of shape {shape}, expected finite values {layout}"
                 )
-            object.__setattr__(self, label, part.detach().float())
+            object.__setattr__(self, label, part)
         if self.spatial is not None:
             alike = self.temporal.ndim == 2 and len(self.spatial) == len(self.temporal)
             shapes = f"temporal part {tuple(self.temporal.shape)} and spatial part {tuple(self.spatial.shape)}"

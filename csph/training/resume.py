@@ -46,8 +46,10 @@ def check_resume(path: Path, module: nn.Module) -> None:
     missing = [key for key in KEYS if not isinstance(state, dict) or key not in state]
     if missing:
         raise InputError(f"{path}: is no state of an interrupted run, {', '.join(missing)} are missing; {CURE}")
+    if not isinstance(state["state_dict"], dict):
+        raise InputError(f"{path}: is no state of an interrupted run, its state_dict is none; {CURE}")
     expected = {name: tuple(value.shape) for name, value in module.state_dict().items()}
     found = {name: tuple(getattr(value, "shape", ())) for name, value in state["state_dict"].items()}
     if expected != found:
-        other = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
+        other = sorted(str(name) for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
         raise InputError(f"{path}: holds another model's weights ({', '.join(other[:3])}); {CURE}")

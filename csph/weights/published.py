@@ -87,7 +87,7 @@ def _tensors(contents: Any, size: int) -> dict[str, Tensor]:
         require(isinstance(value, Tensor) and value.is_floating_point(), f"{name} is no tensor of weights")
         left -= value.numel() * value.element_size()
         require(left >= 0, f"tensor {name} has shape {tuple(value.shape)}, more than the file of {size} bytes holds")
-        require(bool(value.isfinite().all()), f"tensor {name} holds NaN or infinite weights")
+        require(bool(value.float().isfinite().all()), f"tensor {name} holds NaN or infinite weights")
     return {name: value.float() for name, value in weights.items()}
 
 

@@ -47,10 +47,27 @@ def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
             names = get_unsafe_globals_in_checkpoint(path) if foreign else []
             empty = [(_NothingInstead if name.startswith("numpy.") else _EmptyInstead, name) for name in names]
             with safe_globals(empty):
-                return torch.load(path, map_location="cpu", weights_only=True)
+                found = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # unpickling raises whatever the pickle asks for
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path}: no checkpoint of tensors alone ({reason})") from None
+    _check_sizes(found, path)
+    return found
+
+
+def _check_sizes(contents: Any, path: Path) -> None:
+    """Raise InputError where a tensor states more elements than its file holds: strides of 0 repeat a few for ever."""
+    import torch
+
+    size, left, known = path.stat().st_size, [contents], set()
+    while left:
+        part = left.pop()
+        if isinstance(part, torch.Tensor):
+            stated = part.numel() * part.element_size()
+            require(stated <= size, f"{path}: a tensor of shape {tuple(part.shape)} is larger than the file")
+        elif isinstance(part, (dict, list, tuple, set)) and id(part) not in known:
+            known.add(id(part))
+            left.extend(part.values() if isinstance(part, dict) else part)
 
 
 def check_torch_file(path: Path) -> None:

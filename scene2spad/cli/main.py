@@ -36,6 +36,7 @@ from scene2spad.cli import (
     ultraphase,
 )
 from scene2spad.options.common import Common, Progress
+from scene2spad.start import STOPPED
 from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
 
@@ -110,7 +111,7 @@ def main(argv: list[str]) -> int:
     except MemoryError:
         return _refuse("out of memory: use a smaller image or fewer samples")
     except KeyboardInterrupt:
-        print("interrupted; finished files stay, nothing is half-written", file=sys.stderr)
+        print(STOPPED, file=sys.stderr)
         return 130
     try:
         print(json.dumps(finite(result), allow_nan=False) if command.json else _format_result(result), flush=True)

@@ -16,9 +16,10 @@ import torch
 from render.transient import Transient, read_transient
 from scene2spad.cli.paths import input_file, output_file, picture
 from scene2spad.options.common import Progress
-from scenes.errors import require
+from scenes.errors import InputError, require
 from scenes.files import read_array
 from spad.detection.detect import expected_in_pixel, sense
+from spad.detection.flux import check_dark_map
 from spad.estimators.depth import confidence, laser_baseline_m
 from spad.formats.histogram import Histogram, write_histogram
 from spad.formats.mat import write_mat
@@ -116,7 +117,7 @@ def run(command: Sense, progress: Progress) -> dict:
     budget = budget_of(command) if optics is None else None
     source, out = _files(command)
     transient = read_transient(source)
-    dark_map = _dark_map(command.dark_map, transient)
+    dark_map = None if command.dark_map is None else read_dark_map(command.dark_map, transient)
     if optics is not None:
         budget = optics.budget(transient, sensor, seed=command.seed, dark_map_hz=dark_map)
     start = time.perf_counter()
@@ -192,13 +193,13 @@ def summary(histogram: Histogram) -> dict:
     }
 
 
-def _dark_map(path: Path | None, transient: Transient) -> np.ndarray | None:
-    if path is None:
-        return None
+def read_dark_map(path: Path, transient: Transient) -> np.ndarray:
+    """Read dark counts per second of every pixel (.npy), NaN for a dead one. Raises InputError that names the file."""
     rates = read_array(path)
-    shape = (transient.height, transient.width)
-    good = rates.dtype.kind in "fiu" and rates.shape == shape
-    require(good, f"{path}: {rates.dtype}{rates.shape}, expected numbers {shape}")
+    try:
+        check_dark_map(rates, (transient.height, transient.width))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     return rates
 
 

@@ -18,6 +18,7 @@ from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.networks.training import network_method
 from scene2spad.studies.results import Store
 from scenes.errors import require
+from scenes.files import read_array
 from scenes.library.sets import scene_set
 from scenes.offsets import OffsetMode
 from spad.formats.histogram import Histogram
@@ -134,7 +135,7 @@ def depth_map(
     seed: int,
 ) -> np.ndarray:
     """Return (H, W) depth [m] that `evaluated` kept."""
-    return np.load(store.map_file(subject.digest, **_key(test, view, level, delay_m, seed)))
+    return read_array(store.map_file(subject.digest, **_key(test, view, level, delay_m, seed)))
 
 
 def _key(test: TestSet, view: int, level: tuple[float, float], delay_m: float, seed: int) -> dict[str, object]:

@@ -13,8 +13,8 @@ from render.engine import render
 from render.settings import RenderSettings
 from render.transient import Transient
 from scene2spad.datasets.rendering import quiet
-from scenes.errors import InputError, require
-from scenes.io.inputs import regular_file
+from scenes.errors import require
+from scenes.files import read_arrays
 from scenes.model import Camera, Laser, Material, Scene, Surface
 from spad.sensor.model import Sensor
 from spad.zones.calibration import ZoneCapture
@@ -24,6 +24,7 @@ PIXELS = 28  # side of the image that the zones' fields of view are cut from
 CONE_DEG = 80.0
 PLANE_M = 2.0  # half its side
 DIRECT = RenderSettings(bounces=1, grid=2)
+MAX_VALUE = 1 << 40  # of counts and millimetres: sums stay exact
 # Bins of the reference channel around its pulse, whose centroid follows the laser as it warms up.
 REFERENCE_REACH = (-4, 16)
 
@@ -54,18 +55,19 @@ def read_plane_captures(path: Path) -> PlaneCaptures:
 
     Raises InputError in one line that names the file and what is missing, of another shape, negative or not finite.
     """
-    path = regular_file(Path(path), "capture file")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            held = {name: file[name] for name in file.files}
-    except Exception as error:  # zip files and numpy raise many kinds
-        raise InputError(f"{path}: not a readable .npz file ({' '.join(str(error).split())[:80]})") from None
-    for name, dims in (("distance_m", 1), ("counts", 3)):
+    path = Path(path)
+    held = read_arrays(path, "capture file")
+    for name, dims in (("distance_m", 1), ("counts", 3), ("reference_counts", 2), ("chip_depth_1_mm", 2)):
+        if dims == 2 and name not in held:
+            continue
         require(name in held, f"{path}: holds no {name}, there are {', '.join(held) or 'none'}")
-        good = held[name].ndim == dims and held[name].dtype.kind in "iuf"
+        good = held[name].ndim == dims and held[name].dtype.kind in "iuf" and held[name].size > 0
         require(good, f"{path}: {name} is {held[name].dtype}{held[name].shape}, expected {dims} dimensions of numbers")
-        good = bool(np.isfinite(held[name]).all() and (held[name] >= 0).all())
-        require(good, f"{path}: {name} holds values that are negative or not finite")
+        known = np.nan_to_num(held[name], nan=0.0) if name == "chip_depth_1_mm" else held[name]
+        good = bool((known >= 0).all() and (known <= MAX_VALUE).all())
+        require(good, f"{path}: {name} holds values that are not finite, negative or above {MAX_VALUE:g}")
+    whole = bool((held["counts"] == np.floor(held["counts"])).all())
+    require(whole, f"{path}: counts are no whole numbers")
     distance, counts = held["distance_m"].astype(np.float64), held["counts"].astype(np.int64)
     require(len(distance) == len(counts) > 0, f"{path}: {len(distance)} distances for {len(counts)} captures")
     require(bool((distance > 0).all()), f"{path}: a distance is 0")

@@ -16,6 +16,7 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import parse_json
+from scenes.io.textures import check_checksums
 
 _PLY_TYPES = {
     "char": "i1",
@@ -307,7 +308,7 @@ def _check_image(header: dict, number: int, binary: bytes, read: ReadImage) -> N
     else:
         data = read(image["uri"])
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)):
-            pass
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as opened:
+            check_checksums(opened)
     except Exception as error:  # each of Pillow's formats has its own
         raise InputError(f"texture {name[:80]!r} is no image that can be read ({type(error).__name__})") from None

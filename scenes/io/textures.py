@@ -71,7 +71,7 @@ def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
 
 @contextmanager
 def opened_image(path: Path, what: str = "image file") -> Iterator[Image.Image]:
-    """Open an image through Pillow, its declared size checked before any pixel is decoded.
+    """Open an image through Pillow, its declared size and checksums checked before any pixel is decoded.
 
     What goes wrong while its pixels are taken is an InputError too, in one line that names the file.
     """
@@ -82,6 +82,8 @@ def opened_image(path: Path, what: str = "image file") -> Iterator[Image.Image]:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             size = image.width, image.height
             require(size[0] * size[1] <= MAX_PIXELS, f"{size[0]} x {size[1]} pixels is over the limit of {MAX_PIXELS}")
+            check_checksums(image)
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             yield image
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -90,6 +92,15 @@ def opened_image(path: Path, what: str = "image file") -> Iterator[Image.Image]:
     except Exception as error:  # each of Pillow's formats has its own
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: broken image file ({reason[:160]})") from None
+
+
+def check_checksums(image: Image.Image) -> None:
+    """Raise SyntaxError or OSError where a chunk of a PNG does not fit its CRC-32; `image` must be opened again then.
+
+    Pillow skips those of the pixels when it decodes them, and keeps what it has where their stream ends in an error.
+    """
+    if image.format == "PNG":
+        image.verify()
 
 
 def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:

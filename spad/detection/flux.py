@@ -69,7 +69,15 @@ def detector_maps(
     """Return dark counts per second (H, W) and dead pixels (H, W) bool: a measured map's, or the sensor's."""
     if dark_map_hz is None:
         return sensor.dark_rate_map_hz(*shape, seed), sensor.dead_pixels(*shape, seed)
-    measured = np.asarray(dark_map_hz, dtype=np.float64)
+    return check_dark_map(dark_map_hz, shape)
+
+
+def check_dark_map(measured_hz: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a measured map's dark counts per second (H, W), 0 in dead pixels, and which are dead (NaN).
+
+    Raises InputError for another shape, and for rates that are negative or infinite.
+    """
+    measured = np.asarray(measured_hz, dtype=np.float64)
     if measured.shape != shape:
         raise InputError(f"dark count map is {measured.shape}, the image {shape}")
     dead = np.isnan(measured)

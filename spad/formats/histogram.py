@@ -52,6 +52,8 @@ class Histogram:
             array = getattr(self, name)
             if array.shape != self.counts.shape[:2]:
                 raise InputError(f"histogram: {name} is {array.shape}, expected {self.counts.shape[:2]}")
+            if array.dtype.kind == "f" and (np.isinf(array) | (array < 0)).any():
+                raise InputError(f"histogram: {name} holds infinite or negative values")
             array.setflags(write=False)
 
     @classmethod

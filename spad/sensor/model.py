@@ -73,6 +73,9 @@ class Sensor:
         self._check_detector(where)
 
     def _check_detector(self, where: str) -> None:
+        kinds = (Pulse, SampledPulse)
+        require(isinstance(self.pulse, kinds), f"{where}: {self.pulse!r} is no pulse")
+        require(self.jitter is None or isinstance(self.jitter, kinds), f"{where}: jitter {self.jitter!r} is no pulse")
         if isinstance(self.dark_count_rate_hz, Iterable):
             rows = tuple(map(float, self.dark_count_rate_hz))
             object.__setattr__(self, "dark_count_rate_hz", rows)

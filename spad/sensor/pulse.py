@@ -100,7 +100,7 @@ class SampledPulse:
         object.__setattr__(self, "samples", tuple(float(value) for value in self.samples))
         count = len(self.samples)
         require(1 <= count <= MAX_SAMPLES, f"measured pulse: {count} samples, expected 1 to {MAX_SAMPLES}")
-        good = all(math.isfinite(value) and value >= 0 for value in self.samples) and sum(self.samples) > 0
+        good = all(value >= 0 for value in self.samples) and 0 < sum(self.samples) < math.inf
         require(good, "measured pulse: samples must be finite, 0 or more, and not all 0")
         good = math.isfinite(self.sample_s) and 0 < self.sample_s < 1e-3
         require(good, f"measured pulse: sample step {self.sample_s:g} s is outside (0, 1e-3)")
@@ -188,10 +188,15 @@ def convolved(pulse: AnyPulse, kernel: AnyPulse | None) -> AnyPulse:
 
 
 def pulse_from_dict(values: dict | None) -> AnyPulse | None:
-    """Return the pulse that `dataclasses.asdict` made."""
+    """Return the pulse that `dataclasses.asdict` made. Raises InputError for anything else."""
     if values is None:
         return None
-    return SampledPulse(**values) if "samples" in values else Pulse(**values)
+    try:
+        return SampledPulse(**values) if "samples" in values else Pulse(**values)
+    except InputError:
+        raise
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{' '.join(repr(values).split())[:60]} is no pulse ({error})") from None
 
 
 def read_pulse(path: Path, sample_s: float) -> SampledPulse:
@@ -206,6 +211,7 @@ def read_pulse(path: Path, sample_s: float) -> SampledPulse:
     good = samples.ndim == 1 and samples.dtype.kind in "fiu"
     require(good, f"{path}: {samples.dtype}{samples.shape}, expected one dimension of numbers")
     samples = samples.astype(np.float64)
+    require(bool(np.isfinite(samples).all()), f"{path}: measured pulse: samples must be finite")
     if len(samples) and not 0.01 <= samples.argmax() / len(samples) < 0.99:
         turn = np.exp(2j * np.pi * np.arange(len(samples)) / len(samples))
         centroid = np.angle(samples @ turn) / (2 * np.pi) * len(samples)

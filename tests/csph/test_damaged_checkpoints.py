@@ -125,6 +125,10 @@ def _config(**changes: object) -> dict:
         _config(model__sensor__bins=1 << 40),
         _config(model__sensor__bin_width_s=0.0),
         _config(model__sensor__bins=None),
+        _config(model__sensor__pulse=None),
+        _config(model__sensor__pulse={"sigma_s": float("nan"), "tail_s": 0.0}),
+        _config(model__sensor__pulse={"samples": ["a"], "sample_s": 1e-11}),
+        _config(model__sensor__jitter="wide"),
         _config(model__layer={"none": True}),
         _config(model__layer=3),
     ],
@@ -181,6 +185,15 @@ def test_a_ckpt_of_code_or_without_checksums_or_a_pipe_is_refused(tmp_path):
     for name, words in (("code", "tensors alone"), ("bare", "no checkpoint"), ("pipe", "pipe"), ("gone", "not found")):
         with pytest.raises(InputError, match=rf"{name}\.ckpt.*{words}"):
             load_torch_file(tmp_path / f"{name}.ckpt")
+
+
+def test_a_ckpt_of_few_elements_repeated_beyond_memory_is_refused(tmp_path):
+    path = tmp_path / "model.ckpt"
+    torch.save({"state_dict": {"temporal": torch.ones(1).expand(8, 1 << 40)}}, path)
+    with pytest.raises(
+        InputError, match=r"model\.ckpt: a tensor of shape \(8, 1099511627776\) is larger than the file"
+    ):
+        coding_of(path)
 
 
 def test_a_ckpt_of_codes_that_are_not_finite_is_refused(tmp_path):

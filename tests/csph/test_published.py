@@ -191,7 +191,7 @@ NAN, WHOLE = torch.full((8, 1, 256, 1, 1), torch.nan), torch.zeros(8, 1, 256, 1,
         ({TEMPORAL: NAN}, "tensor csph3d_layer.Cmat_tdim holds NaN or infinite weights"),
         ({TEMPORAL: WHOLE}, "Cmat_tdim is no tensor of weights"),
         ({TEMPORAL: torch.zeros(8, 1, 200, 1, 1)}, "blocks of 200 bins do not divide the sensor's 1024"),
-        ({TEMPORAL: torch.zeros(1).expand(8, 1, 2**30, 1, 1)}, "more than the file of"),
+        ({TEMPORAL: torch.zeros(1).expand(8, 1, 2**30, 1, 1)}, "is larger than the file"),
     ],
 )
 def test_other_checkpoints_are_refused_in_one_line(changes, message, tmp_path):

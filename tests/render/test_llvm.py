@@ -7,6 +7,7 @@ import types
 from pathlib import Path
 
 import pytest
+from processes import run_process
 
 from render.backend import llvm
 from scenes import InputError
@@ -14,9 +15,7 @@ from scenes import InputError
 
 def run(code: str, **environment: str) -> subprocess.CompletedProcess:
     inherited = {k: v for k, v in os.environ.items() if k != llvm.PATH_VARIABLE}
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env={**inherited, **environment}
-    )
+    return run_process([sys.executable, "-c", code], env={**inherited, **environment})
 
 
 START = """

@@ -65,6 +65,9 @@ def test_sense_takes_the_calibrated_sensor(calibrated, capfd, tmp_path, monkeypa
         (["bad.npz"], "not a readable .npz file"),
         (["thin.npz"], "holds no counts"),
         (["small.npz"], "captures of 2 zones and 5 bins"),
+        (["halves.npz"], "counts are no whole numbers"),
+        (["endless.npz"], "endless.npz: reference_counts holds values that are not finite"),
+        (["huge.npz"], "huge.npz: counts holds values that are not finite, negative or above"),
         (["--sensor", "reference"], "has no zones"),
         (["--every", "1"], "leaves no capture"),
         (["--nearest", "0.39"], "expected 16 or more"),
@@ -77,7 +80,11 @@ def test_mistakes_end_in_one_line(arguments, words, capfd, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bad.npz").write_text("no")
     np.savez(tmp_path / "thin.npz", distance_m=np.ones(3))
-    np.savez(tmp_path / "small.npz", distance_m=np.linspace(0.1, 0.4, 20), counts=np.ones((20, 2, 5)))
+    distance_m, counts = np.linspace(0.1, 0.4, 20), np.ones((20, 2, 5))
+    np.savez(tmp_path / "small.npz", distance_m=distance_m, counts=counts)
+    np.savez(tmp_path / "halves.npz", distance_m=distance_m, counts=0.5 * counts)
+    np.savez(tmp_path / "endless.npz", distance_m=distance_m, counts=counts, reference_counts=np.full((20, 5), np.nan))
+    np.savez(tmp_path / "huge.npz", distance_m=distance_m, counts=1e300 * counts)
     status = main(["calibrate", *arguments])
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("scene2spad: ")]
     assert status == 2 and len(lines) == 1 and words in lines[0]

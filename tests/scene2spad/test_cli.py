@@ -1,11 +1,11 @@
 """The command line as a user meets it: results, files, one line for every mistake."""
 
 import json
-import subprocess
 import sys
 
 import numpy as np
 import pytest
+from processes import run_process
 
 from render.transient import read_transient
 from scene2spad.cli import main
@@ -116,7 +116,7 @@ def test_help_teaches_every_command(capfd):
 
 def test_help_needs_neither_torch_nor_mitsuba():
     code = "import sys; from scene2spad.cli import main; main(['-h']); print({'torch', 'mitsuba'} & {*sys.modules})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = run_process([sys.executable, "-c", code])
     assert done.stdout.endswith("set()\n")
 
 

@@ -1,7 +1,6 @@
 """What the command line says to somebody who mistyped, or gave a file of another kind."""
 
 import io
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
+from processes import run_process
 from readers import READERS
 
 from csph import CodingTensor, encode, temporal_code
@@ -123,5 +123,37 @@ builtins.__import__ = importing
 sys.argv = ["scene2spad", "scenes"]
 script()
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    _is_interrupted(program)
+
+
+IN_A_DESTRUCTOR = """
+    class Dying:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGINT)
+    Dying()
+"""
+IN_A_START_IN_C = """
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt as stop:
+        raise ImportError("initialization failed") from stop
+"""
+
+
+@pytest.mark.parametrize("comes", [IN_A_DESTRUCTOR, IN_A_START_IN_C], ids=["destructor", "start in C++"])
+def test_ctrl_c_that_python_swallows_or_renames_is_one_line(comes):
+    program = f"""
+import os, signal, sys, types
+from scene2spad.start import script
+def main(argv):{comes}
+    while True:
+        pass
+sys.modules["scene2spad.cli"] = types.SimpleNamespace(main=main)
+script()
+"""
+    _is_interrupted(program)
+
+
+def _is_interrupted(program: str) -> None:
+    done = run_process([sys.executable, "-c", program])
     assert done.returncode == 130 and done.stderr.count("\n") == 1 and "interrupted" in done.stderr, done.stderr

@@ -183,6 +183,7 @@ def test_rows_are_scaled_between_their_extremes():
         (["study", "tensors", "--checkpoints", "words.ckpt"], "words.ckpt: no checkpoint"),
         (["study", "tensors", "--checkpoints", "empty.ckpt"], "holds 0 coding tensors"),
         (["study", "tensors", "--checkpoints", "line.npy"], "temporal part of shape (4,)"),
+        (["study", "tensors", "--checkpoints", "huge.npy"], "huge.npy: states shape (40000000000,)"),
         (["study", "codes", "--scene", "castle"], "castle"),
         (["study", "memory", "--out", "words.ckpt"], "words.ckpt: is a file"),
         (["study", "everything"], "everything"),
@@ -194,9 +195,12 @@ def test_mistakes_end_in_one_line(capfd, tmp_path, monkeypatch, argv, message):
     (tmp_path / "words.ckpt").write_text("no tensors")
     torch.save({"weight": torch.ones(2)}, tmp_path / "empty.ckpt")
     np.save(tmp_path / "line.npy", np.ones(4))
+    line = (tmp_path / "line.npy").read_bytes()
+    (tmp_path / "huge.npy").write_bytes(line.replace(b"(4,), }          ", b"(40000000000,), }"))
+    files = {path.name for path in tmp_path.iterdir()}
     status, _, err = run(capfd, *argv)
     assert status == 2 and message in err and len(err.strip().splitlines()) == 1
-    assert {path.name for path in tmp_path.iterdir()} == {"words.ckpt", "empty.ckpt", "line.npy"}
+    assert {path.name for path in tmp_path.iterdir()} == files
 
 
 @pytest.mark.parametrize("code", ["gray", "coarse", "hadamard", "random"])

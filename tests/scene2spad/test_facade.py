@@ -1,11 +1,11 @@
 """The public names: they exist, they start nothing, and their examples run."""
 
 import doctest
-import subprocess
 import sys
 
 import numpy as np
 import pytest
+from processes import run_process
 
 import scene2spad as s2s
 from spad.estimators.depth import histogram_depth_m
@@ -15,7 +15,7 @@ HEAVY = ("mitsuba", "drjit", "torch", "matplotlib", "scipy", "h5py", "OpenEXR", 
 
 def test_importing_starts_nothing():
     asked = f"import sys, scene2spad; print([n for n in {HEAVY} if n in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, timeout=60)
+    done = run_process([sys.executable, "-c", asked])
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 

@@ -2,12 +2,12 @@
 
 import ast
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import run_process
 
 from render.transient import write_transient
 from spad.formats.rgbd import transient_from_rgbd
@@ -51,7 +51,7 @@ def test_a_light_command_loads_nothing_heavy(command, allowed):
         f"status = main({command.split()!r})\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], status, file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    done = run_process([sys.executable, "-c", code], cwd=ROOT)
     assert done.stderr.splitlines()[-1] == f"{list(allowed)} 0", done.stderr
 
 
@@ -65,7 +65,5 @@ def test_depth_and_sense_load_no_renderer(tmp_path):
         "print([name for name in heavy if name in sys.modules], file=sys.stderr)"
     )
     surroundings = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=surroundings, capture_output=True, text=True, timeout=120
-    )
+    done = run_process([sys.executable, "-c", code], cwd=tmp_path, env=surroundings)
     assert done.returncode == 0 and done.stderr.splitlines()[-1] == "[]", done.stderr

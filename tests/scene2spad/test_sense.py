@@ -107,6 +107,8 @@ def test_export_by_command(scene, capfd, tmp_path):
         (["--pulse", "p.npy"], "go together"),
         (["--pulse", "none.npy", "--pulse-step", "1e-11"], "none.npy"),
         (["--dark-map", "none.npy"], "none.npy"),
+        (["--dark-map", "negative.npy"], "negative.npy: dark count map: rates must be finite and 0 or more"),
+        (["--dark-map", "small.npy"], "small.npy: dark count map is (2, 2)"),
         (["--radiometric", "--signal", "3"], "leave out --signal"),
         (["--pde", "2"], "PDE 2"),
         (["--dead-time", "1e-6", "--model", "first-photon"], "use free-running"),
@@ -119,6 +121,8 @@ def test_export_by_command(scene, capfd, tmp_path):
     ],
 )
 def test_bad_options_are_refused_in_one_line(scene, capfd, tmp_path, options, words):
+    np.save(tmp_path / "negative.npy", np.full((8, 10), -1.0))
+    np.save(tmp_path / "small.npy", np.ones((2, 2)))
     status, _, err = run(capfd, "sense", "s.exr", *options)
     lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
     assert status == 2 and len(lines) == 1 and words in lines[0] and not (tmp_path / "s.h5").exists()

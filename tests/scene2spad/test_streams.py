@@ -1,9 +1,9 @@
 """Standard output and standard error that are closed, full or left early."""
 
-import subprocess
 import sys
 
 import pytest
+from processes import run_process
 
 
 @pytest.mark.parametrize(
@@ -18,6 +18,6 @@ import pytest
 )
 def test_closed_and_full_streams_end_without_a_traceback(command, status):
     shell = f"set -o pipefail; {sys.executable} -m scene2spad.cli {command}"
-    done = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, timeout=60)
+    done = run_process(["bash", "-c", shell])
     assert done.returncode == status and "Traceback" not in done.stderr and "ignored" not in done.stderr
     assert len(done.stderr.splitlines()) == (status != 0)

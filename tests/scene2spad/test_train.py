@@ -215,18 +215,17 @@ def test_killed_and_resumed(packed, tmp_path):
         command = [sys.executable, "-c", code, "train", *QUICK, *arguments, "--out", str(folder)]
         return subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=subprocess.DEVNULL)
 
-    assert start(tmp_path / "whole").wait(300) == 0
+    assert start(tmp_path / "whole").wait() == 0
     folder = tmp_path / "killed"
     process = start(folder)
     for wait in (lambda: (folder / "config.json").is_file(), lambda: (folder / "resume.ckpt").is_file()):
-        end = time.monotonic() + 120
-        while not wait() and time.monotonic() < end and process.poll() is None:
+        while not wait() and process.poll() is None:
             time.sleep(0.01)
         time.sleep(0.3)
         assert process.poll() is None, "the run ended before it could be killed"
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         process = start(folder)
-    assert process.wait(300) == 0
+    assert process.wait() == 0
     for name in ("last.safetensors", "model.safetensors", "log.csv", "energy.csv"):
         assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name

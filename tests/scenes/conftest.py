@@ -52,4 +52,4 @@ def mitsuba() -> Iterator[object]:
 
     yield ask
     process.stdin.close()
-    process.wait(timeout=30)
+    process.wait()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from scenes import InputError
-from scenes.files import open_seal, read_array, whole_file
+from scenes.files import open_seal, read_array, read_arrays, whole_file
 from scenes.io import hdf5 as hdf5_module
 from scenes.io.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
 
@@ -58,12 +58,34 @@ def test_arrays_that_are_none_are_refused_in_one_line(tmp_path):
     np.save(tmp_path / "o.npy", np.array([{}], object), allow_pickle=True)
     np.save(tmp_path / "s.npy", np.zeros(3))
     data = (tmp_path / "s.npy").read_bytes()
-    (tmp_path / "huge.npy").write_bytes(data.replace(b"(3,)", b"(3000000000000,)"[:4].ljust(4)))
+    (tmp_path / "syntax.npy").write_bytes(data.replace(b"(3,)", b"(300"))
+    for name, shape in (("huge", b"(3000000000000,), }"), ("negative", b"(-1, -3), }")):
+        (tmp_path / f"{name}.npy").write_bytes(data.replace(b"(3,), }".ljust(len(shape)), shape))
     (tmp_path / "cut.npy").write_bytes(data[:-1])
     (tmp_path / "magic.npy").write_bytes(b"\0" * 8 + data[8:])
-    for name in ("o.npy", "huge.npy", "cut.npy", "magic.npy", "none.npy"):
-        with pytest.raises(InputError, match=rf"^[^\n]*{name}[^\n]*$"):
-            read_array(tmp_path / name)
+    for name in ("o", "syntax", "huge", "negative", "cut", "magic", "none"):
+        with pytest.raises(InputError, match=rf"^[^\n]*{name}\.npy: [^\n]*$"):
+            read_array(tmp_path / f"{name}.npy")
+
+
+def test_archives_of_arrays_are_read_within_memory_and_refused_in_one_line(tmp_path, monkeypatch):
+    written = {"a": np.arange(6.0).reshape(2, 3), "b": np.array(7)}
+    np.savez_compressed(tmp_path / "good.npz", **written)
+    found = read_arrays(tmp_path / "good.npz")
+    assert found.keys() == written.keys() and all(np.array_equal(found[name], written[name]) for name in written)
+    np.savez_compressed(tmp_path / "object.npz", a=np.array([{}], object))
+    data = bytearray((tmp_path / "good.npz").read_bytes())
+    (tmp_path / "cut.npz").write_bytes(data[:-30])
+    data[60] ^= 1
+    (tmp_path / "flipped.npz").write_bytes(data)
+    for name in ("object", "cut", "flipped", "none"):
+        with pytest.raises(InputError, match=rf"^[^\n]*{name}\.npz: [^\n]*$"):
+            read_arrays(tmp_path / f"{name}.npz")
+    np.savez_compressed(tmp_path / "bomb.npz", a=np.zeros(1 << 20))
+    assert (tmp_path / "bomb.npz").stat().st_size < 20_000
+    monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "0.01")
+    with pytest.raises(InputError, match=r"bomb\.npz: its arrays: needs 0.0168 GB"):
+        read_arrays(tmp_path / "bomb.npz")
 
 
 def hdf5(path: Path, **datasets) -> Path:

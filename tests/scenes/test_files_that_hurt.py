@@ -321,6 +321,26 @@ def test_an_image_that_declares_too_many_pixels_is_refused(tmp_path, read, side,
     assert "limit" in refused
 
 
+@pytest.mark.parametrize("read", [load_texture, read_levels])
+def test_no_damaged_byte_of_a_pngs_pixels_is_accepted(tmp_path, read):
+    """Pillow reads past the checksums of pixels, and keeps the rows that it has where their stream breaks off."""
+    levels = np.random.default_rng(0).integers(800, 3000, (24, 32)).astype(np.uint16)
+    Image.fromarray(levels).save(tmp_path / "good.png")
+    content = (tmp_path / "good.png").read_bytes()
+    read(tmp_path / "good.png")
+    for at in range(content.index(b"IDAT") + 4, content.index(b"IEND") - 4, 23):
+        (tmp_path / "bad.png").write_bytes(content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :])
+        refusal(read, tmp_path / "bad.png")
+
+
+def test_a_glb_with_a_damaged_texture_is_refused(tmp_path):
+    path = textured_glb(tmp_path / "a.glb")
+    content = bytearray(path.read_bytes())
+    content[content.index(b"IDAT") + 10] ^= 16
+    path.write_bytes(content)
+    assert "no image that can be read" in mesh_refusal(path)
+
+
 def test_an_exr_that_declares_too_many_pixels_is_refused(tmp_path):
     path = tmp_path / "bomb.exr"
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Y": np.zeros((2, 2), np.float32)}) as file:

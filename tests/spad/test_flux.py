@@ -130,7 +130,7 @@ def test_nothing_to_scale_is_refused_in_one_line():
     [
         {"bins": 0}, {"bins": 70000}, {"bins": 1.5}, {"bin_width_s": 0.0}, {"bin_width_s": float("nan")},
         {"period_s": 1e-9}, {"period_s": 100.03e-9}, {"exposure_s": 1e-9}, {"dark_count_rate_hz": -1.0},
-        {"dark_count_rate_hz": float("inf")},
+        {"dark_count_rate_hz": float("inf")}, {"pulse": None}, {"jitter": 1e-10},
     ],
 )  # fmt: skip
 def test_bad_sensors_are_refused_in_one_line(bad):

@@ -162,6 +162,24 @@ def test_an_exported_frame_comes_back_with_its_sensor(name, tmp_path):
     assert read_mat(tmp_path / "f.mat").sensor.pulse == Sensor().pulse
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("dist", math.inf), ("dist", -1.0), ("dist", 1e300), ("intensity", 1e9), ("photons", math.nan),
+        ("photons", -1.0), ("bin_size", math.nan), ("bin_size", -1e-10), ("mean_background_photons", math.inf),
+        ("spad", math.nan), ("spad", 0.5), ("spad", -1.0), ("spad", 1e300),
+    ],
+)  # fmt: skip
+def test_numbers_that_no_frame_has_are_refused_in_one_line(name, value, tmp_path):
+    write_mat(sensed(Sensor()), tmp_path / "f.mat")
+    contents = scipy.io.loadmat(tmp_path / "f.mat")
+    array = contents[name].toarray() if scipy.sparse.issparse(contents[name]) else contents[name].astype(float)
+    array.flat[0] = value
+    saved(tmp_path / "f.mat", **{key: array if key == name else contents[key] for key in contents if key[0] != "_"})
+    with np.errstate(over="ignore"), pytest.raises(InputError, match=r"^[^\n]*f\.mat: [^\n]*$"):
+        read_mat(tmp_path / "f.mat")
+
+
 def test_a_pulse_that_is_no_preset_is_read_by_its_taps(tmp_path):
     slow = Pulse(300e-12, 400e-12)
     histogram = sensed(Sensor(pulse=slow))

@@ -121,6 +121,23 @@ def test_preset_constants_are_the_calibration(shared_data) -> None:
     assert sensor.period_s == pytest.approx(81.92e-9) and sensor.pulse.sample_s == sensor.bin_width_s
 
 
+@pytest.mark.parametrize(
+    "samples", [[np.nan, 1, 2], [np.inf, 1, 2], [1, np.nan, 2], [-1, 2, 3], [0, 0], [], [[1, 2], [3, 4]], [1e308] * 9]
+)
+def test_samples_that_are_no_pulse_are_refused_in_one_line(tmp_path, samples) -> None:
+    np.save(tmp_path / "p.npy", np.array(samples, float))
+    with pytest.raises(InputError, match=r"^[^\n]*p\.npy: [^\n]*$"):
+        read_pulse(tmp_path / "p.npy", 1e-11)
+
+
+@pytest.mark.parametrize(
+    "values", ["text", [1], {"sigma_s": "a"}, {"sigma_s": np.nan}, {"width": 1}, {"samples": ["a"], "sample_s": 1e-11}]
+)
+def test_what_is_no_pulse_in_a_file_of_ours_is_refused(values) -> None:
+    with pytest.raises(InputError):
+        Sensor.from_dict({**Sensor().to_dict(), "pulse": values})
+
+
 def test_measured_pulse_from_a_file(tmp_path, shared_data) -> None:
     """Recorded around the laser's period, with its peak at sample 0: rolled, and narrow as the file says."""
     pulse = read_pulse(shared_data / "irf" / "irf_8ps_10ns_unimodal.npy", 8e-12)

@@ -10,17 +10,19 @@ import json
 import os
 import resource
 import select
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from processes import Hang
 
 # What one file may take: seconds of the processor, children included, since others may keep the machine busy; memory
 # above that of the process before its first file.
 SECONDS, MEMORY_BYTES = 10.0, 2 << 30
-WAITING_SECONDS = 120.0  # by the clock, for a file that takes no processor time either; imports at the start
+ENDLESS_CPU_S, ASLEEP_S = 60.0, 120.0  # after which a file is given up
 ROOT = Path(__file__).parents[2]
 
 
@@ -88,14 +90,19 @@ def _read_some(reader: str, folder: Path, good: Path, listing: Path, count: int)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, __file__, reader, str(folder), str(good), str(listing)]
     found: list[Verdict] = []
-    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=folder) as process:
+    options = {"stdout": subprocess.PIPE, "env": environment, "cwd": folder, "start_new_session": True}
+    with subprocess.Popen(command, **options) as process:
+        hang = Hang(process.pid, ENDLESS_CPU_S, ASLEEP_S)
         while len(found) < count:
-            if not select.select([process.stdout], [], [], WAITING_SECONDS)[0]:
-                process.kill()
-                return found, f"hang of over {WAITING_SECONDS:g} s"
+            if not select.select([process.stdout], [], [], 1.0)[0]:
+                if hang.found():
+                    os.killpg(process.pid, signal.SIGKILL)
+                    return found, f"hang of over {ENDLESS_CPU_S:g} CPU-s, or asleep for {ASLEEP_S:g} s"
+                continue
             line = process.stdout.readline()
             if not line:
                 break
+            hang = Hang(process.pid, ENDLESS_CPU_S, ASLEEP_S)
             message = json.loads(line)
             if "ready" not in message:
                 found.append(Verdict(**message))
@@ -107,7 +114,8 @@ def _cpu_seconds() -> float:
 
 
 def _peak_bytes() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    """Of this process, or of the largest child that has ended."""
+    return 1024 * max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
 
 
 def _numbers(values: object) -> tuple[str, bool]:

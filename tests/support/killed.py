@@ -16,18 +16,19 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
+from processes import Hang, cpu_seconds
 
 from csph.networks.model import load_model
 from csph.weights.torch_files import check_torch_file
 from render.transient import read_transient
 from render.transient.packs import read_pack
-from scenes.files import read_array
+from scenes.files import read_array, read_arrays
 from scenes.io.inputs import parse_json, read_whole_lines
 
 SERVER = """
@@ -71,7 +72,6 @@ for line in sys.stdin:
 # Not Mitsuba: Dr.Jit's threads would not live in a child.
 MODULES = ("torch", "pytorch_lightning", "matplotlib.pyplot", "OpenEXR", "skimage.metrics", "scipy.io", "h5py")
 MODULES += ("trimesh", "distributed", "csph.training.loop", "spad.formats.linospad", "scene2spad.cli", "rich.progress")
-SECONDS = 300  # that no run may take
 
 
 class Warm:
@@ -116,15 +116,20 @@ class Warm:
             self._ended[child] = found
         return self._ended[child]
 
-    def wait(self, child: int, cpu_s: float = math.inf, seconds: float = SECONDS) -> int | None:
-        """Exit status; None where the group still runs after so many CPU-seconds, or seconds.
+    def wait(self, child: int, cpu_s: float = math.inf, seconds: float = math.inf) -> int | None:
+        """Exit status; None where the group still runs after so many CPU-seconds, or seconds, or where it hangs.
 
         Moments are told in CPU-seconds: they fall on the same work on a machine that does other things beside.
         """
-        end, self.cpu_s = time.monotonic() + seconds, 0.0
+        end, self.cpu_s, hang = time.monotonic() + seconds, 0.0, Hang(child)
+        looked = time.monotonic()
         while (status := self.status(child)) is None and time.monotonic() < end and self.cpu_s < cpu_s:
             self.cpu_s = max(self.cpu_s, cpu_seconds(child))
             time.sleep(0.02)
+            if time.monotonic() - looked > 1:
+                looked = time.monotonic()
+                if hang.found():
+                    break
         return status
 
     def kill(self, child: int, number: int = signal.SIGKILL) -> None:
@@ -137,28 +142,6 @@ class Warm:
 def command(*argv: str, before: str = "") -> str:
     """Code that runs the command line."""
     return f"{before}\nimport sys\nfrom scene2spad.start import script\nsys.argv = {['scene2spad', *argv]!r}\nscript()"
-
-
-def _members(group: int) -> Iterator[list[str]]:
-    """What /proc tells of a group's living processes, from their state on."""
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:  # it has ended
-            continue
-        if int(fields[2]) == group and fields[0] != "Z":
-            yield fields
-
-
-def cpu_seconds(group: int) -> float:
-    """CPU time of a process group's members [s]."""
-    ticks = sum(int(fields[11]) + int(fields[12]) for fields in _members(group))
-    return ticks / os.sysconf("SC_CLK_TCK")
-
-
-def is_alone(group: int) -> bool:
-    """Whether no process of a group lives any more."""
-    return next(_members(group), None) is None
 
 
 @dataclass(frozen=True)
@@ -209,6 +192,8 @@ def check_whole(folder: Path) -> None:
                 check_torch_file(path)
             case ".npy":
                 read_array(path)
+            case ".npz":
+                read_arrays(path)
             case ".json":
                 parse_json(path.read_bytes())
             case ".csv":

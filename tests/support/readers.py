@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-Numbers = Iterable[tuple[np.ndarray, bool]]  # arrays, and whether they may hold NaN
+from scene_files import (
+    XML,
+    Numbers,
+    read_rgbd,
+    read_scene,
+    read_serialized,
+    read_texture,
+    write_depth_exr,
+    write_depth_image,
+    write_image,
+    write_mesh,
+    write_serialized,
+)
 
 
 @dataclass(frozen=True)
@@ -147,72 +158,6 @@ def _read_pulse(path: Path) -> Numbers:
     yield np.array(read_pulse(path, 1e-11).samples), False
 
 
-def _write_mesh(path: Path) -> None:
-    import trimesh
-
-    trimesh.creation.icosphere(subdivisions=1, radius=0.5).export(path)
-
-
-def _read_scene(path: Path) -> Numbers:
-    from scenes.library.catalog import load_scene
-
-    for surface in load_scene(str(path), width=16, height=12).surfaces:
-        yield surface.vertices, False
-        yield surface.faces, False
-
-
-XML = """<scene version="3.0.0">
-  <sensor type="perspective"><float name="fov" value="40"/>
-    <transform name="to_world"><lookat origin="0, 1, 4" target="0, 0.5, 0" up="0, 1, 0"/></transform></sensor>
-  <bsdf type="roughplastic" id="paint"><rgb name="diffuse_reflectance" value="0.4, 0.3, 0.2"/>
-    <float name="alpha" value="0.2"/></bsdf>
-  <shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/></transform>
-    <ref id="paint"/></shape>
-  <shape type="sphere"><float name="radius" value="0.5"/><point name="center" x="0" y="0.5" z="0"/>
-    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
-  <emitter type="constant"><rgb name="radiance" value="0.01"/></emitter>
-</scene>
-"""
-
-
-def _write_image(path: Path) -> None:
-    from PIL import Image
-
-    Image.fromarray(np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)).save(path)
-
-
-def _read_texture(path: Path) -> Numbers:
-    from scenes.io.textures import load_texture
-
-    yield load_texture(path).image, False
-
-
-def _write_depth_image(path: Path) -> None:
-    from PIL import Image
-
-    levels = np.random.default_rng(0).integers(800, 3000, (24, 32)).astype(np.uint16)
-    Image.fromarray(levels).save(path)
-
-
-def _read_rgbd(path: Path) -> Numbers:
-    from scenes.io.relief import RgbdFiles, rgbd
-
-    photograph = path.parent / "photograph.bmp"
-    if not photograph.is_file():
-        photograph = Path(path.parent.parent / "photograph.bmp")
-        _write_grey(photograph)
-    scene = rgbd(RgbdFiles(photograph, path, 40.0, 0.001, False), width=16)
-    for surface in scene.surfaces:
-        yield surface.vertices, False
-
-
-def _write_grey(path: Path) -> None:
-    from PIL import Image
-
-    if not path.is_file():
-        Image.fromarray(np.random.default_rng(1).integers(20, 255, (24, 32), np.uint8)).save(path)
-
-
 def _write_assembly(path: Path) -> None:
     path.write_text(
         ".equ K, 4\n.space codes, s16, K\n.reg t, r1\nloop:   BNT idle\n        RDT t\n.for k in 0..K - 1\n"
@@ -278,45 +223,89 @@ def _read_state(path: Path) -> Numbers:
         yield value.numpy(), False
 
 
-def _write_serialized(path: Path) -> None:
-    """One mesh of Mitsuba's format, version 4, with normals."""
-    import struct
-    import zlib
-
-    import trimesh
-
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
-    body = struct.pack("<I", 0x1001) + b"ball\0" + struct.pack("<QQ", len(ball.vertices), len(ball.faces))
-    body += np.asarray(ball.vertices, "<f4").tobytes() + np.asarray(ball.vertex_normals, "<f4").tobytes()
-    body += np.asarray(ball.faces, "<u4").tobytes()
-    path.write_bytes(struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1))
+def _write_dark_map(path: Path) -> None:
+    np.save(path, np.random.default_rng(0).uniform(10, 1000, (4, 6)))
 
 
-def _read_serialized(path: Path) -> Numbers:
-    from scenes.io.serialized import read_serialized
+def _read_dark_map(path: Path) -> Numbers:
+    from scene2spad.cli.sensing import read_dark_map
 
-    found = read_serialized(path)
-    yield found.vertices, True
-    yield found.faces, False
+    yield read_dark_map(path, _transient()), True
+
+
+def _write_codes(path: Path) -> None:
+    np.save(path, np.random.default_rng(0).normal(0, 1, (4, 16)))
+
+
+def _read_codes(path: Path) -> Numbers:
+    from scene2spad.studies.tensors import coding_of
+
+    yield coding_of(path).temporal.numpy(), False
+
+
+def _write_sensor(path: Path) -> None:
+    from spad.sensor.files import preset_files
+
+    path.write_bytes(preset_files()["tmf8820"].read_bytes())
+
+
+def _read_sensor(path: Path) -> Numbers:
+    import math
+    from dataclasses import asdict, astuple
+
+    from spad.sensor.files import read_sensor
+
+    def numbers(value: object) -> list[float]:
+        if isinstance(value, (list, tuple)):
+            return [number for item in value for number in numbers(item)]
+        return [float(value)] if isinstance(value, (bool, int, float)) else []
+
+    found = read_sensor(path)
+    values = asdict(found.sensor)
+    endless = {name for name, value in values.items() if value == math.inf}  # of what has no limit unless stated
+    yield np.array(numbers([value for name, value in values.items() if name not in endless])), False
+    for part in (found.optics, found.zones):
+        yield np.array(numbers(astuple(part) if part else ())), False
+
+
+def _write_plane_captures(path: Path) -> None:
+    rng = np.random.default_rng(0)
+    counts, reference = rng.integers(0, 99, (6, 2, 24)), rng.integers(0, 99, (6, 24))
+    np.savez_compressed(path, distance_m=np.linspace(0.1, 0.5, 6), counts=counts, reference_counts=reference)
+
+
+def _read_plane_captures(path: Path) -> Numbers:
+    from scene2spad.datasets.zone_captures import read_plane_captures
+
+    found = read_plane_captures(path)
+    for array in (found.distance_m, found.counts, found.drift_bins):
+        yield array, False
+    yield found.chip_m, True
 
 
 READERS: dict[str, Reader] = {
-    "obj": Reader(".obj", _write_mesh, _read_scene),
-    "ply": Reader(".ply", _write_mesh, _read_scene),
-    "stl": Reader(".stl", _write_mesh, _read_scene),
-    "glb": Reader(".glb", _write_mesh, _read_scene),
-    "xml": Reader(".xml", lambda path: path.write_text(XML) and None, _read_scene),
-    "texture": Reader(".png", _write_image, _read_texture),
-    "rgbd": Reader(".png", _write_depth_image, _read_rgbd),
+    "obj": Reader(".obj", write_mesh, read_scene),
+    "ply": Reader(".ply", write_mesh, read_scene),
+    "stl": Reader(".stl", write_mesh, read_scene),
+    "glb": Reader(".glb", write_mesh, read_scene),
+    "xml": Reader(".xml", lambda path: path.write_text(XML) and None, read_scene),
+    "texture": Reader(".png", write_image, read_texture, checked=True),
+    "rgbd": Reader(".png", write_depth_image, read_rgbd, checked=True),
     "transient": Reader(".exr", _write_transient, _read_transient, checked=True),
     "histogram": Reader(".h5", _write_histogram, _read_histogram, checked=True),
     "pack": Reader(".h5", _write_pack, _read_pack, checked=True),
     "index": Reader(".jsonl", _write_index, _read_index),
-    "frame": Reader(".mat", _write_frame, _read_frame),
-    "capture": Reader(".mat", _write_capture, _read_capture),
+    "frame": Reader(".mat", _write_frame, _read_frame, checked=True),
+    "capture": Reader(".mat", _write_capture, _read_capture, checked=True),
     "weights": Reader(".safetensors", _write_weights, _read_weights, checked=True),
     "pulse": Reader(".npy", _write_numbers, _read_pulse),
     "assembly": Reader(".s", _write_assembly, _read_assembly),
     "state": Reader(".ckpt", _write_state, _read_state, checked=True),
-    "serialized": Reader(".serialized", _write_serialized, _read_serialized),
+    "serialized": Reader(".serialized", write_serialized, read_serialized, checked=True),
+    "jpeg": Reader(".jpg", write_image, read_texture),
+    "depth exr": Reader(".exr", write_depth_exr, read_rgbd),
+    "dark map": Reader(".npy", _write_dark_map, _read_dark_map),
+    "codes": Reader(".npy", _write_codes, _read_codes),
+    "sensor": Reader(".toml", _write_sensor, _read_sensor),
+    "plane captures": Reader(".npz", _write_plane_captures, _read_plane_captures, checked=True),
 }

@@ -6,7 +6,6 @@ import hashlib
 import json
 import logging
 import os
-import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from scene2spad.bench.rendering.errors import Reference
-from scenes.files import whole_file
+from scenes.errors import InputError
+from scenes.files import read_arrays, whole_file
 
 log = logging.getLogger("scene2spad")
 FORMAT = 1
@@ -76,11 +76,11 @@ def _half(
 
 
 def _load(path: Path) -> tuple[np.ndarray | None, int]:
-    try:
-        with np.load(path) as file:
-            return file["mean"], int(file["passes"])
-    except FileNotFoundError:
+    if not path.is_file():
         return None, 0
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    try:
+        kept = read_arrays(path)
+        return kept["mean"], int(kept["passes"])
+    except (InputError, KeyError, TypeError):
         log.warning("%s: unreadable, made again", path)
         return None, 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import zipfile
 from dataclasses import astuple
 from pathlib import Path
 
@@ -21,8 +20,8 @@ from scene2spad.studies.power.emulated_chain import Emulated, by_torch, decode, 
 from scene2spad.studies.power.front import designs, front_rows, loss_rows, printed_rows
 from scene2spad.studies.power.front_figure import draw_front
 from scene2spad.studies.power.program_tables import all_costs, int8_temporal
-from scenes.errors import require
-from scenes.files import whole_file, write_csv
+from scenes.errors import InputError, require
+from scenes.files import read_arrays, whole_file, write_csv
 from scenes.library.catalog import load_scene
 from spad.detection.detect import sense
 from spad.estimators.depth import depth_errors
@@ -131,9 +130,9 @@ def _emulated(histogram: Histogram, chosen: Method, out: Path) -> Emulated:
     path = out / "emulated" / f"{chosen.name}-{sha.hexdigest()[:16]}.npz"
     if path.is_file():
         try:
-            with np.load(path) as kept:
-                return Emulated(kept["codes"], Counters(*kept["counters"].tolist()), int(kept["bits"]))
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+            kept = read_arrays(path)
+            return Emulated(kept["codes"], Counters(*kept["counters"].tolist()), int(kept["bits"]))
+        except (InputError, KeyError, TypeError):
             log.warning("%s cannot be read, and is made again", path)
     found = emulate(histogram.counts, chosen)
     path.parent.mkdir(exist_ok=True)
