@@ -22,7 +22,7 @@ def read_codes(path: Path) -> CodingTensor:
     if values.ndim not in (2, 4):
         raise InputError(f"{path}: shape {values.shape}, expected codes (K, T) or (K, Mt, Mr, Mc)")
     try:
-        return CodingTensor(Path(path).stem, torch.from_numpy(values))
+        return CodingTensor(Path(path).stem, torch.from_numpy(values.astype(np.float64)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -105,11 +105,20 @@ def check_checksums(image: Image.Image) -> None:
 
 def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:
     """Return the channels of a flat EXR, float64, by name, its declared size checked before any pixel is decoded."""
+    channels, _ = read_flat_exr(path, what)
+    return {name: np.asarray(pixels, np.float64) for name, pixels in channels.items()}
+
+
+def read_flat_exr(path: Path, what: str = "image file") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read a flat EXR's channels by name, and its header; the declared size is checked before any pixel is decoded.
+
+    Raises InputError naming the file where it is missing, broken or too large.
+    """
     import OpenEXR
 
     path = regular_file(path, what)
     try:
-        with silenced():
+        with silenced():  # OpenEXR reports damage on stdout
             with OpenEXR.File(str(path), header_only=True) as file:
                 low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
                 channels = len(file.header()["channels"])
@@ -119,7 +128,7 @@ def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:
             message = f"{wide} x {tall} pixels of {channels} channels are over the limit of {MAX_EXR_VALUES} values"
             require(values <= MAX_EXR_VALUES, message)
             with OpenEXR.File(str(path), separate_channels=True) as file:
-                return {name: np.asarray(part.pixels, np.float64) for name, part in file.channels().items()}
+                return {name: part.pixels for name, part in file.channels().items()}, dict(file.header())
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # OpenEXR raises bare exceptions of its own

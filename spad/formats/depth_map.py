@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from scenes.errors import InputError
-from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
+from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
+from scenes.io.textures import read_flat_exr
 
 
 def write_depth(depth_m: np.ndarray, path: Path, meta: dict[str, Any], confidence: np.ndarray | None = None) -> None:
@@ -35,17 +36,8 @@ def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any
 
     Raises InputError in one line for a missing, foreign, truncated or altered file.
     """
-    import OpenEXR
-
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: file not found")
-    try:
-        # OpenEXR reports damage on stdout and returns what it could read
-        with silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
-            header, channels = dict(file.header()), {k: c.pixels for k, c in file.channels().items()}
-    except Exception as error:  # OpenEXR raises bare exceptions of its own
-        raise InputError(f"{path}: not a readable EXR file ({' '.join(str(error).split())[:120]})") from None
+    channels, header = read_flat_exr(path, "file")
     try:
         if ATTRIBUTE not in header or "Z" not in channels:
             raise InputError("no depth map of scene2spad")

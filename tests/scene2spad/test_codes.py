@@ -182,7 +182,7 @@ def test_rows_are_scaled_between_their_extremes():
         (["study", "tensors", "--checkpoints", "missing.ckpt"], "missing.ckpt: file not found"),
         (["study", "tensors", "--checkpoints", "words.ckpt"], "words.ckpt: no checkpoint"),
         (["study", "tensors", "--checkpoints", "empty.ckpt"], "holds 0 coding tensors"),
-        (["study", "tensors", "--checkpoints", "line.npy"], "temporal part of shape (4,)"),
+        (["study", "tensors", "--checkpoints", "line.npy"], "line.npy: shape (4,), expected codes"),
         (["study", "tensors", "--checkpoints", "huge.npy"], "huge.npy: states shape (40000000000,)"),
         (["study", "codes", "--scene", "castle"], "castle"),
         (["study", "memory", "--out", "words.ckpt"], "words.ckpt: is a file"),

@@ -283,6 +283,21 @@ def _read_plane_captures(path: Path) -> Numbers:
     yield found.chip_m, True
 
 
+def _write_depth_map(path: Path) -> None:
+    from spad.formats.depth_map import write_depth
+
+    depth = _transient().depth_m
+    write_depth(depth, path, {"method": "argmax"}, np.where(np.isnan(depth), 0, 0.5))
+
+
+def _read_depth_map(path: Path) -> Numbers:
+    from spad.formats.depth_map import read_depth
+
+    depth, confidence, _ = read_depth(path)
+    yield depth, True
+    yield confidence, False
+
+
 READERS: dict[str, Reader] = {
     "obj": Reader(".obj", write_mesh, read_scene),
     "ply": Reader(".ply", write_mesh, read_scene),
@@ -308,4 +323,5 @@ READERS: dict[str, Reader] = {
     "codes": Reader(".npy", _write_codes, _read_codes),
     "sensor": Reader(".toml", _write_sensor, _read_sensor),
     "plane captures": Reader(".npz", _write_plane_captures, _read_plane_captures, checked=True),
+    "depth map": Reader(".exr", _write_depth_map, _read_depth_map, checked=True),
 }
