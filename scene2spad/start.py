@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import sys
 
-STOPPED = "interrupted; finished files stay, nothing is half-written"
+from scene2spad.interrupts import STOPPED, comes_of_interrupt, interrupt_again
 
 
 def script() -> None:
     """Run the command line and exit with its status; 130 for Ctrl-C, also while libraries are being imported."""
     _open_standard_streams()
-    sys.unraisablehook = _interrupt_again
+    sys.unraisablehook = interrupt_again
     try:
         from scene2spad.cli import main
 
@@ -22,7 +22,7 @@ def script() -> None:
         print(STOPPED, file=sys.stderr)
         status = 130
     except ImportError as error:
-        if not _comes_of_interrupt(error):
+        if not comes_of_interrupt(error):
             raise
         print(STOPPED, file=sys.stderr)
         status = 130
@@ -32,24 +32,6 @@ def script() -> None:
         if status:
             print(f"scene2spad: standard output: {error.strerror or error}", file=sys.stderr)
     sys.exit(status)
-
-
-def _interrupt_again(swallowed: sys.UnraisableHookArgs) -> None:
-    """Raise Ctrl-C again a moment after it came in a destructor or callback, from which no exception gets out."""
-    if not isinstance(swallowed.exc_value, KeyboardInterrupt):
-        sys.__unraisablehook__(swallowed)
-        return
-    import signal
-
-    signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, 0.01)
-
-
-def _comes_of_interrupt(error: BaseException | None) -> bool:
-    """Whether Ctrl-C lies at the root of an exception: modules in C++ that it meets in their start say ImportError."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 def _open_standard_streams() -> None:

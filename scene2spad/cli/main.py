@@ -35,8 +35,8 @@ from scene2spad.cli import (
     train,
     ultraphase,
 )
+from scene2spad.interrupts import STOPPED
 from scene2spad.options.common import Common, Progress
-from scene2spad.start import STOPPED
 from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
 
