@@ -37,7 +37,7 @@ SEED = 30  # of the textures
 
 
 def hall(*, width: int, height: int) -> Scene:
-    """A closed hall of 2.8 x 6.2 x 2.9 m in which nine of ten surfaces are glossy; the same bytes every time."""
+    """Make a closed hall of 2.8 x 6.2 x 2.9 m in which nine of ten surfaces are glossy; the same bytes every time."""
     palette = _palette()
     surfaces = [*_shell(palette), *_stairs(palette), *_railing(palette)]
     surfaces += placed(_door(palette), -0.45, LOW[2])

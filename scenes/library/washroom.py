@@ -45,7 +45,7 @@ SHEETS = ("door: glass",)  # single sheets, with edges of their own
 
 
 def washroom(*, width: int, height: int) -> Scene:
-    """A closed room of 2.6 x 3.4 x 2.5 m whose laser light is half that of metal, glass and glaze.
+    """Make a closed room of 2.6 x 3.4 x 2.5 m whose laser light is half that of metal, glass and glaze.
 
     Chrome is polished (the pipes are perfect mirrors, the taps have alpha 0.02), tiles and glaze are coated plastic of
     alpha 0.05 to 0.1. The same bytes every time.

@@ -119,7 +119,7 @@ def lathe(profile: Sequence[Vector], segments: int = 24) -> shapes.Shape:
 
 
 def creased(profile: Sequence[Vector], sharpest_deg: float = 35.0) -> list[Vector]:
-    """A profile for `lathe` whose sharp corners are there twice, so that each side has shading normals of its own."""
+    """Return a profile for `lathe` whose sharp corners are there twice, so that each side has shading normals of its own."""
     points = np.asarray(profile, float)
     along = np.arctan2(*np.diff(points, axis=0).T[::-1])
     bend = np.abs((np.diff(along) + np.pi) % (2 * np.pi) - np.pi)
@@ -128,7 +128,7 @@ def creased(profile: Sequence[Vector], sharpest_deg: float = 35.0) -> list[Vecto
 
 
 def solid(profile: Sequence[Vector], segments: int = 24) -> shapes.Shape:
-    """`lathe` with creases: a turned body, closed where its profile begins and ends on the axis."""
+    """Return `lathe` with creases: a turned body, closed where its profile begins and ends on the axis."""
     return lathe(creased(profile), segments)
 
 
@@ -155,7 +155,7 @@ def tube(points: np.ndarray, radius: float, segments: int = 8) -> shapes.Shape:
 
 
 def rod(points: np.ndarray, radius: float, segments: int = 12) -> shapes.Shape:
-    """`tube` with flat caps: a closed body."""
+    """Return `tube` with flat caps: a closed body."""
     vertices, faces, uv = tube(points, radius, segments)
     ends = np.asarray(points, float)[[0, -1]]
     first, last = np.arange(segments + 1), np.arange(-segments - 1, 0) + len(vertices)
@@ -173,7 +173,7 @@ def rod(points: np.ndarray, radius: float, segments: int = 12) -> shapes.Shape:
 
 
 def cloth(points: np.ndarray, thickness: Vector) -> shapes.Shape:
-    """A `sheet` seen from its front, its back moved by `thickness`, and the seams between them: a closed body."""
+    """Return a `sheet` seen from its front, its back moved by `thickness`, and the seams between them: a closed body."""
     front = np.asarray(points, float)
     back = front + np.asarray(thickness, float)
     around = np.concatenate((front, back[::-1], front[:1]))
