@@ -43,10 +43,10 @@ from render.transient import Transient
 from render.transient.samples import concatenate, no_samples, select_pixels, to_returns
 from scenes.limits import require_memory
 from scenes.model import Scene
+from scenes.random_streams import Stream
 
 log = logging.getLogger(__name__)
 
-STAGE_PLAN, STAGE_AMBIENT, STAGE_MORE = 10, 12, 14
 AMBIENT_BOUNCES = 16  # most paths end long before, by chance
 # paths traced on top are at most this many times those traced before; filtered light has no pilot
 MAX_MORE, MAX_MORE_FILTERED = 3.0, 15.0
@@ -88,7 +88,7 @@ def render(
     if plan.ambient:
         report("ambient light", 0.9)
         by, spp = layers if settings.ambient_filtered else None, settings.ambient_spp or MAX_AMBIENT_SPP
-        ambient_seed = derived_seed(seed, STAGE_AMBIENT)
+        ambient_seed = derived_seed(seed, Stream.AMBIENT)
         ambient = ambient_light(world, spp, AMBIENT_BOUNCES, ambient_seed, by, noise=plan.ambient_noise)
         message = f"ambient light: {ambient.spp} paths a pixel, noise {ambient.error:.2g} of its mean"
         plan = replace(plan, reasons=(*plan.reasons, message))
@@ -116,7 +116,7 @@ def _traced_to_target(
     world: TracedScene, plan: Plan, settings: RenderSettings, seed: int, report: Progress
 ) -> tuple[Plan, LightSamples, ErrorEstimate]:
     """Trace what the plan says, and more where its error misses the target; the plan then says so."""
-    checked = pilot_pixels(world, derived_seed(seed, STAGE_PLAN))
+    checked = pilot_pixels(world, derived_seed(seed, Stream.PLAN))
     traced = trace(world, plan, settings, seed=seed, checked=checked, progress=report)
     plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, *traced.reasons))
     error = _estimated(world, plan, settings, traced, checked)
@@ -124,7 +124,7 @@ def _traced_to_target(
         more = _additional_schedule(world, plan, settings, traced, error)
         if more is None:
             break
-        extra = MoreSamples(more, derived_seed(seed, STAGE_MORE, 0, number), checked)
+        extra = MoreSamples(more, derived_seed(seed, Stream.MORE, 0, number), checked)
         traced = add_samples(world, plan, settings, traced, extra, report)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
         error = _estimated(world, plan, settings, traced, checked)
@@ -133,7 +133,7 @@ def _traced_to_target(
 
 def planned(world: TracedScene, settings: RenderSettings, seed: int = 0) -> Plan:
     """Return the plan that `render` makes with these settings and this seed."""
-    return make_plan(world, settings, derived_seed(seed, STAGE_PLAN))
+    return make_plan(world, settings, derived_seed(seed, Stream.PLAN))
 
 
 def _additional_schedule(

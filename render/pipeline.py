@@ -27,8 +27,8 @@ from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, Plan, RenderSettings
 from render.specular.image_method import specular_light
 from render.transient.samples import SampleBuffer, Samples, concatenate, no_samples, select
+from scenes.random_streams import Stream
 
-STAGE_INDIRECT, STAGE_PILOT = 11, 13
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
 MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
 FIRST_FILTERED_SPP = 16  # filtered light has no pilot: it starts with few paths
@@ -113,7 +113,7 @@ def trace(
     ends = len(light), len(light) + len(specular.samples.pixel)
     light.add(specular.samples)
     if schedule is not None:
-        task = _task(world, plan, settings, schedule, derived_seed(seed, STAGE_INDIRECT), origin_m, brightest)
+        task = _task(world, plan, settings, schedule, derived_seed(seed, Stream.INDIRECT), origin_m, brightest)
         probed = np.empty(0, np.int64) if checked is None else checked
         indirect = indirect_light(task, probed, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part))
         rays += schedule.rays(plan.bounces)
@@ -185,7 +185,7 @@ def _schedule(
         # under a lamp the noise that the filter leaves is even, and a pilot costs more than it saves
         if plan.adaptive and spp >= FIRST_FILTERED_SPP and not is_wide(world):
             from_m = float(filter_octaves.from_m[0])
-            noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT), from_m)
+            noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT), from_m)
             schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES)
         least, most = schedule.spp.min(), schedule.spp.max()
         least_m, most_m = filter_octaves.size_m[0], filter_octaves.size_m[-1]
@@ -195,7 +195,7 @@ def _schedule(
     if plan.spp is not None and (not plan.adaptive or plan.spp < BATCHES):
         rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
         return uniform(blocks, rounds, reuses_paths=False), ()
-    own, reused = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, STAGE_PILOT))
+    own, reused = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT))
     if not plan.adaptive:
         own, reused = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
     if plan.spp is not None:

@@ -27,11 +27,11 @@ from csph.networks.posterior import Decoder
 from csph.training.views import Views
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import require
+from scenes.random_streams import Stream
 from spad.detection.detect import sense
 from spad.formats.histogram import TRUTH, Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
-STAGE_EVALUATE = 34
 PIXELS = ("all", "unmixed", "mixed")
 FIGURES = ("mae_mm", "rmse_mm", *(f"within_{t}mm" for t in TOLERANCES_MM))
 LEVEL_GROUPS: dict[str, Callable[[float, float], bool]] = {
@@ -148,7 +148,7 @@ def evaluate(
         moved = transient.delayed(offset_m) if offset_m else transient
         for number, (signal, background) in enumerate(levels):
             report(f"{scene}, {signal:g} + {background:g} photons", (view * len(levels) + number) / total)
-            draw = np.random.SeedSequence(seed, spawn_key=(STAGE_EVALUATE, view, number)).generate_state(1)[0]
+            draw = np.random.SeedSequence(seed, spawn_key=(Stream.EVALUATE, view, number)).generate_state(1)[0]
             histogram = sense(moved, sensor, PhotonBudget(signal, background), seed=int(draw), model="poisson")
             histogram = _tiled(histogram, tile)
             for name, method in methods.items():

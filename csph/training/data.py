@@ -20,10 +20,10 @@ from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.training.config import WINDOW_STEP, TrainConfig
 from csph.training.levels import CONTINUOUS, draw_level
 from scenes.errors import require
+from scenes.random_streams import Stream
 from spad.detection.training_patches import Batch, PackedTransients, Patch, sense_patches
 from spad.sensor.model import Sensor
 
-STAGE_TRAIN, STAGE_VALIDATE, STAGE_WINDOW = 31, 32, 36
 FULL_LENGTH_FRACTION = 0.1  # of a run with windows, its last: on all bins
 
 
@@ -62,7 +62,7 @@ class Samples(Dataset):
     def __getitem__(self, number: int) -> Request:
         config = self.config
         key = (config.seed, self.epoch, number)
-        rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(STAGE_TRAIN,)))
+        rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(Stream.TRAIN,)))
         signal, background = draw_level(rng, config.levels)
         # of one set nothing is drawn: the samples are those of a tree that knew only one
         source = int(np.searchsorted(self.edges, rng.random(), side="right")) if len(self.shapes) > 1 else 0
@@ -104,7 +104,7 @@ class Frames(Dataset):
         scene, turn = divmod(self.chosen[number], len(self.levels))
         signal, background = self.levels[(number + turn) % len(self.levels)]
         # sets after the first have noise of their own
-        key = (self.config.seed, STAGE_VALIDATE, number, *((self.source,) if self.source else ()))
+        key = (self.config.seed, Stream.VALIDATE, number, *((self.source,) if self.source else ()))
         return Request(self.source, Patch(scene, 0, 0, signal, background, key))
 
 
@@ -130,7 +130,7 @@ def _window_start(batch: Batch, number: int, patch: Patch, sensor: Sensor, windo
     """First bin of a window that holds the label of one pixel, drawn with the patch's key; -1 without windows."""
     if not window:
         return -1
-    rng = np.random.default_rng(np.random.SeedSequence(patch.seed, spawn_key=(STAGE_WINDOW,)))
+    rng = np.random.default_rng(np.random.SeedSequence(patch.seed, spawn_key=(Stream.WINDOW,)))
     labels = batch.depth_m[number][batch.valid[number]]
     label = float(labels[rng.integers(len(labels))]) if len(labels) else 0.0
     block = int(label / sensor.bin_depth_m) // WINDOW_STEP - int(rng.integers(window // WINDOW_STEP))

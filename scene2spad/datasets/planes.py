@@ -14,8 +14,8 @@ import numpy as np
 from csph.training.views import Views
 from render.transient import Transient
 from scenes.errors import require
+from scenes.random_streams import Stream
 
-STAGE_PLANES = 33
 NEAR_M, FAR_M = 0.6, 8.0  # of the point that a plane has on the camera's axis
 BEYOND_M = 12.0  # no plane is seen from here on
 FOV_DEG = 60.0
@@ -43,7 +43,7 @@ def random_planes(count: int, *, size: int = 64, seed: int = 0) -> Views:
     """Return `count` scenes of two random planes, size x size pixels. Raises InputError for a count or size below 1."""
     require(count >= 1 and size >= 1, f"planes: {count} scenes of {size} pixels, expected 1 or more")
     scenes = [
-        _scene(size, np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_PLANES, number))))
+        _scene(size, np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.PLANES, number))))
         for number in range(count)
     ]
     return Views(tuple(scenes), tuple(f"planes/{number}" for number in range(count)))

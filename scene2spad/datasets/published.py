@@ -40,6 +40,7 @@ from scenes.io.relief import (
     middlebury_names,
     read_levels,
 )
+from scenes.random_streams import Stream
 from spad.formats.histogram import Histogram
 from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor
@@ -47,7 +48,6 @@ from spad.sensor.model import PhotonBudget, Sensor
 log = logging.getLogger("scene2spad")
 
 SCENES = 8  # of the published test set
-STAGE_PUBLISHED = 35
 LUMA = (0.2989, 0.5870, 0.1140)
 SHRINK, PAD_TO = 8, 64
 PADLESS_M = 1.962  # of the wall seen through Bowling1's large hole
@@ -200,7 +200,7 @@ def errors_of(
 def _drawn(pair: Pair, level: tuple[float, float], offset_m: float, key: tuple[int, ...]) -> Histogram:
     budget, sensor = PhotonBudget(*level), Sensor()
     expected = from_rgbd(pair.depth_m + offset_m, pair.luma, pair.luma, sensor, budget, convention="published")
-    rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(STAGE_PUBLISHED,)))
+    rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(Stream.PUBLISHED,)))
     return Histogram(
         rng.poisson(expected.rates).astype(np.int32),
         sensor,

@@ -32,6 +32,7 @@ from scenes.library.sets import LARGEST, scene_set
 from scenes.limits import require_memory
 from scenes.model import MAX_IMAGE_SIDE, Scene
 from scenes.offsets import OffsetMode, check_offset
+from scenes.random_streams import Stream
 
 if TYPE_CHECKING:
     from render.scene.traced_scene import TracedScene
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("scene2spad")
 
 Progress = Callable[[str, float], None]
-STAGE_VIEW = 20
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 # Of the squared error target: a set's views are to meet it together, not each by itself. With indirect light plans do
@@ -213,7 +213,7 @@ def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
 
 
 def _seed(job: Job, view: int, again: int = 0) -> int:
-    key = (STAGE_VIEW, view, *((again,) if again else ()))
+    key = (Stream.VIEW, view, *((again,) if again else ()))
     return int(np.random.SeedSequence(job.seed, spawn_key=key).generate_state(1)[0])
 
 

@@ -14,6 +14,7 @@ import torch
 from render.transient import Transient
 from scenes.errors import InputError
 from scenes.limits import require_memory
+from scenes.random_streams import Stream
 from spad.detection.flux import Rates, expected_counts
 from spad.detection.laws import (
     Detections,
@@ -27,8 +28,6 @@ from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import Sensor
 
-STAGE_SENSE = 20
-STAGE_CROSSTALK = 22
 # One random stream for this many pixels: the counts do not depend on threads, nor on how the work is cut.
 STREAM_PIXELS = 1024
 # From this many primary detections a bin on, drawing every bin is cheaper than drawing every photon (measured).
@@ -95,7 +94,7 @@ def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
     _draw(exposure, fill, progress, np.zeros(height * width))
     counts = counts.reshape(height, width, bins)
     if exposure.sensor.crosstalk and exposure.model == "poisson":
-        add_crosstalk(counts, exposure.sensor.crosstalk, exposure.rng(STAGE_CROSSTALK, slice(0, 0)))
+        add_crosstalk(counts, exposure.sensor.crosstalk, exposure.rng(Stream.CROSSTALK, slice(0, 0)))
     return counts
 
 
@@ -143,7 +142,7 @@ def _draw(exposure: Exposure, finish: Callable, progress: Progress | None, ready
 
 
 def _block(exposure: Exposure, block: slice, ready: np.ndarray) -> np.ndarray:
-    sensor, rng, light = exposure.sensor, exposure.rng(STAGE_SENSE, block), exposure.light(block)
+    sensor, rng, light = exposure.sensor, exposure.rng(Stream.SENSE, block), exposure.light(block)
     if exposure.model == "free-running":
         places = [_places(part, sensor) for part in _free_running(exposure, light, rng, ready)]
         return np.concatenate(places)
@@ -207,7 +206,7 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
     everything, before = [], ready.copy()
     total = 0
     for block in exposure.blocks:
-        rng, light = exposure.rng(STAGE_SENSE, block), exposure.light(block)
+        rng, light = exposure.rng(Stream.SENSE, block), exposure.light(block)
         if exposure.model == "first-photon":
             parts = [_first_photons(exposure, light, rng)]
         else:
@@ -220,7 +219,7 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
                 "lower the photon budget or the exposure, or take model poisson"
             )
     events = Detections(*(np.concatenate(columns) for columns in zip(*everything, strict=True)))
-    rng = exposure.rng(STAGE_CROSSTALK, slice(0, 0))
+    rng = exposure.rng(Stream.CROSSTALK, slice(0, 0))
     cause, pixel = crosstalk_events(events.pixel, sensor.crosstalk, transient.height, transient.width, rng)
     fired = Detections(pixel, events.cycle[cause], events.position[cause])
     both = Detections(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))

@@ -22,11 +22,10 @@ from torch import Tensor
 
 from render.transient import Transient
 from scenes.errors import InputError
+from scenes.random_streams import Stream
 from spad.detection.flux import background_scales
 from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries, paths_in_bins
 from spad.sensor.model import PhotonBudget, Sensor
-
-STAGE_FLY = 23
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +129,7 @@ def sense_patches(
     def draw(number: int) -> None:
         patch = patches[number]
         light = _light_of_patch(packed, sensor, patch, height, width)
-        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(patch.seed, spawn_key=(STAGE_FLY, 0, 0))))
+        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(patch.seed, spawn_key=(Stream.PATCH, 0, 0))))
         events = draw_primaries(light, sensor, rng)
         _count(events, counts[number].view(bins, pixels))
         rows, columns = slice(patch.row, patch.row + height), slice(patch.column, patch.column + width)

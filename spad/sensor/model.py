@@ -11,10 +11,10 @@ import numpy as np
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import did_you_mean, require
+from scenes.random_streams import Stream
 from spad.sensor.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
 from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_from_dict
 
-STAGE_PIXELS = 21
 Reset = Literal["synchronous", "free-running"]
 
 
@@ -142,7 +142,7 @@ class Sensor:
     def _chosen(fraction: float, height: int, width: int, seed: int, what: int) -> np.ndarray:
         chosen = np.zeros(height * width, dtype=bool)
         if fraction > 0:
-            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_PIXELS, what, 0)))
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.PIXELS, what, 0)))
             chosen[rng.choice(chosen.size, round(fraction * chosen.size), replace=False)] = True
         return chosen.reshape(height, width)
 

@@ -16,11 +16,11 @@ import torch
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
+from scenes.random_streams import Stream
 from spad.detection.flux import interval_cdf
 from spad.detection.saturation import draw_saturated, saturated
 from spad.sensor.model import Sensor
 
-STAGE_ZONES = 23
 # Switches that an ablation turns off one by one: name and what `without` puts in their place.
 EFFECTS = (
     "parallax",
@@ -231,6 +231,6 @@ def draw_zone_counts(
     returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, *, seed: int = 0, drift_s: float = 0.0
 ) -> np.ndarray:
     """Draw counts (Z, T) int64 of one exposure; the same seed gives the same counts."""
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STAGE_ZONES, 0, 0)))
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.ZONES, 0, 0)))
     flux = zone_flux(returns, sensor, zones, drift_s)
     return draw_saturated(flux, np.asarray(zones.trials), zones.recovery, rng, zones.compression)

@@ -16,11 +16,10 @@ from render.transient import Transient
 from scene2spad.studies.results import Store
 from scene2spad.studies.transport.plan import FAILS, HOLDS, LEVELS, LIMIT, OPEN
 from scene2spad.studies.transport.tables import Contender
+from scenes.random_streams import Stream
 from spad.detection.flux import expected_counts, rates_for
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
-
-STAGE_COUPLED = 36
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +114,7 @@ def _both(
         missing = [one for one in checked if store.get(one.subject.digest, **named) is None]
         if missing:
             rates = rates or [expected(one, sensor, budget) for one in (place.full, place.planned)]
-            rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(STAGE_COUPLED,)))
+            rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(Stream.COUPLED,)))
             histograms = coupled(*rates, sensor, budget, rng)
             for one in missing:
                 depths = [one.subject.model.depth_of(histogram)[0] for histogram in histograms]

@@ -119,7 +119,8 @@ def lathe(profile: Sequence[Vector], segments: int = 24) -> shapes.Shape:
 
 
 def creased(profile: Sequence[Vector], sharpest_deg: float = 35.0) -> list[Vector]:
-    """Return a profile for `lathe` whose sharp corners are there twice, so that each side has shading normals of its own."""
+    """Return a profile for `lathe` whose sharp corners are there twice, so that each side has shading normals of its
+    own."""
     points = np.asarray(profile, float)
     along = np.arctan2(*np.diff(points, axis=0).T[::-1])
     bend = np.abs((np.diff(along) + np.pi) % (2 * np.pi) - np.pi)
@@ -173,7 +174,8 @@ def rod(points: np.ndarray, radius: float, segments: int = 12) -> shapes.Shape:
 
 
 def cloth(points: np.ndarray, thickness: Vector) -> shapes.Shape:
-    """Return a `sheet` seen from its front, its back moved by `thickness`, and the seams between them: a closed body."""
+    """Return a `sheet` seen from its front, its back moved by `thickness`, and the seams between them: a closed
+    body."""
     front = np.asarray(points, float)
     back = front + np.asarray(thickness, float)
     around = np.concatenate((front, back[::-1], front[:1]))
