@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all lint clean
+.PHONY: demo test test-all lint docs notebooks clean
 
 demo: $(STAMP)
 	$(BIN)/scene2spad demo
@@ -22,6 +22,17 @@ test-all: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# Pages of the documentation, from docs/ and the code: out/site/index.html, which loads nothing from elsewhere.
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+notebooks: $(VENV)/.docs
+	$(BIN)/jupytext --quiet --to notebook examples/*.py
+
+$(VENV)/.docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	touch $@
 
 # The stamp is touched last: an interrupted installation starts again. The wheel of LLVM completes itself when the
 # environment's Python first starts, hence the start before the stamp.

@@ -12,7 +12,7 @@ from scene2spad.cli.main import RUNNERS, main
 from spad.sensor.files import read_sensor
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = {command.__name__.lower() for command in RUNNERS}
 WORDS = 1000
 IN_CODE = re.compile(r"`[^`\n]+`|^    .*$|```.*?```", re.M | re.S)

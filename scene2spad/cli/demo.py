@@ -6,17 +6,26 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from scene2spad.cli.depth import depth_map
 from scene2spad.cli.paths import output_file
 from scene2spad.cli.render import in_view
 from scene2spad.options.common import Common, Progress
 from scenes.errors import InputError
 from scenes.library.catalog import load_scene
 
+NETWORK = "learned-256x4x4-128x-s0"
+METHODS = {
+    "argmax, all bins": "argmax",
+    "log-matched, all bins": "log-matched",
+    "Fourier, 128x": "fourier-8",
+    "learned 256x4x4, 128x": NETWORK,
+}
+ON_THE_CHIP = ("fourier-1024x1x1-128x-s0", "fourier-learned-256x2x2-128x-s0", NETWORK)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Common):
-    """From the default scene to depth, with a figure: render, sense, classical and compressive depth."""
+    """From the default scene to depth, with a figure: render, sense, and depth from all bins, from Fourier codes and
+    from learned codes by a network that ships, both at 128x; and what the codes cost on the chip."""
 
     scene: str = "living-room"
     """A scene as `render` takes it."""
@@ -24,8 +33,8 @@ class Demo(Common):
     """Image width, pixels."""
     height: int = 96
     """Image height, pixels."""
-    signal: float = 50.0
-    """Mean signal photons per pixel."""
+    signal: float = 10.0
+    """Mean signal photons per pixel; the network was trained on 2 to 10."""
     background: float = 50.0
     """Mean background photons per pixel."""
     out: Path = Path("out/demo")
@@ -36,6 +45,7 @@ def run(command: Demo, progress: Progress) -> dict:
     """Run the command: scene -> transient -> histogram -> four depth maps -> one figure."""
     from render.engine import render
     from render.transient import write_transient
+    from scene2spad.methods import depth_method
     from scene2spad.plots import figures
     from spad.detection.detect import sense
     from spad.estimators.depth import depth_errors
@@ -56,13 +66,16 @@ def run(command: Demo, progress: Progress) -> dict:
     sensor = sensor_by_name("reference")
     histogram = sense(transient, sensor, budget, seed=command.seed, progress=progress)
     sensed = time.perf_counter()
-    names = {"argmax": "argmax", "matched": "matched", "log-matched": "log-matched", "compressive": "Fourier K = 16"}
-    depths = {name: depth_map(histogram, method) for method, name in names.items()}
+    depths = {}
+    for number, (label, method) in enumerate(METHODS.items()):
+        progress(label, number / len(METHODS))
+        depths[label] = depth_method(method, sensor, seed=command.seed)(histogram)
     errors = {n: depth_errors(d, histogram.depth_m, range_m=sensor.range_m) for n, d in depths.items()}
     estimated = time.perf_counter()
     write_transient(transient, folder / f"{scene.name}.exr")
     write_histogram(histogram, folder / f"{scene.name}.h5")
-    figure = figures.draw_demo(transient, histogram, depths, errors, folder / "demo.png")
+    costs = {model: chip_cost(model) for model in ON_THE_CHIP}
+    figure = figures.draw_demo(transient, histogram, depths, errors, folder / "demo.png", costs)
     return {
         "seconds": time.perf_counter() - start,
         "seconds_render": rendered - start,
@@ -72,5 +85,24 @@ def run(command: Demo, progress: Progress) -> dict:
         "target_met": transient.meta["target_met"],
         "mae_mm": {name: e["mae_mm"] for name, e in errors.items()},
         "within_10mm": {name: e["within_10mm"] for name, e in errors.items()},
+        "chip": costs,
         "figure": str(figure),
     }
+
+
+def chip_cost(model: str) -> str:
+    """Say what a model's codes cost on emulated cores, or why they do not fit."""
+    from csph.networks.model import load_model
+    from csph.weights.cards import checkpoint_of
+    from scene2spad.studies.chip.chain import measured
+    from scene2spad.studies.chip.code import compile_model
+
+    try:
+        compiled = compile_model(load_model(checkpoint_of(model))[0], model).compiled
+    except InputError as error:
+        return "does not fit: " + str(error).removeprefix(f"code {model} ").partition(";")[0]
+    cost = measured(compiled)
+    return (
+        f"{cost.clocks_per_photon:.0f} clocks a photon, {compiled.layout.total} of {compiled.chip.ram_bytes} bytes of "
+        f"RAM a core, {cost.bits_per_pixel / 8:.0f} bytes read out a pixel"
+    )

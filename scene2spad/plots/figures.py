@@ -264,9 +264,15 @@ def draw_pulse(sensor: Sensor, path: Path) -> Path:
 
 
 def draw_demo(
-    transient: Transient, histogram: Histogram, depths: dict[str, np.ndarray], errors: dict[str, dict], path: Path
+    transient: Transient,
+    histogram: Histogram,
+    depths: dict[str, np.ndarray],
+    errors: dict[str, dict],
+    path: Path,
+    chip: dict[str, str],
 ) -> Path:
-    """Draw intensity, true depth, every estimate with its error, and one pixel from returns to detections."""
+    """Draw intensity, true depth, every estimate with its error, one pixel from returns to detections, and what the codes
+    cost in the pixel (`chip`, by model)."""
     figure = plt.figure(figsize=(14, 11.5), layout="constrained")
     panels = figure.subplot_mosaic("ABC;DEF;GGG;HHH", height_ratios=(1, 1, 0.45, 0.6))
     limits = depth_limits(histogram.depth_m)
@@ -274,12 +280,14 @@ def draw_demo(
            vmax=np.quantile(histogram.expected_signal, 0.98))  # fmt: skip
     _image(panels["B"], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     for key, (name, depth) in zip("CDEF", depths.items(), strict=True):
-        message = f"{name}: MAE {errors[name]['mae_mm']:.0f} mm, {errors[name]['within_10mm']:.0%} within 10 mm"
+        message = f"{name}\nMAE {errors[name]['mae_mm']:.0f} mm, {errors[name]['within_10mm']:.0%} within 10 mm"
         _image(panels[key], depth, message, "m", cmap=DEPTH_COLOURS, **limits)
     row, column = _telling_pixel(transient)
     for key in "ABCDEF":
         panels[key].plot(column, row, "o", mfc="none", mec="red", ms=9)
     _one_pixel(panels["G"], panels["H"], transient, histogram, row, column)
+    told = "\n".join(f"{model}: {cost}" for model, cost in chip.items())
+    figure.supxlabel(f"The codes on emulated in-pixel cores\n{told}", fontsize=8.5)
     budget = histogram.budget
     figure.suptitle(
         f"{transient.meta['scene']}: {budget.signal:g} signal + {budget.background:g} background photons per pixel, "

@@ -159,9 +159,10 @@ def _cloud(content: Content) -> dict[str, Any] | None:
     every = -(-len(content.points) // MAX_POINTS)
     points = content.points[::every]
     distance = np.linalg.norm(points, axis=1)
-    low, high = (float(v) for v in np.quantile(distance, (0.01, 0.99)))
-    centre = np.median(points, axis=0)
-    radius = float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.98)) or 1.0
+    low, high = (float(v) for v in np.quantile(distance, (0.01, 0.97)))
+    seen = points[distance <= high]
+    centre = (seen.min(axis=0) + seen.max(axis=0)) / 2
+    radius = float(np.quantile(np.linalg.norm(seen - centre, axis=1), 0.95)) or 1.0
     value = None if content.point_value is None else packed(content.point_value[::every].astype(np.float32))
     return {
         "data": packed(points),

@@ -91,7 +91,8 @@ function drawPlot() {
     c.beginPath(); c.moveTo(x(t), 8); c.lineTo(x(t), bottom); c.stroke();
     c.fillText(number(t, 6), x(t), bottom + 14);
   }
-  c.fillText(`time since emission [ns]; 1 ns is ${number(page.metres_per_ns, 4)} m of depth`, (left + right) / 2, height - 5);
+  const deep = right - left > 380 ? `; 1 ns is ${number(page.metres_per_ns, 4)} m of depth` : "";
+  c.fillText(`time since emission [ns]${deep}`, (left + right) / 2, height - 5);
   c.textAlign = "right"; for (const v of [0, top]) c.fillText(number(v, 3), left - 4, y(v) + 4);
   c.save(); c.beginPath(); c.rect(left, 0, right - left, bottom + 1); c.clip();
   for (const cube of page.cubes) cube.drawn === "bars" ? bars(c, cube, pixel, x, y, low, high) : curve(c, cube, pixel, x, y, low, high);
@@ -131,9 +132,9 @@ function drawMovie() {
   const cube = movieCube(), frame = new Float32Array(W * H), reach = cube.drawn === "bars" ? 4 : 0;
   for (let p = 0; p < W * H; p++) {
     let sum = 0; for (let t = Math.max(0, state.frame - reach); t <= Math.min(cube.bins - 1, state.frame + reach); t++) sum += value(cube, p, t);
-    frame[p] = sum;
+    frame[p] = sum - (cube.base ? cube.base[p] : 0);
   }
-  paint($("movie"), frame, "light", cube.floor * (2 * reach + 1), cube.white * (2 * reach + 1), 1 / 2.2); cross($("movie"));
+  paint($("movie"), frame, "light", 0, cube.white * (reach ? 3 : 1), 1 / 2.2); cross($("movie"));
   const at = cube.start_ns + (state.frame + .5) * cube.step_ns;
   $("when").textContent = `${number(at, 5)} ns, ${number(at * page.metres_per_ns, 4)} m deep`;
   $("time").value = state.frame;
@@ -143,9 +144,15 @@ function prepareMovie() {
   for (let p = 0; p < W * H; p++) for (let t = 0; t < cube.bins; t++) total[t] += value(cube, p, t);
   const steady = Float64Array.from(total).sort()[Math.floor(cube.bins / 2)];
   let first = total.findIndex((v) => v > 1.5 * steady && v > 0); if (first < 0) first = 0;
-  for (let p = 0; p < W * H; p++) { let m = 0; for (let t = 0; t < cube.bins; t++) m = Math.max(m, value(cube, p, t)); bright.push(m); }
+  if (cube.drawn === "line") cube.base = new Float32Array(W * H); // steady light of each pixel, taken away
+  for (let p = 0; p < W * H; p++) {
+    let most = 0, least = Infinity;
+    for (let t = 0; t < cube.bins; t++) { const v = value(cube, p, t); most = Math.max(most, v); least = Math.min(least, v); }
+    if (cube.base) cube.base[p] = least;
+    bright.push(most - (cube.base ? least : 0));
+  }
   bright.sort((a, b) => a - b);
-  cube.white = bright[Math.floor(.9 * (bright.length - 1))] || 1; cube.floor = cube.drawn === "bars" ? 0 : Math.min(1.2 * steady / (W * H), .5 * cube.white);
+  cube.white = bright[Math.floor(.9 * (bright.length - 1))] || 1;
   $("time").max = cube.bins - 1; state.frame = Math.max(0, first - 2);
   $("time").setAttribute("aria-valuetext", "time bin");
 }
@@ -175,7 +182,7 @@ function drawCloud() {
   order.sort((a, b) => away[b] - away[a]);
   const size = Math.max(1.5, scale * p.spacing);
   for (const i of order) {
-    const rgb = colour("depth", p.share[i]), light = p.light ? .35 + .65 * Math.sqrt(p.light[i]) : 1;
+    const rgb = colour("depth", p.share[i]), light = p.light ? .55 + .45 * Math.sqrt(p.light[i]) : 1;
     c.fillStyle = `rgb(${rgb.map((v) => Math.round(v * light)).join()})`;
     c.fillRect(at[2 * i] - size / 2, at[2 * i + 1] - size / 2, size, size);
   }
