@@ -271,7 +271,7 @@ def draw_demo(
     path: Path,
     chip: dict[str, str],
 ) -> Path:
-    """Draw intensity, true depth, every estimate with its error, one pixel from returns to detections, and what the codes
+    """Draw intensity, true depth, every estimate with its error, one pixel from returns to detections, and what codes
     cost in the pixel (`chip`, by model)."""
     figure = plt.figure(figsize=(14, 11.5), layout="constrained")
     panels = figure.subplot_mosaic("ABC;DEF;GGG;HHH", height_ratios=(1, 1, 0.45, 0.6))
@@ -286,8 +286,8 @@ def draw_demo(
     for key in "ABCDEF":
         panels[key].plot(column, row, "o", mfc="none", mec="red", ms=9)
     _one_pixel(panels["G"], panels["H"], transient, histogram, row, column)
-    told = "\n".join(f"{model}: {cost}" for model, cost in chip.items())
-    figure.supxlabel(f"The codes on emulated in-pixel cores\n{told}", fontsize=8.5)
+    costs = "\n".join(f"{model}: {cost}" for model, cost in chip.items())
+    figure.supxlabel(f"The codes on emulated in-pixel cores\n{costs}", fontsize=8.5)
     budget = histogram.budget
     figure.suptitle(
         f"{transient.meta['scene']}: {budget.signal:g} signal + {budget.background:g} background photons per pixel, "
