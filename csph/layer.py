@@ -19,6 +19,15 @@ from torch import Tensor, nn
 from csph.codes import blocks, rank
 from csph.codes.design import Design
 from csph.codes.photons import encode_photons, photon_table
+from csph.codes.quantise import (
+    HALF_RANGE,
+    Quantised,
+    clipped_steps,
+    from_factors,
+    quantised,
+    straight_through,
+    wrapped_sums,
+)
 from csph.codes.temporal import circle_of, orthogonal_start, temporal_code, uniform_start
 from csph.codes.tensor import CodingTensor, full_tensor
 from scenes.errors import require
@@ -40,6 +49,8 @@ class LayerOptions:
     keep_mean         no removal of the mean over K from 1 to 4 codes: of K = 2 it leaves one sign bit, of K = 1 nothing
     pulse_in_decoder  back-project with the codes of a returning pulse, C h(tau), instead of those of one bin
     pulse_in_codes    encode and back-project with codes smoothed by the pulse
+    int8              train for the chip: each factor in 255 steps within a range that is learned, sums of 16 bits that
+                      wrap (a core's, before its spatial weight); rounding is passed straight through backward
     """
 
     zero_mean: bool = True
@@ -47,6 +58,7 @@ class LayerOptions:
     keep_mean: bool = False
     pulse_in_decoder: bool = False
     pulse_in_codes: bool = False
+    int8: bool = False
 
 
 def make_coding(
@@ -80,6 +92,9 @@ class CompressiveLayer(nn.Module):
     background  (T,) shape in time of a background that is not uniform (a gate, pile-up), any scale: the direction that
                 it takes among the codes of each time block is projected out of codes and weights before normalisation
 
+    With `int8` the logarithms of the clipping ranges are parameters as well, `temporal_range` and `spatial_range`; they
+    begin at each factor's largest magnitude (`fit_ranges`).
+
     Sums are in float32 whatever the counts' type and autocast, in float64 where the weights are.
     """
 
@@ -111,6 +126,13 @@ class CompressiveLayer(nn.Module):
                 self.register_buffer(name, copied)
         self.register_buffer("pulse", self._pulse(sensor or Sensor()), persistent=False)
         self.register_buffer("background", self._background(background), persistent=False)
+        self.temporal_range = self.spatial_range = None
+        if self.options.int8:
+            full = coding.is_full and coding.block[1:] != (1, 1)
+            require(not full, f"coding tensor {coding.name}: int8 is for a temporal and a spatial factor, this is full")
+            self.temporal_range = nn.Parameter(torch.zeros(()))
+            self.spatial_range = None if coding.spatial is None else nn.Parameter(torch.zeros(()))
+            self.fit_ranges()
 
     @classmethod
     def of(
@@ -155,22 +177,58 @@ class CompressiveLayer(nn.Module):
         flat = weights.reshape(*weights.shape[:2], -1)
         return (self.pulse.to(weights.dtype).T @ flat).view(weights.shape)
 
-    def _temporal_part(self) -> Tensor:
+    def _exact_temporal(self) -> Tensor:
         part = blocks.centred(self.temporal, 1) if self.options.zero_mean else self.temporal
         return self._blurred(part) if self.options.pulse_in_codes else part
 
+    def _temporal_steps(self) -> tuple[Tensor, Tensor]:
+        return clipped_steps(self._exact_temporal(), self.temporal_range)
+
+    def _spatial_steps(self) -> tuple[Tensor, Tensor]:
+        return clipped_steps(self.spatial, self.spatial_range)
+
+    def _temporal_part(self) -> Tensor:
+        if not self.options.int8:
+            return self._exact_temporal()
+        steps, step = self._temporal_steps()
+        return steps * step
+
+    def _spatial_part(self) -> Tensor | None:
+        if self.spatial is None or not self.options.int8:
+            return self.spatial
+        steps, step = self._spatial_steps()
+        return steps * step
+
+    @torch.no_grad()
+    def fit_ranges(self) -> None:
+        """Set the clipping ranges of `int8` to the largest magnitude of each factor as it is now."""
+        self.temporal_range.copy_(self._exact_temporal().abs().max().clamp(min=1e-30).log())
+        if self.spatial is not None:
+            self.spatial_range.copy_(self.spatial.abs().max().clamp(min=1e-30).log())
+
+    @torch.no_grad()
+    def quantised(self) -> Quantised:
+        """Return the weights in 8 bits: within the learned ranges of `int8`, else within their largest magnitudes."""
+        if not self.options.int8:
+            return quantised(self.coding())
+        parts = [self._temporal_steps(), (None, 1.0) if self.spatial is None else self._spatial_steps()]
+        factors = [
+            (None if steps is None else steps.to(torch.int8).cpu().numpy(), float(step)) for steps, step in parts
+        ]
+        return from_factors(self.name, *factors)
+
     def weights(self) -> Tensor:
         """Return (K, Mt, Mr, Mc) that counts are encoded with: the constraint and the pulse applied."""
-        return full_tensor(self._temporal_part(), self.spatial)
+        return full_tensor(self._temporal_part(), self._spatial_part())
 
     def coding(self) -> CodingTensor:
         """Return the weights as they are now, constraint and pulse applied; separable ones stay so."""
-        return CodingTensor(self.name, self._temporal_part(), self.spatial, computed=self.computed)
+        return CodingTensor(self.name, self._temporal_part(), self._spatial_part(), computed=self.computed)
 
     def pixel_gram(self) -> Tensor:
         """Return inner products of the codes of each two pixels of a block, (Mr Mc, Mr Mc): see `csph.codes.rank`."""
-        temporal = self._temporal_part()
-        return rank.pixel_gram(temporal) if self.spatial is None else rank.separable_gram(temporal, self.spatial)
+        temporal, spatial = self._temporal_part(), self._spatial_part()
+        return rank.pixel_gram(temporal) if spatial is None else rank.separable_gram(temporal, spatial)
 
     def _forms(self, counts: int) -> bool:
         return self.spatial is None or blocks.forms(self.codes, self.block, counts)
@@ -179,13 +237,41 @@ class CompressiveLayer(nn.Module):
         """Return codes of a histogram. Raises InputError for counts of another shape or type, or that blocks do not
         tile."""
         with torch.autocast(counts.device.type, enabled=False):
+            if self.options.int8:
+                return self._encode_int8(counts)
             if self.spatial is not None and not self._forms(counts.numel()):
                 return blocks.encode_separable(counts, self._temporal_part(), self.spatial)
             return blocks.encode_blocks(counts, self.weights())
 
+    def _core_sums(self, counts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return sums of int8 steps that each pixel's core makes, (B, K, T/Mt, R, C) exact, and the value of a step."""
+        blocks.check_counts(counts, self.block)
+        steps, step = self._temporal_steps()
+        return blocks.encode_blocks(counts, steps.view(*steps.shape[:2], 1, 1)), step
+
+    def _encode_int8(self, counts: Tensor) -> Tensor:
+        sums, step = self._core_sums(counts)
+        # the slope of a sum that wraps would narrow the range, which wraps more
+        held = straight_through(sums * step, wrapped_sums(sums) * step)
+        if self.spatial is None:
+            return held
+        (batch, codes, times, rows, columns), (_, down, right) = held.shape, self.block
+        of_blocks = held.view(batch, codes, times, rows // down, down, columns // right, right)
+        return (of_blocks * self._spatial_part()[:, None, None, :, None, :]).sum((4, 6))
+
+    def sum_excess(self, counts: Tensor) -> Tensor:
+        """Return the mean over all cores' sums of what is beyond 16 bits, in units of half their range, with `int8`; its gradient
+        widens the clipping range."""
+        with torch.autocast(counts.device.type, enabled=False):
+            sums, _ = self._core_sums(counts)
+            return (sums.abs() / HALF_RANGE - 1).relu().mean()
+
     def encode_timestamps(self, timestamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
-        """Return the same codes from detections; size (T, R, C) of the histogram that is not built. See
-        `encode_photons`."""
+        """Return the same codes from detections; size (T, R, C) of the histogram that is not built.
+
+        See `encode_photons`. Raises InputError with `int8`, whose sums are each core's.
+        """
+        require(not self.options.int8, f"coding tensor {self.name}: int8 codes are made from histograms")
         with torch.autocast(timestamps.device.type, enabled=False):
             return encode_photons(timestamps, offsets, photon_table(self.weights()), self.block, size, name=self.name)
 
@@ -210,7 +296,7 @@ class CompressiveLayer(nn.Module):
             temporal = self._temporal_part()
             if self.options.pulse_in_decoder:
                 temporal = self._blurred(temporal)
-            return blocks.correlate_separable(unit, temporal, self.spatial, centre=centre)
+            return blocks.correlate_separable(unit, temporal, self._spatial_part(), centre=centre)
         weights = self.weights()
         direction = None if self.background is None else self._direction(self.background, weights, codes.shape[2])
         if self.options.pulse_in_decoder:

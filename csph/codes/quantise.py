@@ -17,6 +17,7 @@ INT8_RULES: tuple[str, ...] = get_args(Int8Rule)
 LEVELS = 127  # +-: symmetric, -128 is left out so that a sign can always be turned
 PRODUCT_SHIFT = 7  # bits that the product of two 8-bit factors is shifted by, back into 8 bits
 ACCUMULATOR_BITS = 16
+HALF_RANGE = 1 << ACCUMULATOR_BITS - 1
 # 255 steps over [-1, 1] for every factor; in single precision as published, so that 1 is 127 steps and not 127.5
 PUBLISHED_STEP = float(np.float32(2 / 255))
 
@@ -47,6 +48,23 @@ class Quantised:
         )
 
 
+def clipped_steps(values: Tensor, log_range: Tensor) -> tuple[Tensor, Tensor]:
+    """Round to 255 steps between plus and minus exp(log_range), for training: (steps, value of one step).
+
+    Whole numbers within +-127 in floating point. Backward goes straight through the rounding, so that values and range
+    learn: within the range d(step value x steps) / d(step value) is the rounding's error, outside it +-127 (LSQ, Esser
+    et al., ICLR 2020); values outside it do not move.
+    """
+    step = log_range.exp() / LEVELS
+    scaled = (values / step).clamp(-LEVELS, LEVELS)
+    return straight_through(scaled, scaled.round()), step
+
+
+def straight_through(values: Tensor, forward: Tensor) -> Tensor:
+    """`forward`, with the derivative of `values`."""
+    return forward.detach() + (values - values.detach())
+
+
 def _to_int8(values: Tensor, scale: float | None = None) -> tuple[np.ndarray, float]:
     """Round to steps of `scale` (default: 1/127 of the largest magnitude), clamped to +-127; and the scale."""
     array = values.double().cpu().numpy()
@@ -60,15 +78,21 @@ def quantised(coding: CodingTensor) -> Quantised:
 
     This is what an in-pixel core computes with: one 8-bit tensor, of separable factors their product in integers.
     """
-    temporal, temporal_scale = _to_int8(coding.temporal)
-    if coding.spatial is None:
-        tensor = temporal.reshape(coding.codes, *coding.block)
-        return Quantised(coding.name, tensor, temporal_scale, temporal, temporal_scale, None, 1.0)
-    spatial, spatial_scale = _to_int8(coding.spatial)
-    product = temporal[:, :, None, None].astype(np.int16) * spatial[:, None].astype(np.int16)
+    spatial = (None, 1.0) if coding.spatial is None else _to_int8(coding.spatial)
+    return from_factors(coding.name, _to_int8(coding.temporal), spatial)
+
+
+def from_factors(
+    name: str, temporal: tuple[np.ndarray, float], spatial: tuple[np.ndarray | None, float] = (None, 1.0)
+) -> Quantised:
+    """Form the 8-bit tensor of int8 factors, each given with the value of one of its steps."""
+    (steps, scale), (weights, weight_scale) = temporal, spatial
+    if weights is None:
+        tensor = steps if steps.ndim == 4 else steps[..., None, None]
+        return Quantised(name, tensor, scale, steps, scale, None, 1.0)
+    product = steps[:, :, None, None].astype(np.int16) * weights[:, None].astype(np.int16)
     tensor = ((product + (1 << PRODUCT_SHIFT - 1)) >> PRODUCT_SHIFT).astype(np.int8)
-    scale = temporal_scale * spatial_scale * (1 << PRODUCT_SHIFT)
-    return Quantised(coding.name, tensor, scale, temporal, temporal_scale, spatial, spatial_scale)
+    return Quantised(name, tensor, scale * weight_scale * (1 << PRODUCT_SHIFT), steps, scale, weights, weight_scale)
 
 
 def published_int8(coding: CodingTensor) -> CodingTensor:
@@ -102,6 +126,10 @@ def encode_int16(counts: Tensor, tensor: Quantised) -> IntegerCodes:
     comes back is right. Exact for up to 2^53 / 127 photons a block. Raises InputError as `encode_blocks` does.
     """
     exact = encode_blocks(counts, torch.from_numpy(tensor.tensor).double()).round().to(torch.int64)
-    half = 1 << ACCUMULATOR_BITS - 1
-    wrapped = torch.remainder(exact + half, 2 * half) - half
+    wrapped = wrapped_sums(exact)
     return IntegerCodes(wrapped.to(torch.int16), int((wrapped != exact).sum()))
+
+
+def wrapped_sums(sums: Tensor) -> Tensor:
+    """Whole numbers as a 16-bit accumulator holds them, of any type."""
+    return torch.remainder(sums + HALF_RANGE, 2 * HALF_RANGE) - HALF_RANGE

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from csph.codes.blocks import encode_blocks
-from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8, quantised
+from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8
 from csph.layer import CompressiveLayer
 from csph.networks.compact import Compact
 from csph.networks.grid import published_position
@@ -66,6 +66,14 @@ class DepthModel(nn.Module):
             torch.manual_seed(seed)
             compact = config.network == "compact"
             self.network = Compact() if compact else DeepBoosting(can_die=config.network == "published")
+
+    def begin_with(self, other: DepthModel) -> None:
+        """Take the weights of a model of the same design and network; clipping ranges of int8 that it has not are
+        fitted to them."""
+        fits = self.layer is not None and self.layer.options.int8 and not other.layer.options.int8
+        self.load_state_dict(other.state_dict(), strict=not fits)
+        if fits:
+            self.layer.fit_ranges()
 
     @property
     def parameters_count(self) -> int:
@@ -183,7 +191,7 @@ class DepthModel(nn.Module):
         if rule == "published":
             weights = published_int8(coding).tensor.to(self.layer.temporal.device)
             return self.network(self.layer.decode(encode_blocks(counts.to(weights.device), weights))), 0
-        tensor = quantised(coding)
+        tensor = self.layer.quantised()
         codes, _ = encode_int16(counts, tensor)
         logits = self.network(self.layer.decode(codes.to(self.layer.temporal.device).float() * tensor.scale))
         blocks = (

@@ -62,6 +62,9 @@ class ModelConfig:
         if self.design is not None:
             bins, block = self.sensor.bins, self.design.block
             require(bins % block[0] == 0, f"blocks of {block[0]} bins do not divide the sensor's {bins}")
+            counted = self.design.code == "coarse" or self.design.full
+            rounded = f"{self.design.name}: int8 is for codes with a table of their own, not counters or full tensors"
+            require(not (counted and self.layer.get("int8")), rounded)
             message = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
             require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{message}, or --layer keep_mean")
 

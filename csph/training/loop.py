@@ -54,6 +54,8 @@ from scenes.io.inputs import read_json_object
 log = logging.getLogger("csph")
 
 Progress = Callable[[str, float], None]
+RANGE_RATE = 0.02  # of the logarithms of int8 clipping ranges: a bit more headroom in some 40 steps
+EXCESS_WEIGHT = 10.0  # of sums beyond 16 bits
 
 
 class DepthTraining(pl.LightningModule):
@@ -65,7 +67,7 @@ class DepthTraining(pl.LightningModule):
         self.config = config
         self.model = DepthModel(config.model, config.seed)
         if init is not None:
-            self.model.load_state_dict(init.state_dict())
+            self.model.begin_with(init)
         self.averaged: DepthModel | None = None
         if config.average:  # a module of its own: Lightning's checkpoint then holds it
             self.averaged = deepcopy(self.model).requires_grad_(False).eval()
@@ -94,8 +96,11 @@ class DepthTraining(pl.LightningModule):
         loss = kl_divergence(logits, depth, valid, sensor)
         if config.tv_weight and self.global_step >= config.tv_start:
             loss = loss + config.tv_weight * total_variation(soft_argmax(logits) / config.model.sensor.bins)
-        if config.coherence and self.model.layer is not None:
-            loss = loss + config.coherence * coherence(self.model.layer.pixel_gram())
+        layer = self.model.layer
+        if config.coherence and layer is not None:
+            loss = loss + config.coherence * coherence(layer.pixel_gram())
+        if layer is not None and layer.options.int8:
+            loss = loss + EXCESS_WEIGHT * layer.sum_excess(batch.counts)
         return loss
 
     def training_step(self, batch: TrainBatch, _: int) -> Tensor:
@@ -122,7 +127,11 @@ class DepthTraining(pl.LightningModule):
             self.absolute_m[decoder].update(error.abs(), weight)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        adam = torch.optim.Adam(self.model.parameters(), lr=self.config.rate, fused=True)
+        named = [*self.model.named_parameters()]
+        groups = [{"params": [one for name, one in named if not name.endswith("_range")]}]
+        ranges = [one for name, one in named if name.endswith("_range")]
+        groups += [{"params": ranges, "lr": RANGE_RATE}] if ranges else []
+        adam = torch.optim.Adam(groups, lr=self.config.rate, fused=True)
         # a function of the step alone: nothing about it has to be restored
         steps = torch.optim.lr_scheduler.LambdaLR(adam, partial(rate_factor, config=self.config))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": steps, "interval": "step"}}
@@ -222,16 +231,11 @@ def _claim(folder: Path, config: TrainConfig) -> None:
 def _check_init(init: DepthModel, config: TrainConfig) -> None:
     """InputError unless a trained model has the tensors and the sensor of the one to be trained."""
     mine, other = config.model, init.config
-    alike = (mine.front, mine.network, mine.design, mine.sensor) == (
-        other.front,
-        other.network,
-        other.design,
-        other.sensor,
-    )
-    require(
-        alike,
-        f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}",
-    )
+    alike = all(getattr(mine, name) == getattr(other, name) for name in ("front", "network", "design", "sensor"))
+    said = f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
+    require(alike, said)
+    less = other.layer.get("int8", False) and not mine.layer.get("int8", False)
+    require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
 
 
 def _listed(views: Views | Sequence[Views]) -> list[Views]:

@@ -7,7 +7,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -35,6 +35,7 @@ class ModelSpec:
     time_offset_m  random delays in training, 0 as published
     trained_on     rooms: direct light in rooms, the recipe of the offset study; mixed: rooms and clutter with indirect
                    light as well, levels over their whole range
+    int8           trained for the chip (`--layer int8`), beginning with `plain`
     """
 
     design: str = "learned"
@@ -44,6 +45,12 @@ class ModelSpec:
     time_offset_m: float = 0.0
     full: bool = False
     trained_on: Literal["rooms", "mixed"] = "rooms"
+    int8: bool = False
+
+    @property
+    def plain(self) -> ModelSpec:
+        """Return the same model in floating point."""
+        return replace(self, int8=False)
 
     @property
     def coded(self) -> bool:
@@ -57,7 +64,8 @@ class ModelSpec:
             return {"none": "no compression", "peak": "peak"}[self.design] + mixed
         sort = f"{'full ' if self.full else ''}{self.design}"
         moved = f", trained with offsets to {self.time_offset_m:g} m" if self.time_offset_m else ""
-        return f"{sort} {'x'.join(map(str, self.block))}{moved}{mixed}"
+        chip = ", trained for the chip" if self.int8 else ""
+        return f"{sort} {'x'.join(map(str, self.block))}{moved}{mixed}{chip}"
 
     @property
     def name(self) -> str:
@@ -69,15 +77,20 @@ class ModelSpec:
             parts.append(f"t{self.time_offset_m:g}")
         if self.trained_on != "rooms":
             parts.append(self.trained_on)
+        if self.int8:
+            parts.append("int8")
         return "-".join([*parts, f"s{self.seed}"])
 
     def command(self, preset: str, training: Path, folder: Path) -> Train:
         """Return the `train` command that makes it in `folder/name`."""
+        begun = folder / self.plain.name
         return Train(
             design=self.design,
             block=self.block,
             compression=self.compression,
             full=self.full,
+            layer=("int8",) if self.int8 else (),
+            init=(str(begun) if begun.is_dir() else begun.name) if self.int8 else None,
             preset=preset,
             seed=self.seed,
             time_offset=self.time_offset_m or None,
@@ -90,6 +103,7 @@ class ModelSpec:
         coded = f" --block {' '.join(map(str, self.block))} --compression {self.compression}" if self.coded else ""
         more = f"{' --full' if self.full else ''}"
         more += f" --time-offset {self.time_offset_m:g}" if self.time_offset_m else ""
+        more += f" --layer int8 --init {self.plain.name}" if self.int8 else ""
         made = f"--preset {preset} --seed {self.seed} --set {training} --out {folder / self.name}"
         return f"scene2spad train --design {self.design}{coded}{more} {made}"
 

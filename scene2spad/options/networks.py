@@ -25,8 +25,9 @@ class Train(Common):
     """Number K of codes, instead of --compression."""
     full: bool = False
     """A full coding tensor instead of a separable one."""
-    layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes"], ...] = ()
-    """Switches of the layer that differ from the published one."""
+    layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes", "int8"], ...] = ()
+    """Switches of the layer that differ from the published one; int8 trains codes for the in-pixel processor: 8 bits
+    within ranges that are learned, sums of 16 bits that wrap (begin with --init)."""
     set: tuple[Path, ...] = (Path("planes"),)
     """Folders of sets that `dataset` rendered, or their packs (.h5); planes: random planes, no renderer needed."""
     set_weights: tuple[float, ...] = ()

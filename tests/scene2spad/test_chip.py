@@ -99,6 +99,27 @@ def test_codes_that_hold_the_pulse_are_no_quarter_wave():
     assert harmonics_of(design, quantised(model.layer.coding()).temporal, Sensor()) == ()
 
 
+@pytest.mark.parametrize("block", [(1024, 1, 1), (256, 2, 2)])
+def test_codes_trained_for_the_chip_run_with_the_ranges_that_they_learned(block):
+    """Smaller tables, no wraps where the full range wraps, and the integers that training has seen."""
+    design = Design("fourier", block, 8)
+    plain = compile_model(DepthModel(ModelConfig(design=design)), "plain").compiled
+    model = DepthModel(ModelConfig(design=design, layer={"int8": True}))
+    with torch.no_grad():
+        model.layer.temporal_range += np.log(4)
+    chip, counts = compile_model(model, "headroom"), view(4, 4, peak=600)
+    found, full = interpret(counts, chip.compiled), interpret(counts, plain)
+    assert found.counters.wraps == 0 < full.counters.wraps
+    assert np.array_equal(found.codes, codes_by_torch(counts, chip.compiled))
+    assert np.array_equal(found.codes, FastCores.of(chip.compiled).frame(counts)[0])
+    assert chip.compiled.program.instructions == plain.program.instructions
+    odd = np.arange(8) // 2 % 2 == 0  # harmonics that a quarter wave gives exactly
+    with torch.no_grad():
+        seen = model.layer.encode(torch.from_numpy(counts).permute(2, 0, 1)[None, None])[0].permute(2, 3, 1, 0)
+    codes = found.codes.reshape(*found.codes.shape[:2], -1, 8)[..., odd] * chip.scale
+    assert np.abs(codes - seen.numpy()[..., odd]).max() <= chip.scale * 0.5001
+
+
 def test_models_that_have_no_program_are_refused():
     with pytest.raises(InputError, match="no codes to compile"):
         compile_model(DepthModel(ModelConfig(front="counts")), "none")

@@ -10,7 +10,7 @@ import torch
 
 from csph.codes.blocks import encode_blocks
 from csph.codes.design import Design
-from csph.codes.quantise import quantised
+from csph.codes.quantise import wrapped_sums
 from csph.codes.temporal import block_pulse, gray_frequencies
 from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer
@@ -23,7 +23,6 @@ from ultraphase.compiler import Compiled, compile_code
 from ultraphase.integer_code import IntegerCode, folded_temporal
 from ultraphase.tables import block_sum, quarter_wave, wave_matrix
 
-HALF = 1 << 15  # of a 16-bit sum's range
 COUNTER_LIMIT = 255
 
 
@@ -53,7 +52,7 @@ def compile_model(model: DepthModel, name: str) -> ChipModel:
     if _is_histogram(design, coding):
         code = IntegerCode(name, coding.temporal.round().to(torch.int8).numpy(), counters=True)
         return ChipModel(model, compile_code(code), 1.0, model)
-    steps = quantised(coding)
+    steps = model.layer.quantised()
     spatial = steps.spatial if coding.rows * coding.columns > 1 else None
     temporal = steps.temporal
     if temporal.ndim == 4 and temporal.shape[2:] == (1, 1):
@@ -68,7 +67,7 @@ def compile_model(model: DepthModel, name: str) -> ChipModel:
 
 def _reader(model: DepthModel, coding: CodingTensor) -> DepthModel:
     """The model with another coding tensor, taken as it is, in the place of its own."""
-    options = replace(model.layer.options, zero_mean=False, pulse_in_codes=False)
+    options = replace(model.layer.options, zero_mean=False, pulse_in_codes=False, int8=False)
     reader = deepcopy(model)
     reader.layer = CompressiveLayer(coding, options=options, sensor=model.config.sensor)
     return reader
@@ -122,7 +121,7 @@ def leave_sensor(sums: np.ndarray, compiled: Compiled) -> np.ndarray:
     int64."""
     if compiled.code.counters:
         return np.minimum(sums, COUNTER_LIMIT)
-    held = (sums + HALF) % (2 * HALF) - HALF
+    held = wrapped_sums(torch.from_numpy(sums)).numpy()
     (rows, columns), (height, width) = compiled.block, sums.shape[:2]
     if (rows, columns) == (1, 1):
         return held

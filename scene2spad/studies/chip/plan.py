@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from csph.evaluation.metrics import PHOTON_LEVELS
 from scene2spad.networks.registry import ModelSpec
@@ -18,6 +18,7 @@ MAIN = (
     ModelSpec("fourier", (1024, 1, 1), 128),
     ModelSpec("fourier", (1024, 1, 1), 64),
 )
+TRAINED_FOR_CHIP = tuple(replace(one, int8=True) for one in MAIN)
 OTHERS = (
     ModelSpec("gray", (1024, 1, 1), 128),
     ModelSpec("fourier+learned", (256, 4, 4), 128),
@@ -32,7 +33,7 @@ class Plan:
     views, size   of each set; None: all, as they come
     """
 
-    models: tuple[ModelSpec, ...] = (*MAIN, *OTHERS)
+    models: tuple[ModelSpec, ...] = (*MAIN, *TRAINED_FOR_CHIP, *OTHERS)
     levels: tuple[Level, ...] = PHOTON_LEVELS
     other_levels: tuple[Level, ...] = PAIR_LEVELS
     views: int | None = None
@@ -42,7 +43,7 @@ class Plan:
 
 
 SMOKE = Plan(
-    models=(MAIN[0], MAIN[2]),
+    models=(MAIN[0], MAIN[2], TRAINED_FOR_CHIP[2]),
     levels=PAIR_LEVELS[:2],
     other_levels=PAIR_LEVELS[:1],
     views=2,

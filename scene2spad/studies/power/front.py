@@ -21,7 +21,7 @@ from scene2spad.datasets.published import PUBLISHED as PUBLISHED_ERRORS
 from scene2spad.networks.registry import ModelRegistry
 from scene2spad.studies.chip.chain import ChipDepth, core_tables, measured
 from scene2spad.studies.chip.code import compile_model
-from scene2spad.studies.chip.plan import MAIN, OTHERS
+from scene2spad.studies.chip.plan import MAIN, OTHERS, TRAINED_FOR_CHIP
 from scene2spad.studies.power.emulated_chain import by_torch, decode
 from spad.detection.detect import sense
 from spad.estimators.depth import depth_errors
@@ -71,7 +71,7 @@ def designs(folder: Path) -> tuple[list[Design], list[str]]:
     """Return trained designs of a folder of runs, else of the package, and coarse histograms; and the names of absent
     ones."""
     library, found, absent = ModelRegistry(folder, WEIGHTS), [], []
-    for wanted in (*MAIN, *OTHERS):
+    for wanted in (*MAIN, *TRAINED_FOR_CHIP, *OTHERS):
         trained = library.find(wanted)
         if trained is None:
             absent.append(wanted.name)

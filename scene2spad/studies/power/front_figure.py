@@ -14,7 +14,7 @@ from scene2spad.plots.figures import plt
 from scene2spad.studies.power.front import HEADLINE, LOST_LIMIT, Design, lost
 from ultraphase.catalog import SPADS
 
-_MARKERS = "oosDv^<Phx"
+_MARKERS = "ospDv^<Phx>*8d"
 
 
 def draw_front(
