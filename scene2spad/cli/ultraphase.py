@@ -19,6 +19,8 @@ class Ultraphase(Common):
     program: Positional[str] = ""
     """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s); of compile, a
     shipped model's name or a checkpoint."""
+    headroom: int = 0
+    """Make the tables so many bits smaller, so that sums of bright pixels fit 16 bits (compile): 0 to 4."""
     define: tuple[str, ...] = ()
     """Constants of a source file, as NAME=VALUE."""
     out: File = None

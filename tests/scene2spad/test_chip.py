@@ -14,7 +14,7 @@ from csph.training.config import ModelConfig
 from csph.weights.shipped import WEIGHTS
 from scene2spad.cli import main
 from scene2spad.studies.chip.chain import ChipDepth, FastCores, interpret, network_depth
-from scene2spad.studies.chip.code import codes_by_torch, compile_model, harmonics_of
+from scene2spad.studies.chip.code import codes_by_torch, compile_model, harmonics_of, with_headroom
 from scenes.errors import InputError
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -104,9 +104,7 @@ def test_codes_trained_for_the_chip_run_with_the_ranges_that_they_learned(block)
     """Smaller tables, no wraps where the full range wraps, and the integers that training has seen."""
     design = Design("fourier", block, 8)
     plain = compile_model(DepthModel(ModelConfig(design=design)), "plain").compiled
-    model = DepthModel(ModelConfig(design=design, layer={"int8": True}))
-    with torch.no_grad():
-        model.layer.temporal_range += np.log(4)
+    model = with_headroom(DepthModel(ModelConfig(design=design)), 2)
     chip, counts = compile_model(model, "headroom"), view(4, 4, peak=600)
     found, full = interpret(counts, chip.compiled), interpret(counts, plain)
     assert found.counters.wraps == 0 < full.counters.wraps
@@ -172,4 +170,9 @@ def test_compile_from_the_command_line(capfd, tmp_path):
         assert main(["ultraphase", "compile", model]) == 2
         out, err = capfd.readouterr()
         assert out == "" and len(err.splitlines()) == 1 and message in err
+    assert main(["ultraphase", "compile", "fourier-256x1x1-128x-s0", "--headroom", "2", "--json"]) == 0
+    assert max(map(int, json.loads(capfd.readouterr().out)["listing"].split("quarter: ")[1].split())) == 32
+    assert main(["ultraphase", "compile", "fourier-256x1x1-128x-s0", "--headroom", "9"]) == 2
+    assert "headroom of 9 bits, expected 0 to 4" in capfd.readouterr().err
+    assert main(["ultraphase", "table", "--headroom", "1"]) == 2 and "for compile" in capfd.readouterr().err
     assert main(["ultraphase", "compile"]) == 2 and "which model?" in capfd.readouterr().err

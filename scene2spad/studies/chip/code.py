@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -24,6 +25,7 @@ from ultraphase.integer_code import IntegerCode, folded_temporal
 from ultraphase.tables import block_sum, quarter_wave, wave_matrix
 
 COUNTER_LIMIT = 255
+MAX_HEADROOM_BITS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +65,22 @@ def compile_model(model: DepthModel, name: str) -> ChipModel:
     parts = [(own, steps.temporal_scale), (spatial, steps.spatial_scale)]
     floats = [None if part is None else torch.from_numpy(part.astype(np.float32) * np.float32(s)) for part, s in parts]
     return ChipModel(model, compile_code(code), scale, _reader(model, CodingTensor(name, *floats)))
+
+
+def with_headroom(model: DepthModel, bits: int) -> DepthModel:
+    """A float model with its codes in 8 bits, the temporal ones `bits` bits smaller: sums wrap at 2^bits times the
+    photons, and rounding is so much coarser. Its network and weights stay as they are: it sees codes normalised.
+
+    Raises InputError for a model without codes, codes that `int8` is not for, or bits outside 0 to MAX_HEADROOM_BITS.
+    """
+    good = 0 <= bits <= MAX_HEADROOM_BITS
+    require(good, f"headroom of {bits} bits, expected 0 to {MAX_HEADROOM_BITS} of the 7 that a code has")
+    require(model.layer is not None, f"{model.config.name}: has no codes to give headroom to")
+    wide = DepthModel(replace(model.config, layer={**model.config.layer, "int8": True}))
+    wide.begin_with(model)
+    with torch.no_grad():
+        wide.layer.temporal_range += bits * math.log(2)
+    return wide.eval()
 
 
 def _reader(model: DepthModel, coding: CodingTensor) -> DepthModel:
