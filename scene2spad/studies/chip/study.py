@@ -2,8 +2,9 @@
 
 Every view is sensed once a photon level; the float model sees its counts, the chip its photons: int8 tables, 16-bit
 sums that wrap, and the model's own network behind what leaves the sensor. The two are compared in pairs, by scene and
-level. A model that was trained for the chip is compared with the float model that it began with. One view a model is
-interpreted photon by photon, and its integers compared with the fast array's and torch's.
+level. Float models are compiled a second time with HEADROOM_BITS, and a model that was trained for the chip is compared
+with the float model that it began with. One view a model is interpreted photon by photon, and its integers compared
+with the fast array's and torch's.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from scene2spad.networks.lookup import obtain
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained
 from scene2spad.options.experiments import Study
 from scene2spad.studies.chip.chain import ChipDepth, interpret
-from scene2spad.studies.chip.code import codes_by_torch, compile_model
-from scene2spad.studies.chip.plan import ROOM_SIZE, TEST_SET, WITHIN, Plan, plan_of
+from scene2spad.studies.chip.code import codes_by_torch, compile_model, with_headroom
+from scene2spad.studies.chip.plan import HEADROOM_BITS, ROOM_SIZE, TEST_SET, WITHIN, Plan, plan_of
 from scene2spad.studies.results import Store
 from scenes.errors import InputError
 from scenes.files import finite, whole_file, write_csv
@@ -33,6 +34,7 @@ from spad.detection.detect import sense
 from spad.sensor.model import PhotonBudget, Sensor
 
 _CHIP = " on the chip"
+_HEADROOM = f", {HEADROOM_BITS} bit of headroom,"
 _INTERPRETED = (50.0, 500.0)  # photons a pixel of the view that is interpreted
 
 
@@ -51,6 +53,7 @@ def run(command: Study, progress: Progress) -> dict:
     }
     pair_rows = _pairs(store, subjects, plan, options)
     peers = {one.name: one.plain.name for one in models.found if one.plain in models.found}
+    peers |= {f"{one.name}{_HEADROOM}": one.name for one in models.found if not one.int8}
     compared = [line for name, rows in sets.items() for line in compared_rows(name, peers, _by_scene(rows))]
     compared += compared_rows("published pairs", peers, _by_pair(pair_rows)) if pair_rows else []
     numbers: dict[str, Any] = {
@@ -70,13 +73,22 @@ def run(command: Study, progress: Progress) -> dict:
 
 
 def _subjects(found: Trained, chip: ChipDepth) -> tuple[EvaluatedModel, ...]:
-    """The model on the chip, what its program and tables are being part of the digest; a float model also as it is."""
+    """The model on the chip; a float model also as it is, and on the chip with HEADROOM_BITS."""
+    name = found.wanted.name
+    by_chip = _by_chip(found, name, chip)
+    if found.wanted.int8:
+        return (by_chip,)
+    smaller = ChipDepth.of(compile_model(with_headroom(found.model, HEADROOM_BITS), name))
+    return found.subject, by_chip, _by_chip(found, f"{name}{_HEADROOM}", smaller)
+
+
+def _by_chip(found: Trained, name: str, chip: ChipDepth) -> EvaluatedModel:
+    """A model on the chip under a name: what its program and tables are is part of the digest."""
     compiled = chip.chip.compiled
     sha = hashlib.sha256(f"{found.subject.digest} {compiled.source}".encode())
     for values in compiled.tables(compiled.block).values():
         sha.update(np.ascontiguousarray(values).tobytes())
-    by_chip = EvaluatedModel(f"{found.wanted.name}{_CHIP}", chip, sha.hexdigest())
-    return (by_chip,) if found.wanted.int8 else (found.subject, by_chip)
+    return EvaluatedModel(f"{name}{_CHIP}", chip, sha.hexdigest())
 
 
 def _pairs(
