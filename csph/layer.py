@@ -260,8 +260,8 @@ class CompressiveLayer(nn.Module):
         return (of_blocks * self._spatial_part()[:, None, None, :, None, :]).sum((4, 6))
 
     def sum_excess(self, counts: Tensor) -> Tensor:
-        """Return the mean over all cores' sums of what is beyond 16 bits, in units of half their range, with `int8`; its gradient
-        widens the clipping range."""
+        """Return the mean excess of all cores' sums over 16 bits, in units of half that range, with `int8`; its
+        gradient widens the clipping range."""
         with torch.autocast(counts.device.type, enabled=False):
             sums, _ = self._core_sums(counts)
             return (sums.abs() / HALF_RANGE - 1).relu().mean()

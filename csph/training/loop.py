@@ -232,8 +232,10 @@ def _check_init(init: DepthModel, config: TrainConfig) -> None:
     """InputError unless a trained model has the tensors and the sensor of the one to be trained."""
     mine, other = config.model, init.config
     alike = all(getattr(mine, name) == getattr(other, name) for name in ("front", "network", "design", "sensor"))
-    said = f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
-    require(alike, said)
+    message = (
+        f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
+    )
+    require(alike, message)
     less = other.layer.get("int8", False) and not mine.layer.get("int8", False)
     require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
 
