@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from render.settings import RenderSettings
 from scene2spad.networks.registry import ModelSpec
 
-BACKGROUNDS = (50.0, 10.0, 5.0, 1.0)
+BACKGROUNDS = (50.0, 10.0, 1.0)
 LEVELS = tuple((signal, background) for signal in (100.0, 50.0, 10.0) for background in BACKGROUNDS)
 HEADLINE = (50.0, 50.0)
 FILTER, PEAK = "log-matched", "argmax"

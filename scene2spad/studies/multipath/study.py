@@ -188,5 +188,6 @@ def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
     rooms = f"{scenes} room{'s' if scenes != 1 else ''}"
-    figure.suptitle(f"Multipath: {rooms} under a flood laser, mean of scenes", fontsize=11)
+    dashed = ". Dashed: trained on direct light alone" if set(MIXED_NAMES.values()) & set(methods) else ""
+    figure.suptitle(f"Multipath: {rooms} under a flood laser, mean of scenes{dashed}", fontsize=11)
     return save(figure, path)
