@@ -196,7 +196,7 @@ def _estimated(
         merged = coarsened(kept, cells, origin_m)
         changes.append(response(concatenate([merged, kept._replace(radiance=-kept.radiance)]), place))
     merging = (changes[0] * changes[1]).sum(axis=1)
-    bias = 0.0
+    bias: np.ndarray | float = 0.0
     if traced.indirect.unfiltered is None:
         indirect = response(seen.samples(), place)
         noise = noise_power(seen.radiance, seen.cells.width_of_m)

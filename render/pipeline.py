@@ -104,7 +104,8 @@ def trace(
     origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
     trim_memory(len(pixels))
-    rays, indirect, schedule, reasons = direct.rays, None, None, ()
+    rays, indirect, schedule = direct.rays, None, None
+    reasons: tuple[str, ...] = ()
     if plan.bounces > 1 and brightest > 0:
         schedule, reasons = _schedule(world, plan, settings, direct.samples, origin_m, seed)
     light = SampleBuffer()
@@ -157,6 +158,7 @@ def add_samples(
     task = _task(world, plan, settings, more, extra.seed, traced.origin_m, brightest)
     added = indirect_light(task, extra.checked, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part))
     before = traced.schedule
+    assert before is not None and traced.indirect is not None
     fraction = np.ones(len(traced.origin_m))
     pixels, real = before.pixels, before.pixels >= 0
     fraction[pixels[real]] = np.repeat(before.spp / (before.spp + more.spp), BLOCK)[real]

@@ -183,6 +183,7 @@ def _limits(world: TracedScene) -> list[str]:
 def _target(settings: RenderSettings, fine: np.ndarray | None) -> tuple[float, str]:
     if settings.budget is not None:
         signal, background = settings.budget
+        assert fine is not None
         target = error_for_budget(fine, signal, background)
         why = f"error target: {target:.2g}, 1 % of shot variance at {signal:g} + {background:g} photons a pixel"
         return target, why
@@ -242,6 +243,7 @@ def _indirect(
         return 1, 0, 0.0, [why]
     most = PILOT_BOUNCES if settings.bounces is None else settings.bounces
     energy, noise = energy_by_bounces(world, pixels, BATCHES, most, seed)
+    assert fine is not None
     energy[1] = fine.sum()
     if energy.sum() <= 0:
         return settings.bounces or 1, settings.spp or BATCHES, 0.0, ["indirect light: nothing is lit"]

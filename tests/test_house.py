@@ -26,7 +26,7 @@ MORE_PARAMETERS = {
     "spad/formats/rgbd.py from_rgbd": 8,
     "spad/zones/calibration.py fit": 8,
 }
-MAX_ANY = 190  # in signatures; Dr.Jit's types have names of their own (`render.backend.drjit_types`)
+MAX_ANY = 220  # in signatures; Dr.Jit's types have names of their own (`render.backend.drjit_types`)
 # Private words for which the field has terms.
 NOT_OURS = {"told", "said", "whys", "share", "shares", "tails", "watched", "thrown", "spelled", "least_share"}
 CONSTANT = re.compile(r"(MOST|LEAST)_")

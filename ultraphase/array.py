@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -240,11 +241,11 @@ class _Run:
         self.wraps += _outside(value, low, high)
         cells[place] = value.astype(cells.dtype)
 
-    def _cells(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> tuple:
+    def _cells(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> tuple[Any, ...]:
         """RAM in cells of the operand's size, and the cell of every core: (cells, index)."""
         last = self.ram_bytes - one.op.size
         at = one.value if one.constant else self.registers[one.rs][lanes] + one.value
-        if not 0 <= at <= last if one.constant else _outside(at, 0, last):
+        if not 0 <= at <= last if one.constant else _outside(at, 0, last):  # type: ignore[arg-type]
             wrong = np.atleast_1d(at)
             wrong = wrong[(wrong < 0) | (wrong > last)][0]
             raise InputError(f"{self.program.where(word)}: RAM address {wrong} is outside the declared 0 to {last}")

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +65,9 @@ class TimedCore(Core):
         require(port >= 1, f"port of {port} timestamps, expected 1 or more")
         self.port = port
         self._frame_is_over, self._drains = False, True
-        self._steps: dict[int, tuple] = {}  # by word: what it does, how many instructions, and whether it asks the port
+        self._steps: dict[
+            int, tuple[Any, ...]
+        ] = {}  # by word: what it does, how many instructions, and whether it asks the port
 
     def timed_frame(
         self, clocks: np.ndarray, timestamps: np.ndarray, frame_clocks: int, *, drain: bool = True
@@ -83,7 +86,7 @@ class TimedCore(Core):
         self._frame_is_over, self._drains = False, drain
         waiting, stamps = times.tolist(), np.asarray(timestamps).tolist()
         now = came = lost = steps = 0
-        idle: tuple | None = None
+        idle: tuple[Any, ...] | None = None
         per, word = self.chip.clocks_per_instruction, self.word
         while True:
             does, length, asks = self._step_at(word)
@@ -106,7 +109,7 @@ class TimedCore(Core):
             if steps > WATCHDOG_STEPS:
                 raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
 
-    def _idle(self, word: int, now: int, until: float, before: tuple | None) -> tuple[int, tuple]:
+    def _idle(self, word: int, now: int, until: float, before: tuple[Any, ...] | None) -> tuple[int, tuple[Any, ...]]:
         """The time of the look at the port that comes next before `until`: turns of an idle loop that leave the core
         as it was are counted, not run."""
         state = (word, tuple(self.registers), bytes(self.ram))
@@ -115,7 +118,7 @@ class TimedCore(Core):
             now += max(0, int((until - now) // turn)) * turn
         return now, (state, now)
 
-    def _step_at(self, word: int) -> tuple:
+    def _step_at(self, word: int) -> tuple[Any, ...]:
         """The instructions from a word to the next branch, without one that asks the port unless it is the first."""
         if word not in self._steps:
             code = self.program.instructions

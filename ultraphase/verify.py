@@ -104,7 +104,7 @@ def verify(
         if bad.any() or slow.any():
             raise InputError(_not_additive(program, bad, before, after, added, slow))
         states += 1
-    assert added is not None, "a program that was run on no state"
+    assert added is not None and clocks is not None, "a program that was run on no state"
     if matrix is not None:
         _compare(program, added, np.asarray(matrix))
     return Tabulated(program.name, added, low, high, saturates & ~wraps, clocks, states)

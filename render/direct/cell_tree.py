@@ -18,7 +18,7 @@ MAX_LAUNCHES = 256
 # long as ten thousand rays, and the last few edges are worth less (measured in rooms: 4 % more error, 26 % less time).
 LAST_FRACTION = 1 / 32
 
-_TYPES = dict.fromkeys(("rank", "column", "row", "level", "child"), np.int32)
+_TYPES: dict[str, type[np.generic]] = dict.fromkeys(("rank", "column", "row", "level", "child"), np.int32)
 _TYPES |= dict.fromkeys(Footprints._fields, np.float32) | {"flags": np.uint32}
 _GLINTS = tuple(Footprints._field_defaults)  # kept of worlds that have some
 # a cut cell's children: (0, 0), (1, 0), (0, 1), (1, 1) in (column, row)
@@ -140,7 +140,7 @@ class CellTree:
         columns = (getattr(self, name) for name in Cells._fields)
         cells = Cells(*(None if column is None else column[: self.used] for column in columns))
         of_image = self.width if self.whole_rows else 0
-        bits, *found = first_edges(cells, path_intervals, self.grid, of_image, self.least)
+        bits, *found = first_edges(cells, path_intervals, self.grid, of_image, float(self.least))
         for interval, new in zip(path_intervals, found, strict=True):
             interval[:] = new
         self.mixed[self.rank[_having(bits, MIXED)]] = True
@@ -159,9 +159,10 @@ class CellTree:
         )
         most = np.zeros(self.used, np.int32)  # level down to which a cell is to be cut
         most[new] = np.where(self.flags[new] & LARGE, levels, 0)
-        places, cells = (kind(*(getattr(self, name) for name in kind._fields)) for kind in (Place, Cells))
+        places = Place(*(getattr(self, name) for name in Place._fields))
+        cells = Cells(*(getattr(self, name) for name in Cells._fields))
         tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
-        one, other, bits = child_edges(tree, places, cells, parents, start, self.least)
+        one, other, bits = child_edges(tree, places, cells, parents, start, float(self.least))
         self.mixed[self.rank[one[_having(bits, MIXED)]]] = True
         for bit, deepest in ((CUT, levels), (GLINT, levels + GLINT_LEVELS)):
             worth = _having(bits, bit)

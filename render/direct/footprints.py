@@ -50,7 +50,9 @@ class Footprints(NamedTuple):
     peak: np.ndarray | None = None
 
 
-def trace(world: TracedScene, column: np.ndarray, row: np.ndarray, level: np.ndarray, grid: int, *, clip: bool = False):
+def trace(
+    world: TracedScene, column: np.ndarray, row: np.ndarray, level: np.ndarray, grid: int, *, clip: bool = False
+) -> Footprints:
     """Return footprints of the cells in these columns and rows (N,) of an image of cells 1/(grid 2^level) pixels wide.
 
     With `clip` a footprint that is not small is cut to the path lengths that its face spans.

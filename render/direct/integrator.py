@@ -167,7 +167,7 @@ def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, fractio
     weight = radiance.astype(np.float64).T * fraction
     path = tree.path_m[index].astype(np.float64).T
     half_width = tree.half_width_m[index].astype(np.float64).T
-    total = sum(weight)
+    total: np.ndarray = sum(weight)  # type: ignore[assignment]  # of arrays: one after the other
     centroid = sum(weight * path) / total if len(total) else total
     variance = sum(weight * ((path - centroid) ** 2 + half_width**2 / 3)) / total if len(total) else total
     pixel = tree.pixels[tree.rank[index[:, 0]]]

@@ -65,12 +65,13 @@ class IndirectAccumulator:
         self, pixel: UInts, batch: UInts, low: Floats, high: Floats, radiance: Floats, active: Masks
     ) -> None:
         """Add one batch's part of such light to the probe rows."""
+        assert self.probed is not None
         origin = dr.gather(Float, self.origin_m, pixel, active)
         row, probe_row = self._probe_row_of(pixel, batch, active)
         radiance = radiance * Float(self.batches) / PROBE_PARTS
         for part in range(PROBE_PARTS):  # these rows' cells are narrower
-            ends = (dr.lerp(low, high, (part + side) / PROBE_PARTS) - origin for side in (0, 1))
-            self.probed.add_between(row, *ends, radiance, probe_row)
+            begin, end = (dr.lerp(low, high, (part + side) / PROBE_PARTS) - origin for side in (0, 1))
+            self.probed.add_between(row, begin, end, radiance, probe_row)
 
     def add_total(self, pixel: UInts, batch: UInts, radiance: Floats) -> None:
         """Add to the pixels' totals by batch."""

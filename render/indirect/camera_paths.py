@@ -87,7 +87,7 @@ def trace_paths(task: PathTask) -> PathBatch:
     late_m = dr.full(Float, dr.inf if reuses_paths else 0, lanes) if from_m is None else primary[-2]
     point = None if from_m is None else Point(*primary[-1])
     return PathBatch(
-        PrimaryVertices(primary[0], interaction_from_parts(primary[1]), *primary[2:-2], late_m, point),
+        PrimaryVertices(primary[0], interaction_from_parts(primary[1]), *primary[2:-2], late_m, point),  # type: ignore[call-arg]
         tuple(Connection(*light) for light in near),
         PathSuffixes(interaction_from_parts(suffixes[0]), *suffixes[1:]),
         light_vertices,
@@ -134,7 +134,7 @@ def _paths(
         # one random shift a block and sample index; the members share a low-discrepancy set of first directions, and
         # their light vertices: rays to these are neighbours
         shift = mi.sample_tea_32(stream, sample_index ^ keys[0])
-        spread = [Float((s + member * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
+        spread: Array = [Float((s + member * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
         first = mi.sample_tea_32(stream, sample_index ^ keys[1])[0]
     else:
         # one randomised (0, 2)-sequence a block and batch (Sobol 1967): the samples of each member are an aligned run
@@ -163,9 +163,9 @@ def _paths(
     reused = reuses_paths or (from_m is not None and reuses_early_paths(world))
     task = SuffixTask(light_vertices, connections, batch, pixel, random, slots, reused)
     suffixes = trace_suffixes(world, primary, Scattered(sample, weight[0]), task)
-    primary = receiver, parts_of(si), *map(_of_any_length, primary[2:-1]), None if point is None else tuple(point)
-    suffixes = parts_of(suffixes.si), *map(_of_any_length, suffixes[1:])
-    return primary, tuple(tuple(light) for light in near), suffixes, batch
+    of_primary = receiver, parts_of(si), *map(_of_any_length, primary[2:-1]), None if point is None else tuple(point)
+    of_suffixes = parts_of(suffixes.si), *map(_of_any_length, suffixes[1:])
+    return of_primary, tuple(tuple(light) for light in near), of_suffixes, batch
 
 
 def _of_any_length(values: Floats) -> Array:

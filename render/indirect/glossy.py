@@ -132,7 +132,9 @@ def _light_path_weight(
     """c of the module's text; 0 where no path from the laser samples the pair."""
     to_x, to_laser, to_eye = dr.normalize(direction), world.laser - x.p, world.eye - y.p
     light, eye = dr.normalize(to_laser), dr.normalize(to_eye)
-    begun = dr.gather(Float, glossy_of(world).sampling_density, pixel, active) * RATIO
+    glossy = glossy_of(world)
+    assert glossy is not None
+    begun = dr.gather(Float, glossy.sampling_density, pixel, active) * RATIO
     begun *= dr.abs(dr.dot(x.n, light) * dr.dot(y.n, to_x)) * dr.squared_norm(to_eye)
     begun *= _density(x, light, -to_x, active)
     ended = dr.abs(dr.dot(y.n, eye) * dr.dot(x.n, to_x)) * dr.squared_norm(to_laser)

@@ -118,6 +118,7 @@ def _sample_first_vertex(
 ) -> tuple[Array, ...]:
     """x1, the path to it, a sample of where light goes from there, its value, and whether there is any."""
     glossy, intensity = glossy_of(world), dr.gather(Float, world.intensity, UInt32(0))
+    assert glossy is not None
     jitter = mi.Point2f(random.next_float32(), random.next_float32())
     ray, aim = laser_rays(world, pixel, jitter.x, jitter.y, glossy.left, glossy.up, glossy.width)
     si, _, path, _ = first_opaque(world, ray, dr.full(Bool, True, dr.width(pixel)))

@@ -69,7 +69,7 @@ def sample_light_vertices(world: TracedScene, lanes: int, batches: int, key: tup
     index = dr.arange(UInt32, count + 3)  # of no other input's length (`render.indirect.camera_paths`)
     dr.eval(index)
     parts, *columns = world.recordings.call(world, "lit points", _sample_vertices, index, opaque, *key)
-    return LightVertices(interaction_from_parts(parts), *columns, opaque)
+    return LightVertices(interaction_from_parts(parts), *columns, opaque)  # type: ignore[call-arg]
 
 
 def _sample_vertices(world: TracedScene, index: UInts, each: UInts, *key: UInts) -> tuple[Array, ...]:

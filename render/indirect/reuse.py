@@ -43,6 +43,7 @@ def add_own_light(paths: PathBatch, sums: IndirectAccumulator, path_filter: Path
     """
     rows = None
     if path_filter is not None:
+        assert paths.primary.point is not None
         rows = path_filter.count_paths(paths.primary.point, _weight(paths, sums))
     _add(_own_lanes(paths), paths, sums, path_filter, rows, own=True)
     if path_filter is not None:
@@ -112,7 +113,8 @@ class _Squares:
     """
 
     def __init__(self, late_m: Floats = None, from_m: Floats = None) -> None:
-        self._late_m, self._from_m, self._lanes = late_m, from_m, None
+        self._late_m, self._from_m = late_m, from_m
+        self._lanes: Floats = None
 
     def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
         """The square of what is added."""
@@ -325,7 +327,7 @@ def _add(
     lanes: _Lanes,
     paths: PathBatch,
     sums: IndirectAccumulator,
-    path_filter: PathSpaceFilter | None = None,
+    path_filter: Array = None,
     rows: UInts = None,
     *,
     own: bool,

@@ -80,7 +80,7 @@ def pilot_noise(
         launch = make_launch(block, block + first, np.full(size, spp))
         chosen = blocks[first * BLOCK : (first + size) * BLOCK]
         if from_m is None:
-            found = noise_of_paths(world, chosen, launch, bounces, seed)
+            found: tuple[np.ndarray, ...] = noise_of_paths(world, chosen, launch, bounces, seed)
         else:
             found = (noise_of_filtered_paths(world, chosen, launch, bounces, seed, from_m),)
         parts.append([part.reshape(size, spp).mean(axis=1) for part in found])

@@ -74,7 +74,9 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
         notes.append("smooth plastic: the laser's glint in its coat is rendered, not what is lit by way of the coat")
     if any(row[5] for row in rows):
         notes.append("mirrors: light by way of them that meets two or more other surfaces first is left out")
-    columns = list(zip(*rows, strict=True)) if rows else [np.empty((0, 3)), [], np.empty((0, 3)), np.empty((0, 3))]
+    columns: list = (
+        list(zip(*rows, strict=True)) if rows else [np.empty((0, 3)), [], np.empty((0, 3)), np.empty((0, 3))]
+    )
     columns += [[]] * (7 - len(columns))
     types = (float, float, float, float, np.int64, bool, bool)
     return Mirrors(*(np.array(c, dtype=t) for c, t in zip(columns, types, strict=True))), notes

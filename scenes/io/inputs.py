@@ -85,7 +85,8 @@ def read_json_object(path: Path, what: str = "JSON file") -> dict[str, Any]:
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(str(path)) else f"{path}: {message}") from None
-    require(isinstance(found, dict), f"{path}: holds no JSON object")
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: holds no JSON object")
     return found
 
 

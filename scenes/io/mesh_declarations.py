@@ -154,7 +154,7 @@ def _end_of_binary(content: bytes, start: int, element: _Element, order: str) ->
     """Where the element's rows end. InputError for rows that are not all there, or lists of different lengths."""
     if element.rows == 0:
         return start
-    fields: list[tuple] = []
+    fields: list[tuple[Any, ...]] = []
     size = 0
     for number, one in enumerate(element.properties):
         length: tuple[int, ...] = ()
@@ -224,7 +224,7 @@ def check_glb(content: bytes, read: ReadImage) -> None:
         raise InputError(f"its JSON is damaged ({type(error).__name__}: {error})") from None
 
 
-def _glb_chunks(content: bytes) -> tuple[dict, bytes]:
+def _glb_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
     """The JSON object and the first binary chunk."""
     require(len(content) >= 20 and content[:4] == b"glTF", "is no GLB")
     version, length, size, kind = struct.unpack_from("<II I4s", content, 4)
@@ -241,7 +241,7 @@ def _glb_chunks(content: bytes) -> tuple[dict, bytes]:
     return header, content[at + 8 : at + 8 + size] if kind == b"BIN\0" else b""
 
 
-def _check_indices(header: dict) -> None:
+def _check_indices(header: dict[str, Any]) -> None:
     """All indices and counts are whole numbers of 0 or more: Python counts negative ones from the end."""
     for key, value in _entries(header):
         if key in _GLB_INDICES:
@@ -262,7 +262,7 @@ def _entries(value: Any) -> Iterator[tuple[str, Any]]:
             pending.extend(one)
 
 
-def _check_accessors(header: dict, size: int) -> None:
+def _check_accessors(header: dict[str, Any], size: int) -> None:
     """InputError where primitives read what has no data of its own, or accessors declare more than the file has."""
     accessors = header.get("accessors", [])
     primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"]]
@@ -276,7 +276,7 @@ def _check_accessors(header: dict, size: int) -> None:
         require(fits, f"accessor {number} declares {accessor['count']} elements in a file of {size} bytes")
 
 
-def _used_images(header: dict) -> set[int]:
+def _used_images(header: dict[str, Any]) -> set[int]:
     """Images of the base colours of materials that primitives use."""
     materials, textures = header.get("materials", []), header.get("textures", [])
     used = {one["material"] for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" in one}
@@ -291,7 +291,7 @@ def _used_images(header: dict) -> set[int]:
     return found
 
 
-def _check_image(header: dict, number: int, binary: bytes, read: ReadImage) -> None:
+def _check_image(header: dict[str, Any], number: int, binary: bytes, read: ReadImage) -> None:
     """InputError where an image is not there, or none that Pillow knows."""
     from PIL import Image
 

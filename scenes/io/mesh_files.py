@@ -53,7 +53,7 @@ def load_trimesh(path: Path, kind: str, **options: Any) -> Any:
                 file_type=kind[1:],
                 resolver=beside,
                 process=False,
-                **options,  # type: ignore[arg-type]
+                **options,
             )
         if triangles is not None:
             found = sum(len(getattr(mesh, "faces", ())) for mesh in loaded.geometry.values())

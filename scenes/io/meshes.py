@@ -308,7 +308,7 @@ class _Paint:
             tint = np.ones(4) if factor is None else np.asarray(factor) / 255
             if image is not None and part.uv is not None:
                 return (id(image), tint.tobytes()), lambda: _image_albedo(image, tint)
-            value = None if factor is None else luminance(tint)  # glTF's factor is linear already
+            value = None if factor is None else float(luminance(tint))  # glTF's factor is linear already
         if value is None:
             value = DEFAULT_ALBEDO
             self.notes.append(f"{part.name}: no colour in the file, albedo {value:g}")

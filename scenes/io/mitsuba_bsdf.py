@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -245,7 +246,7 @@ def _relative_index(plugin: Plugin, inside: str) -> float:
     return int_ior / ext_ior
 
 
-def _microfacets(materials: Materials, plugin: Plugin, default: float) -> dict:
+def _microfacets(materials: Materials, plugin: Plugin, default: float) -> dict[str, Any]:
     """Alpha and distribution of the normals; one number stands for two directions and for a texture."""
     plugin.ignore(("sample_visible",))
     distribution = plugin.string("distribution", "beckmann")
@@ -262,21 +263,21 @@ def _microfacets(materials: Materials, plugin: Plugin, default: float) -> dict:
     return {"roughness": alpha, "distribution": distribution}
 
 
-def _rough(values: dict, smooth: str, rough: dict) -> dict:
+def _rough(values: dict[str, Any], smooth: str, rough: dict[str, Any]) -> dict[str, Any]:
     """`values` with what makes them rough; alpha 0 is the smooth kind."""
     return values | ({"kind": smooth} if rough["roughness"] == 0 else rough)
 
 
-def _diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+def _diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
     return {"albedo": materials.fraction(plugin, "reflectance", 0.5, uv)}
 
 
-def _rough_diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+def _rough_diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
     plugin.ignore(("use_fast_approx",))
     return _rough(_diffuse(materials, plugin, uv), "diffuse", {"roughness": materials.mean(plugin, "alpha", 0.2)})
 
 
-def _plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+def _plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
     if plugin.boolean("nonlinear", False):
         plugin.note("the colour shift of internal scattering (nonlinear) is left out")
     return {
@@ -286,11 +287,11 @@ def _plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
     }
 
 
-def _rough_plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+def _rough_plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
     return _rough(_plastic(materials, plugin, uv), "plastic", _microfacets(materials, plugin, 0.1))
 
 
-def _conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+def _conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
     eta, k = _complex_index(materials, plugin)
     specular = _clipped(plugin, "specular_reflectance", materials.mean(plugin, "specular_reflectance", 1.0))
     return {"eta": eta, "k": k, "specular": specular}
@@ -315,11 +316,11 @@ def _complex_index(materials: Materials, plugin: Plugin) -> tuple[float, float]:
     return CONDUCTORS[material][0] / outside, CONDUCTORS[material][1] / outside
 
 
-def _rough_conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+def _rough_conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
     return _rough(_conductor(materials, plugin, uv), "conductor", _microfacets(materials, plugin, 0.1))
 
 
-def _phong(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+def _phong(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
     """Phong's lobe as rough plastic of the same width: alpha = sqrt(2 / (exponent + 2)) (Walter et al. 2007, 5.2)."""
     exponent = materials.mean(plugin, "exponent", 30.0)
     if exponent < 0:
@@ -337,14 +338,14 @@ def _phong(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
     }
 
 
-def _dielectric(materials: Materials, plugin: Plugin, uv: _Uv) -> dict:
+def _dielectric(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
     for name in ("specular_reflectance", "specular_transmittance"):
         if materials.mean(plugin, name, 1.0) != 1:
             plugin.note(f"{name} is left out, glass keeps the Fresnel shares")
     return {"ior": _relative_index(plugin, "bk7")}
 
 
-_KINDS: dict[str, Callable[[Materials, Plugin, _Uv], dict]] = {
+_KINDS: dict[str, Callable[[Materials, Plugin, _Uv], dict[str, Any]]] = {
     "diffuse": _diffuse,
     "roughdiffuse": _rough_diffuse,
     "plastic": _plastic,

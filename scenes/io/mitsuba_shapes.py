@@ -74,9 +74,11 @@ class Shapes:
         look = self._materials.of_shape(plugin)
         emission = self._emission(plugin)
         plugin.note_unused()
-        values = {"uv": _project_uv(mesh.uv, look), "normals": mesh.normals, "emission": emission, "name": name}
+        uv = _project_uv(mesh.uv, look)
         try:
-            return Surface(mesh.vertices, mesh.faces, look.material, **values)
+            return Surface(
+                mesh.vertices, mesh.faces, look.material, uv=uv, normals=mesh.normals, emission=emission, name=name
+            )
         except InputError as error:
             raise plugin.fail(f"{plugin.string('filename', '')}: {error}".removeprefix(": ")) from None
 
@@ -146,7 +148,8 @@ def _read_serialized(path: Path, index: int) -> Mesh:
 
 
 def _joined(arrays: list[np.ndarray | None]) -> np.ndarray | None:
-    return None if any(array is None for array in arrays) else np.concatenate(arrays)
+    there = [array for array in arrays if array is not None]
+    return np.concatenate(there) if len(there) == len(arrays) else None
 
 
 def _obj(builder: Shapes, plugin: Plugin) -> Mesh:

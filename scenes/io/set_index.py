@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, parse_json, read_text
 
 
-def read_set_index(folder: Path) -> list[dict]:
+def read_set_index(folder: Path) -> list[dict[str, Any]]:
     """Return the records of a set's finished views in order; those of failed views are left out.
 
     Every `file` of a record is a regular file inside the folder. Raises InputError in one line where there is no
@@ -30,7 +31,7 @@ def read_set_index(folder: Path) -> list[dict]:
     return records
 
 
-def _checked(folder: Path, line: str, last: int) -> tuple[int, dict]:
+def _checked(folder: Path, line: str, last: int) -> tuple[int, dict[str, Any]]:
     """Return a line's view and record; InputError where it is none, or not of a later view than `last`."""
     record = parse_json(line)
     require(isinstance(record, dict), "holds no JSON object")

@@ -168,7 +168,8 @@ def corner_cube() -> Scene:
     faces = []
     for i in range(3):
         a, b = edges[:, i], edges[:, (i + 1) % 3]
-        faces.append(quad([apex, apex + a, apex + a + b, apex + b], material, f"mirror {i}"))
+        corners = [(float(x), float(y), float(z)) for x, y, z in (apex, apex + a, apex + a + b, apex + b)]
+        faces.append(quad(corners, material, f"mirror {i}"))
     return Scene("corner cube", tuple(faces), camera(15, 11, 10.0))
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import pairwise
 from numbers import Integral
+from typing import Any
 
 import numpy as np
 
@@ -247,10 +248,10 @@ def sculpture(palette: Palette, rng: Random, height: float = 0.4) -> list[Surfac
 def _palette(colours: Random, textures: Random) -> Palette:
     """The materials of one seed by name. Albedos span 0.05 (leather, dark covers) to 0.9 (ceiling)."""
 
-    def plain(low: float, high: float) -> dict:
+    def plain(low: float, high: float) -> dict[str, Any]:
         return {"albedo": float(colours.uniform(low, high))}
 
-    def printed(image: np.ndarray) -> dict:
+    def printed(image: np.ndarray) -> dict[str, Any]:
         return {"albedo": Texture(image, "made from the seed")}
 
     gloss = {"kind": "roughplastic", "ior": 1.5}

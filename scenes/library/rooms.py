@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -176,13 +176,16 @@ def _lumber(corners: np.ndarray, ceiling: float) -> Place:
     return Place(Piece(()), (0.0, 0.0, 0.0), 0.0, plan, 0.0, ceiling)
 
 
-def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: float) -> tuple:
+def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: float) -> tuple[Any, ...]:
     """A board along a wall from start to end (x, z), on the inside."""
     along = (end - start) / np.linalg.norm(end - start)
     inward = thick * np.array((-along[1], along[0]))
     line = np.array((start, start + inward, start + inward, start))
     lift = np.array((y + tall, y + tall, y, y))
-    ring = lambda shift: np.column_stack((line[:, 0] + shift[0], lift, line[:, 1] + shift[1]))  # noqa: E731
+
+    def ring(shift: np.ndarray) -> np.ndarray:
+        return np.column_stack((line[:, 0] + shift[0], lift, line[:, 1] + shift[1]))
+
     return sheet(np.stack((ring(np.zeros(2)), ring(end - start)), axis=1)[::-1])
 
 

@@ -21,6 +21,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from scenes.errors import InputError
 from scenes.io.inputs import file_inside, read_text
@@ -178,7 +179,7 @@ class _Assembly:
     def _name(line: Line, token: Token) -> str:
         """A name with its {h} filled in."""
 
-        def value(found: re.Match) -> str:
+        def value(found: re.Match[str]) -> str:
             if found[1] not in line.loops:
                 raise line.fail(token.column, f"{token.text!r}: {found[1]} is no loop variable here")
             return str(line.loops[found[1]])
@@ -249,7 +250,7 @@ class _Assembly:
             self._operand(cursor, kind, fields, targets)
         self.pending.append((cursor, Instruction(name, **fields), targets))  # type: ignore[arg-type]
 
-    def _operand(self, cursor: Cursor, kind: str, fields: dict, targets: dict[str, Token]) -> None:
+    def _operand(self, cursor: Cursor, kind: str, fields: dict[str, Any], targets: dict[str, Token]) -> None:
         if kind in "dt":
             fields["rd"] = self._register(cursor)
         elif kind == "s":
@@ -279,7 +280,7 @@ class _Assembly:
         else:
             self._ram_operand(cursor, fields)
 
-    def _ram_operand(self, cursor: Cursor, fields: dict) -> None:
+    def _ram_operand(self, cursor: Cursor, fields: dict[str, Any]) -> None:
         """[register + constant] in any order, or one of the two alone."""
         cursor.expect("[")
         at, base, offset = cursor.next, None, 0
