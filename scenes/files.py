@@ -16,7 +16,7 @@ from contextlib import contextmanager, redirect_stdout
 from functools import lru_cache
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, BinaryIO
+from typing import IO, Any
 from zipfile import ZipFile
 
 import numpy as np
@@ -156,7 +156,7 @@ def read_arrays(path: Path, what: str = "array file") -> dict[str, np.ndarray]:
     return found
 
 
-def _array(file: BinaryIO, size: int) -> np.ndarray:
+def _array(file: IO[bytes], size: int) -> np.ndarray:
     """Read one array from a file of .npy format with so many bytes; nothing is allocated before shapes are checked."""
     version = np.lib.format.read_magic(file)
     header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

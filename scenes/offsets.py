@@ -96,7 +96,7 @@ def _divided(table: np.ndarray, faces: np.ndarray, metres: float, name: str) -> 
 
 
 def _unit(points: np.ndarray) -> np.ndarray:
-    return points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-12)
+    return np.asarray(points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-12))
 
 
 def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:

@@ -78,8 +78,8 @@ def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ra
                     saturations += int(held != r[one.rs])
                     r[one.rd] = held
                 case "LDB" | "LDBS" | "LDH":
-                    memory = {"LDB": ram, "LDBS": ram.view(np.int8), "LDH": halves}[one.name]
-                    r[one.rd] = memory[cell // memory.itemsize]
+                    size = 2 if one.name == "LDH" else 1
+                    r[one.rd] = ram.view({"LDB": "u1", "LDBS": "i1", "LDH": "i2"}[one.name])[cell // size]
                 case "STB":
                     value = int(r[one.rd])
                     ram[cell] = value & 255

@@ -71,14 +71,15 @@ def combined(one: IndirectLight, other: IndirectLight, fraction: np.ndarray) -> 
     """Average two independent estimates but for their samples; `fraction` is the first one's weight in each pixel."""
     weight = fraction[one.probed.pixels][:, None, None]
 
-    def mean(first: ProbePixels | None, second: ProbePixels | None) -> ProbePixels | None:
-        if first is None or second is None:
-            return None
+    def mean(first: ProbePixels, second: ProbePixels) -> ProbePixels:
         both = (weight * a + (1 - weight) * b for a, b in zip(first[-3:], second[-3:], strict=True))
         return ProbePixels(*first[:-3], *both)
 
     noise = np.hypot(fraction * one.noise, (1 - fraction) * other.noise)
-    return IndirectLight(noise, mean(one.probed, other.probed), mean(one.unfiltered, other.unfiltered))
+    unfiltered = None
+    if one.unfiltered is not None and other.unfiltered is not None:
+        unfiltered = mean(one.unfiltered, other.unfiltered)
+    return IndirectLight(noise, mean(one.probed, other.probed), unfiltered)
 
 
 def combined_samples(one: Samples, other: Samples, fraction: np.ndarray, cells: Cells, origin_m: np.ndarray) -> Samples:

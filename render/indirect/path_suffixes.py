@@ -177,7 +177,8 @@ def _trace_suffix(
     Returns radiances and path lengths from x2 to the laser, in their slots; how many slots each lane has filled, and
     the shortest path.
     """
-    light_vertices, batch, pixel, random = task.light_vertices, task.batch, task.pixel, task.random
+    batch, pixel, random = task.batch, task.pixel, task.random
+    light_vertices: Array = task.light_vertices  # None where nothing is connected
     lanes, connecting = dr.width(pixel), _connects_suffix(world, light_vertices)
     lane, values, paths, stride, last = task.slots
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)

@@ -7,6 +7,8 @@ Every body is closed. Lengths are metres.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from scenes.library.things import shapes
@@ -56,7 +58,7 @@ def _palette() -> Palette:
     def printed(image: np.ndarray) -> Texture:
         return Texture(image, "made from a seed")
 
-    def coat(albedo: float | Texture, alpha: float) -> dict:
+    def coat(albedo: float | Texture, alpha: float) -> dict[str, Any]:
         return {"kind": "roughplastic", "ior": 1.5, "albedo": albedo, "roughness": alpha}
 
     made = {

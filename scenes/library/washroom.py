@@ -9,6 +9,7 @@ metres.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,7 @@ def _palette() -> Palette:
     ground = Texture(tiles(draw, 0.35, 256, 4), "made from a seed")
     gloss = {"kind": "roughplastic", "ior": 1.5}
     chrome = {"eta": 3.1, "k": 3.3}
-    made = {
+    made: dict[str, dict[str, Any]] = {
         "wall tiles": {"albedo": shades, "roughness": 0.05} | gloss,
         "floor tiles": {"albedo": ground, "roughness": 0.1} | gloss,
         "paint": {"albedo": 0.75},
@@ -101,7 +102,7 @@ def _shell(palette: Palette) -> list[Surface]:
     ]
 
 
-def _arc(centre: tuple, radius: float, first_deg: float, last_deg: float, count: int = 13) -> np.ndarray:
+def _arc(centre: tuple[float, float], radius: float, first_deg: float, last_deg: float, count: int = 13) -> np.ndarray:
     """Points of an arc in the plane x = 0: angles from +z towards +y."""
     angle = np.radians(np.linspace(first_deg, last_deg, count))
     return np.column_stack((0 * angle, centre[0] + radius * np.sin(angle), centre[1] + radius * np.cos(angle)))

@@ -94,7 +94,7 @@ def plant(palette: Palette, rng: Random) -> Piece:
         bend = tip * (0.35, 0.75, 1.0)
         s = np.linspace(0, 1, 6)[:, None]
         curve = 2 * s * (1 - s) * bend + s**2 * tip
-        stems.append(turned((curve, np.empty((0, 3), np.int64), None), "y", angle, foot)[0])
+        stems.append(turned((curve, np.empty((0, 3), np.int64), curve), "y", angle, foot)[0])
         blade = turned(
             _leaf(rng, rng.uniform(0.14, 0.3) * high**0.7, rng.uniform(0.03, 0.08) * high**0.7),
             "z",
