@@ -16,6 +16,7 @@ import numpy as np
 
 from scenes.arrays import check_faces, checked_radiance, finite_number, frozen_array, rigid_pose
 from scenes.errors import InputError, require
+from scenes.notebook import html_card
 
 MaterialKind = Literal[
     "diffuse", "roughdiffuse", "plastic", "roughplastic", "conductor", "roughconductor", "dielectric", "thindielectric"
@@ -333,6 +334,12 @@ class Scene:
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
         object.__setattr__(self, "notes", tuple(" ".join(note.split()) for note in self.notes))
         require(len(self.surfaces) > 0, f"scene {self.name}: has no surfaces")
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the facts."""
+        seen = f"{self.camera.height} rows x {self.camera.width} columns, {self.camera.fov_deg:g} degrees wide"
+        facts = {"surfaces": len(self.surfaces), "triangles": self.triangles, "camera": seen, "laser": self.laser.mode}
+        return html_card(f"Scene {self.name}", facts)
 
     def __repr__(self) -> str:
         camera, laser = self.camera, self.laser

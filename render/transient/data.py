@@ -16,6 +16,7 @@ import numpy as np
 
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
+from scenes.notebook import html_card
 
 RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bounces": "bounces"}
 LAYER_CHANNELS = ("depth", "normal.X", "normal.Y", "normal.Z", "albedo", "ambient", "mixed", "error")
@@ -98,6 +99,16 @@ class Transient:
             f"Transient({self.meta.get('scene', 'unnamed')!r}, {self.height} x {self.width} pixels (rows x columns), "
             f"{self.returns} returns, {paths}{self.indirect_fraction:.1%} indirect)"
         )
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the facts, and the laser's light as a picture."""
+        facts = {
+            "scene": self.meta.get("scene", "unnamed"),
+            "pixels": f"{self.height} rows x {self.width} columns",
+            "returns": f"{self.returns:,}",
+            "indirect light": f"{self.indirect_fraction:.1%}",
+        }
+        return html_card("Transient", facts, self.total_radiance())
 
     @property
     def returns(self) -> int:

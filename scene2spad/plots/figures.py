@@ -7,18 +7,16 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from render.transient import Transient
+from scene2spad.plots.style import COLOURS, letter_panels, plt
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.files import whole_file
 from spad.detection.detect import expected_in_pixel
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 DEPTH_COLOURS = matplotlib.colormaps["viridis_r"].with_extremes(bad="lightgrey")
 ERROR_COLOURS = matplotlib.colormaps["magma"].with_extremes(bad="lightgrey")
@@ -205,6 +203,7 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
     _image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     title = f"{method}: MAE {errors['mae_mm']:.1f} mm, {errors['within_10mm']:.0%} within 10 mm"
     _image(axes[1], depth_m, title, "m", cmap=DEPTH_COLOURS, **limits)
+    letter_panels(axes)
     error_mm = 1000 * np.abs(depth_m - histogram.depth_m)
     _image(axes[2], error_mm, "absolute error (colours end at 100 mm)", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
     return save(figure, path)
@@ -318,8 +317,8 @@ def _one_pixel(above: Axes, below: Axes, transient: Transient, histogram: Histog
     centre = 0.5 * (transient.path_near_m + transient.path_far_m)[mine] / SPEED_OF_LIGHT_M_PER_S * ns
     fraction = transient.radiance[mine] / transient.radiance[mine].sum()
     for name, colour, kept in (
-        ("direct", "tab:green", transient.bounces[mine] == 1),
-        ("indirect", "tab:red", transient.bounces[mine] > 1),
+        ("direct", COLOURS["green"], transient.bounces[mine] == 1),
+        ("indirect", COLOURS["vermilion"], transient.bounces[mine] > 1),
     ):
         if kept.any():
             above.vlines(centre[kept], 0, fraction[kept], color=colour, lw=1)
@@ -342,7 +341,7 @@ def _one_pixel(above: Axes, below: Axes, transient: Transient, histogram: Histog
     edges_ns = np.arange(sensor.bins + 1) * sensor.bin_width_s * ns
     below.stairs(histogram.counts[row, column], edges_ns, fill=True, color="0.75", label="detections")
     expected = expected_in_pixel(transient, sensor, histogram.budget, row, column)
-    below.stairs(expected, edges_ns, color="tab:blue", label="expected counts")
+    below.stairs(expected, edges_ns, color=COLOURS["blue"], label="expected counts")
     first_ns = min(float(centre.min()), edges_ns[-1] - 1)
     for axes in (above, below):
         axes.set_xlim(max(first_ns - 3, 0), min(first_ns + 18, edges_ns[-1]))

@@ -13,6 +13,7 @@ from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
 from scenes.limits import require_memory
+from scenes.notebook import html_card
 from spad.formats.timestamps import counts_from_timestamps, timestamps_from_counts
 from spad.sensor.model import PhotonBudget, Sensor
 
@@ -109,6 +110,17 @@ class Histogram:
             f"{int(self.counts.sum(dtype=np.int64))} detections, signal {self.budget.signal:g} + background "
             f"{self.budget.background:g} a pixel, sensor {sensor.name!r})"
         )
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the facts, and the detections as a picture."""
+        (height, width, bins), sensor = self.counts.shape, self.sensor
+        facts = {
+            "pixels": f"{height} rows x {width} columns",
+            "time": f"{bins} bins of {sensor.bin_width_s * 1e12:.4g} ps, sensor {sensor.name}",
+            "asked": f"{self.budget.signal:g} signal + {self.budget.background:g} background detections a pixel",
+            "detections": f"{int(self.counts.sum(dtype=np.int64)):,}",
+        }
+        return html_card("Histogram", facts, self.counts.sum(axis=2, dtype=np.int64))
 
     def timestamps(self) -> tuple[np.ndarray, np.ndarray]:
         """Return sparse form: time bin of every detection (uint16, ascending in a pixel), and (H*W + 1,) int64

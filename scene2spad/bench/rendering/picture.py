@@ -11,11 +11,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 from scene2spad.bench.rendering import settings
 from scene2spad.bench.rendering.measure import Row
 from scene2spad.plots.figures import save
+from scene2spad.plots.style import COLOURS
 
 STYLES = {
-    settings.OURS_DIRECT: ("tab:blue", "o"),
-    settings.UNBIASED: ("tab:green", "s"),
-    settings.FILTERED: ("tab:red", "D"),
+    settings.OURS_DIRECT: (COLOURS["blue"], "o"),
+    settings.UNBIASED: (COLOURS["green"], "s"),
+    settings.FILTERED: (COLOURS["vermilion"], "D"),
     settings.MULTIJITTER: ("black", "^"),
     settings.INDEPENDENT: ("0.55", "v"),
 }

@@ -16,18 +16,19 @@ from csph import CodingTensor, Design, make_coding
 from csph.evaluation.metrics import is_low_sbr
 from scene2spad.networks.registry import ModelSpec, Trained
 from scene2spad.plots.figures import DEPTH_COLOURS, plain_log, plt, save
+from scene2spad.plots.style import COLOURS as OKABE_ITO
 from scene2spad.studies import tensors as tensor_figures
 from scene2spad.studies.depth_offset.tables import ENERGY_BAR, LEAST, boundary_bin, energy_history, energy_ratio
 from spad.sensor.model import Sensor
 
 # as in the paper: truncated Fourier blue, learned 1024 orange, 1024x4x4 green, 256x4x4 red
 COLOURS = {
-    "fourier 1024x1x1": "tab:blue",
-    "learned 1024x1x1": "tab:orange",
-    "learned 1024x4x4": "tab:green",
-    "learned 256x4x4": "tab:red",
+    "fourier 1024x1x1": OKABE_ITO["blue"],
+    "learned 1024x1x1": OKABE_ITO["orange"],
+    "learned 1024x4x4": OKABE_ITO["green"],
+    "learned 256x4x4": OKABE_ITO["vermilion"],
     "no compression": "black",
-    "peak": "tab:grey",
+    "peak": OKABE_ITO["grey"],
 }
 MARKERS = {128: "o", 64: "s"}  # by compression; others ^
 PAPER_FIGURE = {128: "1", 64: "17"}
@@ -35,7 +36,7 @@ NO_OFFSETS = ", trained with offsets"
 
 
 def colour_of(label: str) -> str:
-    return COLOURS.get(label.split(NO_OFFSETS)[0], "tab:purple")
+    return COLOURS.get(label.split(NO_OFFSETS)[0], OKABE_ITO["purple"])
 
 
 def tensors(models: Sequence[Trained], compressions: Sequence[int], out: Path) -> list[Path]:
@@ -219,7 +220,7 @@ def range_end(found: dict, path: Path) -> Path:
 def _model_colour(name: str) -> str:
     """Colour of a model's design by its file's name; those trained with offsets are like no other."""
     if "-t" in name:
-        return "tab:purple" if "1x1" in name else "tab:olive"
+        return OKABE_ITO["purple"] if "1x1" in name else OKABE_ITO["brown"]
     designs = {label.replace(" ", "-"): colour for label, colour in COLOURS.items()}
     designs["none"] = COLOURS["no compression"]
     return next(colour for start, colour in designs.items() if name.startswith(start))

@@ -25,6 +25,7 @@ from scene2spad.networks.lookup import ModelLookup, obtain, where_trained
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import plain_log, plt, save
+from scene2spad.plots.style import COLOURS as OKABE_ITO
 from scene2spad.studies.multipath.plan import FILTER, HEADLINE, LIGHTS, MIXED, MODELS, PEAK, PLANS, Plan
 from scene2spad.studies.results import Store
 from scene2spad.studies.transport.study import direct_alone, rendered_once, without_network
@@ -34,7 +35,7 @@ from scenes.model import Laser
 
 log = logging.getLogger("scene2spad")
 
-COLOURS = {FILTER: "black", PEAK: "tab:grey"}
+COLOURS = {FILTER: "black", PEAK: OKABE_ITO["grey"]}
 COLOURS |= {one.name: f"C{n}" for models in (MODELS, MIXED) for n, one in enumerate(models)}
 # a model trained on direct light -> the same design trained with indirect light
 MIXED_NAMES = {plain.name: mixed.name for plain, mixed in zip(MODELS, MIXED, strict=True)}

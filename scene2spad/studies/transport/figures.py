@@ -12,10 +12,11 @@ from matplotlib.ticker import PercentFormatter
 
 from csph.evaluation.methods import Evaluation, Row
 from scene2spad.plots.figures import plain_log, plt, save
+from scene2spad.plots.style import COLOURS
 from scene2spad.studies.transport.plan import KEPT, LASERS, LATER, LEVELS, LIMIT, OPEN, REVERSED, STEPS
 
 LABELS = [label.replace(", ", ",\n") for label in STEPS.values()]
-VERDICTS = {KEPT: "tab:blue", REVERSED: "tab:red", OPEN: "0.6"}
+VERDICTS = {KEPT: COLOURS["blue"], REVERSED: COLOURS["vermilion"], OPEN: "0.6"}
 MARKS = "os^DvP*X<>hd"
 MAX_PAIRS = 24  # of a panel
 
@@ -104,7 +105,7 @@ def draw_planned(planned: Sequence[Mapping[str, Any]], scenes: Sequence[Mapping[
     figure, (left, right) = plt.subplots(
         1, 2, figsize=(12, 1.8 + 0.3 * len(names)), layout="constrained", sharey=True, width_ratios=(1.6, 1)
     )
-    left.axvspan(-LIMIT, LIMIT, color="tab:green", alpha=0.12, label=f"under {LIMIT:.0%}")
+    left.axvspan(-LIMIT, LIMIT, color=COLOURS["green"], alpha=0.12, label=f"under {LIMIT:.0%}")
     left.axvline(0, color="k", lw=0.6)
     for number, design in enumerate(designs):
         mine = [row for row in planned if row["design"] == design]
@@ -120,7 +121,9 @@ def draw_planned(planned: Sequence[Mapping[str, Any]], scenes: Sequence[Mapping[
     left.legend(fontsize=8)
     place = np.arange(len(names))
     right.barh(place - 0.18, [one["full_rays"] for one in scenes], 0.34, color="0.7", label="full")
-    bars = right.barh(place + 0.18, [one["planned_rays"] for one in scenes], 0.34, color="tab:blue", label="planned")
+    bars = right.barh(
+        place + 0.18, [one["planned_rays"] for one in scenes], 0.34, color=COLOURS["blue"], label="planned"
+    )
     right.bar_label(bars, [f"{one['rays_saved']:.0%} saved" for one in scenes], fontsize=7, padding=2)
     right.set_xscale("log")
     right.set_xlim(0.3 * min(one["planned_rays"] for one in scenes), 4 * max(one["full_rays"] for one in scenes))

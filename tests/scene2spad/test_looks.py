@@ -1,0 +1,39 @@
+"""What notebooks show, and the one style of figures."""
+
+import base64
+import io
+import re
+from itertools import pairwise
+
+import numpy as np
+from PIL import Image
+
+import scene2spad as s2s
+from scene2spad.plots.style import COLOURS, plt
+from scenes.notebook import html_card
+
+
+def test_objects_of_the_chain_show_themselves():
+    scene = s2s.load_scene("plane", width=8, height=6)
+    image = np.ones((6, 8))
+    transient = s2s.transient_from_rgbd(2 * image, image, image)
+    histogram = s2s.sense(transient, signal=5, background=5)
+    assert "6 rows x 8 columns" in scene._repr_html_()
+    for shown in (transient._repr_html_(), histogram._repr_html_()):
+        png = base64.b64decode(re.search(r"base64,([^\"]+)", shown)[1])
+        with Image.open(io.BytesIO(png)) as picture:
+            assert picture.size == (8 * 32, 6 * 32)
+
+
+def test_a_card_escapes_what_files_say():
+    shown = html_card("<b>", {"a": "<script>"}, np.zeros((2, 2)))
+    assert "<script>" not in shown and "&lt;script&gt;" in shown
+
+
+def test_figures_take_colours_that_differ_in_lightness_too():
+    """Okabe and Ito's, in the order of the style; no two neighbours of the first four are alike in grey."""
+    cycle = plt.rcParams["axes.prop_cycle"].by_key()["color"]
+    assert cycle == [*COLOURS.values()]
+    rgb = [[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in cycle[:4]]
+    grey = [float(np.dot(one, (0.2126, 0.7152, 0.0722))) for one in rgb]
+    assert min(abs(a - b) for a, b in pairwise(grey)) > 0.02
