@@ -61,7 +61,7 @@ def clipped_steps(values: Tensor, log_range: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def straight_through(values: Tensor, forward: Tensor) -> Tensor:
-    """`forward`, with the derivative of `values`."""
+    """Return `forward`, with the derivative of `values`."""
     return forward.detach() + (values - values.detach())
 
 

@@ -68,7 +68,7 @@ def compile_model(model: DepthModel, name: str) -> ChipModel:
 
 
 def with_headroom(model: DepthModel, bits: int) -> DepthModel:
-    """A float model with its codes in 8 bits, the temporal ones `bits` bits smaller: sums wrap at 2^bits times the
+    """Return a float model with its codes in 8 bits, temporal ones `bits` bits smaller: sums wrap at 2^bits times the
     photons, and rounding is so much coarser. Its network and weights stay as they are: it sees codes normalised.
 
     Raises InputError for a model without codes, codes that `int8` is not for, or bits outside 0 to MAX_HEADROOM_BITS.
