@@ -143,7 +143,7 @@ def test_early_light_may_be_shared_alone(kind, from_m):
 @pytest.mark.parametrize("cone_deg", [30, 120, 360])
 def test_any_cone_and_a_displaced_laser(cone_deg, monkeypatch):
     scene = room("roughplastic", Laser("flood", cone_deg=cone_deg, baseline_m=(0.3, 0.1, 0)))
-    monkeypatch.setattr(lit, "NARROW_JOINS", (2, 2))
+    monkeypatch.setattr(lit, "NARROW_CONNECTIONS", (2, 2))
     joined = totals(scene, 1, reuses_paths=True)
     monkeypatch.setattr(paths, "connections_per_vertex", lambda world, reuses_paths: 0)
     plain = totals(scene, 2, reuses_paths=True, rounds=128)
