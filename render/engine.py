@@ -13,6 +13,7 @@ import numpy as np
 from render.ambient import AmbientLight, ambient_light
 from render.direct.integrator import centre_layers
 from render.error import (
+    RULED,
     ErrorEstimate,
     estimate,
     is_met,
@@ -27,6 +28,8 @@ from render.indirect.path_cells import coarsened
 from render.indirect.probe import ProbePixels
 from render.indirect.schedule import Schedule
 from render.pipeline import (
+    HOPELESS,
+    PROPOSAL,
     LightSamples,
     MoreSamples,
     Progress,
@@ -82,8 +85,7 @@ def render(
     # where nothing is in view there is nothing to explain
     for line in (*scene.notes, *plan.reasons) if len(traced.samples.pixel) else ():
         log.info("%s", line)
-    noise = np.zeros(camera.height * camera.width) if traced.indirect is None else traced.indirect.noise
-
+    noise = _standard_error(traced)
     ambient = AmbientLight(np.zeros((camera.height, camera.width), np.float32), 0.0, 0)
     if plan.ambient:
         report("ambient light", 0.9)
@@ -128,7 +130,16 @@ def _traced_to_target(
         traced = add_samples(world, plan, settings, traced, extra, report)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
         error = _estimated(world, plan, settings, traced, checked)
-    return replace(plan, reasons=(*plan.reasons, *_bias_reasons(plan, traced, error))), traced, error
+    reasons = (*plan.reasons, *_bias_reasons(plan, traced, error), *_clamp_reasons(plan, settings, traced, error))
+    return replace(plan, reasons=reasons), traced, error
+
+
+def _standard_error(traced: LightSamples) -> np.ndarray:
+    """Of every pixel's total radiance; what a clamp removed of it counts as such."""
+    if traced.indirect is None:
+        return np.zeros(len(traced.origin_m))
+    removed = traced.indirect.removed
+    return traced.indirect.noise if removed is None else np.hypot(traced.indirect.noise, removed.pixels)
 
 
 def planned(world: TracedScene, settings: RenderSettings, seed: int = 0) -> Plan:
@@ -143,7 +154,8 @@ def _additional_schedule(
     if settings.spp is not None or traced.schedule is None or traced.indirect is None or plan.target <= 0:
         return None
     batches = traced.schedule.batches
-    allowed = settings.target_fraction * plan.target**2 - error.direct**2 - error.merging**2 - error.bias**2
+    allowed = settings.target_fraction * plan.target**2
+    allowed -= error.direct**2 + error.merging**2 + error.bias**2 + error.clamped**2
     if plan.filter and error.bias < plan.target:
         # what merging and the filter seem to cost after few paths falls with more
         allowed = max(allowed, MIN_ALLOWED * settings.target_fraction * plan.target**2)
@@ -151,7 +163,10 @@ def _additional_schedule(
     if enough or allowed <= 0 or batches < (FILTERED_BATCHES if plan.filter else BATCHES):
         return None
     left = most_spp(settings)[0] / traced.schedule.cost - 1
-    factor = min(error.monte_carlo**2 / allowed - 1, MAX_MORE_FILTERED if plan.filter else MAX_MORE, left)
+    needed = error.monte_carlo**2 / allowed - 1
+    if needed > HOPELESS and not plan.filter:  # filtered light begins with few paths, whatever it needs
+        return None
+    factor = min(needed, MAX_MORE_FILTERED if plan.filter else MAX_MORE, left)
     if factor <= 0:
         return None
     rounds = np.ceil(traced.schedule.spp * factor / batches).astype(np.int64) * batches
@@ -160,6 +175,24 @@ def _additional_schedule(
         filter_octaves = filter_octaves_of(world, plan, settings, traced.origin_m, traced.schedule.cost + more.cost)
         return more._replace(filter_octaves=filter_octaves)
     return more
+
+
+def _clamp_reasons(plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
+    """What a clamp removed; or that one would help, where the target is out of reach for a few rare bright paths."""
+    if traced.indirect is None:
+        return ()
+    if traced.indirect.removed is not None:
+        fraction = traced.indirect.removed.pixels.sum() / max(traced.samples.radiance.sum(), 1e-300)
+        message = (
+            f"clamp: paths of more than {plan.clamp:g} times the direct light around lost {fraction:.2%} of all light"
+        )
+        return (f"{message}, an error of {error.clamped:.2g}",)
+    missed = settings.spp is None and not plan.filter and not is_met(error, plan.target)
+    times = error.monte_carlo**2 / plan.target**2 if missed else 0.0
+    if times < 1 + HOPELESS:
+        return ()
+    remedy = PROPOSAL if error.worst_share > RULED else "force more with spp"
+    return (f"indirect light: stopped, as the target takes {times:.0f} times these paths; {remedy}",)
 
 
 def _bias_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
@@ -208,8 +241,16 @@ def _estimated(
     variance = traced.indirect.noise**2
     of_checked = variance[checked].mean()
     typical = variance.mean() / of_checked if of_checked > 0 else 1.0
-    error = estimate(coarse, fine, indirect, noise * typical, merging, bias)
+    error = estimate(coarse, fine, indirect, noise * typical, merging, bias, _lost_to_clamp(traced, checked))
     return replace(error, worst_share=worst_fraction_of(traced.indirect.noise, error))
+
+
+def _lost_to_clamp(traced: LightSamples, checked: np.ndarray) -> np.ndarray | float:
+    """Squared error of the checked pixels by what a clamp removed: that of their regions, in the mean the image's."""
+    if traced.indirect.removed is None:
+        return 0.0
+    of_pixels = traced.indirect.removed.squared_error()
+    return of_pixels[checked] + of_pixels.mean() - of_pixels[checked].mean()
 
 
 def _filter_bias(filtered: list[np.ndarray], unfiltered: ProbePixels, place: np.ndarray) -> np.ndarray | float:

@@ -28,8 +28,9 @@ RULED = 0.5  # share of the squared error in these pixels above which they rule 
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """Relative errors: overall (nRMSE) and its parts, `bias` the filter's; median and 95th percentile of pixels.
+    """Relative errors: overall (nRMSE) and its parts; median and 95th percentile of pixels.
 
+    `bias` is the filter's, `clamped` what a clamp removes.
     `worst_share` is the share of the squared overall error in the worst pixels (`worst_fraction_of`). The overall error
     is a sum of squares: one firefly can rule it, while the median pixel is fine, and being in both of its sums holds it
     below 1. It is the error all the same, so that a target it exceeds is missed; the share says what to do about it.
@@ -43,6 +44,7 @@ class ErrorEstimate:
     pixel_median: float
     pixel_p95: float
     worst_share: float = 0.0
+    clamped: float = 0.0
 
     def to_dict(self) -> dict:
         return asdict(self)
@@ -103,26 +105,28 @@ def estimate(
     noise: np.ndarray | float = 0.0,
     merging: np.ndarray | float = 0.0,
     bias: np.ndarray | float = 0.0,
+    clamped: np.ndarray | float = 0.0,
 ) -> ErrorEstimate:
-    """Return error of direct light by `coarse` against `fine` cells beside the indirect light's `noise`, `merging` and
-    `bias`.
+    """Return error of direct light by `coarse` against `fine` cells beside the indirect light's own errors.
 
-    coarse, fine, indirect are (pixels, bins) responses; noise, merging and bias squared errors of the pixels. Without
-    these four there is direct light alone.
+    coarse, fine, indirect are (pixels, bins) responses; noise, merging, bias and clamped squared errors of the pixels.
+    Without these five there is direct light alone.
     """
-    noise, merging, bias = (np.broadcast_to(part, len(coarse)) for part in (noise, merging, bias))
+    noise, merging, bias, clamped = (np.broadcast_to(part, len(coarse)) for part in (noise, merging, bias, clamped))
     direct = ((coarse - fine) ** 2).sum(axis=1)
     power = ((fine + indirect) ** 2).sum(axis=1)
     whole = power.sum()
     if whole <= 0:
         return ErrorEstimate(*(0.0,) * 7)
-    parts = [max(part.sum() / whole, 0.0) for part in (direct, merging, noise, bias)]
-    per_pixel = np.sqrt(np.maximum(direct + merging + noise + bias, 0)[power > 0] / power[power > 0])
+    *parts, lost = (max(part.sum() / whole, 0.0) for part in (direct, merging, noise, bias, clamped))
+    squared = np.maximum(direct + merging + noise + bias + clamped, 0)
+    per_pixel = np.sqrt(squared[power > 0] / power[power > 0])
     return ErrorEstimate(
-        math.sqrt(sum(parts)),
+        math.sqrt(sum(parts) + lost),
         *(math.sqrt(part) for part in parts),  # type: ignore[misc]  # mypy cannot count them
         pixel_median=float(np.median(per_pixel)),
         pixel_p95=float(np.quantile(per_pixel, 0.95)),
+        clamped=math.sqrt(lost),
     )
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.malloc import trim_memory
+from render.clamping import Clamp, make_clamp
 from render.direct.integrator import direct_light
 from render.error import power_of
 from render.indirect.integrator import (
@@ -31,6 +32,9 @@ from scenes.random_streams import Stream
 
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
 MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
+# Beyond so many times the work that a plan may spend, or that it planned, there is no more than a first try.
+HOPELESS = 10
+PROPOSAL = "trade fireflies for a stated bias with --clamp 10"
 FIRST_FILTERED_SPP = 16  # filtered light has no pilot: it starts with few paths
 
 Progress = Callable[[str, float], None]
@@ -177,6 +181,25 @@ def _schedule(
     world: TracedScene, plan: Plan, settings: RenderSettings, direct: Samples, origin_m: np.ndarray, seed: int
 ) -> tuple[Schedule, tuple[str, ...]]:
     """How many paths each pixel traces, and why: from the noise of a pilot of a few paths, which is not used again."""
+    clamp = None
+    if plan.clamp is not None:
+        camera = world.scene.camera
+        light = np.bincount(direct.pixel, weights=direct.radiance, minlength=camera.height * camera.width)
+        clamp = make_clamp(light, camera, plan.clamp)
+    schedule, reasons = _allocated(world, plan, settings, direct, origin_m, seed, clamp)
+    return schedule._replace(clamp=clamp), reasons
+
+
+def _allocated(
+    world: TracedScene,
+    plan: Plan,
+    settings: RenderSettings,
+    direct: Samples,
+    origin_m: np.ndarray,
+    seed: int,
+    clamp: Clamp | None,
+) -> tuple[Schedule, tuple[str, ...]]:
+    """The schedule but for its clamp, with which the pilot's paths are clamped, too."""
     camera = world.scene.camera
     blocks = block_order(np.arange(camera.height * camera.width), camera.width)
     if plan.filter:
@@ -187,7 +210,7 @@ def _schedule(
         # under a lamp the noise that the filter leaves is even, and a pilot costs more than it saves
         if plan.adaptive and spp >= FIRST_FILTERED_SPP and not is_wide(world):
             from_m = float(filter_octaves.from_m[0])
-            noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT), from_m)
+            noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT), from_m, clamp)
             schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES)
         least, most = schedule.spp.min(), schedule.spp.max()
         least_m, most_m = filter_octaves.size_m[0], filter_octaves.size_m[-1]
@@ -197,7 +220,7 @@ def _schedule(
     if plan.spp is not None and (not plan.adaptive or plan.spp < BATCHES):
         rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
         return uniform(blocks, rounds, reuses_paths=False), ()
-    own, reused = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT))
+    own, reused = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT), clamp=clamp)
     if not plan.adaptive:
         own, reused = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
     if plan.spp is not None:
@@ -208,8 +231,11 @@ def _schedule(
     limit, asked = most_spp(settings)
     wanted, reasons = schedule.cost, []
     if wanted > limit:
-        schedule = allocate(blocks, own, reused, cost=limit)
+        hopeless = wanted > HOPELESS * limit
+        schedule = allocate(blocks, own, reused, cost=min(limit, MAX_SPP_BY_DEFAULT) if hopeless else limit)
         remedy = "force more with spp" if asked else "ask for more with an error target"
+        if hopeless and clamp is None:
+            remedy = f"{remedy}, or {PROPOSAL}"
         reasons.append(f"indirect light: the work of {wanted:.0f} paths a pixel would meet the target; {remedy}")
     spread = f"{schedule.spp.min()} to {schedule.spp.max()} paths a pixel, {schedule.reuses_paths.mean():.0%} shared"
     reasons.append(f"indirect light: {spread}; the work of {schedule.cost:.0f} paths a pixel")

@@ -145,6 +145,7 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
         adaptive=settings.adaptive and mode_is_flood,
         filter=settings.filter,
         ambient_noise=ambient_noise,
+        clamp=settings.clamp,
     )
 
 

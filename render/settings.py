@@ -27,6 +27,8 @@ class RenderSettings:
     spp         work on indirect light, in paths per pixel; spent where the noise is, and partly on sharing paths
     adaptive    whether it is spent so, or evenly and without sharing
     filter      whether late indirect light is averaged over regions of surfaces instead: far less noise, and a bias
+    clamp       the most that one path of indirect light may add to a pixel, in units of the direct light around it:
+                fireflies go, and some energy, which is measured and counted as an error
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
     ambient_spp paths per pixel of ambient light; open: as many as its noise asks for
@@ -46,6 +48,7 @@ class RenderSettings:
     spp: int | None = None
     adaptive: bool = True
     filter: bool = False
+    clamp: float | None = None
     grid: int | None = None
     ambient: bool | None = None
     ambient_spp: int | None = None
@@ -62,6 +65,7 @@ class RenderSettings:
         limits = (
             ("bounces", 1, MAX_BOUNCES),
             ("spp", 1, MAX_SAMPLES),
+            ("clamp", 1e-3, 1e6),
             ("grid", 1, 64),
             ("error", 1e-4, 1.0),
             ("target_fraction", 0.1, 2.0),
@@ -111,6 +115,7 @@ class Plan:
     adaptive: bool = True
     filter: bool = False
     ambient_noise: float = 0.0
+    clamp: float | None = None
 
     def to_dict(self) -> dict:
         return asdict(self)

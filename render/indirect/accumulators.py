@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from render.backend.drjit_types import Array, Floats, Masks, UInts
+from render.clamping import ClampedPixels
 from render.indirect.path_cells import MomentHistogram, scatter_add_fixed_point
 from render.scene.traced_scene import Float, UInt32, dr, mi, upload
 
@@ -19,6 +20,7 @@ class IndirectAccumulator:
     probe_row  the probe row of every pixel, -1 for none
     batches    sample s of a pixel belongs to batch s modulo this
     spp        paths of every pixel: each counts one of them
+    clamp      set afterwards: what one path may add at most, and where the rest is kept
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
@@ -34,11 +36,23 @@ class IndirectAccumulator:
         probe_row: np.ndarray | None = None,
     ) -> None:
         self.rows, self.probed, self.unfiltered = rows, probed, unfiltered
+        self.clamp: ClampedPixels | None = None
         self.origin_m = upload(Float, origin_m)
         self.probe_row = None if probe_row is None else upload(mi.Int32, probe_row)
         self.totals = dr.zeros(mi.UInt64, rows.rows * batches)
         self.batches = dr.opaque(UInt32, batches)
         self.scale = upload(Float, 1 / spp)
+
+    def clamped(
+        self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks, adding: Masks
+    ) -> Array:
+        """Return radiance of one path, no more than it may add; the rest is kept where it would be `adding`."""
+        if self.clamp is None:
+            return radiance
+        allowed = self.clamp.clamped(pixel, radiance, active)
+        x, excess, over = self._given(pixel, path, radiance - allowed, adding)
+        self.clamp.add(pixel, batch, x, excess, over)
+        return allowed
 
     def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
         """Add samples to the pixels' and the probe rows; returns what was added, for `add_total`."""
@@ -94,3 +108,5 @@ class IndirectAccumulator:
         """Run what was added so far."""
         kept = [rows for rows in (self.rows, self.probed, self.unfiltered) if rows is not None]
         dr.eval(self.totals, [rows.moments for rows in kept])
+        if self.clamp is not None:
+            self.clamp.sums.evaluate()

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.malloc import trim_memory
+from render.clamping import ClampedPixels, ClampSums, RemovedLight, clamped_splats, mean_removed
 from render.indirect.accumulators import IndirectAccumulator
 from render.indirect.camera_paths import PathTask, trace_paths
 from render.indirect.launch_layout import BLOCK, LaunchLayout, make_launch
@@ -57,7 +58,8 @@ class IndirectTask(NamedTuple):
 
 
 class IndirectLight(NamedTuple):
-    """Standard error of each pixel's total; batches of the probe pixels, and what they would be without a filter.
+    """Standard error of each pixel's total; batches of the probe pixels, and what they would be without a filter;
+    what a clamp took.
 
     Its samples are handed on as they come.
     """
@@ -65,6 +67,7 @@ class IndirectLight(NamedTuple):
     noise: np.ndarray
     probed: ProbePixels
     unfiltered: ProbePixels | None = None
+    removed: RemovedLight | None = None
 
 
 def combined(one: IndirectLight, other: IndirectLight, fraction: np.ndarray) -> IndirectLight:
@@ -79,7 +82,8 @@ def combined(one: IndirectLight, other: IndirectLight, fraction: np.ndarray) -> 
     unfiltered = None
     if one.unfiltered is not None and other.unfiltered is not None:
         unfiltered = mean(one.unfiltered, other.unfiltered)
-    return IndirectLight(noise, mean(one.probed, other.probed), unfiltered)
+    removed = mean_removed(one.removed, other.removed, fraction)
+    return IndirectLight(noise, mean(one.probed, other.probed), unfiltered, removed)
 
 
 def combined_samples(one: Samples, other: Samples, fraction: np.ndarray, cells: Cells, origin_m: np.ndarray) -> Samples:
@@ -117,22 +121,26 @@ def indirect_light(
 ) -> IndirectLight:
     """Trace indirect light of the scheduled pixels; `add` is given its samples, part by part.
 
-    Unbiased, unless the schedule asks for a filter. The `probed` pixels, sorted, must be among the scheduled.
+    Unbiased, unless the schedule filters or clamps. The `probed` pixels, sorted, must be among the scheduled.
     """
     (origin_m, _, fine, brightest), schedule = task.grid, task.schedule
     batches, filtered = schedule.batches, schedule.filter_octaves is not None
     probe = make_probe(probed, origin_m, fine, batches, brightest, filtered=filtered)
-    splats = _trace_light(task, probe, add)
+    clamp = None
+    if schedule.clamp is not None:
+        clamp = ClampSums(schedule.clamp, fine, quantum_for(brightest), batches)
+    splats = _trace_light(task, probe, clamp, add)
     noise = _standard_error(splats)
     for fraction, blocks in _groups(task):
         report(fraction)
-        pixels, samples, totals = _trace_camera(task, blocks, probe)
+        pixels, samples, totals = _trace_camera(task, blocks, probe, clamp)
         add(samples)
         real = pixels >= 0
         noise[pixels[real]] = _standard_error(totals[real] + splats[pixels[real]])
     rows, unfiltered = (None, None) if probe is None else (probe.rows, probe.unfiltered)
     plain = None if unfiltered is None else read_probe(unfiltered, probed, origin_m, fine, batches)
-    return IndirectLight(noise, read_probe(rows, probed, origin_m, fine, batches), plain)
+    removed = None if clamp is None else clamp.removed()
+    return IndirectLight(noise, read_probe(rows, probed, origin_m, fine, batches), plain, removed)
 
 
 def _standard_error(totals: np.ndarray) -> np.ndarray:
@@ -141,11 +149,15 @@ def _standard_error(totals: np.ndarray) -> np.ndarray:
     return totals.std(axis=1, ddof=1) * np.sqrt(batches) if batches > 1 else np.zeros(len(totals))
 
 
-def _trace_light(task: IndirectTask, probe: Probe | None, add: Callable[[Samples], None]) -> np.ndarray:
+def _trace_light(
+    task: IndirectTask, probe: Probe | None, clamp: ClampSums | None, add: Callable[[Samples], None]
+) -> np.ndarray:
     """Trace light paths from glossy surfaces and hand out their light; return its totals, (pixels, batches)."""
     origin_m, batches = task.grid.origin_m, task.schedule.batches
     totals, merged = np.zeros((len(origin_m), batches)), no_samples()
     for light in trace_light_paths(task.world, task.schedule.cost, batches, task.bounces, task.seed):
+        if clamp is not None:
+            light = clamped_splats(clamp, light, task.schedule.cost, origin_m)
         np.add.at(totals, (light.pixel, light.batch), light.radiance)
         if probe is not None:
             probe_splats(probe, light, origin_m, batches)
@@ -168,7 +180,7 @@ def _groups(task: IndirectTask) -> Iterator[tuple[float, np.ndarray]]:
 
 
 def _trace_camera(
-    task: IndirectTask, blocks: np.ndarray, probe: Probe | None
+    task: IndirectTask, blocks: np.ndarray, probe: Probe | None, clamp: ClampSums | None
 ) -> tuple[np.ndarray, Samples, np.ndarray]:
     """Trace the camera paths of some blocks, all of which reuse paths or none.
 
@@ -177,7 +189,7 @@ def _trace_camera(
     world, schedule, bounces, seed, grid = task
     pixels = schedule.pixels.reshape(-1, BLOCK)[blocks].ravel()
     reuses_paths = bool(schedule.reuses_paths[blocks[0]])
-    sums, path_filter = _accumulators(task, blocks, pixels, probe)
+    sums, path_filter = _accumulators(task, blocks, pixels, probe, clamp)
     from_m = None if path_filter is None else path_filter.from_m
     launches = 0
     for launch in _launches(blocks, schedule, reuses_paths=reuses_paths):
@@ -197,7 +209,7 @@ def _trace_camera(
 
 
 def _accumulators(
-    task: IndirectTask, blocks: np.ndarray, pixels: np.ndarray, probe: Probe | None
+    task: IndirectTask, blocks: np.ndarray, pixels: np.ndarray, probe: Probe | None, clamp: ClampSums | None
 ) -> tuple[IndirectAccumulator, PathSpaceFilter | None]:
     """Make empty sums for some blocks, and the filter that late light passes through, if the schedule asks for one."""
     schedule, grid = task.schedule, task.grid
@@ -211,6 +223,8 @@ def _accumulators(
         unfiltered=None if probe is None else probe.unfiltered,
         probe_row=None if probe is None else np.where(pixels >= 0, probe.row_of[pixels], -1),
     )
+    if clamp is not None:
+        sums.clamp = ClampedPixels(clamp, pixels)
     if schedule.filter_octaves is None:
         return sums, None
     return sums, PathSpaceFilter(task.world, pixels, schedule.filter_octaves, schedule.batches, rows.quantum, task.seed)

@@ -28,7 +28,7 @@ from render.indirect.light_vertices import diffuse_fraction, mis_weight_bsdf
 from render.indirect.path_space_filter import UNIT_WEIGHT, ArrivingLight, PathSpaceFilter
 from render.indirect.primary_vertices import reuses_early_paths
 from render.scene.rays import interaction_from_parts, parts_of, segment
-from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
 # Of one launch, 30 and 75 MB in its course.
 CONNECTIONS_PER_LAUNCH = 3 << 18  # connections
@@ -69,14 +69,20 @@ def _weight(paths: PathBatch, sums: IndirectAccumulator) -> Array:
 
 
 def noise_of_paths(
-    world: TracedScene, pixels: np.ndarray, launch: LaunchLayout, bounces: int, seed: int
+    world: TracedScene,
+    pixels: np.ndarray,
+    launch: LaunchLayout,
+    bounces: int,
+    seed: int,
+    limit: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sum squared contributions of a block's sample to the pixels of the block, own and reused.
 
-    Histograms of paths that fall into different bins have this variance.
+    Histograms of paths that fall into different bins have this variance. `limit`: what a path may add to each pixel.
     """
+    most = None if limit is None else upload(Float, limit)
     paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, reuses_paths=True))
-    own, alone, reused = _Squares(), _Squares(), _Squares()
+    own, alone, reused = (_Squares(limit=most) for _ in range(3))
     lanes = _own_lanes(paths)
     _add(lanes._replace(early_m=Float(0)), paths, own, own=True)
     _add(lanes, paths, alone, own=True)
@@ -85,20 +91,26 @@ def noise_of_paths(
 
 
 def noise_of_filtered_paths(
-    world: TracedScene, pixels: np.ndarray, launch: LaunchLayout, bounces: int, seed: int, from_m: float
+    world: TracedScene,
+    pixels: np.ndarray,
+    launch: LaunchLayout,
+    bounces: int,
+    seed: int,
+    from_m: float,
+    limit: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the same of filtered light: what is later than `from_m` behind direct light is read from regions, whose
     area, and with it the number of paths in them, grows with the square of its excess path."""
-    start = dr.opaque(Float, from_m)
+    start, most = dr.opaque(Float, from_m), None if limit is None else upload(Float, limit)
     paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, from_m=start))
     primary = paths.primary
     late_m = primary.path + primary.late_m
-    own = _Squares(late_m, start)
+    own = _Squares(late_m, start, most)
     _add(_own_lanes(paths), paths, own, own=True)
     noise = own.by_block(BLOCK)
     pairs = _pairs(paths, reuses_paths=False, early=reuses_early_paths(world))
     if pairs is not None:
-        early = _Squares(dr.gather(Float, late_m, pairs.vertex), start)
+        early = _Squares(dr.gather(Float, late_m, pairs.vertex), start, most)
         _add(_pair_lanes(world, paths, pairs), paths, early, own=False)
         block = dr.gather(UInt32, pairs.suffix, dr.arange(UInt32, dr.width(pairs.suffix) // BLOCK) * BLOCK) // BLOCK
         np.add.at(noise, block.numpy(), early.by_block(BLOCK))
@@ -112,9 +124,18 @@ class _Squares:
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
-    def __init__(self, late_m: Floats = None, from_m: Floats = None) -> None:
-        self._late_m, self._from_m = late_m, from_m
+    def __init__(self, late_m: Floats = None, from_m: Floats = None, limit: Floats = None) -> None:
+        self._late_m, self._from_m, self._limit = late_m, from_m, limit
         self._lanes: Floats = None
+
+    def clamped(
+        self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks, adding: Masks
+    ) -> Array:
+        """Return radiance of one path, no more than it may add."""
+        if self._limit is None:
+            return radiance
+        limit = dr.gather(Float, self._limit, pixel, active)
+        return dr.select(dr.isfinite(radiance), dr.minimum(radiance, limit), radiance)
 
     def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
         """The square of what is added."""
@@ -353,6 +374,7 @@ def _add(
                 radiance, path = dr.select(near, light.value, radiance), dr.select(near, light.path, path)
                 towards, diffuse = dr.select(near, light.direction, towards), near | diffuse
             adding = going & ~((path < early_m) & dr.select(beyond, suffixes.onward, suffixes.reusable & (step == 0)))
+            radiance = sums.clamped(receiver, batch, path1 + path, radiance, going, adding)
             if dr.hint(path_filter is not None, mode="scalar"):
                 sums.add_unfiltered(receiver, batch, path1 + path, radiance, going)
                 primary, weight = paths.primary, _weight(paths, sums)
@@ -364,6 +386,7 @@ def _add(
                 )
         else:
             adding = going & (path < early_m)
+            radiance = sums.clamped(receiver, batch, path1 + path, radiance, going, adding)
         total += sums.add(receiver, batch, path1 + path, radiance, adding)
         going &= (step < connection_count) | ((step < last + connection_count) & (onward > 0))
         step += 1

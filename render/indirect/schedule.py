@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from render.clamping import Clamp
 from render.indirect.launch_layout import BLOCK, make_launch
 from render.indirect.path_space_filter import GATHER_POINTS, Octaves
 from render.indirect.reuse import CONNECTIONS_PER_LAUNCH, noise_of_filtered_paths, noise_of_paths
@@ -20,13 +21,15 @@ class Schedule(NamedTuple):
     """Sample allocation: pixels in blocks of BLOCK (-1 pads), samples per pixel of each block, whether it reuses paths.
 
     `batches` of samples are kept apart for the error estimate. With
-    `filter_octaves` no block reuses paths, and late light is filtered over regions of these octaves.
+    `filter_octaves` no block reuses paths, and late light is filtered over regions of these octaves. With a `clamp`
+    no path adds more.
     """
 
     pixels: np.ndarray
     spp: np.ndarray
     reuses_paths: np.ndarray
     filter_octaves: Octaves | None = None
+    clamp: Clamp | None = None
 
     @property
     def batches(self) -> int:
@@ -63,7 +66,12 @@ def uniform(blocks: np.ndarray, spp: int, *, reuses_paths: bool) -> Schedule:
 
 
 def pilot_noise(
-    world: TracedScene, blocks: np.ndarray, bounces: int, seed: int, from_m: float | None = None
+    world: TracedScene,
+    blocks: np.ndarray,
+    bounces: int,
+    seed: int,
+    from_m: float | None = None,
+    clamp: Clamp | None = None,
 ) -> tuple[np.ndarray, ...]:
     """Return squared contributions of one sample summed over the pixels of every block, without and with path reuse.
 
@@ -79,10 +87,11 @@ def pilot_noise(
         block = np.arange(size)
         launch = make_launch(block, block + first, np.full(size, spp))
         chosen = blocks[first * BLOCK : (first + size) * BLOCK]
+        limit = None if clamp is None else clamp.limit[chosen]
         if from_m is None:
-            found: tuple[np.ndarray, ...] = noise_of_paths(world, chosen, launch, bounces, seed)
+            found: tuple[np.ndarray, ...] = noise_of_paths(world, chosen, launch, bounces, seed, limit)
         else:
-            found = (noise_of_filtered_paths(world, chosen, launch, bounces, seed, from_m),)
+            found = (noise_of_filtered_paths(world, chosen, launch, bounces, seed, from_m, limit),)
         parts.append([part.reshape(size, spp).mean(axis=1) for part in found])
     kernel = np.array((1, 2, 3, 2, 1)) / 9
     totals = (np.concatenate(column) for column in zip(*parts, strict=True))

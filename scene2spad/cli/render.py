@@ -81,6 +81,9 @@ class Render(Common):
     filter: bool = False
     """Average late indirect light over small regions of surfaces: far less noise for the same paths, and a bias, which
     is measured and stated."""
+    clamp: Number = None
+    """Fireflies: one indirect path adds at most this many times the direct light around it (10, say); what that removes
+    is measured and counted as an error (default: nothing is removed)."""
     grid: Count = None
     """Direct rays per pixel side (default: planned from a pilot)."""
     error: Number = None
@@ -117,6 +120,7 @@ def run(command: Render, progress: Progress) -> dict:
         bounces=command.bounces,
         spp=command.spp,
         filter=command.filter,
+        clamp=command.clamp,
         grid=command.grid,
         ambient={"auto": None, "on": True, "off": False}[command.ambient],
         ambient_spp=command.ambient_spp,

@@ -125,12 +125,14 @@ def test_a_missed_target_is_made_good():
     scene, pixels = room(), np.arange(24 * 18)
     fine = as_response(render(scene, RenderSettings(spp=8192, grid=16, bounces=4), seed=99), pixels)
     world, settings = TracedScene(scene), RenderSettings(bounces=4, error=0.02)
-    plan = replace(make_plan(world, settings, 1), noise=0.1)  # a pilot that promises five times too much
+    plan = replace(make_plan(world, settings, 1), noise=0.05)  # a pilot that promises 2.5 times too much
     first = tracing.trace(world, plan, settings, seed=1, checked=pixels)
     error = engine._estimated(world, plan, settings, first, pixels)
     more = engine._additional_schedule(world, plan, settings, first, error)
     assert error.total > 0.02 and more is not None
-    both = tracing.add_samples(world, plan, settings, first, more, 1, pixels, lambda what, fraction: None)
+    both = tracing.add_samples(
+        world, plan, settings, first, tracing.MoreSamples(more, 1, pixels), lambda what, fraction: None
+    )
     assert both.spp > first.spp
 
     def true(traced: tracing.LightSamples) -> float:

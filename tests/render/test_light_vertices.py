@@ -38,6 +38,9 @@ class Sum:
 
     lanes = None
 
+    def clamped(self, pixel, batch, path, radiance, active, adding):
+        return radiance
+
     def add(self, pixel, batch, path, radiance, active):
         return dr.select(active & dr.isfinite(radiance), radiance, 0)
 
