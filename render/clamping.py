@@ -163,9 +163,8 @@ def clamped_splats(sums: ClampSums, light: LightPathSplats, paths: float, origin
     over = np.flatnonzero(kept < light.radiance)
     if len(over):
         pixel = light.pixel[over]
-        columns = (pixel, light.batch[over], sums.clamp.region[pixel])
+        region, batch = sums.clamp.region[pixel], light.batch[over]
         x_m, excess = light.path_m[over] - origin_m[pixel], (light.radiance - kept)[over]
-        sums.add(
-            *(upload(UInt32, column) for column in columns), upload(Float, x_m), upload(Float, excess), mi.Bool(True)
-        )
+        indices = upload(UInt32, pixel), upload(UInt32, batch), upload(UInt32, region)
+        sums.add(indices[0], indices[1], indices[2], upload(Float, x_m), upload(Float, excess), mi.Bool(True))
     return light._replace(radiance=kept)

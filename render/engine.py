@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 
 from render.ambient import AmbientLight, ambient_light
+from render.clamping import RemovedLight
 from render.direct.integrator import centre_layers
 from render.error import (
     RULED,
@@ -241,15 +242,17 @@ def _estimated(
     variance = traced.indirect.noise**2
     of_checked = variance[checked].mean()
     typical = variance.mean() / of_checked if of_checked > 0 else 1.0
-    error = estimate(coarse, fine, indirect, noise * typical, merging, bias, _lost_to_clamp(traced, checked))
+    error = estimate(
+        coarse, fine, indirect, noise * typical, merging, bias, _lost_to_clamp(traced.indirect.removed, checked)
+    )
     return replace(error, worst_share=worst_fraction_of(traced.indirect.noise, error))
 
 
-def _lost_to_clamp(traced: LightSamples, checked: np.ndarray) -> np.ndarray | float:
+def _lost_to_clamp(removed: RemovedLight | None, checked: np.ndarray) -> np.ndarray | float:
     """Squared error of the checked pixels by what a clamp removed: that of their regions, in the mean the image's."""
-    if traced.indirect.removed is None:
+    if removed is None:
         return 0.0
-    of_pixels = traced.indirect.removed.squared_error()
+    of_pixels = removed.squared_error()
     return of_pixels[checked] + of_pixels.mean() - of_pixels[checked].mean()
 
 
