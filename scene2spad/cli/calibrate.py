@@ -7,7 +7,7 @@ from pathlib import Path
 
 from scene2spad.options.common import Common, Positional, Progress
 
-FITTED = ("delay", "clock", "bin_width", "background", "trials", "recovery", "compression")
+FITTED = ("delay", "skew", "clock", "bin_width", "background", "leak", "echo", "trials", "recovery", "compression")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class Calibrate(Common):
     """Nearest distance that is used [m]."""
     effects: tuple[str, ...] = FITTED
     """What is fitted beside pulse and gains; crosstalk too, if named. What is left out is off."""
-    model_error: float = 0.005
+    model_error: float = 0.004
     """Relative error of the model that every bin's variance is widened by; 0 is the Poisson likelihood alone."""
 
 

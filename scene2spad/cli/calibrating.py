@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,15 +11,15 @@ import numpy as np
 from scene2spad.datasets.zone_captures import read_plane_captures, shipped_captures, within, zone_captures
 from scene2spad.options.common import Progress
 from scenes.errors import require
-from spad.sensor.files import SensorFile, load_sensor, write_sensor
-from spad.zones.calibration import Calibration, ZoneCapture, calibrate, check_effects, poisson_deviance
+from spad.sensor.files import load_sensor, write_sensor
+from spad.zones.calibration import Calibration, calibrate, calibrated_file, check_effects, poisson_deviance
+from spad.zones.expected_counts import ZoneCapture
 from spad.zones.sensor import expected_zone_counts
 
 if TYPE_CHECKING:
     from scene2spad.cli.calibrate import Calibrate
 
 MIN_CAPTURES = 16
-CALIBRATED = ("gain", "delay", "clock", "background", "trials", "recovery", "compression", "crosstalk")
 
 
 def run(command: Calibrate, progress: Progress) -> dict:
@@ -55,22 +54,13 @@ def run(command: Calibrate, progress: Progress) -> dict:
         "deviance": fitted.deviance,
         "held_out_deviance": mean_deviance(held, fitted),
         "bin_width_ps": fitted.sensor.bin_width_s * 1e12,
-        "trials": zones.trials[0],
-        "recovery": zones.recovery,
-        "compression": zones.compression,
+        "trials": list(zones.trials),
+        "recovery": list(zones.recovery),
+        "compression": list(zones.compression),
         "crosstalk": zones.crosstalk,
         "standard_errors": {name: float(np.max(error)) for name, error in fitted.errors.items()},
         "out": str(command.out),
     }
-
-
-def calibrated_file(start: SensorFile, fitted: Calibration, name: str, how: str) -> SensorFile:
-    """Return the sensor file of a calibration; the sources of what was not fitted are kept."""
-    sources = {key: source for key, source in start.sources.items() if not key.startswith(("pulse.", "jitter."))}
-    keys = ("histogram.bin_width", "pulse.samples", "pulse.step", *(f"zones.{key}" for key in CALIBRATED))
-    sources.update(dict.fromkeys(keys, how))
-    sensor = replace(fitted.sensor, name=name)
-    return SensorFile(sensor, start.optics, fitted.zones, f"{start.sensor.name}, {how}", sources)
 
 
 def mean_deviance(captures: Sequence[ZoneCapture], fitted: Calibration) -> float:

@@ -17,12 +17,12 @@ from scenes.errors import require
 from scenes.files import read_arrays
 from scenes.model import Camera, Laser, Material, Scene, Surface
 from spad.sensor.model import Sensor
-from spad.zones.calibration import ZoneCapture
+from spad.zones.expected_counts import ZoneCapture
 from spad.zones.sensor import ZoneArray, zone_returns
 
 PIXELS = 28  # side of the image that the zones' fields of view are cut from
 CONE_DEG = 80.0
-PLANE_M = 2.0  # half its side
+PLANE_SIZE = 1.5  # half its side, in its distances: beyond what the zones see, and free to tilt
 DIRECT = RenderSettings(bounces=1, grid=2)
 MAX_VALUE = 1 << 40  # of counts and millimetres: sums stay exact
 # Bins of the reference channel around its pulse, whose centroid follows the laser as it warms up.
@@ -108,7 +108,7 @@ def plane_scene(
         for centre, size in ((zones.centre_x, zones.width), (zones.centre_y, zones.height))
     )
     camera = Camera(np.eye(4), 2 * math.degrees(math.atan(1.05 * reach)), pixels, pixels)
-    side = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], dtype=np.float64) * PLANE_M
+    side = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], dtype=np.float64) * PLANE_SIZE * distance_m
     depth = distance_m + side @ np.tan(tilt_rad)
     require(bool((depth > 0).all()), f"plane at {distance_m:g} m: its tilt brings it behind the sensor")
     wall = Surface(np.column_stack((side, depth)), np.array([[0, 1, 2], [0, 2, 3]]), Material(albedo=0.5))

@@ -54,7 +54,8 @@ class Study(Common):
     beside the same models in floating point; of trained models: scenes moved out
     of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
     captures (13, 14); how much the error of a rendered set itself matters to depth; what a renderer adds to RGB-D
-    simulation, step by step; and networks beside the filter where light takes several paths."""
+    simulation, step by step; networks beside the filter where light takes several paths; and a real chip's histograms
+    beside what the renderer and the calibrated sensor predict."""
 
     name: Positional[
         Literal[
@@ -71,6 +72,7 @@ class Study(Common):
             "render-error",
             "transport",
             "multipath",
+            "sim-to-real",
         ]
     ]
     """Which study."""

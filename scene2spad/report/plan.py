@@ -291,6 +291,21 @@ _BEYOND = Section(
             ("multipath.csv",),
         ),
         Item(
+            "sim-to-real",
+            "A real chip's histograms, predicted",
+            "scene2spad study sim-to-real",
+            (
+                Picture("sim-to-real-histograms.png", "Measured and predicted histograms of nine zones"),
+                Picture("sim-to-real-errors.png", "Errors of shape, amplitude and range against distance"),
+                Picture("sim-to-real-pose.png", "Errors of the plane's distance and tilt from single captures"),
+            ),
+            (
+                Table("sim-to-real.csv", "Errors of the prediction by distance"),
+                Table("sim-to-real-ablation.csv", "What each effect buys: it is off, the rest calibrated again"),
+            ),
+            ("sim-to-real-pose.csv",),
+        ),
+        Item(
             "render-error",
             "How much the error of a rendered set matters",
             "scene2spad study render-error",

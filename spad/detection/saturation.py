@@ -14,15 +14,16 @@ import math
 
 import numpy as np
 
+PerZone = float | np.ndarray  # one number, or one of each zone (Z,)
 
-def armed_fraction(flux: np.ndarray, trials: np.ndarray, recovery: float) -> np.ndarray:
-    """Return share of trials whose detector is armed when they begin: flux (Z, T) detections a histogram -> (Z,)."""
+
+def armed_fraction(flux: np.ndarray, trials: np.ndarray, recovery: PerZone) -> np.ndarray:
+    """Return the share of trials whose detector is armed when they begin: flux (Z, T) detections a histogram -> (Z,)."""
     return 1 / (1 - recovery * np.expm1(-flux.sum(axis=-1) / trials))
 
 
-def saturated(flux: np.ndarray, trials: np.ndarray, recovery: float, compression: float = 0.0) -> np.ndarray:
-    """Return expected counts (Z, T) of a flux (Z, T) of primary detections a histogram; `trials` (Z,), infinite for
-    none lost.
+def saturated(flux: np.ndarray, trials: np.ndarray, recovery: PerZone, compression: PerZone = 0.0) -> np.ndarray:
+    """Return the counts expected (Z, T) of a flux (Z, T) of primary detections a histogram; `trials` (Z,), infinite for none lost.
 
     n_k = trials x armed x exp(-sum_(j<k) mu_j) (1 - exp(-mu_k)), mu the flux of one trial; then the compression.
     """
@@ -32,11 +33,11 @@ def saturated(flux: np.ndarray, trials: np.ndarray, recovery: float, compression
     finite = np.isfinite(trials)[:, None]
     scale = np.where(finite, trials[:, None], 1.0)
     first = np.where(finite, scale * armed * np.exp(-before) * -np.expm1(-mu), flux)
-    return first / (1 + compression * first / trials[:, None])
+    return first / (1 + np.reshape(compression, (-1, 1)) * first / trials[:, None])
 
 
 def draw_saturated(
-    flux: np.ndarray, trials: np.ndarray, recovery: float, rng: np.random.Generator, compression: float = 0.0
+    flux: np.ndarray, trials: np.ndarray, recovery: PerZone, rng: np.random.Generator, compression: PerZone = 0.0
 ) -> np.ndarray:
     """Draw counts (Z, T) int64 of one exposure.
 
@@ -55,14 +56,15 @@ def draw_saturated(
         free = rng.binomial(max(1, round(trials[zone] * armed[zone])), q)
         total = max(0, round(mean.sum() + (free - mean.sum()) * armed[zone]))
         counts[zone] = rng.multinomial(total, mean / mean.sum()) if mean.sum() > 0 else 0
-    return rng.binomial(counts, 1 / (1 + compression * expected / trials[:, None])) if compression else counts
+    if not np.any(compression):
+        return counts
+    return rng.binomial(counts, 1 / (1 + np.reshape(compression, (-1, 1)) * expected / trials[:, None]))
 
 
 def saturated_jacobian(
-    flux: np.ndarray, jacobian: np.ndarray, trials: np.ndarray, recovery: float, compression: float = 0.0
+    flux: np.ndarray, jacobian: np.ndarray, trials: np.ndarray, recovery: PerZone, compression: PerZone = 0.0
 ) -> np.ndarray:
-    """Apply the chain rule through `saturated`: flux (Z, T), its derivatives (Z, T, P) -> derivatives of the counts (Z,
-    T, P)."""
+    """Apply the chain rule through `saturated`: flux (Z, T), its derivatives (Z, T, P) -> derivatives of the counts (Z, T, P)."""
     mu, dmu = flux / trials[:, None], jacobian / trials[:, None, None]
     after, dafter = np.cumsum(mu, axis=1), np.cumsum(dmu, axis=1)
     before, dbefore = after - mu, dafter - dmu
@@ -74,4 +76,4 @@ def saturated_jacobian(
     slope = scale[:, None, None] * (right * dafter - left * dbefore)
     slope -= (recovery * armed * np.exp(-after[:, -1]))[:, None, None] * first[..., None] * dafter[:, -1:, :]
     slope = np.where(finite[:, None, None], slope, jacobian)
-    return slope / (1 + compression * first / trials[:, None])[..., None] ** 2
+    return slope / (1 + np.reshape(compression, (-1, 1)) * first / trials[:, None])[..., None] ** 2

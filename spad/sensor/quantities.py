@@ -13,6 +13,7 @@ UNITS: dict[str, dict[str, int]] = {
     "time": {"s": 0, "ms": -3, "us": -6, "ns": -9, "ps": -12, "fs": -15},
     "rate": {"Hz": 0, "kHz": 3, "MHz": 6},
     "length": {"m": 0, "mm": -3, "um": -6, "nm": -9},
+    "area": {"m2": 0, "mm2": -6, "um2": -12},
     "bandwidth": {"nm": 0, "um": 3},
     "energy": {"J": 0, "mJ": -3, "uJ": -6, "nJ": -9, "pJ": -12, "fJ": -15},
 }

@@ -28,12 +28,28 @@ EFFECTS = (
     "illumination",
     "clock",
     "delay",
+    "skew",
+    "leak",
+    "echo",
     "crosstalk",
     "saturation",
     "recovery",
     "compression",
     "background",
 )
+# What a switch is where it is off, of those that have a number for each zone.
+_OFF = {
+    "gain": 1.0,
+    "delay_s": 0.0,
+    "skew_s": 0.0,
+    "clock": 1.0,
+    "background": 0.0,
+    "leak": 0.0,
+    "echo_m2": 0.0,
+    "trials": math.inf,
+    "recovery": 0.0,
+    "compression": 0.0,
+}
 
 
 @dataclass(frozen=True)
@@ -43,12 +59,16 @@ class ZoneArray:
     centre_x, centre_y, width, height   fields of view [tangents], one number a zone
     gain          primary detections an exposure per unit of a zone's light, 1 / (m^2 J); one number a zone
     delay_s       electronic delay of each zone's converter [s]; off 0
+    skew_s        of the delays of a zone's detectors: half of them are late by half of it, half early; off 0
     clock         real seconds per second of each zone's converter; off 1
     background    primary detections an exposure and bin of each zone, dark counts and ambient light; off 0
+    leak          light that the module itself reflects at a path of 0, in units of a zone's light; off 0
+    echo_m2       of light that goes from the scene to the module, and once more to the scene and back: at twice the
+                  path, this over the squared distance of the light that came back first; off 0
     crosstalk     share of the sum of all zones' signal that every zone sees besides, light scattered in the lens; off 0
     trials        detectors times laser cycles of each zone, which saturate (`spad.detection.saturation`); off infinite
-    recovery      further cycles that a detection costs its detector; off 0
-    compression   of full bins, n / (1 + compression n / trials), no law but a description; off 0
+    recovery      further cycles that a detection costs its detectors, one number a zone or one for all; off 0
+    compression   of full bins, n / (1 + compression n / trials), the same; no law but a description; off 0
     illumination_x, illumination_y   direction in which the emitter is brightest [tangent]
     curvature_x, curvature_y         of the emitter's intensity exp(-(k_x u^2 + k_y v^2) / 2); off 0, uniform
     baseline_m    emitter minus receiver (x right, y down, z forward): parallax in the near field; off 0
@@ -61,12 +81,15 @@ class ZoneArray:
     height: tuple[float, ...]
     gain: tuple[float, ...] = ()
     delay_s: tuple[float, ...] = ()
+    skew_s: tuple[float, ...] = ()
     clock: tuple[float, ...] = ()
     background: tuple[float, ...] = ()
+    leak: tuple[float, ...] = ()
+    echo_m2: tuple[float, ...] = ()
     crosstalk: float = 0.0
     trials: tuple[float, ...] = ()
-    recovery: float = 0.0
-    compression: float = 0.0
+    recovery: float | tuple[float, ...] = ()
+    compression: float | tuple[float, ...] = ()
     illumination_x: float = 0.0
     illumination_y: float = 0.0
     curvature_x: float = 0.0
@@ -77,11 +100,12 @@ class ZoneArray:
     def __post_init__(self) -> None:
         count = len(self.centre_x)
         require(1 <= count <= 4096, f"zones: {count} of them, expected 1 to 4096")
-        defaults = {"gain": 1.0, "delay_s": 0.0, "clock": 1.0, "background": 0.0, "trials": math.inf}
-        for name in ("centre_y", "width", "height", *defaults):
+        for name in ("centre_y", "width", "height", *_OFF):
             values = getattr(self, name)
-            if not values and name in defaults:
-                values = (defaults[name],) * count
+            if isinstance(values, int | float):
+                values = (values,) * count
+            elif not values and name in _OFF:
+                values = (_OFF[name],) * count
             require(len(values) == count, f"zones: {len(values)} numbers of {name} for {count} zones")
             object.__setattr__(self, name, tuple(float(value) for value in values))
         require(len(self.baseline_m) == 3, f"zones: baseline of {len(self.baseline_m)} numbers, expected 3")
@@ -101,6 +125,11 @@ class ZoneArray:
     def count(self) -> int:
         return len(self.centre_x)
 
+    @property
+    def saturation(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Trials, recovery and compression of the zones, (Z,) each."""
+        return np.asarray(self.trials), np.asarray(self.recovery), np.asarray(self.compression)
+
     def without(self, effect: str) -> ZoneArray:
         """Return the array with one of EFFECTS off; delays and clocks become their mean over the zones."""
         even = self.count
@@ -110,10 +139,13 @@ class ZoneArray:
             "illumination": {"curvature_x": 0.0, "curvature_y": 0.0},
             "clock": {"clock": (float(np.mean(self.clock)),) * even},
             "delay": {"delay_s": (float(np.mean(self.delay_s)),) * even},
+            "skew": {"skew_s": (0.0,) * even},
+            "leak": {"leak": (0.0,) * even},
+            "echo": {"echo_m2": (0.0,) * even},
             "crosstalk": {"crosstalk": 0.0},
             "saturation": {"trials": (math.inf,) * even},
-            "recovery": {"recovery": 0.0},
-            "compression": {"compression": 0.0},
+            "recovery": {"recovery": (0.0,) * even},
+            "compression": {"compression": (0.0,) * even},
             "background": {"background": (0.0,) * even},
         }
         require(effect in off, f"effect {effect!r} is unknown, expected one of {', '.join(EFFECTS)}")
@@ -193,6 +225,29 @@ def _ramp(at: np.ndarray, blur: np.ndarray) -> np.ndarray:
     return np.where(np.abs(at) < half, (at + half) ** 2 / (4 * half), np.maximum(at, 0.0))
 
 
+def with_skew(returns: ZoneReturns, skew_m: float) -> ZoneReturns:
+    """Split returns into halves, half of `skew_m` [m of path] before and behind."""
+    if not skew_m:
+        return returns
+    near_m, far_m, light = returns
+    half = skew_m / 2
+    return ZoneReturns(
+        np.concatenate((near_m - half, near_m + half)),
+        np.concatenate((far_m - half, far_m + half)),
+        np.tile(light / 2, 2),
+    )
+
+
+def stray_returns(returns: ZoneReturns, leak: float, echo_m2: float) -> ZoneReturns:
+    """Return the module's own reflection, at a path of 0, and the echo at twice the paths, as one interval each."""
+    near_m, far_m, light = returns
+    if not len(light) or not (leak or echo_m2):
+        return ZoneReturns(*np.zeros((3, 0)))
+    echo = echo_m2 * float((light / ((near_m + far_m) / 4) ** 2).sum())
+    near, far = 2 * near_m.min(), 2 * far_m.max()
+    return ZoneReturns(np.array([0.0, near]), np.array([0.0, far]), np.array([leak, echo]))
+
+
 def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0) -> np.ndarray:
     """Return expected primary signal detections (Z, T) float64: pulses integrated over each zone's own bins, crosstalk
     added.
@@ -202,10 +257,13 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
     """
     own = np.zeros((zones.count, sensor.bins))
     edges = torch.arange(sensor.bins + 1, dtype=torch.float64) * sensor.bin_width_s
-    for zone, (near_m, far_m, light) in enumerate(returns):
-        if not len(light):
+    for zone, seen in enumerate(returns):
+        if not len(seen.light):
             continue
         scale = 1 / (SPEED_OF_LIGHT_M_PER_S * zones.clock[zone])
+        every = zip(seen, stray_returns(seen, zones.leak[zone], zones.echo_m2[zone]), strict=True)
+        all_light = ZoneReturns(*(np.concatenate(pair) for pair in every))
+        near_m, far_m, light = with_skew(all_light, zones.skew_s[zone] / scale)
         start = torch.from_numpy(near_m * scale + zones.delay_s[zone] + drift_s)[:, None]
         length = torch.from_numpy((far_m - near_m) * scale)[:, None]
         arrived = interval_cdf(sensor.response, edges - start, length.expand(-1, len(edges)))
@@ -224,7 +282,7 @@ def expected_zone_counts(
 ) -> np.ndarray:
     """Return expected counts (Z, T) float64 of one exposure, after saturation."""
     flux = zone_flux(returns, sensor, zones, drift_s)
-    return saturated(flux, np.asarray(zones.trials), zones.recovery, zones.compression)
+    return saturated(flux, *zones.saturation)
 
 
 def draw_zone_counts(
@@ -233,4 +291,5 @@ def draw_zone_counts(
     """Draw counts (Z, T) int64 of one exposure; the same seed gives the same counts."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.ZONES, 0, 0)))
     flux = zone_flux(returns, sensor, zones, drift_s)
-    return draw_saturated(flux, np.asarray(zones.trials), zones.recovery, rng, zones.compression)
+    trials, recovery, compression = zones.saturation
+    return draw_saturated(flux, trials, recovery, rng, compression)

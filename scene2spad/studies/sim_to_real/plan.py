@@ -1,0 +1,40 @@
+"""What `study sim-to-real` runs. Plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spad.zones.sensor import EFFECTS
+
+SENSOR = "tmf8820"
+# What is calibrated. Crosstalk is not: captures of a plane alone give it a share of 0.
+FITTED = ("delay", "skew", "clock", "bin_width", "background", "leak", "echo", "trials", "recovery", "compression")
+# Effects of the light's geometry: the plane is rendered again without them.
+GEOMETRY = ("parallax", "aperture", "illumination")
+FULL_BIN = 10_000  # counts from which on a bin's misfit is the model's, not the photons'
+MODEL_ERROR = 0.004  # relative, of a bin: what a calibration and a pose weigh with
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is run.
+
+    nearest_m   captures nearer than this are predicted, but not calibrated on
+    every       of the captures from there on, each that many-th is calibrated on; the others are held out
+    ablated     effects that are switched off in turn
+    pose_every  of the captures held out, each that many-th gives a pose
+    shown_m     distances of the first figure
+    """
+
+    nearest_m: float = 0.1
+    every: int = 2
+    ablated: tuple[str, ...] = EFFECTS
+    pose_every: int = 3
+    shown_m: tuple[float, ...] = (0.105, 0.2, 0.3825)
+
+
+SMOKE = Plan(nearest_m=0.3, every=4, ablated=("background",), pose_every=12, shown_m=(0.31, 0.35, 0.39))
+
+
+def plan_of(preset: str) -> Plan:
+    return SMOKE if preset == "smoke" else Plan()

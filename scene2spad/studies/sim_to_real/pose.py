@@ -1,0 +1,95 @@
+"""Distance and tilt of a plane from one capture of all zones, by the renderer's derivative, with Fisher covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from scene2spad.datasets.zone_captures import render_plane
+from spad.sensor.model import Sensor
+from spad.zones.fit import covariance_of
+from spad.zones.sensor import ZoneArray, ZoneReturns, expected_zone_counts, zone_returns
+
+# Rigid motions that the derivative is taken over: metres, and radians about the sensor's y and x axes.
+STEPS = (5e-4, 0.01, 0.01)
+REACH = (0.02, 0.2, 0.2)  # the most that one step of the fit moves
+ITERATIONS = 5
+
+
+class Pose(NamedTuple):
+    """Distance [m], tilts about y and x [rad], reflectance relative to the calibration's plane; covariance (4, 4)."""
+
+    values: np.ndarray
+    covariance: np.ndarray
+
+
+def render_light(values: np.ndarray, zones: ZoneArray) -> list[ZoneReturns]:
+    """Render a plane of that pose: the light of each zone at a reflectance of 1."""
+    distance, about_y, about_x, _ = values
+    return zone_returns(render_plane(float(distance), zones, (float(about_y), float(about_x))), zones)
+
+
+def sensed(
+    light: list[ZoneReturns], reflectance: float, sensor: Sensor, zones: ZoneArray, drift_s: float
+) -> np.ndarray:
+    """Expected counts (Z, T) of rendered light."""
+    lit = [seen._replace(light=seen.light * reflectance) for seen in light]
+    return expected_zone_counts(lit, sensor, zones, drift_s)
+
+
+def render_counts(values: np.ndarray, sensor: Sensor, zones: ZoneArray, drift_s: float) -> np.ndarray:
+    """Expected counts (Z, T) of a plane of that pose and reflectance: rendered, then sensed."""
+    return sensed(render_light(values, zones), values[3], sensor, zones, drift_s)
+
+
+def counts_and_derivative(
+    values: np.ndarray, sensor: Sensor, zones: ZoneArray, drift_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Expected counts (Z, T), and their central differences over small rigid motions and reflectance, (Z, T, 4)."""
+    light, columns = render_light(values, zones), []
+    for number, step in enumerate(STEPS):
+        move = np.eye(4)[number] * step
+        up, down = (render_counts(values + sign * move, sensor, zones, drift_s) for sign in (1, -1))
+        columns.append((up - down) / (2 * step))
+    bright, dim = (sensed(light, values[3] * factor, sensor, zones, drift_s) for factor in (1.01, 0.99))
+    columns.append((bright - dim) / (0.02 * values[3]))
+    return sensed(light, values[3], sensor, zones, drift_s), np.stack(columns, axis=-1)
+
+
+def find_pose(
+    counts: np.ndarray,
+    sensor: Sensor,
+    zones: ZoneArray,
+    start_m: float,
+    *,
+    drift_s: float = 0.0,
+    model_error: float = 0.01,
+) -> Pose:
+    """Maximise the likelihood of counts (Z, T) by Fisher scoring, from a plane that faces the sensor at `start_m`.
+
+    A bin of n counts has the variance n + (model_error n)^2. The covariance is the inverse Fisher information.
+    """
+    values = np.array([start_m, 0.0, 0.0, 1.0])
+    reach = np.array([*REACH, 0.5])
+    for _ in range(ITERATIONS):
+        expected, derivative = counts_and_derivative(values, sensor, zones, drift_s)
+        slope = derivative.reshape(-1, 4)
+        weight = 1 / (np.maximum(expected, 1e-3) + (model_error * expected) ** 2).ravel()
+        information = slope.T @ (slope * weight[:, None])
+        covariance = covariance_of(information)
+        step = covariance @ (slope.T @ (weight * (counts - expected).ravel()))
+        step *= min(1.0, float((reach / np.maximum(np.abs(step), 1e-12)).min()))
+        values = values + step
+        values[0], values[3] = max(values[0], 5e-3), max(values[3], 1e-3)
+        if (np.abs(step) < 0.05 * np.sqrt(np.diag(covariance))).all():
+            break
+    return Pose(values, covariance)
+
+
+def nearest_start(counts: np.ndarray, known_m: Sequence[float], known: np.ndarray) -> float:
+    """Return the distance, among expected counts (M, Z, T) of known ones, whose histograms look most like `counts`."""
+    flat = known.reshape(len(known), -1)
+    likeness = flat @ counts.ravel() / np.linalg.norm(flat, axis=1)
+    return float(known_m[int(likeness.argmax())])

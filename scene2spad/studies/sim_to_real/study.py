@@ -1,0 +1,256 @@
+"""`study sim-to-real`: calibrate a chip on half of its captures of a plane, and predict the others with the renderer.
+
+Then every effect of the sensor is switched off in turn and the rest calibrated again: what likelihood and which error
+it buys. Last, distance and tilt of the plane are found from single captures, and compared with the arm's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from render.pipeline import Progress
+from scene2spad.datasets.zone_captures import (
+    PlaneCaptures,
+    read_plane_captures,
+    shipped_captures,
+    within,
+    zone_captures,
+)
+from scene2spad.options.experiments import Study
+from scene2spad.studies.sim_to_real import figures
+from scene2spad.studies.sim_to_real.measures import Comparison, compare, summary
+from scene2spad.studies.sim_to_real.plan import FITTED, GEOMETRY, MODEL_ERROR, SENSOR, Plan, plan_of
+from scene2spad.studies.sim_to_real.pose import find_pose, nearest_start
+from scenes.files import finite, whole_file, write_csv
+from spad.sensor.files import SensorFile, load_sensor, write_sensor
+from spad.zones.calibration import Calibration, calibrate, calibrated_file
+from spad.zones.expected_counts import ZoneCapture
+from spad.zones.histogram import zone_grid
+from spad.zones.sensor import expected_zone_counts
+
+SPANS = ((0.0, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.4), (0.1, 0.4))  # metres: what is told apart
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Captures and what the calibrated sensor makes of the rendered plane.
+
+    lit       light of each capture, rendered, beside its counts
+    used      indices of the captures calibrated on; `held` (N,) bool: the others
+    expected  counts (N, Z, T) by the renderer and the calibrated sensor; `errors` against the measured ones
+    """
+
+    plan: Plan
+    start: SensorFile
+    captures: PlaneCaptures
+    lit: list[ZoneCapture]
+    used: np.ndarray
+    fitted: Calibration
+    expected: np.ndarray
+    errors: Comparison
+
+    @property
+    def held(self) -> np.ndarray:
+        held = np.ones(len(self.lit), dtype=bool)
+        held[self.used] = False
+        return held
+
+    @property
+    def judged(self) -> np.ndarray:
+        """Indices of the captures held out, from the nearest distance calibrated on."""
+        return np.flatnonzero(self.held & (self.captures.distance_m >= self.plan.nearest_m))
+
+
+def run(command: Study, progress: Progress) -> dict:
+    """Calibrate, predict, ablate, find poses; tables, figures, a sensor file and JSON in `command.out`."""
+    command.out.mkdir(parents=True, exist_ok=True)
+    of = predict(plan_of(command.preset), command.seed, progress)
+    spans = span_rows(of)
+    ablation = ablated(of, progress)
+    progress("poses", 0.8)
+    # a pose weighs with the model's error as the captures calibrated on show it
+    model_error = summary(of.errors, of.used)["model_error"]
+    poses = pose_rows(of, model_error)
+    numbers: dict[str, Any] = {
+        "preset": command.preset,
+        "captures": {"calibrated_on": len(of.used), "held_out": int(of.held.sum())},
+        "prediction": spans,
+        "chip": chip_range(within(of.captures, of.plan.nearest_m)),
+        "ablation": ablation,
+        "pose": {**pose_summary(poses), "model_error": model_error},
+        "standard_errors": {name: np.asarray(error).tolist() for name, error in of.fitted.errors.items()},
+    }
+    made = [
+        write_csv(_flat(ablation), command.out / "sim-to-real-ablation.csv"),
+        write_csv(poses, command.out / "sim-to-real-pose.csv"),
+        write_csv(_flat(spans), command.out / "sim-to-real.csv"),
+    ]
+    path = command.out / "sim-to-real.json"
+    with whole_file(path) as beside:
+        beside.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
+    shown = numbers if command.json else in_words(numbers)
+    files = {
+        "figures": [str(one) for one in draw_all(of, poses, command.out)],
+        "csv": [str(one) for one in made],
+        "sensor": str(write_calibrated(of, command.out)),
+    }
+    return {**shown, **files, "numbers": str(path)}
+
+
+def predict(plan: Plan, seed: int, progress: Progress) -> Prediction:
+    """Render the plane at every distance, calibrate on some captures, and predict all."""
+    start, captures = load_sensor(SENSOR), read_plane_captures(shipped_captures())
+    used = np.flatnonzero(captures.distance_m >= plan.nearest_m)[:: plan.every]
+    progress("render the plane", 0.0)
+    lit = zone_captures(captures, start.sensor, start.zones)
+    progress("calibrate", 0.05)
+    fitted = calibrate([lit[at] for at in used], start.sensor, start.zones, free=FITTED, model_error=MODEL_ERROR)
+    expected = expected_of(lit, fitted)
+    errors = compare(captures.counts, expected, fitted.sensor.bin_width_s, seed)
+    return Prediction(plan, start, captures, lit, used, fitted, expected, errors)
+
+
+def write_calibrated(of: Prediction, out: Path) -> Path:
+    """Write the calibrated sensor's file."""
+    nearest = of.captures.distance_m[of.used[0]]
+    how = f"calibrated from {len(of.used)} captures of {shipped_captures().name}, {nearest:g} m on"
+    name = f"{SENSOR}-calibrated"
+    return write_sensor(calibrated_file(of.start, of.fitted, name, how), out / f"{name}.toml")
+
+
+def span_rows(of: Prediction) -> list[dict[str, Any]]:
+    """Errors of the captures held out, a row a span of distances that has any."""
+    rows = []
+    for low, high in SPANS:
+        inside = of.held & (of.captures.distance_m >= low) & (of.captures.distance_m < high)
+        if inside.any():
+            rows.append({"from_m": low, "to_m": high, **summary(of.errors, inside)})
+    return rows
+
+
+def expected_of(captures: Sequence[ZoneCapture], fitted: Calibration) -> np.ndarray:
+    """Expected counts (N, Z, T) of captures on the calibrated sensor."""
+    return np.array([expected_zone_counts(c.returns, fitted.sensor, fitted.zones, c.drift_s) for c in captures])
+
+
+def ablated(of: Prediction, progress: Progress) -> list[dict[str, Any]]:
+    """A row for the whole model, then one for each effect that is off while the rest is calibrated again."""
+    rows = [{"off": "none", **summary(of.errors, of.judged)}]
+    for number, effect in enumerate(of.plan.ablated):
+        off = of.start.zones.without(effect)
+        parameter = {"saturation": "trials"}.get(effect, effect)
+        if effect in GEOMETRY and off != of.start.zones:
+            lit = zone_captures(of.captures, of.start.sensor, off)
+        elif parameter in FITTED:
+            lit = of.lit
+        else:
+            continue  # off in the preset
+        progress(f"without {effect}", 0.3 + 0.5 * number / len(of.plan.ablated))
+        free = tuple(name for name in FITTED if name not in _gone_with(parameter))
+        options = {"free": free, "model_error": MODEL_ERROR, "start": of.fitted}
+        without = calibrate([lit[at] for at in of.used], of.start.sensor, off, **options)
+        expected = expected_of([lit[at] for at in of.judged], without)
+        errors = compare(of.captures.counts[of.judged], expected, without.sensor.bin_width_s)
+        rows.append({"off": effect, **summary(errors, np.arange(len(expected)))})
+    return rows
+
+
+def _gone_with(parameter: str) -> tuple[str, ...]:
+    """What goes with a parameter: nothing recovers or is compressed where nothing saturates."""
+    return ("trials", "recovery", "compression") if parameter == "trials" else (parameter,)
+
+
+def chip_range(captures: PlaneCaptures) -> dict[str, list[float]]:
+    """The chip's own answer less the arm's distance, by zone [mm]."""
+    error = 1e3 * (captures.chip_m - captures.distance_m[:, None])
+    return {"bias_mm": np.nanmean(error, axis=0).tolist(), "spread_mm": np.nanstd(error, axis=0).tolist()}
+
+
+def pose_rows(of: Prediction, model_error: float) -> list[dict[str, float]]:
+    """Errors of distance and tilt of single captures, and their standard errors. The arm's plane faces the sensor."""
+    captures, fitted, used = of.captures, of.fitted, of.used
+    rows = []
+    for at in of.judged[:: of.plan.pose_every]:
+        counts = captures.counts[at].astype(np.float64)
+        drift_s = float(captures.drift_bins[at]) * fitted.sensor.bin_width_s
+        start_m = nearest_start(counts, captures.distance_m[used], of.expected[used])
+        found = find_pose(counts, fitted.sensor, fitted.zones, start_m, drift_s=drift_s, model_error=model_error)
+        sigma, truth = np.sqrt(np.diag(found.covariance)), np.array([captures.distance_m[at], 0.0, 0.0, 1.0])
+        row: dict[str, float] = {"distance_m": float(captures.distance_m[at])}
+        units = {"distance_mm": 1e3, "about_y_deg": 180 / np.pi, "about_x_deg": 180 / np.pi, "reflectance": 1.0}
+        for number, (name, unit) in enumerate(units.items()):
+            row[f"{name}_error"] = float(found.values[number] - truth[number]) * unit
+            row[f"{name}_sigma"] = float(sigma[number]) * unit
+        rows.append(row)
+    return rows
+
+
+def pose_summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """Median absolute error, its mean, and the share of 95 % intervals that hold the arm's pose, of each quantity."""
+    found: dict[str, Any] = {"captures": len(rows)}
+    for name in ("distance_mm", "about_y_deg", "about_x_deg"):
+        error, sigma = (np.array([row[f"{name}_{what}"] for row in rows]) for what in ("error", "sigma"))
+        found[name] = {
+            "median_error": float(np.median(np.abs(error))),
+            "worst_error": float(np.abs(error).max()),
+            "bias": float(error.mean()),
+            "spread": float(error.std()),
+            "median_sigma": float(np.median(sigma)),
+            "covered": float((np.abs(error) < 1.96 * sigma).mean()),
+        }
+    return found
+
+
+def draw_all(of: Prediction, poses: Sequence[dict[str, float]], out: Path) -> list[Path]:
+    """Histograms of the zones at three distances, errors against distance, and poses."""
+    _, columns, order = zone_grid(of.fitted.zones)
+    distance_m, left_out = of.captures.distance_m, np.flatnonzero(of.held)
+    shown = [left_out[np.abs(distance_m[left_out] - metres).argmin()] for metres in of.plan.shown_m]
+    pairs = (of.captures.counts[shown], of.expected[shown])
+    return [
+        figures.draw_histograms(distance_m[shown], *pairs, order, columns, out / "sim-to-real-histograms.png"),
+        figures.draw_errors(distance_m, of.held, of.errors, out / "sim-to-real-errors.png"),
+        figures.draw_poses(poses, out / "sim-to-real-pose.png"),
+    ]
+
+
+def _flat(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows for a table: of a list over zones its median and its worst."""
+    found = []
+    for row in rows:
+        line: dict[str, Any] = {}
+        for key, value in row.items():
+            if isinstance(value, list):
+                line |= {f"{key} median zone": float(np.median(value)), f"{key} worst zone": max(value, key=abs)}
+            else:
+                line[key] = value
+        found.append(line)
+    return found
+
+
+def in_words(numbers: dict[str, Any]) -> dict[str, Any]:
+    """What the terminal shows."""
+    spans = [
+        f"{s['from_m']:g} to {s['to_m']:g} m, {s['captures']} captures: shape nRMSE "
+        f"{max(s['shape_median']):.3f} in the worst zone, amplitude within {max(s['amplitude_worst']):.1%}, range bias "
+        f"{max(map(abs, s['range_bias_mm'])):.2f} mm, {s['covered']:.0%} of bins in their interval"
+        for s in numbers["prediction"]
+        if s["from_m"] >= 0.05
+    ]
+    without = [
+        f"without {row['off']}: deviance {row['deviance']:.1f} a bin, shape {max(row['shape_median']):.3f}, amplitude "
+        f"{max(row['amplitude_worst']):.1%}, range bias {max(map(abs, row['range_bias_mm'])):.2f} mm"
+        for row in numbers["ablation"]
+    ]
+    pose = [
+        f"{name}: median error {numbers['pose'][name]['median_error']:.2f}, {numbers['pose'][name]['covered']:.0%} of "
+        "intervals hold the arm's"
+        for name in ("distance_mm", "about_y_deg", "about_x_deg")
+    ]
+    return {"prediction": spans, "ablation": without, "pose": pose}

@@ -1,0 +1,185 @@
+"""Expected counts of a multi-zone sensor by the numbers that a calibration fits, and their derivatives.
+
+The pulse is free: steps of a sixth of a bin over its rise and peak, of half a bin in its tail. The histograms are
+linear in it, so that a step of the fit costs one product of matrices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from spad.detection.saturation import saturated, saturated_jacobian
+from spad.zones.sensor import ZoneReturns, stray_returns, with_skew
+
+FINE = 6  # steps of the pulse in a bin
+TAIL = 2  # the same in the tail
+_STEPS = {
+    "delay": 1e-5,
+    "skew": 1e-4,
+    "clock": 1e-6,
+    "bin_width": 1e-6,
+    "trials": 1e-5,
+    "recovery": 1e-5,
+    "compression": 1e-5,
+    "leak": 1e-3,
+    "echo": 1e-5,
+}
+LIGHT = ("delay", "skew", "clock", "bin_width", "leak", "echo")
+SATURATION = ("trials", "recovery", "compression")
+
+
+class ZoneCapture(NamedTuple):
+    """Counts (Z, T) of one exposure, the light that made them, and how late the laser was [s]."""
+
+    returns: list[ZoneReturns]
+    counts: np.ndarray
+    drift_s: float = 0.0
+
+
+class PulseBasis(NamedTuple):
+    """The pulse's steps: `matrix` (fine steps, K) spreads K numbers; `first` fine step, counted from a path of 0."""
+
+    first: int
+    matrix: np.ndarray
+
+    @classmethod
+    def made(cls, first_bin: int, fine_bins: int, tail_bins: int) -> PulseBasis:
+        fine, tail, step = fine_bins * FINE, tail_bins * TAIL, FINE // TAIL
+        matrix = np.zeros((fine + tail * step, fine + tail))
+        matrix[np.arange(fine), np.arange(fine)] = 1
+        for number in range(tail):
+            matrix[fine + number * step : fine + (number + 1) * step, fine + number] = 1 / step
+        return cls(first_bin * FINE, matrix)
+
+
+# By name: pulse (K,); bin_width and crosstalk (1,); all others (Z,), delay and skew in bins.
+Values = dict[str, np.ndarray]
+
+
+class ZoneModel:
+    """Expected counts and their derivatives for the fit's parameters; delays count in bins.
+
+    Zone `reference` holds the gauge: its gain is 1 (the pulse carries the scale), its delay 0 (the pulse carries it),
+    and its clock 1 (the bin width carries it). Zone `narrowest` has no skew: the pulse carries it.
+    """
+
+    def __init__(self, basis: PulseBasis, bins: int, zones: int, reference: int, narrowest: int | None = None) -> None:
+        self.basis, self.bins, self.zones, self.reference = basis, bins, zones, reference
+        self.narrowest = reference if narrowest is None else narrowest
+
+    def parameter_names(self, values: Values, free: Sequence[str]) -> list[tuple[str, int]]:
+        """List the numbers that a fit changes: the gauge's are left out."""
+        fixed = {(name, self.reference) for name in ("gain", "delay", "clock")} | {("skew", self.narrowest)}
+        return [(name, at) for name in free for at in range(len(values[name])) if (name, at) not in fixed]
+
+    def own(self, values: Values, capture: ZoneCapture, zone: int) -> np.ndarray:
+        """Return expected signal (T,) of one zone without crosstalk."""
+        first, mass = self._mass(values, capture, zone)
+        # a pulse step's counts in a bin are the sum of FINE neighbouring masses
+        full = np.convolve(mass, self.basis.matrix @ values["pulse"])
+        at = np.arange(self.bins) * FINE + FINE - 1 - first - self.basis.first
+        inside = (at >= 0) & (at < len(full))
+        return np.where(inside, full[np.clip(at, 0, len(full) - 1)], 0.0) * values["gain"][zone]
+
+    def responses(self, values: Values, capture: ZoneCapture, zone: int) -> np.ndarray:
+        """Return derivative of `own` with respect to the pulse, (T, K)."""
+        first, mass = self._mass(values, capture, zone)
+        steps = np.arange(len(self.basis.matrix))
+        at = np.arange(self.bins)[:, None] * FINE + FINE - 1 - (steps + self.basis.first)[None, :] - first
+        inside = (at >= 0) & (at < len(mass))
+        return np.where(inside, mass[np.clip(at, 0, len(mass) - 1)], 0.0) @ (self.basis.matrix * values["gain"][zone])
+
+    def _mass(self, values: Values, capture: ZoneCapture, zone: int) -> tuple[int, np.ndarray]:
+        """Return the light of one zone that a bin would catch, by its start in fine steps: the first step, and the masses.
+
+        Exact for returns that are uniform over their paths and a pulse that is uniform over a step.
+        """
+        step_s = values["bin_width"][0] / FINE
+        scale = 1 / (SPEED_OF_LIGHT_M_PER_S * values["clock"][zone] * step_s)
+        late = values["delay"][zone] * FINE + capture.drift_s / step_s
+        skew_m = values["skew"][zone] * FINE / scale
+        stray = stray_returns(capture.returns[zone], values["leak"][zone], values["echo"][zone])
+        parts = [_masses(with_skew(capture.returns[zone], skew_m), scale, late)]
+        for at in range(len(stray.light)):
+            alone = ZoneReturns(*(column[at : at + 1] for column in stray))
+            parts.append(_masses(with_skew(alone, skew_m), scale, late))
+        first = min(start for start, _ in parts)
+        mass = np.zeros(max(start + len(part) for start, part in parts) - first)
+        for start, part in parts:
+            mass[start - first : start - first + len(part)] += part
+        return first, mass
+
+    def flux(self, values: Values, capture: ZoneCapture) -> np.ndarray:
+        own = np.array([self.own(values, capture, zone) for zone in range(self.zones)])
+        return own + values["crosstalk"][0] * own.sum(axis=0) + values["background"][:, None]
+
+    def expected(self, values: Values, capture: ZoneCapture) -> np.ndarray:
+        """Return expected counts (Z, T)."""
+        return self._saturated(values, self.flux(values, capture))
+
+    def _saturated(self, values: Values, flux: np.ndarray) -> np.ndarray:
+        return saturated(flux, values["trials"], values["recovery"], values["compression"])
+
+    def jacobian(
+        self, values: Values, capture: ZoneCapture, names: Sequence[tuple[str, int]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return expected counts (Z, T) and their derivatives (Z, T, P) with respect to the named numbers."""
+        own = np.zeros((self.zones, self.bins))
+        slope = np.zeros((self.zones, self.bins, len(names)))
+        pulse = [column for column, (name, _) in enumerate(names) if name == "pulse"]
+        for zone in range(self.zones):
+            response = self.responses(values, capture, zone)
+            own[zone] = response @ values["pulse"]
+            slope[zone][:, pulse] = response
+        for column, (name, at) in enumerate(names):
+            if name == "gain":
+                slope[at, :, column] = own[at] / values["gain"][at]
+            elif name in LIGHT:
+                for zone in range(self.zones) if name == "bin_width" else (at,):
+                    slope[zone, :, column] = self._difference(values, capture, name, at, zone)
+        crosstalk = values["crosstalk"][0]
+        slope += crosstalk * slope.sum(axis=0)
+        flux = own + crosstalk * own.sum(axis=0) + values["background"][:, None]
+        for column, (name, at) in enumerate(names):
+            if name == "background":
+                slope[at, :, column] = 1
+            elif name == "crosstalk":
+                slope[:, :, column] = own.sum(axis=0)
+        slope = saturated_jacobian(flux, slope, values["trials"], values["recovery"], values["compression"])
+        for column, (name, at) in enumerate(names):
+            if name in SATURATION:
+                up, down, width = _beside(values, name, at)
+                slope[:, :, column] = (self._saturated(up, flux) - self._saturated(down, flux)) / width
+        return self._saturated(values, flux), slope
+
+    def _difference(self, values: Values, capture: ZoneCapture, name: str, at: int, zone: int) -> np.ndarray:
+        up, down, width = _beside(values, name, at)
+        return (self.own(up, capture, zone) - self.own(down, capture, zone)) / width
+
+
+def _masses(returns: ZoneReturns, scale: float, late: float) -> tuple[int, np.ndarray]:
+    """Return the light that a bin would catch by its start in fine steps: the first step, and masses; `scale` steps a metre."""
+    near_m, far_m, light = returns
+    near = near_m * scale + late
+    length = np.maximum((far_m - near_m) * scale, 1e-6)
+    first, last = math.floor(near.min()) - 1, math.ceil((near + length).max()) + 2
+    after = np.arange(first - 1, last + 2)[:, None] - near
+    area = (np.maximum(after, 0) ** 2 - np.maximum(after - length, 0) ** 2) @ (light / (2 * length))
+    return first, np.convolve(np.diff(area, 2), np.ones(FINE))
+
+
+def _beside(values: Values, name: str, at: int) -> tuple[Values, Values, float]:
+    """Return values a little above and below in one number, and the distance between them."""
+    size = abs(values[name][at])
+    step = _STEPS[name] * (max(size, 1.0) if name != "bin_width" else size)
+    pair = []
+    for sign in (1, -1):
+        moved = values[name].copy()
+        moved[at] += sign * step
+        pair.append({**values, name: moved})
+    return pair[0], pair[1], 2 * step

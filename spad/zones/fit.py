@@ -1,0 +1,126 @@
+"""Fit the numbers of a multi-zone sensor to counts: Poisson maximum likelihood by Fisher scoring."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from spad.zones.expected_counts import Values, ZoneCapture, ZoneModel
+
+_RIDGE = 1e-11
+_HALVINGS = 8
+_TOLERANCE = 1e-5
+_ACTIVE_SETS = 12
+# The most that one step may change of what moves the light in time [bins], and relatively of clocks.
+_REACH = {"delay": 0.5, "skew": 0.5, "clock": 0.02}
+_REACH_RELATIVE = {"bin_width": 0.02, "trials": 1.0}
+_POSITIVE = ("pulse", "gain", "background", "trials")
+_NOT_NEGATIVE = ("recovery", "compression", "crosstalk", "skew", "leak", "echo")
+
+
+def fit(
+    model: ZoneModel,
+    captures: Sequence[ZoneCapture],
+    start: Values,
+    free: Sequence[str],
+    *,
+    steps: int = 12,
+    model_error: float = 0.0,
+    smoothing: float = 0.0,
+) -> tuple[Values, np.ndarray, list[tuple[str, int]]]:
+    """Maximise the Poisson likelihood; return the values, the Fisher information and what its rows are.
+
+    `model_error` widens the variance of a bin of n counts to n + (model_error n)^2: a model that is wrong by some per
+    cent must not be ruled by its fullest bins. `smoothing` is the weight of second differences of the pulse over its
+    start. Steps are halved until the weighted squares fall.
+    """
+    values = {name: np.asarray(value, dtype=np.float64).copy() for name, value in start.items()}
+    names = model.parameter_names(values, free)
+    pulse = [column for column, (name, _) in enumerate(names) if name == "pulse"]
+    over = np.maximum(start["pulse"], 1e-6 * start["pulse"].max())
+    rough = np.diff(np.eye(len(over)), 2, axis=0) / over * math.sqrt(smoothing)
+    information = np.zeros((len(names), len(names)))
+    for _ in range(steps):
+        information[:], gradient, weights = 0, np.zeros(len(names)), []
+        for capture in captures:
+            expected, slope = model.jacobian(values, capture, names)
+            weights.append(1 / (np.maximum(expected, 1e-3) + (model_error * expected) ** 2))
+            flat = slope.reshape(-1, len(names))
+            weighted = flat * weights[-1].reshape(-1, 1)
+            information += flat.T @ weighted
+            gradient += weighted.T @ (capture.counts - expected).ravel()
+        information[np.ix_(pulse, pulse)] += rough.T @ rough
+        gradient[pulse] -= rough.T @ (rough @ values["pulse"])
+        direction = _limited(_bounded_step(information, gradient, _room_below(values, names)), values, names)
+
+        def squares(at: Values, weights: list[np.ndarray] = weights) -> float:
+            total = float(((rough @ at["pulse"]) ** 2).sum())
+            pairs = zip(captures, weights, strict=True)
+            return total + sum(float((w * (c.counts - model.expected(at, c)) ** 2).sum()) for c, w in pairs)
+
+        now, moved = squares(values), values
+        for halving in range(_HALVINGS):
+            moved = _moved(values, names, direction * 0.5**halving)
+            after = squares(moved)
+            if after < now:
+                break
+        else:
+            break
+        values = moved
+        if now - after < _TOLERANCE * now:
+            break
+    return values, information, names
+
+
+def _room_below(values: Values, names: Sequence[tuple[str, int]]) -> np.ndarray:
+    """Return how far each number may fall in a step, (P,): what is positive keeps a twentieth of its size."""
+    room = np.full(len(names), math.inf)
+    for column, (name, at) in enumerate(names):
+        if name in _POSITIVE:
+            room[column] = 0.95 * values[name][at]
+        elif name in _NOT_NEGATIVE:
+            room[column] = values[name][at]
+    return room
+
+
+def _bounded_step(information: np.ndarray, gradient: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """Solve information x step = gradient (P,), steps not below -room: those that would are held there in turn."""
+    step, held = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
+    for _ in range(_ACTIVE_SETS):
+        free = np.flatnonzero(~held)
+        pull = gradient[free] - information[np.ix_(free, np.flatnonzero(held))] @ step[held]
+        step[free] = covariance_of(information[np.ix_(free, free)]) @ pull
+        below = ~held & (step < -room)
+        if not below.any():
+            break
+        held |= below
+        step[held] = -room[held]
+    return np.maximum(step, -room)
+
+
+def _limited(step: np.ndarray, values: Values, names: Sequence[tuple[str, int]]) -> np.ndarray:
+    """Shorten a step so that no number moves farther than the linearisation can be trusted."""
+    longest = 1.0
+    for (name, at), change in zip(names, step, strict=True):
+        reach = _REACH.get(name, math.inf)
+        if name in _REACH_RELATIVE:
+            reach = _REACH_RELATIVE[name] * abs(values[name][at])
+        longest = min(longest, reach / max(abs(change), 1e-300))
+    return step * longest
+
+
+def _moved(values: Values, names: Sequence[tuple[str, int]], step: np.ndarray) -> Values:
+    """Add a step."""
+    moved = {name: value.copy() for name, value in values.items()}
+    for (name, at), change in zip(names, step, strict=True):
+        moved[name][at] += change
+    return moved
+
+
+def covariance_of(information: np.ndarray) -> np.ndarray:
+    """Invert a Fisher information (P, P) whose rows differ in scale by many orders of magnitude."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    system = information * scale[:, None] * scale + _RIDGE * np.eye(len(scale))
+    return scale[:, None] * scale * np.linalg.inv(system)
