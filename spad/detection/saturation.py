@@ -18,12 +18,12 @@ PerZone = float | np.ndarray  # one number, or one of each zone (Z,)
 
 
 def armed_fraction(flux: np.ndarray, trials: np.ndarray, recovery: PerZone) -> np.ndarray:
-    """Return the share of trials whose detector is armed when they begin: flux (Z, T) detections a histogram -> (Z,)."""
+    """Return the share of trials that begin armed: flux (Z, T) detections a histogram -> (Z,)."""
     return 1 / (1 - recovery * np.expm1(-flux.sum(axis=-1) / trials))
 
 
 def saturated(flux: np.ndarray, trials: np.ndarray, recovery: PerZone, compression: PerZone = 0.0) -> np.ndarray:
-    """Return the counts expected (Z, T) of a flux (Z, T) of primary detections a histogram; `trials` (Z,), infinite for none lost.
+    """Return counts (Z, T) expected of a flux (Z, T) of primary detections; `trials` (Z,), infinite for none lost.
 
     n_k = trials x armed x exp(-sum_(j<k) mu_j) (1 - exp(-mu_k)), mu the flux of one trial; then the compression.
     """
@@ -64,7 +64,7 @@ def draw_saturated(
 def saturated_jacobian(
     flux: np.ndarray, jacobian: np.ndarray, trials: np.ndarray, recovery: PerZone, compression: PerZone = 0.0
 ) -> np.ndarray:
-    """Apply the chain rule through `saturated`: flux (Z, T), its derivatives (Z, T, P) -> derivatives of the counts (Z, T, P)."""
+    """Apply the chain rule through `saturated` to a flux (Z, T) and its derivatives (Z, T, P)."""
     mu, dmu = flux / trials[:, None], jacobian / trials[:, None, None]
     after, dafter = np.cumsum(mu, axis=1), np.cumsum(dmu, axis=1)
     before, dbefore = after - mu, dafter - dmu

@@ -143,7 +143,7 @@ def calibrated_file(start: SensorFile, fitted: Calibration, name: str, how: str)
 
 
 def poisson_deviance(counts: np.ndarray, expected: np.ndarray) -> float:
-    """Return twice the log-likelihood ratio of counts to the saturated model, summed: about one a bin for a true model."""
+    """Return twice the log-likelihood ratio of counts to the saturated model: about one a bin for a true model."""
     ratio = np.where(counts > 0, counts, 1) / np.maximum(expected, 1e-9)
     return float(2 * (np.where(counts > 0, counts * np.log(ratio), 0) - counts + expected).sum())
 
@@ -154,7 +154,7 @@ def poisson_deviance(counts: np.ndarray, expected: np.ndarray) -> float:
 def starting_values(
     captures: Sequence[ZoneCapture], sensor: Sensor, zones: int, first_bin: int, basis: PulseBasis, reference: int
 ) -> Values:
-    """Find rough values from the captures themselves: pulse from the middle capture, gains and delays from its zones."""
+    """Find rough values from the captures: pulse from the middle capture, gains and delays from its zones."""
     middle = captures[len(captures) // 2]
     counts = middle.counts.astype(np.float64)
     background = np.maximum(np.median(counts, axis=1), 1.0)
@@ -247,7 +247,7 @@ def calibrate(
 
 
 def _basis_for(captures: Sequence[ZoneCapture], sensor: Sensor, reference: int) -> PulseBasis:
-    """Choose the steps of the pulse: fine from three bins before the return's peak to four after it, coarse for TAIL_BINS more."""
+    """Choose the pulse's steps: fine from 3 bins before the return's peak to 4 after it, coarse for TAIL_BINS more."""
     middle = captures[len(captures) // 2]
     near_m, far_m, light = middle.returns[reference]
     path = float((near_m + far_m) @ light / (2 * light.sum()))

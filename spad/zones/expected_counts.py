@@ -95,7 +95,7 @@ class ZoneModel:
         return np.where(inside, mass[np.clip(at, 0, len(mass) - 1)], 0.0) @ (self.basis.matrix * values["gain"][zone])
 
     def _mass(self, values: Values, capture: ZoneCapture, zone: int) -> tuple[int, np.ndarray]:
-        """Return the light of one zone that a bin would catch, by its start in fine steps: the first step, and the masses.
+        """Return the light of a zone that a bin would catch, by its start: the first fine step, and masses.
 
         Exact for returns that are uniform over their paths and a pulse that is uniform over a step.
         """
@@ -163,7 +163,7 @@ class ZoneModel:
 
 
 def _masses(returns: ZoneReturns, scale: float, late: float) -> tuple[int, np.ndarray]:
-    """Return the light that a bin would catch by its start in fine steps: the first step, and masses; `scale` steps a metre."""
+    """Return the light that a bin would catch, by its start: the first fine step, and masses; `scale` steps a metre."""
     near_m, far_m, light = returns
     near = near_m * scale + late
     length = np.maximum((far_m - near_m) * scale, 1e-6)

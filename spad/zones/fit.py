@@ -11,8 +11,9 @@ from spad.zones.expected_counts import Values, ZoneCapture, ZoneModel
 
 _RIDGE = 1e-11
 _HALVINGS = 8
-_TOLERANCE = 1e-5
+_TOLERANCE = 1e-6
 _ACTIVE_SETS = 12
+_FLAT = 1e-6  # squared relative precision below which nothing is known of a number
 # The most that one step may change of what moves the light in time [bins], and relatively of clocks.
 _REACH = {"delay": 0.5, "skew": 0.5, "clock": 0.02}
 _REACH_RELATIVE = {"bin_width": 0.02, "trials": 1.0}
@@ -26,7 +27,7 @@ def fit(
     start: Values,
     free: Sequence[str],
     *,
-    steps: int = 12,
+    steps: int = 40,
     model_error: float = 0.0,
     smoothing: float = 0.0,
 ) -> tuple[Values, np.ndarray, list[tuple[str, int]]]:
@@ -53,7 +54,7 @@ def fit(
             gradient += weighted.T @ (capture.counts - expected).ravel()
         information[np.ix_(pulse, pulse)] += rough.T @ rough
         gradient[pulse] -= rough.T @ (rough @ values["pulse"])
-        direction = _limited(_bounded_step(information, gradient, _room_below(values, names)), values, names)
+        direction = _bounded_step(information, gradient, *_step_bounds(values, names, np.diag(information)))
 
         def squares(at: Values, weights: list[np.ndarray] = weights) -> float:
             total = float(((rough @ at["pulse"]) ** 2).sum())
@@ -74,41 +75,39 @@ def fit(
     return values, information, names
 
 
-def _room_below(values: Values, names: Sequence[tuple[str, int]]) -> np.ndarray:
-    """Return how far each number may fall in a step, (P,): what is positive keeps a twentieth of its size."""
-    room = np.full(len(names), math.inf)
+def _step_bounds(
+    values: Values, names: Sequence[tuple[str, int]], curvature: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far each number may fall and rise in a step, (P,): within the linearisation, and what is positive stays so.
+
+    What the captures say nothing about, as a skew of 0 whose derivative is 0, stays where it is.
+    """
+    low, high = np.full(len(names), -math.inf), np.full(len(names), math.inf)
     for column, (name, at) in enumerate(names):
-        if name in _POSITIVE:
-            room[column] = 0.95 * values[name][at]
-        elif name in _NOT_NEGATIVE:
-            room[column] = values[name][at]
-    return room
+        value, size = values[name][at], float(np.abs(values[name]).max())
+        reach = _REACH.get(name, math.inf)
+        if name in _REACH_RELATIVE:
+            reach = _REACH_RELATIVE[name] * abs(value)
+        if curvature[column] * size * size < _FLAT:
+            reach = 0.0
+        room = 0.95 * value if name in _POSITIVE else value if name in _NOT_NEGATIVE else math.inf
+        low[column], high[column] = -min(reach, room), reach
+    return low, high
 
 
-def _bounded_step(information: np.ndarray, gradient: np.ndarray, room: np.ndarray) -> np.ndarray:
-    """Solve information x step = gradient (P,), steps not below -room: those that would are held there in turn."""
-    step, held = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
+def _bounded_step(information: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Solve information x step = gradient (P,) within bounds: what would leave them is held there, in turn."""
+    step, held = np.zeros(len(gradient)), low == high
     for _ in range(_ACTIVE_SETS):
         free = np.flatnonzero(~held)
         pull = gradient[free] - information[np.ix_(free, np.flatnonzero(held))] @ step[held]
         step[free] = covariance_of(information[np.ix_(free, free)]) @ pull
-        below = ~held & (step < -room)
-        if not below.any():
+        outside = ~held & ((step < low) | (step > high))
+        if not outside.any():
             break
-        held |= below
-        step[held] = -room[held]
-    return np.maximum(step, -room)
-
-
-def _limited(step: np.ndarray, values: Values, names: Sequence[tuple[str, int]]) -> np.ndarray:
-    """Shorten a step so that no number moves farther than the linearisation can be trusted."""
-    longest = 1.0
-    for (name, at), change in zip(names, step, strict=True):
-        reach = _REACH.get(name, math.inf)
-        if name in _REACH_RELATIVE:
-            reach = _REACH_RELATIVE[name] * abs(values[name][at])
-        longest = min(longest, reach / max(abs(change), 1e-300))
-    return step * longest
+        held |= outside
+        step[held] = np.clip(step, low, high)[held]
+    return np.clip(step, low, high)
 
 
 def _moved(values: Values, names: Sequence[tuple[str, int]], step: np.ndarray) -> Values:

@@ -127,7 +127,7 @@ class ZoneArray:
 
     @property
     def saturation(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Trials, recovery and compression of the zones, (Z,) each."""
+        """Return trials, recovery and compression of the zones, (Z,) each."""
         return np.asarray(self.trials), np.asarray(self.recovery), np.asarray(self.compression)
 
     def without(self, effect: str) -> ZoneArray:

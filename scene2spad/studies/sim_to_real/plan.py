@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from spad.zones.sensor import EFFECTS
 
 SENSOR = "tmf8820"
-# What is calibrated. Crosstalk is not: captures of a plane alone give it a share of 0.
+# What is calibrated. Crosstalk is not: a plane that fills all zones hardly tells it from the zones' own light.
 FITTED = ("delay", "skew", "clock", "bin_width", "background", "leak", "echo", "trials", "recovery", "compression")
 # Effects of the light's geometry: the plane is rendered again without them.
 GEOMETRY = ("parallax", "aperture", "illumination")
