@@ -12,7 +12,6 @@ FILES = {path: ast.parse(path.read_text(encoding="utf-8")) for one in PACKAGES f
 MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_MODULES = 400, 60, 7, 14
 # What is larger still, at its size: it may shrink, not grow, and nothing may join it.
 LARGER = {
-    "spad/zones/calibration.py": 419,
     "csph/training/loop.py train": 67,
     "scene2spad/cli": 25,
 }
@@ -24,7 +23,6 @@ MORE_PARAMETERS = {
     "scene2spad/datasets/test_sets.py rendered": 8,
     "scenes/io/relief.py relief": 9,
     "spad/formats/rgbd.py from_rgbd": 8,
-    "spad/zones/calibration.py fit": 8,
 }
 MAX_ANY = 220  # in signatures; Dr.Jit's types have names of their own (`render.backend.drjit_types`)
 # Private words for which the field has terms.

@@ -130,7 +130,7 @@ def as_sensor(model: ZoneModel, values: Values, sensor: Sensor, zones: ZoneArray
 
 def calibrated_file(start: SensorFile, fitted: Calibration, name: str, how: str) -> SensorFile:
     """Return the sensor file of a calibration; the sources of what was not fitted are kept."""
-    sources = {key: said for key, said in start.sources.items() if not key.startswith(("pulse.", "jitter."))}
+    sources = {key: source for key, source in start.sources.items() if not key.startswith(("pulse.", "jitter."))}
     keys = (
         "histogram.bin_width",
         "pulse.samples",

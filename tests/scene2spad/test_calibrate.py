@@ -21,9 +21,9 @@ def test_shipped_captures_are_a_tmf8820s():
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):
-    """A calibration of every seventh capture beyond 0.25 m, enough for a test."""
+    """A calibration of every sixth capture beyond 0.25 m, enough for a test."""
     folder = tmp_path_factory.mktemp("calibrated")
-    assert main(["calibrate", "--every", "7", "--nearest", "0.25", "--out", str(folder / "mine.toml")]) == 0
+    assert main(["calibrate", "--every", "6", "--nearest", "0.25", "--out", str(folder / "mine.toml")]) == 0
     return folder / "mine.toml"
 
 

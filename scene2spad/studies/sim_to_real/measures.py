@@ -92,7 +92,7 @@ def centroid(histograms: np.ndarray) -> np.ndarray:
 
 
 def summary(of: Comparison, which: np.ndarray) -> dict[str, list[float] | float]:
-    """Numbers by zone of some captures (a mask or indices), over them: what the bars are set on."""
+    """Summarise some captures (a mask or indices) by zone: the numbers that bars are set on."""
     chosen = Comparison(*(values[which] for values in of))
     return {
         "captures": len(chosen.shape),

@@ -34,20 +34,20 @@ def render_light(values: np.ndarray, zones: ZoneArray) -> list[ZoneReturns]:
 def sensed(
     light: list[ZoneReturns], reflectance: float, sensor: Sensor, zones: ZoneArray, drift_s: float
 ) -> np.ndarray:
-    """Expected counts (Z, T) of rendered light."""
+    """Return expected counts (Z, T) of rendered light."""
     lit = [seen._replace(light=seen.light * reflectance) for seen in light]
     return expected_zone_counts(lit, sensor, zones, drift_s)
 
 
 def render_counts(values: np.ndarray, sensor: Sensor, zones: ZoneArray, drift_s: float) -> np.ndarray:
-    """Expected counts (Z, T) of a plane of that pose and reflectance: rendered, then sensed."""
+    """Return expected counts (Z, T) of a plane of that pose and reflectance: rendered, then sensed."""
     return sensed(render_light(values, zones), values[3], sensor, zones, drift_s)
 
 
 def counts_and_derivative(
     values: np.ndarray, sensor: Sensor, zones: ZoneArray, drift_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Expected counts (Z, T), and their central differences over small rigid motions and reflectance, (Z, T, 4)."""
+    """Return expected counts (Z, T) and their differences over small motions and reflectance, (Z, T, 4)."""
     light, columns = render_light(values, zones), []
     for number, step in enumerate(STEPS):
         move = np.eye(4)[number] * step

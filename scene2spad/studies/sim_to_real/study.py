@@ -135,12 +135,12 @@ def span_rows(of: Prediction) -> list[dict[str, Any]]:
 
 
 def expected_of(captures: Sequence[ZoneCapture], fitted: Calibration) -> np.ndarray:
-    """Expected counts (N, Z, T) of captures on the calibrated sensor."""
+    """Return expected counts (N, Z, T) of captures on the calibrated sensor."""
     return np.array([expected_zone_counts(c.returns, fitted.sensor, fitted.zones, c.drift_s) for c in captures])
 
 
 def ablated(of: Prediction, progress: Progress) -> list[dict[str, Any]]:
-    """A row for the whole model, then one for each effect that is off while the rest is calibrated again."""
+    """Return a row for the whole model, then one for each effect that is off while the rest is calibrated again."""
     rows = [{"off": "none", **summary(of.errors, of.judged)}]
     for number, effect in enumerate(of.plan.ablated):
         off = of.start.zones.without(effect)
@@ -167,7 +167,7 @@ def _gone_with(parameter: str) -> tuple[str, ...]:
 
 
 def chip_range(captures: PlaneCaptures) -> dict[str, list[float]]:
-    """The chip's own answer less the arm's distance, by zone [mm]."""
+    """Return the chip's own answer less the arm's distance, by zone [mm]."""
     error = 1e3 * (captures.chip_m - captures.distance_m[:, None])
     return {"bias_mm": np.nanmean(error, axis=0).tolist(), "spread_mm": np.nanstd(error, axis=0).tolist()}
 
@@ -235,7 +235,7 @@ def _flat(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def in_words(numbers: dict[str, Any]) -> dict[str, Any]:
-    """What the terminal shows."""
+    """Return what the terminal shows."""
     spans = [
         f"{s['from_m']:g} to {s['to_m']:g} m, {s['captures']} captures: shape nRMSE "
         f"{max(s['shape_median']):.3f} in the worst zone, amplitude within {max(s['amplitude_worst']):.1%}, range bias "
