@@ -12,7 +12,7 @@ from scene2spad.options.common import Common, Progress
 from scenes.errors import InputError
 from scenes.library.catalog import load_scene
 
-NETWORK = "learned-256x4x4-128x-s0"
+NETWORK = "learned-256x4x4-128x-mixed-s0"
 METHODS = {
     "argmax, all bins": "argmax",
     "log-matched, all bins": "log-matched",
@@ -34,7 +34,7 @@ class Demo(Common):
     height: int = 96
     """Image height, pixels."""
     signal: float = 10.0
-    """Mean signal photons per pixel; the network was trained on 2 to 10."""
+    """Mean signal photons per pixel; the network was trained on 1 to 100."""
     background: float = 50.0
     """Mean background photons per pixel."""
     out: Path = Path("out/demo")
