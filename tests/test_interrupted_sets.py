@@ -155,8 +155,7 @@ def test_ten_killed_workers_of_a_cluster_change_no_byte(whole, warm, tmp_path, c
 
 @pytest.mark.slow
 def test_ten_killed_schedulers_are_one_line_each_and_the_run_goes_on(whole, warm, tmp_path, cluster):
-    run = set_of(warm, whole, tmp_path, "--scheduler", cluster.address, before=PATIENT)
-    moments = random.Random(4)
+    run, moments = set_of(warm, whole, tmp_path, "--scheduler", cluster.address), random.Random(4)
     for number in range(10):
         child = run.start()
         status = wait_for_views(run, child, max(1, 2 * number), moments.uniform(0, 0.3))
@@ -169,7 +168,7 @@ def test_ten_killed_schedulers_are_one_line_each_and_the_run_goes_on(whole, warm
         check_whole(run.folder / "out")
         cluster.close()
         cluster.start()
-    run.finish()
+    set_of(warm, whole, tmp_path, "--scheduler", cluster.address, before=PATIENT).finish()
 
 
 def test_an_address_where_nobody_listens_is_one_line(tmp_path, capsys, monkeypatch):
