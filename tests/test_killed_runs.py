@@ -40,7 +40,6 @@ RUNS = {
     "codes": Run(command("study", "codes", "--width", "12", "--height", "8", "--out", "out")),
     "render-error": Run(command(*RENDER_ERROR, "--out", "out/study", "--cache", "out/cache", before=SMALLER)),
     "transport": Run(command("study", "transport", *SMOKE, before=SMALLER)),
-    "power": Run(command("study", "power", "--scene", "plane", "--width", "8", "--height", "8", "--out", "out")),
 }
 RUNS |= {
     name: Run(command("study", name, *SMOKE), UNLIKE)

@@ -28,7 +28,7 @@ from csph.networks.model import load_model
 from csph.weights.torch_files import check_torch_file
 from render.transient import read_transient
 from render.transient.packs import read_pack
-from scenes.files import read_array, read_arrays
+from scenes.files import read_array
 from scenes.io.inputs import parse_json, read_whole_lines
 
 SERVER = """
@@ -192,8 +192,6 @@ def check_whole(folder: Path) -> None:
                 check_torch_file(path)
             case ".npy":
                 read_array(path)
-            case ".npz":
-                read_arrays(path)
             case ".json":
                 parse_json(path.read_bytes())
             case ".csv":
