@@ -253,7 +253,8 @@ def _lost_to_clamp(removed: RemovedLight | None, checked: np.ndarray) -> np.ndar
     if removed is None:
         return 0.0
     of_pixels = removed.squared_error()
-    return of_pixels[checked] + of_pixels.mean() - of_pixels[checked].mean()
+    whole, local = max(float(of_pixels.mean()), 0.0), np.maximum(of_pixels[checked], 0)
+    return local * (whole / local.mean()) if local.any() else np.full(len(checked), whole)
 
 
 def _filter_bias(filtered: list[np.ndarray], unfiltered: ProbePixels, place: np.ndarray) -> np.ndarray | float:
