@@ -18,7 +18,7 @@ codes = s2s.coding_tensor("fourier", 8)
 kept = s2s.encode_timestamps(torch.from_numpy(timestamps.astype(np.int64)), torch.from_numpy(offsets), codes)
 dense = s2s.encode(histogram.counts, codes).reshape(-1, codes.codes)
 print("numbers a pixel:", codes.codes, "instead of", codes.bins)
-print("largest difference to codes of the histogram:", float((kept - dense).abs().max()))
+print(f"largest difference to codes of the histogram: {float((kept - dense).abs().max()):.1e}")
 
 # %%
 depth_m = s2s.decode_depth(kept, codes, histogram.sensor).numpy().reshape(HEIGHT, WIDTH)
