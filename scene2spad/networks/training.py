@@ -209,8 +209,10 @@ def photon_levels(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     """Return networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
-    models = [load_model(checkpoint_of(path))[0] for path in command.checkpoints]
-    require(bool(models), "evaluate: give at least one checkpoint")
+    loaded = [load_model(checkpoint_of(path)) for path in command.checkpoints]
+    require(bool(loaded), "evaluate: give at least one checkpoint")
+    models = [model for model, _, _ in loaded]
+    designs = group_names([config for _, config, _ in loaded], [path.stem for path in command.checkpoints])
     require(command.int8 or command.int8_rule is None, "evaluate: --int8-rule goes with --int8")
     rule = command.int8_rule or "calibrated"
     in_8_bits = " int8" if rule == "calibrated" else f" int8 {rule}"
@@ -225,12 +227,12 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         views = Views(views.transients[: command.views], views.scenes[: command.views])
     overflows: list[int] = []
     methods: dict[str, Method] = {}
-    groups: dict[str, list[str]] = {}  # trainings of one design by different seeds are one group
-    for path, model in zip(command.checkpoints, models, strict=True):
+    groups: dict[str, list[str]] = {}
+    for path, model, group in zip(command.checkpoints, models, designs, strict=True):
         for suffix, int8 in (("", False), (in_8_bits, True))[: 1 + command.int8]:
             read = {"int8": int8, "int8_rule": rule, "decoder": command.decoder}
             methods[f"{path}{suffix}"] = network_method(model, **read, overflows=overflows)
-            groups.setdefault(f"{model.config.name}{suffix}", []).append(f"{path}{suffix}")
+            groups.setdefault(f"{group}{suffix}", []).append(f"{path}{suffix}")
     methods |= {name: baseline(name) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
     found = evaluate(
@@ -245,11 +247,23 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     )
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
-    first = f"{models[0].config.name}{in_8_bits if command.int8 else ''}"
+    first = f"{designs[0]}{in_8_bits if command.int8 else ''}"
     shown = results(found, groups, first, command.json)
     if command.levels:
         shown["by_level"] = by_level(found, groups, command.json)
     return {**shown, "overflows": sum(overflows), "csv": str(table)}
+
+
+def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[str]:
+    """Name the group of each checkpoint: trainings of one design and recipe by different seeds are one group.
+
+    Recipes differ in preset or training sets. Where one design was trained by several, a group is named after its first
+    checkpoint, too.
+    """
+    recipes = [(c.model.name, c.preset, str(c.data.get("training_sha256"))) for c in configs]
+    several = {name for name, _, _ in recipes if len({one for one in recipes if one[0] == name}) > 1}
+    firsts = dict(reversed([*zip(recipes, names, strict=True)]))
+    return [f"{one[0]} ({firsts[one]})" if one[0] in several else one[0] for one in recipes]
 
 
 def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[dict[str, Any]]:

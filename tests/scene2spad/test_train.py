@@ -16,12 +16,14 @@ import torch
 
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.networks.model import load_model
+from csph.training.config import ModelConfig, preset
 from csph.weights.cards import checkpoint_of
 from render.transient import write_transient
 from render.transient.packs import write_pack
 from scene2spad.bench import network as bench
 from scene2spad.cli import main
 from scene2spad.datasets.planes import FAR_M, Plane, random_planes
+from scene2spad.networks.training import group_names
 from spad.detection.detect import sense
 from spad.formats.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -130,6 +132,14 @@ def test_training_goes_on_from_a_model_by_name(capfd, packed, tmp_path):
     assert config.data["init"] == "learned-256x4x4-128x-s0"
     for name, value in tuned.state_dict().items():
         torch.testing.assert_close(value, shipped.state_dict()[name], rtol=0, atol=1e-9)
+
+
+def test_trainings_by_other_recipes_are_groups_of_their_own():
+    config = preset("smoke", ModelConfig(front="matched"))
+    again, other = replace(config, seed=1), replace(config, seed=2, data={"training_sha256": "0" * 64})
+    assert group_names([config, again], ["a", "b"]) == ["no compression, compact"] * 2
+    named = group_names([config, again, other], ["a", "b", "c"])
+    assert named == ["no compression, compact (a)"] * 2 + ["no compression, compact (c)"]
 
 
 def test_models_are_listed_with_their_limits(capfd):
