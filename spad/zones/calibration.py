@@ -32,6 +32,7 @@ OPTIONAL = (
     "crosstalk",
 )
 _OFF = {
+    "background": 0.0,
     "recovery": 0.0,
     "compression": 0.0,
     "crosstalk": 0.0,
