@@ -251,7 +251,7 @@ def _write_sensor(path: Path) -> None:
 
 def _read_sensor(path: Path) -> Numbers:
     import math
-    from dataclasses import asdict, astuple
+    from dataclasses import asdict
 
     from spad.sensor.files import read_sensor
 
@@ -261,11 +261,10 @@ def _read_sensor(path: Path) -> Numbers:
         return [float(value)] if isinstance(value, (bool, int, float)) else []
 
     found = read_sensor(path)
-    values = asdict(found.sensor)
-    endless = {name for name, value in values.items() if value == math.inf}  # of what has no limit unless stated
-    yield np.array(numbers([value for name, value in values.items() if name not in endless])), False
-    for part in (found.optics, found.zones):
-        yield np.array(numbers(astuple(part) if part else ())), False
+    for part in (found.sensor, found.optics, found.zones):
+        values = [numbers(value) for value in asdict(part).values()] if part else []
+        # infinite is what has no limit unless one is stated: filter width, trials of saturation
+        yield np.array([number for some in values if math.inf not in some for number in some]), False
 
 
 def _write_plane_captures(path: Path) -> None:

@@ -44,7 +44,7 @@ SCENES = (
     ("clutter/test/0", 0),
 )
 PLANS = {
-    "smoke": Plan(SCENES[:1], (24, 20), RenderSettings(bounces=2, spp=16, ambient=True), LEVELS[:1]),
+    "smoke": Plan(SCENES[:1], (24, 20), RenderSettings(bounces=2, spp=16, ambient=True), (HEADLINE,)),
     "laptop": Plan(SCENES, (88, 72), RenderSettings(error=0.02, ambient=True)),
     "paper": Plan(SCENES, (176, 144), RenderSettings(error=0.01, ambient=True)),
 }
