@@ -154,7 +154,8 @@ class CompressiveLayer(nn.Module):
         )
 
     def _pulse(self, sensor: Sensor) -> Tensor | None:
-        """(Mt, Mt) float32: h_i(tau) on a circle of Mt bins, column tau the arrival at a bin centre."""
+        """Compute h_i(tau) on a circle of Mt bins, (Mt, Mt) float32, column tau the arrival at a bin centre; None where
+        no option uses it."""
         if not (self.options.pulse_in_codes or self.options.pulse_in_decoder):
             return None
         circle = circle_of(self.block[0], sensor)
@@ -172,7 +173,7 @@ class CompressiveLayer(nn.Module):
         return (shape / shape.abs().max()).float()
 
     def _blurred(self, weights: Tensor) -> Tensor:
-        """sum_i C[k, i, ...] h_i(tau): the codes of a pulse that arrives at each bin centre."""
+        """Compute sum_i C[k, i, ...] h_i(tau): the codes of a pulse that arrives at each bin centre."""
         assert self.pulse is not None
         flat = weights.reshape(*weights.shape[:2], -1)
         return (self.pulse.to(weights.dtype).T @ flat).view(weights.shape)
@@ -311,7 +312,8 @@ class CompressiveLayer(nn.Module):
         return blocks.back_project(unit, blocks.zero_normalised(weights, axis, centre=centre))
 
     def _direction(self, background: Tensor, weights: Tensor, times: int) -> Tensor:
-        """(T/Mt, K) unit vectors along what the background leaves in the codes of each time block; 0 where nothing."""
+        """Compute the (T/Mt, K) unit vectors along what the background leaves in the codes of each time block; 0 where
+        nothing."""
         shape = background.to(weights.dtype).view(-1, self.block[0])
         require(len(shape) == times, f"background of {shape.numel()} bins, codes of {times * self.block[0]}")
         per_bin = weights.sum((2, 3))

@@ -72,7 +72,7 @@ class _Sums:
         self.squares = np.zeros((2, pixels))  # of what is emitted where it is seen, and of all
 
     def trace(self, spp: int, bounces: int, seed: int) -> None:
-        """Go on until there are `spp` paths of each pixel."""
+        """Trace until there are `spp` paths of each pixel."""
         pixels = self.emitted.size
         per_pass = max(1, MAX_LANES // pixels)
         while self.spp < spp:
@@ -132,7 +132,7 @@ def bilateral_filter(light: np.ndarray, layers: Layers, camera: Camera) -> np.nd
 
 @recorded
 def _bilateral_filter(pixel: UInts, columns: list, lights: list, width: UInts, height: UInts) -> list:
-    """`bilateral_filter` of each pixel; what has an albedo is hit."""
+    """Apply `bilateral_filter` to each pixel; pixels with an albedo hit a surface."""
     albedo = columns[0]
     albedos, *totals = _sums(pixel, columns, lights, width, height)
     fraction = albedo / dr.select(albedos > 0, albedos, 1)
@@ -141,7 +141,7 @@ def _bilateral_filter(pixel: UInts, columns: list, lights: list, width: UInts, h
 
 @dr.syntax
 def _sums(pixel: UInts, columns: list, lights: list, width: UInts, height: UInts) -> list:
-    """Weighted sums over each pixel's neighbours of the albedo and of all lights."""
+    """Compute weighted sums over each pixel's neighbours of the albedo and of all lights."""
     side, tap = 2 * FILTER_RADIUS + 1, dr.zeros(UInt32, dr.width(pixel))
     sums = [dr.zeros(Float, dr.width(pixel)) for _ in range(1 + len(lights))]
     while tap < side * side:
@@ -152,7 +152,7 @@ def _sums(pixel: UInts, columns: list, lights: list, width: UInts, height: UInts
 
 
 def _with_neighbour(sums: list, pixel: UInts, columns: list, lights: list, way: tuple, size: tuple) -> list:
-    """The sums with what the pixel that way adds."""
+    """Add the albedo and the lights of the neighbour in direction `way` to the sums."""
     albedo, depth, point, normal = columns[0], columns[1], mi.Vector3f(*columns[2:5]), mi.Vector3f(*columns[5:])
     (right, down), (width, height) = way, size
     column, row = mi.Int32(pixel) % width + right, mi.Int32(pixel) // width + down
@@ -237,7 +237,8 @@ def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple
 
 
 def _pane(world: TracedScene, si: Interactions, ray: Rays, sample: LobeSamples, hit: Masks) -> tuple[Array, Array]:
-    """Whether a ray passes straight through what it meets, thin glass or the hole of a cut-out, or glass mirrors it."""
+    """Return whether a ray passes straight through what it hits (thin glass, the hole of a cut-out), and whether thin
+    glass mirrors it."""
     passing, mirrored = Bool(False), Bool(False)
     if world.has_glass:
         thin = dr.gather(Float, world.thin_ior, shape_index(si), hit)
@@ -250,14 +251,15 @@ def _pane(world: TracedScene, si: Interactions, ray: Rays, sample: LobeSamples, 
 
 
 def _transmission(ior: Array, ray: Rays, si: Interactions) -> Array:
-    """Of a thin pane with all its inner reflections, (1 - F) / (1 + F)."""
+    """Compute the transmittance of a thin pane with all its inner reflections, (1 - F) / (1 + F)."""
     fresnel = mi.fresnel(dr.abs(dr.dot(ray.d, si.n)), dr.maximum(ior, 1.0001))[0]
     return (1 - fresnel) / (1 + fresnel)
 
 
 @dr.syntax
 def _open(world: TracedScene, si: Interactions, to_light: Vectors, active: Masks) -> Array:
-    """Transmission of the straight way from a surface to a sampled light; solid glass blocks it, as it bends light."""
+    """Compute the transmission of the straight way from a surface to a sampled light; solid glass blocks it, as it
+    bends light."""
     ray = si.spawn_ray_to(to_light.p)
     transmission = dr.full(Float, 1, dr.width(ray.d))
     if dr.hint(not world.sees_through, mode="scalar"):

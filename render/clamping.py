@@ -29,7 +29,8 @@ AT_A_TIME = 512  # regions whose response is worked out at a time
 
 
 class Clamp(NamedTuple):
-    """What a path may add to every flat pixel of the image, and the region that the pixel belongs to."""
+    """Limits of a clamp: the most that one path may add to every flat pixel of the image, and the region of each
+    pixel."""
 
     limit: np.ndarray
     region: np.ndarray
@@ -40,8 +41,8 @@ class Clamp(NamedTuple):
 
 
 class RemovedLight(NamedTuple):
-    """What a clamp took, in two independent halves of the paths: of every flat pixel's radiance, (pixels, 2); and its
-    moments by path length in `cells`, (3, regions, 2, cells), means over the pixels of each `region`."""
+    """Light that a clamp removed, in two independent halves of the paths: the radiance of every flat pixel, (pixels,
+    2); and its moments by path length in `cells`, (3, regions, 2, cells), means over the pixels of each `region`."""
 
     halves: np.ndarray
     cells: Cells
@@ -50,7 +51,7 @@ class RemovedLight(NamedTuple):
 
     @property
     def pixels(self) -> np.ndarray:
-        """Radiance that is missing in every flat pixel: the mean of both halves."""
+        """Return the radiance that is missing in every flat pixel: the mean of both halves."""
         return self.halves.mean(axis=1)
 
     def squared_error(self) -> np.ndarray:
@@ -64,7 +65,8 @@ class RemovedLight(NamedTuple):
         return self._of_regions()[self.region] * (max(uneven / even, 1.0) if even > 0 else 1.0)
 
     def _of_regions(self) -> np.ndarray:
-        """The same of light that is as the mean of a region in each of its pixels, (regions,)."""
+        """Estimate the squared error after the pulse in a pixel that misses its region's mean removed light,
+        (regions,)."""
         regions = self.moments.shape[1]
         found = np.zeros(regions)
         for first in range(0, regions, AT_A_TIME):
@@ -92,7 +94,7 @@ def make_clamp(direct: np.ndarray, camera: Camera, multiple: float) -> Clamp:
 
 
 class ClampSums:
-    """Where what a clamp takes is added, of a whole image.
+    """Accumulator of the light that a clamp removes from a whole image.
 
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """

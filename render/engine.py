@@ -136,7 +136,7 @@ def _traced_to_target(
 
 
 def _standard_error(traced: LightSamples) -> np.ndarray:
-    """Of every pixel's total radiance; what a clamp removed of it counts as such."""
+    """Compute the standard error of every pixel's total radiance; light that a clamp removed counts as error."""
     if traced.indirect is None:
         return np.zeros(len(traced.origin_m))
     removed = traced.indirect.removed
@@ -151,7 +151,8 @@ def planned(world: TracedScene, settings: RenderSettings, seed: int = 0) -> Plan
 def _additional_schedule(
     world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate
 ) -> Schedule | None:
-    """What to trace on top where a planned render misses its target: pilots see few of the rare bright paths."""
+    """Return the schedule of extra samples if a planned render misses its target, else None. A short pilot sees few of
+    the rare bright paths and underestimates the variance."""
     if settings.spp is not None or traced.schedule is None or traced.indirect is None or plan.target <= 0:
         return None
     batches = traced.schedule.batches
@@ -179,7 +180,8 @@ def _additional_schedule(
 
 
 def _clamp_reasons(plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
-    """What a clamp removed; or that one would help, where the target is out of reach for a few rare bright paths."""
+    """State how much light a clamp removed; or that a clamp would help, where a few rare bright paths put the target
+    out of reach."""
     if traced.indirect is None:
         return ()
     if traced.indirect.removed is not None:
@@ -197,7 +199,7 @@ def _clamp_reasons(plan: Plan, settings: RenderSettings, traced: LightSamples, e
 
 
 def _bias_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
-    """What to know of a filter's bias, measured against the same paths without it."""
+    """State the bias of a filter, measured against the same paths without it."""
     if not plan.filter or traced.schedule is None:
         return ()
     if traced.schedule.batches < FILTERED_BATCHES:
@@ -213,7 +215,7 @@ def _bias_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tup
 def _estimated(
     world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, checked: np.ndarray
 ) -> ErrorEstimate:
-    """The error of a trace, from the checked pixels' batches and from finer direct light there."""
+    """Estimate the error of a trace, from the checked pixels' batches and from finer direct light there."""
     coarse = response(select_pixels(traced.direct, checked), checked)
     glints = response(select_pixels(traced.specular, checked), checked)
     fine = finer_pilot(world, checked, plan.grid, plan.edge_threshold) + glints
@@ -249,7 +251,8 @@ def _estimated(
 
 
 def _lost_to_clamp(removed: RemovedLight | None, checked: np.ndarray) -> np.ndarray | float:
-    """Squared error of the checked pixels by what a clamp removed: that of their regions, in the mean the image's."""
+    """Compute the squared error of the checked pixels by what a clamp removed: that of their regions, in the mean the
+    image's."""
     if removed is None:
         return 0.0
     of_pixels = removed.squared_error()
@@ -258,7 +261,7 @@ def _lost_to_clamp(removed: RemovedLight | None, checked: np.ndarray) -> np.ndar
 
 
 def _filter_bias(filtered: list[np.ndarray], unfiltered: ProbePixels, place: np.ndarray) -> np.ndarray | float:
-    """Squared difference that the filter makes, per pixel, from two independent halves of the batches.
+    """Compute the squared difference that the filter makes, per pixel, from two independent halves of the batches.
 
     What noise adds to it has mean 0; 0 where the sum is not CLEAR standard deviations above that.
     """

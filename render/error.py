@@ -1,4 +1,4 @@
-"""How wrong a render is: nRMSE of the expected counts at the reference sensor's response."""
+"""Estimate the error of a render: nRMSE of the expected counts at the reference sensor's response."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
 
 
 def _in_pieces(samples: Samples) -> Samples:
-    """Samples of half widths up to WIDEST_PIECE sigma, of MAX_PIECES pieces at most."""
+    """Split samples into pieces of half widths up to WIDEST_PIECE sigma, MAX_PIECES pieces at most."""
     pieces = np.ceil(samples.half_width_m / (WIDEST_PIECE * SIGMA_M)).clip(1, MAX_PIECES).astype(np.int64)
     if len(pieces) == 0 or pieces.max() == 1:
         return samples

@@ -180,7 +180,8 @@ def add_samples(
 def _schedule(
     world: TracedScene, plan: Plan, settings: RenderSettings, direct: Samples, origin_m: np.ndarray, seed: int
 ) -> tuple[Schedule, tuple[str, ...]]:
-    """How many paths each pixel traces, and why: from the noise of a pilot of a few paths, which is not used again."""
+    """Allocate paths to pixels by the noise of a pilot of a few paths, which is not used again; return the schedule and
+    the reasons for it."""
     clamp = None
     if plan.clamp is not None:
         camera = world.scene.camera
@@ -199,7 +200,7 @@ def _allocated(
     seed: int,
     clamp: Clamp | None,
 ) -> tuple[Schedule, tuple[str, ...]]:
-    """The schedule but for its clamp, with which the pilot's paths are clamped, too."""
+    """Allocate paths, and say why: the schedule but for its clamp, with which the pilot's paths are clamped, too."""
     camera = world.scene.camera
     blocks = block_order(np.arange(camera.height * camera.width), camera.width)
     if plan.filter:

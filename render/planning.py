@@ -97,7 +97,8 @@ def rays_for_all(errors: Sequence[float], settings: RenderSettings) -> tuple[int
 
 
 def _direct_fraction(settings: RenderSettings, direct_alone: bool) -> float:
-    """Of the target; where there is no other light, direct light has all that is aimed at."""
+    """Return the part of the target nRMSE that direct light may use: DIRECT_FRACTION, or all that is planned where
+    there is no other light."""
     return math.sqrt(settings.target_fraction) if direct_alone else DIRECT_FRACTION
 
 
@@ -150,7 +151,8 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
 
 
 def _ambient(world: TracedScene, settings: RenderSettings, target: float) -> tuple[bool, float, str]:
-    """Whether steady light is rendered: only if there is any, and a photon budget has room for it; and its noise.
+    """Decide whether to render steady ambient light, to which noise, and say why: only if there is any, and a photon
+    budget has room for it.
 
     Noise that would make an error of AMBIENT_FRACTION of the target beside the signal of the budget's photons, or where
     there is no budget beside as many signal photons as background.
@@ -171,7 +173,7 @@ def _ambient(world: TracedScene, settings: RenderSettings, target: float) -> tup
 
 
 def _limits(world: TracedScene) -> list[str]:
-    """What this renderer leaves out of the given scene."""
+    """List the features of a scene that this renderer simplifies, a line each."""
     materials: list[Material] = [surface.material for surface in world.scene.surfaces]
     lines = []
     if world.has_cutouts:
@@ -196,7 +198,7 @@ def _target(settings: RenderSettings, fine: np.ndarray | None) -> tuple[float, s
 def _grid(
     world: TracedScene, settings: RenderSettings, pixels: np.ndarray, allowed: float, paths: float, squared: float
 ) -> tuple[int, float, str]:
-    """The grid whose direct light is off by at most `allowed`, how much it is off, and why.
+    """Choose the grid whose direct light is off by at most `allowed`; return it, how much it is off, and why.
 
     The smallest such; or a finer one, if that saves more than it costs where the square of the error of all light may
     be `squared`, for which indirect light alone takes `paths` a pixel.
@@ -235,7 +237,8 @@ def _grid(
 def _indirect(
     world: TracedScene, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray | None, target: float, seed: int
 ) -> tuple[int, int | None, float, list[str]]:
-    """Bounces; paths a pixel, if they are forced; about how many meet the target if every pixel has its own; why."""
+    """Choose bounces and paths a pixel; return both (None paths: left to the schedule), about how many paths meet the
+    target if every pixel has its own, and why."""
     mode = world.scene.laser.mode
     if settings.bounces == 1:
         return 1, 0, 0.0, ["indirect light: none, forced by 1 bounce"]
@@ -269,7 +272,7 @@ def _indirect(
 
 
 def _bounces(energy: np.ndarray, allowed: float) -> tuple[int, float]:
-    """Fewest bounces that leave out at most the share `allowed` of the energy, and the share left out.
+    """Find the fewest bounces that leave out at most the share `allowed` of the energy, and the share left out.
 
     What lies beyond the pilot's last bounce follows the geometric series of its later half: of two alone, a rare
     bright path in the last one would make any number too few.

@@ -1,4 +1,4 @@
-"""What a render is asked for, and the plan that answers it. Imports neither Mitsuba nor torch."""
+"""Define the settings of a render and the plan that answers them. Imports neither Mitsuba nor torch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FILTERED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours shar
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What the user asks for; None leaves a choice to the plan.
+    """Settings of a render, as the user asks for them; None leaves a choice to the plan.
 
     bounces     surfaces that light may meet, 1 = direct light only
     spp         work on indirect light, in paths per pixel; spent where the noise is, and partly on sharing paths
@@ -95,7 +95,7 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the renderer will do, and why: one reason a line, stored with the result.
+    """Plan of a render, and its reasons: one a line, stored with the result.
 
     spp         work on indirect light in paths per pixel; None: whatever `noise` takes
     noise       target of the Monte-Carlo part of the error where spp is open

@@ -1,4 +1,4 @@
-"""What is there: geometry, materials, camera, laser and ambient light. Knows nothing of any renderer."""
+"""Describe scenes: geometry, materials, camera, laser and ambient light. Knows nothing of any renderer."""
 
 from scenes.errors import InputError
 from scenes.model import Ambient, Camera, Laser, Material, Scene, Surface, Texture

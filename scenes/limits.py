@@ -1,4 +1,4 @@
-"""How much memory one piece of work may take: asked before anything is allocated, not found out by the kernel."""
+"""Limit the memory of one piece of work: asked before anything is allocated, not found out by the kernel."""
 
 from __future__ import annotations
 

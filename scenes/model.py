@@ -53,7 +53,7 @@ class Texture:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two vectors; numpy's takes longer to see that they are."""
+    """Compute the cross product of two vectors; numpy's takes longer to see that there are two."""
     (ax, ay, az), (bx, by, bz) = a, b
     return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
@@ -69,7 +69,7 @@ def _fraction(value: float | Texture, what: str) -> float | Texture:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a surface reflects at the laser's wavelength.
+    """Material of a surface: how it reflects at the laser's wavelength.
 
     kind        the reflectance model; names and meaning are those of Mitsuba 3
     albedo      diffuse reflectance, number or texture (diffuse, roughdiffuse, plastic, roughplastic)
@@ -111,7 +111,7 @@ class Material:
 
     @property
     def is_glass(self) -> bool:
-        """Whether light goes through the surface itself (not through holes cut in it)."""
+        """Return whether light goes through the surface itself (not through holes cut in it)."""
         return self.kind in ("dielectric", "thindielectric")
 
     @property

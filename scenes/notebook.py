@@ -1,4 +1,4 @@
-"""What notebooks show of an object: a table of facts and a grey picture, without matplotlib."""
+"""Show objects in notebooks: a table of facts and a grey picture, without matplotlib."""
 
 from __future__ import annotations
 

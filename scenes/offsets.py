@@ -138,7 +138,8 @@ def moved_away(scene: Scene, metres: float, *, median_m: float, nearest_m: float
 
 
 def _beyond(surface: Surface, origin: np.ndarray, axis: np.ndarray, least_m: float) -> Surface | None:
-    """What of a surface lies at least that far along the axis: faces that cross the plane are cut along it."""
+    """Cut off the part of a surface that lies less than `least_m` along the axis: faces that cross the plane are cut
+    along it."""
     depth = (surface.vertices - origin) @ axis - least_m
     inside = depth[surface.faces] >= 0
     count = inside.sum(axis=1)

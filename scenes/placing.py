@@ -1,4 +1,4 @@
-"""What a user may say of a scene beyond its file: its size, its upward axis, and where the camera stands."""
+"""Place a scene as the user asks beyond its file: its size, its upward axis, and where the camera stands."""
 
 from __future__ import annotations
 

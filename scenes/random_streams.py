@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Stream(IntEnum):
-    """Which stage draws from a stream. A new stage takes a number that is free.
+    """Stage that draws from a stream of random numbers. A new stage takes a number that is free.
 
     Results in files follow from these numbers, so that none is ever changed: also not the three that had been given
     away twice before there was one list.

@@ -116,7 +116,7 @@ def compared(old: Path, new: Path) -> Iterator[str]:
 
 
 def same(first: Any, second: Any) -> bool:
-    """Whether two values are equal bit for bit; arrays with NaN at the same places are."""
+    """Return whether two values are equal bit for bit; arrays with NaN at the same places are."""
     if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
         if first.dtype.hasobject:  # MATLAB structures: their bytes would be addresses
             return first.shape == second.shape and all(map(same, first.ravel().tolist(), second.ravel().tolist()))

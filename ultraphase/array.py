@@ -100,13 +100,13 @@ class CoreArray:
 
 
 def _neighbours(row: np.ndarray, column: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Lane at (row, column), -1 where none is."""
+    """Return the lane at (row, column), -1 where there is none."""
     there = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
     return np.where(there, row * shape[1] + column, -1)
 
 
 def _block_ends(program: Program) -> list[int]:
-    """For every word the first one behind its basic block."""
+    """Find for every word the first one behind its basic block."""
     starts = set(program.labels.values()) | {one.target for one in program.instructions if "l" in one.op.takes}
     ends = [0] * len(program.instructions)
     for word in reversed(range(len(ends))):
@@ -117,7 +117,7 @@ def _block_ends(program: Program) -> list[int]:
 
 
 def _outside(value: np.ndarray, low: int, high: int) -> int:
-    """How many values are outside low .. high; one pass where none is: below low is huge as an unsigned number."""
+    """Count the values outside low .. high; one pass where none is: below low is huge as an unsigned number."""
     raised = (value - low).view(np.uint64)
     return int(np.count_nonzero(raised > high - low)) if int(raised.max(initial=0)) > high - low else 0
 
@@ -172,7 +172,7 @@ class _Run:
         return self._result()
 
     def _block(self, first: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
-        """The instructions up to a branch or a label: only there do cores part or meet."""
+        """Run the instructions up to a branch or a label: only there do cores part or meet."""
         end = self.block_end[first]
         for word in range(first, end - 1):
             self.code[word](self.program.instructions[word], word, lanes, index)
@@ -185,7 +185,7 @@ class _Run:
         self.instructions[went] += 1
 
     def _one_by_one(self, lanes: np.ndarray) -> None:
-        """These cores each go through their timestamps alone, to where they need the array again."""
+        """Run each core alone through its timestamps, to where it needs the array again."""
         blank = {region.name: np.zeros(region.count, np.int64) for region in self.program.regions if region.table}
         core = Core(self.program, blank, chip=self.array.chip)
         for lane in lanes:
@@ -205,7 +205,8 @@ class _Run:
         self.events += core.counters.photons
 
     def _kind(self, one: Instruction) -> Callable[..., np.ndarray | None]:
-        """What does it: called with instruction, word, cores and their indices; returns the cores that it holds."""
+        """Select the function that executes an instruction: called with instruction, word, cores and their indices;
+        returns the cores that it holds."""
         if one.name in ALU:
             return self._alu
         if "m" in one.op.takes:
@@ -242,7 +243,7 @@ class _Run:
         cells[place] = value.astype(cells.dtype)
 
     def _cells(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> tuple[Any, ...]:
-        """RAM in cells of the operand's size, and the cell of every core: (cells, index)."""
+        """Return the RAM in cells of the operand's size, and the cell of every core: (cells, index)."""
         last = self.ram_bytes - one.op.size
         at = one.value if one.constant else self.registers[one.rs][lanes] + one.value
         if not 0 <= at <= last if one.constant else _outside(at, 0, last):  # type: ignore[arg-type]
@@ -339,12 +340,12 @@ class _Run:
         return other
 
     def _wait(self, lanes: np.ndarray, until: np.ndarray) -> None:
-        """Cores whose clock is behind the link's wait for it."""
+        """Stall cores whose clock is behind the time up to which they wait for a link."""
         now = self.instructions[lanes] + self.stalled[lanes]
         self.stalled[lanes] += np.maximum(until - now, 0)
 
     def _hold(self, lanes: np.ndarray, word: int, wake: np.ndarray) -> np.ndarray:
-        """Cores that cannot go on stay at this instruction; those at the other end of a moved word try again."""
+        """Hold cores that cannot go on at this instruction; those at the other end of a moved word try again."""
         self.status[lanes], self.word[lanes], self.changed = _BLOCKED, word, True
         self.status[wake[self.status[wake] == _BLOCKED]] = _RUNS
         self.events += bool(wake.size)
@@ -355,7 +356,7 @@ class _Run:
         return f"({row}, {column})"
 
     def _explain_waiting(self) -> None:
-        """InputError if cores wait for links that nobody will serve any more."""
+        """Raise InputError if cores wait for links that nobody will serve any more."""
         blocked = np.flatnonzero(self.status == _BLOCKED)
         if not blocked.size:
             return

@@ -119,7 +119,8 @@ class TimedCore(Core):
         return now, (state, now)
 
     def _step_at(self, word: int) -> tuple[Any, ...]:
-        """The instructions from a word to the next branch, without one that asks the port unless it is the first."""
+        """Compile the instructions from a word to the next branch, without one that asks the port unless it is the
+        first."""
         if word not in self._steps:
             code = self.program.instructions
             asks = code[word].name if word < len(code) and code[word].name in _PORT_INSTRUCTIONS else ""

@@ -96,12 +96,12 @@ class Method:
 
     @property
     def block(self) -> tuple[int, int]:
-        """Cores whose codes leave the sensor as one."""
+        """Return the rows and columns of cores whose codes leave the sensor as one."""
         return SPATIAL_BLOCK if self.family in ("separable", "learned") else (1, 1)
 
     @property
     def temporal_bins(self) -> int:
-        """Mt of the temporal coding tensor that its table comes from; 0 where there is none."""
+        """Return Mt of the temporal coding tensor that the program's table comes from; 0 where there is none."""
         wide = dict.fromkeys(("fourier", "addressed"), TIMESTAMPS)
         return {**wide, "separable": TIME_BLOCK, "learned": TIME_BLOCK}.get(self.family, 0)
 

@@ -1,4 +1,4 @@
-"""What is public about the UltraPhase chip, what we assume beside it, and the rates and powers that follow.
+"""State what is public about the UltraPhase chip, what is assumed beside it, and the rates and powers that follow.
 
 Source: supplement of the ICCV 2023 paper, section S.2 and Supplementary Figure 5; efficiency from the authors' public
 plotting script. The chip's instruction set is not public: the emulated one is UltraPhase-constrained, not UltraPhase's.
@@ -56,12 +56,12 @@ class ChipSpec:
 
     @property
     def timestamps(self) -> int:
-        """How many different timestamps there are."""
+        """Return the number of different timestamps."""
         return 1 << self.timestamp_bits
 
     @property
     def instructions_per_second(self) -> float:
-        """Per core."""
+        """Return the instructions per second of one core."""
         return 1 / (self.clock_s * self.clocks_per_instruction)
 
     def processing_time_s(self, photons: float, clocks_per_photon: float) -> float:

@@ -81,13 +81,14 @@ class Compiled:
 
     @cached_property
     def weights(self) -> np.ndarray | None:
-        """Spatial weights of the cores of one block, (Mr, Mc, K); None where nothing is multiplied."""
+        """Return the spatial weights of the cores of one block, (Mr, Mc, K); None where nothing is multiplied."""
         spatial = self.code.spatial
         return None if spatial is None or self.block == (1, 1) else np.moveaxis(spatial, 0, -1).astype(np.int64)
 
     @property
     def on_the_chip(self) -> bool:
-        """Whether the fabricated array has as many rows and columns of cores as the block; else a larger one is due."""
+        """Return whether the fabricated array has as many rows and columns of cores as the block; else a larger one is
+        due."""
         return all(part <= whole for part, whole in zip(self.block, self.chip.cores, strict=True))
 
     def tables(self, shape: tuple[int, int]) -> dict[str, np.ndarray]:
@@ -117,7 +118,8 @@ class Compiled:
 
 
 def _ways(block: tuple[int, int]) -> np.ndarray:
-    """What each core of a block takes and gives at the frame's end: the tree of `sumblock.s`, (Mr, Mc)."""
+    """Return the directions in which each core of a block takes and gives sums at the frame's end: the tree of
+    `sumblock.s`, (Mr, Mc)."""
     row, column = np.indices(block)
     first = column == 0
     return (
@@ -147,7 +149,7 @@ def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
 
 
 def _what_fits(code: IntegerCode, chip: ChipSpec) -> str:
-    """Which change of one thing would make the RAM do."""
+    """Say which change of one thing would make the code fit into the RAM."""
     cores, folded = code.block[0] * code.block[1], bool(code.harmonics)
 
     def fits(codes: int, bins: int, shared: int = 1) -> bool:
@@ -177,7 +179,7 @@ def _fourier_fits(code: IntegerCode, cores: int, chip: ChipSpec) -> bool:
 
 
 def _counters(code: IntegerCode, chip: ChipSpec) -> Compiled:
-    """A coarse histogram is a program of the catalogue."""
+    """Compile a coarse histogram: a program of the catalogue."""
     chosen = Method("coarse", code.codes)
     program = chosen.program(chip)
     ram = Layout(0, 0, 0, program.ram_bytes)
@@ -196,7 +198,7 @@ def _matrix(code: IntegerCode, chip: ChipSpec) -> np.ndarray:
 
 
 def _program(code: IntegerCode, chip: ChipSpec) -> tuple[str, str, Program]:
-    """The fastest text that the program store holds: all harmonics one after the other, else in a loop."""
+    """Assemble the fastest text that the program store holds: all harmonics one after the other, else in a loop."""
     refused: InputError | None = None
     for turns in turns_of(code):
         source = source_of(code, chip, turns)
@@ -212,7 +214,7 @@ def _assembled(source: str, name: str, chip: ChipSpec) -> Program:
 
 
 def _fewer_codes(code: IntegerCode, chip: ChipSpec) -> int:
-    """The most codes of a Fourier code whose program the store holds."""
+    """Find the most codes of a Fourier code whose program the store holds."""
     for codes in range(code.codes - 2, 0, -2):
         spatial = None if code.spatial is None else code.spatial[:codes]
         less = replace(code, temporal=code.temporal[:codes], spatial=spatial, harmonics=code.harmonics[: codes // 2])

@@ -22,7 +22,7 @@ _STOP = -1
 
 @dataclass(frozen=True)
 class Counters:
-    """What a run cost. cycles = instructions x clocks per instruction (+ stalls on links, in an array)."""
+    """Cost of a run. cycles = instructions x clocks per instruction (+ stalls on links, in an array)."""
 
     instructions: int = 0
     cycles: int = 0
@@ -211,12 +211,12 @@ class Core:
 
     @property
     def visits(self) -> tuple[int, ...]:
-        """How often each word was executed since the core was made."""
+        """Return how often each word was executed since the core was made."""
         return tuple(self._visits[:-1])
 
     @property
     def counters(self) -> Counters:
-        """Since the core was made."""
+        """Return the cost of all runs since the core was made."""
         ops, visits = [one.op for one in self.program.instructions], self.visits
         total = sum(visits)
         return Counters(
@@ -236,7 +236,7 @@ class Core:
     # What the compiled instructions call
 
     def _not_yet(self, word: int) -> int:
-        """It stops in front of this instruction, and has not executed it."""
+        """Stop the core in front of this instruction, which is not counted as executed."""
         self._visits[word] -= 1
         return _STOP
 
@@ -271,7 +271,7 @@ class Core:
 
 @lru_cache(maxsize=4096)
 def _compiled(statements: str) -> CodeType:
-    """A function `does` of them, for any core."""
+    """Compile statements into a function `does`, for any core."""
     text = "def does():\n    " + statements.replace("\n", "\n    ")
     return compile(text, "<instructions>", "exec")
 

@@ -38,23 +38,23 @@ class IntegerCode:
 
     @property
     def codes(self) -> int:
-        """K"""
+        """Return K, the number of codes."""
         return self.temporal.shape[0]
 
     @property
     def bins(self) -> int:
-        """Mt"""
+        """Return Mt, the number of time bins of a block."""
         return self.temporal.shape[1]
 
     @property
     def block(self) -> tuple[int, int]:
-        """(Mr, Mc): cores whose codes leave the sensor as one."""
+        """Return (Mr, Mc): the cores whose codes leave the sensor as one."""
         return tuple((self.temporal.shape[2:] if self.spatial is None else self.spatial.shape[1:]) or (1, 1))
 
     @property
     def output_shift(self) -> int:
-        """Bits that the sum of a block's cores is shifted by, so that what 16-bit sums make never leaves 16 bits: 7 of
-        the weights' steps and one for every doubling of the cores."""
+        """Return the bits that the sum of a block's cores is shifted by, so that what 16-bit sums make never leaves 16
+        bits: 7 of the weights' steps and one for every doubling of the cores."""
         rows, columns = self.block
         weights = 0 if self.spatial is None or rows * columns == 1 else 7
         return weights + (rows * columns - 1).bit_length()

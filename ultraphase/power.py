@@ -37,7 +37,7 @@ READINGS = {
 
 @dataclass(frozen=True)
 class Load:
-    """What the sensor is asked to do."""
+    """Load of the sensor: photons a frame and pixel, frames a second, and pixels."""
 
     photons: float = 550.0
     frames_per_s: float = 30.0
@@ -155,7 +155,7 @@ def table(costs: dict[str, Cost], chip: ChipSpec | None = None) -> list[dict[str
 
 
 def _columns(clocks: float, bytes_per_pixel: float, found: Power) -> dict[str, float]:
-    """The columns of Supplementary Figure 5; processing power in both readings."""
+    """Make the columns of Supplementary Figure 5; processing power in both readings."""
     return {
         "clocks": clocks,
         "bytes_per_pixel": bytes_per_pixel,

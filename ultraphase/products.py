@@ -76,7 +76,7 @@ class _Product:
         self.sums = np.empty((chunk // rows, rows, numbers), np.float32)
 
     def of_histograms(self, part: np.ndarray) -> np.ndarray:
-        """Sums (pixels, numbers) float32, valid until the next call."""
+        """Compute the sums (pixels, numbers) float32 of histograms, valid until the next call."""
         np.copyto(self.counts.reshape(-1, part.shape[1])[: len(part)], part, casting="unsafe")
         np.matmul(self.counts, self.table, out=self.sums)
         return self.sums.reshape(-1, self.sums.shape[-1])[: len(part)]

@@ -124,7 +124,8 @@ def _states(low: np.ndarray, high: np.ndarray, random: np.random.Generator) -> I
 def _run(
     program: Program, array: CoreArray, before: np.ndarray, random: np.random.Generator
 ) -> tuple[np.ndarray, Frame]:
-    """One photon of every timestamp, each on a core in the state `before`: numbers in RAM after it."""
+    """Run one photon of every timestamp, each on a core in the state `before`; return the numbers in RAM after it, and
+    the frame."""
     at = 0
     for region in program.state:
         part = before[at : at + region.count].astype(KINDS[region.kind])

@@ -43,8 +43,8 @@ def check_tiling(size: tuple[int, ...], block: tuple[int, int, int]) -> None:
 
 
 def _wide(values: Tensor, columns: int) -> Tensor:
-    """The same memory in the widest elements that a run of `columns` entries is made of: up to 16 bytes are then
-    moved at a time, five times faster than one by one."""
+    """View memory in the widest elements that a run of `columns` entries is made of: up to 16 bytes are then moved at a
+    time, five times faster than one by one."""
     run = columns * values.element_size()
     for dtype, size in ((torch.complex128, 16), (torch.int64, 8), (torch.int32, 4)):
         if (

@@ -19,7 +19,8 @@ _TIE = 1e-6  # of the largest score: what float32 sums cannot tell apart
 
 @lru_cache(maxsize=8)
 def _templates(coding: CodingTensor, sensor: Sensor, device: str) -> Tensor:
-    """(T, G, K) float64: unit vectors P C h(tau) for arrivals at T bin centres and G steps of -1 to 1 bin around each.
+    """Compute the unit vectors P C h(tau), (T, G, K) float64, for arrivals at T bin centres and G steps of -1 to 1 bin
+    around each.
 
     P removes the direction C 1 that a uniform background takes: nothing where rows sum to zero (Fourier), the mean
     over K for a coarse histogram. The mean over K is not removed where C 1 = 0: it would carry depth there, and of

@@ -73,7 +73,7 @@ class Design:
 
     @property
     def size(self) -> int:
-        """M = Mt Mr Mc, counts of one block."""
+        """Return M = Mt Mr Mc, the number of counts of one block."""
         return math.prod(self.block)
 
     @property
@@ -82,24 +82,24 @@ class Design:
 
     @property
     def has_spatial(self) -> bool:
-        """Whether there is a spatial factor: a separable tensor over more than one pixel."""
+        """Return whether there is a spatial factor: a separable tensor over more than one pixel."""
         return not self.full and math.prod(self.block[1:]) > 1
 
     @property
     def name(self) -> str:
-        """As in "fourier+learned 256x4x4 K32"."""
+        """Return the name of the design, as in "fourier+learned 256x4x4 K32"."""
         plus = "+learned" if self.has_spatial and self.spatial_learned and self.code != "learned" else ""
         return f"{'full ' if self.full else ''}{self.code}{plus} {'x'.join(map(str, self.block))} K{self.codes}"
 
     @property
     def learned(self) -> tuple[str, ...]:
-        """The parts that training changes: temporal, spatial."""
+        """Name the parts that training changes: temporal, spatial."""
         spatial = self.has_spatial and (self.code == "learned" or self.spatial_learned)
         return (("temporal",) if self.code == "learned" else ()) + (("spatial",) if spatial else ())
 
     @property
     def compression_ratio(self) -> float:
-        """Mt Mr Mc / K"""
+        """Return the compression ratio Mt Mr Mc / K."""
         return self.size / self.codes
 
     @property
@@ -108,20 +108,22 @@ class Design:
 
     @property
     def parameters(self) -> int:
-        """K Mt Mr Mc of a full tensor, K Mt + K Mr Mc of a separable one, K Mt over single pixels."""
+        """Count the parameters: K Mt Mr Mc of a full tensor, K Mt + K Mr Mc of a separable one, K Mt over single
+        pixels."""
         return self.codes * (self.size if self.full else self.block[0]) + self.spatial_parameters
 
     @property
     def computed(self) -> int | None:
-        """Numbers from which the temporal part is computed on the fly: a quarter wave, Mt/4, for Fourier codes
-        whatever K (supplement S.2), none for gates and Walsh functions; None where every entry is stored."""
+        """Count the numbers from which the temporal part is computed on the fly: a quarter wave, Mt/4, for Fourier
+        codes whatever K (supplement S.2), none for gates and Walsh functions; None where every entry is stored."""
         if self.code in _QUARTER_WAVE:
             return math.ceil(self.block[0] / 4)
         return 0 if self.code in _COUNTED else None
 
     @property
     def storage(self) -> int:
-        """Numbers that a sensor stores: `parameters`, with the temporal part computed on the fly where it can be."""
+        """Count the numbers that a sensor stores: `parameters`, with the temporal part computed on the fly where it can
+        be."""
         return self.parameters if self.computed is None else self.computed + self.spatial_parameters
 
 

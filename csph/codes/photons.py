@@ -30,7 +30,7 @@ def photon_table(weights: Tensor) -> Tensor:
 
 
 class _Tiling(NamedTuple):
-    """How blocks tile images, as far as it does not depend on detections; P pixels, all int32."""
+    """Tiling of images by blocks, as far as it does not depend on detections; P pixels, all int32."""
 
     row: Tensor  # (P,) where the part of the table that is of each pixel's place in its block begins
     by_place: Tensor  # (P,) the pixels of the first place in their blocks, then of the next
@@ -97,7 +97,8 @@ def encode_photons(
 
 
 def _checked(timestamps: Tensor, offsets: Tensor, bins: int, name: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Both, in int32 where that suffices, which halves what is read, and detections per pixel; or an InputError."""
+    """Check timestamps and offsets; return both, in int32 where that suffices, which halves what is read, and
+    detections per pixel; or raise an InputError."""
     whole = not (timestamps.is_floating_point() or offsets.is_floating_point())
     if not (whole and timestamps.ndim == offsets.ndim == 1 and len(offsets)):
         raise InputError(
@@ -120,7 +121,7 @@ def _checked(timestamps: Tensor, offsets: Tensor, bins: int, name: str) -> tuple
 
 
 def _extremes(stamps: Tensor) -> tuple[int, int]:
-    """Least and greatest; by numpy on a CPU, which also knows uint16."""
+    """Return the least and the greatest stamp; by numpy on a CPU, which also knows uint16."""
     if stamps.device.type == "cpu":
         values = stamps.numpy()
         return int(values.min()), int(values.max())
@@ -129,7 +130,7 @@ def _extremes(stamps: Tensor) -> tuple[int, int]:
 
 
 def _bags(index: Tensor, table: Tensor, starts: Tensor) -> Tensor:
-    """Sums of table[index] between neighbouring starts, (bags, K)."""
+    """Sum table[index] between neighbouring starts, (bags, K)."""
     starts = starts.to(index.dtype)
     return torch.nn.functional.embedding_bag(index, table, starts, mode="sum", include_last_offset=True)
 
@@ -137,7 +138,7 @@ def _bags(index: Tensor, table: Tensor, starts: Tensor) -> Tensor:
 def _reordered(
     stamps: Tensor, starts: Tensor, counts: Tensor, order: Tensor, bins: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The detections of pixels in another order, by copying runs: the rows of a sparse matrix, whose values nobody
+    """Put the detections of pixels in another order, by copying runs: the rows of a sparse matrix, whose values nobody
     reads."""
     values = np.empty(len(stamps), np.int8)
     pixels = csr_array((values, stamps.numpy(), starts.numpy()), shape=(len(order), bins))[order.numpy()]
@@ -158,13 +159,13 @@ def _time_bags(stamps: Tensor, starts: Tensor, counts: Tensor, mt: int, times: i
 
 @lru_cache(maxsize=16)
 def _marks(times: int, mt: int) -> Tensor:
-    """(T, T') float32: 1 where a bin is in a time block. Their sum over detections counts them, in a third of the
-    time of a `bincount`."""
+    """Make the (T, T') float32 matrix that is 1 where a bin is in a time block. Summing its rows over detections counts
+    them, in a third of the time of a `bincount`."""
     return torch.eye(times).repeat_interleave(mt, 0)
 
 
 def _ascending(stamps: np.ndarray, starts: np.ndarray) -> bool:
-    """Whether no pixel's detection is earlier than the one before."""
+    """Return whether the detections of every pixel are in ascending order of time."""
     falls = stamps[1:] < stamps[:-1]
     firsts = starts[(starts > 0) & (starts < len(stamps))]  # of pixels; repeated where one is empty
     between = np.count_nonzero(falls[firsts - 1][np.diff(firsts, prepend=0) > 0])
@@ -177,7 +178,8 @@ def _in_block(stamps: Tensor, mt: int) -> Tensor:
 
 
 def _repeated(per_pixel: Tensor, counts: Tensor) -> Tensor:
-    """A pixel's number once for each of its detections; by numpy on a CPU, which takes a quarter of torch's time."""
+    """Repeat a pixel's number once for each of its detections; by numpy on a CPU, which takes a quarter of torch's
+    time."""
     if per_pixel.device.type == "cpu":
         return torch.from_numpy(np.repeat(per_pixel.numpy(), counts.numpy()))
     return torch.repeat_interleave(per_pixel, counts)

@@ -1,4 +1,5 @@
-"""How many of a block's pixels codes tell apart: participation rank and coherence of a coding tensor's spatial part."""
+"""Measure how many of a block's pixels codes tell apart: participation rank and coherence of a coding tensor's spatial
+part."""
 
 from __future__ import annotations
 

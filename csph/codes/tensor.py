@@ -58,59 +58,59 @@ class CodingTensor:
 
     @property
     def codes(self) -> int:
-        """K"""
+        """Return K, the number of codes."""
         return self.temporal.shape[0]
 
     @property
     def bins(self) -> int:
-        """Mt"""
+        """Return Mt, the number of time bins of a block."""
         return self.temporal.shape[1]
 
     @property
     def rows(self) -> int:
-        """Mr"""
+        """Return Mr, the number of rows of a block."""
         return self.block[1]
 
     @property
     def columns(self) -> int:
-        """Mc"""
+        """Return Mc, the number of columns of a block."""
         return self.block[2]
 
     @property
     def block(self) -> tuple[int, int, int]:
-        """(Mt, Mr, Mc)"""
+        """Return the size of a block, (Mt, Mr, Mc)."""
         spatial = self.temporal.shape[2:] if self.spatial is None else self.spatial.shape[1:]
         return (self.bins, *(spatial or (1, 1)))
 
     @property
     def is_full(self) -> bool:
-        """Whether every entry of the tensor is a number of its own."""
+        """Return whether every entry of the tensor is a number of its own, not a product of factors."""
         return self.temporal.ndim == 4
 
     @cached_property
     def tensor(self) -> Tensor:
-        """(K, Mt, Mr, Mc) float32"""
+        """Return the full coding tensor, (K, Mt, Mr, Mc) float32."""
         return full_tensor(self.temporal, self.spatial)
 
     @cached_property
     def table(self) -> Tensor:
-        """The tensor as `encode_photons` wants it, one row of K a place in the block."""
+        """Return the tensor as `encode_photons` wants it, one row of K a place in the block."""
         return photon_table(self.tensor)
 
     @property
     def compression_ratio(self) -> float:
-        """Mt Mr Mc / K"""
+        """Return the compression ratio Mt Mr Mc / K."""
         return self.bins * self.rows * self.columns / self.codes
 
     @property
     def parameters(self) -> int:
-        """Numbers that make the tensor: K Mt Mr Mc if full, K Mt + K Mr Mc if separable."""
+        """Count the numbers that make the tensor: K Mt Mr Mc if full, K Mt + K Mr Mc if separable."""
         return self.temporal.numel() + (0 if self.spatial is None else self.spatial.numel())
 
     @property
     def storage(self) -> int:
-        """Numbers that a sensor stores where it computes the temporal part on the fly (supplement S.2): Mt/4 + K Mr Mc
-        for Fourier codes; else `parameters`."""
+        """Count the numbers that a sensor stores where it computes the temporal part on the fly (supplement S.2): Mt/4
+        + K Mr Mc for Fourier codes; else `parameters`."""
         temporal = self.temporal.numel() if self.computed is None else self.computed
         return temporal + self.parameters - self.temporal.numel()
 

@@ -1,4 +1,4 @@
-"""What a sensor stores and sends with and without compressive histograms (supplement S.6, Table 1).
+"""Compute what a sensor stores and sends with and without compressive histograms (supplement S.6, Table 1).
 
 A histogram tensor of N counts in B blocks of M = N/B counts each keeps B K codes; the sensor also holds the K coding
 tensors, once for all blocks, in as many bits a number as counts. Needs numpy alone; every argument may be an array.

@@ -45,7 +45,7 @@ Progress = Callable[[str, float], None]
 
 
 class DepthEstimator(Protocol):
-    """What evaluation asks of a model, or of what stands for one."""
+    """Interface of a depth estimator that evaluation measures: a model, or a stand-in for one."""
 
     def depth_of(self, histogram: Histogram, *, decoder: Decoder | None = None) -> tuple[np.ndarray, int]: ...
 
@@ -160,7 +160,7 @@ def evaluate(
 
 
 def _tiled(histogram: Histogram, tile: tuple[int, int]) -> Histogram:
-    """Its first rows and columns, as many as tiles cover; InputError where not one fits."""
+    """Crop a histogram to the first rows and columns that whole tiles cover; InputError where not one fits."""
     size = histogram.depth_m.shape
     rows, columns = (side // part * part for side, part in zip(size, tile, strict=True))
     fits = rows > 0 and columns > 0

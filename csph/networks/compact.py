@@ -123,7 +123,7 @@ def fold(slices: Tensor) -> Tensor:
 
 
 def _over_time(convolution: nn.Conv2d, x: Tensor, batch: int) -> Tensor:
-    """relu of a kernel 3 x 1 over (T, R C) of features (B T, channels, R, C)."""
+    """Convolve features (B T, channels, R, C) with a kernel 3 x 1 over (T, R C), followed by relu."""
     rows, columns = x.shape[2:]
     stretched = x.permute(0, 2, 3, 1).reshape(batch, -1, rows * columns, x.shape[1]).permute(0, 3, 1, 2)
     y = convolution(stretched).relu_().permute(0, 2, 3, 1)  # in place before it is seen otherwise: no copy
@@ -131,7 +131,7 @@ def _over_time(convolution: nn.Conv2d, x: Tensor, batch: int) -> Tensor:
 
 
 def _linear(layer: nn.Linear, x: Tensor) -> Tensor:
-    """A 1 x 1 convolution of features (N, channels, ...) with channels last in memory."""
+    """Apply a 1 x 1 convolution to features (N, channels, ...) with channels last in memory."""
     return layer(x.movedim(1, -1)).movedim(-1, 1)
 
 
@@ -187,7 +187,7 @@ def averages(slices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _averages_back(grad: Tensor, gates: Tensor, scratch: Tensor, size: torch.Size) -> Tensor:
-    """gate_0 grad + sum of the transposed averages of gate_v grad: (N, F, P) -> `size`."""
+    """Compute gate_0 grad + sum of the transposed averages of gate_v grad: (N, F, P) -> `size`."""
     total = torch.mul(grad, gates[:, :1]).view(-1, *size[2:])
     for number, (left, right) in enumerate(zip(*_means(total), strict=True), start=1):
         torch.mul(grad, gates[:, number : number + 1], out=scratch)
@@ -197,13 +197,14 @@ def _averages_back(grad: Tensor, gates: Tensor, scratch: Tensor, size: torch.Siz
 
 
 def _means(slices: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
-    """Of rows and of columns: both matrices of each."""
+    """Return both mean matrices of the rows and both of the columns."""
     return tuple(_mean_matrices(size, slices.dtype, str(slices.device)) for size in slices.shape[-2:])
 
 
 @lru_cache(maxsize=32)
 def _mean_matrices(size: int, dtype: torch.dtype, device: str) -> tuple[Tensor, Tensor]:
-    """(size, size) each: means over three neighbours, and over three pairs, given to both of a pair."""
+    """Make two matrices, (size, size) each: means over three neighbours, and over three pairs, given to both of a
+    pair."""
     with torch.inference_mode(False):  # kept beyond the validation that may have asked first
         pairs = torch.arange(-(-size // 2))
         member = (torch.arange(size) // 2 == pairs.unsqueeze(-1)).double()
@@ -241,7 +242,7 @@ def _every_other(axes: tuple[int, ...], first: tuple[int, ...]) -> tuple[slice, 
 
 
 def _parts(fine: Tensor, coarse: Tensor, axes: tuple[int, ...]) -> list[tuple[Tensor, Tensor]]:
-    """Views of every other value of the fine tensor, and of the coarse one as far as those reach (odd sizes)."""
+    """View every other value of the fine tensor, and the coarse one as far as those reach (odd sizes)."""
     found = []
     for first in product((0, 1), repeat=len(axes)):
         part = fine[_every_other(axes, first)]

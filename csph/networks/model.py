@@ -34,7 +34,7 @@ KIND = "network"
 
 
 class Estimate(NamedTuple):
-    """What a network says of an image.
+    """Depth estimate of an image by a network.
 
     depth_m      (H, W) float32 [m]
     confidence   (H, W) float32: share of the posterior within 3 bins of the answer (`posterior.confidence`)
@@ -184,7 +184,7 @@ class DepthModel(nn.Module):
         return Estimate(radial_depth_of(histogram, depth), sure, overflows)
 
     def _logits_int8(self, counts: Tensor, inside: tuple[slice, slice], rule: Int8Rule) -> tuple[Tensor, int]:
-        """Logits from codes of 8-bit weights, and how many sums wrapped of the blocks that reach `inside`."""
+        """Compute logits from codes of 8-bit weights, and how many sums wrapped of the blocks that reach `inside`."""
         if self.layer is None:
             raise InputError(f"{self.config.name}: has no codes to hold in 8 bits")
         coding = self.layer.coding()
@@ -278,7 +278,7 @@ def load_model(path: Path) -> tuple[DepthModel, TrainConfig, dict]:
 
 
 def _check_design(config: ModelConfig, stored: int) -> None:
-    """InputError for a coding tensor of more numbers than the file holds, before it is made."""
+    """Raise InputError for a coding tensor of more numbers than the file holds, before it is made."""
     design = config.design
     if design is None:
         return
@@ -290,7 +290,8 @@ def _check_design(config: ModelConfig, stored: int) -> None:
 
 
 def _check_weights(weights: dict[str, Tensor], model: DepthModel) -> None:
-    """InputError that names the first tensor that is missing, too many, of another shape or kind, or not finite."""
+    """Raise InputError that names the first tensor that is missing, too many, of another shape or kind, or not
+    finite."""
     expected = model.state_dict()
     of = f"of another design than {model.config.name}:"
     for name in sorted({*expected, *weights}):

@@ -29,7 +29,7 @@ COUNT_BYTES = 4 * 4  # of a batch: counts, logits, their gradient and the target
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """What stands between counts and depth.
+    """Configuration of a depth model: all that stands between counts and depth.
 
     front    what the network sees: the back-projection of codes; without compression the counts, or their correlation
              with the pulse (`spad.estimators.matching.normalised_correlation`); or one-hot argmax
@@ -70,12 +70,13 @@ class ModelConfig:
 
     @property
     def block(self) -> tuple[int, int, int]:
-        """(Mt, Mr, Mc); one pixel and bin without codes."""
+        """Return the size of a block, (Mt, Mr, Mc); one pixel and bin without codes."""
         return (1, 1, 1) if self.design is None else self.design.block
 
     @property
     def decoder(self) -> Decoder:
-        """How its answer is read unless one asks otherwise: the published way on the published grid."""
+        """Return the default decoder of the network's posterior: soft-argmax on the published grid, as published, else
+        the median."""
         return "soft-argmax" if self.grid == "published" else "median"
 
     @property

@@ -111,7 +111,7 @@ class Frames(Dataset):
 def _sensed(
     sets: Sequence[PackedTransients], sensor: Sensor, size: tuple[int, int], window: int, requests: Sequence[Request]
 ) -> TrainBatch:
-    """A batch whose patches keep their order; patches of one set are sensed together."""
+    """Sense a batch whose patches keep their order; patches of one set are sensed together."""
     sources = [request.source for request in requests]
     parts, order = [], []
     for source in sorted(set(sources)):
@@ -127,7 +127,7 @@ def _sensed(
 
 
 def _window_start(batch: Batch, number: int, patch: Patch, sensor: Sensor, window: int) -> int:
-    """First bin of a window that holds the label of one pixel, drawn with the patch's key; -1 without windows."""
+    """Draw the first bin of a window that holds the label of one pixel, with the patch's key; -1 without windows."""
     if not window:
         return -1
     rng = np.random.default_rng(np.random.SeedSequence(patch.seed, spawn_key=(Stream.WINDOW,)))

@@ -77,7 +77,8 @@ class DepthTraining(pl.LightningModule):
 
     @property
     def kept(self) -> DepthModel:
-        """What is validated and kept: the averaged weights, or the weights themselves."""
+        """Return the model that is validated and kept: the one with averaged weights where there is one, else the
+        trained one."""
         return self.model if self.averaged is None else self.averaged
 
     def loss(self, batch: TrainBatch) -> Tensor:
@@ -197,7 +198,7 @@ class Record(pl.Callback):
 
 
 def _validation_mm(module: DepthTraining) -> dict[str, float]:
-    """Validation RMSE and MAE [mm] as the model is decoded, and by each decoder."""
+    """Compute the validation RMSE and MAE [mm] as the model is decoded, and by each decoder."""
     squared, absolute = module.squared_m2, module.absolute_m
     errors = {
         name: (float(squared[name].compute()) ** 0.5 * 1e3, float(absolute[name].compute()) * 1e3) for name in DECODERS
@@ -229,7 +230,7 @@ def _claim(folder: Path, config: TrainConfig) -> None:
 
 
 def _check_init(init: DepthModel, config: TrainConfig) -> None:
-    """InputError unless a trained model has the tensors and the sensor of the one to be trained."""
+    """Raise InputError unless a trained model has the tensors and the sensor of the one to be trained."""
     mine, other = config.model, init.config
     alike = all(getattr(mine, name) == getattr(other, name) for name in ("front", "network", "design", "sensor"))
     message = (
@@ -246,7 +247,8 @@ def _listed(views: Views | Sequence[Views]) -> list[Views]:
 
 @contextmanager
 def _quiet() -> Any:
-    """Lightning's advice on workers and devices is not the user's business: what is said here goes to the log."""
+    """Silence Lightning's advice on workers and devices, which is not the user's business: what is said here goes to
+    the log."""
     loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning.pytorch")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -261,7 +263,7 @@ def _quiet() -> Any:
 
 
 def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
-    """Lightning's Trainer without what `Record` does instead. InputError for mixed precision on a CPU."""
+    """Make Lightning's Trainer without what `Record` does instead. InputError for mixed precision on a CPU."""
     runner = pl.Trainer(
         max_epochs=config.epochs,
         precision=config.precision,

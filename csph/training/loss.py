@@ -1,4 +1,4 @@
-"""What training minimises: KL divergence to the sensor's pulse centred on the depth label, and total variation."""
+"""Compute the training loss: KL divergence to the sensor's pulse centred on the depth label, and total variation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an interrupted run goes on from: Lightning's state, written whole, and checked before it is believed."""
+"""Write the state of a run as a whole file, and check it before an interrupted run goes on from it."""
 
 from __future__ import annotations
 

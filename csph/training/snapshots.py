@@ -1,4 +1,4 @@
-"""How the energy of a learned temporal code moves over time bins while it is trained: `energy.csv` of a run."""
+"""Record how the energy of a learned temporal code moves over time bins in training: `energy.csv` of a run."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def _from_folder(path: Path) -> tuple[list[Transient], list[str]]:
 
 
 def _scene(meta: dict, number: int) -> str:
-    """What a view shows: views of one place are not independent, whatever their numbers."""
+    """Return the scene that a view shows: views of one place are not independent, whatever their numbers."""
     return str(meta.get("place", meta.get("scene", number)))
 
 

@@ -21,7 +21,7 @@ LONG_BLOCK = 256  # bins; learned codes over more of them know the depths of the
 
 @dataclass(frozen=True)
 class Card:
-    """What a shipped model is.
+    """Card of a shipped model: its training, its errors, and its limits.
 
     training, training_sha256   its sets' files and their SHA-256
     levels        photon levels of training, in words

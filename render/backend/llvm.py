@@ -100,7 +100,8 @@ def _found(library: str, variable: str) -> bool:
 
 
 def _loads(library: str) -> bool:
-    """Whether the dynamic linker loads it. ctypes.util.find_library would run a compiler, whose files a kill leaves."""
+    """Return whether the dynamic linker loads a library. ctypes.util.find_library would run a compiler, whose files a
+    kill leaves."""
     try:
         ctypes.CDLL(library)
     except OSError:

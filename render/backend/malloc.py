@@ -1,4 +1,5 @@
-"""What glibc's malloc does with freed memory: gives it back between the stages of a render, or keeps it for the next.
+"""Control what glibc's malloc does with freed memory: give it back between the stages of a render, or keep it for the
+next.
 
 No Mitsuba import: training keeps its memory by the same call as the renderer (`render.scene.traced_scene`).
 """
@@ -43,7 +44,7 @@ def trim_memory(pixels: int) -> None:
 
 @cache
 def _glibc(name: str) -> Callable[..., int]:
-    """A function of glibc; where the C library is another, memory stays and goes as it sees fit."""
+    """Look up a function of glibc; with another C library a function that does nothing."""
     if platform.libc_ver()[0] != "glibc":
         return lambda *arguments: 0
     return getattr(ctypes.CDLL(None), name, lambda *arguments: 0)

@@ -173,5 +173,6 @@ class CellTree:
 
 
 def _having(bits: np.ndarray, wanted: int) -> np.ndarray:
-    """Where one of the bits is set. By way of booleans, of which numpy skips those that are false fast."""
+    """Find the indices at which one of the `wanted` bits is set. By way of booleans, of which numpy skips those that
+    are false fast."""
     return np.flatnonzero((bits & wanted) != 0)

@@ -1,4 +1,5 @@
-"""What lies between neighbouring cells of pixels, compared all at once; and how cells follow their neighbours."""
+"""Detect edges (depth, crease, shadow, albedo, highlight) between neighbouring cells of pixels, all at once, and fit
+path intervals across cells without an edge."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ ACROSS, PAIRS = 8, 12  # pairs of a cut cell's children: with what lies beyond i
 
 
 class Cells(NamedTuple):
-    """What is compared of cells, (N,) each: see `render.direct.footprints.Footprints`."""
+    """Columns by which cells are compared, (N,) each: see `render.direct.footprints.Footprints`."""
 
     distance_m: Floats
     slope_x_m: Floats
@@ -45,7 +46,7 @@ class Cells(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where cells lie: level, column and row in cells of that level, and the rank of their pixel, (N,) each."""
+    """Positions of cells: level, column and row in cells of that level, and the rank of their pixel, (N,) each."""
 
     level: UInts
     column: UInts
@@ -54,8 +55,8 @@ class Place(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """How cells, `grid` a pixel side, are found in an image `width` wide: `rank_of` each pixel from the `first` one on
-    (-1: none), and the first `child` of each cell (-1: a leaf); both int32."""
+    """Lookup of cells, `grid` a pixel side, in an image `width` wide: `rank_of` each pixel from the `first` one on (-1:
+    none), and the first `child` of each cell (-1: a leaf); both int32."""
 
     grid: int
     width: int
@@ -65,9 +66,10 @@ class Tree(NamedTuple):
 
 
 class _Between(NamedTuple):
-    """Of a pair of cells: whether an edge lies between them, whether it parts surfaces too far from each other (or one
-    from nothing), the share of the brighter one's radiance that misplacing it can change, whether both are hits on
-    one surface, bent or not, and the mean radiance that a highlight between them may add to a cell."""
+    """Comparison of two neighbouring cells: whether an edge lies between them, whether their surfaces are too far from
+    each other (or only one cell hits a surface), the share of the brighter one's radiance that misplacing the edge can
+    change, whether both are hits on one surface, bent or not, and the mean radiance that a highlight between them may
+    add to a cell."""
 
     differ: Array
     apart: Array
@@ -131,7 +133,7 @@ def child_edges(
 
 
 def _seen(cells: Cells) -> tuple[Array, ...]:
-    """The same memory, as Dr.Jit sees it."""
+    """View the columns of cells as Dr.Jit arrays on the same memory."""
     return tuple((UInt32 if column.dtype == np.uint32 else Float)(column) for column in cells if column is not None)
 
 
@@ -285,7 +287,7 @@ def _bits(cut: Masks, mixed: Masks, glint: Masks) -> Array:
 
 
 def _at(columns: Array, index: UInts, active: bool | Masks = True) -> Array:
-    """Those of other cells; of nothing where not `active`."""
+    """Gather the columns of the cells `index`; zeros where not `active`."""
     gathered = (dr.gather(type(column), column, index, active) for column in columns if column is not None)
     return type(columns)(*gathered)
 
@@ -312,7 +314,7 @@ def _between(one: Cells, other: Cells, step: UInts, rise: Floats, other_rise: Fl
 
 
 def _highlight(one: Cells, other: Cells) -> Array:
-    """Mean radiance of a cell that holds the highlight between two neighbours on a surface that bends.
+    """Estimate the mean radiance of a cell that holds the highlight between two neighbours on a surface that bends.
 
     Between them the tilt off its middle, in units of the roughness, runs from one's to the other's, and in the
     neighbouring rows as far to the side as half the step. GGX falls as 1 / (1 + t^2)^2 with the tilt t, Beckmann

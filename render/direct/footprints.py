@@ -70,7 +70,7 @@ def trace(
 
 
 def _lanes(count: int) -> int:
-    """The next number that neither 2 nor 3 divides, from 5 on.
+    """Find the next number of lanes that neither 2 nor 3 divides, from 5 on.
 
     Dr.Jit records anew where two inputs have one size that had not before. Coordinates of meshes and their textures
     come in twos and threes; and arrays of one entry are scalars to it.
@@ -141,7 +141,7 @@ def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *
 
 
 def _first_hit(world: TracedScene, ray: Rays) -> tuple[Array, Array, Array, Array]:
-    """`first_opaque` of rays from the camera in the order of their pixels."""
+    """Trace `first_opaque` of rays from the camera in the order of their pixels."""
     if world.sees_through:
         return first_opaque(world, ray, Bool(True))
     # neighbouring lanes are neighbouring rays: told so, Embree is three times as fast
@@ -160,7 +160,7 @@ def _clip_to_face(
 
 
 def _off_centre(column: UInts, row: UInts, level: UInts) -> tuple[Array, Array]:
-    """Where in its cell a ray goes, off the centre along x and y in cells' widths: 0 in cells of level 0.
+    """Compute a ray's offset from the centre of its cell along x and y, in cell widths: 0 in cells of level 0.
 
     Cells that were cut lie along edges, and edges of rooms run along rows or columns: with rays in the middle all cells
     of a row would round to the same side. So a row's rays are moved along it, and a column's along the column, by
@@ -175,7 +175,7 @@ def _off_centre(column: UInts, row: UInts, level: UInts) -> tuple[Array, Array]:
 def _glint(
     world: TracedScene, si: Interactions, ray: Rays, to_laser: Vectors, hit: Masks, irradiance: Floats
 ) -> tuple[Array, Array, Array]:
-    """Tilt off the highlight's middle, and its radiance there: see `Footprints`."""
+    """Compute the tilt off the highlight's middle, and the radiance there: see `Footprints`."""
     index = shape_index(si)
     peak = dr.gather(Float, world.peak, index, hit) * irradiance
     glossy = hit & (peak > 0)
@@ -210,7 +210,7 @@ def _slopes(
 
 
 def _face_span(world: TracedScene, si: Interactions, path: Floats, active: Masks) -> tuple[Array, Array]:
-    """Bounds [m] of the path length over the hit triangle.
+    """Bound the path length [m] over the hit triangle.
 
     p(x) = |x - C| + |x - L| is convex: it is largest at a vertex, and nowhere on the face below its linearisation at
     the hit point, p + g . (x - x_0) with g the sum of the two unit vectors, whose least value is at a vertex too.

@@ -30,7 +30,8 @@ class DirectLight(NamedTuple):
 
 
 class Layers(NamedTuple):
-    """What the pixel-centre ray meets: radial depth [m] (NaN: nothing), world normal toward the camera, albedo."""
+    """First surface along every pixel-centre ray: radial depth [m] (NaN: nothing), world normal toward the camera,
+    albedo."""
 
     depth_m: np.ndarray
     normal: np.ndarray
@@ -102,7 +103,7 @@ def _chunk(
 
 
 def _samples(tree: CellTree, cells: np.ndarray, pitch: np.ndarray | float, tolerance_m: float) -> Samples:
-    """What cells of that width, in pixels, return.
+    """Make the returns of `cells` that are `pitch` pixels wide.
 
     A cell with half spans a > b is a trapezoid of path lengths, which one uniform return describes badly at the edges
     of bins. Where b is above the tolerance two returns do it better, without another ray: its halves along the smaller
@@ -127,7 +128,7 @@ def _samples(tree: CellTree, cells: np.ndarray, pitch: np.ndarray | float, toler
 
 
 def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Samples:
-    """Merged returns of pixels whose cells are all of level 0.
+    """Merge the returns of pixels whose cells are all of level 0.
 
     Most pixels need no sort: all their cells merge, or no two do.
     """
@@ -155,7 +156,7 @@ def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Sampl
 
 
 def _all(conditions: list[np.ndarray], length: int) -> np.ndarray:
-    """Elementwise and."""
+    """Combine conditions by elementwise and."""
     every = np.ones(length, bool)
     for condition in conditions:
         every &= condition
@@ -163,7 +164,7 @@ def _all(conditions: list[np.ndarray], length: int) -> np.ndarray:
 
 
 def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, fraction: float) -> Samples:
-    """One return for each row of cells, with the sum of energy, the centroid and the variance of its cells."""
+    """Make one return for each row of cells, with the sum of energy, the centroid and the variance of its cells."""
     weight = radiance.astype(np.float64).T * fraction
     path = tree.path_m[index].astype(np.float64).T
     half_width = tree.half_width_m[index].astype(np.float64).T

@@ -44,7 +44,7 @@ class PathBatch(NamedTuple):
 
 
 class PathTask(NamedTuple):
-    """What one launch is to trace: a path in every pixel of every block.
+    """Configuration of one launch: a path in every pixel of every block.
 
     pixels        flat pixels, block by block (-1: none)
     launch        which block has which sample
@@ -96,8 +96,8 @@ def trace_paths(task: PathTask) -> PathBatch:
 
 
 class _Given(NamedTuple):
-    """What paths are traced from, as arrays: `Slots`; `LaunchLayout`, the numbers of a block's sample together; flat
-    pixels; keys of the random numbers; how many batches there are; the parts of `LightVertices`; and from where on
+    """Inputs of the path tracing kernel, as arrays: `Slots`; `LaunchLayout`, the numbers of a block's sample together;
+    flat pixels; keys of the random numbers; the number of batches; the parts of `LightVertices`; and from where on
     light is filtered [m], or None.
 
     Dr.Jit records anew where two inputs have one size that had not before: there are 16 n lanes, 4 n + 2 numbers of
@@ -116,7 +116,7 @@ class _Given(NamedTuple):
 def _paths(
     world: TracedScene, *given: Array, reuses_paths: bool, connections: int
 ) -> tuple[tuple, tuple, tuple, Array]:
-    """The parts of `PathBatch`, in plain tuples, which recordings look into."""
+    """Trace the parts of `PathBatch`, in plain tuples, which recordings look into."""
     given = _Given(*given)
     slots, keys, from_m = Slots(*given.slots), given.keys, given.from_m
     light_vertices = (
@@ -169,7 +169,7 @@ def _paths(
 
 
 def _of_any_length(values: Floats) -> Array:
-    """A constant as one entry: a recording would return it in the length of the launch that was recorded."""
+    """Shorten a constant to one entry: a recording would return it in the length of the launch that was recorded."""
     constant = dr.is_array_v(values) and values.state == dr.VarState.Literal
     return type(values)(values[0]) if constant else values
 

@@ -1,4 +1,5 @@
-"""Polished surfaces that the laser shines on: which paths of indirect light are better begun on them.
+"""Find polished surfaces that the laser shines on, and weight the paths of indirect light that are better begun on
+them.
 
 Polished metal throws a flash's light as caustics on what is around it. A path from a wall meets such metal by chance
 where that sends the light of the laser on its way, once in ten thousand times, and is as bright then. A path from the
@@ -57,7 +58,7 @@ def glossy_of(world: TracedScene) -> Glossy | None:
 
 
 def _look_for(world: TracedScene) -> tuple[Array, ...]:
-    """The parts of `Glossy`, none if nowhere: a plain tuple, which recordings take for an input."""
+    """Find the parts of `Glossy`, none if no surface is glossy: a plain tuple, which recordings take for an input."""
     camera, laser = world.scene.camera, world.scene.laser
     angle = min(math.acos(laser.cos_half_angle(camera)), math.radians(WIDEST_DEG))
     reach = camera.focal_px * math.tan(angle)
@@ -129,7 +130,8 @@ def mis_weight_light_path(
 def _light_path_weight(
     world: TracedScene, pixel: UInts, y: Interactions, direction: Vectors, x: Interactions, active: Masks
 ) -> Array:
-    """c of the module's text; 0 where no path from the laser samples the pair."""
+    """Compute the weight c of a path from the laser, as in the module's text; 0 where no path from the laser samples
+    the pair."""
     to_x, to_laser, to_eye = dr.normalize(direction), world.laser - x.p, world.eye - y.p
     light, eye = dr.normalize(to_laser), dr.normalize(to_eye)
     glossy = glossy_of(world)
@@ -144,7 +146,8 @@ def _light_path_weight(
 
 
 def _density(si: Interactions, seen_from: Vectors, towards: Vectors, active: Masks) -> Array:
-    """Density per solid angle with which the lobes of a surface, seen from one direction, sample another."""
+    """Compute the density per solid angle with which the lobes of a surface, seen from one direction, sample
+    another."""
     seen = interaction_from_parts(parts_of(si))
     seen.wi = si.to_local(seen_from)
     return si.bsdf().pdf(mi.BSDFContext(), seen, si.to_local(towards), active)

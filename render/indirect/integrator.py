@@ -144,7 +144,7 @@ def indirect_light(
 
 
 def _standard_error(totals: np.ndarray) -> np.ndarray:
-    """Standard error of the sum of batches, (pixels, batches) -> (pixels,); 0 for one batch."""
+    """Compute the standard error of the sum of batches, (pixels, batches) -> (pixels,); 0 for one batch."""
     batches = totals.shape[1]
     return totals.std(axis=1, ddof=1) * np.sqrt(batches) if batches > 1 else np.zeros(len(totals))
 

@@ -72,7 +72,7 @@ def trace_light_paths(
 def _trace_launch(
     world: TracedScene, pixel: UInts, lane: UInts, number: UInts, batch: UInts, keys: list[Array], bounces: int
 ) -> tuple[Array, Array, Array]:
-    """Target pixels, paths and radiances, (bounces - 1) x lanes flat."""
+    """Trace light paths; return target pixels, paths and radiances, (bounces - 1) x lanes flat."""
     lanes = dr.width(lane)
     targets = dr.zeros(UInt32, lanes * (bounces - 1))
     paths, values = dr.zeros(Float, lanes * (bounces - 1)), dr.zeros(Float, lanes * (bounces - 1))
@@ -116,7 +116,8 @@ def _trace_launch(
 def _sample_first_vertex(
     world: TracedScene, pixel: UInts, number: UInts, batch: UInts, keys: list[Array], random: Generators
 ) -> tuple[Array, ...]:
-    """x1, the path to it, a sample of where light goes from there, its value, and whether there is any."""
+    """Sample x1: the vertex, the path to it, a sample of where light goes from there, its value, and whether there is
+    any."""
     glossy, intensity = glossy_of(world), dr.gather(Float, world.intensity, UInt32(0))
     assert glossy is not None
     jitter = mi.Point2f(random.next_float32(), random.next_float32())
@@ -133,6 +134,7 @@ def _sample_first_vertex(
 
 
 def _ratio(si: Interactions, local: Vectors) -> Array:
-    """Cosine to the shading normal over that to the surface, of a direction in the shading frame."""
+    """Compute the cosine to the shading normal over that to the surface's normal, of a direction in the shading
+    frame."""
     shading, true = dr.abs(local.z), dr.abs(dr.dot(si.n, si.to_world(local)))
     return dr.maximum(shading, MIN_SHADING_COSINE) / dr.maximum(true, MIN_SHADING_COSINE)

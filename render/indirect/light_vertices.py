@@ -73,7 +73,7 @@ def sample_light_vertices(world: TracedScene, lanes: int, batches: int, key: tup
 
 
 def _sample_vertices(world: TracedScene, index: UInts, each: UInts, *key: UInts) -> tuple[Array, ...]:
-    """The parts of `LightVertices`, in plain tuples."""
+    """Sample the parts of `LightVertices`, in plain tuples."""
     # each batch has a randomised (0, 2)-sequence of its own
     shift = mi.sample_tea_32(index // each + key[0], index * 0 + key[1])
     number = index % each
@@ -96,7 +96,7 @@ def density_of(world: TracedScene, si: Interactions, to_laser: Vectors) -> Array
 
 
 def _cap(world: TracedScene) -> Array:
-    """Solid angle of the laser's cone over 2 pi: 1 - cos, without cancellation."""
+    """Compute the solid angle of the laser's cone over 2 pi: 1 - cos, without cancellation."""
     return 2 * dr.square(dr.sin(0.5 * world.half_angle))
 
 

@@ -39,7 +39,7 @@ class Cells(NamedTuple):
 
     @property
     def width_of_m(self) -> np.ndarray:
-        """Width of every cell [m]."""
+        """Return the width of every cell [m]."""
         return np.diff(self.edges_m)
 
 

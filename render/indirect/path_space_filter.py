@@ -150,7 +150,7 @@ class PathSpaceFilter:
         self._lay_out(found, nearest)
 
     def _lay_out(self, found: np.ndarray, nearest_m: np.ndarray) -> None:
-        """Cells for the regions with these keys, whose points are at least so far from the camera."""
+        """Lay out cells for the regions of the keys `found`, whose points are at least `nearest_m` from the camera."""
         octave = (found >> np.uint64(3 * (KEY_BITS + NORMAL_BITS))).astype(np.int64) // HASH_GRIDS
         cells = self.filter_octaves.cells[octave]
         reach = 0.5 * math.sqrt(3) * self.filter_octaves.size_m[octave]
@@ -162,7 +162,7 @@ class PathSpaceFilter:
         self.paths, self.filled = dr.zeros(UInt64, len(found) + 1), dr.zeros(UInt32, len(found) + 1)
 
     def _key(self, point: Point, level: UInts) -> Array:
-        """Level, class of normals and cube of a point in one number. A level is a grid of an octave."""
+        """Encode level, class of normals and cube of a point in one number. A level is a grid of an octave."""
         size, key = dr.gather(Float, self._size, level), UInt64(level)
         for part in point.n:
             key = (key << NORMAL_BITS) | UInt64(UInt32(Int32(dr.round(part)) + 1))
@@ -172,7 +172,7 @@ class PathSpaceFilter:
         return key
 
     def _from_middle(self, point: Point, level: UInts) -> Array:
-        """The way along the surface to a point from the middle of its cube."""
+        """Compute the vector along the surface from the middle of a point's cube to the point."""
         size = dr.gather(Float, self._size, level)
         parts = [part / size + dr.gather(Float, shift, level) for part, shift in zip(point.p, self._shift, strict=True)]
         off = mi.Vector3f(*(part - dr.floor(part) - 0.5 for part in parts)) * size
@@ -255,7 +255,8 @@ class PathSpaceFilter:
         sums.evaluate()
 
     def _readings(self) -> tuple[Array, Array, Array, Array, Point]:
-        """Which place reads which region, once, with its points' summed reflectance and their mean.
+        """List every pair of a place and a region that it reads once, with the summed reflectance of the place's points
+        and their mean weighted by reflectance.
 
         Points of one place lie next to each other.
         """
@@ -277,7 +278,7 @@ class PathSpaceFilter:
         return place, level, row, weight, Point(mi.Point3f(x, y, z) / weight, normal, path / weight, weight)
 
     def _reads(self, reader: UInts, level: UInts, place: UInts, row: UInts) -> Array:
-        """Whether there is such a point of this place, and it reads this region."""
+        """Return whether the point `reader` exists, belongs to `place` and reads the region `row` at this level."""
         readers = dr.opaque(UInt32, dr.width(self.place))
         there = (reader >= 0) & (reader < Int32(readers))
         number = UInt32(dr.select(there, reader, 0))
@@ -285,11 +286,12 @@ class PathSpaceFilter:
         return there & (dr.gather(UInt32, self._row_of, level * readers + number, there) == row)
 
     def _energies(self, index: UInts) -> list:
-        """Every batch's energy in a cell."""
+        """Read the energy of every batch in a cell."""
         return [Float(dr.gather(UInt64, self.energy, index * self.batches + b)) for b in range(self.batches)]
 
     def _growing(self, index: UInts, energies: list) -> Array:
-        """Mean direction in which the path of a cell's light grows; of all batches, whose energies these are."""
+        """Compute the mean direction in which the path of a cell's light grows, over all batches, whose `energies`
+        these are."""
         energy = sum(energies[1:], energies[0])
         parts = (2 * Float(dr.gather(UInt64, self.path_gradient, 3 * index + axis)) - energy for axis in range(3))
         return dr.select(energy > 0, mi.Vector3f(*parts) / energy, 0)
@@ -331,14 +333,15 @@ class _Reading(NamedTuple):
 
 
 def _numbered(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct keys, sorted, and the number of each one's. Neighbours mostly have the same: runs of them are sorted."""
+    """Find the distinct keys, sorted, and the number of each key among them. Neighbours mostly have the same key: runs
+    are sorted."""
     begins = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
     found, number = np.unique(keys[begins], return_inverse=True)
     return found, np.repeat(number, np.diff(np.append(begins, len(keys))))
 
 
 def _by_level(of_octaves: np.ndarray) -> Array:
-    """Values of octaves for their levels: one a grid."""
+    """Repeat the values of octaves for their levels: one a grid."""
     return upload(Float, np.repeat(of_octaves, HASH_GRIDS))
 
 
@@ -347,12 +350,13 @@ def _plus(totals: list, energies: list, weight: Floats) -> list:
 
 
 def _edge(cell: UInts) -> Array:
-    """Where a cell begins, in widths of the first."""
+    """Compute where a cell begins, in widths of the first cell."""
     return (dr.exp(GROWTH * Float(cell)) - 1) / GROWTH
 
 
 def _each(count: int, times: int) -> tuple[Array, Array]:
-    """All pairs of 0 .. `count` and 0 .. `times`, the first running faster. Opaque: counts differ from run to run."""
+    """List all pairs of 0 .. `count` and 0 .. `times`, the first running faster. Opaque: counts differ from run to
+    run."""
     lane, number = dr.arange(UInt32, count * times), dr.opaque(UInt32, max(count, 1))
     return lane % number, lane // number
 
@@ -362,7 +366,8 @@ def _gathered(columns: NamedTuple, index: UInts) -> Array:
 
 
 def _points(world: TracedScene, pixels: np.ndarray, key: UInts) -> tuple[Array, Point]:
-    """READERS points of every pixel, spread evenly, where they reflect diffusely, and their places in `pixels`."""
+    """Sample GATHER_POINTS points of every pixel, spread evenly, where they reflect diffusely, and their places in
+    `pixels`."""
     lane = dr.arange(UInt32, len(pixels) * GATHER_POINTS)
     place, number = lane // GATHER_POINTS, lane % GATHER_POINTS
     pixel = dr.gather(UInt32, upload(UInt32, pixels.astype(np.int64) & 0xFFFFFFFF), place)

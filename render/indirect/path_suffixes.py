@@ -53,8 +53,8 @@ class PathSuffixes(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """Where paths put the light of x3, x4, ...: lanes; memory for radiances and paths, slots x lanes; and how many of
-    both there are, as arrays."""
+    """Memory for the light of the path vertices x3, x4, ...: lanes; radiances and paths, slots x lanes; and the numbers
+    of lanes and slots, as arrays."""
 
     lane: UInts
     values: Floats
@@ -73,12 +73,12 @@ def slots_for(world: TracedScene, light_vertices: LightVertices | None, lanes: i
 
 
 def _connects_suffix(world: TracedScene, light_vertices: LightVertices | None) -> bool:
-    """Whether vertices after x1 are joined to lit points."""
+    """Return whether path vertices after x1 are connected to light vertices."""
     return light_vertices is not None and is_wide(world)
 
 
 class SuffixTask(NamedTuple):
-    """What the suffixes of a launch are traced with.
+    """Inputs for tracing the path suffixes of a launch.
 
     light_vertices, connections  what vertices are connected to, and how many of them x1 is; None, 0: to none
     batch, pixel, random         batch, flat pixel and random numbers of every path
@@ -152,7 +152,7 @@ def trace_suffixes(
 
 
 class _SuffixState(NamedTuple):
-    """Where paths stand and how they go on: a sample of the surface's lobes and its weight.
+    """Current vertices of paths and their continuation: a sample of the surface's lobes and its weight.
 
     `throughput` is the factor of light that comes from there, `throughput_at_vertex` that of light reflected on the
     spot, reflectance counted in that light; `connectable` says whether there is such, `readable` whether other paths

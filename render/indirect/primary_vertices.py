@@ -29,12 +29,12 @@ class PrimaryVertices(NamedTuple):
 
     @property
     def early_m(self) -> Array:
-        """`late_m` of those that share, 0 for others."""
+        """Return `late_m` of the vertices that allow reuse, 0 for others."""
         return dr.select(self.allows_reuse, self.late_m, 0)
 
 
 class Connection(NamedTuple):
-    """What x1 reflects of a lit point: radiance, path to the laser, and direction to the point."""
+    """Light that x1 reflects of a lit point: radiance, path to the laser, and direction to the point."""
 
     value: Floats
     path: Floats

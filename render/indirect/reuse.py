@@ -64,7 +64,8 @@ def add_reused_light(
 
 
 def _weight(paths: PathBatch, sums: IndirectAccumulator) -> Array:
-    """Of a path in the regions: all of a pixel count as much as those of another."""
+    """Compute the integer weight of a path in the regions' sums: all paths of a pixel count as much as those of
+    another."""
     return UInt32(UNIT_WEIGHT * dr.gather(Float, sums.scale, paths.primary.receiver) + 0.5)
 
 
@@ -138,7 +139,7 @@ class _Squares:
         return dr.select(dr.isfinite(radiance), dr.minimum(radiance, limit), radiance)
 
     def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
-        """The square of what is added."""
+        """Compute the square of an added radiance."""
         square = dr.select(active & dr.isfinite(radiance), dr.square(radiance), 0)
         if self._late_m is None:
             return square
@@ -150,7 +151,7 @@ class _Squares:
         self._lanes = total
 
     def by_block(self, size: int) -> np.ndarray:
-        """Sums over so many lanes each."""
+        """Sum the squares over groups of `size` lanes each."""
         return self._lanes.numpy().astype(np.float64).reshape(-1, size).sum(axis=1)
 
 
@@ -166,7 +167,8 @@ class _Pairs(NamedTuple):
 
 
 def _pairs_of(number: UInts, chosen: UInts = None) -> _Pairs:
-    """Neighbours in a block are neighbours in the launch, which keeps rays coherent."""
+    """Make the pairs of these numbers. Neighbours in a block are neighbours in the launch, which keeps rays
+    coherent."""
     group = number // BLOCK
     suffix = group if chosen is None else dr.gather(UInt32, chosen, group)
     return _Pairs(suffix // BLOCK * BLOCK + number % BLOCK, suffix, group, number, chosen)
@@ -177,7 +179,7 @@ def _all_pairs(lanes: int) -> _Pairs:
 
 
 def _pairs(paths: PathBatch, *, reuses_paths: bool, early: bool) -> _Pairs | None:
-    """The pairs that may have light for each other."""
+    """Select the pairs of primary vertex and suffix that may have light for each other; None where there are none."""
     if reuses_paths:
         return _all_pairs(dr.width(paths.batch))
     if not early:
@@ -200,8 +202,8 @@ def _early(paths: PathBatch) -> Array:
 
 
 class _Ends(NamedTuple):
-    """What pairs need of primary vertices and suffixes, as arrays and plain tuples, which recordings look into: see
-    `PrimaryVertices` and `PathSuffixes`."""
+    """Parts of primary vertices and suffixes that pairs of both need, as arrays and plain tuples, which recordings look
+    into: see `PrimaryVertices` and `PathSuffixes`."""
 
     si1: tuple
     transmission: Floats
@@ -218,8 +220,8 @@ class _Ends(NamedTuple):
 
 
 class _Connections(NamedTuple):
-    """Of every pair: leg x1 to x2 [m], pixel radiance from x2's laser light and from beyond, times the densities; the
-    sums of these over each group."""
+    """Connections of every pair: leg x1 to x2 [m], pixel radiance of x2's laser light and factor of the light from
+    beyond x2, both before division by a density; and the sums of the sampling densities over each group."""
 
     leg: Floats
     value: Floats
@@ -229,7 +231,7 @@ class _Connections(NamedTuple):
 
 
 def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> tuple[Array, ...]:
-    """The parts of `_Connections`."""
+    """Compute the fields of `_Connections` for pairs of primary vertex and suffix."""
     vertex, suffix, _ = _pairs_of(number, chosen)[:3]
     ends = _Ends(*ends)
     reusable = dr.gather(Bool, ends.reusable, suffix) & dr.gather(Bool, ends.allows_reuse, vertex)
@@ -275,7 +277,8 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
 
 
 class _Weights(NamedTuple):
-    """Of every pair: leg from x1 to x2 [m], radiance of x2's laser light, factor of what lies beyond x2."""
+    """Weighted connections of every pair: leg from x1 to x2 [m], radiance of x2's laser light, factor of the light from
+    beyond x2."""
 
     leg: Floats
     first: UInts
@@ -330,8 +333,8 @@ def _own_lanes(paths: PathBatch) -> _Lanes:
 
 
 class _Lanes(NamedTuple):
-    """What lanes add: pixel and batch; suffix; paths from camera to x1 and on to x2; one from the laser up to which
-    light is reused; radiance of x2's laser light, factor of light beyond."""
+    """Contributions of lanes: pixel and batch; suffix; paths from camera to x1 and on to x2; path from the laser up to
+    which light is reused; radiance of x2's laser light, factor of the light from beyond x2."""
 
     receiver: UInts
     batch: UInts

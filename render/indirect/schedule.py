@@ -38,12 +38,12 @@ class Schedule(NamedTuple):
 
     @property
     def paths(self) -> int:
-        """Paths traced from the camera."""
+        """Count the paths traced from the camera."""
         return int((self.spp * (self.pixels.reshape(-1, BLOCK) >= 0).sum(axis=1)).sum())
 
     @property
     def connections(self) -> int:
-        """Rays between pixels and their neighbours' paths."""
+        """Count the rays between pixels and their neighbours' paths."""
         return int(self.spp[self.reuses_paths].sum()) * BLOCK**2
 
     def rays(self, bounces: int) -> int:
@@ -107,7 +107,8 @@ def allocate(
     squared_error: float = 0.0,
     batches: int = BATCHES,
 ) -> Schedule:
-    """Spend work where it lowers the summed squared error most, until the error is met or `cost` paths a pixel spent.
+    """Allocate work where it lowers the summed squared error most, until the error is met or `cost` paths a pixel
+    spent.
 
     R samples with noise N and work c add N / R to the error and R c to the work, in one block and one way (own paths or
     reused ones); N / R + L R c is least at R = sqrt(N / (L c)), at least `batches` (Neyman 1934). L comes by bisection.

@@ -92,7 +92,8 @@ def first_opaque(
 def _pass_layers(
     world: TracedScene, ray: Rays, origin: Vectors, active: Masks, limit: Floats, in_air: bool
 ) -> tuple[Array, ...]:
-    """`first_opaque` with layers, no farther than `limit`; where nothing stops the ray the paths run to the limit.
+    """Trace `first_opaque` through layers, no farther than `limit`; where nothing stops the ray the paths run to the
+    limit.
 
     A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
     ray that starts at a surface may start inside glass: the side of its first interface tells. A ray that meets more

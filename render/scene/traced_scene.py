@@ -123,7 +123,8 @@ class TracedScene:
         self.half_angle = dr.opaque(Float, math.acos(scene.laser.cos_half_angle(camera)) * (1 + 1e-5))
 
     def _reflectance(self, material: Material, masks: str, known: Mapping[tuple, Any]) -> Array:
-        """Mitsuba's BSDF of a material, taken from those known if it is a plain, whole plastic that is among them."""
+        """Make Mitsuba's BSDF of a material, taken from those known if it is a plain, whole plastic that is among
+        them."""
         bsdf = _bsdf(material, _albedo(material))
         if masks == "mitsuba" and _has_cutouts(material):
             bsdf = {"type": "mask", "opacity": _texture(material.opacity), "nested": bsdf}
@@ -234,7 +235,7 @@ _PARAMETERS = {
 
 
 def _merge_key(surface: Surface) -> tuple:
-    """Surfaces with equal keys share a mesh: equal materials but for a plain albedo, which each face keeps."""
+    """Make a key by which surfaces share a mesh: equal materials but for a plain albedo, which each face keeps."""
     material = surface.material
     kind = "diffuse" if material.kind == "roughdiffuse" else material.kind
     albedo: object = id(material.albedo) if isinstance(material.albedo, Texture) else None
@@ -250,7 +251,8 @@ def _has_cutouts(material: Material) -> bool:
 
 
 def _specular_albedo(material: Material) -> float:
-    """Scaled reflectance of a conductor at normal incidence; -1 for what has a diffuse reflectance of its own."""
+    """Compute the scaled reflectance of a conductor at normal incidence; -1 for what has a diffuse reflectance of its
+    own."""
     if material.kind not in ("conductor", "roughconductor"):
         return -1.0
     eta, k = material.eta, material.k
@@ -258,8 +260,8 @@ def _specular_albedo(material: Material) -> float:
 
 
 def _peak(material: Material) -> float:
-    """f cos of a rough lobe at the middle of its highlight seen along the light, F_0 / (4 pi alpha^2) [1/sr] (GGX or
-    Beckmann with all cosines 1); 0 for other lobes."""
+    """Compute f cos of a rough lobe at the middle of its highlight seen along the light, F_0 / (4 pi alpha^2) [1/sr]
+    (GGX or Beckmann with all cosines 1); 0 for other lobes."""
     if material.kind == "roughconductor":
         mirrored = _specular_albedo(material)
     elif material.kind == "roughplastic":
@@ -270,7 +272,8 @@ def _peak(material: Material) -> float:
 
 
 def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: Array, masks: str) -> Array:
-    """One mesh of surfaces that share a material; cut-outs by `masks`: none, ours (an attribute), or the BSDF's own."""
+    """Make one mesh of surfaces that share a material; cut-outs by `masks`: none, ours (an attribute), or the BSDF's
+    own."""
     material = surfaces[0].material
     starts = np.cumsum([0] + [len(s.vertices) for s in surfaces])
     vertices = np.concatenate([s.vertices for s in surfaces]) - origin
@@ -305,12 +308,12 @@ def _mesh(name: str, surfaces: tuple[Surface, ...], origin: np.ndarray, bsdf: Ar
 
 
 def _is_on_faces(material: Material) -> bool:
-    """Whether the albedo is an attribute of the mesh's faces."""
+    """Return whether a material's albedo is stored as an attribute of the mesh's faces."""
     return material.kind in ("diffuse", "roughdiffuse") and not isinstance(material.albedo, Texture)
 
 
 def _is_on_ramp(material: Material) -> bool:
-    """Whether the albedo is a texture coordinate on a ramp.
+    """Return whether a material's albedo is stored as a texture coordinate on a ramp.
 
     Mitsuba's plastics need a texture with a mean, which an attribute has not. With textured opacity the coordinates are
     taken; such a surface has a mesh of its own.
@@ -320,7 +323,7 @@ def _is_on_ramp(material: Material) -> bool:
 
 
 def _albedo(material: Material) -> dict[str, Any] | None:
-    """Mitsuba's texture for the albedo of a mesh."""
+    """Describe Mitsuba's texture for the albedo of a mesh; None where the material has no albedo."""
     if material.kind not in ("diffuse", "roughdiffuse", "plastic", "roughplastic"):
         return None
     if _is_on_faces(material):
@@ -371,7 +374,7 @@ def _bsdf(material: Material, albedo: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def _power(surfaces: Sequence[Surface]) -> float:
-    """Of what emits: radiance times area."""
+    """Compute the emission weight of surfaces: radiance x area summed over those that emit."""
     power = 0.0
     for surface in surfaces:
         if surface.emission > 0:

@@ -96,7 +96,7 @@ class _Tables:
 
 
 def _reflectance(tables: _Tables, shape: Array, cosine: Floats, active: Masks) -> Array:
-    """Unpolarised Fresnel reflectance: a metal's, one interface's, or 2F / (1 + F) of a thin pane."""
+    """Compute the unpolarised Fresnel reflectance: a metal's, one interface's, or 2F / (1 + F) of a thin pane."""
     kind = dr.gather(Float, tables.kind, shape, active)
     cosine = dr.minimum(dr.abs(cosine), 1)
     index = mi.Complex2f(dr.gather(Float, tables.eta, shape, active), dr.gather(Float, tables.k, shape, active))
@@ -169,7 +169,7 @@ def _connect(
 
 
 def _glints(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray) -> Samples:
-    """The laser itself in rows of (m, k) planes, from the camera on."""
+    """Find the glints of the laser itself in rows of (m, k) planes, from the camera on."""
     camera, laser = world.scene.camera, world.scene.laser
     laser_point = laser.position(camera) - camera.origin
     image = image_of(mirrors, sequence, laser_point)
@@ -209,7 +209,8 @@ def _glints(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.
 
 
 def _made_up(image: np.ndarray, came_back: np.ndarray) -> np.ndarray:
-    """Factor (m,) that makes up for the one or two rays of a lobe (m, LOBE_RAYS) lost to rounding on a border of faces.
+    """Compute the factor (m,) that makes up for the one or two rays of a lobe (m, LOBE_RAYS) lost to rounding on a
+    border of faces.
 
     In a corner cube the ways in different order share one image and divide its lobe among them.
     """
@@ -222,7 +223,8 @@ def _made_up(image: np.ndarray, came_back: np.ndarray) -> np.ndarray:
 
 
 def _raster(world: TracedScene, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row (floored, -1: behind the camera) of the pixels that look in the given directions (m, 3)."""
+    """Compute column and row (floored, -1: behind the camera) of the pixels that look in the given directions (m,
+    3)."""
     camera = world.scene.camera
     x, y, z = (direction @ camera.rotation).T
     ahead = z > 0
@@ -235,7 +237,8 @@ def _raster(world: TracedScene, direction: np.ndarray) -> tuple[np.ndarray, np.n
 def _shines_on(
     world: TracedScene, point: np.ndarray, laser_point: np.ndarray, column: np.ndarray, row: np.ndarray
 ) -> np.ndarray:
-    """Whether the laser shines on points (m, 3) while the pixel (column, row) is measured: `in_beam` in float64."""
+    """Return whether the laser shines on points (m, 3) while the pixel (column, row) is measured: `in_beam` in
+    float64."""
     camera, laser = world.scene.camera, world.scene.laser
     if laser.mode == "flood":
         x, y, z = ((point - laser_point) @ camera.rotation).T
@@ -245,7 +248,8 @@ def _shines_on(
 
 
 def _lobe(image: np.ndarray) -> np.ndarray:
-    """Points in a small disk around each image as seen from the camera, (m, LOBE_RAYS, 3): a sunflower's spiral."""
+    """Spread points over a small disk around each image as seen from the camera, (m, LOBE_RAYS, 3): a sunflower's
+    spiral."""
     number = np.arange(LOBE_RAYS)
     radius = LOBE_RAD * np.sqrt((number + 0.5) / LOBE_RAYS)
     angle = number * math.pi * (3 - math.sqrt(5)) + 0.5
@@ -261,7 +265,8 @@ def _lobe(image: np.ndarray) -> np.ndarray:
 
 
 def _mirrored(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray, grid: int) -> list[Samples]:
-    """What the camera sees, directly or by way of up to MAX_ORDER mirrors, lit by the planes of `sequence` (k,)."""
+    """Trace what the camera sees, directly or by way of up to MAX_ORDER mirrors, lit by way of the mirror planes
+    `sequence` (k,)."""
     camera, laser = world.scene.camera, world.scene.laser
     image = image_of(mirrors, sequence[None], laser.position(camera) - camera.origin)[0]
     target = mi.Point3f(*(dr.opaque(Float, float(v)) for v in image + world.eye_m))
@@ -284,7 +289,8 @@ def _mirrored(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: n
 def _cells(
     world: TracedScene, tables: _Tables, first: int, lanes: int, grid: int, target: UInts, planes: list[Array]
 ) -> tuple[Array, Array, Array, Array]:
-    """Per cell of the pixels from `first` on: path and its half width [m], radiance / cells, mirrors met on the way."""
+    """Trace the cells of the pixels from `first` on; return path and its half width [m], radiance / cells, and mirrors
+    met."""
     side = dr.opaque(UInt32, grid)
     lane = dr.arange(UInt32, lanes)
     cells = side * side
@@ -314,7 +320,7 @@ def _cells(
 
 @dr.syntax
 def _seen(world: TracedScene, tables: _Tables, ray: Rays, lanes: int) -> tuple[Array, ...]:
-    """The first surface that is no plane mirror: interaction, weight of the way, optical and geometric length [m].
+    """Find the first surface that is no plane mirror: interaction, weight of the way, optical and geometric length [m].
 
     Also the camera's axes as the mirrors show them (the unfolded camera's frame) and the number of mirrors met.
     """
@@ -346,7 +352,8 @@ def _seen(world: TracedScene, tables: _Tables, ray: Rays, lanes: int) -> tuple[A
 def _half_width(
     local: Vectors, axes: tuple, normal: Vectors, from_laser: Vectors, distance: Floats, pitch: Floats
 ) -> Array:
-    """Half width [m] of the path lengths over a cell of angular size `pitch`, sqrt(a^2 + b^2), by the tangent plane.
+    """Compute the half width [m] of the path lengths over a cell of angular size `pitch`, sqrt(a^2 + b^2), by the
+    tangent plane.
 
     In the unfolded camera's frame the point seen along l = (x, y, 1) lies at rho = const |l| / (n . l), so
     drho/dx = rho (x / |l|^2 - n_x / (n . l)) and dp/dx = (drho/dx) r + rho (e_x / |l| - l x / |l|^3); the path's half

@@ -149,7 +149,8 @@ def image_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
 
 
 def _longer(planes: np.ndarray, most: int, notes: list[str], what: str) -> list[np.ndarray]:
-    """Sequences of 2 and of 3 planes, no plane twice in a row; a length that has more than `most` left is noted."""
+    """List sequences of 2 and of 3 planes, no plane twice in a row; a length of more than `most` sequences is left out
+    and noted."""
     found, count = [], len(planes)
     for order in range(2, MAX_ORDER + 1):
         number = count * (count - 1) ** (order - 1)
@@ -219,7 +220,7 @@ def check_slabs(world: TracedScene) -> list[str]:
 
 
 def _gathered(names: list[str]) -> str:
-    """The name of one, the number and the first names of several."""
+    """Name one solid, or give the number and the first names of several."""
     return names[0] if len(names) == 1 else f"({len(names)} solids: {listed(names)})"
 
 

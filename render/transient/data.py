@@ -116,7 +116,7 @@ class Transient:
 
     @property
     def return_pixel(self) -> np.ndarray:
-        """Flat pixel index of every return, int64."""
+        """Return the flat pixel index of every return, int64."""
         return np.repeat(np.arange(self.height * self.width), np.diff(self.offsets))
 
     def total_radiance(self) -> np.ndarray:
@@ -135,7 +135,7 @@ class Transient:
 
     @property
     def indirect_fraction(self) -> float:
-        """Share of the summed radiance that met more than one surface."""
+        """Return the share of the summed radiance that met more than one surface."""
         total = float(self.radiance.sum(dtype=np.float64))
         return float(self.radiance[self.bounces > 1].sum(dtype=np.float64)) / total if total > 0 else 0.0
 
@@ -210,7 +210,8 @@ def _write_exr(transient: Transient, path: Path) -> None:
 
 
 def _ragged(values: np.ndarray, transient: Transient) -> np.ndarray:
-    """(H, W) object array of each pixel's values, None where a pixel has none: what OpenEXR takes as deep samples."""
+    """Arrange each pixel's values in an (H, W) object array, None where a pixel has none: what OpenEXR takes as deep
+    samples."""
     if values.dtype == np.uint8:
         values = values.astype(np.uint32)
     cells = np.empty(transient.height * transient.width, dtype=object)

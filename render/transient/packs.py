@@ -107,13 +107,13 @@ def rounded(view: Transient) -> Transient:
 
 
 def _short(values: np.ndarray, bits: int) -> np.ndarray:
-    """float32 rounded to that many bits of mantissa."""
+    """Round to float32 with `bits` bits of mantissa."""
     mantissa, exponent = np.frexp(values.astype(np.float64))
     return np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits).astype(np.float32)
 
 
 def _encoded(values: np.ndarray, steps: int) -> np.ndarray:
-    """Values as uint16 on a scale of `steps` per octave, from 2^-32 to 2^32; 0 stays 0."""
+    """Encode values as uint16 on a scale of `steps` per octave, from 2^-32 to 2^32; 0 stays 0."""
     with np.errstate(divide="ignore"):
         code = np.rint((np.log2(values, dtype=np.float64) + OCTAVES) * steps)
     return np.where(values > 0, np.clip(code, 1, 65535), 0).astype(np.uint16)
@@ -125,7 +125,7 @@ def _decoded(codes: np.ndarray, steps: int) -> np.ndarray:
 
 
 def _arrays(view: Transient) -> dict[str, np.ndarray]:
-    """A transient in the pack's whole numbers, in the types that they have in memory."""
+    """Convert a transient to the pack's whole numbers, in the types that they have in memory."""
     near, far = view.path_near_m.astype(np.float64), view.path_far_m.astype(np.float64)
     centre, width = np.rint((near + far) / (2 * PATH_STEP_M)), np.rint((far - near) / WIDTH_STEP_M)
     depth = np.maximum(np.rint(np.nan_to_num(view.depth_m) / DEPTH_STEP_M), 1)
@@ -152,7 +152,7 @@ def _arrays(view: Transient) -> dict[str, np.ndarray]:
 
 
 def _is_first(counts: np.ndarray) -> np.ndarray:
-    """Of every return, whether it is its pixel's first."""
+    """Return for every return whether it is its pixel's first."""
     counts = counts.ravel().astype(np.int64)
     first = np.zeros(int(counts.sum()), bool)
     first[(np.cumsum(counts) - counts)[counts > 0]] = True
@@ -160,7 +160,7 @@ def _is_first(counts: np.ndarray) -> np.ndarray:
 
 
 def _expected_centre(depth: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Where the first return of each pixel that has one is expected, in steps: twice the depth."""
+    """Predict the first return of each pixel that has one, in steps: twice the depth."""
     return (2 * depth.astype(np.int64) * DEPTH_STEP_M / PATH_STEP_M).astype(np.int64)[counts > 0]
 
 
@@ -174,7 +174,7 @@ def _signed(stored: np.ndarray) -> np.ndarray:
 
 
 def _differences(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What the file holds of a view: differences from what is known already, and returns in two parts."""
+    """Encode a view for the file: differences from what is known already, and returns in two parts."""
     first = _is_first(arrays["count"])
     centre, radiance = arrays["centre"].astype(np.int64), arrays["radiance"]
     step = np.diff(centre, prepend=0)
@@ -190,7 +190,7 @@ def _differences(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _summed(stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The whole numbers of a view from what the file holds of it; ValueError if its parts do not fit."""
+    """Decode the whole numbers of a view from what the file holds of it; ValueError if its parts do not fit."""
     arrays = {name: stored[name] for name in PER_VIEW}
     arrays["depth"] = _signed(stored["depth"]).cumsum(axis=1).cumsum(axis=0).astype(np.int32)
     first = _is_first(arrays["count"])
@@ -222,7 +222,7 @@ def write_pack(views: Iterable[tuple[Transient, dict]], path: Path) -> int:
 
 
 def _append_views(views: Iterable[tuple[Transient, dict]], file: h5py.File, sink: Sink) -> int:
-    """Append view after view, then their records and the seal; returns how many."""
+    """Append view after view, then their records and the seal; return the number of views."""
     metas: list[dict] = []
     starts = [0]
     sha = hashlib.sha256()
@@ -270,7 +270,7 @@ def _datasets(file: h5py.File, height: int, width: int) -> dict[str, h5py.Datase
 
 
 def _all_views(file: h5py.File) -> dict[str, np.ndarray]:
-    """The whole numbers of all views of a pack, those of returns one after the other."""
+    """Read the whole numbers of all views of a pack, those of returns one after the other."""
     names = STORED_VIEW | {f"{part} {name}": dtype for part in PARTS for name, dtype in STORED.items()}
     stored = {name: np.asarray(read_dataset(file, name), dtype) for name, dtype in names.items()}
     counts = stored["count"].reshape(len(stored["count"]), -1)

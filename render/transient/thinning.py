@@ -54,7 +54,8 @@ def thinned(view: Transient, error: float) -> Transient:
 
 
 def _groups(view: Transient, pixel: np.ndarray, direct: np.ndarray, error: float) -> np.ndarray:
-    """The group of every return, numbered in their order; the k-th returns of all pixels are looked at together."""
+    """Find the group of every return, numbered in their order; the k-th returns of all pixels are looked at
+    together."""
     near, far = view.path_near_m.astype(np.float64), view.path_far_m.astype(np.float64)
     total = np.maximum(np.bincount(pixel, view.radiance, view.height * view.width), np.finfo(float).tiny)
     opens = np.ones(view.returns, bool)
@@ -80,7 +81,7 @@ def _groups(view: Transient, pixel: np.ndarray, direct: np.ndarray, error: float
 
 
 def _moments(centre: np.ndarray, half: np.ndarray, energy: np.ndarray) -> np.ndarray:
-    """Energy times the raw moments 0 to 4 of uniform returns, (5, n)."""
+    """Compute energy times the raw moments 0 to 4 of uniform returns, (5, n)."""
     square = half**2
     powers = (
         np.ones_like(centre),
@@ -93,7 +94,8 @@ def _moments(centre: np.ndarray, half: np.ndarray, energy: np.ndarray) -> np.nda
 
 
 def _blurred(sums: np.ndarray) -> np.ndarray:
-    """Norm of the difference between a group and its uniform return after the pulse, as a share of the group's own."""
+    """Compute the norm of the difference between a group and its uniform return after the pulse, as a share of the
+    group's own."""
     energy = np.maximum(sums[0], np.finfo(float).tiny)
     m1, m2, m3, m4 = sums[1:] / energy
     variance = np.maximum(m2 - m1**2, 0)

@@ -105,7 +105,7 @@ def _one(chosen: Method, seed: int) -> list[dict]:
 
 
 def _left(chosen: Method, sums: np.ndarray, shape: tuple[int, int] = (16, 32)) -> np.ndarray:
-    """What leaves the sensor of numbers that the cores hold, as the array orders it."""
+    """Compute the numbers that leave the sensor from those that the cores hold, in the order of the array."""
     if chosen.block == (1, 1):
         return sums
     (down, right), (height, width) = chosen.block, shape

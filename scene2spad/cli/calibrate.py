@@ -26,7 +26,7 @@ class Calibrate(Common):
     nearest: float = 0.1
     """Nearest distance that is used [m]."""
     effects: tuple[str, ...] = FITTED
-    """What is fitted beside pulse and gains; crosstalk too, if named. What is left out is off."""
+    """Effects to fit beside pulse and gains; crosstalk too, if named. Effects left out are off."""
     model_error: float = 0.004
     """Relative error of the model that every bin's variance is widened by; 0 is the Poisson likelihood alone."""
 

@@ -49,7 +49,7 @@ class Dataset(Common):
     offset: float = 0.0
     """Move every scene this many metres away."""
     offset_mode: Offset = "time"
-    """As of `render`."""
+    """Offset mode, as in `render`: time, ray or rigid."""
 
 
 def run(command: Dataset, progress: Progress) -> dict:

@@ -44,11 +44,12 @@ class Depth(Common):
     model: Annotated[str | None, may_stay_open("NAME")] = None
     """A model that comes with the package (see `models`), instead of --checkpoint."""
     decoder: Annotated[Literal["soft-argmax", "median"] | None, may_stay_open("{soft-argmax,median}")] = None
-    """How `--method network` reads the posterior: its mean, or its median (default: the model's)."""
+    """Depth that `--method network` reads from the posterior: its mean, or its median (default: the model's)."""
     int8: bool = False
     """Codes of `--method network` in 8 bits, summed in 16."""
     int8_rule: Annotated[Literal["calibrated", "published"] | None, may_stay_open("{calibrated,published}")] = None
-    """How --int8 rounds weights: 255 steps over each factor's own range (default), or over -1 to 1 as published."""
+    """Rounding of weights with --int8: 255 steps over each factor's own range (default), or over -1 to 1 as
+    published."""
     code: Literal["fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published"] = "fourier"
     """Temporal code of `--method compressive`: truncated Fourier, Gray Fourier, coarse histogram, Walsh-Hadamard; or
     the first two in their published rows."""

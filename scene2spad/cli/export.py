@@ -24,7 +24,7 @@ class Export(Common):
     file: Positional[Path]
     """A transient or depth map (.exr), a histogram (.h5), codes (.npy), a checkpoint, or a model's name."""
     out: Path
-    """What to write: .npz or .h5 (dense), .ply (points), .txt or .npy (codes)."""
+    """File to write: .npz or .h5 (dense), .ply (points), .txt or .npy (codes)."""
     layout: Literal["hwt", "thw"] = "hwt"
     """Order of the dense array's axes: row, column, time, or time first."""
     sensor: Annotated[str | None, may_stay_open("NAME")] = None
@@ -34,7 +34,7 @@ class Export(Common):
     int8: bool = False
     """Codes as the 8-bit integers that a core in the pixel adds, with the value of one step."""
     view: int = 0
-    """Of a pack: which view, from 0."""
+    """View of a pack, from 0."""
 
 
 def run(command: Export, progress: Progress) -> dict:

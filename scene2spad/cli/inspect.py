@@ -36,7 +36,7 @@ class Inspect(Common):
     pixel: Annotated[tuple[int, int] | None, may_stay_open("ROW COLUMN")] = None
     """Row and column of one pixel, both from 0, row 0 on top."""
     view: int = 0
-    """Of a pack: which view, from 0."""
+    """View of a pack, from 0."""
 
 
 def run(command: Inspect, progress: Progress) -> dict:
@@ -64,7 +64,7 @@ def run(command: Inspect, progress: Progress) -> dict:
 
 
 def _transient(command: Inspect, path: Path, kind: str) -> tuple[dict[str, Any], Transient]:
-    """What the file says of itself, and its transient; of a pack that of the view asked for."""
+    """Read the facts that a file states of itself, and its transient; in a pack those of the view asked for."""
     if kind == "transient":
         from render.transient import read_transient
 

@@ -35,7 +35,7 @@ KNOWN = (
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What a depth map's file holds."""
+    """Contents of a depth map's file."""
 
     depth_m: np.ndarray
     confidence: np.ndarray | None

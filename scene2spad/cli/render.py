@@ -55,7 +55,8 @@ class Render(Common):
     height: Pixels = None
     """Image height, pixels."""
     laser: Mode = None
-    """What is lit: the field of view, the row being measured, or the pixel being measured (default: the scene's)."""
+    """Laser mode: it lights the field of view, the row being measured, or the pixel being measured (default: the
+    scene's)."""
     baseline: Annotated[Metres, may_stay_open("X Y Z")] = None
     """Laser minus camera [m], in the camera's frame: x right, y down, z forward (default: the scene's)."""
     sunlight: Annotated[float | None, may_stay_open("LUX")] = None
@@ -67,9 +68,9 @@ class Render(Common):
     from_: Annotated[
         tuple[float, float, float] | None, tyro.conf.arg(name="from", metavar="X Y Z", help_behavior_hint="")
     ] = None
-    """Where the camera stands [m], y up (default: the scene's own)."""
+    """Camera position [m], y up (default: the scene's own)."""
     look_at: Annotated[Metres, may_stay_open("X Y Z")] = None
-    """What the middle of the image shows [m] (default: the scene's own; with --from the middle of the scene)."""
+    """Point in the middle of the image [m] (default: the scene's own; with --from the middle of the scene)."""
     fov: Annotated[float | None, may_stay_open("DEGREES")] = None
     """Full horizontal angle of the camera (default: the scene's own)."""
     bare: bool = False

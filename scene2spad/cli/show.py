@@ -33,13 +33,13 @@ class Show(Common):
     file: Positional[Path]
     """The file, the folder of a set or of a run, or a model's name."""
     out: File = None
-    """What to write: .html, .png, .pdf or .gif (default: the file's name with .html)."""
+    """File to write: .html, .png, .pdf or .gif (default: the file's name with .html)."""
     transient: File = None
     """The transient that a histogram was sensed from (default: the .exr beside it, if it is that one)."""
     view: int = 0
-    """Of a pack: which view, from 0."""
+    """View of a pack, from 0."""
     frame: int = 0
-    """Of a capture (.mat): which frame, from 0."""
+    """Frame of a capture (.mat), from 0."""
 
 
 def run(command: Show, progress: Progress) -> dict:
@@ -102,7 +102,7 @@ def _content(command: Show, kind: str) -> Content:
 
 
 def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, list[dict[str, Any]]], ...]]:
-    """What a sensor, a code, a model or a set says of itself: short facts, and tables."""
+    """Read the facts that a sensor, a code, a model or a set states of itself: short facts, and tables."""
     path = command.file
     if kind == "sensor":
         from spad.sensor.files import read_sensor, sensor_tables

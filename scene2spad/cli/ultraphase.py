@@ -15,7 +15,7 @@ class Ultraphase(Common):
     `sweep`."""
 
     action: Positional[Literal["table", "compile", "run", "asm", "list", "verify", "sweep"]] = "table"
-    """What is done."""
+    """Action: tabulate or sweep the chip's power, or compile, run, assemble, list or verify a program."""
     program: Positional[str] = ""
     """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s); of compile, a
     shipped model's name or a checkpoint."""
@@ -29,7 +29,7 @@ class Ultraphase(Common):
     photons: tuple[float, ...] = (550.0,)
     """Photons a pixel and frame, background included; `run` takes one number, `sweep` several."""
     signal: float = 50.0
-    """Of these, photons of one laser return (run)."""
+    """Photons of one laser return among --photons (run)."""
     fps: tuple[float, ...] = (30.0,)
     """Frames a second (sweep)."""
     codes: tuple[int, ...] = ()

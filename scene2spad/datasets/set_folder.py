@@ -62,7 +62,7 @@ class Folder:
                     yield record
 
     def _stands(self, record: dict) -> bool:
-        """Whether the view of a record is there in full; failed ones are tried again."""
+        """Return whether the view of a record is there in full; failed ones are tried again."""
         if "failed" in record or record.get("file") != file_name(record["view"]):
             return False
         path = self.path / record["file"]

@@ -1,4 +1,5 @@
-"""What trained models are tested on, and trained on where no set is given: rendered once into a study's folder."""
+"""Render the sets that trained models are tested on, and trained on where none is given: once, into a study's
+folder."""
 
 from __future__ import annotations
 

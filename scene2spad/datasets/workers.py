@@ -1,4 +1,4 @@
-"""Who does the work on numbered things: this process, several processes, or the workers of a Dask cluster.
+"""Run work on numbered things in this process, in several processes, or on the workers of a Dask cluster.
 
 Work comes in runs, numbers that one process does in a row. A run whose worker dies is tried again number by number.
 """

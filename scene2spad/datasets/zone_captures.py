@@ -85,7 +85,8 @@ def read_plane_captures(path: Path) -> PlaneCaptures:
 
 
 def _drift_bins(reference: np.ndarray) -> np.ndarray:
-    """How late the reference channel's pulse is in each capture, bins after its mean; 0 without such a channel."""
+    """Compute how late the reference channel's pulse is in each capture, bins after its mean; 0 without such a
+    channel."""
     if not reference.any():
         return np.zeros(len(reference))
     peak = int(reference.sum(axis=0).argmax())

@@ -69,7 +69,8 @@ class ModelSpec:
 
     @property
     def name(self) -> str:
-        """Of its run's folder and of the shipped file: learned-1024x4x4-128x-s0, none-mixed-s0, ...-t8-s0."""
+        """Return the name of the run's folder and of the shipped file: learned-1024x4x4-128x-s0, none-mixed-s0,
+        ...-t8-s0."""
         parts = [f"{'full-' if self.full else ''}{self.design.replace('+', '-')}"]
         if self.coded:
             parts += ["x".join(map(str, self.block)), f"{self.compression}x"]
@@ -189,7 +190,7 @@ def _sensor(model: ModelConfig) -> str:
 
 @dataclass(frozen=True)
 class ModelRegistry:
-    """Where models are looked for: `folder/NAME` as `train --out` fills it, then among those that come with the package
+    """Registry of trained models: `folder/NAME` as `train --out` fills it, then those that come with the package
     (`shipped`; None: not there)."""
 
     folder: Path
@@ -240,7 +241,7 @@ def _loaded(wanted: ModelSpec, path: Path) -> Trained:
 
 
 def _finished(found: Trained) -> bool:
-    """Whether a run came to its end; one that was killed between its log and its last weights did not."""
+    """Return whether a run came to its end; one that was killed between its log and its last weights did not."""
     folder = found.path.parent
     if (folder / "last.safetensors").is_file():
         return True

@@ -1,4 +1,4 @@
-"""What the options of all commands are made of. No torch, no Mitsuba: --help must be quick."""
+"""Define the parts that the options of all commands are made of. No torch, no Mitsuba: --help must be quick."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ class Bench(Common):
     table of `hard-cases`."""
 
     stage: Positional[Literal["render", "sense", "encode", "network", "emulate", "hard-cases"]] = "render"
-    """What is measured."""
+    """Stage to measure."""
     scenes: tuple[Literal["flash", "lamp", "artist", "gallery", "groove", "hall", "hall-lamp", "washroom"], ...] = ()
     """Scenes of `bench render` (default: all)."""
     sizes: tuple[int, ...] = ()
@@ -75,7 +75,7 @@ class Study(Common):
             "sim-to-real",
         ]
     ]
-    """Which study."""
+    """Study to run."""
     checkpoints: tuple[Path, ...] = ()
     """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc); trained
     networks of `study render-error` and `study real-data`."""
@@ -99,7 +99,7 @@ class Study(Common):
     retrain: bool = False
     """Train what is not finished in --models, and use no model that came with the package."""
     set: Annotated[Path | None, may_stay_open("SET")] = None
-    """What --retrain trains on, as of `train` (default: 2,000 rooms, rendered into --out)."""
+    """Set that --retrain trains on, as in `train` (default: 2,000 rooms, rendered into --out)."""
     ship: bool = False
     """Put the models found into the package in half precision, with configuration and training log."""
     scene: str = "tabletop/kitchen"
@@ -115,7 +115,7 @@ class Study(Common):
     scene_set: str = "tabletop"
     """Scene set of `study render-error`, as `dataset` takes it."""
     views: int = 3
-    """Its first N views, at --width x --height."""
+    """First N views of --scene-set to render, at --width x --height."""
     cache: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder that keeps its renders from run to run (default: ~/.cache/scene2spad)."""
     capture: tuple[Path, ...] = ()

@@ -31,7 +31,7 @@ class Train(Common):
     set: tuple[Path, ...] = (Path("planes"),)
     """Folders of sets that `dataset` rendered, or their packs (.h5); planes: random planes, no renderer needed."""
     set_weights: tuple[float, ...] = ()
-    """How often patches are drawn from each set (default: alike)."""
+    """Relative frequency at which patches are drawn from each set (default: alike)."""
     validation: tuple[Path, ...] = ()
     """Sets to validate on (default: the last tenth of the scenes)."""
     preset: Literal["smoke", "laptop", "workstation", "laptop-v1", "paper"] = "laptop"
@@ -95,7 +95,7 @@ class Evaluate(Common):
     """Checkpoints of `train`, their folders, or names of models (see `models`); the first is the one that the others
     are compared with."""
     decoder: Annotated[Literal["soft-argmax", "median"] | None, may_stay_open("{soft-argmax,median}")] = None
-    """How posteriors are read: their mean, or their median (default: each model's)."""
+    """Depth read from posteriors: their mean, or their median (default: each model's)."""
     tiled: bool = False
     """Cut images to what the blocks of all networks tile, instead of reflecting what is missing."""
     set: Path
@@ -112,6 +112,7 @@ class Evaluate(Common):
     int8: bool = False
     """Codes in 8 bits as well, summed in 16."""
     int8_rule: Annotated[Literal["calibrated", "published"] | None, may_stay_open("{calibrated,published}")] = None
-    """How --int8 rounds weights: 255 steps over each factor's own range (default), or over -1 to 1 as published."""
+    """Rounding of weights with --int8: 255 steps over each factor's own range (default), or over -1 to 1 as
+    published."""
     out: Path = Path("out/evaluate")
     """Folder for the table (.csv)."""

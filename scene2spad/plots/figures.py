@@ -66,7 +66,7 @@ def display(radiance: np.ndarray, white: float = 0.99) -> np.ndarray:
 
 
 def _beyond(image: np.ndarray, low: float, high: float) -> str:
-    """Which ends of a colour scale are exceeded, in matplotlib's words."""
+    """Return which ends of a colour scale are exceeded, in matplotlib's words."""
     known = image[np.isfinite(image)]
     below, above = bool((known < low).any()), bool((known > high).any())
     return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]

@@ -107,7 +107,7 @@ def smoke_results(files: Mapping[str, Sequence[Path]]) -> set[Path]:
 
 
 def _is_smoke(path: Path) -> bool:
-    """Whether a study's numbers are of the preset `smoke`, or stand on models of it."""
+    """Return whether a study's numbers are of the preset `smoke`, or rest on models of it."""
     try:
         numbers = read_json_object(path)
     except UNREADABLE:

@@ -83,7 +83,8 @@ def compose(found: Found) -> str:
 
 
 def _item(item: Item, found: Found) -> str:
-    """What was measured of an item; nothing where that is nothing. What is missing goes into the list at the end."""
+    """Format what was measured of an item; nothing where that is nothing. What is missing goes into the list at the
+    end."""
     absent: dict[str, list[str]] = {}
     parts = beside_print.published_tables(item.published, lambda name: _rows_of(Table(name, ""), found)[0])
     found.tables += sum("<table>" in part for part in parts)
@@ -100,7 +101,7 @@ def _item(item: Item, found: Found) -> str:
 
 
 def _notes(item: Item, found: Found) -> Iterator[str]:
-    """What a study's own JSON says of the models that it stands on."""
+    """Describe the models that a study rests on, as its own JSON states them."""
     for name in dict.fromkeys(one.file for one in item.tables if one.file.endswith(".json")):
         path = found.newest(name)
         numbers = None if path is None else found.read(path, read_json_object)

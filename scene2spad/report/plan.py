@@ -1,4 +1,5 @@
-"""What `report` expects of the results, in its order: figures, tables, and the command that makes each. Plain data."""
+"""List the results that `report` expects, in its order: figures, tables, and the command that makes each. Plain
+data."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Row:
 
 
 class _Truth(NamedTuple):
-    """What is kept of a histogram once it is encoded."""
+    """Truth of a histogram that is kept once it is encoded."""
 
     depth_m: np.ndarray
     left_out: np.ndarray

@@ -1,4 +1,5 @@
-"""What a study has computed so far, a line each: a run that was stopped anywhere repeats nothing that was finished."""
+"""Store what a study has computed so far, a line each: a run that was stopped anywhere repeats nothing that was
+finished."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a page shows: images, cubes over time, returns and points, packed small enough to travel within the page."""
+"""Pack the content of a page: images, cubes over time, returns and points, small enough to travel within the page."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def page_html(content: Content) -> str:
 
 
 def _sections(content: Content, payload: dict[str, Any]) -> list[str]:
-    """What the page has room for, in order."""
+    """Return the sections of the page that the content fills, in order."""
     markup = (ROOM / "viewer.html").read_text(encoding="utf-8")
     parts = dict(re.findall(r"<!-- (\w+) -->\n(.*?)(?=<!--|\Z)", markup, re.S))
     found = []
@@ -89,7 +89,7 @@ def _marks(content: Content) -> str:
 
 
 def _precision(content: Content, cubes: list[dict[str, Any]]) -> str:
-    """What the page rounds, in words."""
+    """Say what the page rounds, in words."""
     lines = []
     for part in cubes:
         summed = f", {part['summed']} bins summed" if part["summed"] > 1 else ""

@@ -1,4 +1,4 @@
-"""What mesh files declare of themselves, held against what is in them, before a loader allocates or believes anything.
+"""Check what mesh files declare of themselves against what is in them, before a loader allocates or believes anything.
 
 trimesh reads a text file that was cut, drops a texture that it cannot find, and takes negative indices as Python does.
 """
@@ -122,7 +122,7 @@ def _check_ply_text(body: bytes, elements: list[_Element]) -> None:
 
 
 def _end_of_text(values: np.ndarray, element: _Element) -> int:
-    """How many numbers the element has by its properties and the lengths of its lists."""
+    """Count the numbers of a text element by its properties and the lengths of its lists."""
     if all(one.count_type is None for one in element.properties):
         return element.rows * len(element.properties)
     width, places = _text_row(values, 0, element)
@@ -151,7 +151,8 @@ def _text_row(values: np.ndarray, start: int, element: _Element) -> tuple[int, l
 
 
 def _end_of_binary(content: bytes, start: int, element: _Element, order: str) -> int:
-    """Where the element's rows end. InputError for rows that are not all there, or lists of different lengths."""
+    """Find where the rows of a binary element end. InputError for rows that are not all there, or lists of different
+    lengths."""
     if element.rows == 0:
         return start
     fields: list[tuple[Any, ...]] = []

@@ -70,7 +70,8 @@ def load_trimesh(path: Path, kind: str, **options: Any) -> Any:
 
 
 def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | None]:
-    """What trimesh is to read, and how many triangles it must find, where the file says so."""
+    """Check a mesh file; return the content that trimesh is to read, and how many triangles it must find, where the
+    file says so."""
     require(bool(content.strip()), "the file is empty")
     actual = next((ext for magic, ext in MAGIC.items() if content.startswith(magic)), kind)
     require(actual == kind, f"holds {actual} data, its extension says {kind}; rename it")

@@ -293,7 +293,7 @@ class _Paint:
         return self.made[key]
 
     def _albedo(self, part: _Part) -> tuple[object, Callable[[], float | Texture]]:
-        """What tells the part's albedo from others, and a function that makes it."""
+        """Return a key that tells the part's albedo from others, and a function that makes the albedo."""
         source = getattr(part.visual, "material", None)
         if source is None:
             value = self._vertex_colour(part)
@@ -333,7 +333,7 @@ def _image_albedo(image: Any, tint: np.ndarray) -> Texture:
 
 @dataclass(frozen=True)
 class _Entry:
-    """What an .mtl says of one material: linear luminance of Kd, file of map_Kd."""
+    """Entry of an .mtl file for one material: linear luminance of Kd, file of map_Kd."""
 
     colour: float | None = None
     image: Path | None = None

@@ -23,7 +23,7 @@ class LocatedError(InputError):
 
 
 class Notes:
-    """What the loader changed or left out: one line a kind, with the names it happened to."""
+    """Notes on what the loader changed or left out: one line a kind, with the names it happened to."""
 
     def __init__(self) -> None:
         self._names: dict[str, dict[str, None]] = {}

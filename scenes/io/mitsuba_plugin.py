@@ -73,7 +73,7 @@ class Plugin:
 
     @property
     def name(self) -> str:
-        """What the notes call it: its id, or that of the plugin it is nested in."""
+        """Return the plugin's name in notes: its id, or that of the plugin it is nested in."""
         return self.id or self._owner or self.type
 
     def fail(self, message: str) -> InputError:

@@ -58,7 +58,7 @@ def read_serialized(path: Path, index: int = 0) -> SerializedMesh:
 
 
 def _place(data: bytes, index: int) -> tuple[int, int]:
-    """Where mesh `index` begins and ends."""
+    """Find the bytes at which mesh `index` begins and ends."""
     magic, version = struct.unpack_from("<HH", data, 0)
     require(magic == MAGIC, f"begins with {magic:#06x}, expected {MAGIC:#06x}")
     require(version in VERSIONS, f"version {version}, expected {' or '.join(map(str, VERSIONS))}")

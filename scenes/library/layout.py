@@ -1,4 +1,5 @@
-"""Where things may stand: plan views as convex quadrilaterals, a room's outline, what a camera would see of both."""
+"""Decide where things may stand: plan views as convex quadrilaterals, a room's outline, what a camera would see of
+both."""
 
 from __future__ import annotations
 
@@ -168,7 +169,7 @@ def in_each_other(a: Place, b: Place) -> bool:
 
 
 def _inside_any(polygon: np.ndarray, points: np.ndarray) -> bool:
-    """Whether any of the points lies well inside a convex polygon."""
+    """Return whether any of the points lies well inside a convex polygon."""
     edge = _onward(polygon) - polygon
     offset = points[:, None] - polygon
     away = (edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]) / np.linalg.norm(edge, axis=1)

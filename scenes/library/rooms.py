@@ -292,7 +292,7 @@ def _cameras(rng: Random, floor: Floor, ceiling: float) -> tuple[Camera, ...] | 
 
 
 def _apart(a: Camera, b: Camera) -> bool:
-    """Whether two cameras of a room differ clearly, in place and in direction."""
+    """Return whether two cameras of a room differ clearly, in place and in direction."""
     turned = a.rotation[:, 2] @ b.rotation[:, 2] < math.cos(math.radians(APART_DEG))
     return bool(turned and np.linalg.norm(a.origin - b.origin) > APART_M)
 
@@ -335,7 +335,7 @@ def _candidates(rng: Random, floor: Floor, ceiling: float) -> list[Seen]:
 
 
 def _head(rng: Random, low: np.ndarray, high: np.ndarray) -> tuple[float, ...]:
-    """Where a person might look from and how: x, z, y, heading, pitch, roll [rad] and field of view [deg]."""
+    """Draw where a person might look from and how: x, z, y, heading, pitch, roll [rad] and field of view [deg]."""
     x, z = rng.uniform(low, high)
     y, heading = rng.uniform(0.9, 1.75), rng.uniform(0, 2 * np.pi)
     return x, z, y, heading, math.radians(rng.normal(-17, 8)), rng.normal(0, 0.02), rng.uniform(*FOV_DEG)

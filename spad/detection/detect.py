@@ -117,7 +117,7 @@ def _planned(
     model: str,
     dark_map_hz: np.ndarray | None,
 ) -> tuple[Exposure, dict]:
-    """The exposure, and what its histogram holds beside the counts."""
+    """Prepare the exposure, and what its histogram holds beside the counts."""
     if model not in MODELS:
         raise InputError(f"detection model {model!r} is unknown, expected one of {', '.join(MODELS)}")
     rates = rates_for(transient, sensor, budget, dark_map_hz=dark_map_hz, seed=seed)
@@ -165,7 +165,8 @@ def _planned(
 
 
 def _sha256(transient: Transient) -> str:
-    """Its hash, computed once: one render is sensed many times, and cannot be written to."""
+    """Return the SHA-256 of a transient, computed once: one render is sensed many times, and transients are
+    immutable."""
     if transient not in _HASHES:
         _HASHES[transient] = transient.sha256()
     return _HASHES[transient]

@@ -53,7 +53,7 @@ class Exposure:
 
     @property
     def cycles(self) -> tuple[int, int]:
-        """First and last + 1 laser cycle of this part; an exposure has a whole number."""
+        """Return the first and last + 1 laser cycle of this part; an exposure has a whole number."""
         total = round(self.sensor.cycles)
         return total * self.part // self.parts, total * (self.part + 1) // self.parts
 
@@ -125,7 +125,7 @@ def timestamps_of(
 
 
 def _draw(exposure: Exposure, finish: Callable, progress: Progress | None, ready: np.ndarray) -> list:
-    """finish(block, detected) of every block, on as many threads as torch has.
+    """Call finish(block, detected) for every block, on as many threads as torch has.
 
     What was detected: counts (P, T), or places pixel x T + bin (N,) int32 in no order, pixels counted from the block's.
     """
@@ -155,7 +155,7 @@ def _block(exposure: Exposure, block: slice, ready: np.ndarray) -> np.ndarray:
 
 
 def _dense(exposure: Exposure, block: slice, rng: np.random.Generator) -> np.ndarray:
-    """Every bin drawn from its rate, (P, T)."""
+    """Draw every bin from its rate, (P, T)."""
     rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()
     if exposure.model == "poisson":
         return rng.poisson(rate * exposure.fraction)
@@ -178,7 +178,7 @@ def _first_photons(
 def _free_running(
     exposure: Exposure, light: PixelFlux, rng: np.random.Generator, ready: np.ndarray
 ) -> Iterator[Detections]:
-    """Detections in turn of as many cycles as memory allows; `ready` (P,) in bins is carried on."""
+    """Yield the detections of as many cycles at a time as memory allows; `ready` (P,) in bins is carried on."""
     sensor, (first, last) = exposure.sensor, exposure.cycles
     primaries = float(light.signal.sum() + light.background.sum()) * exposure.fraction
     pieces = min(max(1, math.ceil(primaries / MAX_EVENTS)), last - first)
@@ -197,7 +197,7 @@ def _alive(events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
 
 
 def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-    """Event by event over the whole image: detections fire neighbours, whose detector then decides between both.
+    """Detect event by event over the whole image: detections fire neighbours, whose detector then decides between both.
 
     A detection that a neighbour's crosstalk makes impossible keeps what it fired itself, and crosstalk fires no
     further crosstalk: both are of second order in its probability. Raises InputError for more than 2^26 detections.

@@ -1,4 +1,4 @@
-"""How unevenly the signal falls on the pixels: glints take photons of a budget by means from all the others."""
+"""Measure how unevenly the signal falls on the pixels: glints take photons of a budget by means from all the others."""
 
 from __future__ import annotations
 

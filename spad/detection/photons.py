@@ -21,7 +21,7 @@ GATED_PIXELS = 1024  # whose rates are held at once
 
 
 class PixelFlux(NamedTuple):
-    """What falls on some pixels in one exposure: N returns grouped by pixel, and a flat background in each of P."""
+    """Light on some pixels in one exposure: N returns grouped by pixel, and a flat background in each of P."""
 
     owner: np.ndarray  # (N,) int32 pixel
     start: np.ndarray  # (N,) float64 first arrival, bins after the laser's emission
@@ -106,7 +106,7 @@ def draw_primaries(
 
 
 def _fold(position: np.ndarray, period: int, out: np.ndarray) -> None:
-    """The bin within the period of positions in bins, (N,), into `out`; positions are overwritten."""
+    """Fold positions in bins, (N,), into bins within the period, written to `out`; positions are overwritten."""
     whole = np.floor(position, out=position).astype(np.int64)
     if period & (period - 1):
         np.mod(whole, period, out=out, casting="same_kind")
@@ -115,7 +115,7 @@ def _fold(position: np.ndarray, period: int, out: np.ndarray) -> None:
 
 
 def _uniform_bins(rng: np.random.Generator, period: int, size: int) -> np.ndarray:
-    """Uniform integers from 0 to period - 1, (size,); powers of two to 2^16 from a quarter of a random word."""
+    """Draw uniform integers from 0 to period - 1, (size,); powers of two to 2^16 from a quarter of a random word."""
     if period & (period - 1) or period > 1 << 16:
         return rng.integers(0, period, size, dtype=np.int32)
     words = rng.integers(0, 1 << 64, -(-size // 4), dtype=np.uint64)
@@ -137,7 +137,7 @@ def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: P
 
 
 def _wrapped(light: PixelFlux, sensor: Sensor) -> float:
-    """Expected signal that arrives later than one period after the laser's emission."""
+    """Compute the expected signal that arrives later than one period after the laser's emission."""
     period, width = sensor.bins_per_period, sensor.bin_width_s
     late = light.start + light.length + sensor.response.window_s(8.5)[1] / width > period
     if not late.any():

@@ -148,7 +148,8 @@ def sense_patches(
 
 
 def _count(events: PhotonEvents, counts: Tensor) -> None:
-    """Detections of each bin and pixel, into `counts` (T, P); whole numbers, so that no order of additions shows.
+    """Count the detections of each bin and pixel, into `counts` (T, P); whole numbers, so that no order of additions
+    shows.
 
     On a CPU in the narrowest type that holds the fullest pixel, so that a core's cache holds the patch, and then wide.
     """
@@ -203,7 +204,7 @@ def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, heig
 
 @lru_cache(maxsize=16)
 def _dark_counts(sensor: Sensor, rows: int, columns: int) -> np.ndarray:
-    """Expected dark counts of an exposure, (H, W) float64, read only."""
+    """Compute the expected dark counts of an exposure, (H, W) float64, read only."""
     dark = sensor.dark_rate_map_hz(rows, columns) * sensor.exposure_s
     dark.flags.writeable = False
     return dark

@@ -41,7 +41,7 @@ def correlate(counts: Tensor, weights: Tensor, first: int, sensor: Sensor) -> Te
 
 
 def _around(counts: Tensor, peak: Tensor, shifts: Tensor, sensor: Sensor) -> tuple[Tensor, Tensor]:
-    """Counts of the bins around a peak, and whether the bins exist: (P, T), (P,) -> (P, L) float64 twice."""
+    """Gather the counts of the bins around a peak, and whether the bins exist: (P, T), (P,) -> (P, L) float64 twice."""
     index = peak.unsqueeze(-1) + shifts
     exists = torch.ones_like(index, dtype=torch.bool)
     if not is_circular(sensor):
@@ -91,7 +91,8 @@ def matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
 
 
 def _best_step(scores_of: Callable[[Tensor], Tensor], taps: Taps) -> Tensor:
-    """Arrival after the bin's centre, in bins (P,): on the fine grid, and for a narrow pulse on a finer one around it.
+    """Find the arrival after the bin's centre, in bins (P,): on the fine grid, and for a narrow pulse on a finer one
+    around it.
 
     `scores_of` takes pulses (G, L), or of each pixel (P, G, L), and gives scores (P, G).
     """

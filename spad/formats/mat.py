@@ -116,7 +116,8 @@ def _peak_offset_bins(sensor: Sensor) -> float:
 
 
 def _normalised_rates(histogram: Histogram, pulses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Each pixel's (rate - min) / (max - min + 1e-8), with min and 1 / (max - min + 1e-8)."""
+    """Normalise each pixel's rates to (rate - min) / (max - min + 1e-8); return these, min and 1 / (max - min +
+    1e-8)."""
     signal = np.where(np.isfinite(histogram.depth_m), histogram.expected_signal.astype(np.float64), 0)
     rates = pulses * signal[..., None]
     low, high = rates.min(axis=-1), rates.max(axis=-1)
@@ -139,7 +140,7 @@ def _sparse(counts: np.ndarray) -> object:
 
 
 def _centred_taps(sensor: Sensor) -> np.ndarray:
-    """The binned pulse that arrives in a bin's centre, as far as it holds anything, (L,) float64."""
+    """Compute the binned pulse that arrives in a bin's centre, as far as it holds anything, (L,) float64."""
     middle = torch.tensor((sensor.bins // 2 + 0.5) * sensor.bin_width_s, dtype=torch.float64)
     pulse = binned_pulse(middle, sensor).numpy()
     held = np.flatnonzero(pulse > 1e-9)

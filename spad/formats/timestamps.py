@@ -43,7 +43,7 @@ class Timestamps:
 
     @property
     def bits(self) -> int:
-        """Bits of one stamp."""
+        """Return the number of bits of one timestamp."""
         return max(1, (self.bins - 1).bit_length())
 
     def counts(self) -> np.ndarray:

@@ -54,17 +54,17 @@ class Optics:
 
     @property
     def aperture_m2(self) -> float:
-        """Area of the lens opening."""
+        """Compute the area of the lens opening [m^2]."""
         return math.pi / 4 * (self.focal_length_m / self.f_number) ** 2
 
     @property
     def pixel_sr(self) -> float:
-        """Solid angle that a pixel on the axis sees, (pitch / focal length)^2."""
+        """Compute the solid angle that a pixel on the axis sees [sr], (pitch / focal length)^2."""
         return (self.pixel_pitch_m / self.focal_length_m) ** 2
 
     @property
     def photons_per_joule(self) -> float:
-        """wavelength / (h c)."""
+        """Compute the photons per joule of laser light, wavelength / (h c)."""
         return self.wavelength_m / (PLANCK_J_S * SPEED_OF_LIGHT_M_PER_S)
 
     def detections_per_radiance(self, sensor: Sensor) -> float:

@@ -106,7 +106,7 @@ TOP = ("schema", "name", "description")
 
 @dataclass(frozen=True)
 class SensorFile:
-    """What a sensor file says.
+    """Contents of a sensor file.
 
     sensor       the detector and its histogram
     optics       lens, filter and laser of a radiometric budget; None where the file has none

@@ -1,4 +1,4 @@
-"""What the single-photon camera is: `Sensor`, and the `PhotonBudget` it is used at. Needs no torch."""
+"""Define the single-photon camera, `Sensor`, and the `PhotonBudget` it is used at. Needs no torch."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class Sensor:
 
     @property
     def response(self) -> AnyPulse:
-        """The pulse with the jitter: what one detection looks like in time."""
+        """Return the pulse convolved with the jitter: what one detection looks like in time."""
         return convolved(self.pulse, self.jitter)
 
     @property
@@ -109,22 +109,22 @@ class Sensor:
 
     @property
     def cycles(self) -> float:
-        """Laser cycles in one exposure."""
+        """Return the number of laser cycles in one exposure."""
         return self.exposure_s / self.period_s
 
     @property
     def range_m(self) -> float:
-        """Unambiguous depth range c period / 2."""
+        """Return the unambiguous depth range [m], c period / 2."""
         return SPEED_OF_LIGHT_M_PER_S * self.period_s / 2
 
     @property
     def bin_depth_m(self) -> float:
-        """Depth that one bin spans, c bin_width / 2."""
+        """Return the depth [m] that one bin spans, c bin_width / 2."""
         return SPEED_OF_LIGHT_M_PER_S * self.bin_width_s / 2
 
     @property
     def timestamp_bits(self) -> int:
-        """Bits of one timestamp: 10 for 1024 bins."""
+        """Return the number of bits of one timestamp: 10 for 1024 bins."""
         return max(1, (self.bins - 1).bit_length())
 
     def dark_rate_map_hz(self, height: int, width: int, seed: int = 0) -> np.ndarray:

@@ -44,12 +44,12 @@ class Pulse:
 
     @property
     def fwhm_s(self) -> float:
-        """Full width at half maximum of the Gaussian part."""
+        """Return the full width at half maximum of the Gaussian part [s]."""
         return 2 * math.sqrt(2 * math.log(2)) * self.sigma_s
 
     @property
     def reach_s(self) -> float:
-        """Half the window outside which the pulse holds less than 1e-11 of its area."""
+        """Return half the window [s] outside which the pulse holds less than 1e-11 of its area."""
         return max(self.window_s(7))
 
     @property
@@ -79,7 +79,8 @@ class Pulse:
 
 
 def _decayed(x: np.ndarray, sigma: float, tail: float) -> np.ndarray:
-    """exp(s^2 / 2 tau^2 - x / tau) Phi(x / s - s / tau) where the exponent cannot overflow: below, Phi itself is 0."""
+    """Compute exp(s^2 / 2 tau^2 - x / tau) Phi(x / s - s / tau) where the exponent cannot overflow: below, Phi itself
+    is 0."""
     exponent = sigma**2 / (2 * tail**2) - x / tail
     return np.where(exponent < 500, np.exp(np.minimum(exponent, 500)), 0) * (
         0.5 * erfc((sigma / tail - x / sigma) / math.sqrt(2))
@@ -111,7 +112,7 @@ class SampledPulse:
 
     @property
     def reach_s(self) -> float:
-        """Half the window outside which the pulse is zero."""
+        """Return half the window [s] outside which the pulse is zero."""
         return max(self.window_s(math.inf))
 
     @property

@@ -29,12 +29,12 @@ NARROW = 0.4  # share of a pulse in one bin above which it is
 
 
 def _normal_cdf(x: Tensor) -> Tensor:
-    """Phi(x) by erfc: torch.special.ndtr goes by 1 + erf, which has no digit left from -8.3 on."""
+    """Compute Phi(x) by erfc: torch.special.ndtr goes by 1 + erf, which has no digit left from -8.3 on."""
     return 0.5 * torch.special.erfc(x * -math.sqrt(0.5))
 
 
 def _decayed(pulse: Pulse, x: Tensor) -> Tensor:
-    """E(x) = exp(s^2 / 2 tau^2 - x / tau) Phi(x / s - s / tau), tau times the density of a pulse with a tail.
+    """Compute E(x) = exp(s^2 / 2 tau^2 - x / tau) Phi(x / s - s / tau), tau times the density of a pulse with a tail.
 
     Left of the point where Phi's argument is 0 by erfcx, whose factor exp(-x^2 / 2 s^2) cannot overflow.
     """
@@ -46,7 +46,8 @@ def _decayed(pulse: Pulse, x: Tensor) -> Tensor:
 
 
 def _steps_of(pulse: SampledPulse, t: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
-    """The table on t's device, the step that t is in, how far into it (0 to 1), and whether t is in any."""
+    """Find the step of a pulse table that t is in: the table on t's device, the step, how far into it t is (0 to 1),
+    and whether t is in any."""
     table = pulse_table(pulse)
     columns = tuple(torch.from_numpy(column).to(t.device) for column in table)
     position = (t.double() - float(table.edges_s[0])) / pulse.sample_s
@@ -185,7 +186,7 @@ class Taps(NamedTuple):
 
     @property
     def centred(self) -> Tensor:
-        """(L,) h for an arrival in the centre of its bin."""
+        """Return h for an arrival in the centre of its bin, (L,)."""
         return self.fine[len(self.steps) // 2]
 
 

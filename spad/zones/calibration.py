@@ -49,7 +49,7 @@ _FIRST_SKEW = 0.3  # bins: where the fit begins, as the derivative at 0 is 0
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What was fitted.
+    """Result of a calibration: the fitted sensor, and how well it is known.
 
     sensor, zones     the calibrated sensor
     errors            standard error of each natural parameter by name, as `natural` orders them

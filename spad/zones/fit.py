@@ -78,7 +78,8 @@ def fit(
 def _step_bounds(
     values: Values, names: Sequence[tuple[str, int]], curvature: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How far each number may fall and rise in a step, (P,): within the linearisation, and what is positive stays so.
+    """Compute how far each parameter may fall and rise in a step, (P,): within the linearisation, and what is positive
+    stays so.
 
     What the captures say nothing about, as a skew of 0 whose derivative is 0, stays where it is.
     """

@@ -153,7 +153,7 @@ class ZoneArray:
 
 
 class ZoneReturns(NamedTuple):
-    """What reaches one zone: path intervals [m] and light [1 / (m^2 J)], (N,) float64 each."""
+    """Light that reaches one zone: path intervals [m] and light [1 / (m^2 J)], (N,) float64 each."""
 
     near_m: np.ndarray
     far_m: np.ndarray

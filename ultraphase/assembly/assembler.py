@@ -87,7 +87,7 @@ def _source_text(path: Path) -> str:
 
 
 class _Assembly:
-    """What is known while the lines are taken, in order; labels last, as branches may look ahead."""
+    """State of an assembly while its lines are taken in order; labels are resolved last, as branches may look ahead."""
 
     def __init__(self, chip: ChipSpec, given: dict[str, int], read: Reader | None) -> None:
         self.chip, self.given, self.read, self.max_shift = chip, given, read, chip.max_shift
@@ -99,7 +99,7 @@ class _Assembly:
         self.includes = self.statements = self.repeated = self.loops = 0
 
     def take(self, lines: list[Line]) -> None:
-        """All lines of a file, or of one turn of a loop."""
+        """Take all lines of a file, or of one turn of a loop."""
         at = 0
         while at < len(lines):
             word = lines[at].tokens[0].text
@@ -177,7 +177,7 @@ class _Assembly:
 
     @staticmethod
     def _name(line: Line, token: Token) -> str:
-        """A name with its {h} filled in."""
+        """Fill in the {h} of a name."""
 
         def value(found: re.Match[str]) -> str:
             if found[1] not in line.loops:
@@ -281,7 +281,7 @@ class _Assembly:
             self._ram_operand(cursor, fields)
 
     def _ram_operand(self, cursor: Cursor, fields: dict[str, Any]) -> None:
-        """[register + constant] in any order, or one of the two alone."""
+        """Parse [register + constant] in any order, or one of the two alone."""
         cursor.expect("[")
         at, base, offset = cursor.next, None, 0
         sign = 1
@@ -371,7 +371,7 @@ class _Assembly:
         return value
 
     def program(self, name: str) -> Program:
-        """All labels known: the branches find their targets; checked against the chip."""
+        """Make the program once all labels are known: the branches find their targets; checked against the chip."""
         instructions = []
         for cursor, instruction, targets in self.pending:
             if targets:

@@ -73,7 +73,7 @@ def _table_lines(code: IntegerCode, many: bool) -> list[str]:
 
 
 def _place(code: IntegerCode, chip: ChipSpec, blocks: int) -> list[str]:
-    """place = 2 K (t / Mt), as the sums begin at address 0: as many instructions for every timestamp."""
+    """Write the instructions for place = 2 K (t / Mt), as the sums begin at address 0: as many for every timestamp."""
     if blocks == 1:
         return ["        MOV  place, #codes"]
     bits, lines, of = code.bins.bit_length() - 1, [], "t"
@@ -94,7 +94,7 @@ _PHOTON_OF_TABLE = [
 
 
 def _photon_of_harmonics(harmonics: tuple[int, ...], turns: int) -> list[str]:
-    """Every harmonic's phase by the fewest instructions, then its cosine and sine."""
+    """Write the instructions for every harmonic's phase, as few as possible, then for its cosine and sine."""
     if turns > 1:
         each = len(harmonics) // turns
         return [
@@ -119,7 +119,7 @@ def _photon_of_harmonics(harmonics: tuple[int, ...], turns: int) -> list[str]:
 
 
 def _step(before: int, h: int) -> list[str]:
-    """From phase p of harmonic `before` (0: of none) to that of h, p = h t + floor(h / 2)."""
+    """Write the step from phase p of harmonic `before` (0: of none) to that of h, p = h t + floor(h / 2)."""
     if h == 1:
         return ["MOV  p, t"]
     if before and h - before == 1:

@@ -154,7 +154,7 @@ def decode(word: int) -> Instruction:
 
 
 def _plain(instruction: Instruction) -> bool:
-    """Unused fields are zero and used ones in range, so that a word has one spelling."""
+    """Return whether unused fields are zero and used ones in range, so that a word has one spelling."""
     takes = instruction.op.takes
     checks = (
         instruction.rd == 0 or "d" in takes or "t" in takes,

@@ -36,13 +36,13 @@ class Region:
 
     @property
     def end(self) -> int:
-        """First byte behind it."""
+        """Return the first byte behind the region."""
         return self.address + self.bits // 8
 
 
 @dataclass(frozen=True)
 class Program:
-    """What a core runs.
+    """Program of a core.
 
     lines    (file, line number) of every instruction, for messages
     labels   name -> word
@@ -56,17 +56,17 @@ class Program:
 
     @property
     def words(self) -> tuple[int, ...]:
-        """The 32-bit words of the program store."""
+        """Return the 32-bit words of the program store."""
         return tuple(encode(instruction) for instruction in self.instructions)
 
     @property
     def ram_bits(self) -> int:
-        """RAM that the program declares."""
+        """Count the bits of RAM that the program declares."""
         return sum(region.bits for region in self.regions)
 
     @property
     def ram_bytes(self) -> int:
-        """First byte behind the last region; the program may touch none from there on."""
+        """Return the first byte behind the last region; the program may touch none from there on."""
         return max((region.end for region in self.regions), default=0)
 
     def region(self, name: str) -> Region:
@@ -78,7 +78,7 @@ class Program:
 
     @property
     def state(self) -> tuple[Region, ...]:
-        """The regions that the program writes."""
+        """Select the regions that the program writes."""
         return tuple(region for region in self.regions if not region.table)
 
     def where(self, word: int) -> str:

@@ -1,4 +1,4 @@
-"""What a hard case is, and how a render is held against an oracle."""
+"""Define hard cases, and compare their renders with an oracle."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Measured(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a case measured, by quantity, and how many footprints or sums its renders had to clip."""
+    """Result of a case: errors by quantity, and how many footprints or sums its renders had to clip."""
 
     errors: dict[str, Measured]
     clipped: int

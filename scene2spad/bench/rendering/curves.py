@@ -88,7 +88,7 @@ def seconds_at(points: list[Point], error: float, *, kindly: bool = False) -> Re
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times faster ours is than theirs at one error.
+    """Speed-up of our renderer over the other one at one error.
 
     at_least: ours is better than asked at its cheapest, and could be cheaper still
     extrapolated: which curves were carried on beyond what was measured ("", "ours", "theirs", "both")

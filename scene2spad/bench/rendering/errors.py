@@ -1,4 +1,4 @@
-"""How wrong a histogram is, against two independent halves of a reference whose own noise cancels."""
+"""Measure the error of a histogram against two independent halves of a reference whose own noise cancels."""
 
 from __future__ import annotations
 

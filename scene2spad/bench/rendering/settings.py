@@ -1,4 +1,4 @@
-"""What `bench render` measures: scenes, methods, qualities and references. Plain data, no renderer."""
+"""List what `bench render` measures: scenes, methods, qualities and references. Plain data, no renderer."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What the studies `spatial-block`, `tensor-size` and `fourier` run (supplement S.3.1 to S.3.3): models, levels, and
-the conclusions of the paper as claims that numbers decide. Plain data."""
+"""Define what the studies `spatial-block`, `tensor-size` and `fourier` run (supplement S.3.1 to S.3.3): models, levels,
+and the conclusions of the paper as claims that numbers decide. Plain data."""
 
 from __future__ import annotations
 

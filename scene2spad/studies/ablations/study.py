@@ -130,7 +130,7 @@ def _drawn(
 
 
 def _summary(numbers: dict[str, Any]) -> dict[str, list[str]]:
-    """What the terminal shows: conclusions, MAE of every model, and the published numbers beside ours."""
+    """Summarise the study for the terminal: conclusions, MAE of every model, and the published numbers beside ours."""
     conclusions = []
     for one in numbers["conclusions"]:
         why = one.get("why") or "{:.1f} and {:.1f} mm, difference {:.1f} to {:.1f}, {} and {} seeds".format(

@@ -27,7 +27,7 @@ _TRIAL_PHOTONS = 550
 
 @dataclass(frozen=True, eq=False)
 class ChipFrame:
-    """What the cores of a view put out: codes (H / Mr, W / Mc, numbers) int64, and what that cost."""
+    """Output of the cores for a view: codes (H / Mr, W / Mc, numbers) int64, and the cost of their computation."""
 
     codes: np.ndarray
     counters: Counters

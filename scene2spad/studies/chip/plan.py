@@ -1,4 +1,4 @@
-"""What `study chip` runs: models, sets, photon levels. Plain data."""
+"""Define what `study chip` runs: models, sets, photon levels. Plain data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OTHERS = (
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is run; `models` at every level of `levels` on the still lifes, at PAIR_LEVELS on rooms and pairs.
+    """Extent of the study: `models` at every level of `levels` on the still lifes, at PAIR_LEVELS on rooms and pairs.
 
     views, size   of each set; None: all, as they come
     """

@@ -1,4 +1,4 @@
-"""What `study depth-offset` runs: models, photon levels, offsets. Plain data."""
+"""Define what `study depth-offset` runs: models, photon levels, offsets. Plain data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Level = tuple[float, float]
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is run. `compressions` and `seeds` (at 128x; one elsewhere) decide the models; None views are all.
+    """Extent of the study. `compressions` and `seeds` (at 128x; one elsewhere) decide the models; None views are all.
 
     Beside the headline, which takes every model and level: `space_levels` of ray and rigid offsets, `relief_levels` of
     the reliefs, `pair_levels` of the photographs, each with seed 0 alone. Beyond what was decided beforehand, up to the

@@ -352,7 +352,8 @@ def _depth_images(study: Session, base: TestSet, shown: Sequence[int], out: Path
 
 
 def _summary(numbers: dict[str, Any]) -> dict[str, list[str]]:
-    """What the terminal shows: the bars, every seed's ratio, the energies, where designs break, what fails far out."""
+    """Summarise the study for the terminal: the bars, every seed's ratio, the energies, where designs break, what fails
+    far out."""
     holds = {True: "holds", False: "does not hold", None: "not decided"}
     bars = [f"{b['design']}: {b['geometric_mean']:.2f}, {b['bar']}: {holds[b['holds']]}" for b in numbers["bars"]]
     ratios = [

@@ -1,4 +1,4 @@
-"""What `study multipath` runs: scenes, photon levels, methods. Plain data."""
+"""Define what `study multipath` runs: scenes, photon levels, methods. Plain data."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def conclusions(means: Sequence[Mapping], scenes: Sequence[Mapping]) -> list[dic
 
 
 def _summary(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
-    """What the terminal shows."""
+    """Summarise the study for the terminal: conclusions, indirect light of every scene, absent models."""
     lines = [
         f"{LIGHTS[c['light']]}, {c['network']}: {c['mae_mm']:.0f} mm at 50 + 50 photons, {FILTER} "
         f"{c['filter_mae_mm']:.0f} mm, the filter better in {c['filter_better_in']} of {c['scenes']} scenes; at 50 + "

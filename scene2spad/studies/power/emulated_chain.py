@@ -26,7 +26,7 @@ INT16 = 1 << 15
 
 @dataclass(frozen=True, eq=False)
 class Emulated:
-    """What the cores of an image put out, and what that cost.
+    """Output of the cores for an image, and the cost of its computation.
 
     codes      (H / block rows, W / block columns, numbers) int64
     counters   sums over all cores

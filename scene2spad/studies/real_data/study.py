@@ -274,7 +274,7 @@ def _row(view: View, label: str, depth: np.ndarray) -> dict:
 
 
 def _pages(found: dict[int, dict[str, Method]]) -> list[tuple[list[str], str, str]]:
-    """What each figure shows: the uncompressed beside one compression ratio."""
+    """List the methods, title and file of each figure: the uncompressed beside one compression ratio."""
     published = {256: "After Supplementary Figure 13 (256x)", 128: "After Supplementary Figure 14 (128x)"}
     return [
         ([*found[1], *found[ratio]], published.get(ratio, f"{ratio}x compression"), f"real-data-{ratio}x.png")

@@ -1,4 +1,5 @@
-"""How a predicted histogram differs from a measured one: shape, amplitude, range, intervals, and the model's error."""
+"""Measure how a predicted histogram differs from a measured one: shape, amplitude, range, intervals, and the model's
+error."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ WINDOW = (-4, 8)  # bins around the fullest that a range is the centroid of
 
 
 class Comparison(NamedTuple):
-    """Of captures (N,) and zones (Z,), all (N, Z) float64.
+    """Differences between predicted and measured histograms of captures (N,) and zones (Z,), all (N, Z) float64.
 
     shape      nRMSE |n - s e| / |n|, s the ratio of sums; `floor` what photon noise alone makes of it
     amplitude  predicted over measured counts, less 1

@@ -1,4 +1,4 @@
-"""What `study sim-to-real` runs. Plain data."""
+"""Define what `study sim-to-real` runs. Plain data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MODEL_ERROR = 0.004  # relative, of a bin: what a calibration and a pose weigh w
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is run.
+    """Extent of the study: which captures are calibrated on, held out and shown, and which effects are switched off.
 
     nearest_m   captures nearer than this are predicted, but not calibrated on
     every       of the captures from there on, each that many-th is calibrated on; the others are held out

@@ -162,7 +162,8 @@ def ablated(of: Prediction, progress: Progress) -> list[dict[str, Any]]:
 
 
 def _gone_with(parameter: str) -> tuple[str, ...]:
-    """What goes with a parameter: nothing recovers or is compressed where nothing saturates."""
+    """Return the parameters that are off together with `parameter`: nothing recovers or is compressed where nothing
+    saturates."""
     return ("trials", "recovery", "compression") if parameter == "trials" else (parameter,)
 
 

@@ -1,4 +1,4 @@
-"""What `study transport` runs, and what its steps, designs and verdicts are called. Plain data."""
+"""Define what `study transport` runs, and the names of its steps, designs and verdicts. Plain data."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def planned_rows(
 
 
 def _row(place: Place, one: Contender, errors: np.ndarray) -> dict[str, Any]:
-    """What (levels, draws, full and planned) errors [mm] of a design say."""
+    """Compare the (levels, draws, full and planned) errors [mm] of a design."""
     full, planned = errors[..., 0].mean(0), errors[..., 1].mean(0)
     fraction, wide = compared(full, planned)
     common = {"scene": place.name, "set": place.set, "laser": place.laser, "design": one.name, "draws": len(full)}

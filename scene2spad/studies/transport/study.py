@@ -225,7 +225,7 @@ def _measured(
 
 
 def _described(place: Place) -> dict[str, Any]:
-    """What is in a scene, and the rays of laser light that both renders traced."""
+    """Describe a scene, and the rays of laser light that both renders traced."""
     full, planned = place.full.meta, place.planned.meta
     return {
         "scene": place.name,
@@ -263,7 +263,7 @@ def _log_saved(scenes: Sequence[dict], seconds: Mapping[tuple[str, str], Mapping
 
 
 def _summary(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
-    """What the terminal shows."""
+    """Summarise the study for the terminal: how the codes rank, MAE of every design, planned renders, absent models."""
     changes = [
         f"{c['laser']}, {STEPS[c['step']]}: {c['ranking']} ({c['kept']} of {c['pairs']} pairs kept, {c['reversed']} "
         f"reversed, {c['not_decided']} not decided){''.join('; ' + one for one in c['turned'])}"

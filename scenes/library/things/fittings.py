@@ -1,4 +1,4 @@
-"""What is fixed to a room: windows with curtains and blinds, doors, radiators, hooks, pictures, shelves, lamps.
+"""Build what is fixed to a room: windows with curtains and blinds, doors, radiators, hooks, pictures, shelves, lamps.
 
 What belongs to a wall has its back at z = 0 and its front towards +z.
 """
