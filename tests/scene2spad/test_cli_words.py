@@ -113,6 +113,7 @@ def test_ctrl_c_while_libraries_are_imported_is_one_line():
     """The signal comes with the first import of the command line, half a second before it used to be answered."""
     program = """
 import builtins, os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job begins with it ignored
 from scene2spad.start import script
 wrapped = builtins.__import__
 def importing(name, *more):
