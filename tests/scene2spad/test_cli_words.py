@@ -113,7 +113,6 @@ def test_ctrl_c_while_libraries_are_imported_is_one_line():
     """The signal comes with the first import of the command line, half a second before it used to be answered."""
     program = """
 import builtins, os, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job begins with it ignored
 from scene2spad.start import script
 wrapped = builtins.__import__
 def importing(name, *more):
@@ -156,5 +155,7 @@ script()
 
 
 def _is_interrupted(program: str) -> None:
-    done = run_process([sys.executable, "-c", program])
+    # a shell's background job, and all that it starts, begins with the signal ignored
+    heeded = "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    done = run_process([sys.executable, "-c", heeded + program])
     assert done.returncode == 130 and done.stderr.count("\n") == 1 and "interrupted" in done.stderr, done.stderr
