@@ -205,8 +205,7 @@ class _Run:
         self.events += core.counters.photons
 
     def _kind(self, one: Instruction) -> Callable[..., np.ndarray | None]:
-        """Select the function that executes an instruction: called with instruction, word, cores and their indices;
-        returns the cores that it holds."""
+        """Select what executes an instruction, of (instruction, word, cores, indices); it returns cores it holds."""
         if one.name in ALU:
             return self._alu
         if "m" in one.op.takes:
