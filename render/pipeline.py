@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +27,7 @@ from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, Plan, RenderSettings
 from render.specular.image_method import specular_light
 from render.transient.samples import SampleBuffer, Samples, concatenate, no_samples, select
+from scenes.progress import Progress
 from scenes.random_streams import Stream
 
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
@@ -36,8 +36,6 @@ MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
 HOPELESS = 10
 PROPOSAL = "trade fireflies for a stated bias with --clamp 10"
 FIRST_FILTERED_SPP = 16  # filtered light has no pilot: it starts with few paths
-
-Progress = Callable[[str, float], None]
 
 
 class LightSamples(NamedTuple):

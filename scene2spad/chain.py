@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from scenes.errors import InputError, did_you_mean
+from scenes.progress import Progress
 
 if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from spad.sensor.budget import Optics
     from spad.sensor.model import Sensor
 
-Progress = Callable[[str, float], None]
 Law = Literal["auto", "poisson", "first-photon", "free-running"]
 
 

@@ -27,6 +27,7 @@ class Stream(IntEnum):
     EVALUATE = 34
     PUBLISHED = 35
     WINDOW = 36
+    DEVICE_PATCH = 37
 
     # given away twice
     VIEW = 20

@@ -27,6 +27,7 @@ from csph.networks.posterior import Decoder
 from csph.training.views import Views
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import require
+from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.detect import sense
 from spad.formats.histogram import TRUTH, Histogram
@@ -41,7 +42,6 @@ LEVEL_GROUPS: dict[str, Callable[[float, float], bool]] = {
 }
 
 Method = Callable[[Histogram], np.ndarray]
-Progress = Callable[[str, float], None]
 
 
 class DepthEstimator(Protocol):

@@ -16,12 +16,14 @@ from scenes.errors import InputError, require
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
 
-Network = Literal["compact", "published", "published-signed"]
+Network = Literal["compact", "compact-wide", "published", "published-signed"]
 Front = Literal["codes", "counts", "matched", "peak"]
-NETWORKS: tuple[str, ...] = ("compact", "published", "published-signed")
+NETWORKS: tuple[str, ...] = ("compact", "compact-wide", "published", "published-signed")
 FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
 Schedule = Literal["steps", "cosine"]
 SCHEDULES: tuple[str, ...] = ("steps", "cosine")
+SenseOn = Literal["host", "device"]
+SENSE_ON: tuple[str, ...] = ("host", "device")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
 MAX_STEPS, MAX_THREADS = 10**8, 1024
 COUNT_BYTES = 4 * 4  # of a batch: counts, logits, their gradient and the target, in float32
@@ -35,7 +37,8 @@ class ModelConfig:
              with the pulse (`spad.estimators.matching.normalised_correlation`); or one-hot argmax
     design   the codes, with `front` = "codes"
     layer    switches of `csph.layer.LayerOptions` that differ from the published layer
-    network  compact; published; or published with logits of any sign, which cannot die
+    network  compact; compact-wide, with twice the features; published; or published with logits of any sign, which
+             cannot die
     sensor   whose histograms it takes
     grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with print
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
@@ -102,6 +105,8 @@ class TrainConfig:
     window        train on so many bins around a label, in steps of 256, but for the last tenth of the run; 0: on all.
                   Not for blocks of more bins, whose codes would then not see the whole range
     weights       how often patches are drawn from each of several training sets (default: alike)
+    sense_on      where patches are sensed: on the host, with the same bytes on every machine, or on the device that
+                  trains, batch by batch (`spad.detection.device_patches`), for GPUs
     coherence     weight of the mean squared cosine between the codes of two pixels of a block (`csph.codes.rank`)
     tv_weight, tv_start        weight of the mean total variation of depth / range, and the step it comes in at
     levels        mean (signal, background) photons, one drawn for each patch; or "continuous" (`csph.training.levels`)
@@ -137,6 +142,7 @@ class TrainConfig:
     window: int = 0
     weights: tuple[float, ...] = ()
     coherence: float = 0.0
+    sense_on: SenseOn = "host"
 
     def __post_init__(self) -> None:
         for name in ("epochs", "steps_per_epoch", "batch", "crop", "decay_steps", "validation_views"):
@@ -159,6 +165,7 @@ class TrainConfig:
     def _check_recipe(self) -> None:
         known = self.schedule in SCHEDULES
         require(known, f"training: schedule {self.schedule!r} is unknown, expected one of {', '.join(SCHEDULES)}")
+        require(self.sense_on in SENSE_ON, f"training: sense_on {self.sense_on!r}, expected {' or '.join(SENSE_ON)}")
         require(self.warmup >= 0, f"training: warm-up of {self.warmup} steps is negative")
         require(0 < self.rate_end <= 1, f"training: rate_end {self.rate_end:g} is outside (0, 1]")
         require(0 <= self.average < 1, f"training: average {self.average:g} is outside [0, 1)")
@@ -244,6 +251,18 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "laptop": {**RECIPE, "epochs": 12, "steps_per_epoch": 650},
     "workstation": {**RECIPE, "epochs": 24, "steps_per_epoch": 1500, "warmup": 400},
+    # a GPU: ten times the pixels of `workstation` in a few minutes of it, patches sensed there
+    "gpu": {
+        **RECIPE,
+        "epochs": 10,
+        "steps_per_epoch": 2000,
+        "batch": 8,
+        "crop": 32,
+        "warmup": 400,
+        "average": 0.998,
+        "validation_views": 12,
+        "sense_on": "device",
+    },
     "laptop-v1": {},  # what the first models were shipped with
     "paper": {
         # half a published epoch: validated and kept twice in each
@@ -263,9 +282,10 @@ def preset(name: str, model: ModelConfig, **changes: Any) -> TrainConfig:
     """Return a preset's configuration with a model; `changes` that are None leave it as it is.
 
     smoke (seconds), laptop (compact, one core, 25 minutes at the most), workstation (compact, two cores, 2 hours at the
-    most), paper (the published network, levels and schedule), laptop-v1 (the recipe of the first models). Windows are
-    left out where the model does not allow them, and with random time offsets. Without compression, and of one-hot
-    peaks, `paper` has the published total variation and a tenth of the learning rate. `levels` may be "paper".
+    most), gpu (compact, minutes on a large GPU), paper (the published network, levels and schedule), laptop-v1 (the
+    recipe of the first models). Windows are left out where the model does not allow them, and with random time offsets.
+    Without compression, and of one-hot peaks, `paper` has the published total variation and a tenth of the learning
+    rate. `levels` may be "paper".
     """
     require(name in PRESETS, f"preset {name!r} is unknown, expected one of {', '.join(PRESETS)}")
     known = {item.name for item in fields(TrainConfig)}

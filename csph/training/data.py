@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytorch_lightning as pl
@@ -21,7 +21,8 @@ from csph.training.config import WINDOW_STEP, TrainConfig
 from csph.training.levels import CONTINUOUS, draw_level
 from scenes.errors import require
 from scenes.random_streams import Stream
-from spad.detection.training_patches import Batch, PackedTransients, Patch, sense_patches
+from spad.detection.device_patches import DevicePatches
+from spad.detection.training_patches import Batch, PackedTransients, Patch, joined, sense_patches
 from spad.sensor.model import Sensor
 
 FULL_LENGTH_FRACTION = 0.1  # of a run with windows, its last: on all bins
@@ -122,25 +123,63 @@ def _sensed(
     if len(parts) > 1:
         back = torch.from_numpy(np.argsort(order))
         batch = Batch(*(torch.cat(same)[back] for same in zip(*parts, strict=True)))
-    starts = [_window_start(batch, i, request.patch, sensor, window) for i, request in enumerate(requests)]
+    starts = [
+        _window_start(batch.depth_m[i][batch.valid[i]].numpy(), request.patch, sensor, window)
+        for i, request in enumerate(requests)
+    ]
     return TrainBatch(batch.counts, batch.depth_m, batch.valid, torch.tensor(starts))
 
 
-def _window_start(batch: Batch, number: int, patch: Patch, sensor: Sensor, window: int) -> int:
-    """Draw the first bin of a window that holds the label of one pixel, with the patch's key; -1 without windows."""
+def _window_start(labels: np.ndarray, patch: Patch, sensor: Sensor, window: int) -> int:
+    """Draw the first bin of a window that holds one of a patch's labels (N,), with the patch's key; -1 without
+    windows."""
     if not window:
         return -1
     rng = np.random.default_rng(np.random.SeedSequence(patch.seed, spawn_key=(Stream.WINDOW,)))
-    labels = batch.depth_m[number][batch.valid[number]]
     label = float(labels[rng.integers(len(labels))]) if len(labels) else 0.0
     block = int(label / sensor.bin_depth_m) // WINDOW_STEP - int(rng.integers(window // WINDOW_STEP))
     return min(max(0, block * WINDOW_STEP), sensor.bins - window)
 
 
+class Requests(NamedTuple):
+    """A batch that is still to be sensed, on the device that trains."""
+
+    requests: tuple[Request, ...]
+    window: int
+
+
+def _asked(window: int, requests: Sequence[Request]) -> Requests:
+    return Requests(tuple(requests), window)
+
+
+class DeviceSensing:
+    """Senses the batches of several training sets on one device, all sets in one; validation stays on the CPU."""
+
+    def __init__(self, sets: Sequence[PackedTransients], config: TrainConfig, device: torch.device) -> None:
+        self.config, self.packed = config, joined(sets)
+        self.firsts = np.cumsum([0, *(packed.scenes for packed in sets)])
+        self.resident = DevicePatches(self.packed, config.model.sensor, device)
+
+    def sense(self, asked: Requests) -> TrainBatch:
+        """Return a batch on the device; the first patch's key decides the noise of all."""
+        sensor, side = self.config.model.sensor, self.config.crop
+        patches = [one.patch._replace(scene=int(self.firsts[one.source]) + one.patch.scene) for one in asked.requests]
+        batch = self.resident.sense(patches, size=(side, side), seed=patches[0].seed)
+        starts = [_window_start(self._labels(one, side), one, sensor, asked.window) for one in patches]
+        # on the CPU, where the windows are cut
+        return TrainBatch(batch.counts, batch.depth_m, batch.valid, torch.tensor(starts))
+
+    def _labels(self, patch: Patch, side: int) -> np.ndarray:
+        rows, columns = slice(patch.row, patch.row + side), slice(patch.column, patch.column + side)
+        depth = self.packed.depth_m[patch.scene, rows, columns]
+        return depth[depth < self.config.model.sensor.range_m]
+
+
 class SetData(pl.LightningDataModule):
     """Loaders over training and validation sets; `workers` processes sense ahead (0: in this one).
 
-    Validation frames are shared out evenly over the validation sets.
+    Validation frames are shared out evenly over the validation sets. With `sense_on` = "device" training batches cross
+    to the device as requests and are sensed there.
     """
 
     def __init__(
@@ -152,6 +191,7 @@ class SetData(pl.LightningDataModule):
     ) -> None:
         super().__init__()
         self.training, self.validation, self.config, self.workers = training, validation, config, workers
+        self.sensing: DeviceSensing | None = None
         Samples(training, config, 0)
         views = -(-config.validation_views // len(validation))
         self.frames = [Frames(packed, config, views, source) for source, packed in enumerate(validation)]
@@ -165,6 +205,14 @@ class SetData(pl.LightningDataModule):
         size = (config.crop, config.crop)
         return self._loader(Samples(self.training, config, epoch), self.training, config.batch, size, window)
 
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """Move a sensed batch to the device, or sense there one that is only asked for."""
+        if not isinstance(batch, Requests):
+            return super().transfer_batch_to_device(batch, device, dataloader_idx)
+        if self.sensing is None:
+            self.sensing = DeviceSensing(self.training, self.config, device)
+        return self.sensing.sense(batch)
+
     def val_dataloader(self) -> list[DataLoader]:
         return [self._loader(frames, self.validation, 1, frames.size, 0) for frames in self.frames]
 
@@ -172,6 +220,8 @@ class SetData(pl.LightningDataModule):
         self, samples: Dataset, sets: Sequence[PackedTransients], batch: int, size: tuple[int, int], window: int
     ) -> DataLoader:
         collate = partial(_sensed, sets, self.config.model.sensor, size, window)
+        if isinstance(samples, Samples) and self.config.sense_on == "device":
+            return DataLoader(samples, batch_size=batch, collate_fn=partial(_asked, window))
         return DataLoader(
             samples,
             batch_size=batch,

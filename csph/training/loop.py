@@ -20,7 +20,7 @@ import logging
 import math
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
@@ -50,10 +50,10 @@ from render.backend.malloc import retain_freed_memory
 from scenes.errors import InputError, require
 from scenes.files import append_line, is_unclaimed, whole_file, write_csv
 from scenes.io.inputs import read_json_object
+from scenes.progress import Progress
 
 log = logging.getLogger("csph")
 
-Progress = Callable[[str, float], None]
 RANGE_RATE = 0.02  # of the logarithms of int8 clipping ranges: a bit more headroom in some 40 steps
 EXCESS_WEIGHT = 10.0  # of sums beyond 16 bits
 
@@ -87,7 +87,7 @@ class DepthTraining(pl.LightningModule):
             depth = published_target(depth, sensor)
         if config.window and bool((batch.first_bin >= 0).all()):
             logits = self.model.windowed(batch.counts, batch.first_bin, config.window)
-            near = batch.first_bin.view(-1, 1, 1) * sensor.bin_depth_m
+            near = batch.first_bin.to(depth.device).view(-1, 1, 1) * sensor.bin_depth_m
             depth = depth - near
             valid = batch.valid & (depth >= 0) & (depth < config.window * sensor.bin_depth_m)
             # gated: what of the pulse falls outside the window is left out

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from render.pipeline import Progress
 from scene2spad.studies.power.emulated_chain import timestamps_of
 from scene2spad.studies.power.program_tables import int8_temporal
 from scenes.errors import require
 from scenes.files import whole_file
+from scenes.progress import Progress
 from ultraphase import Core, CoreArray, Method, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.tables import INT8_SCALE, spatial_sum

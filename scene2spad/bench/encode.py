@@ -23,10 +23,10 @@ from torch.nn.functional import conv3d, conv_transpose3d
 from csph import CompressiveLayer, Design
 from csph.codes.blocks import EPSILON
 from csph.codes.photons import encode_photons, photon_table
-from render.pipeline import Progress
 from scene2spad.options.experiments import Bench
 from scenes.errors import require
 from scenes.files import whole_file
+from scenes.progress import Progress
 from spad.formats.histogram import counts_from_timestamps
 
 BATCH, SIZE, PHOTONS = 4, (1024, 32, 32), 60

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,12 @@ from scene2spad.bench.hard import optics as hard_cases_optics
 from scene2spad.bench.hard.case import Case, Measured
 from scenes.errors import InputError, require
 from scenes.files import whole_file
+from scenes.progress import Progress
 
 CASES: dict[str, Case] = {
     case.name: case for case in (*hard_cases_direct.CASES, *hard_cases_indirect.CASES, *hard_cases_optics.CASES)
 }
 COLUMNS = ("name", "passed", "quantity", "error", "limit", "seconds", "clipped", "oracle")
-
-Progress = Callable[[str, float], None]
 
 
 def run(command: Any, progress: Progress) -> dict:

@@ -24,11 +24,11 @@ from csph.training.config import NETWORKS, ModelConfig, preset
 from csph.training.loss import kl_divergence
 from csph.training.views import packed_views, split_views
 from render.backend.malloc import retain_freed_memory
-from render.pipeline import Progress
 from scene2spad.datasets.planes import random_planes
 from scene2spad.options.experiments import Bench
 from scenes.errors import require
 from scenes.files import write_csv
+from scenes.progress import Progress
 from spad.detection.training_patches import sense_patches
 
 PATCH = (1, 1, 1024, 32, 32)  # what multiply-accumulates are counted for

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from render.pipeline import Progress
 from render.scene.traced_scene import TracedScene
 from scene2spad.bench.rendering import ours, peers, settings
 from scene2spad.bench.rendering.binning import binned
@@ -28,6 +27,7 @@ from scene2spad.options.experiments import Bench
 from scenes.errors import InputError
 from scenes.files import whole_file
 from scenes.model import Scene
+from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 

@@ -20,6 +20,7 @@ from render.transient import Transient
 from scene2spad.bench import estimators
 from scenes.errors import require
 from scenes.files import whole_file, write_csv
+from scenes.progress import Progress
 from spad.detection.detect import sense, sense_timestamps
 from spad.detection.flux import expected_counts, rates_for
 from spad.detection.laws import first_photon_counts
@@ -32,8 +33,6 @@ BUDGETS = ((10.0, 50.0), (10.0, 1000.0))
 CYCLES = (1_000, 1_000_000)
 FLUX_PER_CYCLE = 0.05
 PATCHES = ((10.0, 50.0), (50.0, 50.0))
-
-Progress = Callable[[str, float], None]
 
 
 def relief(height: int, width: int) -> Transient:

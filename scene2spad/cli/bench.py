@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import importlib
 
-from scene2spad.options.common import Progress
 from scene2spad.options.experiments import Bench
 from scenes.errors import InputError
+from scenes.progress import Progress
 
 
 def run(command: Bench, progress: Progress) -> dict:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from scene2spad.options.common import Common, Positional, Progress
+from scene2spad.options.common import Common, Positional
+from scenes.progress import Progress
 
 FITTED = ("delay", "skew", "clock", "bin_width", "background", "leak", "echo", "trials", "recovery", "compression")
 

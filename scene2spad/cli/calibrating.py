@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scene2spad.datasets.zone_captures import read_plane_captures, shipped_captures, within, zone_captures
-from scene2spad.options.common import Progress
 from scenes.errors import require
+from scenes.progress import Progress
 from spad.sensor.files import load_sensor, write_sensor
 from spad.zones.calibration import Calibration, calibrate, calibrated_file, check_effects, poisson_deviance
 from spad.zones.expected_counts import ZoneCapture

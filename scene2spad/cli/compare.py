@@ -8,8 +8,9 @@ from pathlib import Path
 
 from scene2spad.cli.opening import open_histogram
 from scene2spad.cli.paths import input_file, output_file
-from scene2spad.options.common import Common, File, Positional, Progress
+from scene2spad.options.common import Common, File, Positional
 from scenes.errors import require
+from scenes.progress import Progress
 
 FIGURES = ("mae_mm", "rmse_mm", "median_mm", "within_10mm", "pixels", "missing")
 

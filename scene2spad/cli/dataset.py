@@ -8,8 +8,9 @@ from typing import Annotated
 
 from render.settings import FILTERED_AMBIENT_SPP
 from scene2spad.cli.paths import output_file
-from scene2spad.options.common import Common, Count, File, Number, Offset, Pixels, Positional, Progress, may_stay_open
+from scene2spad.options.common import Common, Count, File, Number, Offset, Pixels, Positional, may_stay_open
 from scenes.library.sets import scene_set
+from scenes.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)

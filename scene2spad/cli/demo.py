@@ -8,9 +8,10 @@ from pathlib import Path
 
 from scene2spad.cli.paths import output_file
 from scene2spad.cli.render import in_view
-from scene2spad.options.common import Common, Progress
+from scene2spad.options.common import Common
 from scenes.errors import InputError
 from scenes.library.catalog import load_scene
+from scenes.progress import Progress
 
 NETWORK = "learned-256x4x4-128x-mixed-s0"
 METHODS = {

@@ -13,8 +13,9 @@ import numpy as np
 from scene2spad.cli.opening import open_histogram
 from scene2spad.cli.paths import holds_kind, input_file, output_file, picture
 from scene2spad.methods import depth_method
-from scene2spad.options.common import Common, File, Positional, Progress, may_stay_open
+from scene2spad.options.common import Common, File, Positional, may_stay_open
 from scenes.errors import InputError, require
+from scenes.progress import Progress
 from spad.formats.depth_map import write_depth
 
 if TYPE_CHECKING:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scene2spad.options.common import Progress
 from scene2spad.options.networks import Evaluate
+from scenes.progress import Progress
 
 PUBLISHED_SET = Path("published")
 

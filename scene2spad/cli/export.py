@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient
-from scene2spad.options.common import Common, File, Positional, Progress, may_stay_open
+from scene2spad.options.common import Common, File, Positional, may_stay_open
 from scenes.errors import InputError, require
+from scenes.progress import Progress
 
 DENSE = (".npz", ".h5", ".hdf5")
 CODES = (".txt", ".npy")

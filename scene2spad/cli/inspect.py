@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from scene2spad.cli.paths import holds_kind, input_file
-from scene2spad.options.common import Common, Positional, Progress, may_stay_open
+from scene2spad.options.common import Common, Positional, may_stay_open
 from scenes.errors import InputError, require
+from scenes.progress import Progress
 
 if TYPE_CHECKING:
     from render.transient import Transient

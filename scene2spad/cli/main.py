@@ -36,9 +36,10 @@ from scene2spad.cli import (
     ultraphase,
 )
 from scene2spad.interrupts import STOPPED
-from scene2spad.options.common import Common, Progress
+from scene2spad.options.common import Common
 from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
+from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."

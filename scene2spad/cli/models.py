@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from scene2spad.options.common import Common, Positional, Progress, may_stay_open
+from scene2spad.options.common import Common, Positional, may_stay_open
 from scenes.errors import InputError
+from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 IMPORT = "import"

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scene2spad.options.common import Common, File, Pixels, Positional, Progress
+from scene2spad.options.common import Common, File, Pixels, Positional
 from scenes.errors import InputError
 from scenes.library.catalog import SCENES, load_scene
 from scenes.library.sets import SETS, scene_set
+from scenes.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)

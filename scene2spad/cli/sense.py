@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from scene2spad.options.common import Common, Count, File, Number, Positional, Progress, may_stay_open
+from scene2spad.options.common import Common, Count, File, Number, Positional, may_stay_open
+from scenes.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,9 +15,9 @@ import torch
 
 from render.transient import Transient, read_transient
 from scene2spad.cli.paths import input_file, output_file, picture
-from scene2spad.options.common import Progress
 from scenes.errors import InputError, require
 from scenes.files import read_array
+from scenes.progress import Progress
 from spad.detection.detect import expected_in_pixel, sense
 from spad.detection.flux import check_dark_map
 from spad.estimators.depth import confidence, laser_baseline_m

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient, transient_of
-from scene2spad.options.common import Common, File, Positional, Progress
+from scene2spad.options.common import Common, File, Positional
 from scenes.errors import InputError, require
 from scenes.io.inputs import read_text, read_whole_lines
+from scenes.progress import Progress
 
 if TYPE_CHECKING:
     from scene2spad.viewer.content import Content, Cube

@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 from importlib.util import find_spec
 
-from scene2spad.options.common import Progress
 from scene2spad.options.experiments import ABLATIONS, Study
 from scenes.errors import InputError
+from scenes.progress import Progress
 
 
 def run(command: Study, progress: Progress) -> dict:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from scene2spad.options.common import Progress
 from scene2spad.options.networks import Train
+from scenes.progress import Progress
 
 
 def run(command: Train, progress: Progress) -> dict:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from scene2spad.options.common import Common, File, Positional, Progress
+from scene2spad.options.common import Common, File, Positional
+from scenes.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)

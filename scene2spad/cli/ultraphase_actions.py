@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scene2spad.options.common import Progress
 from scene2spad.studies.power.program_tables import all_costs, fixed_spatial, int8_temporal, verified
 from scenes.errors import InputError, require
 from scenes.files import whole_file
+from scenes.progress import Progress
 from ultraphase import ChipSpec, Core, CoreArray, Method, Program, assemble_file, listing, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.chip import ASSUMPTIONS

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from render.engine import render
-from render.pipeline import Progress
 from render.settings import RenderSettings
 from render.transient import Transient
 from scene2spad.datasets.rendering import quiet
 from scene2spad.plots.figures import DEPTH_COLOURS, display, plt, save
 from scenes.model import Scene
+from scenes.progress import Progress
 
 DRAFT = RenderSettings(bounces=1, grid=2)
 DEPTH_SHOWN_M = (0.5, 7.0)

@@ -26,7 +26,6 @@ from csph.networks.grid import published_centroid_bins
 from csph.networks.model import DepthModel, load_model
 from csph.networks.posterior import DECODERS, Decoder
 from csph.weights.cards import checkpoint_of
-from render.pipeline import Progress
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec
 from scene2spad.options.networks import Evaluate
 from scene2spad.studies.results import Store
@@ -40,6 +39,7 @@ from scenes.io.relief import (
     middlebury_names,
     read_levels,
 )
+from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.formats.histogram import Histogram
 from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, from_rgbd

@@ -10,7 +10,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -32,6 +32,7 @@ from scenes.library.sets import LARGEST, scene_set
 from scenes.limits import require_memory
 from scenes.model import MAX_IMAGE_SIDE, Scene
 from scenes.offsets import OffsetMode, check_offset
+from scenes.progress import Progress
 from scenes.random_streams import Stream
 
 if TYPE_CHECKING:
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("scene2spad")
 
-Progress = Callable[[str, float], None]
 # Of path. Merged returns keep energy, centroid and variance, and the error estimate sees what merging changes.
 DIRECT_TOLERANCE_M, INDIRECT_TOLERANCE_M, INDIRECT_GROWTH = 0.08, 0.08, 0.15
 # Of the squared error target: a set's views are to meet it together, not each by itself. With indirect light plans do

@@ -13,7 +13,6 @@ import numpy as np
 from csph.evaluation.methods import Method, Row, as_dicts, evaluate
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.training.views import Views, read_views
-from render.pipeline import Progress
 from scene2spad.datasets.rendering import Job, make_set, pack_set
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.networks.training import network_method
@@ -22,6 +21,7 @@ from scenes.errors import require
 from scenes.files import read_array
 from scenes.library.sets import scene_set
 from scenes.offsets import OffsetMode
+from scenes.progress import Progress
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from csph.weights.shipped import WEIGHTS
-from render.pipeline import Progress
 from scene2spad.datasets.test_sets import rooms
 from scene2spad.networks.registry import ModelRegistry, ModelSpec, Trained
 from scene2spad.networks.training import PLANES
 from scene2spad.options.experiments import Study
 from scenes.errors import InputError
+from scenes.progress import Progress
 
 OTHER_SEEDS = (1, 2)
 log = logging.getLogger("scene2spad")

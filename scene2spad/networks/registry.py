@@ -19,10 +19,10 @@ from csph.evaluation.methods import DepthEstimator
 from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training.config import ModelConfig, TrainConfig
 from csph.weights.shipped import RESUME, RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
-from render.pipeline import Progress
 from scene2spad.networks.training import config_of, run_train
 from scene2spad.options.networks import Train
 from scenes.errors import require
+from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 

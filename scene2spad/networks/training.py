@@ -21,12 +21,12 @@ from csph.networks.model import DepthModel, load_model
 from csph.training.config import ModelConfig, TrainConfig, preset
 from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
-from render.pipeline import Progress
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.workers import check_workers
 from scene2spad.options.networks import Evaluate, Train
 from scenes.errors import InputError, require
 from scenes.files import write_csv
+from scenes.progress import Progress
 from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor, sensor_by_name
@@ -34,7 +34,7 @@ from spad.sensor.model import Sensor, sensor_by_name
 log = logging.getLogger("scene2spad")
 
 PLANES = "planes"  # the set that needs no renderer
-PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "paper": 13851}
+PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "gpu": 4000, "paper": 13851}
 SMOKE_PIXELS = 32
 
 
@@ -43,7 +43,9 @@ def config_of(command: Train) -> TrainConfig:
     sensor = sensor_by_name(command.sensor)
     network = command.network or ("published" if command.preset == "paper" else "compact")
     # the published network finds the pulse in the counts by itself; ours, of few layers, is given them matched
-    front = {"none": "matched" if network == "compact" else "counts", "peak": "peak"}.get(command.design, "codes")
+    front = {"none": "matched" if network.startswith("compact") else "counts", "peak": "peak"}.get(
+        command.design, "codes"
+    )
     design = None
     if front == "codes":
         compression = command.compression if command.codes is None else None
@@ -72,6 +74,7 @@ def config_of(command: Train) -> TrainConfig:
         window=command.window,
         weights=command.set_weights or None,
         coherence=command.coherence,
+        sense_on=command.sense_on,
     )
     if command.steps is None:
         return config

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional as Positional
-
-Progress = Callable[[str, float], None]
 
 
 def may_stay_open(metavar: str) -> object:

@@ -34,14 +34,16 @@ class Train(Common):
     """Relative frequency at which patches are drawn from each set (default: alike)."""
     validation: tuple[Path, ...] = ()
     """Sets to validate on (default: the last tenth of the scenes)."""
-    preset: Literal["smoke", "laptop", "workstation", "laptop-v1", "paper"] = "laptop"
-    """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; paper: the
-    published network and schedule (GPU); laptop-v1: the recipe of the first models."""
+    preset: Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"] = "laptop"
+    """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; gpu: our
+    network, minutes on a large GPU; paper: the published network and schedule (GPU); laptop-v1: the recipe of the first
+    models."""
     network: Annotated[
-        Literal["compact", "published", "published-signed"] | None,
-        may_stay_open("{compact,published,published-signed}"),
+        Literal["compact", "compact-wide", "published", "published-signed"] | None,
+        may_stay_open("{compact,compact-wide,published,published-signed}"),
     ] = None
-    """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
+    """Our own, the same with twice the features, the published, or the published without its final ReLU, which can die
+    (default: the preset's)."""
     sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
     """Sensor preset."""
     init: Annotated[str | None, may_stay_open("MODEL")] = None
@@ -65,6 +67,9 @@ class Train(Common):
     """Labels: continuous, or on whole bins and decoded as published, for comparison with print."""
     spatial_start: Annotated[Literal["uniform", "orthogonal"] | None, may_stay_open("{uniform,orthogonal}")] = None
     """Start of learned spatial codes (default: orthogonal; uniform with paper and laptop-v1)."""
+    sense_on: Annotated[Literal["host", "device"] | None, may_stay_open("{host,device}")] = None
+    """Where patches are sensed: on the host, with the same bytes on every machine, or on the GPU that trains (default:
+    the preset's)."""
     coherence: Number = None
     """Weight of the penalty on codes that are alike for two pixels of a block (default: 0)."""
     tv: Number = None

@@ -14,7 +14,6 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from render.pipeline import Progress
 from scene2spad.options.experiments import Report
 from scene2spad.report import html
 from scene2spad.report import published as beside_print
@@ -24,6 +23,7 @@ from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.io.inputs import read_json_object
 from scenes.io.set_index import read_set_index
+from scenes.progress import Progress
 
 TITLE = "scene2spad: results"
 PACKAGES = ("scene2spad", "mitsuba", "drjit", "torch", "pytorch-lightning", "numpy", "scipy", "OpenEXR", "matplotlib")

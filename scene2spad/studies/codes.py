@@ -25,7 +25,6 @@ from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.evaluation.metrics import LOW_SBR
 from csph.evaluation.metrics import PHOTON_LEVELS as LEVELS
 from render.engine import render
-from render.pipeline import Progress
 from render.settings import RenderSettings
 from render.transient import Transient
 from scene2spad.options.experiments import Study
@@ -35,6 +34,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.library.catalog import load_scene
+from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.estimators.depth import cramer_rao_m, depth_errors, estimate_depth
 from spad.formats.histogram import Histogram

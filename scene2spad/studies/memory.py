@@ -19,9 +19,9 @@ from csph.evaluation.memory import (
     memory_compression,
     separable_factor,
 )
-from render.pipeline import Progress
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import save
+from scenes.progress import Progress
 
 COUNTS = 10.0 ** np.arange(6, 10)
 BLOCKS = 10.0 ** np.arange(7)

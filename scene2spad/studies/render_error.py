@@ -28,7 +28,6 @@ import numpy as np
 from csph.evaluation.methods import Method, evaluate
 from csph.networks.model import DepthModel, load_model
 from csph.training.views import Views
-from render.pipeline import Progress
 from render.transient import Transient, read_transient
 from scene2spad.bench.rendering.references import default_folder, key_of
 from scene2spad.datasets.rendering import Job, render_view
@@ -37,6 +36,7 @@ from scene2spad.options.experiments import Study
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv
 from scenes.library.sets import scene_set
+from scenes.progress import Progress
 from spad.detection.flux import signal_per_bin
 from spad.sensor.model import Sensor
 

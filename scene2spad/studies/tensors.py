@@ -13,11 +13,11 @@ from torch import Tensor
 from csph import CodingTensor, Design, make_coding
 from csph.codes.files import read_codes
 from csph.weights.torch_files import load_torch_file
-from render.pipeline import Progress
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import save
 from scenes.errors import InputError, require
 from scenes.io.inputs import regular_file
+from scenes.progress import Progress
 
 CURVES = 4
 # Figure 1 is at a compression of 128, Figure 17 at 64; its learned tensors come from training (`--checkpoints`).

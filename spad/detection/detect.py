@@ -13,7 +13,8 @@ import numpy as np
 
 from render.transient import Transient
 from scenes.errors import InputError
-from spad.detection.exposure import Exposure, Progress, counts_of, timestamps_of
+from scenes.progress import Progress
+from spad.detection.exposure import Exposure, counts_of, timestamps_of
 from spad.detection.flux import expected_counts, rates_for
 from spad.detection.glints import glint_warning, signal_fractions
 from spad.detection.laws import LOW_FLUX

@@ -14,6 +14,7 @@ import torch
 from render.transient import Transient
 from scenes.errors import InputError
 from scenes.limits import require_memory
+from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.flux import Rates, expected_counts
 from spad.detection.laws import (
@@ -34,8 +35,6 @@ STREAM_PIXELS = 1024
 DENSE_FROM = 4.0
 MAX_EVENTS = 1 << 22  # held at once by the event-by-event laws, about 200 MB
 MAX_CROSSTALK_EVENTS = 1 << 26
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)

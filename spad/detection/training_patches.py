@@ -86,6 +86,18 @@ def packed_transients(transients: Iterable[Transient]) -> PackedTransients:
     return PackedTransients(np.concatenate([*offsets, starts[-1:]]), **columns, **layers)
 
 
+def joined(packs: Sequence[PackedTransients]) -> PackedTransients:
+    """Return several packed sets in one, scene after scene; InputError for none, or views of different sizes."""
+    sizes = {packed.depth_m.shape[1:] for packed in packs}
+    if len(sizes) != 1:
+        raise InputError(f"packed sets with views of sizes {sorted(sizes)} cannot be joined")
+    firsts = np.cumsum([0, *(len(packed.radiance) for packed in packs)])
+    offsets = [packed.offsets[:-1] + first for packed, first in zip(packs, firsts[:-1], strict=True)]
+    layers = ("path_near_m", "path_far_m", "radiance", "depth_m", "ambient", "mixed")
+    columns = {name: np.concatenate([getattr(packed, name) for packed in packs]) for name in layers}
+    return PackedTransients(np.concatenate([*offsets, firsts[-1:]]), **columns)
+
+
 class Patch(NamedTuple):
     """One patch to sense. The seed is what the caller keys by (epoch, sample), never by worker."""
 

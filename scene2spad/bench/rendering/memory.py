@@ -8,11 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-from render.pipeline import Progress
 from scene2spad.bench.rendering import ours, peers, settings
 from scene2spad.bench.rendering.settings import BIN_M, BINS, BOUNCES, METHODS
 from scene2spad.options.experiments import Bench
 from scenes.errors import InputError
+from scenes.progress import Progress
 
 SIZE, SPP = 256, 64
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from csph.evaluation.methods import Evaluation, Row, as_dicts
 from csph.evaluation.metrics import PHOTON_LEVELS
-from render.pipeline import Progress
 from scene2spad.datasets import published
 from scene2spad.datasets.test_sets import TestSet, depth_map, evaluated, rendered
 from scene2spad.networks.lookup import obtain, other_seeds
@@ -28,6 +27,7 @@ from scene2spad.studies.depth_offset.plan import SHOWN_VIEWS, SMOKE, TEST_SET
 from scene2spad.studies.depth_offset.tables import summary_rows
 from scene2spad.studies.results import Store
 from scenes.files import finite, whole_file, write_csv
+from scenes.progress import Progress
 
 
 def run(command: Study, progress: Progress) -> dict:

@@ -18,7 +18,6 @@ import numpy as np
 
 from csph.evaluation.methods import Evaluation, Row, as_dicts
 from csph.evaluation.metrics import paired_difference
-from render.pipeline import Progress
 from scene2spad.datasets import published
 from scene2spad.datasets.test_sets import TestSet, evaluated, rendered
 from scene2spad.networks.lookup import obtain
@@ -30,6 +29,7 @@ from scene2spad.studies.chip.plan import HEADROOM_BITS, ROOM_SIZE, TEST_SET, WIT
 from scene2spad.studies.results import Store
 from scenes.errors import InputError
 from scenes.files import finite, whole_file, write_csv
+from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.sensor.model import PhotonBudget, Sensor
 

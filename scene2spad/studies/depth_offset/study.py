@@ -19,7 +19,6 @@ from typing import Any
 from csph.evaluation.methods import Row, as_dicts
 from csph.networks.model import DepthModel, weights_sha256
 from csph.training.views import read_views, split_views
-from render.pipeline import Progress
 from scene2spad.datasets import published
 from scene2spad.datasets.test_sets import TestSet, depth_map, evaluated, rendered
 from scene2spad.networks.lookup import obtain
@@ -40,6 +39,7 @@ from scene2spad.studies.depth_offset.plan import (
 from scene2spad.studies.results import Store
 from scenes.errors import InputError, require
 from scenes.files import finite, whole_file, write_csv
+from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 

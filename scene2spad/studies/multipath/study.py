@@ -18,7 +18,6 @@ import numpy as np
 
 from csph.evaluation.methods import Row, as_dicts
 from csph.training.views import Views
-from render.pipeline import Progress
 from render.transient import Transient
 from scene2spad.datasets.test_sets import TestSet, evaluated
 from scene2spad.networks.lookup import ModelLookup, obtain, where_trained
@@ -32,6 +31,7 @@ from scene2spad.studies.transport.study import direct_alone, rendered_once, with
 from scenes.files import finite, whole_file, write_csv
 from scenes.library.catalog import load_scene
 from scenes.model import Laser
+from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from csph.weights.shipped import WEIGHTS
-from render.pipeline import Progress
 from render.transient import Transient
 from scene2spad.datasets.published import PUBLISHED as PUBLISHED_ERRORS
 from scene2spad.networks.registry import ModelRegistry
@@ -23,6 +22,7 @@ from scene2spad.studies.chip.chain import ChipDepth, core_tables, measured
 from scene2spad.studies.chip.code import compile_model
 from scene2spad.studies.chip.plan import MAIN, OTHERS, TRAINED_FOR_CHIP
 from scene2spad.studies.power.emulated_chain import by_torch, decode
+from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.estimators.depth import depth_errors
 from spad.formats.histogram import Histogram

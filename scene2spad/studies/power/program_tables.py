@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from csph.codes.waves import truncated_waves
-from scene2spad.options.common import Progress
+from scenes.progress import Progress
 from ultraphase import Method, method
 from ultraphase.catalog import PUBLISHED
 from ultraphase.power import Cost, measured_cost

@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from render.engine import render
-from render.pipeline import Progress
 from scene2spad.options.experiments import Study
 from scene2spad.plots import figures
 from scene2spad.plots.figures import DEPTH_COLOURS, plt
@@ -23,6 +22,7 @@ from scene2spad.studies.power.program_tables import all_costs, int8_temporal
 from scenes.errors import InputError, require
 from scenes.files import read_arrays, whole_file, write_csv
 from scenes.library.catalog import load_scene
+from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.estimators.depth import depth_errors
 from spad.formats.histogram import Histogram

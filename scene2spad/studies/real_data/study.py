@@ -19,7 +19,6 @@ import torch
 
 from csph.networks.model import DepthModel, load_model
 from render.engine import render
-from render.pipeline import Progress
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
 from scene2spad.networks.training import classical
@@ -32,6 +31,7 @@ from scenes.errors import require
 from scenes.files import write_csv
 from scenes.library.catalog import load_scene
 from scenes.model import Ambient, Texture
+from scenes.progress import Progress
 from spad.detection.detect import sense_timestamps
 from spad.estimators.depth import depth_errors
 from spad.formats.linospad import Capture, capture_of, read_linospad, resampled, resampled_sensor, write_linospad

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from render.pipeline import Progress
 from scene2spad.datasets.zone_captures import (
     PlaneCaptures,
     read_plane_captures,
@@ -28,6 +27,7 @@ from scene2spad.studies.sim_to_real.measures import Comparison, compare, summary
 from scene2spad.studies.sim_to_real.plan import FITTED, GEOMETRY, MODEL_ERROR, SENSOR, Plan, plan_of
 from scene2spad.studies.sim_to_real.pose import find_pose, nearest_start
 from scenes.files import finite, whole_file, write_csv
+from scenes.progress import Progress
 from spad.sensor.files import SensorFile, load_sensor, write_sensor
 from spad.zones.calibration import Calibration, calibrate, calibrated_file
 from spad.zones.expected_counts import ZoneCapture

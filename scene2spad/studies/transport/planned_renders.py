@@ -11,11 +11,11 @@ import numpy as np
 from scipy import stats
 
 from csph.evaluation.metrics import image_errors
-from render.pipeline import Progress
 from render.transient import Transient
 from scene2spad.studies.results import Store
 from scene2spad.studies.transport.plan import FAILS, HOLDS, LEVELS, LIMIT, OPEN
 from scene2spad.studies.transport.tables import Contender
+from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.flux import expected_counts, rates_for
 from spad.formats.histogram import Histogram

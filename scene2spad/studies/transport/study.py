@@ -24,7 +24,6 @@ from csph.evaluation.methods import as_dicts
 from csph.networks.posterior import Decoder
 from csph.training.views import Views
 from render.engine import render
-from render.pipeline import Progress
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
 from scene2spad.bench.rendering.references import key_of
@@ -44,6 +43,7 @@ from scenes.files import append_line, finite, whole_file, write_csv
 from scenes.io.inputs import read_whole_lines
 from scenes.library.sets import scene_set
 from scenes.model import Ambient, Laser, Scene
+from scenes.progress import Progress
 from spad.formats.histogram import Histogram
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import Sensor
