@@ -33,7 +33,6 @@ from render.pipeline import (
     PROPOSAL,
     LightSamples,
     MoreSamples,
-    Progress,
     add_samples,
     derived_seed,
     filter_octaves_of,
@@ -47,6 +46,7 @@ from render.transient import Transient
 from render.transient.samples import concatenate, no_samples, select_pixels, to_returns
 from scenes.limits import require_memory
 from scenes.model import Scene
+from scenes.progress import Progress
 from scenes.random_streams import Stream
 
 log = logging.getLogger(__name__)

@@ -26,7 +26,6 @@ from csph.autograd import Context
 from csph.networks.published import check_input
 
 FOLD = 16  # fine bins of one coarse bin
-WIDTHS, WIDE = (16, 32, 48), (32, 64, 64)  # channels at full, half and quarter resolution
 VIEWS = 3  # of the back-projection: as it is, and two averages
 
 
@@ -62,9 +61,9 @@ class Compact(nn.Module):
     reach = 20  # pixels around one that its answer depends on
     coarsest = 4  # pixels of a cell of its coarsest level, whose grid begins at the image's first
 
-    def __init__(self, widths: tuple[int, int, int] = WIDTHS) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        near, middle, far = widths
+        near, middle, far = 16, 32, 48
         self.stem = nn.Conv2d(FOLD, near, (3, 1), padding=(1, 0))
         self.near = _FactorisedConv(near)
         self.halved = nn.Conv2d(near, middle, 3, stride=2, padding=1)

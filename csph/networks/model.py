@@ -16,12 +16,12 @@ from torch import Tensor, nn
 from csph.codes.blocks import encode_blocks
 from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8
 from csph.layer import CompressiveLayer
-from csph.networks.compact import WIDE, WIDTHS, Compact
+from csph.networks.compact import Compact
 from csph.networks.grid import published_position
 from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
 from csph.networks.posterior import Decoder, confidence, decoded
 from csph.networks.published import DeepBoosting, parameters_of
-from csph.training.config import ModelConfig, Network, TrainConfig
+from csph.training.config import ModelConfig, TrainConfig
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.inputs import regular_file
@@ -51,13 +51,6 @@ def _inside(span: Span) -> slice:
     return slice(span.inner, span.inner + span.own.stop - span.own.start)
 
 
-def _network(name: Network) -> Compact | DeepBoosting:
-    """Make the network of a configuration."""
-    if name.startswith("compact"):
-        return Compact(WIDE if name == "compact-wide" else WIDTHS)
-    return DeepBoosting(can_die=name == "published")
-
-
 class DepthModel(nn.Module):
     """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin."""
 
@@ -71,7 +64,8 @@ class DepthModel(nn.Module):
             )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.network = _network(config.network)
+            compact = config.network == "compact"
+            self.network = Compact() if compact else DeepBoosting(can_die=config.network == "published")
 
     def begin_with(self, other: DepthModel) -> None:
         """Take the weights of a model of the same design and network; clipping ranges of int8 that it has not are

@@ -16,9 +16,9 @@ from scenes.errors import InputError, require
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
 
-Network = Literal["compact", "compact-wide", "published", "published-signed"]
+Network = Literal["compact", "published", "published-signed"]
 Front = Literal["codes", "counts", "matched", "peak"]
-NETWORKS: tuple[str, ...] = ("compact", "compact-wide", "published", "published-signed")
+NETWORKS: tuple[str, ...] = ("compact", "published", "published-signed")
 FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
 Schedule = Literal["steps", "cosine"]
 SCHEDULES: tuple[str, ...] = ("steps", "cosine")
@@ -37,8 +37,7 @@ class ModelConfig:
              with the pulse (`spad.estimators.matching.normalised_correlation`); or one-hot argmax
     design   the codes, with `front` = "codes"
     layer    switches of `csph.layer.LayerOptions` that differ from the published layer
-    network  compact; compact-wide, with twice the features; published; or published with logits of any sign, which
-             cannot die
+    network  compact; published; or published with logits of any sign, which cannot die
     sensor   whose histograms it takes
     grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with print
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
@@ -108,6 +107,8 @@ class TrainConfig:
     sense_on      where patches are sensed: on the host, with the same bytes on every machine, or on the device that
                   trains, batch by batch (`spad.detection.device_patches`), for GPUs
     coherence     weight of the mean squared cosine between the codes of two pixels of a block (`csph.codes.rank`)
+    decoded_weight   of the mean absolute error, in bins, of the posterior's mean: for models that are read by the
+                  soft-argmax, as published; it takes mass from far bins that the divergence hardly sees
     tv_weight, tv_start        weight of the mean total variation of depth / range, and the step it comes in at
     levels        mean (signal, background) photons, one drawn for each patch; or "continuous" (`csph.training.levels`)
     time_offset_m random delay, uniform from 0 to this, of every patch: 0 is off, as published
@@ -143,6 +144,7 @@ class TrainConfig:
     weights: tuple[float, ...] = ()
     coherence: float = 0.0
     sense_on: SenseOn = "host"
+    decoded_weight: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("epochs", "steps_per_epoch", "batch", "crop", "decay_steps", "validation_views"):
@@ -169,6 +171,8 @@ class TrainConfig:
         require(self.warmup >= 0, f"training: warm-up of {self.warmup} steps is negative")
         require(0 < self.rate_end <= 1, f"training: rate_end {self.rate_end:g} is outside (0, 1]")
         require(0 <= self.average < 1, f"training: average {self.average:g} is outside [0, 1)")
+        good = math.isfinite(self.decoded_weight) and self.decoded_weight >= 0
+        require(good, f"training: weight {self.decoded_weight:g} of the decoded error is negative")
         require(self.coherence >= 0, f"training: weight {self.coherence:g} of the coherence is negative")
         weighted = all(math.isfinite(weight) and weight > 0 for weight in self.weights)
         require(weighted, f"training: set weights {', '.join(map(str, self.weights))} are not all positive")
@@ -251,7 +255,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "laptop": {**RECIPE, "epochs": 12, "steps_per_epoch": 650},
     "workstation": {**RECIPE, "epochs": 24, "steps_per_epoch": 1500, "warmup": 400},
-    # a GPU: ten times the pixels of `workstation` in a few minutes of it, patches sensed there
+    # for a GPU, which senses its patches itself: three times the pixels of `workstation`
     "gpu": {
         **RECIPE,
         "epochs": 10,
@@ -282,7 +286,7 @@ def preset(name: str, model: ModelConfig, **changes: Any) -> TrainConfig:
     """Return a preset's configuration with a model; `changes` that are None leave it as it is.
 
     smoke (seconds), laptop (compact, one core, 25 minutes at the most), workstation (compact, two cores, 2 hours at the
-    most), gpu (compact, minutes on a large GPU), paper (the published network, levels and schedule), laptop-v1 (the
+    most), gpu (compact, three times workstation's pixels, sensed on the GPU), paper (the published network, levels and schedule), laptop-v1 (the
     recipe of the first models). Windows are left out where the model does not allow them, and with random time offsets.
     Without compression, and of one-hot peaks, `paper` has the published total variation and a tenth of the learning
     rate. `levels` may be "paper".

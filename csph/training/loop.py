@@ -26,7 +26,7 @@ from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytorch_lightning as pl
 import torch
@@ -40,7 +40,7 @@ from csph.networks.posterior import DECODERS
 from csph.networks.published import soft_argmax
 from csph.training.config import TrainConfig
 from csph.training.data import SetData, TrainBatch
-from csph.training.loss import kl_divergence, total_variation
+from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.resume import WholeFileCheckpoints, check_resume
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
@@ -58,15 +58,23 @@ RANGE_RATE = 0.02  # of the logarithms of int8 clipping ranges: a bit more headr
 EXCESS_WEIGHT = 10.0  # of sums beyond 16 bits
 
 
+class NetworkOf(NamedTuple):
+    """A trained model whose network alone a training begins with."""
+
+    model: DepthModel
+
+
 class DepthTraining(pl.LightningModule):
     """KL divergence to the pulse at the label, plus total variation and coherence where asked; Adam, and an average of
     the weights where asked."""
 
-    def __init__(self, config: TrainConfig, init: DepthModel | None = None) -> None:
+    def __init__(self, config: TrainConfig, init: DepthModel | NetworkOf | None = None) -> None:
         super().__init__()
         self.config = config
         self.model = DepthModel(config.model, config.seed)
-        if init is not None:
+        if isinstance(init, NetworkOf):
+            self.model.network.load_state_dict(init.model.network.state_dict())
+        elif init is not None:
             self.model.begin_with(init)
         self.averaged: DepthModel | None = None
         if config.average:  # a module of its own: Lightning's checkpoint then holds it
@@ -97,6 +105,8 @@ class DepthTraining(pl.LightningModule):
         loss = kl_divergence(logits, depth, valid, sensor)
         if config.tv_weight and self.global_step >= config.tv_start:
             loss = loss + config.tv_weight * total_variation(soft_argmax(logits) / config.model.sensor.bins)
+        if config.decoded_weight:
+            loss = loss + config.decoded_weight * decoded_error(logits, depth / sensor.bin_depth_m, valid)
         layer = self.model.layer
         if config.coherence and layer is not None:
             loss = loss + config.coherence * coherence(layer.pixel_gram())
@@ -229,14 +239,19 @@ def _claim(folder: Path, config: TrainConfig) -> None:
         beside.write_text(text)
 
 
-def _check_init(init: DepthModel, config: TrainConfig) -> None:
-    """Raise InputError unless a trained model has the tensors and the sensor of the one to be trained."""
-    mine, other = config.model, init.config
-    alike = all(getattr(mine, name) == getattr(other, name) for name in ("front", "network", "design", "sensor"))
+def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
+    """Raise InputError unless a trained model has the sensor and the tensors, or the kind of network, of the one to be
+    trained."""
+    network_alone = isinstance(init, NetworkOf)
+    mine, other = config.model, (init.model if isinstance(init, NetworkOf) else init).config
+    names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
+    alike = all(getattr(mine, name) == getattr(other, name) for name in names)
     message = (
         f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
     )
     require(alike, message)
+    if network_alone:
+        return
     less = other.layer.get("int8", False) and not mine.layer.get("int8", False)
     require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
 
@@ -289,7 +304,7 @@ def train(
     validation: Views | Sequence[Views],
     folder: Path,
     *,
-    init: DepthModel | None = None,
+    init: DepthModel | NetworkOf | None = None,
     workers: int = 0,
     progress: Progress | None = None,
     **trainer: Any,
@@ -297,7 +312,8 @@ def train(
     """Run a configuration to its end in a folder, or go on where an interrupted run of the same configuration stopped.
 
     Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
-    the same design to begin with, instead of random weights. `trainer` holds further arguments of Lightning's Trainer
+    the same design to begin with, instead of random weights, or `NetworkOf` one of any design on the same sensor, whose
+    codes begin anew. `trainer` holds further arguments of Lightning's Trainer
     (accelerator, devices, strategy). Returns steps, seconds (of this call), val_rmse_mm of the weights kept, their
     checkpoint, and the number of parameters. Raises InputError for sets or an `init` that do not fit, and a folder of
     another run.
@@ -311,7 +327,7 @@ def train(
         hashes = [packed_sha256(packed) for packed in packs]
         data[f"{name}_sha256"] = hashes[0] if len(hashes) == 1 else hashes
     if init is not None:  # a run that goes on must have begun with the same weights
-        data["init_sha256"] = weights_sha256(init)
+        data["init_sha256"] = weights_sha256(init.model if isinstance(init, NetworkOf) else init)
     config = replace(config, data={**config.data, **data})
     if config.model.grid == "published":
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]

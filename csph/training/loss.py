@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from csph.autograd import Context
+from csph.networks.published import soft_argmax
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.sensor.model import Sensor
 from spad.sensor.template import wrapped_mass
@@ -82,6 +83,17 @@ class _CrossEntropy(torch.autograd.Function):
         grad = grad.unsqueeze(1)
         slope = exponential * (grad / total)
         return slope.scatter_add_(1, bins, mass * -grad).to(ctx.kind), None, None
+
+
+def decoded_error(logits: Tensor, position: Tensor, valid: Tensor) -> Tensor:
+    """Return the mean over the valid pixels of |soft-argmax(logits) - position|, in bins.
+
+    logits (B, T, R, C), position (B, R, C) in bins from the edge of bin 0, valid (B, R, C). Its slope at bin i is
+    p_i (i - mean) times a sign: mass far from the answer is moved, mass near it stays with the divergence. Zero where
+    no pixel is valid.
+    """
+    error = torch.where(valid, soft_argmax(logits) - position, 0.0)
+    return error.abs().sum() / valid.sum().clamp(min=1)
 
 
 def total_variation(values: Tensor) -> Tensor:

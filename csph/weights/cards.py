@@ -27,7 +27,7 @@ class Card:
     levels        photon levels of training, in words
     cpu_minutes   of its training; None where they were not recorded
     val_mae_mm    on its validation set, as the model was decoded then
-    init          model whose weights its training began with; None: random weights
+    init          model whose weights, or network alone, its training began with; None: random weights
     errors        MAE [mm] by set and level, where `ship` was told
     not_for       what it must not be used for
     """
@@ -67,7 +67,7 @@ def read_card(path: Path) -> Card:
         steps=config.steps,
         cpu_minutes=stored.get("cpu_minutes"),
         val_mae_mm=state.get("val_mae_mm"),
-        init=config.data.get("init"),
+        init=config.data.get("init", config.data.get("init_network")),
         errors=stored.get("errors", {}),
         not_for=limits(config),
     )

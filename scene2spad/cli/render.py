@@ -23,7 +23,6 @@ from scene2spad.options.common import (
     Offset,
     Pixels,
     Positional,
-    Progress,
     may_stay_open,
 )
 from scenes import Ambient, InputError, Laser, Scene
@@ -33,6 +32,7 @@ from scenes.errors import require
 from scenes.library.catalog import WIDTH, load_scene
 from scenes.offsets import check_offset
 from scenes.placing import Placing
+from scenes.progress import Progress
 
 if TYPE_CHECKING:
     from render.transient import Transient

@@ -43,9 +43,7 @@ def config_of(command: Train) -> TrainConfig:
     sensor = sensor_by_name(command.sensor)
     network = command.network or ("published" if command.preset == "paper" else "compact")
     # the published network finds the pulse in the counts by itself; ours, of few layers, is given them matched
-    front = {"none": "matched" if network.startswith("compact") else "counts", "peak": "peak"}.get(
-        command.design, "codes"
-    )
+    front = {"none": "matched" if network == "compact" else "counts", "peak": "peak"}.get(command.design, "codes")
     design = None
     if front == "codes":
         compression = command.compression if command.codes is None else None
@@ -75,6 +73,7 @@ def config_of(command: Train) -> TrainConfig:
         weights=command.set_weights or None,
         coherence=command.coherence,
         sense_on=command.sense_on,
+        decoded_weight=command.decoded,
     )
     if command.steps is None:
         return config
@@ -124,13 +123,16 @@ def run_train(command: Train, progress: Progress) -> dict:
     config.check_memory()
     require(bool(command.set), "train: --set without a set")
     check_workers(command.workers, least=0)
-    from csph.training.loop import train  # and Lightning, which takes seconds to import
+    from csph.training.loop import NetworkOf, train  # and Lightning, which takes seconds to import
 
     training, validation, data = views_of(command)
-    init = None
-    if command.init is not None:
-        init = load_model(checkpoint_of(command.init))[0]
-        data["init"] = Path(command.init).name
+    require(command.init is None or command.init_network is None, "train: give --init or --init-network, not both")
+    init: DepthModel | NetworkOf | None = None
+    begun = command.init or command.init_network
+    if begun is not None:
+        init = load_model(checkpoint_of(begun))[0]
+        init = NetworkOf(init) if command.init_network else init
+        data["init" if command.init else "init_network"] = Path(begun).name
     name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
     folder = command.out or Path("out/train") / name
     result = train(

@@ -36,19 +36,20 @@ class Train(Common):
     """Sets to validate on (default: the last tenth of the scenes)."""
     preset: Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"] = "laptop"
     """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; gpu: our
-    network, minutes on a large GPU; paper: the published network and schedule (GPU); laptop-v1: the recipe of the first
-    models."""
+    network with three times workstation's pixels, sensed on the GPU; paper: the published network and schedule (GPU);
+    laptop-v1: the recipe of the first models."""
     network: Annotated[
-        Literal["compact", "compact-wide", "published", "published-signed"] | None,
-        may_stay_open("{compact,compact-wide,published,published-signed}"),
+        Literal["compact", "published", "published-signed"] | None,
+        may_stay_open("{compact,published,published-signed}"),
     ] = None
-    """Our own, the same with twice the features, the published, or the published without its final ReLU, which can die
-    (default: the preset's)."""
+    """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
     sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
     """Sensor preset."""
     init: Annotated[str | None, may_stay_open("MODEL")] = None
     """Begin with the weights of a trained model of the same design, a shipped name or a checkpoint, instead of random
     ones (fine-tuning)."""
+    init_network: Annotated[str | None, may_stay_open("MODEL")] = None
+    """Begin with the network of a trained model of any design, and codes of one's own from their start."""
     steps: Count = None
     """Steps of the whole run (default: the preset's)."""
     batch: Count = None
@@ -70,6 +71,8 @@ class Train(Common):
     sense_on: Annotated[Literal["host", "device"] | None, may_stay_open("{host,device}")] = None
     """Where patches are sensed: on the host, with the same bytes on every machine, or on the GPU that trains (default:
     the preset's)."""
+    decoded: Number = None
+    """Weight of the mean absolute error of the soft-argmax, in bins, for models that are read by it (default: 0)."""
     coherence: Number = None
     """Weight of the penalty on codes that are alike for two pixels of a block (default: 0)."""
     tv: Number = None

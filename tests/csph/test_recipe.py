@@ -15,9 +15,10 @@ from csph.evaluation.metrics import PHOTON_LEVELS, TRAIN_LEVELS
 from csph.networks.grid import on_published_grid, published_centroid_bins, published_position, published_target
 from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training.config import RECIPE, ModelConfig, TrainConfig, preset
-from csph.training.data import Samples, SetData, _sensed
+from csph.training.data import DeviceSensing, Requests, Samples, SetData, _sensed
 from csph.training.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
-from csph.training.loop import DepthTraining, train
+from csph.training.loop import DepthTraining, NetworkOf, train
+from csph.training.loss import decoded_error
 from csph.training.schedule import rate_factor
 from csph.training.views import packed_views, split_views
 from scene2spad.datasets.planes import random_planes
@@ -180,6 +181,54 @@ def test_a_run_begins_with_a_trained_model(tmp_path):
     other = DepthModel(replace(MODEL, design=Design("learned", (32, 2, 2), 4)))
     with pytest.raises(InputError, match="init: a model of learned 32x2x2 K4"):
         train(config, training, validation, tmp_path / "third", init=other)
+    # of another design the network alone is taken, the codes begin anew
+    config = replace(still, model=other.config)
+    train(config, training, validation, tmp_path / "fourth", init=NetworkOf(first))
+    fourth, said, _ = load_model(tmp_path / "fourth")
+    for name, value in fourth.network.state_dict().items():
+        torch.testing.assert_close(value, first.network.state_dict()[name], rtol=0, atol=1e-9)
+    start = DepthModel(config.model, config.seed).layer
+    torch.testing.assert_close(fourth.layer.temporal, start.temporal, rtol=0, atol=1e-9)
+    assert said.data["init_sha256"] == weights_sha256(first)
+
+
+def test_the_decoded_error_is_the_soft_argmaxs_and_moves_far_mass():
+    """Its value by hand, its slope by finite differences in float64; none where no pixel is valid."""
+    generator = torch.Generator().manual_seed(3)
+    logits = torch.randn((2, 20, 3, 2), generator=generator, dtype=torch.float64, requires_grad=True)
+    position = 20 * torch.rand((2, 3, 2), generator=generator, dtype=torch.float64)
+    valid = torch.tensor([True, False, True, True, True, True] * 2).view(2, 3, 2)
+    centres = torch.arange(20, dtype=torch.float64) + 0.5
+    mean = (logits.softmax(1) * centres.view(1, 20, 1, 1)).sum(1)
+    by_hand = (mean - position).abs()[valid].mean()
+    found = decoded_error(logits, torch.where(valid, position, torch.nan), valid)
+    torch.testing.assert_close(found, by_hand, rtol=1e-6, atol=0, check_dtype=False)
+    (slope,) = torch.autograd.grad(found, logits)
+    assert slope.isfinite().all()
+    direction = (mean - position).sign() * valid / valid.sum()
+    expected = logits.softmax(1) * (centres.view(1, 20, 1, 1) - mean.unsqueeze(1)) * direction.unsqueeze(1)
+    torch.testing.assert_close(slope, expected, rtol=1e-4, atol=1e-7)
+    assert float(decoded_error(logits.detach(), position, torch.zeros_like(valid))) == 0
+
+
+def test_training_senses_on_the_device_when_asked(tmp_path):
+    """Two sets joined; the same seed gives the same weights, and labels and windows are those of the host's route."""
+    views = [split_views(near_planes(6, seed=seed)) for seed in (0, 1)]
+    training, validation = ([pair[i] for pair in views] for i in (0, 1))
+    config = preset("smoke", MODEL, **FEW, weights=(1.0, 2.0), sense_on="device", decoded_weight=0.02)
+    for name in ("one", "two"):
+        train(config, training, validation, tmp_path / name)
+    one, two = (load_model(tmp_path / name)[0] for name in ("one", "two"))
+    assert weights_sha256(one) == weights_sha256(two)
+    packs = [packed_views(views) for views in training]
+    window = 512 if config.model.sensor.bins > 512 else 0
+    requests = [Samples(packs, config, 0)[i] for i in range(4)]
+    here = DeviceSensing(packs, config, torch.device("cpu")).sense(Requests(tuple(requests), window))
+    there = _sensed(packs, config.model.sensor, (config.crop, config.crop), window, requests)
+    assert torch.equal(here.depth_m.nan_to_num(-1), there.depth_m.nan_to_num(-1))
+    assert torch.equal(here.valid, there.valid) and torch.equal(here.first_bin, there.first_bin)
+    with pytest.raises(InputError, match="sense_on 'gpu', expected host or device"):
+        replace(config, sense_on="gpu")
 
 
 def test_the_published_grid_puts_one_return_where_print_has_it():
