@@ -286,10 +286,10 @@ def preset(name: str, model: ModelConfig, **changes: Any) -> TrainConfig:
     """Return a preset's configuration with a model; `changes` that are None leave it as it is.
 
     smoke (seconds), laptop (compact, one core, 25 minutes at the most), workstation (compact, two cores, 2 hours at the
-    most), gpu (compact, three times workstation's pixels, sensed on the GPU), paper (the published network, levels and schedule), laptop-v1 (the
-    recipe of the first models). Windows are left out where the model does not allow them, and with random time offsets.
-    Without compression, and of one-hot peaks, `paper` has the published total variation and a tenth of the learning
-    rate. `levels` may be "paper".
+    most), gpu (compact, three times workstation's pixels, sensed on the GPU), paper (the published network, levels and
+    schedule), laptop-v1 (the recipe of the first models). Windows are left out where the model does not allow them, and
+    with random time offsets. Without compression, and of one-hot peaks, `paper` has the published total variation and a
+    tenth of the learning rate. `levels` may be "paper".
     """
     require(name in PRESETS, f"preset {name!r} is unknown, expected one of {', '.join(PRESETS)}")
     known = {item.name for item in fields(TrainConfig)}
