@@ -34,7 +34,8 @@ class ModelSpec:
     design         as of `train`, none and peak among them (block and compression then mean nothing)
     time_offset_m  random delays in training, 0 as published
     trained_on     rooms: direct light in rooms, the recipe of the offset study; mixed: rooms and clutter with indirect
-                   light as well, levels over their whole range
+                   light as well, levels over their whole range; published: rooms and clutter on the published grid, for
+                   comparison with print
     int8           trained for the chip (`--layer int8`), beginning with `plain`
     """
 
@@ -44,7 +45,7 @@ class ModelSpec:
     seed: int = 0
     time_offset_m: float = 0.0
     full: bool = False
-    trained_on: Literal["rooms", "mixed"] = "rooms"
+    trained_on: Literal["rooms", "mixed", "published"] = "rooms"
     int8: bool = False
 
     @property
@@ -59,7 +60,7 @@ class ModelSpec:
     @property
     def label(self) -> str:
         """Without compression and seed: what a line in a figure is called."""
-        mixed = ", mixed training" if self.trained_on == "mixed" else ""
+        mixed = {"rooms": "", "mixed": ", mixed training", "published": ", published grid"}[self.trained_on]
         if not self.coded:
             return {"none": "no compression", "peak": "peak"}[self.design] + mixed
         sort = f"{'full ' if self.full else ''}{self.design}"
@@ -173,6 +174,7 @@ def check(config: TrainConfig, wanted: ModelSpec, path: Path) -> None:
         "front": (config.model.front, expected.model.front),
         "design": (_design_name(config.model.design), _design_name(expected.model.design)),
         "layer": (config.model.layer, expected.model.layer),
+        "grid": (config.model.grid, "published" if wanted.trained_on == "published" else "continuous"),
         "sensor": (_sensor(config.model), _sensor(expected.model)),
     }
     wrong = [f"{what} {has}, expected {should}" for what, (has, should) in pairs.items() if has != should]

@@ -18,7 +18,7 @@ from csph.evaluation.methods import Evaluation, Row, as_dicts
 from csph.evaluation.metrics import PHOTON_LEVELS
 from scene2spad.datasets import published
 from scene2spad.datasets.test_sets import TestSet, depth_map, evaluated, rendered
-from scene2spad.networks.lookup import obtain, other_seeds
+from scene2spad.networks.lookup import obtain, other_seeds, where_trained
 from scene2spad.networks.registry import ModelSpec, Trained, ship_all
 from scene2spad.options.experiments import Study
 from scene2spad.studies.ablations import figures
@@ -47,13 +47,15 @@ def run(command: Study, progress: Progress) -> dict:
     shown = [view for view in SHOWN_VIEWS if view < len(test.views.scenes)]
     rows = evaluated(store, [*subjects.values()], test, levels, maps=shown, **options)
     repeated = evaluated(store, [model.subject for model in again.values()], test, levels, **options)
-    # published numbers are means of all test levels
+    # with print, models of print's grid are compared as well; published numbers are means of all test levels
+    twins = where_trained([replace(one, trained_on="published") for one in models.found], command)
+    beside = subjects | {one: model.subject for one, model in twins.items()}
     pair_options = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, PHOTON_LEVELS)
     numbers: dict[str, Any] = {
         "preset": command.preset,
         **models.described(),
         "conclusions": [decided(claim, [*rows, *repeated], {**models.found, **again}) for claim in claims],
-        "published": published.compared(store, subjects, *pair_options, (0.0,), **options),
+        "published": published.compared(store, beside, *pair_options, (0.0,), **options),
         "summary": summary_rows(rows, models.found, {"set": TEST_SET}),
     }
     drawn = [

@@ -14,6 +14,7 @@ FILTER, PEAK = "log-matched", "argmax"
 MODELS = (
     ModelSpec("learned", (256, 4, 4)),
     ModelSpec("learned", (1024, 4, 4)),
+    ModelSpec("learned", (1024, 2, 2)),
     ModelSpec("fourier", (1024, 1, 1)),
     ModelSpec("none"),
 )
