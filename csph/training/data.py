@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytorch_lightning as pl
@@ -205,7 +205,9 @@ class SetData(pl.LightningDataModule):
         size = (config.crop, config.crop)
         return self._loader(Samples(self.training, config, epoch), self.training, config.batch, size, window)
 
-    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+    def transfer_batch_to_device(
+        self, batch: TrainBatch | Requests, device: torch.device, dataloader_idx: int
+    ) -> TrainBatch:
         """Move a sensed batch to the device, or sense there one that is only asked for."""
         if not isinstance(batch, Requests):
             return super().transfer_batch_to_device(batch, device, dataloader_idx)

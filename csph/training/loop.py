@@ -51,6 +51,7 @@ from scenes.errors import InputError, require
 from scenes.files import append_line, is_unclaimed, whole_file, write_csv
 from scenes.io.inputs import read_json_object
 from scenes.progress import Progress
+from spad.detection.training_patches import PackedTransients
 
 log = logging.getLogger("csph")
 
@@ -260,6 +261,20 @@ def _listed(views: Views | Sequence[Views]) -> list[Views]:
     return [views] if isinstance(views, Views) else list(views)
 
 
+def _with_hashes(
+    config: TrainConfig, sets: Sequence[Sequence[PackedTransients]], init: DepthModel | NetworkOf | None
+) -> TrainConfig:
+    """Return the configuration with the SHA-256 of its sets and of the weights it begins with: a run that goes on must
+    have begun with the same."""
+    data: dict[str, str | list[str]] = {}
+    for name, packs in zip(("training", "validation"), sets, strict=True):
+        hashes = [packed_sha256(packed) for packed in packs]
+        data[f"{name}_sha256"] = hashes[0] if len(hashes) == 1 else hashes
+    if init is not None:
+        data["init_sha256"] = weights_sha256(init.model if isinstance(init, NetworkOf) else init)
+    return replace(config, data={**config.data, **data})
+
+
 @contextmanager
 def _quiet() -> Any:
     """Silence Lightning's advice on workers and devices, which is not the user's business: what is said here goes to
@@ -313,22 +328,15 @@ def train(
 
     Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
     the same design to begin with, instead of random weights, or `NetworkOf` one of any design on the same sensor, whose
-    codes begin anew. `trainer` holds further arguments of Lightning's Trainer
-    (accelerator, devices, strategy). Returns steps, seconds (of this call), val_rmse_mm of the weights kept, their
-    checkpoint, and the number of parameters. Raises InputError for sets or an `init` that do not fit, and a folder of
-    another run.
+    codes begin anew. `trainer` holds further arguments of Lightning's Trainer (accelerator, devices, strategy). Returns
+    steps, seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of parameters.
+    Raises InputError for sets or an `init` that do not fit, and a folder of another run.
     """
     config.check_memory()
     if init is not None:
         _check_init(init, config)
     sets = [[packed_views(one) for one in _listed(views)] for views in (training, validation)]
-    data = {}
-    for name, packs in zip(("training", "validation"), sets, strict=True):
-        hashes = [packed_sha256(packed) for packed in packs]
-        data[f"{name}_sha256"] = hashes[0] if len(hashes) == 1 else hashes
-    if init is not None:  # a run that goes on must have begun with the same weights
-        data["init_sha256"] = weights_sha256(init.model if isinstance(init, NetworkOf) else init)
-    config = replace(config, data={**config.data, **data})
+    config = _with_hashes(config, sets, init)
     if config.model.grid == "published":
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
     module_data = SetData(*sets, config, workers)
@@ -347,14 +355,13 @@ def train(
     if not (folder / "last.safetensors").is_file():
         with _quiet():
             try:
-                runner.fit(module, module_data, ckpt_path=str(resume) if resume.is_file() else None, weights_only=True)
+                runner.fit(module, module_data, ckpt_path=resume if resume.is_file() else None, weights_only=True)
             except SystemExit:  # what Lightning makes of Ctrl-C
                 raise KeyboardInterrupt from None
         if runner.is_global_zero:
             save_model(module.kept, config, record.rows[-1], folder / "last.safetensors")
         runner.strategy.barrier()
-    _, _, best = load_model(folder)
-    _, _, last = load_model(folder / "last.safetensors")
+    best, last = (load_model(path)[2] for path in (folder, folder / "last.safetensors"))
     diverged = f"{folder}: the run diverged, its validation error is no number; use a lower --rate"
     require(math.isfinite(best["val_rmse_mm"]), diverged)
     return {
