@@ -8,7 +8,8 @@ import pytest
 
 from scene2spad.cli import main
 from scene2spad.studies.sim_to_real.measures import centroid, compare, randomised_pit
-from scene2spad.studies.sim_to_real.pose import find_pose, nearest_start, render_counts
+from scene2spad.studies.sim_to_real.pose import Pose, find_pose, model_covariance, nearest_start, render_counts
+from scenes.errors import InputError
 from spad.sensor.files import load_sensor
 from spad.zones.sensor import ZoneArray
 
@@ -77,6 +78,27 @@ def test_the_pose_of_a_simulated_capture_is_found_within_its_own_errors(sensor):
         assert abs(error[0]) < 2e-3 and np.abs(error[1:3]).max() < 0.05
         total += float(error @ np.linalg.solve(found.covariance, error))
     assert total < 32.9  # chi-square of 12 at 0.1 %
+
+
+def test_intervals_hold_poses_whose_model_errs():
+    """Errors of a common covariance beside the Fisher one: from 40 known poses, 95 % intervals hold 95 % of others."""
+    rng = np.random.default_rng(5)
+    fisher = np.diag([1e-10, 1e-6, 1e-6, 1e-5])
+    factor = 1e-3 * rng.standard_normal((4, 4))
+    errors = rng.standard_normal((4000, 4)) @ factor.T + rng.standard_normal((4000, 4)) * np.sqrt(np.diag(fisher))
+    covered = []
+    for known in np.split(errors[:2000], 50):
+        model = model_covariance(known, np.repeat(fisher[None], len(known), axis=0))
+        assert np.linalg.eigvalsh(model.covariance).min() > -1e-18
+        _, half = model.interval(Pose(np.zeros(4), fisher))
+        covered.append((np.abs(errors[2000:]) < half).mean(axis=0))
+    assert np.abs(np.mean(covered, axis=0) - 0.95).max() < 0.015
+    # no model error: what the photons say stays, up to what 2,000 poses leave open
+    exact = rng.standard_normal((2000, 4)) * np.sqrt(np.diag(fisher))
+    small = model_covariance(exact, np.repeat(fisher[None], 2000, axis=0)).covariance
+    assert (np.diag(small) < 0.2 * np.diag(fisher)).all()
+    with pytest.raises(InputError, match="no capture of a known pose"):
+        model_covariance(np.zeros((0, 4)), np.zeros((0, 4, 4)))
 
 
 @pytest.mark.slow

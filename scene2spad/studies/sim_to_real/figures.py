@@ -80,10 +80,10 @@ def draw_poses(rows: Sequence[dict], path: Path) -> Path:
         strict=True,
     ):
         error = np.array([row[f"{key}_error"] for row in rows])
-        panel.errorbar(distance, error, yerr=[1.96 * row[f"{key}_sigma"] for row in rows], fmt="o", ms=3, lw=0.8)
+        panel.errorbar(distance, error, yerr=[row[f"{key}_interval"] for row in rows], fmt="o", ms=3, lw=0.8)
         panel.axhline(0, color="0.4", lw=0.8)
         panel.set_ylabel(label)
         panel.grid(alpha=0.3)
     panels[-1].set_xlabel("distance of the arm [mm]")
-    figure.suptitle("Pose of the plane from one capture, less the arm's; bars: 95 % by the Fisher matrix", fontsize=11)
+    figure.suptitle("Pose of the plane from one capture, less the arm's; bars: 95 %, photons and model", fontsize=11)
     return save(figure, path)

@@ -22,14 +22,14 @@ class Plan:
     nearest_m   captures nearer than this are predicted, but not calibrated on
     every       of the captures from there on, each that many-th is calibrated on; the others are held out
     ablated     effects that are switched off in turn
-    pose_every  of the captures held out, each that many-th gives a pose
+    pose_every  of the captures of either half, each that many-th gives a pose
     shown_m     distances of the first figure
     """
 
     nearest_m: float = 0.1
     every: int = 2
     ablated: tuple[str, ...] = EFFECTS
-    pose_every: int = 3
+    pose_every: int = 1
     shown_m: tuple[float, ...] = (0.105, 0.2, 0.3825)
 
 

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from scene2spad.datasets.zone_captures import render_plane
+from scenes.errors import require
 from spad.sensor.model import Sensor
 from spad.zones.fit import covariance_of
 from spad.zones.sensor import ZoneArray, ZoneReturns, expected_zone_counts, zone_returns
@@ -86,6 +88,34 @@ def find_pose(
         if (np.abs(step) < 0.05 * np.sqrt(np.diag(covariance))).all():
             break
     return Pose(values, covariance)
+
+
+class ModelCovariance(NamedTuple):
+    """Covariance (4, 4) that the model's errors add to a pose, and the number of known poses that it is from."""
+
+    covariance: np.ndarray
+    poses: int
+
+    def interval(self, found: Pose) -> tuple[np.ndarray, np.ndarray]:
+        """Return standard errors of a pose's values, photons and model together, and half widths of 95 % intervals.
+
+        Student's t with as many degrees of freedom as there were known poses: few of them make intervals wider.
+        """
+        sigma = np.sqrt(np.diag(found.covariance + self.covariance))
+        return sigma, sigma * stdtrit(self.poses, 0.975)
+
+
+def model_covariance(errors: np.ndarray, covariances: np.ndarray) -> ModelCovariance:
+    """Return mean over known poses of e e^T - covariance, without its negative directions.
+
+    errors (N, 4) of poses found from captures of known poses, covariances (N, 4, 4) by the Fisher information. That
+    takes the errors of bins as independent. The model's own are not: all bins of a capture are late together. Errors
+    are about zero, so that a bias widens the intervals, too. InputError without a known pose.
+    """
+    require(len(errors) > 0, "model covariance: no capture of a known pose")
+    excess = (errors[:, :, None] * errors[:, None, :] - covariances).mean(axis=0)
+    values, directions = np.linalg.eigh(excess)
+    return ModelCovariance((directions * np.maximum(values, 0)) @ directions.T, len(errors))
 
 
 def nearest_start(counts: np.ndarray, known_m: Sequence[float], known: np.ndarray) -> float:

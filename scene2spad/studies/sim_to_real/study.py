@@ -25,7 +25,7 @@ from scene2spad.options.experiments import Study
 from scene2spad.studies.sim_to_real import figures
 from scene2spad.studies.sim_to_real.measures import Comparison, compare, summary
 from scene2spad.studies.sim_to_real.plan import FITTED, GEOMETRY, MODEL_ERROR, SENSOR, Plan, plan_of
-from scene2spad.studies.sim_to_real.pose import find_pose, nearest_start
+from scene2spad.studies.sim_to_real.pose import Pose, find_pose, model_covariance, nearest_start
 from scenes.files import finite, whole_file, write_csv
 from scenes.progress import Progress
 from spad.sensor.files import SensorFile, load_sensor, write_sensor
@@ -35,6 +35,10 @@ from spad.zones.histogram import zone_grid
 from spad.zones.sensor import expected_zone_counts
 
 SPANS = ((0.0, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.4), (0.1, 0.4))  # metres: what is told apart
+
+
+# of a pose, as rows have them
+UNITS = {"distance_mm": 1e3, "about_y_deg": 180 / np.pi, "about_x_deg": 180 / np.pi, "reflectance": 1.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,20 +178,33 @@ def chip_range(captures: PlaneCaptures) -> dict[str, list[float]]:
 
 
 def pose_rows(of: Prediction, model_error: float) -> list[dict[str, float]]:
-    """Errors of distance and tilt of single captures, and their standard errors. The arm's plane faces the sensor."""
-    captures, fitted, used = of.captures, of.fitted, of.used
+    """Errors of distance and tilt of single captures held out, their standard errors, and half widths of 95 %
+    intervals.
+
+    The arm's plane faces the sensor. What the model's errors add to the Fisher covariance is measured on poses of the
+    captures calibrated on.
+    """
+
+    def found(at: int) -> tuple[Pose, np.ndarray]:
+        counts = of.captures.counts[at].astype(np.float64)
+        drift_s = float(of.captures.drift_bins[at]) * of.fitted.sensor.bin_width_s
+        start_m = nearest_start(counts, of.captures.distance_m[of.used], of.expected[of.used])
+        options = {"drift_s": drift_s, "model_error": model_error}
+        pose = find_pose(counts, of.fitted.sensor, of.fitted.zones, start_m, **options)
+        return pose, pose.values - np.array([of.captures.distance_m[at], 0.0, 0.0, 1.0])
+
+    known = [found(at) for at in of.used[:: of.plan.pose_every]]
+    model = model_covariance(np.array([error for _, error in known]), np.array([pose.covariance for pose, _ in known]))
     rows = []
     for at in of.judged[:: of.plan.pose_every]:
-        counts = captures.counts[at].astype(np.float64)
-        drift_s = float(captures.drift_bins[at]) * fitted.sensor.bin_width_s
-        start_m = nearest_start(counts, captures.distance_m[used], of.expected[used])
-        found = find_pose(counts, fitted.sensor, fitted.zones, start_m, drift_s=drift_s, model_error=model_error)
-        sigma, truth = np.sqrt(np.diag(found.covariance)), np.array([captures.distance_m[at], 0.0, 0.0, 1.0])
-        row: dict[str, float] = {"distance_m": float(captures.distance_m[at])}
-        units = {"distance_mm": 1e3, "about_y_deg": 180 / np.pi, "about_x_deg": 180 / np.pi, "reflectance": 1.0}
-        for number, (name, unit) in enumerate(units.items()):
-            row[f"{name}_error"] = float(found.values[number] - truth[number]) * unit
+        pose, error = found(at)
+        sigma, half = model.interval(pose)
+        row: dict[str, float] = {"distance_m": float(of.captures.distance_m[at])}
+        for number, (name, unit) in enumerate(UNITS.items()):
+            row[f"{name}_error"] = float(error[number]) * unit
+            row[f"{name}_photon_sigma"] = float(pose.covariance[number, number]) ** 0.5 * unit
             row[f"{name}_sigma"] = float(sigma[number]) * unit
+            row[f"{name}_interval"] = float(half[number]) * unit
         rows.append(row)
     return rows
 
@@ -196,14 +213,17 @@ def pose_summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Median absolute error, its mean, and the share of 95 % intervals that hold the arm's pose, of each quantity."""
     found: dict[str, Any] = {"captures": len(rows)}
     for name in ("distance_mm", "about_y_deg", "about_x_deg"):
-        error, sigma = (np.array([row[f"{name}_{what}"] for row in rows]) for what in ("error", "sigma"))
+        columns = ("error", "photon_sigma", "sigma", "interval")
+        error, photons, sigma, half = (np.array([row[f"{name}_{what}"] for row in rows]) for what in columns)
         found[name] = {
             "median_error": float(np.median(np.abs(error))),
             "worst_error": float(np.abs(error).max()),
             "bias": float(error.mean()),
             "spread": float(error.std()),
+            "median_photon_sigma": float(np.median(photons)),
             "median_sigma": float(np.median(sigma)),
-            "covered": float((np.abs(error) < 1.96 * sigma).mean()),
+            "covered": float((np.abs(error) < half).mean()),
+            "covered_by_photons_alone": float((np.abs(error) < 1.96 * photons).mean()),
         }
     return found
 
@@ -250,8 +270,8 @@ def in_words(numbers: dict[str, Any]) -> dict[str, Any]:
         for row in numbers["ablation"]
     ]
     pose = [
-        f"{name}: median error {numbers['pose'][name]['median_error']:.2f}, {numbers['pose'][name]['covered']:.0%} of "
-        "intervals hold the arm's"
-        for name in ("distance_mm", "about_y_deg", "about_x_deg")
+        f"{name}: median error {of['median_error']:.2f}, {of['covered']:.0%} of 95 % intervals hold the arm's "
+        f"({of['covered_by_photons_alone']:.0%} of those by photons alone)"
+        for name, of in ((name, numbers["pose"][name]) for name in ("distance_mm", "about_y_deg", "about_x_deg"))
     ]
     return {"prediction": spans, "ablation": without, "pose": pose}
