@@ -128,8 +128,7 @@ def run_train(command: Train, progress: Progress) -> dict:
     if command.init is not None:
         init = load_model(checkpoint_of(command.init))[0]
         data["init"] = Path(command.init).name
-    name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
-    folder = command.out or Path("out/train") / name
+    folder = folder_of(command)
     result = train(
         replace(config, data=data),
         training,
@@ -141,6 +140,12 @@ def run_train(command: Train, progress: Progress) -> dict:
         devices=command.devices or "auto",
     )
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
+
+
+def folder_of(command: Train) -> Path:
+    """Return the folder of a run: the one asked for, or one named after its options."""
+    name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
+    return command.out or Path("out/train") / name
 
 
 def network_method(model: DepthEstimator, *, overflows: list[int] | None = None, **reading: Any) -> Method:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from scene2spad.options.common import Common, Count, Number, Pixels, Positional, may_stay_open
+from scene2spad.options.common import Common, Count, Long, Number, Pixels, Positional, may_stay_open
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Common):
+class Train(Long):
     """Train a depth network, with or without compressive codes, on a rendered set; a run that was killed goes on."""
 
     design: str = "learned"
