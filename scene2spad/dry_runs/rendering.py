@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 from render.engine import planned, render
 from render.scene.traced_scene import TracedScene
@@ -20,7 +19,7 @@ TRIAL_PIXELS = 2304
 FIRST_PIXELS = 64  # compiles, so that the trial's time is that of tracing
 
 
-def dry_run(scene: Scene, settings: RenderSettings, seed: int) -> dict[str, Any]:
+def dry_run(scene: Scene, settings: RenderSettings, seed: int) -> dict:
     """Return plan, memory and estimated work of a render, and what the estimate is based on."""
     camera = scene.camera
     pixels = camera.width * camera.height

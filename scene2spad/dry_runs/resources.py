@@ -6,9 +6,11 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 from scenes.limits import memory_limit
+
+T = TypeVar("T")
 
 
 class Cost(NamedTuple):
@@ -18,7 +20,7 @@ class Cost(NamedTuple):
     cpu_s: float
 
 
-def timed(work: Callable[[], Any]) -> tuple[Any, Cost]:
+def timed(work: Callable[[], T]) -> tuple[T, Cost]:
     """Return what `work()` returns and what it cost."""
     wall, cpu = time.perf_counter(), time.process_time()
     made = work()

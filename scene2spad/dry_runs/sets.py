@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 from render.settings import MIN_PIXEL_BYTES
 from scene2spad.datasets.rendering import Job, check_asked, render_view
@@ -17,7 +16,7 @@ from scenes.library.sets import scene_set
 TRIALS = 3  # the first compiles; the others tell what a view costs
 
 
-def dry_run(job: Job, count: int, out: Path, workers: int) -> dict[str, Any]:
+def dry_run(job: Job, count: int, out: Path, workers: int) -> dict:
     """Return what `make_set` would do, with memory, bytes and seconds, and what these are based on."""
     check_asked(job, count, workers)
     records = finished_views(out, job.made())

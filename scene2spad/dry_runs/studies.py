@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from csph.weights.shipped import shipped_file
 from scene2spad.dry_runs.resources import memory
@@ -16,7 +15,7 @@ from scene2spad.studies.every import TIMINGS
 from scenes.io.inputs import read_whole_lines
 
 
-def dry_run(command: Study) -> dict[str, Any]:
+def dry_run(command: Study) -> dict:
     """Return models, kept results, memory and seconds of one study, as far as they are known."""
     wanted = wanted_models(command)
     folder = command.out / command.preset

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -29,7 +29,7 @@ class Recorded(NamedTuple):
     seconds: float
 
 
-def dry_run(command: Train) -> dict[str, Any]:
+def dry_run(command: Train) -> dict:
     """Return configuration, memory and estimated seconds of a training, and what these are based on."""
     config = config_of(command)
     config.check_memory()
@@ -66,7 +66,7 @@ def dry_run(command: Train) -> dict[str, Any]:
     }
 
 
-def plan_of(config: TrainConfig) -> dict[str, Any]:
+def plan_of(config: TrainConfig) -> dict:
     """Return what a run consists of, in the words of `config.json`."""
     names = ("preset", "epochs", "steps_per_epoch", "batch", "crop", "rate", "schedule", "window", "precision")
     return {name: getattr(config, name) for name in names} | {"steps": config.steps}

@@ -23,6 +23,7 @@ from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from render.pipeline import Progress
 from scene2spad.datasets.planes import random_planes
+from scene2spad.datasets.renders import views_at
 from scene2spad.datasets.workers import check_workers
 from scene2spad.options.networks import Evaluate, Train
 from scenes.errors import InputError, require
@@ -226,7 +227,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
     if not 0 <= command.offset < sensor.range_m:
         raise InputError(f"offset {command.offset:g} m is outside 0 to the sensor's range {sensor.range_m:.4f} m")
-    views = read_views(command.set)
+    views = views_at(command.set)
     if command.views is not None:
         require(command.views >= 1, f"views {command.views} is below 1")
         views = Views(views.transients[: command.views], views.scenes[: command.views])

@@ -99,8 +99,8 @@ class Evaluate(Common):
     tiled: bool = False
     """Cut images to what the blocks of all networks tile, instead of reflecting what is missing."""
     set: Path
-    """Folder of a set that `dataset` rendered, or its pack (.h5); published: the paper's pairs that lie beside the
-    project, in its own simulation, read by both decoders."""
+    """Folder of a set that `dataset` rendered, its pack (.h5), a transient (.exr) or a folder of them; published: the
+    paper's pairs that lie beside the project, in its own simulation, read by both decoders."""
     baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
     """Estimators of `depth`, and CODE-K decoded without a network."""
     levels: tuple[str, ...] = ()

@@ -66,7 +66,7 @@ def run_all(command: Study, progress: Progress) -> dict:
     return {"studies": shown, "left_out": left, "preset": command.preset, "out": str(command.out)}
 
 
-def _attempt(command: Study, progress: Progress) -> dict[str, Any]:
+def _attempt(command: Study, progress: Progress) -> dict:
     start = time.perf_counter()
     try:
         result = run_one(command, progress)
@@ -87,7 +87,7 @@ def _asked(command: Study) -> str:
     return json.dumps({**options, "version": version("scene2spad")}, sort_keys=True, default=str)
 
 
-def _finished(command: Study) -> dict[str, Any] | None:
+def _finished(command: Study) -> dict | None:
     """Return the row of a study that has been run with these options; None where it is to be run."""
     asked = _asked(command)
     for line in read_whole_lines(command.out / JOURNAL):
@@ -102,7 +102,7 @@ def _part(progress: Progress, name: str, number: int) -> Progress:
     return lambda what, fraction: progress(f"{name}: {what}", (number + fraction) / len(STUDIES))
 
 
-def _table(rows: list[dict[str, Any]]) -> list[str]:
+def _table(rows: list[dict]) -> list[str]:
     return [
         f"{row['study']:<14} {row['status']:<12} {row['seconds']:8.1f} s  "
         + (row["why"] if "why" in row else f"{len(row['figures'])} figures")
