@@ -107,7 +107,7 @@ class Job:
             THINNED,
             self.settings().target_fraction,
         ]
-        return asdict(self) | {"schema": 7, "tolerances": tolerances}
+        return asdict(self) | {"schema": 8, "tolerances": tolerances}
 
 
 def render_view(job: Job, view: int, again: int = 0) -> Done:
