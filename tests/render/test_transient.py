@@ -199,10 +199,9 @@ def test_flat_layers_in_float32_come_first(tmp_path):
 
 
 def test_mitsuba_reads_the_layers_without_rounding(tmp_path):
-    import mitsuba as mi
+    from render.backend.llvm import start_mitsuba
 
-    if not mi.variant():
-        mi.set_variant("scalar_rgb")
+    mi = start_mitsuba()
     write_transient(make(), tmp_path / "t.exr")
     bitmap = mi.Bitmap(str(tmp_path / "t.exr"))
     names = [field.name for field in bitmap.struct_()]
