@@ -185,10 +185,13 @@ def _log_to_stderr() -> None:
 @contextlib.contextmanager
 def _progress() -> Iterator[Progress]:
     """A progress bar on stderr, and the function that moves it; silent where nobody looks."""
+    if not sys.stderr.isatty():
+        yield lambda what, fraction: None
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("start", total=1.0)
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
