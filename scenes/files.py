@@ -28,7 +28,8 @@ from scenes.limits import require_memory
 ATTRIBUTE = "scene2spad"
 # numpy's header is Python, and so are the errors of a damaged one
 _NPY_ERRORS = (OSError, ValueError, KeyError, EOFError, SyntaxError, TypeError, RecursionError, TokenError, MemoryError)
-SCHEMAS = {"transient": 1, "histogram": 1, "depth": 1, "pack": 2, "network": 1}
+SCHEMAS = {"transient": 2, "histogram": 1, "depth": 1, "pack": 2, "network": 1}
+OLDER = {"transient": (1,)}  # schemas that are still read; they differ in where things lie in the file
 
 
 @contextmanager
@@ -200,7 +201,7 @@ def open_seal(text: str, kind: str) -> tuple[dict[str, Any], str]:
         raise InputError(f"its {ATTRIBUTE} attribute is not one of ours, expected a {kind}")
     if body["kind"] != kind:
         raise InputError(f"holds a {body['kind']}, expected a {kind}")
-    if body.get("schema") != SCHEMAS[kind]:
+    if body.get("schema") not in (SCHEMAS[kind], *OLDER.get(kind, ())):
         raise InputError(
             f"{kind} of schema {body.get('schema')}, this program reads {SCHEMAS[kind]}; use another scene2spad"
         )

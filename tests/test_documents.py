@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 from processes import run_process
 
-from scene2spad.cli.main import RUNNERS, main
+from scene2spad.cli.main import COMMANDS as NAMES
+from scene2spad.cli.main import main
 from spad.sensor.files import read_sensor
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-COMMANDS = {command.__name__.lower() for command in RUNNERS}
+COMMANDS = {*NAMES}
 WORDS = 1000
 IN_CODE = re.compile(r"`[^`\n]+`|^    .*$|```.*?```", re.M | re.S)
 

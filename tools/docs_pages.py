@@ -38,10 +38,11 @@ def front_page() -> str:
 
 def command_line_page() -> str:
     """Return a section for each command: what it does, and its options with types and defaults."""
-    from scene2spad.cli.main import _commands
+    from scene2spad.cli.main import COMMANDS, options_of
 
     lines = ["# Command line", "", "`scene2spad COMMAND --help` says the same. Written from the code.", ""]
-    for name, options in _commands().items():
+    for name in COMMANDS:
+        options = options_of(name)
         told = " ".join(inspect.cleandoc(options.__doc__ or "").split())
         lines += [f"## {name}", "", _plain(told), "", "| option | default | meaning |", "|---|---|---|"]
         words = option_docs(options)

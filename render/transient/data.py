@@ -1,7 +1,9 @@
 """`Transient`: what a camera's pixels see of a pulse, over path length, and its file. Imports no renderer.
 
-One render serves every sensor: nothing here is tied to a bin width. The file is one multi-part OpenEXR, a deep part
-(Z = near, ZBack = far, Y = radiance, bounces) and a flat part, with all metadata in one JSON attribute `scene2spad`.
+One render serves every sensor: nothing here is tied to a bin width. The file is one multi-part OpenEXR. Its first part
+is flat and all float32, since viewers open the first part, some in the type of its first channel; then a flat part of
+other types, then the deep one (Z = near, ZBack = far, Y = radiance, bounces) with all metadata in one JSON attribute
+`scene2spad`. Files of schema 1 had the deep part first and all layers in the other; parts are found by name.
 """
 
 from __future__ import annotations
@@ -19,6 +21,10 @@ from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole
 from scenes.notebook import html_card
 
 RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bounces": "bounces"}
+FLAT_PARTS = {
+    "layers": ("depth", "ambient", "error"),
+    "surface": ("normal.X", "normal.Y", "normal.Z", "albedo", "mixed"),
+}
 LAYER_CHANNELS = ("depth", "normal.X", "normal.Y", "normal.Z", "albedo", "ambient", "mixed", "error")
 
 
@@ -202,7 +208,11 @@ def _write_exr(transient: Transient, path: Path) -> None:
         ATTRIBUTE: seal(transient.meta, "transient", transient.sha256()),
     }
     flat_header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-    parts = [OpenEXR.Part(deep_header, deep, "transient"), OpenEXR.Part(flat_header, flat, "layers")]
+    parts = [
+        OpenEXR.Part(dict(flat_header), {channel: flat[channel] for channel in channels}, name)
+        for name, channels in FLAT_PARTS.items()
+    ]
+    parts.append(OpenEXR.Part(deep_header, deep, "transient"))
     try:
         OpenEXR.File(parts).write(str(path))
     except RuntimeError as error:
@@ -249,10 +259,11 @@ def read_transient(path: Path) -> Transient:
         )
     try:
         meta, sha256 = open_seal(headers["transient"][ATTRIBUTE], "transient")
-        missing = {*RETURN_FIELDS.values()} - {*channels["transient"]} | {*LAYER_CHANNELS} - {*channels["layers"]}
+        flat = channels["layers"] | channels.get("surface", {})
+        missing = {*RETURN_FIELDS.values()} - {*channels["transient"]} | {*LAYER_CHANNELS} - {*flat}
         if missing:
             raise InputError(f"channels {', '.join(sorted(missing))} are missing")
-        transient = _assemble(channels["transient"], channels["layers"])
+        transient = _assemble(channels["transient"], flat)
         return replace(transient, meta=check_seal(meta, sha256, transient.sha256()))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

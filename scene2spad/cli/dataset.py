@@ -8,13 +8,13 @@ from typing import Annotated
 
 from render.settings import FILTERED_AMBIENT_SPP
 from scene2spad.cli.paths import output_file
-from scene2spad.options.common import Common, Count, File, Number, Offset, Pixels, Positional, may_stay_open
+from scene2spad.options.common import Count, File, Long, Number, Offset, Pixels, Positional, may_stay_open
 from scenes.library.sets import scene_set
 from scenes.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dataset(Common):
+class Dataset(Long):
     """Render a scene set to a folder of EXR files with an index; stopped at any moment, it goes on where it was."""
 
     set: Positional[str] = "rooms"
@@ -67,6 +67,10 @@ def run(command: Dataset, progress: Progress) -> dict:
         output_file(command.pack, ".h5", "pack")
     out = command.out or Path("out") / of.name.replace("/", "-")
     count = command.count if command.count is not None else of.size or 100
+    if command.dry_run:
+        from scene2spad.dry_runs.sets import dry_run
+
+        return dry_run(job, count, out, command.workers)
     options = {"workers": command.workers, "scheduler": command.scheduler, "progress": progress}
     result = make_set(job, count, out, **options)
     if command.pack is not None:

@@ -1,4 +1,4 @@
-"""Estimate depth from a histogram, and compare it with the truth."""
+"""Estimate depth from a histogram, or from a transient that is sensed first, and compare it with the truth."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from scene2spad.cli.opening import open_histogram
+from scene2spad.cli.opening import open_histogram, open_transient
 from scene2spad.cli.paths import holds_kind, input_file, output_file, picture
 from scene2spad.methods import depth_method
-from scene2spad.options.common import Common, File, Positional, may_stay_open
+from scene2spad.options.common import Common, File, Number, Positional, may_stay_open
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.formats.depth_map import write_depth
@@ -26,16 +26,20 @@ if TYPE_CHECKING:
     from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")
+SENSING = ("sensor", "signal", "background")  # options of a transient alone
+MEANS = ("mae_mm", "rmse_mm", "within_10mm")  # over the views of a folder
 
 
 @dataclass(frozen=True, kw_only=True)
 class Depth(Common):
-    """Estimate depth from a histogram and compare it with the truth; writes the depth map and a picture."""
+    """Estimate depth from a histogram and compare it with the truth; writes the depth map and a picture. A transient is
+    sensed first, as `sense` does; of a folder, every one."""
 
     file: Positional[Path]
-    """A histogram written by `sense` (.h5), or a frame or capture of the published family (.mat)."""
+    """A histogram written by `sense` (.h5), a frame or capture of the published family (.mat), a transient (.exr), or
+    the folder of a set or of transients."""
     out: File = None
-    """The depth map (.exr) to write (default: the histogram's and the method's name)."""
+    """The depth map (.exr) to write (default: the file's and the method's name); of a folder, the folder for them."""
     method: Literal[
         "argmax", "matched", "log-matched", "correlation", "lmf-published", "coates", "compressive", "network"
     ] = "log-matched"
@@ -60,22 +64,96 @@ class Depth(Common):
     """Codes of your own for `--method compressive`, (K, T) in a .npy file, instead of --code and --codes."""
     frame: int = 0
     """Frame of a capture (.mat) of several, from 0."""
+    sensor: Annotated[str | None, may_stay_open("NAME")] = None
+    """Sensor preset or file (.toml) that a transient is sensed with (default: reference)."""
+    signal: Number = None
+    """Mean signal photons per pixel that a transient is sensed with (default: 50)."""
+    background: Number = None
+    """Mean background photons per pixel that a transient is sensed with (default: 50)."""
     figure: bool = True
     """Draw estimate, truth and error beside the file."""
 
 
 def run(command: Depth, progress: Progress) -> dict:
-    """Run the command: histogram -> depth map, error figures and a picture."""
+    """Run the command: one file or a folder of transients -> depth maps, error figures and pictures."""
+    label = depth_label(command)
+    if command.file.is_dir():
+        return _run_folder(command, label, progress)
+    source = input_file(command.file)
+    if source.suffix.lower() == ".safetensors":
+        raise InputError(f"{source}: is a checkpoint, expected a histogram; give it as --method network --checkpoint")
+    out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
+    network = _network(command)
+    if source.suffix.lower() == ".exr" and holds_kind(source, "transient"):
+        histogram, sensed = _sensed(command, source, command.seed)
+        log.info("%s: sensed %s", source, sensed)
+    else:
+        asked = [name for name in SENSING if getattr(command, name) is not None]
+        message = f"{source}: --{', --'.join(asked)} go with a transient (.exr), a histogram has been sensed"
+        require(not asked, message)
+        histogram, sensed = open_histogram(source, command.frame), ""
+    progress(command.method, 0.1)
+    result = _estimated(command, network, histogram, source, out)
+    return ({"sensed": sensed} if sensed else {}) | result
+
+
+def _sensed(command: Depth, source: Path, seed: int) -> tuple[Histogram, str]:
+    """Return the histogram of a transient, and the words that say what it was sensed with."""
+    from scene2spad.cli.sensing import DEFAULT_PHOTONS
+    from spad.detection.detect import sense
+    from spad.sensor.files import load_sensor
+    from spad.sensor.model import PhotonBudget
+
+    require(not command.frame, f"{source}: --frame is for captures (.mat)")
+    found = load_sensor(command.sensor or "reference")
+    require(found.zones is None, f"{source}: a sensor of zones has no pixels; run `scene2spad sense` first")
+    signal, background = (DEFAULT_PHOTONS if value is None else value for value in (command.signal, command.background))
+    transient = open_transient(source, "transient", 0)
+    histogram = sense(transient, found.sensor, PhotonBudget(signal, background), seed=seed)
+    default = ", the defaults" if command.signal is None and command.background is None else ""
+    return histogram, (
+        f"by {found.sensor.name} with {signal:g} signal and {background:g} background photons a pixel{default}, "
+        f"seed {seed}"
+    )
+
+
+def _run_folder(command: Depth, label: str, progress: Progress) -> dict:
+    """Run the command on every transient of a folder, each sensed by a seed of its own."""
+    from scene2spad.datasets.renders import transient_files
+
+    folder = command.file
+    files = transient_files(folder)
+    out = command.out or folder.resolve().with_name(f"{folder.resolve().name}-{label}")
+    require(out.resolve().parent.is_dir(), f"{out}: folder {out.parent} does not exist")
+    require(not out.is_file(), f"{out}: is a file, expected a folder for the depth maps")
+    require(out.resolve() != folder.resolve(), f"{out}: is the folder of the transients")
+    network = _network(command)
+    targets = [out / f"{file.stem}-{label}.exr" for file in files]
+    views, sensed = [], ""
+    for number, (file, target) in enumerate(zip(files, targets, strict=True)):
+        progress(file.name, number / len(files))
+        histogram, words = _sensed(command, input_file(file), command.seed + number)
+        sensed = sensed or f"{words} and more, one for each"
+        out.mkdir(exist_ok=True)
+        found = _estimated(command, network, histogram, file, output_file(target, ".exr", "depth"))
+        views.append({"file": str(file), **{key: found[key] for key in (*MEANS, "out")}})
+    log.info("%s: %d transients sensed %s", folder, len(files), sensed)
+    means = {key: _mean([view[key] for view in views]) for key in MEANS}
+    return {"sensed": sensed, "views": len(views), "method": label, **means, "by_view": views, "out": str(out)}
+
+
+def _mean(values: list[float]) -> float:
+    """Mean over the views that have a value, NaN of none."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram, source: Path, out: Path) -> dict:
+    """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
     from scene2spad.cli.sensing import mean_confidence
     from spad.estimators.depth import depth_errors
 
-    label = depth_label(command)
-    source = input_file(command.file)
-    _expect_histogram(source)
-    out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
-    histogram = open_histogram(source, command.frame)
-    progress(command.method, 0.1)
-    network, fraction = _network(command), None
+    label, fraction = depth_label(command), None
     start = time.perf_counter()
     if network is None:
         depth = _chosen_method(command, histogram.sensor)(histogram)
@@ -129,14 +207,6 @@ def depth_label(command: Depth) -> str:
         return f"network-{checkpoint.resolve().name}"
     run = f"{checkpoint.resolve().parent.name}-" if checkpoint.stem in RUN_WEIGHTS else ""
     return f"network-{run}{checkpoint.stem}"
-
-
-def _expect_histogram(path: Path) -> None:
-    """Refuse a file of another of our kinds by its name, with the command that takes it."""
-    if path.suffix.lower() == ".exr" and holds_kind(path, "transient"):
-        raise InputError(f"{path}: is a transient, expected a histogram; run `scene2spad sense {path}` first")
-    if path.suffix.lower() == ".safetensors":
-        raise InputError(f"{path}: is a checkpoint, expected a histogram; give it as --method network --checkpoint")
 
 
 def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import json
 import logging
@@ -10,31 +11,13 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import fields
+from functools import reduce
 from importlib.metadata import version
-from typing import Annotated, Any, get_args
+from operator import or_
+from typing import Annotated, Any
 
 import tyro
 
-from scene2spad.cli import (
-    bench,
-    calibrate,
-    compare,
-    dataset,
-    demo,
-    depth,
-    evaluate,
-    export,
-    inspect,
-    models,
-    render,
-    report,
-    scenes,
-    sense,
-    show,
-    study,
-    train,
-    ultraphase,
-)
 from scene2spad.interrupts import STOPPED
 from scene2spad.options.common import Common
 from scenes.errors import InputError, did_you_mean, require
@@ -43,46 +26,27 @@ from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."
-Command = (
-    Annotated[demo.Demo, tyro.conf.subcommand("demo")]
-    | Annotated[scenes.Scenes, tyro.conf.subcommand("scenes")]
-    | Annotated[render.Render, tyro.conf.subcommand("render")]
-    | Annotated[dataset.Dataset, tyro.conf.subcommand("dataset")]
-    | Annotated[sense.Sense, tyro.conf.subcommand("sense")]
-    | Annotated[depth.Depth, tyro.conf.subcommand("depth")]
-    | Annotated[inspect.Inspect, tyro.conf.subcommand("inspect")]
-    | Annotated[compare.Compare, tyro.conf.subcommand("compare")]
-    | Annotated[export.Export, tyro.conf.subcommand("export")]
-    | Annotated[show.Show, tyro.conf.subcommand("show")]
-    | Annotated[calibrate.Calibrate, tyro.conf.subcommand("calibrate")]
-    | Annotated[train.Train, tyro.conf.subcommand("train")]
-    | Annotated[models.Models, tyro.conf.subcommand("models")]
-    | Annotated[evaluate.Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[ultraphase.Ultraphase, tyro.conf.subcommand("ultraphase")]
-    | Annotated[study.Study, tyro.conf.subcommand("study")]
-    | Annotated[bench.Bench, tyro.conf.subcommand("bench")]
-    | Annotated[report.Report, tyro.conf.subcommand("report")]
+# In the order of --help. `scene2spad.cli.NAME` has the options, a class `Name`, and `run`; only what runs is imported.
+COMMANDS = (
+    "demo",
+    "scenes",
+    "render",
+    "dataset",
+    "sense",
+    "depth",
+    "inspect",
+    "compare",
+    "export",
+    "show",
+    "calibrate",
+    "train",
+    "models",
+    "evaluate",
+    "ultraphase",
+    "study",
+    "bench",
+    "report",
 )
-RUNNERS: dict[type, Callable[[Any, Progress], dict]] = {
-    demo.Demo: demo.run,
-    scenes.Scenes: scenes.run,
-    render.Render: render.run,
-    dataset.Dataset: dataset.run,
-    sense.Sense: sense.run,
-    depth.Depth: depth.run,
-    compare.Compare: compare.run,
-    export.Export: export.run,
-    inspect.Inspect: inspect.run,
-    show.Show: show.run,
-    calibrate.Calibrate: calibrate.run,
-    train.Train: train.run,
-    models.Models: models.run,
-    evaluate.Evaluate: evaluate.run,
-    ultraphase.Ultraphase: ultraphase.run,
-    study.Study: study.run,
-    bench.Bench: bench.run,
-    report.Report: report.run,
-}
 
 
 def main(argv: list[str]) -> int:
@@ -104,7 +68,7 @@ def main(argv: list[str]) -> int:
         return _refuse(f"seed {command.seed} is negative, expected 0 or more")
     try:
         with _progress() as progress:
-            result = RUNNERS[type(command)](command, progress)
+            result = runner_of(argv[0])(command, progress)
     except InputError as error:
         return _refuse(str(error))
     except OSError as error:
@@ -124,25 +88,28 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _commands() -> dict[str, type[Common]]:
-    """Return each command's options by its name, from the union that tyro parses."""
-    found = {}
-    for one in get_args(Command):
-        options, *notes = get_args(one)
-        found[next(note.name for note in notes if hasattr(note, "name"))] = options
-    return found
+def options_of(name: str) -> type[Common]:
+    """Return the class of a command's options; its module is imported now."""
+    options: type[Common] = getattr(importlib.import_module(f"scene2spad.cli.{name}"), name.capitalize())
+    return options
+
+
+def runner_of(name: str) -> Callable[[Any, Progress], dict]:
+    """Return the function that runs a command."""
+    run: Callable[[Any, Progress], dict] = importlib.import_module(f"scene2spad.cli.{name}").run
+    return run
 
 
 def _check_words(argv: list[str]) -> None:
     """Raise InputError for a command or an option that does not exist, with the one that was probably meant."""
-    known = _commands()
     name = argv[0]
     if name.startswith("-"):
         require(name in ("-h", "--help"), f"no option {name}{did_you_mean(name, ('--help', '--version'))}")
         return
-    require(name in known, f"no command {name!r}{did_you_mean(name, known)} (there are {', '.join(known)})")
-    options = {f"--{field.name.rstrip('_').replace('_', '-')}" for field in fields(known[name])}
-    switches = {f"--no-{field.name.replace('_', '-')}" for field in fields(known[name]) if field.type in ("bool", bool)}
+    require(name in COMMANDS, f"no command {name!r}{did_you_mean(name, COMMANDS)} (there are {', '.join(COMMANDS)})")
+    known = fields(options_of(name))
+    options = {f"--{field.name.rstrip('_').replace('_', '-')}" for field in known}
+    switches = {f"--no-{field.name.replace('_', '-')}" for field in known if field.type in ("bool", bool)}
     options |= switches | {"--help"}
     for word in argv[1:]:
         option = word.partition("=")[0].replace("_", "-")
@@ -157,7 +124,10 @@ def _parse(argv: list[str]) -> Common:
     usage = io.StringIO()
     try:
         with contextlib.redirect_stderr(usage):
-            return tyro.cli(Command, prog="scene2spad", description=DESCRIPTION, args=argv)
+            if argv[0] in COMMANDS:
+                return tyro.cli(options_of(argv[0]), prog=f"scene2spad {argv[0]}", args=argv[1:])
+            every = [Annotated[options_of(name), tyro.conf.subcommand(name)] for name in COMMANDS]
+            return tyro.cli(reduce(or_, every), prog="scene2spad", description=DESCRIPTION, args=argv)
     except SystemExit as stop:
         if stop.code:
             print(f"scene2spad: {_one_line(usage.getvalue())}", file=sys.stderr)
@@ -216,10 +186,13 @@ def _log_to_stderr() -> None:
 @contextlib.contextmanager
 def _progress() -> Iterator[Progress]:
     """A progress bar on stderr, and the function that moves it; silent where nobody looks."""
+    if not sys.stderr.isatty():
+        yield lambda what, fraction: None
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("start", total=1.0)
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)

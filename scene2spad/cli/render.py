@@ -14,9 +14,9 @@ import tyro
 from render.settings import RenderSettings
 from scene2spad.cli.paths import output_file, picture
 from scene2spad.options.common import (
-    Common,
     Count,
     File,
+    Long,
     Metres,
     Mode,
     Number,
@@ -43,7 +43,7 @@ MAX_LUX = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render(Common):
+class Render(Long):
     """Render a scene's time-resolved radiance to a deep EXR file, with a picture beside it."""
 
     scene: Positional[str] = "living-room"
@@ -117,17 +117,7 @@ def run(command: Render, progress: Progress) -> dict:
     from render.transient import write_transient
     from scene2spad.plots import figures
 
-    settings = RenderSettings(
-        bounces=command.bounces,
-        spp=command.spp,
-        filter=command.filter,
-        clamp=command.clamp,
-        grid=command.grid,
-        ambient={"auto": None, "on": True, "off": False}[command.ambient],
-        ambient_spp=command.ambient_spp,
-        error=command.error,
-        budget=command.budget,
-    )
+    settings = _settings(command)
     check_offset(command.offset)
     if command.out is not None:
         output_file(command.out, ".exr", "transient")
@@ -139,6 +129,10 @@ def run(command: Render, progress: Progress) -> dict:
         from scene2spad.datasets.moving import moved
 
         scene = moved(scene, command.offset, command.offset_mode)
+    if command.dry_run:
+        from scene2spad.dry_runs.rendering import dry_run
+
+        return dry_run(scene, settings, command.seed) | {"out": str(out)}
     transient = in_view(render(scene, settings, seed=command.seed, progress=progress))
     seconds = time.perf_counter() - start
     if command.offset and command.offset_mode == "time":
@@ -161,6 +155,20 @@ def run(command: Render, progress: Progress) -> dict:
     if command.figure:
         result["figure"] = str(figures.draw_transient(transient, picture(out, "transient")))
     return result | {"target_met": transient.meta["target_met"]}
+
+
+def _settings(command: Render) -> RenderSettings:
+    return RenderSettings(
+        bounces=command.bounces,
+        spp=command.spp,
+        filter=command.filter,
+        clamp=command.clamp,
+        grid=command.grid,
+        ambient={"auto": None, "on": True, "off": False}[command.ambient],
+        ambient_spp=command.ambient_spp,
+        error=command.error,
+        budget=command.budget,
+    )
 
 
 def _load(command: Render) -> Scene:

@@ -22,12 +22,10 @@ from spad.detection.detect import expected_in_pixel, sense
 from spad.detection.flux import check_dark_map
 from spad.estimators.depth import confidence, laser_baseline_m
 from spad.formats.histogram import Histogram, write_histogram
-from spad.formats.mat import write_mat
 from spad.sensor.budget import Optics
 from spad.sensor.files import FWHM_PER_SIGMA, load_sensor
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, read_pulse
-from spad.zones.histogram import sense_zones, with_budget
 from spad.zones.sensor import ZoneArray
 
 if TYPE_CHECKING:
@@ -130,6 +128,8 @@ def run(command: Sense, progress: Progress) -> dict:
     write_histogram(histogram, out)
     result = {"seconds": seconds, **summary(histogram), "out": str(out)}
     if command.export == "mat":
+        from spad.formats.mat import write_mat
+
         mat = out.with_suffix(".mat")
         result.update({"pulse_file": str(write_mat(histogram, mat)), "export": str(mat)})
     if command.figure:
@@ -151,6 +151,8 @@ def _files(command: Sense) -> tuple[Path, Path]:
 
 def _run_zones(command: Sense, zones: ZoneArray) -> dict:
     """Transient -> histogram of a multi-zone sensor, whose gains are its own unless a budget is asked for."""
+    from spad.zones.histogram import sense_zones, with_budget
+
     pixels_alone = ("radiometric", "dark_map", "export", "dark_count_rate", "dead_time", "crosstalk", "hot_pixels")
     for option in (*pixels_alone, "dead_pixels", "reset"):
         given = getattr(command, option) not in (None, False)

@@ -1,21 +1,25 @@
-"""Run one study. Its options: `scene2spad.options.experiments`."""
+"""Run one study, or all. Its options: `scene2spad.options.experiments`."""
 
 from __future__ import annotations
 
-import importlib
-from importlib.util import find_spec
+from dataclasses import replace
 
-from scene2spad.options.experiments import ABLATIONS, Study
+from scene2spad.options.experiments import STUDIES, Study
 from scenes.errors import InputError
 from scenes.progress import Progress
 
 
 def run(command: Study, progress: Progress) -> dict:
-    """Run the command: one study: the module of its name, imported only when it is asked for."""
+    """Run the command: one study or all of them, or say what that would take."""
     if command.out.is_file():
         raise InputError(f"{command.out}: is a file, expected a folder for the figures")
-    name = "ablations" if command.name in ABLATIONS else command.name.replace("-", "_")
-    room = f"scene2spad.studies.{name}"
-    spec = find_spec(room)
-    module = room if spec is None or spec.submodule_search_locations is None else f"{room}.study"
-    return importlib.import_module(module).run(command, progress)
+    if not command.dry_run:
+        from scene2spad.studies import every
+
+        return every.run(command, progress)
+    from scene2spad.dry_runs.studies import dry_run
+
+    if command.name != "all":
+        return dry_run(command)
+    found = [dry_run(replace(command, name=name)) for name in STUDIES]  # type: ignore[arg-type]
+    return {"dry_run": True, "studies": found, "out": str(command.out)}

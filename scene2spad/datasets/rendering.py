@@ -107,7 +107,7 @@ class Job:
             THINNED,
             self.settings().target_fraction,
         ]
-        return asdict(self) | {"schema": 7, "tolerances": tolerances}
+        return asdict(self) | {"schema": 8, "tolerances": tolerances}
 
 
 def render_view(job: Job, view: int, again: int = 0) -> Done:
@@ -264,7 +264,7 @@ def _runs(job: Job, views: Iterable[int]) -> Iterator[tuple[int, ...]]:
     return (tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place))
 
 
-def _check_asked(job: Job, count: int, workers: int) -> None:
+def check_asked(job: Job, count: int, workers: int) -> None:
     """Raise InputError for a set that is too large, or views that do not fit in memory, before anything is made."""
     size = scene_set(job.set).size
     most = LARGEST if size is None else size
@@ -311,7 +311,7 @@ def make_set(
     workers: processes on this machine; scheduler: address of a running Dask scheduler instead, whose workers send the
     files back, so that no file system need be shared. Returns numbers for the command line.
     """
-    _check_asked(job, count, workers)
+    check_asked(job, count, workers)
     folder = Folder(out, job.made())
     missing = count - sum(view < count for view in folder.records)
     todo = (view for view in range(count) if view not in folder.records)

@@ -11,7 +11,6 @@ timings.jsonl seconds and places, kept out of the index so that two runs are the
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,42 +32,57 @@ def file_name(view: int) -> str:
     return f"views/{view:06d}.exr"
 
 
+def _as_text(made: dict) -> str:
+    return json.dumps(made, sort_keys=True, indent=1) + "\n"
+
+
+def _is_continued(path: Path, made: dict) -> bool:
+    """Tell whether a folder holds views of this set already; InputError where it holds anything else."""
+    config = path / "set.json"
+    if not config.is_file():
+        require(is_unclaimed(path), f"{path}: is not empty and holds no set; choose another --out")
+        return False
+    if read_text(config) != _as_text(made):
+        raise InputError(
+            f"{path}: holds a set that was made with other options or another version; choose another --out"
+        )
+    return True
+
+
+def finished_views(path: Path, made: dict) -> dict[int, dict]:
+    """Return the records of the views that need not be rendered again. InputError for the folder of something else."""
+    return _records(path) if _is_continued(path, made) else {}
+
+
+def _records(path: Path) -> dict[int, dict]:
+    lines = [line for name in ("index.jsonl", "journal.jsonl") for line in read_whole_lines(path / name)]
+    known = (line for line in lines if isinstance(line, dict) and isinstance(line.get("view"), int))
+    return {record["view"]: record for record in known if _stands(path, record)}
+
+
+def _stands(folder: Path, record: dict) -> bool:
+    """Return whether the view of a record is there in full; failed ones are tried again."""
+    if "failed" in record or record.get("file") != file_name(record["view"]):
+        return False
+    path = folder / record["file"]
+    if not isinstance(record.get("error"), (int, float)):
+        return False
+    return path.is_file() and path.stat().st_size == record.get("bytes")
+
+
 class Folder:
     """A set's folder: what is there already, and where finished views go. `made` is all that decides their bytes."""
 
     def __init__(self, path: Path, made: dict) -> None:
         self.path = path
-        asked = json.dumps(made, sort_keys=True, indent=1) + "\n"
-        config = path / "set.json"
-        if config.is_file():
-            if read_text(config) != asked:
-                raise InputError(
-                    f"{path}: holds a set that was made with other options or another version; choose another --out"
-                )
-        else:
-            require(is_unclaimed(path), f"{path}: is not empty and holds no set; choose another --out")
+        if not _is_continued(path, made):
             path.mkdir(parents=True, exist_ok=True)
-            with whole_file(config) as beside:
-                beside.write_text(asked)
+            with whole_file(path / "set.json") as beside:
+                beside.write_text(_as_text(made))
         (path / "views").mkdir(exist_ok=True)
         for left in (*abandoned_files(path), *abandoned_files(path / "views")):
             left.unlink(missing_ok=True)
-        self.records = {r["view"]: r for r in self._known() if self._stands(r)}
-
-    def _known(self) -> Iterator[dict]:
-        for name in ("index.jsonl", "journal.jsonl"):
-            for record in read_whole_lines(self.path / name):
-                if isinstance(record, dict) and isinstance(record.get("view"), int):
-                    yield record
-
-    def _stands(self, record: dict) -> bool:
-        """Return whether the view of a record is there in full; failed ones are tried again."""
-        if "failed" in record or record.get("file") != file_name(record["view"]):
-            return False
-        path = self.path / record["file"]
-        if not isinstance(record.get("error"), (int, float)):
-            return False
-        return path.is_file() and path.stat().st_size == record.get("bytes")
+        self.records = _records(path)
 
     def add(self, done: Done) -> None:
         """Write the file first, then the line that vouches for it."""

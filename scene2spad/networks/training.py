@@ -22,6 +22,7 @@ from csph.training.config import ModelConfig, TrainConfig, preset
 from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
+from scene2spad.datasets.renders import views_at
 from scene2spad.datasets.workers import check_workers
 from scene2spad.options.networks import Evaluate, Train
 from scenes.errors import InputError, require
@@ -133,8 +134,7 @@ def run_train(command: Train, progress: Progress) -> dict:
         init = load_model(checkpoint_of(begun))[0]
         init = NetworkOf(init) if command.init_network else init
         data["init" if command.init else "init_network"] = Path(begun).name
-    name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
-    folder = command.out or Path("out/train") / name
+    folder = folder_of(command)
     result = train(
         replace(config, data=data),
         training,
@@ -146,6 +146,12 @@ def run_train(command: Train, progress: Progress) -> dict:
         devices=command.devices or "auto",
     )
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
+
+
+def folder_of(command: Train) -> Path:
+    """Return the folder of a run: the one asked for, or one named after its options."""
+    name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
+    return command.out or Path("out/train") / name
 
 
 def network_method(model: DepthEstimator, *, overflows: list[int] | None = None, **reading: Any) -> Method:
@@ -226,7 +232,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
     if not 0 <= command.offset < sensor.range_m:
         raise InputError(f"offset {command.offset:g} m is outside 0 to the sensor's range {sensor.range_m:.4f} m")
-    views = read_views(command.set)
+    views = views_at(command.set)
     if command.views is not None:
         require(command.views >= 1, f"views {command.views} is below 1")
         views = Views(views.transients[: command.views], views.scenes[: command.views])

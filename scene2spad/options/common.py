@@ -30,3 +30,11 @@ class Common:
     """Seed of everything random; the same seed gives the same bytes."""
     json: bool = False
     """Print one JSON object as the last line of stdout, and nothing else there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Long(Common):
+    """Options of commands that may take long."""
+
+    dry_run: bool = False
+    """Say what would be done, in which memory and about how long, and write nothing."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
-from scene2spad.options.common import Common, Positional, may_stay_open
+from scene2spad.options.common import Common, Long, Positional, may_stay_open
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,37 +45,39 @@ class Bench(Common):
 
 
 ABLATIONS = ("spatial-block", "tensor-size", "fourier")
+StudyName = Literal[
+    "tensors",
+    "memory",
+    "codes",
+    "power",
+    "chip",
+    "depth-offset",
+    "spatial-block",
+    "tensor-size",
+    "fourier",
+    "real-data",
+    "render-error",
+    "transport",
+    "multipath",
+    "sim-to-real",
+    "all",
+]
+STUDIES: tuple[str, ...] = tuple(name for name in get_args(StudyName) if name != "all")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study(Common):
+class Study(Long):
     """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
     decoded from codes without a network, and the in-pixel processor's power (4, 5); trained codes on that processor,
     beside the same models in floating point; of trained models: scenes moved out
     of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
     captures (13, 14); how much the error of a rendered set itself matters to depth; what a renderer adds to RGB-D
     simulation, step by step; networks beside the filter where light takes several paths; and a real chip's histograms
-    beside what the renderer and the calibrated sensor predict."""
+    beside what the renderer and the calibrated sensor predict. `all` runs one after the other, goes on past those whose
+    data are absent, and ends in a table."""
 
-    name: Positional[
-        Literal[
-            "tensors",
-            "memory",
-            "codes",
-            "power",
-            "chip",
-            "depth-offset",
-            "spatial-block",
-            "tensor-size",
-            "fourier",
-            "real-data",
-            "render-error",
-            "transport",
-            "multipath",
-            "sim-to-real",
-        ]
-    ]
-    """Study to run."""
+    name: Positional[StudyName]
+    """Study to run, or all of them."""
     checkpoints: tuple[Path, ...] = ()
     """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc); trained
     networks of `study render-error` and `study real-data`."""

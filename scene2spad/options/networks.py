@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from scene2spad.options.common import Common, Count, Number, Pixels, Positional, may_stay_open
+from scene2spad.options.common import Common, Count, Long, Number, Pixels, Positional, may_stay_open
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Common):
+class Train(Long):
     """Train a depth network, with or without compressive codes, on a rendered set; a run that was killed goes on."""
 
     design: str = "learned"
@@ -107,8 +107,8 @@ class Evaluate(Common):
     tiled: bool = False
     """Cut images to what the blocks of all networks tile, instead of reflecting what is missing."""
     set: Path
-    """Folder of a set that `dataset` rendered, or its pack (.h5); published: the paper's pairs that lie beside the
-    project, in its own simulation, read by both decoders."""
+    """Folder of a set that `dataset` rendered, its pack (.h5), a transient (.exr) or a folder of them; published: the
+    paper's pairs that lie beside the project, in its own simulation, read by both decoders."""
     baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
     """Estimators of `depth`, and CODE-K decoded without a network."""
     levels: tuple[str, ...] = ()

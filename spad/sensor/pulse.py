@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import erfc, ndtr
 
 from scenes.constants import REFERENCE_PULSE_SIGMA_S
 from scenes.errors import InputError, require
 from scenes.files import read_array
+from spad.sensor.normal import erfc, ndtr
 
 MAX_SAMPLES = 1 << 16
 # Steps of a table that stands for two kernels in one, per standard deviation of the narrower: the table widens the

@@ -1,5 +1,6 @@
 """The transient's file: bit for bit, and every kind of damage refused in one line."""
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -100,7 +101,7 @@ def test_damaged_contents_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema": 2}, "schema 2"),
+        ({"schema": 3}, "schema 3"),
         ({"kind": "depth"}, "holds a depth, expected a transient"),
         ({"kind": "dream"}, "not one of ours"),
         ({"seed": 5}, "do not match"),
@@ -113,8 +114,8 @@ def test_other_kinds_newer_schemas_and_altered_metadata_are_refused(tmp_path, ch
     write_transient(make(300, 6, 8), tmp_path / "t.exr")
     with OpenEXR.File(str(tmp_path / "t.exr"), separate_channels=True) as file:
         parts = [OpenEXR.Part(dict(p.header), dict(p.channels), p.name()) for p in file.parts]
-        meta = json.loads(parts[0].header[ATTRIBUTE])
-        parts[0].header[ATTRIBUTE] = json.dumps({**meta, **change})
+        meta = json.loads(parts[-1].header[ATTRIBUTE])
+        parts[-1].header[ATTRIBUTE] = json.dumps({**meta, **change})
         OpenEXR.File(parts).write(str(tmp_path / "u.exr"))
     with pytest.raises(InputError, match=message):
         read_transient(tmp_path / "u.exr")
@@ -178,3 +179,53 @@ def test_one_bad_pixel_of_a_layer_is_refused(layer, bad):
         InputError, match=rf"1 of 48 values of {layer} are negative or not finite: .* in row 2, column 3"
     ):
         replace(good, **{layer: values})
+
+
+def layers_of(transient: Transient) -> dict[str, np.ndarray]:
+    return {"depth": transient.depth_m, "ambient": transient.ambient, "error": transient.error}
+
+
+def test_flat_layers_in_float32_come_first(tmp_path):
+    import OpenEXR
+
+    write_transient(make(), tmp_path / "t.exr")
+    with OpenEXR.File(str(tmp_path / "t.exr"), separate_channels=True) as file:
+        assert [part.name() for part in file.parts] == ["layers", "surface", "transient"]
+        assert file.parts[0].type() == OpenEXR.scanlineimage and file.parts[2].type() == OpenEXR.deepscanline
+        first = {name: channel.pixels for name, channel in file.parts[0].channels.items()}
+    assert first.keys() == layers_of(make()).keys()
+    for name, values in layers_of(make()).items():
+        assert first[name].dtype == np.float32 and first[name].tobytes() == values.tobytes(), name
+
+
+def test_mitsuba_reads_the_layers_without_rounding(tmp_path):
+    from render.backend.llvm import start_mitsuba
+
+    mi = start_mitsuba()
+    write_transient(make(), tmp_path / "t.exr")
+    bitmap = mi.Bitmap(str(tmp_path / "t.exr"))
+    names = [field.name for field in bitmap.struct_()]
+    values = np.asarray(bitmap).reshape(12, 16, len(names))
+    for name, layer in layers_of(make()).items():
+        np.testing.assert_allclose(values[..., names.index(name)], layer, rtol=1e-6)
+
+
+def test_files_with_the_deep_part_first_still_open(tmp_path):
+    """As version 1 of the file had it: the deep part, then one part of all layers."""
+    import OpenEXR
+
+    transient = make(300, 6, 8)
+    write_transient(transient, tmp_path / "t.exr")
+    with OpenEXR.File(str(tmp_path / "t.exr"), separate_channels=True) as file:
+        parts = {p.name(): (dict(p.header), dict(p.channels)) for p in file.parts}
+    header, deep = parts["transient"]
+    body = {**transient.meta, "kind": "transient", "schema": 1}
+    digest = hashlib.sha256((json.dumps(body, sort_keys=True) + transient.sha256()).encode()).hexdigest()
+    header[ATTRIBUTE] = json.dumps({**body, "sha256": digest}, sort_keys=True)
+    flat = parts["layers"][1] | parts["surface"][1]
+    kept = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File([OpenEXR.Part(header, deep, "transient"), OpenEXR.Part(kept, flat, "layers")]).write(
+        str(tmp_path / "old.exr")
+    )
+    again = read_transient(tmp_path / "old.exr")
+    assert again.sha256() == transient.sha256() and again.meta == transient.meta

@@ -55,10 +55,8 @@ def test_alone_it_prints_its_help_and_version_its_version(capsys):
 
 
 def test_a_file_of_another_kind_is_named_with_the_command_that_takes_it(tmp_path, capsys):
-    for kind in ("transient", "histogram", "weights"):
+    for kind in ("histogram", "weights"):
         READERS[kind].make(tmp_path / f"a{READERS[kind].suffix}")
-    status, _, err = run(capsys, "depth", str(tmp_path / "a.exr"))
-    assert status == 2 and "is a transient" in err and "scene2spad sense" in err
     status, _, err = run(capsys, "depth", str(tmp_path / "a.safetensors"))
     assert status == 2 and "is a checkpoint" in err
     status, _, err = run(capsys, "sense", str(tmp_path / "a.h5"))

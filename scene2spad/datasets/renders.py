@@ -1,0 +1,64 @@
+"""Rendered transients wherever they lie: one file, a folder of files, the folder of a set, or its pack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from scenes.errors import require
+from scenes.files import ATTRIBUTE
+from scenes.io.set_index import read_set_index
+
+if TYPE_CHECKING:
+    from csph.training.views import Views
+
+HEADER_BYTES = 1 << 20  # a file's attributes come first
+
+
+def is_set(folder: Path) -> bool:
+    """Tell whether a folder is one that `dataset` fills."""
+    return any((folder / name).is_file() for name in ("set.json", "index.jsonl"))
+
+
+def transient_files(folder: Path) -> list[Path]:
+    """Return the transients of a set's folder in the order of its index, or those (.exr) of any folder by name.
+
+    Depth maps and other EXR images are passed over. Raises InputError for a folder without a transient.
+    """
+    if is_set(folder):
+        found = [folder / record["file"] for record in read_set_index(folder)]
+    else:
+        found = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr" and is_transient(path))
+    require(bool(found), f"{folder}: no transient (.exr) in this folder, and it is none of a set")
+    return found
+
+
+def is_transient(path: Path) -> bool:
+    """Tell whether the attributes of an EXR file say that it is a transient of ours."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(HEADER_BYTES)
+    return ATTRIBUTE.encode() in head and b'"kind": "transient"' in head
+
+
+def views_at(path: Path) -> Views:
+    """Return the views of a set's folder, of a pack (.h5), of a folder of transients, or of one transient (.exr).
+
+    Raises InputError in one line for anything else, and for a laser that is not at the camera.
+    """
+    from csph.training.views import Views, read_views
+    from render.transient import read_transient
+
+    single = path.is_file() and path.suffix.lower() == ".exr"
+    if not single and not (path.is_dir() and not is_set(path)):
+        return read_views(path)
+    files = [path] if single else transient_files(path)
+    transients = [read_transient(file) for file in files]
+    for file, transient in zip(files, transients, strict=True):
+        displaced = any(transient.meta.get("laser", {}).get("baseline_m", (0, 0, 0)))
+        require(not displaced, f"{file}: its laser is not at the camera, its path is not twice the depth")
+    return Views(
+        tuple(transients),
+        tuple(str(one.meta.get("scene", file.stem)) for file, one in zip(files, transients, strict=True)),
+    )

@@ -1,0 +1,102 @@
+"""Dry run of `study`: the models that it asks for, what is kept of earlier runs, and the seconds of recorded ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import median
+
+from csph.weights.shipped import shipped_file
+from scene2spad.dry_runs.resources import memory
+from scene2spad.dry_runs.training import step_seconds
+from scene2spad.networks.registry import ModelSpec
+from scene2spad.networks.training import PLANES, config_of
+from scene2spad.options.experiments import ABLATIONS, Study
+from scene2spad.studies.every import TIMINGS
+from scenes.io.inputs import read_whole_lines
+
+
+def dry_run(command: Study) -> dict:
+    """Return models, kept results, memory and seconds of one study, as far as they are known."""
+    wanted = wanted_models(command)
+    folder = command.out / command.preset
+    library = command.models or folder / "models"
+    trains = command.retrain or command.preset == "smoke"
+    there = [one.name for one in wanted if _is_there(one, library, shipped=not trains)]
+    missing = [one for one in wanted if one.name not in there]
+    to_train = missing if trains else []
+    training_s = sum(_training_seconds(one, command.preset) for one in to_train)
+    earlier = recorded_seconds(command)
+    basis = []
+    if earlier:
+        basis.append(f"the median of {len(earlier)} finished runs of this preset in {command.out}")
+    if to_train:
+        basis.append(f"{len(to_train)} trainings by some steps of each network on random counts")
+    known = bool(earlier) or bool(to_train)
+    return {
+        "dry_run": True,
+        "study": command.name,
+        "preset": command.preset,
+        "models": {
+            "there": there,
+            "to_train": [one.name for one in to_train],
+            "left_out": [one.name for one in missing if one not in to_train],
+        },
+        "kept": {"results": _lines(folder / "results"), "rendered_views": _views(folder / "sets")},
+        "memory": memory(None),
+        "estimate": {"seconds": (median(earlier) if earlier else training_s) if known else None},
+        "basis": "; ".join(basis) or "unknown: no run of this preset has been recorded here",
+        "out": str(command.out),
+    }
+
+
+def wanted_models(command: Study) -> list[ModelSpec]:
+    """Return the trained models that a study asks for; none of those that need none."""
+    found: tuple[ModelSpec, ...] = ()
+    if command.name in ABLATIONS:
+        from scene2spad.studies.ablations.plan import sheets_of
+
+        sheets = sheets_of(command.name, command.preset, command.full)
+        found = tuple(one for sheet in sheets for one in sheet.wanted)
+    elif command.name == "depth-offset":
+        from scene2spad.studies.depth_offset.plan import plan_of
+
+        found = plan_of(command.preset, command.full).wanted
+    elif command.name == "chip":
+        from scene2spad.studies.chip.plan import plan_of as chip_plan
+
+        found = chip_plan(command.preset).models
+    elif command.name == "multipath":
+        from scene2spad.studies.multipath.plan import MODELS as found
+    elif command.name == "transport" and command.retrain:
+        from scene2spad.studies.transport.plan import MODELS as found
+    return list(dict.fromkeys(found))
+
+
+def recorded_seconds(command: Study) -> list[float]:
+    """Return the seconds of finished runs of this study and preset into this folder."""
+    found = []
+    for line in read_whole_lines(command.out / TIMINGS):
+        match line:
+            case {"study": str(name), "preset": str(preset), "seconds": float(seconds) | int(seconds)}:
+                if (name, preset) == (command.name, command.preset):
+                    found.append(float(seconds))
+    return found
+
+
+def _is_there(one: ModelSpec, library: Path, *, shipped: bool) -> bool:
+    return (library / one.name / "model.safetensors").is_file() or (shipped and shipped_file(one.name).is_file())
+
+
+def _training_seconds(one: ModelSpec, preset: str) -> float:
+    config = config_of(one.command(preset, Path(PLANES), Path()))
+    return step_seconds(config)[0] * config.steps
+
+
+def _lines(folder: Path) -> int:
+    return (
+        sum(sum(1 for _ in read_whole_lines(path)) for path in sorted(folder.glob("*.jsonl"))) if folder.is_dir() else 0
+    )
+
+
+def _views(folder: Path) -> int:
+    return sum(1 for _ in folder.rglob("views/*.exr")) if folder.is_dir() else 0

@@ -1,0 +1,114 @@
+"""Dry run of `train`: the run's configuration, and its cost from recorded epochs or from some steps on noise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import torch
+
+from csph.networks.model import DepthModel, load_model
+from csph.training.config import COUNT_BYTES, TrainConfig
+from csph.weights.cards import checkpoint_of
+from csph.weights.shipped import TIMINGS
+from scene2spad.datasets.workers import check_workers
+from scene2spad.dry_runs.resources import Cost, memory, timed
+from scene2spad.networks.training import PLANES, config_of, folder_of
+from scene2spad.options.networks import Train
+from scenes.errors import require
+from scenes.io.inputs import read_json_object, read_whole_lines
+
+PILOT_STEPS = 3
+
+
+class Recorded(NamedTuple):
+    """Epochs of a run that are done, and the median seconds of one."""
+
+    epochs: int
+    seconds: float
+
+
+def dry_run(command: Train) -> dict:
+    """Return configuration, memory and estimated seconds of a training, and what these are based on."""
+    config = config_of(command)
+    config.check_memory()
+    require(bool(command.set), "train: --set without a set")
+    check_workers(command.workers, least=0)
+    for path in (*command.set, *command.validation):
+        require(str(path) == PLANES or path.exists(), f"{path}: file not found")
+    if command.init is not None:
+        load_model(checkpoint_of(command.init))
+    folder = folder_of(command)
+    done = recorded_epochs(folder)
+    if done is None:
+        seconds, parameters = step_seconds(config)
+        steps = config.steps
+        basis = (
+            f"{PILOT_STEPS} steps of this network on random counts, after one that is not counted: without drawing "
+            "patches, reading sets, and validation"
+        )
+    else:
+        seconds, parameters = done.seconds / config.steps_per_epoch, DepthModel(config.model).parameters_count
+        steps = max(config.epochs - done.epochs, 0) * config.steps_per_epoch
+        basis = f"the recorded seconds of {done.epochs} epochs in this folder"
+    return {
+        "dry_run": True,
+        "model": config.model.name,
+        "parameters": parameters,
+        "plan": plan_of(config),
+        "sets": [str(path) for path in command.set],
+        "steps_left": steps,
+        "memory": memory(COUNT_BYTES * config.batch * config.crop**2 * config.model.sensor.bins),
+        "estimate": {"seconds": seconds * steps, "seconds_per_step": seconds},
+        "basis": basis,
+        "out": str(folder),
+    }
+
+
+def plan_of(config: TrainConfig) -> dict:
+    """Return what a run consists of, in the words of `config.json`."""
+    names = ("preset", "epochs", "steps_per_epoch", "batch", "crop", "rate", "schedule", "window", "precision")
+    return {name: getattr(config, name) for name in names} | {"steps": config.steps}
+
+
+def recorded_epochs(folder: Path) -> Recorded | None:
+    """Return what a run's folder has recorded of its epochs; None where there is nothing. InputError for another
+    folder."""
+    if not folder.exists():
+        return None
+    require(folder.is_dir(), f"{folder}: is a file, expected a folder")
+    if not (folder / "config.json").is_file():
+        return None
+    read_json_object(folder / "config.json", "configuration")
+    found = {}
+    for line in read_whole_lines(folder / TIMINGS):
+        match line:
+            case {"epoch": int(epoch), "wall_s": float(wall) | int(wall)}:
+                found[epoch] = float(wall)
+    return Recorded(max(found), median(found.values())) if found else None
+
+
+def step_seconds(config: TrainConfig) -> tuple[float, int]:
+    """Return seconds of a training step on this machine, on random counts, and the number of parameters."""
+    from csph.training.data import TrainBatch
+    from csph.training.loop import DepthTraining  # and Lightning, which takes seconds to import
+
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    module, sensor = DepthTraining(config), config.model.sensor
+    bins, shape = config.window or sensor.bins, (config.batch, config.crop, config.crop)
+    random = torch.Generator().manual_seed(0)
+    counts = torch.poisson(torch.full((shape[0], 1, bins, *shape[1:]), 0.1), generator=random)
+    depth = torch.full(shape, 0.4 * bins * sensor.bin_depth_m)
+    first = torch.full(shape[:1], 0 if config.window else -1)
+    batch = TrainBatch(counts, depth, torch.ones(shape, dtype=torch.bool), first)
+    adam = torch.optim.Adam(module.model.parameters(), lr=config.rate, fused=True)
+
+    def step() -> None:
+        adam.zero_grad()
+        module.loss(batch).backward()
+        adam.step()
+
+    costs: list[Cost] = [timed(step)[1] for _ in range(1 + PILOT_STEPS)]
+    return median(cost.wall_s for cost in costs[1:]), module.model.parameters_count

@@ -1,0 +1,110 @@
+"""Run a study by its name, or all of them one after the other; the seconds of each go to a journal beside results."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import time
+from dataclasses import asdict, replace
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from scene2spad.options.experiments import ABLATIONS, STUDIES, Study
+from scenes.errors import InputError
+from scenes.files import append_line
+from scenes.io.inputs import read_whole_lines
+from scenes.progress import Progress
+
+log = logging.getLogger("scene2spad")
+
+TIMINGS = "timings.jsonl"
+ALL = "all"
+JOURNAL = "study-all.jsonl"
+
+
+def run(command: Study, progress: Progress) -> dict:
+    """Run one study, or with `all` every one; see `run_all`."""
+    if command.name == ALL:
+        return run_all(command, progress)
+    return run_one(command, progress)
+
+
+def run_one(command: Study, progress: Progress) -> dict:
+    """Run the study of the command's name, whose module is imported now; its seconds are appended to TIMINGS."""
+    name = "ablations" if command.name in ABLATIONS else command.name.replace("-", "_")
+    room = f"scene2spad.studies.{name}"
+    spec = find_spec(room)
+    module = room if spec is None or spec.submodule_search_locations is None else f"{room}.study"
+    start = time.perf_counter()
+    result = importlib.import_module(module).run(command, progress)
+    took = {"study": command.name, "preset": command.preset, "seconds": round(time.perf_counter() - start, 3)}
+    append_line(command.out / TIMINGS, json.dumps(took))
+    return result
+
+
+def run_all(command: Study, progress: Progress) -> dict:
+    """Run every study with the same options; the data of some may be absent.
+
+    Studies that came to their end with these options are not run again, as long as their figures are there. Returns a
+    table of all: done, done before, or left out and why. Raises InputError where not one could be run.
+    """
+    rows: list[dict[str, Any]] = []
+    for number, name in enumerate(STUDIES):
+        one = replace(command, name=name)  # type: ignore[arg-type]  # STUDIES are the names of the option
+        row = _finished(one)
+        if row is None:
+            log.info("study %s (%d of %d)", name, number + 1, len(STUDIES))
+            row = _attempt(one, _part(progress, name, number))
+        rows.append(row)
+    if all(row["status"] == "left out" for row in rows):
+        raise InputError(f"study all: none could be run; {rows[0]['study']}: {rows[0]['why']}")
+    left = [row["study"] for row in rows if row["status"] == "left out"]
+    shown = rows if command.json else _table(rows)
+    return {"studies": shown, "left_out": left, "preset": command.preset, "out": str(command.out)}
+
+
+def _attempt(command: Study, progress: Progress) -> dict:
+    start = time.perf_counter()
+    try:
+        result = run_one(command, progress)
+    except InputError as error:
+        why = " ".join(str(error).split())
+        log.warning("study %s: left out, %s", command.name, why)
+        return {"study": command.name, "status": "left out", "seconds": time.perf_counter() - start, "why": why}
+    figures = [str(path) for path in result.get("figures", [])]
+    append_line(command.out / JOURNAL, json.dumps({"asked": _asked(command), "figures": figures}))
+    seconds = time.perf_counter() - start
+    return {"study": command.name, "status": "done", "seconds": seconds, "figures": figures}
+
+
+def _asked(command: Study) -> str:
+    """All that decides a study's results, but for what it finds in folders."""
+    ignored = {"json": False, "dry_run": False, "ship": False}
+    options = asdict(replace(command, **ignored))
+    return json.dumps({**options, "version": version("scene2spad")}, sort_keys=True, default=str)
+
+
+def _finished(command: Study) -> dict | None:
+    """Return the row of a study that has been run with these options; None where it is to be run."""
+    asked = _asked(command)
+    for line in read_whole_lines(command.out / JOURNAL):
+        match line:
+            case {"asked": str(known), "figures": [*figures]} if known == asked:
+                if all(Path(str(path)).is_file() for path in figures):
+                    return {"study": command.name, "status": "done before", "seconds": 0.0, "figures": figures}
+    return None
+
+
+def _part(progress: Progress, name: str, number: int) -> Progress:
+    return lambda what, fraction: progress(f"{name}: {what}", (number + fraction) / len(STUDIES))
+
+
+def _table(rows: list[dict]) -> list[str]:
+    return [
+        f"{row['study']:<14} {row['status']:<12} {row['seconds']:8.1f} s  "
+        + (row["why"] if "why" in row else f"{len(row['figures'])} figures")
+        for row in rows
+    ]
