@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from spad.zones.sensor import ZoneArray, ZoneReturns, expected_zone_counts, zone
 STEPS = (5e-4, 0.01, 0.01)
 REACH = (0.02, 0.2, 0.2)  # the most that one step of the fit moves
 ITERATIONS = 5
+COVERAGE = 0.95  # of intervals
 
 
 class Pose(NamedTuple):
@@ -91,18 +93,16 @@ def find_pose(
 
 
 class ModelCovariance(NamedTuple):
-    """Covariance (4, 4) that the model's errors add to a pose, and the number of known poses that it is from."""
+    """Covariance (4, 4) that the model's errors add to a pose, and half widths (4,) of 95 % intervals in units of the
+    standard errors of both together."""
 
     covariance: np.ndarray
-    poses: int
+    factors: np.ndarray
 
     def interval(self, found: Pose) -> tuple[np.ndarray, np.ndarray]:
-        """Return standard errors of a pose's values, photons and model together, and half widths of 95 % intervals.
-
-        Student's t with as many degrees of freedom as there were known poses: few of them make intervals wider.
-        """
+        """Return standard errors of a pose's values, photons and model together, and half widths of 95 % intervals."""
         sigma = np.sqrt(np.diag(found.covariance + self.covariance))
-        return sigma, sigma * stdtrit(self.poses, 0.975)
+        return sigma, sigma * self.factors
 
 
 def model_covariance(errors: np.ndarray, covariances: np.ndarray) -> ModelCovariance:
@@ -111,11 +111,20 @@ def model_covariance(errors: np.ndarray, covariances: np.ndarray) -> ModelCovari
     errors (N, 4) of poses found from captures of known poses, covariances (N, 4, 4) by the Fisher information. That
     takes the errors of bins as independent. The model's own are not: all bins of a capture are late together. Errors
     are about zero, so that a bias widens the intervals, too. InputError without a known pose.
+
+    Intervals are conformal: the known pose of rank ceil(0.95 (N + 1)) decides how many standard errors hold 95 % of
+    further ones, whatever the law of the errors (Vovk et al., Algorithmic Learning in a Random World, 2005). Below 19
+    known poses there is no such rank, and Student's t of N degrees of freedom stands in.
     """
-    require(len(errors) > 0, "model covariance: no capture of a known pose")
+    count = len(errors)
+    require(count > 0, "model covariance: no capture of a known pose")
     excess = (errors[:, :, None] * errors[:, None, :] - covariances).mean(axis=0)
     values, directions = np.linalg.eigh(excess)
-    return ModelCovariance((directions * np.maximum(values, 0)) @ directions.T, len(errors))
+    added = (directions * np.maximum(values, 0)) @ directions.T
+    in_sigmas = np.sort(np.abs(errors) / np.sqrt(np.diagonal(covariances + added, axis1=1, axis2=2)), axis=0)
+    rank = math.ceil(COVERAGE * (count + 1))
+    student = np.full(errors.shape[1], stdtrit(count, (1 + COVERAGE) / 2))
+    return ModelCovariance(added, in_sigmas[rank - 1] if rank <= count else student)
 
 
 def nearest_start(counts: np.ndarray, known_m: Sequence[float], known: np.ndarray) -> float:
