@@ -37,8 +37,8 @@ def dry_run(scene: Scene, settings: RenderSettings, seed: int) -> dict:
         "memory": memory(MIN_PIXEL_BYTES * pixels),
         "estimate": _estimate(trial, cost, planning.wall_s + compiling.wall_s, pixels / traced),
         "basis": f"the plan's pilot, and a trial of {trial.width} x {trial.height} pixels by that plan in "
-        f"{cost.wall_s:.2f} s, scaled by the number of pixels; larger pixels take more rays each, so this is an "
-        "upper bound but for other work on this machine",
+        f"{cost.wall_s:.2f} s, scaled by the number of pixels; larger pixels take more rays each, so this is "
+        "rather too much, but for other work on this machine",
     }
 
 
