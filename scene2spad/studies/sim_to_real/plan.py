@@ -29,7 +29,7 @@ class Plan:
     nearest_m: float = 0.1
     every: int = 2
     ablated: tuple[str, ...] = EFFECTS
-    pose_every: int = 1
+    pose_every: int = 2
     shown_m: tuple[float, ...] = (0.105, 0.2, 0.3825)
 
 
