@@ -75,8 +75,12 @@ def _on_processes(workers: int, work: Work, runs: Iterable[Numbers], lost: Lost)
             try:
                 while True:
                     for run in islice(waiting, 2 * workers - len(running)):
-                        with _interrupts_blocked():
-                            running[pool.submit(work, run)] = run
+                        try:
+                            with _interrupts_blocked():
+                                running[pool.submit(work, run)] = run
+                        except BrokenProcessPool:  # noticed here first: nobody has this run
+                            waiting = chain([run], waiting)
+                            raise
                     if not running:
                         return
                     for future in wait(running, return_when=FIRST_COMPLETED).done:

@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from scene2spad.cli import main
 from scene2spad.datasets import rendering as dataset
 from scene2spad.datasets.rendering import Job, make_set, pack_set, render_view
 from scene2spad.datasets.set_folder import Folder
+from scene2spad.datasets.workers import executor
 from scenes import InputError
 from scenes.io.set_index import read_set_index
 
@@ -304,6 +307,23 @@ def test_a_dead_worker_process_loses_nothing(whole, tmp_path):
     if workers:
         os.kill(int(workers[0]), signal.SIGKILL)
     assert process.wait() == 0 and contents(out) == contents(whole)
+
+
+def test_a_run_that_a_broken_pool_refuses_is_not_lost(monkeypatch):
+    """The death of a worker can be noticed by `submit`, whose run then nobody has."""
+    refused = []
+
+    def submit(pool, work, run):
+        if run == (3,) and not refused:
+            refused.append(run)
+            raise BrokenProcessPool("a worker died")
+        return ordinary(pool, work, run)
+
+    ordinary = ProcessPoolExecutor.submit
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", submit)
+    with executor(2, None) as run:
+        found = list(run(list, [(number,) for number in range(6)], lambda number, why: -1))
+    assert refused and sorted(found) == list(range(6))
 
 
 @pytest.mark.slow
