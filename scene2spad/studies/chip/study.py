@@ -169,7 +169,7 @@ def _in_words(numbers: dict[str, Any]) -> dict[str, Any]:
     for row in numbers["compared"]:
         message = f"{row['float_mae_mm']:.1f} mm in float, {row['chip_mae_mm']:.1f} on the chip"
         apart = f"{row['difference']:+.2%} ({row['low']:+.2%} to {row['high']:+.2%})"
-        lines.append(f"{row['set']}, {row['model'].rstrip(",")}: {message}, {apart}")
+        lines.append(f"{row['set']}, {row['model'].rstrip(',')}: {message}, {apart}")
     emulated = [
         f"{row['model']}: {row['photons']:,} photons interpreted, {row['wraps']} wraps, {row['differs_from_torch']} "
         f"integers differ from torch, {row['differs_from_fast']} from the fast array"
