@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -101,3 +102,11 @@ def test_importing_a_package_starts_nothing(package):
     code = f"import sys, {package}; print([m for m in ('mitsuba', 'drjit', 'torch', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_wheel_holds_every_package():
+    """Packages are listed by hand; one that is forgotten is missing from the wheel alone, where no other test looks."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert sorted(settings["tool"]["setuptools"]["packages"]) == sorted(
+        {".".join(p.parent.relative_to(ROOT).parts) for p in FILES.values()}
+    )

@@ -25,6 +25,7 @@ FITS = {
     "gray-1024x1x1-128x-s0": (132, 272),
     "fourier-256x1x1-128x-s0": (48, 80),
     "fourier-learned-256x2x2-128x-s0": (141, 137),
+    "fourier-learned-256x2x2-64x-s0": (261, 209),
     "fourier-learned-256x4x4-128x-s0": (519, 353),
     "learned-16x4x4-128x-s0": (30, 291),
 }  # clocks a photon and bytes of RAM
