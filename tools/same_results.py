@@ -89,10 +89,11 @@ def run_all(tree: Path, commands: tuple[str, ...], folder: Path) -> None:
     """Run commands of a tree in a folder that is emptied before; what each prints with --json is kept beside."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    module = next(one for one in MODULES if (tree / one.replace(".", "/")).exists())
+    found = (one for one in MODULES for end in ("", ".py") if (tree / f"{one.replace('.', '/')}{end}").exists())
+    program = f"import sys; from {next(found)} import main; sys.exit(main(sys.argv[1:]))"
     surroundings = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
     for number, command in enumerate(commands):
-        words = [sys.executable, "-m", module, *command.split(), "--json"]
+        words = [sys.executable, "-c", program, *command.split(), "--json"]
         done = subprocess.run(words, cwd=folder, env=surroundings, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"{tree}: {command}: exit status {done.returncode}\n{done.stderr[-2000:]}")

@@ -1,4 +1,4 @@
-"""The command line: one file a command, its options above what it does. Heavy imports wait inside `run`."""
+"""The command line: one file a command, in rooms by stage, its options first. Heavy imports wait inside `run`."""
 
 from scene2spad.cli.main import main
 

@@ -14,6 +14,7 @@ from dataclasses import fields
 from functools import reduce
 from importlib.metadata import version
 from operator import or_
+from types import ModuleType
 from typing import Annotated, Any
 
 import tyro
@@ -26,27 +27,28 @@ from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."
-# In the order of --help. `scene2spad.cli.NAME` has the options, a class `Name`, and `run`; only what runs is imported.
-COMMANDS = (
-    "demo",
-    "scenes",
-    "render",
-    "dataset",
-    "sense",
-    "depth",
-    "inspect",
-    "compare",
-    "export",
-    "show",
-    "calibrate",
-    "train",
-    "models",
-    "evaluate",
-    "ultraphase",
-    "study",
-    "bench",
-    "report",
-)
+# In the order of --help: every command and its room. `scene2spad.cli.ROOM.NAME` has the options, a class `Name`, and
+# `run`; only what runs is imported.
+COMMANDS = {
+    "demo": "simulation",
+    "scenes": "simulation",
+    "render": "simulation",
+    "dataset": "simulation",
+    "sense": "simulation",
+    "depth": "simulation",
+    "inspect": "results",
+    "compare": "results",
+    "export": "results",
+    "show": "results",
+    "calibrate": "simulation",
+    "train": "networks",
+    "models": "networks",
+    "evaluate": "networks",
+    "ultraphase": "experiments",
+    "study": "experiments",
+    "bench": "experiments",
+    "report": "experiments",
+}
 
 
 def main(argv: list[str]) -> int:
@@ -90,14 +92,18 @@ def main(argv: list[str]) -> int:
 
 def options_of(name: str) -> type[Common]:
     """Return the class of a command's options; its module is imported now."""
-    options: type[Common] = getattr(importlib.import_module(f"scene2spad.cli.{name}"), name.capitalize())
+    options: type[Common] = getattr(_module_of(name), name.capitalize())
     return options
 
 
 def runner_of(name: str) -> Callable[[Any, Progress], dict]:
     """Return the function that runs a command."""
-    run: Callable[[Any, Progress], dict] = importlib.import_module(f"scene2spad.cli.{name}").run
+    run: Callable[[Any, Progress], dict] = _module_of(name).run
     return run
+
+
+def _module_of(name: str) -> ModuleType:
+    return importlib.import_module(f"scene2spad.cli.{COMMANDS[name]}.{name}")
 
 
 def _check_words(argv: list[str]) -> None:

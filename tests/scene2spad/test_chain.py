@@ -114,7 +114,7 @@ def test_flood_light_is_reported_beside_the_scan(capsys):
 
 @pytest.mark.parametrize("baseline", [(0.5, 0.0, 0.0), (0.0, 0.2, -0.3)])
 def test_displaced_laser_is_decoded_by_its_ellipsoid(baseline):
-    from scene2spad.cli.depth import depth_map
+    from scene2spad.cli.simulation.depth import depth_map
     from scenes.library.catalog import load_scene
 
     scene = replace(load_scene("plane", width=24, height=18), laser=Laser("flood", baseline, 120.0))

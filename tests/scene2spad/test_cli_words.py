@@ -64,7 +64,7 @@ def test_a_file_of_another_kind_is_named_with_the_command_that_takes_it(tmp_path
 
 
 def test_depth_maps_of_two_checkpoints_have_two_names():
-    from scene2spad.cli.depth import Depth, depth_label
+    from scene2spad.cli.simulation.depth import Depth, depth_label
 
     def label(checkpoint: str) -> str:
         return depth_label(Depth(file=Path("a.h5"), method="network", checkpoint=Path(checkpoint)))

@@ -13,7 +13,7 @@ from render.engine import render
 from render.settings import RenderSettings
 from scene2spad.bench import encode as bench_encode
 from scene2spad.cli import main
-from scene2spad.cli.depth import depth_map
+from scene2spad.cli.simulation.depth import depth_map
 from scene2spad.studies import codes, memory, tensors
 from scenes import Laser
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S

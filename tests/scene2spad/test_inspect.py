@@ -8,7 +8,7 @@ import pytest
 
 from render.transient import read_transient
 from scene2spad.cli import main
-from scene2spad.cli.inspect import BARS, WIDTH, drawn
+from scene2spad.cli.results.inspect import BARS, WIDTH, drawn
 from spad.formats.histogram import read_histogram
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_flux import transient_of
 
-from scene2spad.cli.sensing import summary
+from scene2spad.cli.simulation.sensing import summary
 from spad.detection.detect import sense
 from spad.detection.glints import glint_warning, signal_fractions
 from spad.sensor.model import PhotonBudget, Sensor

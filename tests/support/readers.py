@@ -228,7 +228,7 @@ def _write_dark_map(path: Path) -> None:
 
 
 def _read_dark_map(path: Path) -> Numbers:
-    from scene2spad.cli.sensing import read_dark_map
+    from scene2spad.cli.simulation.sensing import read_dark_map
 
     yield read_dark_map(path, _transient()), True
 

@@ -99,7 +99,7 @@ def run(command: Depth, progress: Progress) -> dict:
 
 def _sensed(command: Depth, source: Path, seed: int) -> tuple[Histogram, str]:
     """Return the histogram of a transient, and the words that say what it was sensed with."""
-    from scene2spad.cli.sensing import DEFAULT_PHOTONS
+    from scene2spad.cli.simulation.sensing import DEFAULT_PHOTONS
     from spad.detection.detect import sense
     from spad.sensor.files import load_sensor
     from spad.sensor.model import PhotonBudget
@@ -150,7 +150,7 @@ def _mean(values: list[float]) -> float:
 
 def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram, source: Path, out: Path) -> dict:
     """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
-    from scene2spad.cli.sensing import mean_confidence
+    from scene2spad.cli.simulation.sensing import mean_confidence
     from spad.estimators.depth import depth_errors
 
     label, fraction = depth_label(command), None

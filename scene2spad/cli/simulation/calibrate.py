@@ -35,6 +35,6 @@ class Calibrate(Common):
 def run(command: Calibrate, progress: Progress) -> dict:
     """Run the command: captures -> sensor file, its standard errors, and the likelihood of the captures that were held
     out."""
-    from scene2spad.cli import calibrating
+    from scene2spad.cli.simulation import calibrating
 
     return calibrating.run(command, progress)

@@ -89,6 +89,6 @@ class Sense(Common):
 
 def run(command: Sense, progress: Progress) -> dict:
     """Run the command: transient -> .h5, a picture of its counts, and with --export the .mat layout."""
-    from scene2spad.cli import sensing
+    from scene2spad.cli.simulation import sensing
 
     return sensing.run(command, progress)

@@ -45,6 +45,6 @@ class Ultraphase(Common):
 
 def run(command: Ultraphase, progress: Progress) -> dict:
     """Run the command: the emulated in-pixel processor."""
-    from scene2spad.cli import ultraphase_actions
+    from scene2spad.cli.experiments import ultraphase_actions
 
     return ultraphase_actions.run(command, progress)

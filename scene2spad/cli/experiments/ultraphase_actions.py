@@ -19,7 +19,7 @@ from ultraphase.chip import ASSUMPTIONS
 from ultraphase.power import READINGS, Cost, Load, as_csv, measured_cost, power, reference_bits, sweep, table
 
 if TYPE_CHECKING:
-    from scene2spad.cli.ultraphase import Ultraphase
+    from scene2spad.cli.experiments.ultraphase import Ultraphase
 
 _MAX_PHOTONS = 20_000
 _MAX_WATCHED = 100

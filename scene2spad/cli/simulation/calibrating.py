@@ -17,7 +17,7 @@ from spad.zones.expected_counts import ZoneCapture
 from spad.zones.sensor import expected_zone_counts
 
 if TYPE_CHECKING:
-    from scene2spad.cli.calibrate import Calibrate
+    from scene2spad.cli.simulation.calibrate import Calibrate
 
 MIN_CAPTURES = 16
 

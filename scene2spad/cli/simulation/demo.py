@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scene2spad.cli.paths import output_file
-from scene2spad.cli.render import in_view
+from scene2spad.cli.simulation.render import in_view
 from scene2spad.options.common import Common
 from scenes.errors import InputError
 from scenes.library.catalog import load_scene

@@ -29,7 +29,7 @@ from spad.sensor.pulse import AnyPulse, Pulse, read_pulse
 from spad.zones.sensor import ZoneArray
 
 if TYPE_CHECKING:
-    from scene2spad.cli.sense import Sense
+    from scene2spad.cli.simulation.sense import Sense
 
 log = logging.getLogger("scene2spad")
 

@@ -1,0 +1,1 @@
+"""Commands of whole experiments: the emulated chip, studies, benches, the report."""

@@ -1,0 +1,1 @@
+"""Commands of trained networks: train, list, evaluate."""

@@ -1,0 +1,1 @@
+"""Commands that read what other commands wrote: look inside, compare, convert, show."""
