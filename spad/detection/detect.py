@@ -13,6 +13,7 @@ import numpy as np
 
 from render.transient import Transient
 from scenes.errors import InputError
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.exposure import Exposure, counts_of, timestamps_of
 from spad.detection.flux import expected_counts, rates_for
@@ -117,7 +118,7 @@ def _planned(
     seed: int,
     model: str,
     dark_map_hz: np.ndarray | None,
-) -> tuple[Exposure, dict]:
+) -> tuple[Exposure, JsonObject]:
     """Prepare the exposure, and what its histogram holds beside the counts."""
     if model not in MODELS:
         raise InputError(f"detection model {model!r} is unknown, expected one of {', '.join(MODELS)}")

@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 from render.transient import Transient
 from scenes.errors import InputError
+from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.progress import Progress
 from scenes.random_streams import Stream
@@ -29,6 +31,7 @@ from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import Sensor
 
+Finished = TypeVar("Finished")
 # One random stream for this many pixels: the counts do not depend on threads, nor on how the work is cut.
 STREAM_PIXELS = 1024
 # From this many primary detections a bin on, drawing every bin is cheaper than drawing every photon (measured).
@@ -72,15 +75,16 @@ class Exposure:
 
     def light(self, block: slice) -> PixelFlux:
         first, last = self.transient.offsets[block.start], self.transient.offsets[block.stop]
-        owner, *returns, background = self.whole
-        return PixelFlux(owner[first:last] - block.start, *(r[first:last] for r in returns), background[block])
+        owner, start, length, signal, background = self.whole
+        part = slice(first, last)
+        return PixelFlux(owner[part] - block.start, start[part], length[part], signal[part], background[block])
 
 
 def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
     """Return (H, W, T) int32."""
     height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
     require_memory(4 * height * width * bins, f"a histogram of {width} x {height} pixels and {bins} bins")
-    counts = np.zeros((height * width, bins), dtype=np.int32)
+    counts: np.ndarray = np.zeros((height * width, bins), dtype=np.int32)
 
     def fill(block: slice, drawn: np.ndarray) -> None:
         if drawn.ndim == 2:
@@ -105,7 +109,7 @@ def _fill(counts: np.ndarray, drawn: np.ndarray) -> None:
 
 
 def timestamps_of(
-    exposure: Exposure, meta: dict, progress: Progress | None, ready: np.ndarray | None = None
+    exposure: Exposure, meta: JsonObject, progress: Progress | None, ready: np.ndarray | None = None
 ) -> Timestamps:
     height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
     if exposure.sensor.crosstalk and exposure.model == "poisson":
@@ -123,14 +127,17 @@ def timestamps_of(
     return Timestamps(height, width, bins, np.concatenate(stamps), offsets, meta)
 
 
-def _draw(exposure: Exposure, finish: Callable, progress: Progress | None, ready: np.ndarray) -> list:
+def _draw(
+    exposure: Exposure, finish: Callable[[slice, np.ndarray], Finished], progress: Progress | None, ready: np.ndarray
+) -> list[Finished]:
     """Call finish(block, detected) for every block, on as many threads as torch has.
 
     What was detected: counts (P, T), or places pixel x T + bin (N,) int32 in no order, pixels counted from the block's.
     """
     if exposure.sensor.crosstalk and exposure.model != "poisson":
         return [finish(block, places) for block, places in _with_crosstalk(exposure, ready)]
-    blocks, workers, finished = exposure.blocks, torch.get_num_threads(), []
+    blocks, workers = exposure.blocks, torch.get_num_threads()
+    finished: list[Finished] = []
     with ThreadPoolExecutor(workers) as pool:
         for start in range(0, len(blocks), 4 * workers):  # no more at once than a few
             if progress is not None:
@@ -167,7 +174,7 @@ def _places(detected: Detections | PhotonEvents, sensor: Sensor) -> np.ndarray:
 
 
 def _first_photons(
-    exposure: Exposure, light: PixelFlux, rng: np.random.Generator, events: tuple | None = None
+    exposure: Exposure, light: PixelFlux, rng: np.random.Generator, events: PhotonEvents | None = None
 ) -> Detections:
     events = events or draw_primaries(light, exposure.sensor, rng, fraction=exposure.fraction)
     cycle = rng.integers(*exposure.cycles, len(events.pixel))

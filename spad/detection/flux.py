@@ -170,7 +170,7 @@ def signal_per_bin(transient: Transient, sensor: Sensor, pixels: slice, device: 
     signal = torch.zeros(count * period, dtype=torch.float64, device=device)
     wrapped = 0.0
     for size in torch.unique(bins).tolist():
-        for rows in torch.nonzero(bins == size).squeeze(1).split(max(1, BLOCK_ENTRIES // size)):
+        for rows in torch.split(torch.nonzero(bins == size).squeeze(1), max(1, BLOCK_ENTRIES // size)):
             steps = torch.arange(size + 1, device=device)
             # in float64: torch would take integers times a number for float32
             time = (start[rows].double() * width - near[rows])[:, None] + steps.double() * width

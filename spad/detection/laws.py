@@ -95,7 +95,9 @@ def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.
 NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
-def crosstalk_events(pixel: np.ndarray, fraction: float, height: int, width: int, rng: np.random.Generator) -> tuple:
+def crosstalk_events(
+    pixel: np.ndarray, fraction: float, height: int, width: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Return detections that others fire in their neighbours: (index of the cause, pixel), each (M',) int64.
 
     Every detection fires each of its neighbours with probability `fraction`, independently; none beyond the array's

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -37,6 +37,7 @@ class PackedTransients:
     depth_m       (S, H, W) float32 label, NaN for none
     ambient       (S, H, W) float32, any scale
     mixed         (S, H, W) bool
+    mean_radiance, mean_ambient   (S,) float64, over all pixels of a scene: computed
     """
 
     offsets: np.ndarray
@@ -46,6 +47,8 @@ class PackedTransients:
     depth_m: np.ndarray
     ambient: np.ndarray
     mixed: np.ndarray
+    mean_radiance: np.ndarray = field(init=False, repr=False)
+    mean_ambient: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         shape, returns = self.depth_m.shape, len(self.radiance)

@@ -92,7 +92,7 @@ def by_pixels(function: Callable[[Tensor], Tensor], rows: Tensor, per_pixel: int
 
     `per_pixel` is the size of its largest intermediate tensor for one pixel, where that exceeds T."""
     size = max(1, _CHUNK.get(rows.device.type, _CHUNK["cuda"]) // max(1, rows.shape[-1], per_pixel))
-    return torch.cat([function(part) for part in rows.split(size)])
+    return torch.cat([function(part) for part in torch.split(rows, size)])
 
 
 def depth_in_range(depth_m: Tensor, sensor: Sensor) -> Tensor:

@@ -104,7 +104,9 @@ def _best_step(scores_of: Callable[[Tensor], Tensor], taps: Taps) -> Tensor:
     return (rows[:, 0] + grid_peak(scores_of(taps.finest[rows]))) * FINEST_STEP - 1 - FINE_STEP
 
 
-def _signal_and_background(near: Tensor, exists: Tensor, total: Tensor, sensor: Sensor, taps: Taps) -> tuple:
+def _signal_and_background(
+    near: Tensor, exists: Tensor, total: Tensor, sensor: Sensor, taps: Taps
+) -> tuple[Tensor, Tensor]:
     """Signal S and background B per bin, (P,) each, by two moments: counts inside a window of +-2 sigma around the peak
     = m S + W B, all counts = M S + T B, where m and M are the pulse's shares in the window and in all bins (M = 1 but
     at the edge of bins that do not cover the period), W the window's bins.

@@ -41,7 +41,7 @@ def dense_counts(histogram: Histogram) -> dict[str, np.ndarray]:
     return {
         "data": histogram.counts,
         "tofs": (np.arange(sensor.bins) + 0.5) * sensor.bin_width_s,
-        "bin_width_s": np.float64(sensor.bin_width_s),
+        "bin_width_s": np.array(sensor.bin_width_s),
         "depth_m": histogram.depth_m,
         "albedo": histogram.albedo.astype(np.float32),
         "expected_signal": histogram.expected_signal,
@@ -60,7 +60,7 @@ def dense_radiance(transient: Transient, sensor: Sensor) -> dict[str, np.ndarray
     return {
         "data": data.reshape(transient.height, transient.width, sensor.bins),
         "tofs": (np.arange(sensor.bins) + 0.5) * sensor.bin_width_s,
-        "bin_width_s": np.float64(sensor.bin_width_s),
+        "bin_width_s": np.array(sensor.bin_width_s),
         "depth_m": transient.depth_m,
         "albedo": transient.albedo.astype(np.float32),
     }
@@ -73,7 +73,7 @@ def write_dense(arrays: dict[str, np.ndarray], path: Path, *, layout: Layout = "
     suffix = path.suffix.lower()
     if suffix == ".npz":
         with whole_file(path) as beside, beside.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, allow_pickle=True, **arrays)
         return path
     if suffix not in (".h5", ".hdf5"):
         raise InputError(f"{path}: a dense export ends in .npz or .h5")

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.textures import read_flat_exr
+from scenes.json_types import JsonObject
 
 
-def write_depth(depth_m: np.ndarray, path: Path, meta: dict[str, Any], confidence: np.ndarray | None = None) -> None:
+def write_depth(depth_m: np.ndarray, path: Path, meta: JsonObject, confidence: np.ndarray | None = None) -> None:
     """Write a depth map (H, W) [m], and beside it how sure a network is of it (`confidence`, in [0, 1])."""
     import OpenEXR
 
@@ -31,7 +31,7 @@ def write_depth(depth_m: np.ndarray, path: Path, meta: dict[str, Any], confidenc
             raise OSError(str(error)) from None
 
 
-def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray | None, dict[str, Any]]:
+def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray | None, JsonObject]:
     """Read a depth map, its confidence or None, and its metadata; check its hash.
 
     Raises InputError in one line for a missing, foreign, truncated or altered file.

@@ -12,6 +12,7 @@ import numpy as np
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
+from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.notebook import html_card
 from spad.formats.timestamps import counts_from_timestamps, timestamps_from_counts
@@ -41,7 +42,7 @@ class Histogram:
     albedo: np.ndarray
     expected_signal: np.ndarray
     expected_background: np.ndarray
-    meta: dict = field(default_factory=dict)
+    meta: JsonObject = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.counts.ndim != 3 or self.counts.dtype != np.int32 or self.counts.shape[2] != self.sensor.bins:
@@ -58,7 +59,7 @@ class Histogram:
             array.setflags(write=False)
 
     @classmethod
-    def from_counts(cls, counts: np.ndarray, sensor: Sensor, meta: dict | None = None) -> Histogram:
+    def from_counts(cls, counts: np.ndarray, sensor: Sensor, meta: JsonObject | None = None) -> Histogram:
         """Make a histogram of measured counts whose truth nobody knows.
 
         Parameters
@@ -188,7 +189,7 @@ def read_histogram(path: Path) -> Histogram:
     return replace(histogram, meta={key: value for key, value in meta.items() if key not in ("sensor", "budget")})
 
 
-def _assemble(meta: dict, data: dict[str, np.ndarray]) -> Histogram:
+def _assemble(meta: JsonObject, data: dict[str, np.ndarray]) -> Histogram:
     if not ({*TRUTH} <= {*data} and ("counts" in data or {"timestamps", "offsets"} <= {*data})):
         raise InputError(f"datasets are missing, there are {', '.join(sorted(data)) or 'none'}")
     sensor, budget = Sensor.from_dict(meta["sensor"]), PhotonBudget(**meta["budget"])

@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -19,7 +18,7 @@ import scipy.sparse
 from scenes.errors import require
 from scenes.limits import require_memory
 from spad.formats.histogram import Histogram
-from spad.formats.matfile import load_mat, save_mat
+from spad.formats.matfile import Matrix, load_mat, save_mat
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import Sensor, sensor_by_name
 
@@ -71,7 +70,7 @@ def read_linospad(path: Path, frame: int = 0, *, bins: int = BINS) -> Capture:
     return frame_of(load_mat(path, [COUNTS, IMAGES]), Path(path), frame, bins=bins)
 
 
-def frame_of(contents: Mapping[str, Any], path: Path, frame: int, *, bins: int = BINS) -> Capture:
+def frame_of(contents: Mapping[str, Matrix], path: Path, frame: int, *, bins: int = BINS) -> Capture:
     """Return one frame of a file's variables, as `read_linospad` does."""
     require(COUNTS in contents, f"{path}: holds no {COUNTS}, it is no LinoSPAD capture")
     frames = _entries(contents[COUNTS])
@@ -85,12 +84,12 @@ def frame_of(contents: Mapping[str, Any], path: Path, frame: int, *, bins: int =
     return Capture(counts, image.astype(np.float32).mean(axis=tuple(range(2, image.ndim))))
 
 
-def _entries(cell: object) -> list:
+def _entries(cell: Matrix) -> list[Matrix]:
     """Entries of a MATLAB cell; what is no cell is the only one."""
     return list(cell.ravel()) if isinstance(cell, np.ndarray) and cell.dtype == object else [cell]
 
 
-def _checked(counts: Any, where: str, bins: int) -> scipy.sparse.csc_matrix:
+def _checked(counts: Matrix, where: str, bins: int) -> scipy.sparse.csc_matrix:
     numeric = scipy.sparse.issparse(counts) or isinstance(counts, np.ndarray)
     require(numeric and counts.ndim == 2 and counts.dtype.kind in "buif", f"{where}: holds no matrix of counts")
     found = scipy.sparse.csc_matrix(counts, dtype=np.float64)
@@ -159,4 +158,4 @@ def resampled(capture: Capture, bins: int = 1024, factor: int = 2) -> np.ndarray
 def resampled_sensor(sensor: Sensor, bins: int = 1024) -> Sensor:
     """Return the sensor whose bins the counts are in afterwards: the same pulse and period."""
     width = sensor.bins * sensor.bin_width_s / bins
-    return replace(sensor, name=f"{sensor.name}-{bins}", bins=bins, bin_width_s=width, period_s=None)
+    return replace(sensor, name=f"{sensor.name}-{bins}", bins=bins, bin_width_s=width, period_s=bins * width)

@@ -8,6 +8,7 @@ published `bin` is round(2 d / (c Delta)), with c = 3e8 m/s.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from scenes.limits import require_memory
 from spad.estimators.depth import estimate_depth
 from spad.formats.histogram import Histogram
 from spad.formats.linospad import COUNTS, capture_histogram, frame_of
-from spad.formats.matfile import load_mat, save_mat
+from spad.formats.matfile import Matrix, load_mat, save_mat
 from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_taps
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 from spad.sensor.pulse import SampledPulse
@@ -68,7 +69,7 @@ def _pulse_file(path: Path, height: int, width: int) -> Path:
     return path.with_name(f"PSF_used_for_simulation_nr-{height}_nc-{width}.mat")
 
 
-def _frame(histogram: Histogram) -> dict:
+def _frame(histogram: Histogram) -> dict[str, Matrix | float | dict[str, np.ndarray]]:
     sensor, depth = histogram.sensor, histogram.depth_m.astype(np.float64)
     pulses, known = _pulses(histogram), np.isfinite(depth)
     rates, offset, scaling = _normalised_rates(histogram, pulses)
@@ -177,7 +178,7 @@ def read_mat(path: Path, frame: int = 0) -> Histogram:
         raise InputError(f"{path}: not a frame of this family ({' '.join(str(error).split())[:80]})") from None
 
 
-def _newer_sensor(contents: dict, bins: int, pulse_file: Path) -> Sensor:
+def _newer_sensor(contents: Mapping[str, Matrix], bins: int, pulse_file: Path) -> Sensor:
     """Return the sensor of a frame that says its bin width, with the pulse of the file beside it."""
     plain = Sensor(name="mat", bins=bins, bin_width_s=float(contents["bin_size"].item()))
     if not pulse_file.is_file():
@@ -197,7 +198,7 @@ def _same_pulse(taps: np.ndarray, other: np.ndarray) -> bool:
     return taps.shape == other.shape and bool(np.abs(taps - other).max() < SAME_PULSE)
 
 
-def _histogram(contents: dict, path: Path) -> Histogram:
+def _histogram(contents: Mapping[str, Matrix], path: Path) -> Histogram:
     index = contents["bin" if "bin" in contents else "range_bins"].astype(np.int64)
     height, width = index.shape
     require(contents["spad"].ndim == 2, f"spad has {contents['spad'].ndim} dimensions, expected 2")
@@ -212,7 +213,8 @@ def _histogram(contents: dict, path: Path) -> Histogram:
     if "bin_size" in contents:
         sensor = _newer_sensor(contents, counts.shape[2], _pulse_file(path, height, width))
     else:
-        sensor = replace(sensor_by_name("iccv2023-train"), bins=counts.shape[2], period_s=None)
+        preset, bins = sensor_by_name("iccv2023-train"), counts.shape[2]
+        sensor = replace(preset, bins=bins, period_s=bins * preset.bin_width_s)
     signal, sbr = float(contents["photons"].item()), float(contents["SBR"].item())
     if "mean_background_photons" in contents:
         background = float(contents["mean_background_photons"].item())

@@ -12,13 +12,19 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.limits import require_memory
+
+if TYPE_CHECKING:
+    import scipy.sparse
+
+# What a variable is: an array of numbers, text or cells, or a sparse matrix
+Matrix: TypeAlias = "np.ndarray | scipy.sparse.csc_matrix"
 
 HEADER_BYTES = 128
 MATRIX, COMPRESSED = 14, 15
@@ -33,7 +39,7 @@ HEADER_TEXT = b"MATLAB 5.0 MAT-file, written by scene2spad"
 HEADER_TEXT_BYTES = 116
 
 
-def save_mat(contents: Mapping[str, Any], path: Path) -> None:
+def save_mat(contents: Mapping[str, Matrix | float | dict[str, np.ndarray]], path: Path) -> None:
     """Write variables as a compressed .mat file of version 5, whole or not at all; the same data give the same bytes.
 
     Raises InputError where it cannot be written.
@@ -48,7 +54,7 @@ def save_mat(contents: Mapping[str, Any], path: Path) -> None:
         beside.write_bytes(made.getbuffer())
 
 
-def load_mat(path: Path, names: Sequence[str] | None = None) -> dict[str, Any]:
+def load_mat(path: Path, names: Sequence[str] | None = None) -> dict[str, Matrix]:
     """Read the variables of a .mat file of version 5.
 
     Parameters: `names` (default: all). Numbers come as numpy arrays, sparse matrices as scipy's with indices that
@@ -80,7 +86,8 @@ def checked_contents(data: bytes) -> bytes:
     if data[:8] == b"\x89HDF\r\n\x1a\n" or b"MATLAB 7.3" in data[:HEADER_BYTES]:
         raise InputError("it is of version 7.3; save it again with -v7")
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
-    require(order is not None, "its header has no mark of byte order")
+    if order is None:
+        raise InputError("its header has no mark of byte order")
     require(data[124:126] == struct.pack(f"{order}H", 0x0100), "not of version 5")
     parts, at = [data[:HEADER_BYTES]], HEADER_BYTES
     while at < len(data):

@@ -14,6 +14,7 @@ import numpy as np
 
 from render.transient import Transient
 from scenes.errors import InputError, require
+from scenes.json_types import JsonObject
 from spad.detection.flux import expected_counts, rates_for
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
@@ -115,7 +116,7 @@ def transient_from_rgbd(
     *,
     fov_deg: float | None = None,
     block: int = 1,
-    meta: dict | None = None,
+    meta: JsonObject | None = None,
 ) -> Transient:
     """Return RGB-D images as a transient of point returns at path 2 d, lit by a radiant intensity of 1 W/sr at the
     camera.

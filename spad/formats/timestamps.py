@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from scenes.errors import InputError
+from scenes.json_types import JsonObject
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +26,7 @@ class Timestamps:
     bins: int
     stamps: np.ndarray
     offsets: np.ndarray
-    meta: dict = field(default_factory=dict)
+    meta: JsonObject = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.stamps.dtype != np.uint16 or self.stamps.ndim != 1:
@@ -51,7 +52,7 @@ class Timestamps:
         return counts_from_timestamps(self.stamps, self.offsets, self.bins).reshape(self.height, self.width, self.bins)
 
     @classmethod
-    def of_counts(cls, counts: np.ndarray, meta: dict | None = None) -> Timestamps:
+    def of_counts(cls, counts: np.ndarray, meta: JsonObject | None = None) -> Timestamps:
         """Return the sparse form of counts (H, W, T)."""
         height, width, bins = counts.shape
         stamps, offsets = timestamps_from_counts(counts)
@@ -73,7 +74,7 @@ class Timestamps:
         return pixel * self.bins + self.stamps
 
     @classmethod
-    def of_places(cls, places: np.ndarray, height: int, width: int, bins: int, meta: dict) -> Timestamps:
+    def of_places(cls, places: np.ndarray, height: int, width: int, bins: int, meta: JsonObject) -> Timestamps:
         """Return from ascending indices in the flat dense form."""
         offsets = np.searchsorted(places, np.arange(height * width + 1) * bins)
         return cls(height, width, bins, (places % bins).astype(np.uint16), offsets.astype(np.int64), meta)

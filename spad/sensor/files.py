@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from scenes.errors import InputError, did_you_mean, listed, require
 from scenes.files import whole_file
@@ -169,11 +169,13 @@ def sensor_from_tables(contents: Mapping[str, object]) -> SensorFile:
     name = contents.get("name")
     require(isinstance(name, str) and bool(name), "name is missing, expected a text")
     description = contents.get("description", "")
-    require(isinstance(description, str), f"description: {description!r} is no text")
+    if not isinstance(description, str):
+        raise InputError(f"description: {description!r} is no text")
     for table in ("histogram", "pulse"):
         require(table in contents, f"table [{table}] is missing")
-    tables = {table: _table(contents, table) for table in TABLES if table in contents}
-    values: dict[str, object] = {"name": name}
+    # checked by `_field`, and by the classes that take them
+    tables: dict[str, dict[str, Any]] = {table: _table(contents, table) for table in TABLES if table in contents}
+    values: dict[str, Any] = {"name": name}
     for table in ("histogram", "detector"):
         values.update(tables.get(table, {}))
     for table in ("pulse", "jitter"):
@@ -202,7 +204,8 @@ def _check_keys(found: Mapping[str, object], known: tuple[str, ...], where: str)
 def _table(contents: Mapping[str, object], name: str) -> dict[str, object]:
     """Return the fields that a table sets, in SI units."""
     table, keys = contents[name], TABLES[name]
-    require(isinstance(table, dict), f"{name}: expected a table [{name}]")
+    if not isinstance(table, dict):
+        raise InputError(f"{name}: expected a table [{name}]")
     _check_keys(table, tuple(keys), f"{name}.")
     missing = [key for key, key_spec in keys.items() if key_spec.required and key not in table]
     require(not missing, f"{name}.{listed(missing)} is missing")
@@ -224,7 +227,7 @@ def _field(value: object, key: Key, where: str) -> object:
     return parse_quantity(value, key.dimension, where, signed=key.signed)
 
 
-def _pulse(values: Mapping[str, object], where: str) -> AnyPulse:
+def _pulse(values: Mapping[str, Any], where: str) -> AnyPulse:
     ways = [way for way in ("sigma_s", "fwhm_s", "samples") if way in values]
     require(len(ways) == 1, f"{where}: expected one of {KINDS_OF_PULSE}, there are {len(ways)}")
     if ways == ["samples"]:
@@ -238,7 +241,8 @@ def _pulse(values: Mapping[str, object], where: str) -> AnyPulse:
 
 def _sources(contents: Mapping[str, object]) -> dict[str, str]:
     sources = contents.get("sources", {})
-    require(isinstance(sources, dict), "sources: expected a table [sources]")
+    if not isinstance(sources, dict):
+        raise InputError("sources: expected a table [sources]")
     known = tuple(f"{table}.{key}" for table, keys in TABLES.items() for key in keys)
     for key, source in sources.items():
         require(isinstance(source, str), f"sources.{key}: {source!r} is no text")
@@ -298,7 +302,7 @@ def _written(holder: object, keys: Mapping[str, Key]) -> Iterator[tuple[str, obj
             yield name, format_quantity(value, key.dimension)
 
 
-def _pulse_table(pulse: AnyPulse) -> dict[str, object]:
+def _pulse_table(pulse: AnyPulse) -> Mapping[str, object]:
     if isinstance(pulse, SampledPulse):
         return {"step": format_quantity(pulse.sample_s, "time"), "samples": list(pulse.samples)}
     table = {"sigma": format_quantity(pulse.sigma_s, "time")}

@@ -11,6 +11,7 @@ import numpy as np
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import did_you_mean, require
+from scenes.json_types import JsonObject
 from scenes.random_streams import Stream
 from spad.sensor.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
 from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_from_dict
@@ -146,11 +147,11 @@ class Sensor:
             chosen[rng.choice(chosen.size, round(fraction * chosen.size), replace=False)] = True
         return chosen.reshape(height, width)
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> JsonObject:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, values: dict) -> Sensor:
+    def from_dict(cls, values: JsonObject) -> Sensor:
         pulses = {"pulse": pulse_from_dict(values["pulse"]), "jitter": pulse_from_dict(values.get("jitter"))}
         return cls(**{**values, **pulses})
 
@@ -198,5 +199,5 @@ class PhotonBudget:
     def sbr(self) -> float:
         return self.signal / self.background if self.background > 0 else math.inf
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> JsonObject:
         return asdict(self)

@@ -16,6 +16,7 @@ import numpy as np
 from scenes.constants import REFERENCE_PULSE_SIGMA_S
 from scenes.errors import InputError, require
 from scenes.files import read_array
+from scenes.json_types import JsonObject
 from spad.sensor.normal import erfc, ndtr
 
 MAX_SAMPLES = 1 << 16
@@ -188,7 +189,7 @@ def convolved(pulse: AnyPulse, kernel: AnyPulse | None) -> AnyPulse:
     return SampledPulse(tuple(np.clip(both, 0, None).tolist()), step)
 
 
-def pulse_from_dict(values: dict | None) -> AnyPulse | None:
+def pulse_from_dict(values: JsonObject | None) -> AnyPulse | None:
     """Return the pulse that `dataclasses.asdict` made. Raises InputError for anything else."""
     if values is None:
         return None

@@ -15,7 +15,7 @@ MAX_BYTES = 1 << 24
 _LINE = 110
 
 
-def read_toml(path: Path, what: str = "sensor file") -> dict:
+def read_toml(path: Path, what: str = "sensor file") -> dict[str, object]:
     """Return the tables of a TOML file. Raises InputError naming the file, and the line where it is no TOML."""
     text = read_text(path, what, most_bytes=MAX_BYTES)
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -234,13 +235,11 @@ def calibrate(
     values["skew"][model.narrowest] = 0.0
     simple = ["pulse", "gain", *(name for name in ("delay", "background") if name in free)]
     everything = ["pulse", "gain", *free]
-    options = {"smoothing": smoothing}
+    fitted = partial(fit, model, smoothing=smoothing)
     if start is None:
-        values, *_ = fit(model, captures[::4], values, simple, steps=8, model_error=max(0.1, model_error), **options)
-        values, *_ = fit(
-            model, captures[::2], values, everything, steps=6, model_error=max(0.02, model_error), **options
-        )
-    values, information, names = fit(model, captures, values, everything, model_error=model_error, **options)
+        values, *_ = fitted(captures[::4], values, simple, steps=8, model_error=max(0.1, model_error))
+        values, *_ = fitted(captures[::2], values, everything, steps=6, model_error=max(0.02, model_error))
+    values, information, names = fitted(captures, values, everything, model_error=model_error)
     calibrated = as_sensor(model, values, sensor, zones)
     bins = sum(capture.counts.size for capture in captures)
     deviance = sum(poisson_deviance(c.counts, model.expected(values, c)) for c in captures) / bins
