@@ -15,42 +15,31 @@ from scenes.io.mitsuba_nodes import Document
 from scenes.io.mitsuba_plugin import Plugin
 from scenes.io.textures import load_texture
 from scenes.model import DISTRIBUTIONS, Material, Texture
+from scenes.refractive_indices import CONDUCTORS, INDICES
 
 MAX_NESTING = 16
 CHECKERBOARD_PIXELS = 256
+MIN_ALPHA = 1e-3
+MIN_CONTRAST = 1e-3  # of indices: below, a surface reflects less than 3e-7 of light
+_UNREAD = Texture(np.full((1, 1), 0.5), "unread")
 
-# Refractive indices at the sodium line, the names that the file format knows and that exported scenes use.
-INDICES = {
-    "vacuum": 1.0,
-    "air": 1.000277,
-    "water": 1.3330,
-    "polypropylene": 1.49,
-    "bk7": 1.5046,
-    "diamond": 2.419,
-}
 
-# n and k at 650 nm, interpolated linearly in the tables of: Johnson and Christy, Phys. Rev. B 6, 4370 (1972) for gold,
-# silver and copper; Johnson and Christy, Phys. Rev. B 9, 5056 (1974) for chromium; Rakic, Appl. Opt. 34, 4755 (1995)
-# for aluminium. "none" is the format's name of a perfect mirror.
-CONDUCTORS = {
-    "none": (0.0, 1.0),
-    "Au": (0.156, 3.602),
-    "Ag": (0.052, 4.409),
-    "Cu": (0.238, 3.626),
-    "Cr": (3.107, 3.331),
-    "Al": (1.558, 7.712),
-}
+Values = dict[str, Any]  # keyword arguments of a Material
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A material and how its textures want the mesh's texture coordinates moved (3x3, v downwards as in Mitsuba)."""
+    """A material and how its textures want the mesh's texture coordinates moved (3x3, v downwards as in Mitsuba).
+
+    `inside_out`: the denser medium is outside, as of a bubble in water, so that the faces must be turned round.
+    """
 
     material: Material
     to_uv: np.ndarray | None = None
+    inside_out: bool = False
 
 
-class _Uv:
+class Uv:
     """The one texture transform that all textures of a material must share, since a mesh has one set of uv."""
 
     def __init__(self) -> None:
@@ -63,10 +52,14 @@ class _Uv:
 
 
 class Materials:
-    """Builds every bsdf once: shapes that refer to the same element share one Material object."""
+    """Builds every bsdf once: shapes that refer to the same element share one Material object.
 
-    def __init__(self, document: Document) -> None:
+    With `reads_images` false every image is one grey pixel: what cannot be taken then shows before images are read.
+    """
+
+    def __init__(self, document: Document, *, reads_images: bool = True) -> None:
         self._document = document
+        self._reads_images = reads_images
         self._looks: dict[Plugin, Look] = {}
         self._images: dict[tuple[Path, bool, str], Texture] = {}
         self._default = Look(Material("diffuse", albedo=0.5, name="default"))
@@ -78,38 +71,28 @@ class Materials:
             raise shape.fail(f"has {len(bsdfs)} bsdfs, expected one")
         return self.look(bsdfs[0]) if bsdfs else self._default
 
-    def check(self, shape: Plugin) -> None:
-        """Refuse a shape whose bsdf has no counterpart here, in one line, before any file is read."""
-        for plugin in shape.nested("bsdf"):
-            for _ in range(MAX_NESTING):
-                inside = plugin.nested("bsdf")
-                if plugin.type not in _WRAPPERS or not inside:
-                    break
-                plugin = inside[0]
-            if plugin.type not in (*_KINDS, *_WRAPPERS):
-                raise plugin.fail(_no_counterpart(plugin.type))
-
     def look(self, plugin: Plugin) -> Look:
         if plugin not in self._looks:
             self._looks[plugin] = self._build(plugin)
         return self._looks[plugin]
 
     def _build(self, plugin: Plugin) -> Look:
-        uv = _Uv()
+        uv = Uv()
         inner, opacity = self._unwrap(plugin, uv)
         if inner.type not in _KINDS:
             raise inner.fail(_no_counterpart(inner.type))
         values = _KINDS[inner.type](self, inner, uv)
         inner.note_unused()
         values.setdefault("kind", inner.type)
+        inside_out = values.pop("inside_out", False)
         name = plugin.id or inner.id or inner.type
         try:
             material = Material(**values, opacity=1.0 if opacity is None else opacity, name=name)
         except InputError as error:
             raise inner.fail(str(error)) from None
-        return Look(material, uv.matrix)
+        return Look(material, uv.matrix, inside_out)
 
-    def _unwrap(self, plugin: Plugin, uv: _Uv) -> tuple[Plugin, float | Texture | None]:
+    def _unwrap(self, plugin: Plugin, uv: Uv) -> tuple[Plugin, float | Texture | None]:
         """The innermost bsdf and the opacity of a mask around it."""
         opacity = None
         for _ in range(MAX_NESTING):
@@ -131,7 +114,7 @@ class Materials:
         raise plugin.fail(f"bsdfs are nested more than {MAX_NESTING} deep")
 
     def fraction(
-        self, plugin: Plugin, name: str, default: float, uv: _Uv, *, channel: str = "luminance"
+        self, plugin: Plugin, name: str, default: float, uv: Uv, *, channel: str = "luminance"
     ) -> float | Texture:
         """Return a reflectance or opacity: a number or a texture, clipped at 1 with a note."""
         nested = plugin.nested_as(name)
@@ -161,7 +144,7 @@ class Materials:
         elif plugin.type == "checkerboard":
             texture = _checkerboard(plugin)
         else:
-            raise plugin.fail(f"texture {plugin.type!r} is not supported, expected bitmap or checkerboard")
+            raise plugin.fail(f"texture {plugin.type!r} is not supported, bake it into a bitmap or checkerboard")
         matrix = _to_uv(plugin)
         plugin.note_unused()
         return texture, matrix
@@ -185,7 +168,8 @@ class Materials:
         """Return a texture file, read once."""
         key = (path.resolve(), linear, channel)
         if key not in self._images:
-            self._images[key] = load_texture(path, linear=linear, channel=channel)
+            read = load_texture(path, linear=linear, channel=channel) if self._reads_images else _UNREAD
+            self._images[key] = read
         return self._images[key]
 
 
@@ -239,14 +223,16 @@ def _index(plugin: Plugin, name: str, default: str) -> float:
 
 
 def _relative_index(plugin: Plugin, inside: str) -> float:
-    """int_ior / ext_ior; light must be slower inside."""
+    """int_ior / ext_ior, positive and not 1."""
     int_ior, ext_ior = _index(plugin, "int_ior", inside), _index(plugin, "ext_ior", "air")
-    if ext_ior <= 0 or int_ior / ext_ior <= 1:
-        raise plugin.fail(f"int_ior {int_ior:g} / ext_ior {ext_ior:g} is not above 1; turn the shape inside out")
+    if int_ior <= 0 or ext_ior <= 0:
+        raise plugin.fail(f"int_ior {int_ior:g} and ext_ior {ext_ior:g}, expected both above 0")
+    if abs(int_ior / ext_ior - 1) < MIN_CONTRAST:
+        raise plugin.fail(f"int_ior {int_ior:g} and ext_ior {ext_ior:g} are alike, light is not bent; remove the shape")
     return int_ior / ext_ior
 
 
-def _microfacets(materials: Materials, plugin: Plugin, default: float) -> dict[str, Any]:
+def _microfacets(materials: Materials, plugin: Plugin, default: float) -> Values:
     """Alpha and distribution of the normals; one number stands for two directions and for a texture."""
     plugin.ignore(("sample_visible",))
     distribution = plugin.string("distribution", "beckmann")
@@ -263,35 +249,38 @@ def _microfacets(materials: Materials, plugin: Plugin, default: float) -> dict[s
     return {"roughness": alpha, "distribution": distribution}
 
 
-def _rough(values: dict[str, Any], smooth: str, rough: dict[str, Any]) -> dict[str, Any]:
+def _rough(values: Values, smooth: str, rough: Values) -> Values:
     """`values` with what makes them rough; alpha 0 is the smooth kind."""
     return values | ({"kind": smooth} if rough["roughness"] == 0 else rough)
 
 
-def _diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
+def _diffuse(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     return {"albedo": materials.fraction(plugin, "reflectance", 0.5, uv)}
 
 
-def _rough_diffuse(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
+def _rough_diffuse(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     plugin.ignore(("use_fast_approx",))
     return _rough(_diffuse(materials, plugin, uv), "diffuse", {"roughness": materials.mean(plugin, "alpha", 0.2)})
 
 
-def _plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
+def _plastic(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
+    index = _relative_index(plugin, "polypropylene")
+    if index < 1:
+        raise plugin.fail(f"int_ior / ext_ior is {index:g}, and a coat is denser than what is around it; write diffuse")
     if plugin.boolean("nonlinear", False):
         plugin.note("the colour shift of internal scattering (nonlinear) is left out")
     return {
         "albedo": materials.fraction(plugin, "diffuse_reflectance", 0.5, uv),
         "specular": _clipped(plugin, "specular_reflectance", materials.mean(plugin, "specular_reflectance", 1.0)),
-        "ior": _relative_index(plugin, "polypropylene"),
+        "ior": index,
     }
 
 
-def _rough_plastic(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
+def _rough_plastic(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     return _rough(_plastic(materials, plugin, uv), "plastic", _microfacets(materials, plugin, 0.1))
 
 
-def _conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
+def _conductor(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     eta, k = _complex_index(materials, plugin)
     specular = _clipped(plugin, "specular_reflectance", materials.mean(plugin, "specular_reflectance", 1.0))
     return {"eta": eta, "k": k, "specular": specular}
@@ -316,12 +305,15 @@ def _complex_index(materials: Materials, plugin: Plugin) -> tuple[float, float]:
     return CONDUCTORS[material][0] / outside, CONDUCTORS[material][1] / outside
 
 
-def _rough_conductor(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
+def _rough_conductor(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     return _rough(_conductor(materials, plugin, uv), "conductor", _microfacets(materials, plugin, 0.1))
 
 
-def _phong(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
-    """Phong's lobe as rough plastic of the same width: alpha = sqrt(2 / (exponent + 2)) (Walter et al. 2007, 5.2)."""
+def _phong(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
+    """Return Phong's lobe as rough plastic of the same width.
+
+    alpha = sqrt(2 / (exponent + 2)) (Walter et al. 2007, 5.2).
+    """
     exponent = materials.mean(plugin, "exponent", 30.0)
     if exponent < 0:
         raise plugin.fail(f"exponent {exponent:g} is negative")
@@ -333,19 +325,51 @@ def _phong(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
         "albedo": materials.fraction(plugin, "diffuse_reflectance", 0.5, uv),
         "specular": min(fraction / fresnel, 1.0),
         "ior": INDICES["polypropylene"],
-        "roughness": min(max(math.sqrt(2 / (exponent + 2)), 1e-3), 1.0),
+        "roughness": min(max(math.sqrt(2 / (exponent + 2)), MIN_ALPHA), 1.0),
         "distribution": "beckmann",
     }
 
 
-def _dielectric(materials: Materials, plugin: Plugin, uv: _Uv) -> dict[str, Any]:
+def _principled(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
+    """Return the principled bsdf (Burley 2012) as rough plastic, or a rough conductor where it is mostly metal.
+
+    alpha = roughness^2; a metal reflects its base colour at every angle; the index of a coat without one is that of
+    normal reflectance 0.08 specular.
+    """
+    transmitted = materials.mean(plugin, "spec_trans", 0.0)
+    if transmitted > 0:
+        raise plugin.fail(f"spec_trans {transmitted:g}: light does not pass principled surfaces here; write dielectric")
+    metallic = materials.mean(plugin, "metallic", 0.0)
+    plugin.ignore(("anisotropic", "spec_tint", "sheen", "sheen_tint", "flatness", "clearcoat", "clearcoat_gloss"))
+    plugin.ignore(("diffuse_reflectance_sampling_rate", "specular_sampling_rate", "clearcoat_sampling_rate"))
+    alpha = max(materials.mean(plugin, "roughness", 0.5) ** 2, MIN_ALPHA)
+    values: Values = {"roughness": alpha, "distribution": "ggx"}
+    left_out = "tints, sheen and clear coat are left out"
+    if metallic > 0.5:
+        plugin.note(f"principled is taken as a rough conductor of its base colour: {left_out}")
+        eta, k = CONDUCTORS["none"]
+        colour = min(materials.mean(plugin, "base_color", 0.5), 1.0)
+        return values | {"kind": "roughconductor", "eta": eta, "k": k, "specular": colour}
+    plugin.note(f"principled is taken as rough plastic: {left_out}")
+    root = math.sqrt(0.08 * max(materials.mean(plugin, "specular", 0.5), MIN_ALPHA))
+    index = plugin.number("eta") if plugin.has("eta") else (1 + root) / (1 - root)
+    values["albedo"] = materials.fraction(plugin, "base_color", 0.5, uv)
+    return values | {"kind": "roughplastic", "ior": index}
+
+
+def _dielectric(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     for name in ("specular_reflectance", "specular_transmittance"):
         if materials.mean(plugin, name, 1.0) != 1:
             plugin.note(f"{name} is left out, glass keeps the Fresnel shares")
-    return {"ior": _relative_index(plugin, "bk7")}
+    index = _relative_index(plugin, "bk7")
+    if index > 1:
+        return {"ior": index}
+    # an interface reflects alike from both sides; which of them is denser is told by the way its faces point
+    plugin.note("the denser medium is outside: the faces of the shape are turned round")
+    return {"ior": 1 / index, "inside_out": plugin.type == "dielectric"}
 
 
-_KINDS: dict[str, Callable[[Materials, Plugin, _Uv], dict[str, Any]]] = {
+_KINDS: dict[str, Callable[[Materials, Plugin, Uv], Values]] = {
     "diffuse": _diffuse,
     "roughdiffuse": _rough_diffuse,
     "plastic": _plastic,
@@ -355,14 +379,19 @@ _KINDS: dict[str, Callable[[Materials, Plugin, _Uv], dict[str, Any]]] = {
     "dielectric": _dielectric,
     "thindielectric": _dielectric,
     "phong": _phong,
+    "principled": _principled,
 }
 _WRAPPERS = ("twosided", "mask", "bumpmap", "normalmap")
 _WAYS_ROUND = {
     "roughdielectric": "no light is bent or scattered by glass here; write dielectric, or diffuse for frosted glass",
     "blendbsdf": "write the stronger of its two bsdfs alone",
-    "principled": "write roughplastic or roughconductor with the same base colour and roughness",
     "hk": "light inside bodies is not followed; write diffuse",
     "difftrans": "light does not pass matte surfaces here; write diffuse",
     "ward": "write roughconductor or roughplastic with alpha for its two widths",
-    "null": "remove the shape, which nothing would see",
+    "coating": "write plastic with the coat's index and the colour below it",
+    "roughcoating": "write roughplastic with the coat's index and the colour below it",
+    "mixturebsdf": "write the stronger of its bsdfs alone",
+    "principledthin": "light does not pass matte sheets here; write diffuse, or thindielectric for clear ones",
+    "measured": "write the roughconductor or roughplastic that is nearest",
+    "null": "remove the bsdf around it",
 }

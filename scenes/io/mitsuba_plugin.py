@@ -11,6 +11,7 @@ import numpy as np
 
 from scenes.blackbody import seen_radiance_w_per_m2_sr_nm
 from scenes.errors import InputError
+from scenes.io.inputs import read_text
 from scenes.io.mitsuba_nodes import Document
 from scenes.io.textures import luminance, srgb_to_linear
 from scenes.library.things.shapes import axis_frame
@@ -18,6 +19,7 @@ from scenes.library.things.shapes import axis_frame
 COLOUR_TAGS = ("float", "integer", "rgb", "srgb", "spectrum")
 # Of a matrix: what is beyond leaves the range of numbers when matrices are multiplied, inverted or decomposed.
 MAX_ENTRY = 1e15
+MAX_SPECTRUM_BYTES = 1 << 20
 VALUE_TAGS = (*COLOUR_TAGS, "boolean", "string", "vector", "point", "blackbody", "transform")
 PLUGIN_TAGS = (
     *("bsdf", "shape", "emitter", "texture", "sensor", "film", "sampler", "rfilter", "integrator"),
@@ -168,19 +170,31 @@ class Plugin:
             return self._blackbody(name, element)
         if element.tag not in COLOUR_TAGS:
             raise self.fail(f"{name} is a <{element.tag}>, expected <rgb>, <spectrum> or <float>")
-        if element.get("type") or element.get("filename"):
-            raise self.fail(f"{name} is a <spectrum> from a plugin or file, expected plain values or <rgb>")
+        if element.get("type"):
+            raise self.fail(f"{name} is a <spectrum> from a plugin, write plain values or <rgb>")
+        if element.get("filename"):
+            return self._mean_of_file(name, element)
         text = self.document.need(element, "value").strip()
         if element.tag == "spectrum" and ":" in text:
-            pairs = [self.numbers(pair.replace(":", " "), name, 2) for pair in re.split(r"[\s,]+", text) if pair]
-            wavelength, value = np.array(sorted(map(tuple, pairs))).T
-            span = wavelength[-1] - wavelength[0]
-            return float(np.trapezoid(value, wavelength) / span if span > 0 else value.mean())
+            return _mean_over_wavelength(
+                [self.numbers(pair.replace(":", " "), name, 2) for pair in re.split(r"[\s,]+", text) if pair]
+            )
         if element.tag in ("rgb", "srgb"):
             encoded = element.tag == "srgb" or text.startswith("#")
             values = np.array(self._hex(name, text) if text.startswith("#") else self.numbers(text, name, 1, 3))
             return float(luminance(np.broadcast_to(srgb_to_linear(values) if encoded else values, 3)))
         return self.numbers(text, name, 1)[0]
+
+    def _mean_of_file(self, name: str, element: Element) -> float:
+        """Return the mean of a .spd file: a wavelength and a value a line, # begins a comment."""
+        path = self.document.file(element, self.document.need(element, "filename"), "spectrum")
+        text = read_text(path, "spectrum", most_bytes=MAX_SPECTRUM_BYTES)
+        lines = (line.partition("#")[0].strip() for line in text.splitlines())
+        pairs = [self.numbers(line, f"{name} in {path.name}", 2) for line in lines if line]
+        if not pairs:
+            raise self.fail(f"{path.name}: holds no wavelengths")
+        self.note(f"{name} is the mean of its spectrum file")
+        return _mean_over_wavelength(pairs)
 
     def _blackbody(self, name: str, element: Element) -> float:
         """Radiance [W/(m^2 sr nm)] of <blackbody temperature="5000K"/> (version 0.6), or of version 3's spectrum."""
@@ -290,6 +304,12 @@ class Plugin:
 def snake_case(name: str) -> str:
     """Return Mitsuba 0.6's camelCase names as Mitsuba 3's: toWorld, intIOR -> to_world, int_ior."""
     return re.sub(r"(?<=[a-z0-9])([A-Z]+)", r"_\1", name).lower()
+
+
+def _mean_over_wavelength(pairs: list[list[float]]) -> float:
+    wavelength, value = np.array(sorted(map(tuple, pairs))).T
+    span = wavelength[-1] - wavelength[0]
+    return float(np.trapezoid(value, wavelength) / span if span > 0 else value.mean())
 
 
 def _or(counts: Iterable[int]) -> str:

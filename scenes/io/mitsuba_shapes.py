@@ -56,23 +56,49 @@ class Shapes:
     def __init__(self, document: Document, materials: Materials) -> None:
         self._document = document
         self._materials = materials
+        self._unread = Materials(document, reads_images=False)
         self._files: dict[tuple[Path, int], Mesh] = {}
 
     def check(self, plugin: Plugin) -> None:
-        """Refuse a <shape> that has no counterpart here, in one line, before any file is read."""
-        if plugin.type in ("shapegroup", "instance"):
-            raise plugin.fail(f"shape {plugin.type!r} is not supported, write every copy out as .obj or .ply")
+        """Refuse a <shape> that has no counterpart here, in one line, before any mesh or image is read."""
+        plugin.refuse("medium", "volume", "phase", "subsurface", "sensor")
+        plugin.transform("to_world")
+        if plugin.type in _CONTAINERS:
+            for part in _parts(plugin):
+                self.check(part)
+            return
         if plugin.type not in _BUILDERS:
-            raise plugin.fail(f"shape {plugin.type!r} is not supported, expected one of {', '.join(_BUILDERS)}")
-        plugin.refuse("medium", "volume", "phase", "subsurface", "sensor", "shape")
-        self._materials.check(plugin)
+            way_round = _WAYS_ROUND.get(plugin.type, f"expected one of {', '.join((*_BUILDERS, *_CONTAINERS))}")
+            raise plugin.fail(f"shape {plugin.type!r} is not supported, {way_round}")
+        plugin.refuse("shape")
+        if plugin.type in _FILES:
+            self._document.file(plugin.element, plugin.string("filename"), "mesh")
+        else:
+            _BUILDERS[plugin.type](self, plugin)
+        if not _is_unseen(plugin):
+            self._unread.of_shape(plugin)
+        self._emission(plugin, self._unread)
+
+    def surfaces(self, plugin: Plugin) -> list[Surface]:
+        """Return the surfaces of a <shape> in the world: one, or those of an instance or a merge; none of a group."""
+        if plugin.type == "shapegroup":
+            return []  # is seen where instances put it
+        if plugin.type in _CONTAINERS:
+            matrix = plugin.transform("to_world")
+            return [_moved(one, matrix) for part in _parts(plugin) for one in self.surfaces(part)]
+        if _is_unseen(plugin):
+            plugin.note("a null bsdf lets all light pass, the shape is left out")
+            return []
+        return [self.surface(plugin)]
 
     def surface(self, plugin: Plugin) -> Surface:
         """Return the surface of a <shape>, in the world, with its material and its light."""
         name = plugin.id or Path(plugin.string("filename", plugin.type).replace("\\", "/")).stem
-        mesh = _placed(_BUILDERS[plugin.type](self, plugin), plugin)
         look = self._materials.of_shape(plugin)
-        emission = self._emission(plugin)
+        mesh = _placed(_BUILDERS[plugin.type](self, plugin), plugin)
+        if look.inside_out:
+            mesh = _turned(mesh)
+        emission = self._emission(plugin, self._materials)
         plugin.note_unused()
         uv = _project_uv(mesh.uv, look)
         try:
@@ -82,7 +108,7 @@ class Shapes:
         except InputError as error:
             raise plugin.fail(f"{plugin.string('filename', '')}: {error}".removeprefix(": ")) from None
 
-    def _emission(self, plugin: Plugin) -> float:
+    def _emission(self, plugin: Plugin, materials: Materials) -> float:
         """Radiance of an area light on the shape."""
         emitters = plugin.nested("emitter")
         if len(emitters) > 1:
@@ -90,9 +116,12 @@ class Shapes:
         if not emitters:
             return 0.0
         emitter = emitters[0]
+        if emitter.type in _BEAMS:
+            plugin.note(f"emitter {emitter.type} on a surface is left out, ambient light lacks it")
+            return 0.0
         if emitter.type != "area":
             raise emitter.fail(f"emitter {emitter.type!r} on a shape is not supported, expected area")
-        radiance = self._materials.mean(emitter, "radiance", 1.0)
+        radiance = materials.mean(emitter, "radiance", 1.0)
         emitter.ignore(("sampling_weight",))
         emitter.note_unused()
         return radiance
@@ -218,6 +247,46 @@ _BUILDERS: dict[str, Callable[[Shapes, Plugin], Mesh]] = {
     "disk": _disk,
     "cylinder": _cylinder,
 }
+_FILES = ("obj", "ply", "serialized")
+_CONTAINERS = ("shapegroup", "instance", "merge")
+# Emitters on surfaces that shine into some directions alone.
+_BEAMS = ("directionalarea", "angulararea")
+_CURVES = "write the strands as thin cylinders or a mesh"
+_WAYS_ROUND = {
+    **dict.fromkeys(("hair", "linearcurve", "bsplinecurve"), _CURVES),
+    **dict.fromkeys(("heightfield", "sdfgrid", "deformable"), "write it as .obj or .ply"),
+    **dict.fromkeys(("ellipsoids", "ellipsoidsmesh"), "write them as spheres or meshes"),
+}
+
+
+def _is_unseen(plugin: Plugin) -> bool:
+    """Return whether a shape is a border that light does not see."""
+    return [inner.type for inner in plugin.nested("bsdf")] == ["null"]
+
+
+def _parts(plugin: Plugin) -> list[Plugin]:
+    """Return the shapes in a group or merge, or of the group that an instance names."""
+    parts = plugin.nested("shape")
+    if plugin.type != "instance":
+        for part in parts:
+            if part.type in ("instance", "shapegroup"):
+                raise part.fail(f"a {part.type} inside a {plugin.type}, expected shapes")
+        return parts
+    if [part.type for part in parts] != ["shapegroup"]:
+        raise plugin.fail('expected <ref id="..."/> of one shapegroup')
+    return _parts(parts[0])
+
+
+def _moved(surface: Surface, matrix: np.ndarray) -> Surface:
+    """Return a surface moved as a whole: its outside stays outside."""
+    faces = surface.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else surface.faces
+    normals = None if surface.normals is None else shapes.transform_normals(surface.normals, matrix)
+    return replace(surface, vertices=shapes.transform(surface.vertices, matrix), faces=faces, normals=normals)
+
+
+def _turned(mesh: Mesh) -> Mesh:
+    """Return a mesh with its inside out."""
+    return replace(mesh, faces=mesh.faces[:, ::-1], normals=None if mesh.normals is None else -mesh.normals)
 
 
 def _positive(plugin: Plugin, name: str) -> float:
@@ -240,9 +309,8 @@ def _placed(mesh: Mesh, plugin: Plugin) -> Mesh:
         faces = faces[:, ::-1]
     if mesh.smooth and np.isfinite(vertices).all():
         normals = _smooth_normals(vertices, faces)
-    if plugin.boolean("flip_normals", False):
-        faces, normals = faces[:, ::-1], None if normals is None else -normals
-    return replace(mesh, vertices=vertices, faces=faces, normals=normals)
+    mesh = replace(mesh, vertices=vertices, faces=faces, normals=normals)
+    return _turned(mesh) if plugin.boolean("flip_normals", False) else mesh
 
 
 def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

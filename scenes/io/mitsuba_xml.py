@@ -22,6 +22,7 @@ _LEFT_OUT_EMITTERS = (
     *("point", "spot", "directional", "directionalarea", "projector", "collimated"),
     *("sky", "sun", "sunsky", "timed_sunsky"),
 )
+_NO_MEDIA = "is not supported, light in fog or inside bodies is not followed; remove it"
 _DEFINITIONS = ("bsdf", "texture", "integrator", "sampler", "film", "rfilter", *VALUE_TAGS)
 # Of a 36 x 24 mm frame, which `focal_length` refers to.
 _FRAME_DIAGONAL_MM = math.hypot(36, 24)
@@ -49,7 +50,7 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
         if element.tag in found:
             found[element.tag].append(Plugin.of(document, element))
         elif element.tag in ("medium", "volume", "phase", "subsurface"):
-            raise document.error(element, "is not supported, remove it")
+            raise document.error(element, _NO_MEDIA)
         elif element.tag not in _DEFINITIONS:
             raise document.error(element, "unknown element in a scene")
     if not found["shape"]:
@@ -57,9 +58,12 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
     # what has no counterpart is told before meshes and images are read, which may take minutes
     for plugin in found["shape"]:
         shapes.check(plugin)
+    _light_around(document, found["emitter"])
     camera = _camera(document, found["sensor"]).resized(width, height)
     ambient = _ambient(document, materials, found["emitter"])
-    surfaces: list[Surface] = [shapes.surface(plugin) for plugin in found["shape"]]
+    surfaces: list[Surface] = [surface for plugin in found["shape"] for surface in shapes.surfaces(plugin)]
+    if not surfaces:
+        raise InputError("holds no shapes that can be seen")
     stem = document.path.stem
     name = document.path.resolve().parent.name if stem == "scene" else stem
     return Scene(name or stem, tuple(surfaces), camera, ambient=ambient, notes=document.notes.lines())
@@ -75,7 +79,7 @@ def _camera(document: Document, sensors: list[Plugin]) -> Camera:
     if sensor.type == "thinlens":
         sensor.note("thinlens is taken as a pinhole: no depth of field")
     elif sensor.type != "perspective":
-        raise sensor.fail(f"sensor {sensor.type!r} is not supported, expected perspective or thinlens")
+        raise sensor.fail(f"sensor {sensor.type!r} is not supported, write perspective (or thinlens)")
     sensor.refuse("medium", "volume", "phase")
     width, height = _film_size(sensor)
     fov = _horizontal_fov(sensor, width, height)
@@ -155,8 +159,8 @@ def _mirror_note(plugin: Plugin, what: str) -> bool:
     return True
 
 
-def _ambient(document: Document, materials: Materials, emitters: list[Plugin]) -> Ambient:
-    """The constant or mapped light around the scene; lights that are points are left out with a note."""
+def _light_around(document: Document, emitters: list[Plugin]) -> Plugin | None:
+    """The one constant or mapped light around the scene; lights that are points are left out with a note."""
     around = []
     for emitter in emitters:
         if emitter.type in ("constant", "envmap"):
@@ -166,12 +170,23 @@ def _ambient(document: Document, materials: Materials, emitters: list[Plugin]) -
         elif emitter.type == "area":
             raise emitter.fail("an area emitter belongs inside its <shape>")
         else:
-            raise emitter.fail(f"emitter {emitter.type!r} is not supported, expected area, constant or envmap")
+            raise emitter.fail(f"emitter {emitter.type!r} is not supported, write area, constant or envmap")
     if len(around) > 1:
         raise around[1].fail(f"a second light around the scene, beside {around[0].label}; expected one")
-    if not around:
+    if around and around[0].type == "envmap":
+        filename = around[0].string("filename")
+        suffix = Path(filename).suffix.lower()
+        if suffix in (".hdr", ".rgbe", ".pfm"):
+            raise around[0].fail(f"{filename}: {suffix} images are not read, convert it to .exr")
+        document.file(around[0].element, filename, "environment map")
+    return around[0] if around else None
+
+
+def _ambient(document: Document, materials: Materials, emitters: list[Plugin]) -> Ambient:
+    """The light around the scene."""
+    emitter = _light_around(document, emitters)
+    if emitter is None:
         return Ambient()
-    emitter = around[0]
     emitter.ignore(("sampling_weight", "mis_compensation", "to_world", "cache", "gamma"))
     ambient = _constant(materials, emitter) if emitter.type == "constant" else _envmap(document, materials, emitter)
     emitter.note_unused()
@@ -188,11 +203,7 @@ def _constant(materials: Materials, emitter: Plugin) -> Ambient:
 
 
 def _envmap(document: Document, materials: Materials, emitter: Plugin) -> Ambient:
-    filename = emitter.string("filename")
-    suffix = Path(filename).suffix.lower()
-    if suffix in (".hdr", ".rgbe", ".pfm"):
-        raise emitter.fail(f"{filename}: {suffix} images are not read, convert it to .exr")
-    path = document.file(emitter.element, filename, "environment map")
+    path = document.file(emitter.element, emitter.string("filename"), "environment map")
     image = materials.image(path, emitter.boolean("raw", False), "luminance").image
     pose, mirrored = _rigid(emitter, "environment map")
     pose[:3, 3] = 0

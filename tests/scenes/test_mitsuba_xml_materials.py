@@ -178,7 +178,7 @@ def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("bsdf", "words"),
     [
-        ('<bsdf type="principled"/>', "'principled'"),
+        ('<bsdf type="principled"><float name="spec_trans" value="1"/></bsdf>', "spec_trans 1"),
         ('<bsdf type="blendbsdf"/>', "'blendbsdf'"),
         ('<bsdf type="roughdielectric"/>', "'roughdielectric'"),
         ('<bsdf type="twosided"/>', "0 bsdfs"),
@@ -188,7 +188,8 @@ def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
         ('<bsdf type="diffuse"><rgb name="reflectance" value="1 2"/></bsdf>', "2 values, expected 1 or 3"),
         ('<bsdf type="diffuse"><rgb name="reflectance" value="-1"/></bsdf>', "albedo"),
         ('<bsdf type="diffuse"><rgb name="reflectance" value="#12"/></bsdf>', "#rrggbb"),
-        ('<bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf>', "plugin or file"),
+        ('<bsdf type="diffuse"><spectrum name="reflectance" filename="a.spd"/></bsdf>', "'a.spd' not found"),
+        ('<bsdf type="diffuse"><spectrum name="reflectance" type="d65"/></bsdf>', "from a plugin"),
         ('<bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1 500"/></bsdf>', "expected 2"),
         ('<bsdf type="diffuse"><texture name="reflectance" type="noise"/></bsdf>', "'noise'"),
         ('<bsdf type="diffuse"><texture name="reflectance" type="bitmap"/></bsdf>', "filename"),
@@ -204,7 +205,7 @@ def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
         ),
         ('<bsdf type="conductor"><string name="material" value="Unobtainium"/></bsdf>', "'Unobtainium'"),
         ('<bsdf type="conductor"><float name="eta" value="1"/></bsdf>', "both eta and k"),
-        ('<bsdf type="dielectric"><float name="int_ior" value="1"/></bsdf>', "not above 1"),
+        ('<bsdf type="dielectric"><float name="int_ior" value="1"/></bsdf>', "light is not bent; remove"),
         ('<bsdf type="dielectric"><string name="int_ior" value="jelly"/></bsdf>', "'jelly'"),
         ('<bsdf type="roughplastic"><float name="alpha" value="3"/></bsdf>', "roughness 3"),
         (

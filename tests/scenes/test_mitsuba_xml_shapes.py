@@ -94,8 +94,8 @@ def test_a_mesh_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     ("shape", "words"),
     [
         ('<shape type="serialized"/>', 'lacks <string name="filename"'),
-        ('<shape type="shapegroup"/>', "'shapegroup'"),
-        ('<shape type="instance"/>', "'instance'"),
+        ('<shape type="shapegroup"/>', "no shapes that can be seen"),
+        ('<shape type="instance"/>', "of one shapegroup"),
         ('<shape type="hair"/>', "'hair'"),
         ("<shape/>", 'lacks type="..."'),
         ('<shape type="obj"/>', 'lacks <string name="filename"'),
