@@ -12,15 +12,7 @@ FILES = {path: ast.parse(path.read_text(encoding="utf-8")) for one in PACKAGES f
 MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_MODULES = 400, 60, 7, 14
 # What is larger still, at its size: it may shrink, not grow, and nothing may join it.
 LARGER: dict[str, int] = {}
-MORE_PARAMETERS = {
-    "csph/evaluation/methods.py evaluate": 8,
-    "csph/training/loop.py train": 8,
-    "scene2spad/datasets/test_sets.py _evaluate": 8,
-    "scene2spad/datasets/test_sets.py evaluated": 8,
-    "scene2spad/datasets/test_sets.py rendered": 8,
-    "scenes/io/relief.py relief": 9,
-    "spad/formats/rgbd.py from_rgbd": 8,
-}
+MORE_PARAMETERS: dict[str, int] = {}
 MAX_ANY = 206  # in signatures; Dr.Jit's types have names of their own (`render.backend.drjit_types`)
 # Private words for which the field has terms.
 NOT_OURS = {"told", "said", "whys", "share", "shares", "tails", "watched", "thrown", "spelled", "least_share"}

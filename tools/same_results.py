@@ -1,6 +1,6 @@
 """Run the same commands on two trees and compare what they write, number by number.
 
-    python tools/same_results.py OLD NEW [--only NAME ...] [--out FOLDER]
+    python tools/same_results.py OLD NEW [--only NAME ...] [--out FOLDER] [--kept]
 
 OLD and NEW are folders of two checkouts; both run with the Python that runs this script. Arrays must be equal bit for
 bit. Fields that name a version, a schema, a checksum, a folder or a time may differ. Exit status 1 where anything else
@@ -70,12 +70,14 @@ def main() -> int:
     parser.add_argument("new", type=Path, help="checkout after the change")
     parser.add_argument("--only", nargs="+", choices=[*RUNS], default=[*RUNS], help="these runs alone")
     parser.add_argument("--out", type=Path, default=Path("out/same-results"), help="folder for what both write")
+    parser.add_argument("--kept", action="store_true", help="compare what an earlier call wrote; run nothing")
     chosen = parser.parse_args()
     found = []
     for name in chosen.only:
         folders = [chosen.out / side / name.replace(" ", "-") for side in ("old", "new")]
         for tree, folder in zip((chosen.old, chosen.new), folders, strict=True):
-            run_all(tree.resolve(), RUNS[name], folder)
+            if not chosen.kept:
+                run_all(tree.resolve(), RUNS[name], folder)
         differences = list(compared(*folders))
         found += differences
         files = sum(1 for path in folders[0].rglob("*") if path.is_file())
@@ -90,14 +92,23 @@ def run_all(tree: Path, commands: tuple[str, ...], folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     found = (one for one in MODULES for end in ("", ".py") if (tree / f"{one.replace('.', '/')}{end}").exists())
-    program = f"import sys; from {next(found)} import main; sys.exit(main(sys.argv[1:]))"
+    module = next(found)
+    program = f"import sys; from {module} import main; sys.exit(main(sys.argv[1:]))"
     surroundings = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
     for number, command in enumerate(commands):
-        words = [sys.executable, "-c", program, *command.split(), "--json"]
+        words = [sys.executable, "-c", program, *in_words_of(module, command.split(), tree), "--json"]
         done = subprocess.run(words, cwd=folder, env=surroundings, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"{tree}: {command}: exit status {done.returncode}\n{done.stderr[-2000:]}")
         (folder / f"printed-{number}.json").write_text(done.stdout.splitlines()[-1] + "\n")
+
+
+def in_words_of(module: str, words: list[str], tree: Path) -> list[str]:
+    """Return a command in the words of an older command line: before the move, models had no names there."""
+    if module != "studies.cli":
+        return words
+    files = {name: str(tree / "csph" / "weights" / f"{name}.safetensors") for name in MODELS}
+    return [files.get(word, "--checkpoint" if word == "--model" and "network" in words else word) for word in words]
 
 
 def compared(old: Path, new: Path) -> Iterator[str]:
@@ -174,16 +185,16 @@ def _exr(path: Path) -> Iterator[tuple[str, Any]]:
     import OpenEXR
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
-        for number, part in enumerate(file.parts):
+        for part in file.parts:  # in any order
             for name, channel in part.channels.items():
                 pixels = channel.pixels
                 if pixels.dtype == object:  # deep: an array a pixel, None where there is no sample
                     empty = np.zeros(0, np.float32)
                     pixels = np.concatenate([empty if one is None else np.asarray(one).ravel() for one in pixels.flat])
-                yield f"{number}.{name}", np.ascontiguousarray(pixels)
+                yield name, np.ascontiguousarray(pixels)
             meta = part.header.get("scene2spad")
             if meta:
-                yield from _flat(json.loads(meta), f"{number}")
+                yield from _flat(json.loads(meta), "scene2spad")
 
 
 def _hdf5(path: Path) -> Iterator[tuple[str, Any]]:

@@ -123,34 +123,49 @@ class Evaluation:
         return {**table, "bias_by_depth": [b._asdict() for b in bias_by_depth(estimate, truth, range(far + 1))]}
 
 
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """How views are sensed for an evaluation.
+
+    levels     (signal, background) of each photon budget
+    tile       rows and columns of which images are cut to whole numbers after sensing
+    offset_m   moves the scenes away in time alone (`Transient.delayed`)
+    seed       of the photons
+    """
+
+    levels: Sequence[tuple[float, float]] = PHOTON_LEVELS
+    tile: tuple[int, int] = (1, 1)
+    offset_m: float = 0.0
+    seed: int = 0
+
+
+PUBLISHED_LEVELS = EvaluationPlan()
+
+
 def evaluate(
     methods: Mapping[str, Method],
     views: Views,
     sensor: Sensor,
+    plan: EvaluationPlan = PUBLISHED_LEVELS,
     *,
-    levels: Sequence[tuple[float, float]] = PHOTON_LEVELS,
-    tile: tuple[int, int] = (1, 1),
-    offset_m: float = 0.0,
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Sense every view at every level and apply all methods to it.
+    """Sense every view at every level of the plan and apply all methods to it.
 
-    After sensing, images are cut to what tiles of `tile` rows and columns cover. `offset_m` moves the scenes away in
-    time alone (`Transient.delayed`); sets rendered with other offsets are given as they are. Raises InputError for an
-    empty set or no method, an image smaller than a tile, and what the methods raise.
+    Sets rendered with other offsets than in time are given as they are. Raises InputError for an empty set or no
+    method, an image smaller than a tile, and what the methods raise.
     """
     require(bool(views.transients) and bool(methods), "evaluation: no view or no method")
     retain_freed_memory()
     report, result = progress or (lambda what, fraction: None), Evaluation(depths={name: [] for name in methods})
-    total = len(views.transients) * len(levels)
+    total = len(views.transients) * len(plan.levels)
     for view, (transient, scene) in enumerate(zip(views.transients, views.scenes, strict=True)):
-        moved = transient.delayed(offset_m) if offset_m else transient
-        for number, (signal, background) in enumerate(levels):
-            report(f"{scene}, {signal:g} + {background:g} photons", (view * len(levels) + number) / total)
-            draw = np.random.SeedSequence(seed, spawn_key=(Stream.EVALUATE, view, number)).generate_state(1)[0]
+        moved = transient.delayed(plan.offset_m) if plan.offset_m else transient
+        for number, (signal, background) in enumerate(plan.levels):
+            report(f"{scene}, {signal:g} + {background:g} photons", (view * len(plan.levels) + number) / total)
+            draw = np.random.SeedSequence(plan.seed, spawn_key=(Stream.EVALUATE, view, number)).generate_state(1)[0]
             histogram = sense(moved, sensor, PhotonBudget(signal, background), seed=int(draw), model="poisson")
-            histogram = _tiled(histogram, tile)
+            histogram = _tiled(histogram, plan.tile)
             for name, method in methods.items():
                 estimate = method(histogram)
                 result.rows += _rows(name, scene, view, (signal, background), estimate, histogram)

@@ -23,7 +23,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -257,6 +257,19 @@ def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
     require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
 
 
+@dataclass(frozen=True)
+class Hardware:
+    """What a training runs on: processes that draw samples, and Lightning's names of accelerator, devices, strategy."""
+
+    workers: int = 0
+    accelerator: str = "auto"
+    devices: int | str = "auto"
+    strategy: str = "auto"
+
+
+ANY_HARDWARE = Hardware()
+
+
 def _listed(views: Views | Sequence[Views]) -> list[Views]:
     return [views] if isinstance(views, Views) else list(views)
 
@@ -292,7 +305,7 @@ def _quiet() -> Any:
             logger.setLevel(level)
 
 
-def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
+def _trainer(config: TrainConfig, record: Record, hardware: Hardware) -> pl.Trainer:
     """Make Lightning's Trainer without what `Record` does instead. InputError for mixed precision on a CPU."""
     runner = pl.Trainer(
         max_epochs=config.epochs,
@@ -305,7 +318,9 @@ def _trainer(config: TrainConfig, record: Record, **more: Any) -> pl.Trainer:
         num_sanity_val_steps=0,
         plugins=[WholeFileCheckpoints()],
         reload_dataloaders_every_n_epochs=1,
-        **more,
+        accelerator=hardware.accelerator,
+        devices=hardware.devices,
+        strategy=hardware.strategy,
     )
     # there, weights' gradients in bf16 read memory that was never written (torch 2.13)
     on_cpu = runner.strategy.root_device.type == "cpu"
@@ -320,15 +335,14 @@ def train(
     folder: Path,
     *,
     init: DepthModel | NetworkOf | None = None,
-    workers: int = 0,
+    hardware: Hardware = ANY_HARDWARE,
     progress: Progress | None = None,
-    **trainer: Any,
 ) -> dict[str, Any]:
     """Run a configuration to its end in a folder, or go on where an interrupted run of the same configuration stopped.
 
     Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
     the same design to begin with, instead of random weights, or `NetworkOf` one of any design on the same sensor, whose
-    codes begin anew. `trainer` holds further arguments of Lightning's Trainer (accelerator, devices, strategy). Returns
+    codes begin anew. No result depends on `hardware`, but for the order of sums on several devices. Returns
     steps, seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of parameters.
     Raises InputError for sets or an `init` that do not fit, and a folder of another run.
     """
@@ -339,10 +353,10 @@ def train(
     config = _with_hashes(config, sets, init)
     if config.model.grid == "published":
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
-    module_data = SetData(*sets, config, workers)
+    module_data = SetData(*sets, config, hardware.workers)
     record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():
-        runner = _trainer(config, record, **trainer)
+        runner = _trainer(config, record, hardware)
     _claim(folder, config)
     if config.threads:
         torch.set_num_threads(config.threads)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from csph.codes.design import Design
-from csph.evaluation.methods import evaluate
+from csph.evaluation.methods import EvaluationPlan, evaluate
 from csph.networks.model import DepthModel
 from csph.networks.published import DeepBoosting, parameters_of
 from csph.training.config import NETWORKS, ModelConfig, preset
@@ -154,7 +154,7 @@ def train_for(model: DepthModel, limit_s: float, seed: int) -> tuple[int, float,
         step += 1
     taken = time.perf_counter() - start
     views = rest._replace(transients=rest.transients[:TEST_SCENES], scenes=rest.scenes[:TEST_SCENES])
-    found = evaluate({"network": lambda h: model.depth_of(h)[0]}, views, sensor, levels=LEVELS, seed=seed)
+    found = evaluate({"network": lambda h: model.depth_of(h)[0]}, views, sensor, EvaluationPlan(LEVELS, seed=seed))
     interval = found.interval(["network"])
     return step, taken, float("nan") if interval is None else interval.mean
 

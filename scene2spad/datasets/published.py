@@ -42,7 +42,7 @@ from scenes.io.relief import (
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.formats.histogram import Histogram
-from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, from_rgbd
+from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor
 
 log = logging.getLogger("scene2spad")
@@ -199,7 +199,7 @@ def errors_of(
 
 def _drawn(pair: Pair, level: tuple[float, float], offset_m: float, key: tuple[int, ...]) -> Histogram:
     budget, sensor = PhotonBudget(*level), Sensor()
-    expected = from_rgbd(pair.depth_m + offset_m, pair.luma, pair.luma, sensor, budget, convention="published")
+    expected = published_from_rgbd(pair.depth_m + offset_m, pair.luma, pair.luma, sensor, budget)
     rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(Stream.PUBLISHED,)))
     return Histogram(
         rng.poisson(expected.rates).astype(np.int32),

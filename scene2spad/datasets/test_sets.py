@@ -4,13 +4,13 @@ folder."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from csph.evaluation.methods import Method, Row, as_dicts, evaluate
+from csph.evaluation.methods import EvaluationPlan, Method, Row, as_dicts, evaluate
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.training.views import Views, read_views
 from scene2spad.datasets.rendering import Job, make_set, pack_set
@@ -31,7 +31,11 @@ ROOMS = 2000  # views that `laptop` models are trained on
 
 @dataclass(frozen=True, eq=False)
 class TestSet:
-    """Views under a name; `offset_m` and `mode` say how they were moved before they were rendered."""
+    """Views under a name.
+
+    `offset_m` and `mode` say how they were moved before they were rendered; `delay_m` moves them when they are sensed,
+    in time alone, with the counts of every pixel as they were.
+    """
 
     __test__ = False  # no test of pytest's
 
@@ -39,6 +43,7 @@ class TestSet:
     views: Views
     offset_m: float = 0.0
     mode: OffsetMode = "time"
+    delay_m: float = 0.0
 
     @cached_property
     def digests(self) -> tuple[str, ...]:
@@ -47,13 +52,17 @@ class TestSet:
 
     def first(self, count: int | None) -> TestSet:
         """Return its first views."""
-        return TestSet(self.name, Views(*(part[:count] for part in self.views)), self.offset_m, self.mode)
+        return replace(self, views=Views(*(part[:count] for part in self.views)))
 
-    def truth_m(self, view: int, delay_m: float) -> np.ndarray:
+    def delayed(self, delay_m: float) -> TestSet:
+        """Return the same views `delay_m` farther away in time."""
+        return replace(self, delay_m=delay_m)
+
+    def truth_m(self, view: int) -> np.ndarray:
         """Return depth of a view as it is evaluated, cut to TILE."""
         depth = self.views.transients[view].depth_m
         rows, columns = (side // part * part for side, part in zip(depth.shape, TILE, strict=True))
-        return depth[:rows, :columns] + np.float32(delay_m)
+        return depth[:rows, :columns] + np.float32(self.delay_m)
 
 
 def rendered(
@@ -64,7 +73,6 @@ def rendered(
     mode: OffsetMode = "time",
     count: int | None = None,
     size: tuple[int, int] | None = None,
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> TestSet:
     """Return a finite set with direct light alone, rendered into `folder` where it is not there; `size` is (width,
@@ -73,7 +81,7 @@ def rendered(
     Raises InputError where a view cannot be rendered.
     """
     width, height = size or (None, None)
-    job = Job(name, seed, width, height, bounces=1, grid=4, error=0.01, offset_m=offset_m, offset_mode=mode)
+    job = Job(name, width=width, height=height, bounces=1, grid=4, error=0.01, offset_m=offset_m, offset_mode=mode)
     of = scene_set(name)
     moved = f"-{mode}-{offset_m:g}m" if offset_m else ""
     path = folder / f"{name.replace('/', '-')}{moved}"
@@ -100,7 +108,6 @@ def evaluated(
     test: TestSet,
     levels: Sequence[tuple[float, float]],
     *,
-    delay_m: float = 0.0,
     maps: Sequence[int] = (),
     seed: int = 0,
     progress: Progress | None = None,
@@ -108,18 +115,17 @@ def evaluated(
     """Return rows of every model, view and level; what the store has is not computed again, the rest sees the same
     photons.
 
-    `delay_m` moves the views in time alone, with the counts of every pixel as they were. Of the views in `maps` the
-    depth maps are kept as well (`depth_map`).
+    Of the views in `maps` the depth maps are kept as well (`depth_map`).
     """
     report, rows = progress or (lambda what, fraction: None), []
     total = len(test.views.transients) * len(levels)
     for view, scene in enumerate(test.views.scenes):
         for number, level in enumerate(levels):
-            report(f"{scene}, {level[0]:g} + {level[1]:g}, {delay_m:g} m", (view * len(levels) + number) / total)
-            key = _key(test, view, level, delay_m, seed)
+            report(f"{scene}, {level[0]:g} + {level[1]:g}, {test.delay_m:g} m", (view * len(levels) + number) / total)
+            key = _key(test, view, level, seed)
             missing = [one for one in subjects if not _has(store, one, key, view in maps)]
             if missing:
-                _evaluate(store, missing, test, view, level, delay_m, seed, view in maps)
+                _evaluate(store, missing, test, view, level, seed, view in maps)
             for one in subjects:
                 kept = store.get(one.digest, **key)
                 rows += [Row(**{**row, "method": one.name, "view": view}) for row in kept]
@@ -132,19 +138,18 @@ def depth_map(
     test: TestSet,
     view: int,
     level: tuple[float, float],
-    delay_m: float,
     seed: int,
 ) -> np.ndarray:
     """Return (H, W) depth [m] that `evaluated` kept."""
-    return read_array(store.map_file(subject.digest, **_key(test, view, level, delay_m, seed)))
+    return read_array(store.map_file(subject.digest, **_key(test, view, level, seed)))
 
 
-def _key(test: TestSet, view: int, level: tuple[float, float], delay_m: float, seed: int) -> dict[str, object]:
+def _key(test: TestSet, view: int, level: tuple[float, float], seed: int) -> dict[str, object]:
     return {
         "view": f"{view}-{test.digests[view]}",
         "signal": float(level[0]),
         "background": float(level[1]),
-        "delay_m": float(delay_m),
+        "delay_m": float(test.delay_m),
         "seed": seed,
     }
 
@@ -160,11 +165,10 @@ def _evaluate(
     test: TestSet,
     view: int,
     level: tuple[float, float],
-    delay_m: float,
     seed: int,
     with_map: bool,
 ) -> None:
-    key = _key(test, view, level, delay_m, seed)
+    key = _key(test, view, level, seed)
     one_view = Views(test.views.transients[view : view + 1], test.views.scenes[view : view + 1])
     estimates: dict[str, np.ndarray] = {}
 
@@ -179,7 +183,7 @@ def _evaluate(
 
     draw = _draw(seed, view, level)
     methods = {subject.digest: method(subject) for subject in subjects}
-    found = evaluate(methods, one_view, Sensor(), levels=(level,), tile=TILE, offset_m=delay_m, seed=draw)
+    found = evaluate(methods, one_view, Sensor(), EvaluationPlan((level,), TILE, test.delay_m, draw))
     for subject in subjects:
         if with_map:
             store.put_map(estimates[subject.digest], subject.digest, **key)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.codes.design import Design
-from csph.evaluation.methods import LEVEL_GROUPS, DepthEstimator, Evaluation, Method, as_dicts, evaluate
+from csph.evaluation.methods import LEVEL_GROUPS, DepthEstimator, Evaluation, EvaluationPlan, Method, as_dicts, evaluate
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.networks.model import DepthModel, load_model
 from csph.training.config import ModelConfig, TrainConfig, preset
@@ -141,9 +141,8 @@ def run_train(command: Train, progress: Progress) -> dict:
         validation,
         folder,
         init=init,
-        workers=command.workers,
+        hardware=Hardware(command.workers, devices=command.devices or "auto"),
         progress=progress,
-        devices=command.devices or "auto",
     )
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
 
@@ -246,16 +245,9 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
             groups.setdefault(f"{group}{suffix}", []).append(f"{path}{suffix}")
     methods |= {name: baseline(name) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
-    found = evaluate(
-        methods,
-        views,
-        sensor,
-        levels=photon_levels(command.levels),
-        tile=common_tile(models) if command.tiled else (1, 1),
-        offset_m=command.offset,
-        seed=command.seed,
-        progress=progress,
-    )
+    tile = common_tile(models) if command.tiled else (1, 1)
+    plan = EvaluationPlan(photon_levels(command.levels), tile, command.offset, command.seed)
+    found = evaluate(methods, views, sensor, plan, progress=progress)
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
     first = f"{designs[0]}{in_8_bits if command.int8 else ''}"

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from csph.evaluation.methods import Method, evaluate
+from csph.evaluation.methods import EvaluationPlan, Method, evaluate
 from csph.networks.model import DepthModel, load_model
 from csph.training.views import Views
 from render.transient import Transient, read_transient
@@ -158,7 +158,7 @@ def errors_of(
     """Return {method: (MAE [mm], its standard error from the draws of photons)}, the mean over views and levels."""
     draws: dict[str, list[float]] = {name: [] for name in methods}
     for draw in range(DRAWS):
-        found = evaluate(methods, views, sensor, levels=LEVELS, tile=tile, seed=seed + draw)
+        found = evaluate(methods, views, sensor, EvaluationPlan(LEVELS, tile, seed=seed + draw))
         for name, values in draws.items():
             values.append(statistics.fmean(r.mae_mm for r in found.rows if r.method == name and r.group == "all"))
     return {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,8 +69,6 @@ def relief(
     *,
     half_level_m: np.ndarray | float = 0.0,
     cosine: bool = False,
-    width: int | None = None,
-    height: int | None = None,
     notes: tuple[str, ...] = (),
 ) -> Scene:
     """Return the relief of a depth image (h, w) along the camera's axis [m], all finite; the camera is its own.
@@ -103,7 +101,7 @@ def relief(
     camera = Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=fov, width=columns, height=rows)
     message = f"relief: {int(apart.sum())} of {apart.size} cells cut at depth edges"
     shading = f"shading: cosine {'applied' if cosine else 'not applied, the photograph holds its own'}"
-    return Scene(name, (mesh,), camera.resized(width, height), notes=(*notes, message, shading))
+    return Scene(name, (mesh,), camera, notes=(*notes, message, shading))
 
 
 def _cuts(depth: np.ndarray, focal_px: float, level: np.ndarray) -> np.ndarray:
@@ -239,17 +237,16 @@ def middlebury(folder: Path, *, cosine: bool = False, width: int | None = None, 
     full = dequantised(levels) + least
     require(bool(full.min() > 0), f"{folder}: disparity + dmin is {full.min():g}, expected more than 0")
     depth = MIDDLEBURY_FOCAL_PX * MIDDLEBURY_BASELINE_M / full
-    return relief(
+    scene = relief(
         f"middlebury/{folder.name}",
         depth,
         _albedo(folder / "view1.png", depth.shape),
         MIDDLEBURY_FOCAL_PX / MIDDLEBURY_SHRUNK,
         half_level_m=0.5 * depth / full,
         cosine=cosine,
-        width=width,
-        height=height,
         notes=(f"holes: {1 - known.mean():.2%} of the disparities filled from behind",),
     )
+    return replace(scene, camera=scene.camera.resized(width, height))
 
 
 def rgbd(files: RgbdFiles, *, width: int | None = None, height: int | None = None) -> Scene:
@@ -273,17 +270,16 @@ def rgbd(files: RgbdFiles, *, width: int | None = None, height: int | None = Non
         notes.append(f"median depth {np.median(depth):.4g} m: is the scale right?")
     half = 0.5 * scale if integer else 0.0
     texture = _albedo(Path(files.image), depth.shape)
-    return relief(
+    scene = relief(
         Path(files.image).stem,
         depth,
         texture,
         files.focal_px,
         half_level_m=half,
         cosine=files.cosine,
-        width=width,
-        height=height,
         notes=tuple(notes),
     )
+    return replace(scene, camera=scene.camera.resized(width, height))
 
 
 def _albedo(path: Path, shape: tuple[int, int]) -> Texture:

@@ -1,14 +1,14 @@
 """RGB-D images -> expected counts: the simulation of the ICCV 2023 paper's supplement S.5.1, in two conventions.
 
-`ours` goes through a transient, one return a depth sample: the pulse's centroid at 2 d / c, radiance
-albedo cos(theta) / (pi d^2), everything else as for a rendered scene. `published` follows the paper's code: one return
-a pixel at the rounded bin, albedo / d^2 without a cosine, c = 3e8 m/s.
+`from_rgbd` goes through a transient, one return a depth sample: the pulse's centroid at 2 d / c, radiance
+albedo cos(theta) / (pi d^2), everything else as for a rendered scene. `published_from_rgbd` follows the paper's code: one
+return a pixel at the rounded bin, albedo / d^2 without a cosine, c = 3e8 m/s.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from spad.detection.flux import expected_counts, rates_for
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
 
-Convention = Literal["ours", "published"]
 PUBLISHED_SPEED_OF_LIGHT_M_PER_S = 3e8
 MIXED_M = 0.05
 
@@ -31,7 +30,7 @@ class Expected(NamedTuple):
     depth_m      (H, W) float64: the label that the convention trains and tests on, NaN for none
     range_bin    (H, W) int64: bin of the pulse's peak, from 1 as in the published files; 0 for none
     signal, background   (H, W) float64 per exposure
-    dark_share   share of the mean background that is dark counts
+    dark_fraction   part of the mean background that is dark counts
     """
 
     rates: np.ndarray
@@ -49,48 +48,14 @@ def from_rgbd(
     sensor: Sensor,
     budget: PhotonBudget,
     *,
-    convention: Convention = "ours",
     fov_deg: float | None = None,
     block: int = 1,
 ) -> Expected:
     """Return expected counts of an RGB-D image: radial depth [m], albedo and ambient light of any scale, (H, W) each.
 
-    ours        as `transient_from_rgbd` says (which takes `fov_deg` and `block`), signal and background by means
-    published   beta = round(2 d / (c Delta)) modulo T, 1 or more; S = signal a / d^2 over its mean; A = dark counts +
-                background b over its mean, rescaled to the asked mean; rate = S h + A / T with the largest sample of
-                the published taps h at bin beta, from 1; the label is beta - 1 bins
-
-    Raises InputError for arrays of different shapes, and where the published convention does not apply: depth that is
-    not finite, bins that do not cover the period, a pulse of other taps.
+    Returns are as `transient_from_rgbd` says, which takes `fov_deg` and `block`; signal and background are means over
+    the image. Raises InputError for arrays of different shapes.
     """
-    if convention == "ours":
-        return _ours(depth_m, albedo, ambient, sensor, budget, fov_deg, block)
-    require(convention == "published", f"convention {convention!r} is unknown, expected ours or published")
-    require(block == 1, "the published convention takes one depth a pixel, block must be 1")
-    depth, white, light = _alike(depth_m, albedo, ambient)
-    return _published(depth, white, light, sensor, budget)
-
-
-def _alike(*images: np.ndarray) -> list[np.ndarray]:
-    arrays = [np.asarray(image, dtype=np.float64) for image in images]
-    shapes = {array.shape for array in arrays}
-    if len(shapes) != 1 or arrays[0].ndim != 2 or not arrays[0].size:
-        raise InputError(f"RGB-D images of shapes {sorted(shapes)}, expected one of (H, W) for all")
-    return arrays
-
-
-# Ours
-
-
-def _ours(
-    depth_m: np.ndarray,
-    albedo: np.ndarray,
-    ambient: np.ndarray,
-    sensor: Sensor,
-    budget: PhotonBudget,
-    fov_deg: float | None,
-    block: int,
-) -> Expected:
     transient = transient_from_rgbd(depth_m, albedo, ambient, fov_deg=fov_deg, block=block)
     shape = (transient.height, transient.width)
     rates = rates_for(transient, sensor, budget)
@@ -107,6 +72,14 @@ def _ours(
         background=background,
         dark_fraction=rates.dark_fraction,
     )
+
+
+def _alike(*images: np.ndarray) -> list[np.ndarray]:
+    arrays = [np.asarray(image, dtype=np.float64) for image in images]
+    shapes = {array.shape for array in arrays}
+    if len(shapes) != 1 or arrays[0].ndim != 2 or not arrays[0].size:
+        raise InputError(f"RGB-D images of shapes {sorted(shapes)}, expected one of (H, W) for all")
+    return arrays
 
 
 def transient_from_rgbd(
@@ -198,9 +171,17 @@ def _tangent(points: np.ndarray, axis: int) -> np.ndarray:
 # Published
 
 
-def _published(
-    depth: np.ndarray, albedo: np.ndarray, ambient: np.ndarray, sensor: Sensor, budget: PhotonBudget
+def published_from_rgbd(
+    depth_m: np.ndarray, albedo: np.ndarray, ambient: np.ndarray, sensor: Sensor, budget: PhotonBudget
 ) -> Expected:
+    """Return expected counts of an RGB-D image as the published code computes them: arrays as for `from_rgbd`.
+
+    beta = round(2 d / (c Delta)) modulo T, 1 or more; S = signal a / d^2 over its mean; A = dark counts + background b
+    over its mean, rescaled to the asked mean; rate = S h + A / T with the largest sample of the published taps h at bin
+    beta, from 1; the label is beta - 1 bins. Raises InputError for arrays of different shapes, depth that is not
+    finite, bins that do not cover the period, and a pulse of other taps.
+    """
+    depth, albedo, ambient = _alike(depth_m, albedo, ambient)
     require(bool(np.isfinite(depth).all() and (depth > 0).all()), "published convention: every pixel needs a depth")
     require(sensor.bins == sensor.bins_per_period, "published convention: the bins must cover the period")
     require(float(albedo.mean()) > 0, "published convention: the albedo is 0 everywhere")

@@ -13,11 +13,11 @@ import pytest
 import torch
 
 from csph.codes.design import Design
-from csph.evaluation.methods import evaluate
+from csph.evaluation.methods import EvaluationPlan, evaluate
 from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
 from csph.training.config import PUBLISHED_TV, ModelConfig, TrainConfig, preset
 from csph.training.data import Frames, Samples, SetData
-from csph.training.loop import train
+from csph.training.loop import Hardware, train
 from csph.training.loss import kl_divergence, pulse_target, total_variation
 from csph.training.views import Views, packed_views, split_views
 from scene2spad.datasets.planes import random_planes
@@ -155,13 +155,13 @@ def test_interruption_is_passed_on(tmp_path):
 def test_images_are_cut_to_whole_blocks():
     model = DepthModel(MODEL).eval()
     views = random_planes(1, size=17, seed=2)
-    found = evaluate({"n": lambda h: model.depth_of(h)[0]}, views, SMALL, levels=[(20, 20)], tile=(2, 2))
+    found = evaluate({"n": lambda h: model.depth_of(h)[0]}, views, SMALL, EvaluationPlan([(20, 20)], tile=(2, 2)))
     row = found.rows[0]
     assert (
         row.group == "all" and row.pixels + row.beyond_range == np.isfinite(views.transients[0].depth_m[:16, :16]).sum()
     )
     with pytest.raises(InputError, match="image of 17 x 17 pixels is smaller than a block of 32 x 32"):
-        evaluate({"n": lambda h: h.depth_m}, views, SMALL, levels=[(20, 20)], tile=(32, 32))
+        evaluate({"n": lambda h: h.depth_m}, views, SMALL, EvaluationPlan([(20, 20)], tile=(32, 32)))
 
 
 def test_a_run_that_stops_goes_on_to_the_same_weights(tmp_path):
@@ -301,9 +301,8 @@ def test_damaged_and_foreign_checkpoints(tmp_path):
 )
 def test_bad_configurations(change, message, tmp_path):
     with pytest.raises(InputError, match=message):
-        train(
-            preset("smoke", MODEL, **{**FEW, **change}), *split_views(near_planes(3)), tmp_path / "x", accelerator="cpu"
-        )
+        config, hardware = preset("smoke", MODEL, **{**FEW, **change}), Hardware(accelerator="cpu")
+        train(config, *split_views(near_planes(3)), tmp_path / "x", hardware=hardware)
     assert not (tmp_path / "x").exists()
 
 

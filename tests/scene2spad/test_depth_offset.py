@@ -24,7 +24,7 @@ from scene2spad.studies.depth_offset import study as depth_offset
 from scene2spad.studies.depth_offset import tables
 from scene2spad.studies.results import Store
 from spad.detection.detect import sense
-from spad.formats.rgbd import from_rgbd, published_taps
+from spad.formats.rgbd import published_from_rgbd, published_taps
 from spad.sensor.model import PhotonBudget, Sensor
 
 SENSOR = Sensor()
@@ -115,19 +115,20 @@ def test_a_time_offset_leaves_every_pixel_its_signal():
 def test_results_are_computed_once_and_shared_by_parts_of_a_set(tmp_path):
     views = random_planes(2, size=10, seed=1)
     test, store = TestSet("planes", views), Store(tmp_path)
+    far = test.delayed(1.0)
     one = EvaluatedModel("one", Counting(), "1" * 64)
     levels = ((10.0, 10.0), (50.0, 50.0))
     Counting.asked = 0
-    rows = evaluated(store, [one], test, levels, delay_m=1.0, maps=(0,))
+    rows = evaluated(store, [one], far, levels, maps=(0,))
     assert Counting.asked == 4 and len(rows) == 4 * 3
-    again = evaluated(Store(tmp_path), [one], test, levels, delay_m=1.0, maps=(0,))
+    again = evaluated(Store(tmp_path), [one], far, levels, maps=(0,))
     assert repr(again) == repr(rows)  # NaN is not NaN
-    first = evaluated(Store(tmp_path), [one._replace(name="again")], test.first(1), levels, delay_m=1.0)
+    first = evaluated(Store(tmp_path), [one._replace(name="again")], far.first(1), levels)
     assert Counting.asked == 4 and {r.method for r in first} == {"again"}
-    evaluated(Store(tmp_path), [one], test, levels, delay_m=1.0, maps=(1,))  # the maps of another view
+    evaluated(Store(tmp_path), [one], far, levels, maps=(1,))  # the maps of another view
     assert Counting.asked == 6
-    evaluated(Store(tmp_path), [one], test, levels[:1], delay_m=0.0)
-    evaluated(Store(tmp_path), [one], test, levels[:1], delay_m=1.0, seed=1)
+    evaluated(Store(tmp_path), [one], test, levels[:1])
+    evaluated(Store(tmp_path), [one], far, levels[:1], seed=1)
     assert Counting.asked == 10
 
 
@@ -159,7 +160,7 @@ def test_arrival_lies_where_the_published_pulse_has_its_centroid(tmp_path):
     level = (50.0, 1000.0)
     histogram = published._drawn(pair, level, 0.0, (0, 0, 0))
     assert histogram.counts.mean() * SENSOR.bins == pytest.approx(1050, rel=0.01)
-    bright = from_rgbd(pair.depth_m, pair.luma, pair.luma, SENSOR, PhotonBudget(1e5, 0), convention="published")
+    bright = published_from_rgbd(pair.depth_m, pair.luma, pair.luma, SENSOR, PhotonBudget(1e5, 0))
     counts = np.round(bright.rates).astype(np.int32)
     clean = SimpleNamespace(counts=counts, sensor=SENSOR, depth_m=bright.depth_m.astype(np.float32))
     errors = published._errors(EvaluatedModel("mean", Counting(), "x"), clean)

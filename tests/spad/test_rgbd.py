@@ -16,7 +16,7 @@ from scenes.errors import InputError
 from spad.detection.detect import sense
 from spad.detection.flux import rates_for
 from spad.formats.mat import read_mat, write_mat
-from spad.formats.rgbd import cosine_of_incidence, from_rgbd, published_taps, transient_from_rgbd
+from spad.formats.rgbd import cosine_of_incidence, from_rgbd, published_from_rgbd, published_taps, transient_from_rgbd
 from spad.sensor.budget import Optics
 from spad.sensor.model import PhotonBudget, Pulse, Sensor, sensor_by_name
 
@@ -48,7 +48,7 @@ def test_ours_is_the_definition() -> None:
 
 def test_published_is_the_definition() -> None:
     depth, albedo, ambient = scene()
-    expected = from_rgbd(depth, albedo, ambient, Sensor(), PhotonBudget(30, 60), convention="published")
+    expected = published_from_rgbd(depth, albedo, ambient, Sensor(), PhotonBudget(30, 60))
     taps = published_taps(Sensor())
     falloff = albedo / depth**2
     for row, column in np.ndindex(depth.shape):
@@ -76,7 +76,7 @@ def test_published_pulses() -> None:
 @pytest.mark.parametrize(("background", "fraction"), [(2, 0.94), (10, 0.76), (50, 0.39)])
 def test_published_dark_share(background: float, fraction: float) -> None:
     flat = np.ones((64, 64))
-    expected = from_rgbd(flat, flat, flat, TRAIN, PhotonBudget(10, background), convention="published")
+    expected = published_from_rgbd(flat, flat, flat, TRAIN, PhotonBudget(10, background))
     assert expected.dark_fraction == pytest.approx(fraction, abs=0.005)
     assert expected.background.mean() == pytest.approx(background)
 
@@ -115,11 +115,10 @@ def test_bad_rgbd_is_refused_in_one_line() -> None:
     ):
         with pytest.raises(InputError, match=words):
             from_rgbd(*bad, Sensor(), PhotonBudget(1, 1))
-    for options, words in (({"convention": "theirs"}, "unknown"), ({"convention": "published", "block": 2}, "block")):
-        with pytest.raises(InputError, match=words):
-            from_rgbd(depth, albedo, ambient, Sensor(), PhotonBudget(1, 1), **options)
+        with pytest.raises(InputError, match=words if words == "shapes" else "albedo"):
+            published_from_rgbd(*bad, Sensor(), PhotonBudget(1, 1))
     with pytest.raises(InputError, match="every pixel"):
-        from_rgbd(depth * math.nan, albedo, ambient, Sensor(), PhotonBudget(1, 1), convention="published")
+        published_from_rgbd(depth * math.nan, albedo, ambient, Sensor(), PhotonBudget(1, 1))
 
 
 # NYUv2 frames
@@ -149,7 +148,7 @@ def test_nyuv2_frames_and_their_bins(frame: str, level: tuple, shared_data: Path
     # the high-resolution bins, unrounded, are depth: reduced as MATLAB does, they give every published bin again
     depth = shrunk(raw["bin_hr"], 64) * LIGHT * 80e-12 / 2
     flat = np.ones((64, 64))
-    expected = from_rgbd(depth, flat, flat, TRAIN, PhotonBudget(50, 5), convention="published")
+    expected = published_from_rgbd(depth, flat, flat, TRAIN, PhotonBudget(50, 5))
     assert (expected.range_bin == raw["bin"]).all()
     assert (expected.rates.argmax(axis=-1) == raw["rates"].argmax(axis=-1)).all()
     # pixels are column-major: their photons lie where the bins are

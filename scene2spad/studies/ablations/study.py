@@ -123,8 +123,8 @@ def _drawn(
     mine = {one: models[one] for one in sheet.wanted if one in models}
     lines = []
     for level in sheet.shown:
-        maps = [depth_map(store, one.subject, test, view, level, 0.0, command.seed) for one in mine.values()]
-        lines.append((f"[{level[0]:g}, {level[1]:g}]", test.truth_m(view, 0.0), maps))
+        maps = [depth_map(store, one.subject, test, view, level, command.seed) for one in mine.values()]
+        lines.append((f"[{level[0]:g}, {level[1]:g}]", test.truth_m(view), maps))
     labels = [figures.label_of(one) for one in mine.values()]
     path = command.out / f"{command.name}-{sheet.figure}-{sheet.compression}x.png"
     title = f"{sheet.title}, {sheet.compression}x, {TEST_SET}, seed 0"

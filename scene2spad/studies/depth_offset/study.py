@@ -85,9 +85,8 @@ class Session:
         maps: Sequence[int] = (),
     ) -> list[Row]:
         """Return rows of a part of the study, kept for the table too."""
-        found = evaluated(
-            self.store, subjects, test, levels, delay_m=delay_m, maps=maps, seed=self.seed, progress=self.progress
-        )
+        moved = test.delayed(delay_m)
+        found = evaluated(self.store, subjects, moved, levels, maps=maps, seed=self.seed, progress=self.progress)
         common = {"part": part, "set": test.name, "mode": test.mode, "offset_m": delay_m or test.offset_m}
         self.rows += [{**common, **row} for row in as_dicts(found)]
         return found
@@ -340,13 +339,14 @@ def _depth_images(study: Session, base: TestSet, shown: Sequence[int], out: Path
         lines = []
         for view in shown:
             for delay in (0.0, OFFSET_M):
+                moved = base.delayed(delay)
                 for level in levels:
                     maps = {
-                        w.label: depth_map(study.store, study.models[w].subject, base, view, level, delay, study.seed)
+                        w.label: depth_map(study.store, study.models[w].subject, moved, view, level, study.seed)
                         for w in mine
                     }
                     message = f"{base.views.scenes[view].split('/')[-1]}\n{'+7 m' if delay else 'as it is'}\n"
-                    lines.append((f"{message}[{level[0]:g}, {level[1]:g}]", base.truth_m(view, delay), maps))
+                    lines.append((f"{message}[{level[0]:g}, {level[1]:g}]", moved.truth_m(view), maps))
         drawn.append(figures.depth_images(lines, ratio, out / f"depth-offset-3-{ratio}x.png"))
     return drawn
 
