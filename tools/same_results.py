@@ -47,13 +47,14 @@ RUNS: dict[str, tuple[str, ...]] = {
         "sense gallery.exr --seed 2",
         *(f"depth gallery.h5 --method {m}" for m in ("argmax", "matched", "log-matched", "correlation", "coates")),
         *(f"depth gallery.h5 --method compressive --code {c} --codes 16" for c in ("fourier", "gray", "coarse")),
-        *(f"depth gallery.h5 --method network --model {model}" for model in MODELS),
-        f"depth gallery.h5 --method network --model {MODELS[0]} --int8 --out int8.exr",
+        *(f"depth gallery.h5 --method network --model {m} --decoder soft-argmax --out {m}.exr" for m in MODELS),
+        f"depth gallery.h5 --method network --model {MODELS[0]} --decoder soft-argmax --int8 --out int8.exr",
     ),
     "dataset": ("dataset rooms --count 12 --width 16 --height 16 --bounces 1 --workers 2 --out set --pack set.h5",),
     "evaluate": (
         "dataset rooms --count 6 --width 16 --height 16 --bounces 1 --out set --pack set.h5",
-        f"evaluate {' '.join(MODELS)} --set set.h5 --baselines log-matched fourier-8 --views 2 --out evaluated",
+        f"evaluate {' '.join(MODELS)} --set set.h5 --baselines log-matched fourier-8 --views 2"
+        " --decoder soft-argmax --out evaluated",
     ),
     "train": ("train --preset smoke --design learned --block 256 4 4 --compression 128 --threads 1 --out run",),
     "ultraphase": ("ultraphase table", "ultraphase verify fourier"),
@@ -104,9 +105,12 @@ def run_all(tree: Path, commands: tuple[str, ...], folder: Path) -> None:
 
 
 def in_words_of(module: str, words: list[str], tree: Path) -> list[str]:
-    """Return a command in the words of an older command line: before the move, models had no names there."""
+    """Return a command in the words of an older command line: before the move, models had no names and one decoder."""
     if module != "studies.cli":
         return words
+    if "--decoder" in words:
+        at = words.index("--decoder")
+        words = words[:at] + words[at + 2 :]
     files = {name: str(tree / "csph" / "weights" / f"{name}.safetensors") for name in MODELS}
     return [files.get(word, "--checkpoint" if word == "--model" and "network" in words else word) for word in words]
 

@@ -124,7 +124,7 @@ def run_train(command: Train, progress: Progress) -> dict:
     config.check_memory()
     require(bool(command.set), "train: --set without a set")
     check_workers(command.workers, least=0)
-    from csph.training.loop import NetworkOf, train  # and Lightning, which takes seconds to import
+    from csph.training.loop import Hardware, NetworkOf, train  # and Lightning, which takes seconds to import
 
     training, validation, data = views_of(command)
     require(command.init is None or command.init_network is None, "train: give --init or --init-network, not both")

@@ -15,7 +15,7 @@ from scenes.io.mitsuba_nodes import Document
 from scenes.io.mitsuba_plugin import Plugin
 from scenes.io.textures import load_texture
 from scenes.model import DISTRIBUTIONS, Material, Texture
-from scenes.refractive_indices import CONDUCTORS, INDICES
+from scenes.optics.refractive_indices import CONDUCTORS, INDICES
 
 MAX_NESTING = 16
 CHECKERBOARD_PIXELS = 256

@@ -1,8 +1,8 @@
 """RGB-D images -> expected counts: the simulation of the ICCV 2023 paper's supplement S.5.1, in two conventions.
 
 `from_rgbd` goes through a transient, one return a depth sample: the pulse's centroid at 2 d / c, radiance
-albedo cos(theta) / (pi d^2), everything else as for a rendered scene. `published_from_rgbd` follows the paper's code: one
-return a pixel at the rounded bin, albedo / d^2 without a cosine, c = 3e8 m/s.
+albedo cos(theta) / (pi d^2), everything else as for a rendered scene. `published_from_rgbd` follows the paper's code:
+one return a pixel at the rounded bin, albedo / d^2 without a cosine, c = 3e8 m/s.
 """
 
 from __future__ import annotations

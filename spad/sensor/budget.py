@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from render.transient import Transient
-from scenes.blackbody import PLANCK_J_S
 from scenes.constants import DEFAULT_WAVELENGTH_M, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
+from scenes.optics.blackbody import PLANCK_J_S
 from spad.detection.flux import detector_maps
 from spad.sensor.model import PhotonBudget, Sensor
 

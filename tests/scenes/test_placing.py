@@ -8,9 +8,9 @@ import pytest
 import xml_files
 
 from scenes import InputError
-from scenes.blackbody import planck_w_per_m2_nm, seen_radiance_w_per_m2_sr_nm, sunlit_sky_w_per_m2_sr_nm
 from scenes.io.meshes import load_mesh
 from scenes.library.catalog import load_scene
+from scenes.optics.blackbody import planck_w_per_m2_nm, seen_radiance_w_per_m2_sr_nm, sunlit_sky_w_per_m2_sr_nm
 from scenes.placing import Placing, scaled
 
 # A tetrahedron whose tip lies along z, half a unit tall.

@@ -10,9 +10,9 @@ import pytest
 import scipy.io
 from test_flux import transient_of
 
-from scenes.blackbody import sunlight_w_per_m2_nm
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
+from scenes.optics.blackbody import sunlight_w_per_m2_nm
 from spad.detection.detect import sense
 from spad.detection.flux import rates_for
 from spad.formats.mat import read_mat, write_mat

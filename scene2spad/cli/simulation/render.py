@@ -26,11 +26,11 @@ from scene2spad.options.common import (
     may_stay_open,
 )
 from scenes import Ambient, InputError, Laser, Scene
-from scenes.blackbody import sunlit_sky_w_per_m2_sr_nm
 from scenes.constants import DEFAULT_WAVELENGTH_M
 from scenes.errors import require
 from scenes.library.catalog import WIDTH, load_scene
 from scenes.offsets import check_offset
+from scenes.optics.blackbody import sunlit_sky_w_per_m2_sr_nm
 from scenes.placing import Placing
 from scenes.progress import Progress
 

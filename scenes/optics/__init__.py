@@ -1,0 +1,1 @@
+"""Constants and laws of optics: spectra of hot bodies, refractive indices."""
