@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from csph.training.loop import train
     from csph.training.views import Views, read_views
     from csph.weights.cards import Card
+    from render.mitsuba_integrator import register_integrator
     from render.settings import RenderSettings
     from render.transient import Transient, read_transient, write_transient
     from scene2spad.chain import (
@@ -56,6 +57,7 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
     ),
     "scenes": ("Ambient", "Camera", "InputError", "Laser", "Material", "Scene", "Surface", "Texture"),
     "scenes.library.catalog": ("load_scene",),
+    "render.mitsuba_integrator": ("register_integrator",),
     "render.settings": ("RenderSettings",),
     "render.transient": ("Transient", "read_transient", "write_transient"),
     "spad.sensor.model": ("PhotonBudget", "Sensor", "sensor_by_name"),
@@ -91,6 +93,7 @@ __all__ = [  # noqa: RUF022 (in the order of the chain)
     "Ambient",
     "render",
     "RenderSettings",
+    "register_integrator",
     "Transient",
     "read_transient",
     "write_transient",

@@ -16,7 +16,8 @@ SAYS = {  # what an example must print, as a pattern
     "01": r"log-matched: \d",
     "07": r"histogram: (0\.0e\+00|\d\.\de-0[4-9])",
     "10": r"right: True",
-    "13": r"sums: \d\.\de-0[5-9]",
+    "13": r"a wall at 2 m is seen at (1\.99|2\.0\d) m",
+    "14": r"of a bin \d\.\de-0[4-9](.|\n)*counts -(0\.99|1\.0)\d*(.|\n)*path (1\.99|2\.0)",
 }
 
 

@@ -1,0 +1,199 @@
+"""The renderer as an integrator of Mitsuba: `scene2spad` in XML and `mi.load_dict`, with dense output.
+
+Mitsuba's scene is read into a `Scene`, so what is rendered is what `render` renders: the pulse of a flood laser at the
+camera. Lights of the scene add nothing, since the output holds the laser's light alone.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from render.backend.drjit_types import Array
+from render.backend.llvm import start_mitsuba
+from render.settings import RenderSettings
+from render.transient import Transient
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.errors import InputError, require
+from scenes.io.textures import luminance
+from scenes.limits import require_memory
+from scenes.model import Camera, Material, Scene, Surface
+
+NAME = "scene2spad"
+TEMPORAL_BINS = 1024
+BIN_WIDTH_OPL_M = SPEED_OF_LIGHT_M_PER_S * 100e-9 / TEMPORAL_BINS  # of the reference sensor: 100 ns in 1,024 bins
+VARIANTS = ("_mono", "_rgb")
+CHUNK = 1 << 20  # returns binned at once
+
+
+def register_integrator(name: str = NAME) -> None:
+    """Register the renderer as an integrator plugin with Mitsuba's present variant.
+
+    Call it after `mi.set_variant`, with a variant in mono or rgb; without a variant one is set. The plugin takes
+    `temporal_bins` (1,024), `bin_width_opl` [m of optical path] (0.0293), `start_opl` [m] (0), `max_depth` (surfaces
+    that light meets plus one, as in Mitsuba; the plan chooses if it is left out) and `error` (0.02). `mi.render(scene)`
+    then returns a tensor (height, width, temporal_bins): radiance per joule of the pulse that arrives in the bin
+    [1/(m^2 sr)]. Light outside the bins is left out. Meshes, `diffuse` (uniform) and `conductor` are read.
+
+    Raises
+    ------
+    InputError
+        For another variant; and by the render for a shape, material or camera that has no counterpart here.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> s2s.register_integrator()
+    >>> import mitsuba as mi
+    >>> integrator = mi.load_dict({"type": "scene2spad", "temporal_bins": 512, "error": 0.05})
+    """
+    if "mitsuba" not in sys.modules or sys.modules["mitsuba"].variant() is None:
+        start_mitsuba()
+    import mitsuba as mi
+
+    variant = str(mi.variant())
+    require(variant.endswith(VARIANTS), f"variant {variant}: the integrator knows those in mono and rgb")
+
+    mi.register_integrator(name, _integrator_class(name, variant))
+
+
+def _integrator_class(name: str, variant: str) -> type:
+    """Make the plugin's class, whose base is that of the variant."""
+    import mitsuba as mi
+
+    class TransientIntegrator(mi.CppADIntegrator):
+        """Dense transient of the scene, by this renderer."""
+
+        def __init__(self, props: Array) -> None:
+            super().__init__(props)
+            self.bins = int(props.get("temporal_bins", TEMPORAL_BINS))
+            self.width_m = float(props.get("bin_width_opl", BIN_WIDTH_OPL_M))
+            self.start_m = float(props.get("start_opl", 0.0))
+            depth, error = int(props.get("max_depth", -1)), float(props.get("error", 0.0))
+            require(self.bins > 0, f"{name}: temporal_bins {self.bins} is not positive")
+            require(0 < self.width_m < np.inf, f"{name}: bin_width_opl {self.width_m:g} m is not a positive length")
+            require(depth == -1 or depth >= 2, f"{name}: max_depth {depth}, expected -1 or at least 2")
+            self.settings = RenderSettings(bounces=None if depth < 0 else depth - 1, error=error or None)
+
+        def render(
+            self,
+            scene: Array,
+            sensor: Array = 0,
+            seed: Array = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> Array:
+            """Return the tensor (height, width, bins). `spp` is chosen by the plan and not looked at."""
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            ours = scene_from_mitsuba(scene, sensor)
+            transient = _rendered(ours, self.settings, int(np.asarray(seed).ravel()[0]), variant)
+            return mi.TensorXf(dense_path_histogram(transient, self.bins, self.width_m, self.start_m))
+
+        def to_string(self) -> str:
+            return f"{name}[temporal_bins={self.bins}, bin_width_opl={self.width_m:g} m, start_opl={self.start_m:g} m]"
+
+    return TransientIntegrator
+
+
+def _rendered(scene: Scene, settings: RenderSettings, seed: int, variant: str) -> Transient:
+    """Render under our own variant, and set the user's again."""
+    import mitsuba as mi
+
+    level = mi.log_level()
+    try:
+        start_mitsuba()
+        from render.engine import render
+
+        return render(scene, settings, seed=seed)
+    finally:
+        mi.set_variant(variant)
+        mi.set_log_level(level)
+
+
+def scene_from_mitsuba(scene: Array, sensor: Array) -> Scene:
+    """Read a loaded Mitsuba scene: meshes, uniform diffuse or conducting materials, a perspective camera.
+
+    Raises InputError in one line that names what has no counterpart here.
+    """
+    surfaces = tuple(_surface(shape) for shape in scene.shapes())
+    require(len(surfaces) > 0, "the scene holds no shapes")
+    return Scene("mitsuba", surfaces, _camera(sensor))
+
+
+def _camera(sensor: Array) -> Camera:
+    import mitsuba as mi
+
+    kind = sensor.class_name()
+    require(kind == "PerspectiveCamera", f"sensor {kind} is not supported, expected perspective")
+    params, film = mi.traverse(sensor), sensor.film()
+    width, height = (int(n) for n in film.size())
+    require(tuple(film.crop_size()) == (width, height), "the film's crop window is not supported")
+    for axis in "xy":
+        offset = float(np.asarray(params[f"principal_point_offset_{axis}"]).ravel()[0])
+        require(offset == 0, f"principal_point_offset_{axis} {offset:g} is not supported, expected 0")
+    pose = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
+    # Mitsuba's camera looks along z with x to the LEFT and y up; half a turn about z gives right and down.
+    pose[:3, :2] *= -1
+    return Camera(pose, float(np.asarray(params["x_fov"]).ravel()[0]), width, height)
+
+
+def _surface(shape: Array) -> Surface:
+    name = shape.id()
+    if not shape.is_mesh():
+        raise InputError(f"shape {name} is a {shape.class_name()}, expected a mesh: write it as triangles")
+    vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    faces = np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
+    smooth = shape.has_vertex_normals() and not shape.has_face_normals()
+    normals = np.array(shape.vertex_normals_buffer(), np.float64).reshape(-1, 3) if smooth else None
+    return Surface(vertices, faces, _material(shape.bsdf(), name), normals=normals, name=name)
+
+
+def _material(bsdf: Array, shape: str) -> Material:
+    """Read a material by its parameters; those of a `twosided` are named brdf_0 and brdf_1."""
+    import mitsuba as mi
+
+    kind, params = bsdf.class_name(), mi.traverse(bsdf)
+    found = {key.removeprefix("brdf_0."): params[key] for key in params.keys()}  # noqa: SIM118 (no mapping)
+    require("brdf_1.reflectance.value" not in params, f"shape {shape}: two materials of twosided, expected one")
+    plain = {key for key in found if not key.startswith("brdf_1.")}
+    if kind in ("SmoothDiffuse", "TwoSidedBRDF") and plain == {"reflectance.value"}:
+        return Material("diffuse", albedo=_grey(found["reflectance.value"]), name=shape)
+    if kind in ("SmoothConductor", "TwoSidedBRDF") and {"eta.value", "k.value"} <= plain and "alpha.value" not in plain:
+        eta, k = _grey(found["eta.value"]), _grey(found["k.value"])
+        specular = _grey(found["specular_reflectance.value"]) if "specular_reflectance.value" in plain else 1.0
+        return Material("conductor", eta=eta, k=k, specular=specular, name=shape)
+    raise InputError(f"shape {shape}: {kind} has no counterpart here, expected a uniform diffuse or a conductor")
+
+
+def _grey(value: Array) -> float:
+    """Return a number, or the luminance of a colour."""
+    values = np.asarray(value, np.float64).ravel()
+    return float(luminance(values) if len(values) == 3 else values[0])
+
+
+def dense_path_histogram(transient: Transient, bins: int, width_m: float, start_m: float = 0.0) -> np.ndarray:
+    """Return radiance (H, W, bins) float32 [1/(m^2 sr)] by optical path, `width_m` a bin from `start_m` on.
+
+    A return is spread evenly over its interval of path length. What lies outside the bins is left out.
+    """
+    pixels = transient.height * transient.width
+    require_memory(12 * pixels * bins, f"a dense transient of {pixels} pixels and {bins} bins")
+    data = np.zeros(pixels * bins)
+    pixel = transient.return_pixel
+    for at in range(0, transient.returns, CHUNK):
+        part = slice(at, at + CHUNK)
+        near = (transient.path_near_m[part].astype(np.float64) - start_m) / width_m
+        far = (transient.path_far_m[part].astype(np.float64) - start_m) / width_m
+        first = np.floor(np.clip(near, -1, bins)).astype(np.int64)
+        count = np.floor(np.clip(far, -1, bins)).astype(np.int64) - first + 1
+        which = np.repeat(np.arange(len(near)), count)
+        column = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + first[which]
+        length = far[which] - near[which]
+        overlap = np.minimum(far[which], column + 1) - np.maximum(near[which], column)
+        fraction = np.divide(overlap, length, out=np.ones_like(overlap), where=length > 0)
+        kept = (column >= 0) & (column < bins)
+        energy = fraction * transient.radiance[part].astype(np.float64)[which]
+        data += np.bincount((pixel[part][which] * bins + column)[kept], energy[kept], minlength=len(data))
+    return data.reshape(transient.height, transient.width, bins).astype(np.float32)

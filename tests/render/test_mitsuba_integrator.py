@@ -1,0 +1,140 @@
+"""The integrator plugin: dense output has the light and the paths of a render of the same file, in XML and by dict."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from render.backend.llvm import start_mitsuba
+from render.engine import render
+from render.mitsuba_integrator import dense_path_histogram, register_integrator
+from render.settings import RenderSettings
+from render.transient import Transient
+from scenes.errors import InputError
+from scenes.io.mitsuba_xml import load_mitsuba_xml
+
+mi = start_mitsuba()
+register_integrator()
+XML = """<scene version="3.0.0">
+  <integrator type="scene2spad"><integer name="temporal_bins" value="400"/><float name="bin_width_opl" value="0.03"/>
+    <integer name="max_depth" value="2"/></integrator>
+  <sensor type="perspective"><float name="fov" value="50"/>
+    <transform name="to_world"><lookat origin="0.3,1,4" target="0,0.8,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/></film></sensor>
+  <shape type="rectangle"><transform name="to_world"><scale value="3"/></transform>
+    <bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0.2 0.4 0.6"/></bsdf></bsdf></shape>
+  <shape type="cube"><transform name="to_world"><scale value="0.4"/><translate x="0.3" y="0.6" z="1"/></transform>
+    <bsdf type="diffuse"><spectrum name="reflectance" value="0.8"/></bsdf></shape>
+</scene>"""
+
+
+def wall(distance_m: float = 3.0, **integrator: object) -> dict:
+    place = mi.ScalarTransform4f().translate([0, 0, -distance_m]).scale(20)
+    camera = mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, -1], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 9, "height": 9}
+    return {
+        "type": "scene",
+        "integrator": {"type": "scene2spad", "max_depth": 2, **integrator},
+        "sensor": {"type": "perspective", "fov": 20, "to_world": camera, "film": film},
+        "wall": {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+    }
+
+
+def test_a_wall_returns_albedo_times_intensity_over_pi_d2_in_its_bin():
+    """Closed form at the centre pixel: radiance albedo x I / (pi d^2), I of the flood cone; path 2 d = 6 m."""
+    data = np.array(mi.render(mi.load_dict(wall(temporal_bins=300, bin_width_opl=0.04))))
+    assert data.shape == (9, 9, 300) and data.dtype == np.float32
+    tangent = np.tan(np.radians(10))
+    rim = np.arctan(np.hypot(tangent, tangent))  # the cone lights the corners
+    intensity = 1 / (2 * np.pi * (1 - np.cos(rim)))
+    centre = data[4, 4]
+    assert centre.sum() == pytest.approx(0.5 * intensity / (np.pi * 9), rel=0.02)
+    assert np.flatnonzero(centre).tolist() == [150] or set(np.flatnonzero(centre)) <= {149, 150, 151}
+    assert centre[149:152].sum() == centre.sum()
+
+
+def test_xml_gives_what_a_render_of_the_same_file_gives(tmp_path):
+    """Two readers of one scene: Mitsuba's own, and ours of the file."""
+    (tmp_path / "corner.xml").write_text(XML)
+    data = np.array(mi.render(mi.load_file(str(tmp_path / "corner.xml"))))
+    transient = render(load_mitsuba_xml(tmp_path / "corner.xml"), RenderSettings(bounces=1))
+    expected = dense_path_histogram(transient, 400, 0.03)
+    assert data.shape == (12, 16, 400)
+    np.testing.assert_allclose(data.sum(axis=2), transient.total_radiance(), rtol=1e-3)
+    assert np.abs(data - expected).sum() < 0.01 * expected.sum()
+
+
+def test_start_and_range_leave_light_out_and_keep_the_rest():
+    whole = np.array(mi.render(mi.load_dict(wall(temporal_bins=300, bin_width_opl=0.04))))
+    late = np.array(mi.render(mi.load_dict(wall(temporal_bins=150, bin_width_opl=0.04, start_opl=6.0))))
+    np.testing.assert_allclose(late, whole[..., 150:], rtol=1e-4, atol=1e-7 * whole.max())
+    none = np.array(mi.render(mi.load_dict(wall(temporal_bins=10, bin_width_opl=0.04))))
+    assert none.sum() == 0
+
+
+def test_returns_are_spread_by_overlap():
+    """By hand, bins of 1 m: a point, a return over two bins, one over the end, one before the start."""
+    zeros = np.zeros((1, 1), np.float32)
+    layers = {
+        "depth_m": zeros + 1,
+        "albedo": zeros.astype(np.float16),
+        "ambient": zeros,
+        "error": zeros,
+        "mixed": zeros.astype(bool),
+    }
+    transient = Transient(
+        height=1,
+        width=1,
+        offsets=np.array([0, 4]),
+        path_near_m=np.array([0.2, 1.5, 1.75, 3.5], np.float32),
+        path_far_m=np.array([0.8, 1.5, 2.75, 4.5], np.float32),
+        radiance=np.array([8, 1, 4, 2], np.float32),
+        bounces=np.ones(4, np.uint8),
+        normal=np.zeros((1, 1, 3), np.float16),
+        meta={},
+        **layers,
+    )
+    assert dense_path_histogram(transient, 3, 1.0, 1.0)[0, 0].tolist() == [2, 3, 1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"wall": {"type": "sphere"}}, "is a Sphere, expected a mesh"),
+        ({"wall": {"type": "cube", "bsdf": {"type": "plastic"}}}, "SmoothPlastic has no counterpart"),
+        (
+            {"wall": {"type": "cube", "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}},
+            "SmoothDiffuse has no counterpart",
+        ),
+        ({"sensor": {"type": "orthographic"}}, "OrthographicCamera is not supported"),
+    ],
+)
+def test_what_has_no_counterpart_is_refused_by_name(change, message):
+    scene = mi.load_dict({**wall(), **change})
+    with pytest.raises(InputError, match=message):
+        scene.integrator().render(scene)
+
+
+@pytest.mark.parametrize("bad", [{"temporal_bins": 0}, {"bin_width_opl": -1.0}, {"max_depth": 1}, {"error": 2.0}])
+def test_settings_out_of_range_are_refused(bad):
+    with pytest.raises((InputError, RuntimeError), match=next(iter(bad))):
+        mi.load_dict({"type": "scene2spad", **bad})
+
+
+@pytest.mark.slow
+def test_colours_become_luminance_and_the_variant_stays():
+    code = f"""
+import numpy as np
+from render.backend.llvm import start_mitsuba
+from render.mitsuba_integrator import register_integrator
+mi, found = start_mitsuba(), []
+for variant in ("llvm_ad_rgb", "llvm_ad_mono"):
+    mi.set_variant(variant)
+    register_integrator()
+    found.append(np.array(mi.render(mi.load_string('''{XML}'''))))
+    assert mi.variant() == variant
+np.testing.assert_allclose(*found, rtol=3e-4, atol=1e-6 * found[1].max())  # Rec. 709 weights to 4 and 6 digits
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
