@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -83,6 +84,10 @@ def make_coding(
     return CodingTensor(design.name, temporal, spatial, computed=design.computed)
 
 
+def _as_int8(steps: Tensor, step: Tensor) -> tuple[np.ndarray, float]:
+    return steps.to(torch.int8).cpu().numpy(), float(step)
+
+
 class CompressiveLayer(nn.Module):
     """Counts (B, 1, T, R, C) -> codes (B, K, T/Mt, R/Mr, C/Mc) -> (B, 1, T, R, C) in [-1, 1].
 
@@ -102,6 +107,8 @@ class CompressiveLayer(nn.Module):
     spatial: Tensor | None
     pulse: Tensor | None
     background: Tensor | None
+    temporal_range: nn.Parameter | None
+    spatial_range: nn.Parameter | None
 
     def __init__(
         self,
@@ -183,9 +190,11 @@ class CompressiveLayer(nn.Module):
         return self._blurred(part) if self.options.pulse_in_codes else part
 
     def _temporal_steps(self) -> tuple[Tensor, Tensor]:
+        assert self.temporal_range is not None
         return clipped_steps(self._exact_temporal(), self.temporal_range)
 
     def _spatial_steps(self) -> tuple[Tensor, Tensor]:
+        assert self.spatial is not None and self.spatial_range is not None
         return clipped_steps(self.spatial, self.spatial_range)
 
     def _temporal_part(self) -> Tensor:
@@ -203,8 +212,9 @@ class CompressiveLayer(nn.Module):
     @torch.no_grad()
     def fit_ranges(self) -> None:
         """Set the clipping ranges of `int8` to the largest magnitude of each factor as it is now."""
+        assert self.temporal_range is not None
         self.temporal_range.copy_(self._exact_temporal().abs().max().clamp(min=1e-30).log())
-        if self.spatial is not None:
+        if self.spatial is not None and self.spatial_range is not None:
             self.spatial_range.copy_(self.spatial.abs().max().clamp(min=1e-30).log())
 
     @torch.no_grad()
@@ -212,11 +222,10 @@ class CompressiveLayer(nn.Module):
         """Return the weights in 8 bits: within the learned ranges of `int8`, else within their largest magnitudes."""
         if not self.options.int8:
             return quantised(self.coding())
-        parts = [self._temporal_steps(), (None, 1.0) if self.spatial is None else self._spatial_steps()]
-        factors = [
-            (None if steps is None else steps.to(torch.int8).cpu().numpy(), float(step)) for steps, step in parts
-        ]
-        return from_factors(self.name, *factors)
+        temporal = _as_int8(*self._temporal_steps())
+        return from_factors(
+            self.name, temporal, (None, 1.0) if self.spatial is None else _as_int8(*self._spatial_steps())
+        )
 
     def weights(self) -> Tensor:
         """Return (K, Mt, Mr, Mc) that counts are encoded with: the constraint and the pulse applied."""
@@ -254,11 +263,12 @@ class CompressiveLayer(nn.Module):
         sums, step = self._core_sums(counts)
         # the slope of a sum that wraps would narrow the range, which wraps more
         held = straight_through(sums * step, wrapped_sums(sums) * step)
-        if self.spatial is None:
+        spatial = self._spatial_part()
+        if spatial is None:
             return held
         (batch, codes, times, rows, columns), (_, down, right) = held.shape, self.block
         of_blocks = held.view(batch, codes, times, rows // down, down, columns // right, right)
-        return (of_blocks * self._spatial_part()[:, None, None, :, None, :]).sum((4, 6))
+        return (of_blocks * spatial[:, None, None, :, None, :]).sum((4, 6))
 
     def sum_excess(self, counts: Tensor) -> Tensor:
         """Return the mean excess of all cores' sums over 16 bits, in units of half that range, with `int8`; its
@@ -297,7 +307,9 @@ class CompressiveLayer(nn.Module):
             temporal = self._temporal_part()
             if self.options.pulse_in_decoder:
                 temporal = self._blurred(temporal)
-            return blocks.correlate_separable(unit, temporal, self._spatial_part(), centre=centre)
+            spatial = self._spatial_part()
+            assert spatial is not None
+            return blocks.correlate_separable(unit, temporal, spatial, centre=centre)
         weights = self.weights()
         direction = None if self.background is None else self._direction(self.background, weights, codes.shape[2])
         if self.options.pulse_in_decoder:

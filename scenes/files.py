@@ -16,13 +16,14 @@ from contextlib import contextmanager, redirect_stdout
 from functools import lru_cache
 from pathlib import Path
 from tokenize import TokenError
-from typing import IO, Any
+from typing import IO
 from zipfile import ZipFile
 
 import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import parse_json, regular_file
+from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 
 ATTRIBUTE = "scene2spad"
@@ -181,14 +182,14 @@ def write_csv(rows: Sequence[Mapping[str, object]], path: Path) -> Path:
     return path
 
 
-def seal(meta: dict[str, Any], kind: str, arrays_sha256: str) -> str:
+def seal(meta: JsonObject, kind: str, arrays_sha256: str) -> str:
     """Return the JSON that a file of ours carries: `meta`, its kind and schema, and a SHA-256 over these and the
     arrays."""
     body = {**meta, "kind": kind, "schema": SCHEMAS[kind]}
     return json.dumps({**body, "sha256": _digest(body, arrays_sha256)}, sort_keys=True)
 
 
-def open_seal(text: str, kind: str) -> tuple[dict[str, Any], str]:
+def open_seal(text: str, kind: str) -> tuple[JsonObject, str]:
     """Return metadata and SHA-256 of a sealed file of the expected kind; `check_seal` follows when the arrays are read.
 
     Raises InputError if it is something else, or of a newer schema.
@@ -208,14 +209,14 @@ def open_seal(text: str, kind: str) -> tuple[dict[str, Any], str]:
     return body, str(body.pop("sha256", ""))
 
 
-def check_seal(body: dict[str, Any], sha256: str, arrays_sha256: str) -> dict[str, Any]:
+def check_seal(body: JsonObject, sha256: str, arrays_sha256: str) -> JsonObject:
     """Return the metadata as it was given to `seal`; InputError where metadata or arrays changed since."""
     if _digest(body, arrays_sha256) != sha256:
         raise InputError("contents do not match their SHA-256: the file is damaged or was altered")
     return {key: value for key, value in body.items() if key not in ("kind", "schema")}
 
 
-def _digest(body: dict[str, Any], arrays_sha256: str) -> str:
+def _digest(body: JsonObject, arrays_sha256: str) -> str:
     return hashlib.sha256((json.dumps(body, sort_keys=True) + arrays_sha256).encode()).hexdigest()
 
 

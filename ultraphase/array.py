@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -241,7 +240,9 @@ class _Run:
         self.wraps += _outside(value, low, high)
         cells[place] = value.astype(cells.dtype)
 
-    def _cells(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> tuple[Any, ...]:
+    def _cells(
+        self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | int]:
         """Return the RAM in cells of the operand's size, and the cell of every core: (cells, index)."""
         last = self.ram_bytes - one.op.size
         at = one.value if one.constant else self.registers[one.rs][lanes] + one.value

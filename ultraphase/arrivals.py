@@ -18,9 +18,9 @@ place (M/D/1/1, Erlang's formula) it would be rho / (1 + rho).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,6 +29,10 @@ from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
 from ultraphase.core import WATCHDOG_STEPS, Core
 
+# What the instructions up to the next branch do, how many they are, and which instruction asks the port
+_Step: TypeAlias = tuple[Callable[[], int], int, str]
+# The core at its last look at an empty port (word, registers, RAM), and when that was
+_Idle: TypeAlias = tuple[tuple[int, tuple[int, ...], bytes], int]
 _PORT_INSTRUCTIONS = ("BNT", "RDT", "BFE")
 
 
@@ -65,9 +69,7 @@ class TimedCore(Core):
         require(port >= 1, f"port of {port} timestamps, expected 1 or more")
         self.port = port
         self._frame_is_over, self._drains = False, True
-        self._steps: dict[
-            int, tuple[Any, ...]
-        ] = {}  # by word: what it does, how many instructions, and whether it asks the port
+        self._steps: dict[int, _Step] = {}  # by word
 
     def timed_frame(
         self, clocks: np.ndarray, timestamps: np.ndarray, frame_clocks: int, *, drain: bool = True
@@ -86,7 +88,7 @@ class TimedCore(Core):
         self._frame_is_over, self._drains = False, drain
         waiting, stamps = times.tolist(), np.asarray(timestamps).tolist()
         now = came = lost = steps = 0
-        idle: tuple[Any, ...] | None = None
+        idle: _Idle | None = None
         per, word = self.chip.clocks_per_instruction, self.word
         while True:
             does, length, asks = self._step_at(word)
@@ -109,7 +111,7 @@ class TimedCore(Core):
             if steps > WATCHDOG_STEPS:
                 raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
 
-    def _idle(self, word: int, now: int, until: float, before: tuple[Any, ...] | None) -> tuple[int, tuple[Any, ...]]:
+    def _idle(self, word: int, now: int, until: float, before: _Idle | None) -> tuple[int, _Idle]:
         """The time of the look at the port that comes next before `until`: turns of an idle loop that leave the core
         as it was are counted, not run."""
         state = (word, tuple(self.registers), bytes(self.ram))
@@ -118,7 +120,7 @@ class TimedCore(Core):
             now += max(0, int((until - now) // turn)) * turn
         return now, (state, now)
 
-    def _step_at(self, word: int) -> tuple[Any, ...]:
+    def _step_at(self, word: int) -> _Step:
         """Compile the instructions from a word to the next branch, without one that asks the port unless it is the
         first."""
         if word not in self._steps:

@@ -18,11 +18,11 @@ import csv
 import io
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
 from scenes.errors import require
+from scenes.json_types import JsonObject
 from ultraphase.array import CoreArray
 from ultraphase.assembly.program import Program
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS, Method
@@ -127,7 +127,7 @@ def reference_bits(photons: float, chip: ChipSpec | None = None) -> dict[str, fl
     return {"raw timestamps": photons * chip.timestamp_bits, "full histogram": chip.timestamps * 8.0}
 
 
-def table(costs: dict[str, Cost], chip: ChipSpec | None = None) -> list[dict[str, Any]]:
+def table(costs: dict[str, Cost], chip: ChipSpec | None = None) -> list[JsonObject]:
     """Return Supplementary Figure 5, a dictionary a row: printed, recomputed from printed clocks, emulated, residuals.
 
     costs   emulated cost by the method's name; residual_clocks = emulated - printed
@@ -173,7 +173,7 @@ def sweep(
     frame_rates: Iterable[float],
     pixels: Iterable[int],
     chip: ChipSpec | None = None,
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Return a row for every program, photon count, frame rate and number of pixels, with the two references beside
     them."""
     chip, rates, sizes, rows = chip or ChipSpec(), tuple(frame_rates), tuple(pixels), []
@@ -193,7 +193,7 @@ def sweep(
     return rows
 
 
-def as_csv(rows: list[dict[str, Any]]) -> str:
+def as_csv(rows: list[JsonObject]) -> str:
     """Return flat rows as CSV, nested dictionaries as `outer.inner` columns."""
     flat = []
     for row in rows:

@@ -7,7 +7,6 @@ cores. Only tests and benches import this module.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -44,7 +43,9 @@ def _is_taken(one: Instruction, a: int, b: int, empty: bool) -> bool:
     return (taken | {"BBS": bit == 1, "BBC": bit == 0})[one.name]
 
 
-def interpret(instructions: Sequence[Instruction], timestamps: Sequence[int], ram_bytes: int) -> dict[str, Any]:
+def interpret(
+    instructions: Sequence[Instruction], timestamps: Sequence[int], ram_bytes: int
+) -> dict[str, int | list[int]]:
     """Run a program until it halts.
 
     Parameters

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from csph.autograd import Context
+from csph.autograd import Context, applied
 from scenes.errors import require
 
 EPSILON = 1e-5  # of zero-normalisation, as published
@@ -76,7 +76,7 @@ class _Gather(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Context, grad: Tensor) -> tuple[Tensor, None]:
-        return _Scatter.apply(grad, ctx.block, ctx.size), None
+        return applied(_Scatter, grad, ctx.block, ctx.size), None
 
 
 class _Scatter(torch.autograd.Function):
@@ -91,7 +91,7 @@ class _Scatter(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Context, grad: Tensor) -> tuple[Tensor, None, None]:
-        return _Gather.apply(grad, ctx.block), None, None
+        return applied(_Gather, grad, ctx.block), None, None
 
 
 class _Centre(torch.autograd.Function):
@@ -105,7 +105,7 @@ class _Centre(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Context, grad: Tensor) -> tuple[Tensor, None]:
-        return _Centre.apply(grad, ctx.axis), None
+        return applied(_Centre, grad, ctx.axis), None
 
 
 def mean_over(values: Tensor, axis: int) -> Tensor:
@@ -117,7 +117,7 @@ def mean_over(values: Tensor, axis: int) -> Tensor:
 
 def centred(values: Tensor, axis: int) -> Tensor:
     """Return v - mean of v over axis 0 or 1."""
-    return _Centre.apply(values, axis)
+    return applied(_Centre, values, axis)
 
 
 class _ZeroNormalise(torch.autograd.Function):
@@ -151,7 +151,7 @@ def zero_normalised(values: Tensor, axis: int, *, centre: bool = True, over: tup
 
     `centre` = False leaves the mean in; the norm is taken over the axes `over` too.
     """
-    return _ZeroNormalise.apply(values, axis, centre, over)
+    return applied(_ZeroNormalise, values, axis, centre, over)
 
 
 def encode_blocks(counts: Tensor, weights: Tensor) -> Tensor:
@@ -168,7 +168,7 @@ def encode_blocks(counts: Tensor, weights: Tensor) -> Tensor:
         stacked = counts.reshape(batch * (bins // mt), mt, rows * columns).to(weights.dtype)
         product = torch.bmm(matrix.expand(len(stacked), -1, -1), stacked)
         return product.view(batch, bins // mt, codes, rows, columns).transpose(1, 2)
-    gathered = _Gather.apply(counts, block).to(weights.dtype)
+    gathered = applied(_Gather, counts, block).to(weights.dtype)
     product = gathered @ matrix.T
     return product.view(batch, bins // mt, rows // mr, columns // mc, codes).permute(0, 4, 1, 2, 3)
 
@@ -191,7 +191,7 @@ def back_project(codes: Tensor, weights: Tensor) -> Tensor:
         product = stacked @ matrix
     else:
         product = codes.permute(0, 2, 3, 4, 1).reshape(-1, count) @ matrix
-    return _Scatter.apply(product.reshape(-1, mt * mr * mc), (mt, mr, mc), size)
+    return applied(_Scatter, product.reshape(-1, mt * mr * mc), (mt, mr, mc), size)
 
 
 def forms(codes: int, block: tuple[int, int, int], counts: int) -> bool:

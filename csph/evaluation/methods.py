@@ -27,6 +27,7 @@ from csph.networks.posterior import Decoder
 from csph.training.views import Views
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import require
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.detect import sense
@@ -103,7 +104,7 @@ class Evaluation:
         """Return paired difference of MAE [mm], first - second, over scenes and levels."""
         return paired_difference(self.values(first, levels=levels), self.values(second, levels=levels))
 
-    def summary(self, methods: Sequence[str]) -> dict[str, Any]:
+    def summary(self, methods: Sequence[str]) -> JsonObject:
         """Return figures by level group and pixel group (means over scenes), intervals of the MAE, and the bias by
         depth."""
         table: dict[str, Any] = {}
@@ -193,5 +194,5 @@ def _rows(
         yield Row(method, scene, view, *level, group, ssim=errors.get("ssim", math.nan), **kept)
 
 
-def as_dicts(rows: Iterable[Row]) -> list[dict[str, Any]]:
+def as_dicts(rows: Iterable[Row]) -> list[JsonObject]:
     return [asdict(row) for row in rows]

@@ -70,10 +70,11 @@ class DepthModel(nn.Module):
     def begin_with(self, other: DepthModel) -> None:
         """Take the weights of a model of the same design and network; clipping ranges of int8 that it has not are
         fitted to them."""
-        fits = self.layer is not None and self.layer.options.int8 and not other.layer.options.int8
+        mine, theirs = self.layer, other.layer
+        fits = mine is not None and theirs is not None and mine.options.int8 and not theirs.options.int8
         self.load_state_dict(other.state_dict(), strict=not fits)
-        if fits:
-            self.layer.fit_ranges()
+        if mine is not None and fits:
+            mine.fit_ranges()
 
     @property
     def parameters_count(self) -> int:
@@ -194,11 +195,11 @@ class DepthModel(nn.Module):
         tensor = self.layer.quantised()
         codes, _ = encode_int16(counts, tensor)
         logits = self.network(self.layer.decode(codes.to(self.layer.temporal.device).float() * tensor.scale))
-        blocks = (
+        rows, columns = (
             slice(one.start, -(-one.stop // side) * side)
             for one, side in zip(inside, self.config.block[1:], strict=True)
         )
-        return logits, encode_int16(counts[(..., *blocks)], tensor).overflows
+        return logits, encode_int16(counts[..., rows, columns], tensor).overflows
 
     def depth_of(
         self,

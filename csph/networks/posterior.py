@@ -10,7 +10,7 @@ from torch import Tensor
 from csph.networks.published import soft_argmax
 
 Decoder = Literal["soft-argmax", "median"]
-DECODERS: tuple[str, ...] = ("soft-argmax", "median")
+DECODERS: tuple[Decoder, ...] = ("soft-argmax", "median")
 CONFIDENT_BINS = 3.0  # either side of the answer: what `confidence` counts as agreeing with it
 
 

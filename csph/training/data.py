@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.training.config import WINDOW_STEP, TrainConfig
-from csph.training.levels import CONTINUOUS, draw_level
+from csph.training.levels import draw_level
 from scenes.errors import require
 from scenes.random_streams import Stream
 from spad.detection.device_patches import DevicePatches
@@ -92,7 +92,7 @@ class Frames(Dataset):
         self.size = (rows // height * height, columns // width * width)
         fits = min(self.size) > 0
         require(fits, f"validation views of {columns} x {rows} pixels are smaller than a block of {width} x {height}")
-        self.levels = PHOTON_LEVELS if config.levels == CONTINUOUS else config.levels
+        self.levels = PHOTON_LEVELS if isinstance(config.levels, str) else config.levels
         # spread over the scenes, so that a few views are not all of the first
         count = min(views or config.validation_views, scenes * len(self.levels))
         self.chosen = [round(i * scenes * len(self.levels) / count) for i in range(count)]

@@ -20,13 +20,13 @@ import logging
 import math
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytorch_lightning as pl
 import torch
@@ -50,6 +50,7 @@ from render.backend.malloc import retain_freed_memory
 from scenes.errors import InputError, require
 from scenes.files import append_line, is_unclaimed, whole_file, write_csv
 from scenes.io.inputs import read_json_object
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.training_patches import PackedTransients
 
@@ -63,6 +64,12 @@ class NetworkOf(NamedTuple):
     """A trained model whose network alone a training begins with."""
 
     model: DepthModel
+
+
+def _mean(means: nn.ModuleDict, decoder: str) -> MeanMetric:
+    found = means[decoder]
+    assert isinstance(found, MeanMetric)
+    return found
 
 
 class DepthTraining(pl.LightningModule):
@@ -120,7 +127,7 @@ class DepthTraining(pl.LightningModule):
         self.train_loss.update(loss.detach())
         return loss
 
-    def optimizer_step(self, *args: Any, **more: Any) -> None:
+    def optimizer_step(self, *args: object, **more: object) -> None:
         super().optimizer_step(*args, **more)
         if self.averaged is not None:
             # the first steps are forgotten sooner
@@ -135,12 +142,12 @@ class DepthTraining(pl.LightningModule):
         for decoder in DECODERS:
             depth = self.kept.position(logits, decoder) * self.config.model.sensor.bin_depth_m
             error = torch.where(batch.valid, depth - batch.depth_m, 0.0)
-            self.squared_m2[decoder].update(error**2, weight)
-            self.absolute_m[decoder].update(error.abs(), weight)
+            _mean(self.squared_m2, decoder).update(error**2, weight)
+            _mean(self.absolute_m, decoder).update(error.abs(), weight)
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> dict[str, object]:
         named = [*self.model.named_parameters()]
-        groups = [{"params": [one for name, one in named if not name.endswith("_range")]}]
+        groups: list[dict[str, object]] = [{"params": [one for name, one in named if not name.endswith("_range")]}]
         ranges = [one for name, one in named if name.endswith("_range")]
         groups += [{"params": ranges, "lr": RANGE_RATE}] if ranges else []
         adam = torch.optim.Adam(groups, lr=self.config.rate, fused=True)
@@ -168,10 +175,10 @@ class Record(pl.Callback):
     def best_mm(self) -> float:
         return min((row["val_rmse_mm"] for row in self.rows), default=float("inf"))
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, list[dict[str, float]]]:
         return {"rows": self.rows}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, list[dict[str, float]]]) -> None:
         self.rows = state["rows"]
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: DepthTraining, *_: object) -> None:
@@ -190,7 +197,8 @@ class Record(pl.Callback):
         layer = module.kept.layer
         if layer is not None and math.prod(layer.block[1:]) > 1:
             row["spatial_rank"] = participation_rank(layer.pixel_gram().detach())
-        for metric in (module.train_loss, *module.squared_m2.values(), *module.absolute_m.values()):
+        means = (module.squared_m2, module.absolute_m)
+        for metric in (module.train_loss, *(_mean(mean, name) for mean in means for name in DECODERS)):
             metric.reset()
         self.rows = [*self.rows, row]
         if trainer.is_global_zero:
@@ -212,7 +220,8 @@ def _validation_mm(module: DepthTraining) -> dict[str, float]:
     """Compute the validation RMSE and MAE [mm] as the model is decoded, and by each decoder."""
     squared, absolute = module.squared_m2, module.absolute_m
     errors = {
-        name: (float(squared[name].compute()) ** 0.5 * 1e3, float(absolute[name].compute()) * 1e3) for name in DECODERS
+        name: (float(_mean(squared, name).compute()) ** 0.5 * 1e3, float(_mean(absolute, name).compute()) * 1e3)
+        for name in DECODERS
     }
     own = errors[module.config.model.decoder]
     return {
@@ -289,7 +298,7 @@ def _with_hashes(
 
 
 @contextmanager
-def _quiet() -> Any:
+def _quiet() -> Iterator[None]:
     """Silence Lightning's advice on workers and devices, which is not the user's business: what is said here goes to
     the log."""
     loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning.pytorch")]
@@ -337,7 +346,7 @@ def train(
     init: DepthModel | NetworkOf | None = None,
     hardware: Hardware = ANY_HARDWARE,
     progress: Progress | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Run a configuration to its end in a folder, or go on where an interrupted run of the same configuration stopped.
 
     Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
@@ -349,11 +358,14 @@ def train(
     config.check_memory()
     if init is not None:
         _check_init(init, config)
-    sets = [[packed_views(one) for one in _listed(views)] for views in (training, validation)]
-    config = _with_hashes(config, sets, init)
+    training_sets, validation_sets = ([packed_views(one) for one in _listed(views)] for views in (training, validation))
+    config = _with_hashes(config, (training_sets, validation_sets), init)
     if config.model.grid == "published":
-        sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
-    module_data = SetData(*sets, config, hardware.workers)
+        training_sets, validation_sets = (
+            [on_published_grid(packed, config.model.sensor) for packed in packs]
+            for packs in (training_sets, validation_sets)
+        )
+    module_data = SetData(training_sets, validation_sets, config, hardware.workers)
     record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():
         runner = _trainer(config, record, hardware)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
 
 import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
@@ -25,7 +24,7 @@ class WholeFileCheckpoints(TorchCheckpointIO):
     the middle of it leaves an empty file in place of the old state.
     """
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None) -> None:
+    def save_checkpoint(self, checkpoint: dict[str, object], path: str | Path, storage_options: object = None) -> None:
         # by way of memory: torch would name the archive after the temporary file, and has no OSError for a full disk
         state = io.BytesIO()
         torch.save(checkpoint, state)
@@ -44,7 +43,7 @@ def check_resume(path: Path, module: nn.Module) -> None:
     except InputError as error:
         raise InputError(f"{error}; {CURE}") from None
     missing = [key for key in KEYS if not isinstance(state, dict) or key not in state]
-    if missing:
+    if not isinstance(state, dict) or missing:
         raise InputError(f"{path}: is no state of an interrupted run, {', '.join(missing)} are missing; {CURE}")
     if not isinstance(state["state_dict"], dict):
         raise InputError(f"{path}: is no state of an interrupted run, its state_dict is none; {CURE}")

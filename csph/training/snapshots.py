@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytorch_lightning as pl
 
@@ -24,10 +23,10 @@ class CodeEnergy(pl.Callback):
         self.folder = folder
         self.rows: list[dict[str, float]] = []
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, list[dict[str, float]]]:
         return {"rows": self.rows}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, list[dict[str, float]]]) -> None:
         self.rows = state["rows"]
 
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from csph.training.config import TrainConfig
 from csph.training.levels import BACKGROUND, CONTINUOUS, SIGNAL
 from csph.weights.shipped import WEIGHTS
 from scenes.errors import InputError, require
+from scenes.json_types import JsonObject
 
 LONG_BLOCK = 256  # bins; learned codes over more of them know the depths of their training set
 
@@ -45,7 +45,7 @@ class Card:
     errors: dict[str, dict[str, float]]
     not_for: tuple[str, ...]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         return asdict(self)
 
 

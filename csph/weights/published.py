@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -66,19 +66,20 @@ def import_checkpoint(path: Path, folder: Path, sensor: Sensor | None = None) ->
         made.load_state_dict(parts | _network(weights, made))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    step = contents.get("global_step")
+    step = contents.get("global_step") if isinstance(contents, dict) else None
     target.parent.mkdir(parents=True, exist_ok=True)
     save_model(made, config, {"step": step} if isinstance(step, int) else {}, target)
     return Imported(config, made.parameters_count, target)
 
 
-def _tensors(contents: Any, size: int) -> dict[str, Tensor]:
+def _tensors(contents: object, size: int) -> dict[str, Tensor]:
     """Return the weights of a file of `size` bytes in their order.
 
     Raises InputError for others than a published compressive model's.
     """
     weights = contents.get("state_dict") if isinstance(contents, dict) else None
-    require(isinstance(weights, dict), "holds no state_dict, it is no checkpoint of the published code")
+    if not isinstance(weights, dict):
+        raise InputError("holds no state_dict, it is no checkpoint of the published code")
     known = {TEMPORAL, SPATIAL, FULL, LEFT_OUT}
     left = size
     for name, value in weights.items():
@@ -97,12 +98,14 @@ def _coding(weights: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
     Over single pixels the spatial factor is one number a code, and goes into the temporal one.
     """
     full, temporal, spatial = (weights.get(name) for name in (FULL, TEMPORAL, SPATIAL))
-    alone = (full is None) != (temporal is None) and (full is None or spatial is None)
-    require(alone, f"expected one coding tensor: {FULL}, or {TEMPORAL} with or without {SPATIAL}")
+    alone = f"expected one coding tensor: {FULL}, or {TEMPORAL} with or without {SPATIAL}"
     if full is not None:
+        require(temporal is None and spatial is None, alone)
         _check_shape(FULL, full, (None, 1, None, None, None))
         part = full[:, 0]
         return (part if part.shape[2:].numel() > 1 else part[..., 0, 0]), None
+    if temporal is None:
+        raise InputError(alone)
     _check_shape(TEMPORAL, temporal, (None, 1, None, 1, 1))
     temporal = temporal[:, 0, :, 0, 0]
     if spatial is None:
@@ -123,9 +126,10 @@ def _design(temporal: Tensor, spatial: Tensor | None) -> Design:
     """Return the design of a coding tensor; its code is the fixed one that its rows are, else learned."""
     codes, bins = temporal.shape[:2]
     if temporal.ndim == 4:
-        return Design("learned", tuple(temporal.shape[1:]), codes, full=True)
-    pixels = (1, 1) if spatial is None else tuple(spatial.shape[1:])
-    return Design(_code(temporal), (bins, *pixels), codes)
+        _, mt, mr, mc = temporal.shape
+        return Design("learned", (mt, mr, mc), codes, full=True)
+    rows, columns = (1, 1) if spatial is None else spatial.shape[1:]
+    return Design(_code(temporal), (bins, rows, columns), codes)
 
 
 def _code(temporal: Tensor) -> str:

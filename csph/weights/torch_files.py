@@ -5,8 +5,8 @@ from __future__ import annotations
 import warnings
 import zipfile
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import regular_file
@@ -29,7 +29,7 @@ class _NothingInstead:
         pass
 
 
-def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
+def load_torch_file(path: Path, *, foreign: bool = False) -> object:
     """Return what torch.save wrote, tensors and plain values alone, on the CPU.
 
     `foreign`: objects of other libraries, such as the settings that a trainer keeps beside its weights, are replaced by
@@ -45,7 +45,9 @@ def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
     try:
         with warnings.catch_warnings(action="ignore"):
             names = get_unsafe_globals_in_checkpoint(path) if foreign else []
-            empty = [(_NothingInstead if name.startswith("numpy.") else _EmptyInstead, name) for name in names]
+            empty: list[Callable[..., object] | tuple[Callable[..., object], str]] = [
+                (_NothingInstead if name.startswith("numpy.") else _EmptyInstead, name) for name in names
+            ]
             with safe_globals(empty):
                 found = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # unpickling raises whatever the pickle asks for
@@ -55,11 +57,12 @@ def load_torch_file(path: Path, *, foreign: bool = False) -> Any:
     return found
 
 
-def _check_sizes(contents: Any, path: Path) -> None:
+def _check_sizes(contents: object, path: Path) -> None:
     """Raise InputError where a tensor states more elements than its file holds: strides of 0 repeat a few for ever."""
     import torch
 
-    size, left, known = path.stat().st_size, [contents], set()
+    size, left = path.stat().st_size, [contents]
+    known: set[int] = set()
     while left:
         part = left.pop()
         if isinstance(part, torch.Tensor):

@@ -55,7 +55,7 @@ class TracedScene:
         *,
         origin_in_scene: bool = False,
         cutouts_by_mitsuba: bool = False,
-        plastics: Mapping[tuple, Any] | None = None,
+        plastics: Mapping[tuple, Array] | None = None,
     ) -> None:
         groups: dict[tuple, list[Surface]] = {}
         for surface in scene.surfaces:
@@ -122,7 +122,7 @@ class TracedScene:
         # the corner pixels' rays lie on the rim of the smallest cone
         self.half_angle = dr.opaque(Float, math.acos(scene.laser.cos_half_angle(camera)) * (1 + 1e-5))
 
-    def _reflectance(self, material: Material, masks: str, known: Mapping[tuple, Any]) -> Array:
+    def _reflectance(self, material: Material, masks: str, known: Mapping[tuple, Array]) -> Array:
         """Make Mitsuba's BSDF of a material, taken from those known if it is a plain, whole plastic that is among
         them."""
         bsdf = _bsdf(material, _albedo(material))
@@ -140,7 +140,7 @@ class TracedScene:
         table[self.shape_ids] = values
         return upload(Float, table)
 
-    def arrays(self) -> dict[str, Any]:
+    def arrays(self) -> dict[str, Array | tuple[Array, ...]]:
         """Return everything of the world that lives in Dr.Jit: a recording has to be told its inputs."""
         held = {
             name: value
@@ -150,7 +150,7 @@ class TracedScene:
         }
         return {**held, "traced": self.mi_scene}
 
-    def with_arrays(self, arrays: dict[str, Any]) -> TracedScene:
+    def with_arrays(self, arrays: dict[str, Array | tuple[Array, ...]]) -> TracedScene:
         """Return a copy with other Dr.Jit arrays: a recording refuses those that are not among its arguments."""
         other = copy.copy(self)
         vars(other).update(arrays)
@@ -322,7 +322,7 @@ def _is_on_ramp(material: Material) -> bool:
     return material.kind in ("plastic", "roughplastic") and plain
 
 
-def _albedo(material: Material) -> dict[str, Any] | None:
+def _albedo(material: Material) -> dict[str, object] | None:
     """Describe Mitsuba's texture for the albedo of a mesh; None where the material has no albedo."""
     if material.kind not in ("diffuse", "roughdiffuse", "plastic", "roughplastic"):
         return None
@@ -335,7 +335,7 @@ def _albedo(material: Material) -> dict[str, Any] | None:
     return _texture(material.albedo)
 
 
-def _texture(value: float | Texture) -> dict[str, Any]:
+def _texture(value: float | Texture) -> dict[str, object]:
     if not isinstance(value, Texture):
         return {"type": "uniform", "value": float(value)}
     return {
@@ -346,7 +346,7 @@ def _texture(value: float | Texture) -> dict[str, Any]:
     }
 
 
-def _bsdf(material: Material, albedo: dict[str, Any] | None) -> dict[str, Any]:
+def _bsdf(material: Material, albedo: dict[str, object] | None) -> dict[str, object]:
     """Describe a material to Mitsuba. Glass and cut-outs are the tracer's business, not the BSDF's."""
     kind = material.kind
     inner: dict[str, Any]
@@ -383,7 +383,7 @@ def _power(surfaces: Sequence[Surface]) -> float:
     return power
 
 
-def _environment(scene: Scene, weight: float) -> dict[str, Any] | None:
+def _environment(scene: Scene, weight: float) -> dict[str, object] | None:
     ambient, sampled = scene.ambient, {"sampling_weight": weight}
     if ambient.environment is not None:
         image = np.repeat(ambient.environment.image[..., None], 3, axis=-1)

@@ -300,7 +300,10 @@ def read_pack(path: Path) -> Pack:
             meta, sha256 = open_seal(file.attrs[ATTRIBUTE], "pack")
             arrays = _all_views(file)
             starts = np.asarray(read_dataset(file, "start"), np.int64)
-            metas = tuple(parse_json(np.asarray(read_dataset(file, "meta"), np.uint8).tobytes()))
+            listed = parse_json(np.asarray(read_dataset(file, "meta"), np.uint8).tobytes())
+            if not isinstance(listed, list):
+                raise InputError("its metadata are no list")
+            metas = tuple(listed)
         returns = arrays["count"].sum(axis=(1, 2), dtype=np.int64)
         fits = len(returns) == len(metas) and np.array_equal(starts, np.concatenate(([0], returns.cumsum())))
         require(fits, "its views do not fit its returns")

@@ -19,7 +19,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NoReturn
+from typing import IO, TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from scenes.limits import require_memory
 
 if TYPE_CHECKING:
     import h5py
+    from typing_extensions import Buffer
 
 USER_BLOCK = 512
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -56,17 +57,17 @@ class Sink(io.RawIOBase):
     def tell(self) -> int:
         return self._file.tell()
 
-    def readinto(self, buffer: Any, /) -> int | None:
+    def readinto(self, buffer: Buffer, /) -> int | None:
         return self._file.readinto(buffer)
 
-    def write(self, data: Any, /) -> int:
+    def write(self, data: Buffer, /) -> int:
         left = memoryview(data).cast("B")
         while self._error is None and len(left):
             try:
                 left = left[self._file.write(left) :]
             except OSError as error:
                 self._error = error
-        return len(data)
+        return memoryview(data).nbytes
 
     def truncate(self, size: int | None = None) -> int:
         try:

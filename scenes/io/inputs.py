@@ -6,9 +6,9 @@ import json
 import stat
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from scenes.errors import InputError, require
+from scenes.json_types import JsonObject
 
 
 def regular_file(path: Path, what: str = "file") -> Path:
@@ -68,7 +68,7 @@ def read_text(path: Path, what: str = "text file", *, most_bytes: int | None = N
         raise InputError(f"{path}: is not text, byte {error.start} is no UTF-8") from None
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes) -> object:
     """Return what JSON text says. Raises InputError for anything else, too deep nesting among it."""
     try:
         return json.loads(text)
@@ -78,7 +78,7 @@ def parse_json(text: str | bytes) -> Any:
         raise InputError(f"is no JSON ({_reason(error)})") from None
 
 
-def read_json_object(path: Path, what: str = "JSON file") -> dict[str, Any]:
+def read_json_object(path: Path, what: str = "JSON file") -> JsonObject:
     """Return the JSON object of a file. Raises InputError naming the file where it holds something else."""
     try:
         found = parse_json(read_text(path, what))
@@ -90,7 +90,7 @@ def read_json_object(path: Path, what: str = "JSON file") -> dict[str, Any]:
     return found
 
 
-def read_whole_lines(path: Path) -> Iterator[Any]:
+def read_whole_lines(path: Path) -> Iterator[object]:
     """Yield what each line of a journal (JSON lines) says, in order; lines that cannot be read are passed over.
 
     A process that was killed while it appended leaves a cut line. Nothing where the file does not exist.

@@ -17,6 +17,7 @@ import numpy as np
 from scenes.errors import InputError, require
 from scenes.io.inputs import parse_json
 from scenes.io.textures import check_checksums
+from scenes.json_types import JsonObject
 
 _PLY_TYPES = {
     "char": "i1",
@@ -225,7 +226,7 @@ def check_glb(content: bytes, read: ReadImage) -> None:
         raise InputError(f"its JSON is damaged ({type(error).__name__}: {error})") from None
 
 
-def _glb_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
+def _glb_chunks(content: bytes) -> tuple[JsonObject, bytes]:
     """The JSON object and the first binary chunk."""
     require(len(content) >= 20 and content[:4] == b"glTF", "is no GLB")
     version, length, size, kind = struct.unpack_from("<II I4s", content, 4)
@@ -233,7 +234,8 @@ def _glb_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
     require(length == len(content), f"cut short or damaged: its header says {length} bytes, it has {len(content)}")
     require(kind == b"JSON" and 20 + size <= length, f"its JSON chunk of {size} bytes does not fit {length} bytes")
     header = parse_json(content[20 : 20 + size])
-    require(isinstance(header, dict), "its JSON holds no object")
+    if not isinstance(header, dict):
+        raise InputError("its JSON holds no object")
     at = 20 + size
     if at + 8 > length:
         return header, b""
@@ -242,7 +244,7 @@ def _glb_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
     return header, content[at + 8 : at + 8 + size] if kind == b"BIN\0" else b""
 
 
-def _check_indices(header: dict[str, Any]) -> None:
+def _check_indices(header: JsonObject) -> None:
     """All indices and counts are whole numbers of 0 or more: Python counts negative ones from the end."""
     for key, value in _entries(header):
         if key in _GLB_INDICES:
@@ -251,7 +253,7 @@ def _check_indices(header: dict[str, Any]) -> None:
                 require(not bad, f"its {key} is {number}, expected a whole number of 0 or more")
 
 
-def _entries(value: Any) -> Iterator[tuple[str, Any]]:
+def _entries(value: object) -> Iterator[tuple[str, object]]:
     """Every key and value of nested objects but the user's own `extras` and extensions."""
     pending = [value]
     while pending:
@@ -263,7 +265,7 @@ def _entries(value: Any) -> Iterator[tuple[str, Any]]:
             pending.extend(one)
 
 
-def _check_accessors(header: dict[str, Any], size: int) -> None:
+def _check_accessors(header: JsonObject, size: int) -> None:
     """InputError where primitives read what has no data of its own, or accessors declare more than the file has."""
     accessors = header.get("accessors", [])
     primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"]]
@@ -277,7 +279,7 @@ def _check_accessors(header: dict[str, Any], size: int) -> None:
         require(fits, f"accessor {number} declares {accessor['count']} elements in a file of {size} bytes")
 
 
-def _used_images(header: dict[str, Any]) -> set[int]:
+def _used_images(header: JsonObject) -> set[int]:
     """Images of the base colours of materials that primitives use."""
     materials, textures = header.get("materials", []), header.get("textures", [])
     used = {one["material"] for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" in one}
@@ -292,7 +294,7 @@ def _used_images(header: dict[str, Any]) -> set[int]:
     return found
 
 
-def _check_image(header: dict[str, Any], number: int, binary: bytes, read: ReadImage) -> None:
+def _check_image(header: JsonObject, number: int, binary: bytes, read: ReadImage) -> None:
     """InputError where an image is not there, or none that Pillow knows."""
     from PIL import Image
 

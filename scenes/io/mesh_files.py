@@ -5,13 +5,16 @@ from __future__ import annotations
 import io
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_declarations import check_glb, check_ply, check_stl
+
+if TYPE_CHECKING:
+    import trimesh
 
 MAX_COORDINATE = 1e12  # in the file's unit: squares and cross products of such stay finite in double precision
 MAX_TRIANGLES = 1 << 25  # with all instances: a scene's arrays take some 200 bytes a triangle
@@ -31,7 +34,7 @@ class _Beside:
         return self.get(name)
 
 
-def load_trimesh(path: Path, kind: str, **options: Any) -> Any:
+def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
     """Return the trimesh.Scene of a file as it is: nothing merged, removed or reordered.
 
     kind     ".obj", ".ply", ".stl" or ".glb"
@@ -91,7 +94,7 @@ def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | N
     return content, None
 
 
-def _check_size(loaded: Any) -> None:
+def _check_size(loaded: trimesh.Scene) -> None:
     """InputError where all instances together are too many triangles."""
     sizes = {name: len(getattr(mesh, "faces", ())) for name, mesh in loaded.geometry.items()}
     triangles = sum(sizes[loaded.graph[node][1]] for node in loaded.graph.nodes_geometry)

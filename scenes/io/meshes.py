@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +22,11 @@ from scenes.io.textures import load_texture, luminance, srgb_to_linear
 from scenes.library.things import shapes
 from scenes.model import Camera, Material, Scene, Surface, Texture
 from scenes.placing import AS_IT_IS, Placing
+
+if TYPE_CHECKING:
+    import trimesh
+    from PIL import Image
+    from trimesh.visual.base import Visuals
 
 EXTENSIONS = (".obj", ".ply", ".stl", ".glb")
 DEFAULT_ALBEDO = 0.6
@@ -52,7 +57,7 @@ class _Part:
     faces: np.ndarray
     uv: np.ndarray | None
     normals: np.ndarray | None
-    visual: Any
+    visual: Visuals
 
 
 def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placing = AS_IT_IS) -> Scene:
@@ -154,7 +159,7 @@ def _read(path: Path) -> list[_Part]:
     return [replace(parts[0], name=path.stem)] if len(parts) == 1 else parts
 
 
-def _part(mesh: Any, pose: np.ndarray, name: str) -> _Part | None:
+def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> _Part | None:
     """One mesh in world coordinates; None for points, lines and meshes without faces."""
     faces = np.asarray(getattr(mesh, "faces", ()))
     if faces.size == 0:
@@ -325,7 +330,7 @@ class _Paint:
         return float(luminance(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours)).mean())
 
 
-def _image_albedo(image: Any, tint: np.ndarray) -> Texture:
+def _image_albedo(image: Image.Image, tint: np.ndarray) -> Texture:
     """The texture of an sRGB image held in memory, times a linear colour."""
     pixels = srgb_to_linear(np.asarray(image.convert("RGB")) / 255)
     return Texture(np.minimum(luminance(pixels * tint[:3]), 1.0), "base colour")

@@ -11,7 +11,6 @@ import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -98,7 +97,7 @@ class _Stream:
         more = self._inflate.decompress(self._packed, CHUNK)
         require(self._inflate.eof and not more and not self._ready, "holds more, or less, than its mesh")
 
-    def numbers(self, form: str) -> tuple[Any, ...]:
+    def numbers(self, form: str) -> tuple[int, ...]:
         return struct.unpack(f"<{form}", self.take(struct.calcsize(f"<{form}")))
 
     def array(self, rows: int, columns: int, dtype: str) -> np.ndarray:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, parse_json, read_text
+from scenes.json_types import JsonObject
 
 
-def read_set_index(folder: Path) -> list[dict[str, Any]]:
+def read_set_index(folder: Path) -> list[JsonObject]:
     """Return the records of a set's finished views in order; those of failed views are left out.
 
     Every `file` of a record is a regular file inside the folder. Raises InputError in one line where there is no
@@ -31,14 +31,16 @@ def read_set_index(folder: Path) -> list[dict[str, Any]]:
     return records
 
 
-def _checked(folder: Path, line: str, last: int) -> tuple[int, dict[str, Any]]:
+def _checked(folder: Path, line: str, last: int) -> tuple[int, JsonObject]:
     """Return a line's view and record; InputError where it is none, or not of a later view than `last`."""
     record = parse_json(line)
-    require(isinstance(record, dict), "holds no JSON object")
+    if not isinstance(record, dict):
+        raise InputError("holds no JSON object")
     view, file = record.get("view"), record.get("file")
-    numbered = isinstance(view, int) and not isinstance(view, bool)
-    require(numbered and view > last, f"is of view {view!r}, expected a whole number above {last}")
+    if not isinstance(view, int) or isinstance(view, bool) or view <= last:
+        raise InputError(f"is of view {view!r}, expected a whole number above {last}")
     if "failed" not in record:
-        require(isinstance(file, str), f"names the file {file!r}, expected a path in the folder")
+        if not isinstance(file, str):
+            raise InputError(f"names the file {file!r}, expected a path in the folder")
         file_inside(folder, file, "view", "the set's folder")
     return view, record

@@ -7,8 +7,6 @@ Every body is closed. Lengths are metres.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from scenes.library.things import shapes
@@ -26,6 +24,7 @@ from scenes.library.things.parts import (
     with_normals,
 )
 from scenes.library.things.patterns import grain, landscape, planks, tiles
+from scenes.material_fields import MaterialFields
 from scenes.model import Camera, Material, Scene, Surface, Texture
 
 LOW, HIGH = np.array((-1.4, 0.0, -3.6)), np.array((1.4, 2.9, 2.6))  # the hall's corners
@@ -58,10 +57,10 @@ def _palette() -> Palette:
     def printed(image: np.ndarray) -> Texture:
         return Texture(image, "made from a seed")
 
-    def coat(albedo: float | Texture, alpha: float) -> dict[str, Any]:
+    def coat(albedo: float | Texture, alpha: float) -> MaterialFields:
         return {"kind": "roughplastic", "ior": 1.5, "albedo": albedo, "roughness": alpha}
 
-    made = {
+    made: dict[str, MaterialFields] = {
         "boards": coat(printed(planks(draw, 0.3)), 0.1),
         "tiles": coat(printed(tiles(draw, 0.45, 256, 6)), 0.08),
         "steps": coat(printed(grain(draw, 0.32)), 0.12),

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import pairwise
 from numbers import Integral
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from scenes.errors import InputError
 from scenes.library.things import shapes
 from scenes.library.things.parts import Palette, Random, box, joined, panel, placed, post, smooth_normals
 from scenes.library.things.patterns import grain, landscape, mottled, planks, rug_pattern
+from scenes.material_fields import MaterialFields
 from scenes.model import Camera, Material, Scene, Surface, Texture
 
 LOW, HIGH = np.array((-2.05, 0.0, -3.2)), np.array((1.85, 2.5, 3.0))  # the room's corners
@@ -248,15 +248,15 @@ def sculpture(palette: Palette, rng: Random, height: float = 0.4) -> list[Surfac
 def _palette(colours: Random, textures: Random) -> Palette:
     """The materials of one seed by name. Albedos span 0.05 (leather, dark covers) to 0.9 (ceiling)."""
 
-    def plain(low: float, high: float) -> dict[str, Any]:
+    def plain(low: float, high: float) -> MaterialFields:
         return {"albedo": float(colours.uniform(low, high))}
 
-    def printed(image: np.ndarray) -> dict[str, Any]:
+    def printed(image: np.ndarray) -> MaterialFields:
         return {"albedo": Texture(image, "made from the seed")}
 
-    gloss = {"kind": "roughplastic", "ior": 1.5}
+    gloss: MaterialFields = {"kind": "roughplastic", "ior": 1.5}
     wood = float(colours.uniform(0.25, 0.42))
-    made = {
+    made: dict[str, MaterialFields] = {
         "oak planks": printed(planks(textures, wood)),
         "plaster": printed(mottled(textures, colours.uniform(0.55, 0.72), 0.03, 6)),
         "ceiling paint": {"albedo": 0.9},

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from scenes.library.things import clutter, fittings, furniture
 from scenes.library.things.palette import make_palette, pick
 from scenes.library.things.parts import Palette, Piece, Random, box, joined, panel, sheet, with_normals
 from scenes.library.things.patterns import on_one_sheet
+from scenes.library.things.shapes import Shape
 from scenes.model import Camera, Scene, Surface
 
 SPLITS = ("train", "val", "test")
@@ -176,7 +177,7 @@ def _lumber(corners: np.ndarray, ceiling: float) -> Place:
     return Place(Piece(()), (0.0, 0.0, 0.0), 0.0, plan, 0.0, ceiling)
 
 
-def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: float) -> tuple[Any, ...]:
+def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: float) -> Shape:
     """A board along a wall from start to end (x, z), on the inside."""
     along = (end - start) / np.linalg.norm(end - start)
     inward = thick * np.array((-along[1], along[0]))

@@ -21,7 +21,6 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from scenes.errors import InputError
 from scenes.io.inputs import file_inside, read_text
@@ -250,7 +249,7 @@ class _Assembly:
             self._operand(cursor, kind, fields, targets)
         self.pending.append((cursor, Instruction(name, **fields), targets))  # type: ignore[arg-type]
 
-    def _operand(self, cursor: Cursor, kind: str, fields: dict[str, Any], targets: dict[str, Token]) -> None:
+    def _operand(self, cursor: Cursor, kind: str, fields: dict[str, int | bool], targets: dict[str, Token]) -> None:
         if kind in "dt":
             fields["rd"] = self._register(cursor)
         elif kind == "s":
@@ -280,7 +279,7 @@ class _Assembly:
         else:
             self._ram_operand(cursor, fields)
 
-    def _ram_operand(self, cursor: Cursor, fields: dict[str, Any]) -> None:
+    def _ram_operand(self, cursor: Cursor, fields: dict[str, int | bool]) -> None:
         """Parse [register + constant] in any order, or one of the two alone."""
         cursor.expect("[")
         at, base, offset = cursor.next, None, 0
