@@ -49,3 +49,28 @@ def detect_free_running(times: Sequence[float], bins: int, dead_bins: float) -> 
             counts[int(time % bins)] += 1
             ready = time + dead_bins
     return counts
+
+
+def time_bin(
+    time_s: float, code_ends: Sequence[float], clock_period_s: float, bin_width_s: float, code_times: Sequence[float]
+) -> int:
+    """Return the bin that a time-to-digital converter puts a detection into.
+
+    Parameters
+    ----------
+    time_s : true time after the laser's emission, within the laser's period
+    code_ends : when each fine code ends, in clock periods after the clock's edge
+    clock_period_s : period of the clock
+    bin_width_s : width of the histogram's bins
+    code_times : time that each fine code is taken for, in clock periods after the clock's edge
+
+    Returns
+    -------
+    number of the bin
+    """
+    ticks = time_s / clock_period_s
+    turn, within = int(ticks), ticks - int(ticks)
+    code = 0
+    while within >= code_ends[code]:
+        code += 1
+    return int((turn + code_times[code]) * clock_period_s / bin_width_s + 1e-9)

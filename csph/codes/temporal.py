@@ -80,7 +80,8 @@ def published_pulse(bins: int, sensor: Sensor) -> Tensor:
 
 def circle_of(bins: int, sensor: Sensor) -> Sensor:
     """Return the sensor on a period of `bins` bins: what a block of that many bins sees of a periodic pulse."""
-    return replace(sensor, name=f"{sensor.name}, {bins} bins", bins=bins, period_s=bins * sensor.bin_width_s)
+    name, period_s = f"{sensor.name}, {bins} bins", bins * sensor.bin_width_s
+    return replace(sensor, name=name, bins=bins, period_s=period_s, tdc=None)
 
 
 def gray_frequencies(pulse: Tensor) -> list[int]:

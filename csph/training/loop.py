@@ -107,7 +107,7 @@ class DepthTraining(pl.LightningModule):
             depth = depth - near
             valid = batch.valid & (depth >= 0) & (depth < config.window * sensor.bin_depth_m)
             # gated: what of the pulse falls outside the window is left out
-            sensor = replace(sensor, bins=config.window)
+            sensor = replace(sensor, bins=config.window, tdc=None)
         else:
             logits, valid = self.model(batch.counts), batch.valid
         loss = kl_divergence(logits, depth, valid, sensor)
@@ -250,12 +250,15 @@ def _claim(folder: Path, config: TrainConfig) -> None:
 
 
 def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
-    """Raise InputError unless a trained model has the sensor and the tensors, or the kind of network, of the one to be
-    trained."""
+    """Raise InputError unless a trained model has the sensor, but for its converters, and the tensors, or the kind of
+    network, of the one to be trained."""
     network_alone = isinstance(init, NetworkOf)
     mine, other = config.model, (init.model if isinstance(init, NetworkOf) else init).config
-    names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
+    names = ("network",) if network_alone else ("front", "network", "design")
     alike = all(getattr(mine, name) == getattr(other, name) for name in names)
+    # a time-to-digital converter may come to a sensor, or go
+    sensors = [replace(config.sensor, name="", tdc=None) for config in (mine, other)]
+    alike = alike and sensors[0] == sensors[1]
     message = (
         f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
     )

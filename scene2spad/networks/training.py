@@ -30,7 +30,8 @@ from scenes.files import write_csv
 from scenes.progress import Progress
 from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
 from spad.formats.histogram import Histogram
-from spad.sensor.model import Sensor, sensor_by_name
+from spad.sensor.files import load_sensor
+from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")
 
@@ -41,7 +42,9 @@ SMOKE_PIXELS = 32
 
 def config_of(command: Train) -> TrainConfig:
     """Return the preset with what the command line changes. Raises InputError for options that do not fit together."""
-    sensor = sensor_by_name(command.sensor)
+    described = load_sensor(command.sensor)
+    require(described.zones is None, f"train: sensor {command.sensor} has zones, networks are for pixels")
+    sensor = described.sensor
     network = command.network or ("published" if command.preset == "paper" else "compact")
     # the published network finds the pulse in the counts by itself; ours, of few layers, is given them matched
     front = {"none": "matched" if network == "compact" else "counts", "peak": "peak"}.get(command.design, "codes")

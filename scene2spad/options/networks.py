@@ -43,8 +43,9 @@ class Train(Long):
         may_stay_open("{compact,published,published-signed}"),
     ] = None
     """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
-    sensor: Literal["reference", "iccv2023-train", "linospad"] = "reference"
-    """Sensor preset."""
+    sensor: str = "reference"
+    """Sensor preset or sensor file (.toml), as in `sense`; with a time-to-digital converter patches are drawn through
+    it."""
     init: Annotated[str | None, may_stay_open("MODEL")] = None
     """Begin with the weights of a trained model of the same design, a shipped name or a checkpoint, instead of random
     ones (fine-tuning)."""

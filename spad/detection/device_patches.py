@@ -24,6 +24,7 @@ from spad.detection.photons import paths_in_bins
 from spad.detection.training_patches import Batch, PackedTransients, Patch
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, pulse_table
+from spad.sensor.tdc import rising_edges
 
 
 class _Photons(NamedTuple):
@@ -55,6 +56,9 @@ class DevicePatches:
         dark = sensor.dark_rate_map_hz(rows, columns) * sensor.exposure_s
         self.mean_radiance, self.mean_ambient, self.mean_dark = packed.mean_radiance, packed.mean_ambient, dark.mean()
         self.dark = self._moved(dark).flatten()
+        edges, converter = sensor.code_edges, sensor.converter_map(rows, columns)
+        self.edges = None if edges is None else torch.from_numpy(rising_edges(edges)).to(self.device)
+        self.converter = None if converter is None else torch.from_numpy(converter).to(self.device).flatten()
         # uniform where a scene has no ambient light, as in `flux.fill_background`
         unlit = packed.mean_ambient <= 0
         self.mean_ambient = np.where(unlit, 1.0, packed.mean_ambient)
@@ -80,7 +84,7 @@ class DevicePatches:
         steady = self._background_photons(self.ambient[pixel] * ambient + self.dark[in_frame] * dark, draw)
         counts = torch.zeros(len(patches) * bins * height * width, device=self.device)
         for photons in (light, steady):
-            self._count(photons, height * width, counts)
+            self._count(photons, in_frame, height * width, counts)
         depth = (self.depth_m[pixel] + moved).view(shape)
         return Batch(
             counts.view(len(patches), 1, bins, height, width),
@@ -128,9 +132,8 @@ class DevicePatches:
         position = self.start[index] + moved[owner]
         if self.spreads:
             position += self.length[index] * torch.rand(len(each), generator=draw, device=self.device)
-        for kernel in (self.sensor.pulse, self.sensor.jitter):
-            if kernel is not None:
-                position += _delays(kernel, len(each), draw) / self.sensor.bin_width_s
+        for kernel in self.sensor.kernels:
+            position += _delays(kernel, len(each), draw) / self.sensor.bin_width_s
         return _Photons(owner, position)
 
     def _background_photons(self, expected: Tensor, draw: torch.Generator) -> _Photons:
@@ -141,10 +144,16 @@ class DevicePatches:
             torch.rand(len(owner), generator=draw, device=self.device) * self.sensor.bins_per_period,
         )
 
-    def _count(self, photons: _Photons, pixels: int, counts: Tensor) -> None:
+    def _count(self, photons: _Photons, in_frame: Tensor, pixels: int, counts: Tensor) -> None:
         """Add detections to flat counts (B T P); whole numbers, so that no order of additions shows."""
         period, bins = self.sensor.bins_per_period, self.sensor.bins
-        place = photons.position.floor().long() % period
+        if self.edges is None or self.converter is None:
+            place = photons.position.floor().long() % period
+        else:
+            first = self.converter[in_frame[photons.pixel]] * bins
+            # as `time_codes`
+            place = torch.searchsorted(self.edges, photons.position.double() % period + first, right=True) - 1 - first
+            place = place.clamp(0, bins - 1)
         patch = photons.pixel // pixels
         index = (patch * bins + place) * pixels + photons.pixel % pixels
         if bins < period:  # the rest of the period has no bins: nothing is detected there

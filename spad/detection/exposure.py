@@ -27,9 +27,10 @@ from spad.detection.laws import (
     first_photon_counts,
     live_detections,
 )
-from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries
+from spad.detection.photons import PixelFlux, draw_primaries
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import Sensor
+from spad.sensor.tdc import time_codes
 
 Finished = TypeVar("Finished")
 # One random stream for this many pixels: the counts do not depend on threads, nor on how the work is cut.
@@ -73,6 +74,24 @@ class Exposure:
         seeds = np.random.SeedSequence(self.seed, spawn_key=(stage, self.part, block.start // STREAM_PIXELS))
         return np.random.Generator(np.random.SFC64(seeds))
 
+    @property
+    def timed(self) -> bool:
+        """Return whether detections are drawn at times, which a converter then puts into bins, or in bins at once."""
+        return self.sensor.tdc is not None
+
+    def coded(self, events: Detections, first: int) -> Detections:
+        """Return detections with the bins that their pixels' converters give them; pixels are counted from `first`."""
+        edges, converter = self.sensor.code_edges, self.rates.converter
+        if edges is None or converter is None:
+            return events
+        mine = converter.reshape(-1)[events.pixel + first]
+        return events._replace(position=time_codes(events.position, mine, edges))
+
+    def primaries(self, light: PixelFlux, rng: np.random.Generator) -> Detections:
+        """Draw primary detections and their laser cycles: times where a converter is to make bins of them."""
+        events = draw_primaries(light, self.sensor, rng, fraction=self.fraction, fractional=self.timed)
+        return Detections(events.pixel, np.zeros(len(events.pixel), np.int8), events.position)
+
     def light(self, block: slice) -> PixelFlux:
         first, last = self.transient.offsets[block.start], self.transient.offsets[block.stop]
         owner, start, length, signal, background = self.whole
@@ -96,7 +115,7 @@ def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
 
     _draw(exposure, fill, progress, np.zeros(height * width))
     counts = counts.reshape(height, width, bins)
-    if exposure.sensor.crosstalk and exposure.model == "poisson":
+    if exposure.sensor.crosstalk and exposure.model == "poisson" and not exposure.timed:
         add_crosstalk(counts, exposure.sensor.crosstalk, exposure.rng(Stream.CROSSTALK, slice(0, 0)))
     return counts
 
@@ -112,7 +131,7 @@ def timestamps_of(
     exposure: Exposure, meta: JsonObject, progress: Progress | None, ready: np.ndarray | None = None
 ) -> Timestamps:
     height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
-    if exposure.sensor.crosstalk and exposure.model == "poisson":
+    if exposure.sensor.crosstalk and exposure.model == "poisson" and not exposure.timed:
         return Timestamps.of_counts(counts_of(exposure, progress), meta)
     ready = np.zeros(height * width) if ready is None else ready
 
@@ -134,7 +153,7 @@ def _draw(
 
     What was detected: counts (P, T), or places pixel x T + bin (N,) int32 in no order, pixels counted from the block's.
     """
-    if exposure.sensor.crosstalk and exposure.model != "poisson":
+    if exposure.sensor.crosstalk and (exposure.timed or exposure.model != "poisson"):
         return [finish(block, places) for block, places in _with_crosstalk(exposure, ready)]
     blocks, workers = exposure.blocks, torch.get_num_threads()
     finished: list[Finished] = []
@@ -150,14 +169,17 @@ def _draw(
 def _block(exposure: Exposure, block: slice, ready: np.ndarray) -> np.ndarray:
     sensor, rng, light = exposure.sensor, exposure.rng(Stream.SENSE, block), exposure.light(block)
     if exposure.model == "free-running":
-        places = [_places(part, sensor) for part in _free_running(exposure, light, rng, ready)]
+        parts = _free_running(exposure, light, rng, ready)
+        places = [_places(exposure.coded(part, block.start), sensor) for part in parts]
         return np.concatenate(places)
     primaries = float(light.signal.sum() + light.background.sum()) * exposure.fraction
     if primaries > DENSE_FROM * sensor.bins * light.pixels:
         return _dense(exposure, block, rng)
+    events = exposure.coded(exposure.primaries(light, rng), block.start)
     if exposure.model == "poisson":
-        return _places(draw_primaries(light, sensor, rng, fraction=exposure.fraction), sensor)
-    return _places(_first_photons(exposure, light, rng), sensor)
+        return _places(events, sensor)
+    # codes rise with time: the first photon is the one of the lowest code
+    return _places(_first_photons(exposure, events, rng), sensor)
 
 
 def _dense(exposure: Exposure, block: slice, rng: np.random.Generator) -> np.ndarray:
@@ -169,16 +191,13 @@ def _dense(exposure: Exposure, block: slice, rng: np.random.Generator) -> np.nda
     return first_photon_counts(rate / round(exposure.sensor.cycles), last - first, rng)
 
 
-def _places(detected: Detections | PhotonEvents, sensor: Sensor) -> np.ndarray:
+def _places(detected: Detections, sensor: Sensor) -> np.ndarray:
     return detected.pixel.astype(np.int32) * np.int32(sensor.bins) + detected.position.astype(np.int32)
 
 
-def _first_photons(
-    exposure: Exposure, light: PixelFlux, rng: np.random.Generator, events: PhotonEvents | None = None
-) -> Detections:
-    events = events or draw_primaries(light, exposure.sensor, rng, fraction=exposure.fraction)
+def _first_photons(exposure: Exposure, events: Detections, rng: np.random.Generator) -> Detections:
     cycle = rng.integers(*exposure.cycles, len(events.pixel))
-    return first_of_each_cycle(Detections(events.pixel, cycle, events.position), exposure.sensor)
+    return first_of_each_cycle(events._replace(cycle=cycle), exposure.sensor)
 
 
 def _free_running(
@@ -214,7 +233,9 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
     for block in exposure.blocks:
         rng, light = exposure.rng(Stream.SENSE, block), exposure.light(block)
         if exposure.model == "first-photon":
-            parts = [_first_photons(exposure, light, rng)]
+            parts = [_first_photons(exposure, exposure.primaries(light, rng), rng)]
+        elif exposure.model == "poisson":
+            parts = [exposure.primaries(light, rng)]
         else:
             parts = list(_free_running(exposure, light, rng, before[block]))
         everything += [part._replace(pixel=part.pixel + block.start) for part in parts]
@@ -229,10 +250,21 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
     cause, pixel = crosstalk_events(events.pixel, sensor.crosstalk, transient.height, transient.width, rng)
     fired = Detections(pixel, events.cycle[cause], events.position[cause])
     both = Detections(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
-    detected = first_of_each_cycle(both, sensor) if exposure.model == "first-photon" else _alive(both, sensor, ready)
+    detected = exposure.coded(_detected(exposure, both, ready), 0)
     places = np.sort(detected.pixel * np.int64(sensor.bins) + detected.position.astype(np.int64))
     edges = [block.start * sensor.bins for block in exposure.blocks]
     edges.append(exposure.rates.alive.size * sensor.bins)
     cuts = np.searchsorted(places, edges)
     for number, block in enumerate(exposure.blocks):
         yield block, (places[cuts[number] : cuts[number + 1]] - edges[number]).astype(np.int32)
+
+
+def _detected(exposure: Exposure, both: Detections, ready: np.ndarray) -> Detections:
+    """Decide by the exposure's law which of photons and crosstalk are detected."""
+    if exposure.model == "poisson":
+        return both
+    return (
+        first_of_each_cycle(both, exposure.sensor)
+        if exposure.model == "first-photon"
+        else _alive(both, exposure.sensor, ready)
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,8 @@ class Rates(NamedTuple):
     """Scale from radiance to expected signal detections; background detections per pixel and exposure (H, W) and why.
 
     dark_share is the share of the mean background that is dark counts; `reasons` belong into the plan. `alive` (H, W)
-    is 0 in dead pixels, whose background is 0 too, and 1 elsewhere.
+    is 0 in dead pixels, whose background is 0 too, and 1 elsewhere. `converter` (H, W) says which of a sensor's
+    time-to-digital converters each pixel has, None where all bins are equal.
     """
 
     signal_scale: float
@@ -34,6 +36,7 @@ class Rates(NamedTuple):
     dark_fraction: float
     reasons: tuple[str, ...]
     alive: np.ndarray
+    converter: np.ndarray | None = None
 
 
 def rates_for(
@@ -60,7 +63,8 @@ def rates_for(
     dark_hz, dead = detector_maps(sensor, shape, dark_map_hz, seed)
     filled = fill_background(transient.ambient, dark_hz * sensor.exposure_s, budget.background)
     reasons = (filled.reason, *_odd_pixels(sensor, dead))
-    return Rates(scale, np.where(dead, 0.0, filled.background), filled.dark_fraction, reasons, np.where(dead, 0.0, 1.0))
+    background, alive = np.where(dead, 0.0, filled.background), np.where(dead, 0.0, 1.0)
+    return Rates(scale, background, filled.dark_fraction, reasons, alive, sensor.converter_map(*shape, seed))
 
 
 def detector_maps(
@@ -144,8 +148,42 @@ def interval_cdf(pulse: AnyPulse, after_near: Tensor, length: Tensor) -> Tensor:
     return torch.where(point, pulse_cdf(pulse, after_near - length / 2), spread)
 
 
-def signal_per_bin(transient: Transient, sensor: Sensor, pixels: slice, device: str = "cpu") -> tuple[Tensor, float]:
+class _Edges(NamedTuple):
+    """Edges of unequal bins on a device, for some pixels.
+
+    edges      (converters, bins + 1) float64 in bins
+    converter  (pixels,) int64
+    """
+
+    edges: Tensor
+    converter: Tensor
+
+    @property
+    def reach(self) -> int:
+        """Return how many bins, at most, an edge lies away from where it is meant to be, and one more."""
+        meant = torch.arange(self.edges.shape[1], dtype=torch.float64, device=self.edges.device)
+        return math.ceil(float((self.edges - meant).abs().max())) + 1
+
+    def at(self, pixel: Tensor, number: Tensor) -> Tensor:
+        """Return the place in bins of edges `number` (n, m), counted from the laser's emission, in pixels (n,)."""
+        period = self.edges.shape[1] - 1
+        turn = torch.div(number, period, rounding_mode="floor")
+        return self.edges[self.converter[pixel, None], number - turn * period] + turn * period
+
+
+def _edges_of(sensor: Sensor, converter: np.ndarray | None, device: str) -> _Edges | None:
+    edges = sensor.code_edges
+    if converter is None or edges is None:
+        return None
+    return _Edges(torch.tensor(edges, device=device), torch.from_numpy(converter).to(device))
+
+
+def signal_per_bin(
+    transient: Transient, sensor: Sensor, pixels: slice, device: str = "cpu", converter: np.ndarray | None = None
+) -> tuple[Tensor, float]:
     """Return expected signal per unit scale in every bin of some pixels, (len, T) float64, and how much of it wrapped.
+
+    `converter` (len,) are these pixels' rows of `sensor.code_edges`; without it all bins are equal.
 
     Each return's pulse is integrated over bins exactly and keeps its energy exactly. Time wraps at the period; what
     falls into the part of the period that has no bins is not detected. Wrapped is the radiance that arrived later than
@@ -165,6 +203,9 @@ def signal_per_bin(transient: Transient, sensor: Sensor, pixels: slice, device: 
     width, (before, after) = sensor.bin_width_s, sensor.response.window_s(WINDOW_SIGMAS)
     start = torch.floor((near - before) / width).long()
     bins = torch.ceil((near + length + after) / width).long() - start
+    edges = _edges_of(sensor, converter, device)
+    if edges is not None:
+        start, bins = start - edges.reach, bins + 2 * edges.reach
     # rows of equal length make a dense table; rounding lengths up only adds bins in which nothing arrives
     bins = (bins + LENGTH_STEP - 1) // LENGTH_STEP * LENGTH_STEP
     signal = torch.zeros(count * period, dtype=torch.float64, device=device)
@@ -173,7 +214,10 @@ def signal_per_bin(transient: Transient, sensor: Sensor, pixels: slice, device: 
         for rows in torch.split(torch.nonzero(bins == size).squeeze(1), max(1, BLOCK_ENTRIES // size)):
             steps = torch.arange(size + 1, device=device)
             # in float64: torch would take integers times a number for float32
-            time = (start[rows].double() * width - near[rows])[:, None] + steps.double() * width
+            if edges is None:
+                time = (start[rows].double() * width - near[rows])[:, None] + steps.double() * width
+            else:
+                time = edges.at(owner[rows], start[rows, None] + steps) * width - near[rows, None]
             arrived = interval_cdf(sensor.response, time, length[rows, None])
             # all of a return's energy lies between its first and last edge, whatever the pulse's tails
             arrived[:, 0], arrived[:, -1] = 0, 1
@@ -191,10 +235,15 @@ def expected_counts(
     """Return expected detections per bin of some pixels, (len, T) float64, and how many of their signal detections
     wrapped.
 
-    lambda_i = scale x signal_i + background / bins per period.
+    lambda_i = scale x signal_i + background x the bin's share of the period.
     """
-    signal, wrapped = signal_per_bin(transient, sensor, pixels, device)
+    converter = None if rates.converter is None else rates.converter.reshape(-1)[pixels]
+    signal, wrapped = signal_per_bin(transient, sensor, pixels, device, converter)
     flat = torch.from_numpy(rates.background.reshape(-1)[pixels]).to(device)
     alive = torch.from_numpy(rates.alive.reshape(-1)[pixels]).to(device)
     detected = signal * (rates.signal_scale * alive)[:, None]
-    return detected + (flat / sensor.bins_per_period)[:, None], wrapped * rates.signal_scale
+    steady = (flat / sensor.bins_per_period)[:, None]
+    edges = _edges_of(sensor, converter, device)
+    if edges is not None:
+        steady = steady * edges.edges.diff(dim=1)[edges.converter]
+    return detected + steady, wrapped * rates.signal_scale

@@ -73,7 +73,7 @@ def draw_primaries(
 ) -> PhotonEvents:
     """Draw primary detections within the sensor's bins in a share of the exposure.
 
-    Whole bins (int64), or positions within them (float64) where a dead time needs to know.
+    Whole bins (int64), or positions within them (float64) where a dead time, or a converter, needs to know.
     """
     period = sensor.bins_per_period
     number = rng.poisson(light.signal * fraction)
@@ -83,11 +83,10 @@ def draw_primaries(
         spread = np.repeat(light.length, number)
         spread *= rng.random(total, dtype=np.float32)
         position += spread
-    for kernel in (sensor.pulse, sensor.jitter):
-        if kernel is not None:
-            delay = kernel.draw(rng, total)
-            delay *= np.float32(1 / sensor.bin_width_s)
-            position += delay
+    for kernel in sensor.kernels:
+        delay = kernel.draw(rng, total)
+        delay *= np.float32(1 / sensor.bin_width_s)
+        position += delay
     steady = rng.poisson(light.background * fraction)
     owner = np.concatenate((light.owner, np.arange(light.pixels, dtype=np.int32)))
     pixel = np.repeat(owner, np.concatenate((number, steady)))

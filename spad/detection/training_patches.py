@@ -26,6 +26,7 @@ from scenes.random_streams import Stream
 from spad.detection.flux import background_scales
 from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries, paths_in_bins
 from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.tdc import time_codes
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +141,18 @@ def sense_patches(
     counts = torch.empty((len(patches), bins * pixels), device=device)
     labels = np.empty((len(patches), height, width), np.float32)
     mixed = np.empty((len(patches), height, width), bool)
+    edges, converter = sensor.code_edges, sensor.converter_map(*packed.depth_m.shape[1:])
 
     def draw(number: int) -> None:
         patch = patches[number]
         light = _light_of_patch(packed, sensor, patch, height, width)
         rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(patch.seed, spawn_key=(Stream.PATCH, 0, 0))))
-        events = draw_primaries(light, sensor, rng)
-        _count(events, counts[number].view(bins, pixels))
         rows, columns = slice(patch.row, patch.row + height), slice(patch.column, patch.column + width)
+        events = draw_primaries(light, sensor, rng, fractional=edges is not None)
+        if edges is not None and converter is not None:
+            mine = converter[rows, columns].reshape(-1)[events.pixel]
+            events = events._replace(position=time_codes(events.position, mine, edges))
+        _count(events, counts[number].view(bins, pixels))
         labels[number] = packed.depth_m[patch.scene, rows, columns] + np.float32(patch.time_offset_m)
         mixed[number] = packed.mixed[patch.scene, rows, columns]
 

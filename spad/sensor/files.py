@@ -1,14 +1,14 @@
 """Sensor files: a `Sensor`, with its optics, as TOML, every quantity with its unit; the presets that come as files.
 
-A file holds `name`, `description`, the tables `histogram`, `pulse`, `jitter`, `detector`, `optics` and `zones`, of
-which `histogram` (bins, bin_width) and `pulse` must be there, and `sources`: where each number comes from.
+A file holds `name`, `description`, the tables `histogram`, `pulse`, `jitter`, `detector`, `tdc`, `optics` and
+`zones`, of which `histogram` (bins, bin_width) and `pulse` must be there, and `sources`: where each number comes from.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -19,6 +19,7 @@ from spad.sensor.budget import Optics
 from spad.sensor.model import PRESETS, Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse
 from spad.sensor.quantities import format_quantity, parse_quantity
+from spad.sensor.tdc import Tdc
 from spad.sensor.toml import format_toml, read_toml
 from spad.zones.sensor import ZoneArray
 
@@ -28,8 +29,8 @@ KINDS_OF_PULSE = "sigma, fwhm, or samples with step"
 
 
 class Key(NamedTuple):
-    """One key of a table: the field that it sets, its dimension ("" a number, "word" a text), whether it must be there,
-    may be negative, and is a list (or may be one)."""
+    """One key of a table: the field that it sets, its dimension ("" a number, "count" a whole one, "word" a text),
+    whether it must be there, may be negative, and is a list (or may be one)."""
 
     field: str
     dimension: str = ""
@@ -39,7 +40,7 @@ class Key(NamedTuple):
 
 
 HISTOGRAM = {
-    "bins": Key("bins", required=True),
+    "bins": Key("bins", "count", required=True),
     "bin_width": Key("bin_width_s", "time", required=True),
     "period": Key("period_s", "time"),
     "exposure": Key("exposure_s", "time"),
@@ -70,6 +71,16 @@ PULSE = {
     "samples": Key("samples", many="must"),
     "step": Key("sample_s", "time"),
 }
+TDC = {
+    "clock_period": Key("clock_period_s", "time", required=True),
+    "table": Key("table", "word"),
+    "codes": Key("codes", "count"),
+    "dnl": Key("dnl"),
+    "missing": Key("missing"),
+    "jitter": Key("jitter_s", "time"),
+    "correction": Key("correction", "word"),
+    "correction_bits": Key("correction_bits", "count"),
+}
 ZONES = {
     "centre_x": Key("centre_x", required=True, signed=True, many="must"),
     "centre_y": Key("centre_y", required=True, signed=True, many="must"),
@@ -98,6 +109,7 @@ TABLES = {
     "pulse": PULSE,
     "jitter": PULSE,
     "detector": DETECTOR,
+    "tdc": TDC,
     "optics": OPTICS,
     "zones": ZONES,
 }
@@ -181,6 +193,9 @@ def sensor_from_tables(contents: Mapping[str, object]) -> SensorFile:
     for table in ("pulse", "jitter"):
         if table in tables:
             values[table] = _pulse(tables[table], table)
+    if "tdc" in tables:
+        require("zones" not in tables, "zones and tdc do not go together: converters are of pixels")
+        values["tdc"] = Tdc(**tables["tdc"])
     optics = Optics(**tables["optics"]) if "optics" in tables else None
     zones = ZoneArray(**tables["zones"]) if "zones" in tables else None
     return SensorFile(Sensor(**values), optics, zones, description, _sources(contents))
@@ -216,7 +231,7 @@ def _field(value: object, key: Key, where: str) -> object:
     if key.dimension == "word":
         require(isinstance(value, str), f"{where}: {value!r} is no text")
         return value
-    if key.field == "bins":
+    if key.dimension == "count":
         whole = isinstance(value, int) and not isinstance(value, bool)
         require(whole, f"{where}: {value!r} is no whole number")
         return value
@@ -274,6 +289,10 @@ def sensor_tables(contents: SensorFile) -> dict[str, object]:
     detector = dict(_written(sensor, differing))
     if detector:
         tables["detector"] = detector
+    if (tdc := sensor.tdc) is not None:
+        defaults = {one.name: one.default for one in fields(Tdc)}
+        used = {name: key for name, key in TDC.items() if getattr(tdc, key.field) != defaults[key.field]}
+        tables["tdc"] = dict(_written(tdc, used))
     if optics is not None:
         tables["optics"] = dict(_written(optics, OPTICS))
     if (zones := contents.zones) is not None:
@@ -294,7 +313,7 @@ def _differing(keys: Mapping[str, Key], holder: object, ideal: object) -> dict[s
 def _written(holder: object, keys: Mapping[str, Key]) -> Iterator[tuple[str, object]]:
     for name, key in keys.items():
         value = getattr(holder, key.field)
-        if key.dimension in ("", "word"):
+        if key.dimension in ("", "word", "count"):
             yield name, list(value) if isinstance(value, tuple) else value
         elif isinstance(value, tuple):
             yield name, [format_quantity(item, key.dimension) for item in value]

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from functools import reduce
 from typing import Literal
 
 import numpy as np
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import did_you_mean, require
+from scenes.errors import InputError, did_you_mean, require
 from scenes.json_types import JsonObject
 from scenes.random_streams import Stream
 from spad.sensor.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
 from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_from_dict
+from spad.sensor.tdc import Tdc
 
 Reset = Literal["synchronous", "free-running"]
 
@@ -36,6 +38,7 @@ class Sensor:
                           laser cycle and detects the first photon; `free-running`: it is armed again after dead_time_s
     dead_time_s           dead time after a detection, not prolonged by photons that arrive in it
     crosstalk             probability that a detection fires a given one of the four neighbours, at the same time
+    tdc                   converters whose codes are not equally wide (`Tdc`); None: every bin is as wide as the others
     """
 
     name: str = "reference"
@@ -53,6 +56,7 @@ class Sensor:
     reset: Reset = "synchronous"
     dead_time_s: float = 0.0
     crosstalk: float = 0.0
+    tdc: Tdc | None = None
 
     def __post_init__(self) -> None:
         where = f"sensor {self.name}"
@@ -93,6 +97,18 @@ class Sensor:
         require(self.reset in ("synchronous", "free-running"), f"{where}: reset {self.reset!r} is unknown")
         dead = self.dead_time_s
         require(math.isfinite(dead) and 0 <= dead <= 1, f"{where}: dead time {dead:g} s is outside 0 to 1")
+        self._check_tdc(where)
+
+    def _check_tdc(self, where: str) -> None:
+        if self.tdc is None:
+            return
+        require(isinstance(self.tdc, Tdc), f"{where}: tdc {self.tdc!r} is no Tdc")
+        period, bins = self.bins_per_period, self.bins
+        require(bins == period, f"{where}: a tdc needs bins that cover the period, there are {bins} of {period}")
+        try:
+            self.tdc.edges(bins, self.bin_width_s)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
 
     @property
     def _dark_rows(self) -> tuple[float, ...]:
@@ -100,9 +116,28 @@ class Sensor:
         return rate if isinstance(rate, tuple) else (rate,)
 
     @property
+    def kernels(self) -> tuple[AnyPulse, ...]:
+        """Return what delays a detection, independently: the pulse, the detector's jitter, the clock's."""
+        clock = self.tdc is not None and self.tdc.jitter_s > 0
+        kernels = (self.pulse, self.jitter, Pulse(self.tdc.jitter_s) if clock else None)
+        return tuple(kernel for kernel in kernels if kernel is not None)
+
+    @property
     def response(self) -> AnyPulse:
-        """Return the pulse convolved with the jitter: what one detection looks like in time."""
-        return convolved(self.pulse, self.jitter)
+        """Return the kernels convolved: what one detection looks like in time."""
+        return reduce(convolved, self.kernels)
+
+    @property
+    def code_edges(self) -> np.ndarray | None:
+        """Return edges of the bins in true time by converter, as `Tdc.edges`; None for equal bins."""
+        return None if self.tdc is None else self.tdc.edges(self.bins, self.bin_width_s)
+
+    def converter_map(self, height: int, width: int, seed: int = 0) -> np.ndarray | None:
+        """Return which converter each pixel has, (H, W) int64 at random by the seed: a row of `code_edges`."""
+        if self.tdc is None:
+            return None
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.PIXELS, 2, 0)))
+        return rng.integers(len(self.tdc.ends()), size=(height, width))
 
     @property
     def bins_per_period(self) -> int:
@@ -148,12 +183,17 @@ class Sensor:
         return chosen.reshape(height, width)
 
     def to_dict(self) -> JsonObject:
-        return asdict(self)
+        """Return what `from_dict` takes, as JSON holds it; without `tdc` where there is none, for older programs."""
+        values = asdict(self)
+        if self.tdc is None:
+            del values["tdc"]
+        return values
 
     @classmethod
     def from_dict(cls, values: JsonObject) -> Sensor:
-        pulses = {"pulse": pulse_from_dict(values["pulse"]), "jitter": pulse_from_dict(values.get("jitter"))}
-        return cls(**{**values, **pulses})
+        parts = {"pulse": pulse_from_dict(values["pulse"]), "jitter": pulse_from_dict(values.get("jitter"))}
+        tdc = values.get("tdc")
+        return cls(**{**values, **parts, "tdc": None if tdc is None else Tdc(**tdc)})
 
 
 PRESETS: dict[str, Sensor] = {

@@ -84,7 +84,12 @@ def test_a_sensor_comes_back_from_its_file_to_the_last_bit(sensor, optics, tmp_p
 
 
 def test_every_field_of_a_sensor_has_a_key():
-    keyed = {key.field for table in (HISTOGRAM, DETECTOR) for key in table.values()} | {"name", "pulse", "jitter"}
+    keyed = {key.field for table in (HISTOGRAM, DETECTOR) for key in table.values()} | {
+        "name",
+        "pulse",
+        "jitter",
+        "tdc",
+    }
     assert keyed == {field.name for field in fields(Sensor)}
     assert {key.field for key in OPTICS.values()} == {field.name for field in fields(Optics)}
     assert {key.field for key in ZONE_KEYS.values()} == {field.name for field in fields(ZoneArray)}
