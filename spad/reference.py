@@ -74,3 +74,25 @@ def time_bin(
     while within >= code_ends[code]:
         code += 1
     return int((turn + code_times[code]) * clock_period_s / bin_width_s + 1e-9)
+
+
+def code_overlap(edges: Sequence[float]) -> np.ndarray:
+    """Return M[t, r], the share of a converter's bin r that lies in true bin t: edges (bins + 1,) -> (bins, bins).
+
+    Parameters
+    ----------
+    edges : edges of the converter's bins in true time, in bins
+
+    Returns
+    -------
+    columns that sum to 1, and are 0 for a bin that never comes
+    """
+    bins = len(edges) - 1
+    shares = np.zeros((bins, bins))
+    for place in range(bins):
+        width = edges[place + 1] - edges[place]
+        for true in range(bins):
+            common = min(edges[place + 1], true + 1) - max(edges[place], true)
+            if width > 0 and common > 0:
+                shares[true, place] = common / width
+    return shares

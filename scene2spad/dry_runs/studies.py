@@ -65,6 +65,10 @@ def wanted_models(command: Study) -> list[ModelSpec]:
         from scene2spad.studies.chip.plan import plan_of as chip_plan
 
         found = chip_plan(command.preset).models
+    elif command.name == "tdc":
+        from scene2spad.studies.tdc.plan import plan_of as tdc_plan
+
+        found = tdc_plan(command.preset).wanted
     elif command.name == "multipath":
         from scene2spad.studies.multipath.plan import MODELS as found
     elif command.name == "transport" and command.retrain:

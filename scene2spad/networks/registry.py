@@ -26,6 +26,9 @@ from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 
+TDC_SENSOR = "reference-tdc"
+FINE_TUNE_STEPS, FINE_TUNE_RATE = 600, 5e-4
+
 
 @dataclass(frozen=True)
 class ModelSpec:
@@ -37,6 +40,7 @@ class ModelSpec:
                    light as well, levels over their whole range; published: rooms and clutter on the published grid, for
                    comparison with print
     int8           trained for the chip (`--layer int8`), beginning with `plain`
+    tdc            trained further behind the real converters of `TDC_SENSOR`, beginning with `plain`
     """
 
     design: str = "learned"
@@ -47,11 +51,17 @@ class ModelSpec:
     full: bool = False
     trained_on: Literal["rooms", "mixed", "published"] = "rooms"
     int8: bool = False
+    tdc: bool = False
 
     @property
     def plain(self) -> ModelSpec:
-        """Return the same model in floating point."""
-        return replace(self, int8=False)
+        """Return the same model in floating point, behind a perfect clock."""
+        return replace(self, int8=False, tdc=False)
+
+    @property
+    def begun(self) -> bool:
+        """Return whether its training begins with `plain`."""
+        return self.int8 or self.tdc
 
     @property
     def coded(self) -> bool:
@@ -65,7 +75,7 @@ class ModelSpec:
             return {"none": "no compression", "peak": "peak"}[self.design] + mixed
         sort = f"{'full ' if self.full else ''}{self.design}"
         moved = f", trained with offsets to {self.time_offset_m:g} m" if self.time_offset_m else ""
-        chip = ", trained for the chip" if self.int8 else ""
+        chip = ", trained for the chip" if self.int8 else ", trained with the clock" if self.tdc else ""
         return f"{sort} {'x'.join(map(str, self.block))}{moved}{mixed}{chip}"
 
     @property
@@ -81,6 +91,8 @@ class ModelSpec:
             parts.append(self.trained_on)
         if self.int8:
             parts.append("int8")
+        if self.tdc:
+            parts.append("tdc")
         return "-".join([*parts, f"s{self.seed}"])
 
     def command(self, preset: str, training: Path, folder: Path) -> Train:
@@ -92,7 +104,10 @@ class ModelSpec:
             compression=self.compression,
             full=self.full,
             layer=("int8",) if self.int8 else (),
-            init=(str(begun) if begun.is_dir() else begun.name) if self.int8 else None,
+            init=(str(begun) if begun.is_dir() else begun.name) if self.begun else None,
+            sensor=TDC_SENSOR if self.tdc else "reference",
+            rate=FINE_TUNE_RATE if self.tdc else None,
+            steps=FINE_TUNE_STEPS if self.tdc and preset != "smoke" else None,
             preset=preset,
             seed=self.seed,
             time_offset=self.time_offset_m or None,
@@ -105,7 +120,10 @@ class ModelSpec:
         coded = f" --block {' '.join(map(str, self.block))} --compression {self.compression}" if self.coded else ""
         more = f"{' --full' if self.full else ''}"
         more += f" --time-offset {self.time_offset_m:g}" if self.time_offset_m else ""
-        more += f" --layer int8 --init {self.plain.name}" if self.int8 else ""
+        more += " --layer int8" if self.int8 else ""
+        more += f" --init {self.plain.name}" if self.begun else ""
+        tuned = f" --sensor {TDC_SENSOR} --rate {FINE_TUNE_RATE:g} --steps {FINE_TUNE_STEPS}"
+        more += tuned if self.tdc else ""
         made = f"--preset {preset} --seed {self.seed} --set {training} --out {folder / self.name}"
         return f"scene2spad train --design {self.design}{coded}{more} {made}"
 
@@ -187,7 +205,8 @@ def _design_name(design: Design | None) -> str:
 
 def _sensor(model: ModelConfig) -> str:
     sensor = model.sensor
-    return f"{sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps, {sensor.response}"
+    clock = "" if sensor.tdc is None else f", {sensor.tdc}"
+    return f"{sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps, {sensor.response}{clock}"
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,7 @@ StudyName = Literal[
     "transport",
     "multipath",
     "sim-to-real",
+    "tdc",
     "all",
 ]
 STUDIES: tuple[str, ...] = tuple(name for name in get_args(StudyName) if name != "all")
@@ -72,9 +73,9 @@ class Study(Long):
     beside the same models in floating point; of trained models: scenes moved out
     of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
     captures (13, 14); how much the error of a rendered set itself matters to depth; what a renderer adds to RGB-D
-    simulation, step by step; networks beside the filter where light takes several paths; and a real chip's histograms
-    beside what the renderer and the calibrated sensor predict. `all` runs one after the other, goes on past those whose
-    data are absent, and ends in a table."""
+    simulation, step by step; networks beside the filter where light takes several paths; a real chip's histograms
+    beside what the renderer and the calibrated sensor predict; and codes behind a real clock, corrected or not.
+    `all` runs one after the other, goes on past those whose data are absent, and ends in a table."""
 
     name: Positional[StudyName]
     """Study to run, or all of them."""

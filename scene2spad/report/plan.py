@@ -292,6 +292,17 @@ _BEYOND = Section(
             ("multipath.csv",),
         ),
         Item(
+            "tdc",
+            "Codes behind a real clock",
+            "scene2spad study tdc",
+            (Picture("tdc.png", "Depth error with five clocks beside the perfect one"),),
+            (
+                Table("tdc.json", "Depth error by method and clock, bits a pixel", "compared"),
+                Table("tdc.json", "Errors of the clocks themselves [ps]", "clocks"),
+            ),
+            ("tdc.csv", "tdc-compared.csv"),
+        ),
+        Item(
             "sim-to-real",
             "A real chip's histograms, predicted",
             "scene2spad study sim-to-real",

@@ -218,28 +218,20 @@ def time_codes(position: np.ndarray, converter: np.ndarray, edges: np.ndarray) -
     )
 
 
-def overlap(edges: np.ndarray) -> np.ndarray:
-    """Return M[t, r], the share of a converter's bin r that lies in true bin t: edges (bins + 1,) -> (bins, bins).
-
-    Columns of bins that never come are 0, all others sum to 1.
-    """
-    bins = len(edges) - 1
-    true = np.arange(bins + 1)
-    common = np.minimum(edges[None, 1:], true[1:, None]) - np.maximum(edges[None, :-1], true[:-1, None])
-    return common.clip(min=0) / np.where(np.diff(edges) > 0, np.diff(edges), 1.0)
-
-
 def recalibrated(counts: np.ndarray, converter: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return a recorded histogram on equal bins: each bin's counts are spread over the true time that it stands for.
 
     counts (H, W, T), converter (H, W) row of `edges` -> (H, W, T) float64. A photon's place within a code's interval is
-    not known: the spread is the expectation for arrivals uniform over it.
+    not known: the spread is the expectation for arrivals uniform over it. Linear in the counts: summing rows of C that
+    are averaged over each code's true time is encoding what this returns.
     """
-    found = np.empty(counts.shape)
-    for row in np.unique(converter):
-        mine = converter == row
-        found[mine] = counts[mine] @ overlap(edges[row]).T
-    return found
+    height, width, bins = counts.shape
+    true, arrived = np.arange(bins + 1.0), np.zeros((height, width, bins + 1))
+    np.cumsum(counts, axis=2, out=arrived[..., 1:])
+    for row, column in np.ndindex(height, width):
+        # edges that coincide hold a code that never comes: nothing arrives between them
+        arrived[row, column] = np.interp(true, edges[converter[row, column]], arrived[row, column])
+    return np.diff(arrived, axis=2)
 
 
 class ClockError(NamedTuple):

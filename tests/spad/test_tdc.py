@@ -17,11 +17,11 @@ from spad.detection.device_patches import DevicePatches
 from spad.detection.flux import expected_counts, rates_for
 from spad.detection.training_patches import Patch, packed_transients, sense_patches
 from spad.formats.histogram import read_histogram, write_histogram
-from spad.reference import arrivals, detect_free_running, detect_synchronous, time_bin
+from spad.reference import arrivals, code_overlap, detect_free_running, detect_synchronous, time_bin
 from spad.sensor import tdc as converters
 from spad.sensor.files import SensorFile, load_sensor, read_sensor, write_sensor
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
-from spad.sensor.tdc import Tdc, clock_error, overlap, recalibrated, shipped_tables, time_codes
+from spad.sensor.tdc import Tdc, clock_error, recalibrated, shipped_tables, time_codes
 
 PERIOD_S, WIDTH_S = 12.5e-9, 12.5e-9 / 128  # five clock periods, 25.6 bins each
 REAL = Tdc(2.5e-9, table="linospad2")
@@ -173,7 +173,7 @@ def test_a_recorded_histogram_is_recalibrated_and_a_code_by_rows_of_its_own() ->
     again = recalibrated(counts, row, edges)
     assert again.sum(-1) == pytest.approx(counts.sum(-1))
     for pixel in range(2):
-        shares = overlap(edges[row[0, pixel]])
+        shares = code_overlap(edges[row[0, pixel]])
         assert shares.sum(0) == pytest.approx(np.where(flat[0, pixel] > 0, 1.0, 0.0))
         assert (coding @ shares) @ counts[0, pixel] == pytest.approx(coding @ again[0, pixel])
 

@@ -1,0 +1,1 @@
+"""Depth from codes and histograms behind a real time-to-digital converter."""

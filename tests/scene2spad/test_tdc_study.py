@@ -1,0 +1,76 @@
+"""`study tdc`: clocks see the same photons, bits a pixel, and a small run."""
+
+import json
+
+import numpy as np
+import pytest
+
+from csph.codes.design import Design
+from scene2spad.cli.main import main
+from scene2spad.datasets.planes import random_planes
+from scene2spad.datasets.test_sets import TestSet
+from scene2spad.networks.registry import TDC_SENSOR, ModelSpec
+from scene2spad.studies.tdc import study
+from scene2spad.studies.tdc.plan import CLOCKS, FOLDED, PERFECT, REAL, TABLE, TRAINED, sensor_of
+
+
+def test_every_clock_sees_the_same_photons_and_none_is_lost() -> None:
+    found = study.recorded_by_clock(TestSet("planes", random_planes(1, size=8)), 0, (50.0, 50.0), 3)
+    assert set(found) == set(CLOCKS)
+    counts = {clock: one.counts.sum(-1) for clock, one in found.items()}
+    for clock, mine in counts.items():
+        assert mine == pytest.approx(counts[PERFECT]), clock
+    assert found[TRAINED].histogram is found[REAL].histogram
+    far = np.abs(np.cumsum(found[REAL].counts - found[PERFECT].counts, axis=-1)).sum()
+    near = np.abs(np.cumsum(found[TABLE].counts - found[PERFECT].counts, axis=-1)).sum()
+    spread = np.abs(np.cumsum(found[FOLDED].counts - found[PERFECT].counts, axis=-1)).sum()
+    assert near < far / 4 and spread < far / 4  # bins that photons were moved by
+
+
+def test_bits_of_a_pixel() -> None:
+    bits = {
+        name: study.code_bits(Design.named(name, block, codes=8, compression=None, full=False))
+        for name, block in (("learned", (256, 4, 4)), ("fourier", (1024, 1, 1)), ("coarse", (1024, 1, 1)))
+    }
+    assert bits["learned"] == (8 * (8 * 256 + 8),) * 2
+    assert bits["fourier"] == (8 * 256, 8 * 8 * 1024)
+    assert [row["correction_bits"] for row in study.clock_rows()] == [0, 0, 14, 980]
+    assert study.code_bits(None) == (None, None)
+
+
+def test_a_difference_from_the_perfect_clock_is_told_with_its_interval() -> None:
+    subject = study.Subject("m", lambda one: one.counts, (PERFECT, TABLE), 8, 64)
+    errors = {PERFECT: (10.0, 20.0), TABLE: (10.5, 20.5)}
+    rows = [
+        {"method": "m", "clock": clock, "view": str(n), "mae_mm": mae, "within_10mm": 0.5}
+        for clock, values in errors.items()
+        for n, mae in enumerate(values)
+    ]
+    perfect, table = study.compared_rows(rows, [subject])
+    assert (perfect["difference"], perfect["holds"]) == (0.0, True)
+    assert table["difference"] == table["low"] == table["high"] == pytest.approx(0.5 / 15)
+    assert table["holds"] and (table["clock_bits"], table["code_bits"]) == (980, 8)
+
+
+def test_models_trained_with_the_clock_begin_with_the_plain_one(tmp_path) -> None:
+    one = ModelSpec("learned", (256, 4, 4), tdc=True)
+    command = one.command("laptop", tmp_path / "set.h5", tmp_path)
+    assert (command.sensor, command.init, one.name) == (TDC_SENSOR, one.plain.name, "learned-256x4x4-128x-tdc-s0")
+    assert f"--init {one.plain.name} --sensor {TDC_SENSOR}" in one.training_command(
+        "laptop", tmp_path / "s.h5", tmp_path
+    )
+    assert sensor_of(REAL).tdc != sensor_of(TABLE).tdc and sensor_of(PERFECT).tdc is not None
+
+
+@pytest.mark.slow
+def test_a_small_run(tmp_path, capfd) -> None:
+    out = tmp_path / "out"
+    assert main(["study", "tdc", "--preset", "smoke", "--out", str(out), "--json"]) == 0
+    shown = json.loads(capfd.readouterr().out)
+    assert (out / "tdc.png").is_file() and (out / "tdc.csv").is_file()
+    by = {(row["method"], row["clock"]): row for row in shown["compared"]}
+    exact = by["log-matched, all bins", TABLE]
+    assert exact["mae_mm"] < by["log-matched, all bins", REAL]["mae_mm"]
+    chip = [row for row in shown["compared"] if row["method"].endswith(study.CHIP)]
+    assert [row["clock"] for row in chip] == list(study.SENSED)
+    assert any(row["clock"] == TRAINED for row in shown["compared"])
