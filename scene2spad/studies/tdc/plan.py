@@ -54,7 +54,7 @@ class Plan:
     classical: tuple[str, ...] = CLASSICAL
     on_chip: ModelSpec | None = ON_CHIP
     views: int = 8
-    size: tuple[int, int] = (48, 48)
+    size: tuple[int, int] = (32, 32)
     levels: tuple[Level, ...] = ((10.0, 10.0), (50.0, 50.0))
 
     @property
