@@ -118,8 +118,8 @@ class Sensor:
     @property
     def kernels(self) -> tuple[AnyPulse, ...]:
         """Return what delays a detection, independently: the pulse, the detector's jitter, the clock's."""
-        clock = self.tdc is not None and self.tdc.jitter_s > 0
-        kernels = (self.pulse, self.jitter, Pulse(self.tdc.jitter_s) if clock else None)
+        clock = None if self.tdc is None or self.tdc.jitter_s == 0 else Pulse(self.tdc.jitter_s)
+        kernels = (self.pulse, self.jitter, clock)
         return tuple(kernel for kernel in kernels if kernel is not None)
 
     @property
