@@ -29,6 +29,16 @@ plan = transport_plan.PLANS["smoke"]
 places = (transport_plan.Places("tabletop", 1, sun=True),)
 transport_plan.PLANS["smoke"] = replace(plan, places=places, size=(12, 8), planned=RenderSettings(error=0.5))
 """
+# Its 8 x 8 pixels are emulated whole; the front behind them has fewer photons.
+SMALLER_POWER = """
+from scene2spad.studies.power import front
+front.PHOTONS, front._EMULATED_PHOTONS, front._COARSE = (50.0,), 1_000, ("coarse-64",)
+"""
+# Four of all studies; what `all` keeps of each is what is killed here.
+FOUR_OF_ALL = """
+from scene2spad.studies import every
+every.STUDIES = ("tensors", "memory", "codes", "chip")
+"""
 RENDER_ERROR = ("study", "render-error", "--width", "12", "--height", "8", "--views", "1")
 RUNS = {
     "dataset": Run(command("dataset", "hard-cases", *SET)),
@@ -40,10 +50,23 @@ RUNS = {
     "codes": Run(command("study", "codes", "--width", "12", "--height", "8", "--out", "out")),
     "render-error": Run(command(*RENDER_ERROR, "--out", "out/study", "--cache", "out/cache", before=SMALLER)),
     "transport": Run(command("study", "transport", *SMOKE, before=SMALLER)),
+    "power": Run(
+        command("study", "power", "--scene", "plane", "--width", "8", "--height", "8", *SMOKE, before=SMALLER_POWER)
+    ),
+    "all": Run(command("study", "all", "--width", "12", "--height", "8", *SMOKE, before=FOUR_OF_ALL), UNLIKE),
 }
 RUNS |= {
     name: Run(command("study", name, *SMOKE), UNLIKE)
-    for name in ("depth-offset", "spatial-block", "tensor-size", "fourier", "real-data", "multipath", "chip")
+    for name in (
+        "depth-offset",
+        "spatial-block",
+        "tensor-size",
+        "fourier",
+        "real-data",
+        "multipath",
+        "chip",
+        "sim-to-real",
+    )
 }
 
 
@@ -57,7 +80,7 @@ def whole(request, warm, tmp_path_factory) -> tuple[Run, Path, float]:
 @pytest.mark.slow
 @pytest.mark.parametrize("temporary", ["same", "other"])
 def test_killed_at_random_moments_a_run_ends_with_the_same_bytes(whole, warm, tmp_path, temporary):
-    """Six times, TMPDIR beside the results or on another file system."""
+    """Six times, TMPDIR beside the results or on another file system: twelve kills of every run."""
     run, folder, seconds = whole
     place = tmp_path if temporary == "same" else other_file_system(tmp_path)
     if place is None:

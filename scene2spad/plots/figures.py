@@ -177,14 +177,19 @@ def _pixel_counts(
 ) -> None:
     """Counts of one pixel as bars, the expected rate as a line over them, its true depth dotted."""
     edges_ns = np.arange(histogram.sensor.bins + 1) * histogram.sensor.bin_width_s * 1e9
-    axes.stairs(histogram.counts[row, column], edges_ns, fill=True, color="0.7", label="detections")
-    if rate is not None:
-        axes.stairs(rate, edges_ns, color=colour, lw=1.4, label="expected")
-    depth_m = float(histogram.depth_m[row, column])
+    depth_m, shown = float(histogram.depth_m[row, column]), slice(0, histogram.sensor.bins)
+    true_ns = 2e9 * depth_m / SPEED_OF_LIGHT_M_PER_S % edges_ns[-1]
     if np.isfinite(depth_m):
-        true_ns = 2e9 * depth_m / SPEED_OF_LIGHT_M_PER_S % edges_ns[-1]
+        window_ns = (max(true_ns - WINDOW_NS[0], 0), min(true_ns + WINDOW_NS[1], edges_ns[-1]))
+        first, last = np.searchsorted(edges_ns, window_ns)
+        shown = slice(max(int(first) - 1, 0), int(last))  # bins outside would take most of the figure's time
+        axes.set_xlim(*window_ns)
+    bins_ns = edges_ns[shown.start : shown.stop + 1]
+    axes.stairs(histogram.counts[row, column, shown], bins_ns, fill=True, color="0.7", label="detections")
+    if rate is not None:
+        axes.stairs(rate[shown], bins_ns, color=colour, lw=1.4, label="expected")
+    if np.isfinite(depth_m):
         axes.axvline(true_ns, color="k", lw=0.8, ls=":", label="true depth")
-        axes.set_xlim(max(true_ns - WINDOW_NS[0], 0), min(true_ns + WINDOW_NS[1], edges_ns[-1]))
     signal, background = (float(v[row, column]) for v in (histogram.expected_signal, histogram.expected_background))
     axes.set_title(f"{name} pixel ({row}, {column}): {signal:.3g} + {background:.3g} photons expected", fontsize=9)
     axes.set_ylabel("per bin", fontsize=8)

@@ -28,8 +28,9 @@ from csph.networks.model import load_model
 from csph.weights.torch_files import check_torch_file
 from render.transient import read_transient
 from render.transient.packs import read_pack
-from scenes.files import read_array
+from scenes.files import read_array, read_arrays
 from scenes.io.inputs import parse_json, read_whole_lines
+from spad.sensor.files import load_sensor
 
 SERVER = """
 import importlib, json, os, signal, sys, traceback
@@ -201,6 +202,10 @@ def check_whole(folder: Path) -> None:
                 Image.open(path).verify()
             case ".jsonl" | ".mat":  # lines that are cut are passed over; .mat by its bytes at the end
                 pass
+            case ".npz":
+                read_arrays(path)
+            case ".toml":
+                load_sensor(str(path))
             case other:
                 raise AssertionError(f"{path}: a file of kind {other!r} nobody expects")
 
