@@ -5,11 +5,13 @@ Every end is one line, nothing runs on, and the same command goes on to the same
 
 from __future__ import annotations
 
+import os
 import random
 import re
 import signal
 import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -96,6 +98,17 @@ def cluster(warm, tmp_path) -> Iterator[Cluster]:
     made.close()
 
 
+def pool_workers(parent: int) -> list[int]:
+    """Process numbers of the workers that a process has started, less Python's own tracker of resources."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            is_worker = b"spawn_main" in (stat.parent / "cmdline").read_bytes()
+            if is_worker and int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append(int(stat.parent.name))
+    return sorted(found)
+
+
 def set_of(warm: Warm, whole: tuple[Path, float], folder: Path, *more: str, before: str = "") -> Killed:
     run = Run(command(*SET, "--out", "out", *more, before=before))
     return Killed(warm, run, *whole, folder / "run", folder / "temporary")
@@ -151,6 +164,30 @@ def test_ten_killed_workers_of_a_cluster_change_no_byte(whole, warm, tmp_path, c
         cluster.add_worker()
     assert warm.wait(child) == 0
     run.finish()  # views whose workers died again and again are tried again
+
+
+@pytest.mark.slow
+def test_ten_killed_worker_processes_change_no_byte(whole, warm, tmp_path):
+    """SIGKILL to one of the two processes of `--workers 2`, which takes the pool with it: the run goes on by itself."""
+    run, moments, killed = set_of(warm, whole, tmp_path, "--workers", "2"), random.Random(5), 0
+    child = run.start()
+    while killed < 10:
+        status = wait_for_views(run, child, min(2 * killed, 20), moments.uniform(0, 1.0))
+        if status is not None:
+            # a view whose process died three times is told, and done by the next run
+            assert status in (0, 1), run.output.read_text()[-3000:]
+            if len([*run.folder.glob("out/views/0*.exr")]) == 24:
+                run.begin_anew(warm.wait(run.start()))
+            child = run.start()
+            continue
+        workers = pool_workers(child)
+        if workers:
+            with suppress(ProcessLookupError):
+                os.kill(moments.choice(workers), signal.SIGKILL)
+                killed += 1
+                check_whole(run.folder / "out")
+    assert warm.wait(child) in (0, 1), run.output.read_text()[-3000:]
+    run.finish()
 
 
 @pytest.mark.slow

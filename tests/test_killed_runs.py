@@ -32,7 +32,7 @@ transport_plan.PLANS["smoke"] = replace(plan, places=places, size=(12, 8), plann
 # Its 8 x 8 pixels are emulated whole; the front behind them has fewer photons.
 SMALLER_POWER = """
 from scene2spad.studies.power import front
-front.PHOTONS, front._EMULATED_PHOTONS, front._COARSE = (50.0,), 1_000, ("coarse-64",)
+front.PHOTONS, front._EMULATED_PHOTONS, front._COARSE = (550.0,), 1_000, ("coarse-64",)
 """
 # Four of all studies; what `all` keeps of each is what is killed here.
 FOUR_OF_ALL = """

@@ -14,7 +14,7 @@ from csph.training.config import ModelConfig
 from csph.weights.shipped import WEIGHTS
 from scene2spad.cli import main
 from scene2spad.studies.chip.chain import ChipDepth, FastCores, interpret, network_depth
-from scene2spad.studies.chip.code import codes_by_torch, compile_model, harmonics_of, with_headroom
+from scene2spad.studies.chip.code import codes_by_torch, compile_model, harmonics_of, headroom_of, with_headroom
 from scenes.errors import InputError
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -170,15 +170,23 @@ def test_compile_from_the_command_line(capfd, tmp_path):
     assert result["clocks_per_photon"] == 141 and "table weight of core (1, 1)" in out.read_text()
     for model, message in (
         ("learned-256x2x2-128x-s0", "needs 2,121 bytes of RAM a core"),
+        ("full-learned-256x4x4-128x-s0", "needs 8,449 bytes of RAM a core"),
         ("none-s0", "has no codes"),
         ("missing", "unknown"),
     ):
         assert main(["ultraphase", "compile", model]) == 2
         out, err = capfd.readouterr()
         assert out == "" and len(err.splitlines()) == 1 and message in err
-    assert main(["ultraphase", "compile", "fourier-256x1x1-128x-s0", "--headroom", "2", "--json"]) == 0
-    quarter = json.loads(capfd.readouterr().out)["listing"].split("; table quarter: ")[1].splitlines()[0]
-    assert max(map(int, quarter.split())) == 32
+    for options, bits in (((), 1), (("--headroom", "0"), 0), (("--headroom", "2"), 2)):
+        assert main(["ultraphase", "compile", "fourier-256x1x1-128x-s0", *options, "--json"]) == 0
+        result = json.loads(capfd.readouterr().out)
+        quarter = result["listing"].split("; table quarter: ")[1].splitlines()[0]
+        assert result["headroom_bits"] == bits and max(map(int, quarter.split())) == round(127 / 2**bits)
+        assert result["differs_from_torch"] == 0
+    assert (
+        headroom_of(with_headroom(DepthModel(ModelConfig(design=Design.named("fourier", (1024, 1, 1), codes=8))), 2))
+        == 0
+    )
     assert main(["ultraphase", "compile", "fourier-256x1x1-128x-s0", "--headroom", "9"]) == 2
     assert "headroom of 9 bits, expected 0 to 4" in capfd.readouterr().err
     assert main(["ultraphase", "table", "--headroom", "1"]) == 2 and "for compile" in capfd.readouterr().err

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from scene2spad.options.common import Common, File, Positional
+from scene2spad.options.common import Common, Count, File, Positional
 from scenes.progress import Progress
 
 
@@ -20,8 +20,9 @@ class Ultraphase(Common):
     program: Positional[str] = ""
     """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s); of compile, a
     shipped model's name or a checkpoint."""
-    headroom: int = 0
-    """Make the tables so many bits smaller, so that sums of bright pixels fit 16 bits (compile): 0 to 4."""
+    headroom: Count = None
+    """Make the tables so many bits smaller, so that sums of bright pixels fit 16 bits (compile): 0 to 4 (default: 1; a
+    model that was trained for the chip keeps the ranges that it learned)."""
     define: tuple[str, ...] = ()
     """Constants of a source file, as NAME=VALUE."""
     out: File = None

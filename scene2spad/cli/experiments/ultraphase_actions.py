@@ -29,7 +29,7 @@ def run(command: Ultraphase, progress: Progress) -> dict:
     """Run the command: one action; see `Ultraphase`."""
     actions = {"table": _table, "run": _run, "asm": _asm, "list": _list, "verify": _verify, "sweep": _sweep}
     actions["compile"] = _compile
-    require(not command.headroom or command.action == "compile", "--headroom is for compile")
+    require(command.headroom is None or command.action == "compile", "--headroom is for compile")
     needs = command.action in ("compile", "run", "asm", "list", "verify")
     require(bool(command.program) == needs, f"ultraphase {command.action}: {_arity(command.action, needs)}")
     return actions[command.action](command, progress)
@@ -112,13 +112,14 @@ def _compile(command: Ultraphase, progress: Progress) -> dict:
     from csph.weights.cards import checkpoint_of
     from csph.weights.shipped import RUN_WEIGHTS
     from scene2spad.studies.chip.chain import measured, trial
-    from scene2spad.studies.chip.code import compile_model, listing_with_tables, with_headroom
+    from scene2spad.studies.chip.code import compile_model, headroom_of, listing_with_tables, with_headroom
 
     require(not command.define, "constants by --define are for source files")
     path = checkpoint_of(command.program)
     run = path if path.is_dir() else path.parent if path.stem in RUN_WEIGHTS else path.with_suffix("")
     model = load_model(path)[0]
-    model = with_headroom(model, command.headroom) if command.headroom else model
+    headroom = headroom_of(model) if command.headroom is None else command.headroom
+    model = with_headroom(model, headroom) if headroom else model
     compiled = compile_model(model, run.resolve().name).compiled
     cost, text = measured(compiled), listing_with_tables(compiled)
     result = {
@@ -128,6 +129,7 @@ def _compile(command: Ultraphase, progress: Progress) -> dict:
         "ram_bytes": compiled.layout.total,
         "ram_bytes_there": compiled.chip.ram_bytes,
         "ram": asdict(compiled.layout),
+        "headroom_bits": headroom,
         "loop_order": compiled.loop_order,
         "block_of_cores": compiled.block,
         "clocks_per_photon": cost.clocks_per_photon,

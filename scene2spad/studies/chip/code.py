@@ -16,6 +16,7 @@ from csph.codes.temporal import block_pulse, gray_frequencies
 from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer
 from csph.networks.model import DepthModel
+from scene2spad.studies.chip.plan import HEADROOM_BITS
 from scenes.errors import InputError, require
 from spad.sensor.model import Sensor
 from ultraphase.assembly.program import listing
@@ -81,6 +82,18 @@ def with_headroom(model: DepthModel, bits: int) -> DepthModel:
     with torch.no_grad():
         wide.layer.temporal_range += bits * math.log(2)
     return wide.eval()
+
+
+def headroom_of(model: DepthModel) -> int:
+    """Return the bits of headroom that `ultraphase compile` gives a model by default.
+
+    One costs nothing that was measured, and keeps bright pixels from wrapping (docs/ultraphase.md); a model that was
+    trained for the chip has its own ranges, gates only count, and full
+    tensors are too large for the chip.
+    """
+    design = model.config.design
+    fixed = model.layer is None or model.layer.options.int8 or design.code == "coarse" or design.full
+    return 0 if fixed else HEADROOM_BITS
 
 
 def _reader(model: DepthModel, coding: CodingTensor) -> DepthModel:

@@ -10,7 +10,7 @@ from scene2spad.networks.registry import ModelSpec
 Level = tuple[float, float]
 TEST_SET = "tabletop"
 WITHIN = 0.02  # of the float model's MAE: what the chip may lose
-HEADROOM_BITS = 1  # that float models are compiled with as well
+HEADROOM_BITS = 1  # that float models are compiled with as well, and by `ultraphase compile` unless asked otherwise
 PAIR_LEVELS: tuple[Level, ...] = ((10.0, 10.0), (10.0, 200.0), (50.0, 50.0), (50.0, 500.0))
 ROOM_VIEWS, ROOM_SIZE = 8, (64, 64)
 MAIN = (
