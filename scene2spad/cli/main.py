@@ -9,6 +9,7 @@ import json
 import logging
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from functools import reduce
@@ -19,6 +20,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from scene2spad.cli.completion import SHELLS, completion_script
 from scene2spad.interrupts import STOPPED
 from scene2spad.options.common import Common
 from scenes.errors import InputError, did_you_mean, require
@@ -27,6 +29,7 @@ from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."
+PIPED_S = 30.0  # between lines of progress where stderr is no terminal
 # In the order of --help: every command and its room. `scene2spad.cli.ROOM.NAME` has the options, a class `Name`, and
 # `run`; only what runs is imported.
 COMMANDS = {
@@ -57,6 +60,8 @@ def main(argv: list[str]) -> int:
         if argv == ["--version"]:
             print(f"scene2spad {version('scene2spad')}")
             return 0
+        if argv[:1] == ["--completion"]:
+            return _print_completion(argv[1:])
         command = _parse(argv or ["--help"])
     except InputError as error:
         return _refuse(str(error))
@@ -113,16 +118,31 @@ def _check_words(argv: list[str]) -> None:
         require(name in ("-h", "--help"), f"no option {name}{did_you_mean(name, ('--help', '--version'))}")
         return
     require(name in COMMANDS, f"no command {name!r}{did_you_mean(name, COMMANDS)} (there are {', '.join(COMMANDS)})")
-    known = fields(options_of(name))
-    options = {f"--{field.name.rstrip('_').replace('_', '-')}" for field in known}
-    switches = {f"--no-{field.name.replace('_', '-')}" for field in known if field.type in ("bool", bool)}
-    options |= switches | {"--help"}
+    options = option_words(name)
     for word in argv[1:]:
         option = word.partition("=")[0].replace("_", "-")
         if option.startswith("--") and option not in options:
             raise InputError(
                 f"{name}: no option {option}{did_you_mean(option, options)} (see scene2spad {name} --help)"
             )
+
+
+def option_words(name: str) -> set[str]:
+    """Return the words that a command takes as options, with their dashes."""
+    known = fields(options_of(name))
+    options = {f"--{field.name.rstrip('_').replace('_', '-')}" for field in known}
+    return (
+        options
+        | {f"--no-{field.name.replace('_', '-')}" for field in known if field.type in ("bool", bool)}
+        | {"--help"}
+    )
+
+
+def _print_completion(argv: list[str]) -> int:
+    shell = " ".join(argv)
+    require(shell in SHELLS, f"--completion {shell or 'of no shell'}, expected one of {', '.join(SHELLS)}")
+    print(completion_script(shell, {name: sorted(option_words(name)) for name in COMMANDS}), end="")
+    return 0
 
 
 def _parse(argv: list[str]) -> Common:
@@ -191,9 +211,9 @@ def _log_to_stderr() -> None:
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Progress]:
-    """A progress bar on stderr, and the function that moves it; silent where nobody looks."""
+    """A progress bar on stderr, and the function that moves it; where stderr is piped, a line now and then."""
     if not sys.stderr.isatty():
-        yield lambda what, fraction: None
+        yield _progress_lines()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -202,3 +222,16 @@ def _progress() -> Iterator[Progress]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("start", total=1.0)
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
+
+
+def _progress_lines() -> Progress:
+    """Return a progress that prints a line where the last one, or the start, is PIPED_S seconds ago."""
+    last_s = time.monotonic()
+
+    def report(what: str, fraction: float) -> None:
+        nonlocal last_s
+        if time.monotonic() - last_s >= PIPED_S:
+            last_s = time.monotonic()
+            print(f"{what}: {fraction:.0%}", file=sys.stderr, flush=True)
+
+    return report

@@ -15,6 +15,7 @@ from readers import READERS
 
 from csph import CodingTensor, encode, temporal_code
 from scene2spad.cli import main
+from scene2spad.cli.main import _progress_lines
 from scenes.library.catalog import load_scene
 from spad.formats.histogram import read_histogram
 from spad.sensor.model import Sensor
@@ -157,3 +158,30 @@ def _is_interrupted(program: str) -> None:
     heeded = "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
     done = run_process([sys.executable, "-c", heeded + program])
     assert done.returncode == 130 and done.stderr.count("\n") == 1 and "interrupted" in done.stderr, done.stderr
+
+
+def test_the_shell_completes_commands_and_options(tmp_path, capsys):
+    """Bash itself runs the script; words that are no options are left to the shell, which knows files."""
+    status, script, _ = run(capsys, "--completion", "bash")
+    assert status == 0
+    (tmp_path / "c.bash").write_text(script)
+    for words, found in ((["re"], "render report"), (["render", "--err"], "--error"), (["render", "li"], "")):
+        typed = f"COMP_WORDS=(scene2spad {' '.join(words)}); COMP_CWORD={len(words)}"
+        code = f"source {tmp_path}/c.bash; {typed}; _scene2spad; echo ${{COMPREPLY[@]}}"
+        assert run_process(["bash", "-c", code]).stdout.strip() == found
+    assert "bashcompinit" in run(capsys, "--completion", "zsh")[1]
+    for words in (["--completion"], ["--completion", "fish"]):
+        asked = words[1] if words[1:] else "of no shell"
+        line = f"scene2spad: --completion {asked}, expected one of bash, zsh\n"
+        assert run(capsys, *words)[::2] == (2, line)
+
+
+def test_progress_also_speaks_when_piped(capsys, monkeypatch):
+    module = sys.modules["scene2spad.cli.main"]
+    monkeypatch.setattr(module, "PIPED_S", 0.0)
+    report = _progress_lines()
+    report("direct light", 0.05)
+    assert capsys.readouterr() == ("", "direct light: 5%\n")
+    monkeypatch.setattr(module, "PIPED_S", 1e9)
+    report("direct light", 0.06)
+    assert capsys.readouterr() == ("", "")
