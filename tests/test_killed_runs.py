@@ -34,11 +34,6 @@ SMALLER_POWER = """
 from scene2spad.studies.power import front
 front.PHOTONS, front._EMULATED_PHOTONS, front._COARSE = (550.0,), 1_000, ("coarse-64",)
 """
-# Four of all studies; what `all` keeps of each is what is killed here.
-FOUR_OF_ALL = """
-from scene2spad.studies import every
-every.STUDIES = ("tensors", "memory", "codes", "chip")
-"""
 RENDER_ERROR = ("study", "render-error", "--width", "12", "--height", "8", "--views", "1")
 RUNS = {
     "dataset": Run(command("dataset", "hard-cases", *SET)),
@@ -53,20 +48,10 @@ RUNS = {
     "power": Run(
         command("study", "power", "--scene", "plane", "--width", "8", "--height", "8", *SMOKE, before=SMALLER_POWER)
     ),
-    "all": Run(command("study", "all", "--width", "12", "--height", "8", *SMOKE, before=FOUR_OF_ALL), UNLIKE),
 }
 RUNS |= {
     name: Run(command("study", name, *SMOKE), UNLIKE)
-    for name in (
-        "depth-offset",
-        "spatial-block",
-        "tensor-size",
-        "fourier",
-        "real-data",
-        "multipath",
-        "chip",
-        "sim-to-real",
-    )
+    for name in ("depth-offset", "spatial-block", "tensor-size", "fourier", "real-data", "multipath", "chip")
 }
 
 

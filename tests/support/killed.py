@@ -30,7 +30,6 @@ from render.transient import read_transient
 from render.transient.packs import read_pack
 from scenes.files import read_array, read_arrays
 from scenes.io.inputs import parse_json, read_whole_lines
-from spad.sensor.files import load_sensor
 
 SERVER = """
 import importlib, json, os, signal, sys, traceback
@@ -204,8 +203,6 @@ def check_whole(folder: Path) -> None:
                 pass
             case ".npz":
                 read_arrays(path)
-            case ".toml":
-                load_sensor(str(path))
             case other:
                 raise AssertionError(f"{path}: a file of kind {other!r} nobody expects")
 
