@@ -10,10 +10,12 @@ from spad.sensor.model import Sensor
 from spad.sensor.tdc import Tdc
 
 Level = tuple[float, float]
-PERFECT, REAL, LINE, TABLE, FOLDED, TRAINED = "perfect", "real", "line", "table", "folded", "trained"
+PERFECT, REAL, DELAY, LINE, TABLE = "perfect", "real", "delay", "line", "table"
+FOLDED, TRAINED = "folded", "trained"
 CLOCKS = {
     PERFECT: "1,024 equal codes",
     REAL: "the table's codes, uncorrected",
+    DELAY: "uncorrected; the mean delay of all pixels is taken off the depth",
     LINE: "a straight line a pixel before summing",
     TABLE: "a look-up table a pixel before summing",
     FOLDED: "real codes, each pixel's rows of C averaged over its codes' true times; of a histogram, recalibrated",

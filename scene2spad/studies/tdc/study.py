@@ -31,6 +31,7 @@ from scene2spad.studies.chip.chain import ChipDepth
 from scene2spad.studies.chip.code import compile_model
 from scene2spad.studies.tdc.plan import (
     CLOCKS,
+    DELAY,
     FILTER,
     FOLDED,
     PERFECT,
@@ -49,8 +50,9 @@ from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.tdc import clock_error, recalibrated
 
-SENSED = tuple(clock for clock in CLOCKS if clock not in (FOLDED, TRAINED))
+SENSED = tuple(clock for clock in CLOCKS if clock not in (DELAY, FOLDED, TRAINED))
 CHIP = ", int8 on the chip"
+FIGURES = ("mae_mm", "within_10mm")
 CODE_BITS = 8  # of an entry of C
 
 
@@ -187,7 +189,7 @@ def measured(
     subjects: Sequence[Subject], test: TestSet, plan: Plan, seed: int, progress: Progress
 ) -> list[dict[str, Any]]:
     """Return a row a method, clock, view and level: MAE [mm] and the share within 10 mm."""
-    rows, total = [], len(test.views.transients) * len(plan.levels)
+    rows, total, delay_m = [], len(test.views.transients) * len(plan.levels), mean_delay_m()
     for view, scene in enumerate(test.views.scenes):
         truth = test.truth_m(view, 0.0)
         for number, level in enumerate(plan.levels):
@@ -196,12 +198,20 @@ def measured(
             for subject in subjects:
                 for clock in subject.clocks:
                     depth = subject.depth_of(recorded[clock])[: truth.shape[0], : truth.shape[1]]
-                    errors = image_errors(depth, truth, Sensor().range_m)
-                    key = {"method": subject.name, "clock": clock, "view": f"{view}-{scene}"}
-                    levels = {"signal": level[0], "background": level[1]}
-                    figures = {name: errors[name] for name in ("mae_mm", "within_10mm")}
-                    rows.append({**key, **levels, **figures})
+                    estimates = {clock: depth} | ({DELAY: depth - delay_m} if clock == REAL else {})
+                    for name, estimate in estimates.items():
+                        key = {"method": subject.name, "clock": name, "view": f"{view}-{scene}"}
+                        levels = {"signal": level[0], "background": level[1]}
+                        errors = image_errors(estimate, truth, Sensor().range_m)
+                        rows.append({**key, **levels, **{figure: errors[figure] for figure in FIGURES}})
     return rows
+
+
+def mean_delay_m() -> float:
+    """Return the depth [m] that the real clock's codes are late by, over all pixels and times."""
+    sensor = sensor_of(REAL)
+    assert sensor.code_edges is not None
+    return clock_error(sensor.code_edges).mean * sensor.bin_depth_m
 
 
 def compared_rows(rows: Sequence[dict[str, Any]], subjects: Sequence[Subject]) -> list[dict[str, Any]]:
@@ -213,7 +223,7 @@ def compared_rows(rows: Sequence[dict[str, Any]], subjects: Sequence[Subject]) -
         mine = [one for one in subjects if one.name == method]
         perfect = _by_view(rows, method, PERFECT, "mae_mm")
         mae = float(np.mean([np.mean(v) for v in perfect.values()]))
-        for clock in (clock for one in mine for clock in one.clocks):
+        for clock in dict.fromkeys(row["clock"] for row in rows if row["method"] == method):
             values = _by_view(rows, method, clock, "mae_mm")
             apart = paired_difference(values, perfect)
             share, low, high = (part / mae for part in apart)
@@ -251,7 +261,7 @@ def draw(compared: Sequence[dict[str, Any]], path: Path) -> Path:
     figure, panels = plt.subplots(1, 2, figsize=(13, 1.5 + 0.55 * len(methods)), layout="constrained", sharey=True)
     for number, clock in enumerate(CLOCKS):
         mine = [row for row in compared if row["clock"] == clock]
-        place = np.array([methods.index(row["method"]) for row in mine]) + (number - 2.5) * 0.13
+        place = np.array([methods.index(row["method"]) for row in mine]) + (number - 3) * 0.12
         panels[0].plot([row["mae_mm"] for row in mine], place, "o", ms=5, color=f"C{number}", label=clock)
         if clock in (PERFECT, REAL):
             continue
