@@ -191,7 +191,7 @@ def measured(
     """Return a row a method, clock, view and level: MAE [mm] and the share within 10 mm."""
     rows, total, delay_m = [], len(test.views.transients) * len(plan.levels), mean_delay_m()
     for view, scene in enumerate(test.views.scenes):
-        truth = test.truth_m(view, 0.0)
+        truth = test.truth_m(view)
         for number, level in enumerate(plan.levels):
             progress(f"{scene}, {level[0]:g} + {level[1]:g}", (view * len(plan.levels) + number) / total)
             recorded = recorded_by_clock(test, view, level, seed)
