@@ -88,11 +88,11 @@ def code_overlap(edges: Sequence[float]) -> np.ndarray:
     columns that sum to 1, and are 0 for a bin that never comes
     """
     bins = len(edges) - 1
-    shares = np.zeros((bins, bins))
+    overlap = np.zeros((bins, bins))
     for place in range(bins):
         width = edges[place + 1] - edges[place]
         for true in range(bins):
             common = min(edges[place + 1], true + 1) - max(edges[place], true)
             if width > 0 and common > 0:
-                shares[true, place] = common / width
-    return shares
+                overlap[true, place] = common / width
+    return overlap

@@ -250,22 +250,17 @@ def _claim(folder: Path, config: TrainConfig) -> None:
 
 
 def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
-    """Raise InputError unless a trained model has the sensor, but for its converters, and the tensors, or the kind of
-    network, of the one to be trained."""
+    """Raise InputError unless a trained model has tensors (or network) and sensor, but for converters, of the new one."""
     network_alone = isinstance(init, NetworkOf)
     mine, other = config.model, (init.model if isinstance(init, NetworkOf) else init).config
-    names = ("network",) if network_alone else ("front", "network", "design")
-    alike = all(getattr(mine, name) == getattr(other, name) for name in names)
-    # a time-to-digital converter may come to a sensor, or go
-    sensors = [replace(config.sensor, name="", tdc=None) for config in (mine, other)]
-    alike = alike and sensors[0] == sensors[1]
+    names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
+    bare = [replace(one, sensor=replace(one.sensor, name="", tdc=None)) for one in (mine, other)]
+    alike = all(getattr(bare[0], name) == getattr(bare[1], name) for name in names)
     message = (
         f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
     )
     require(alike, message)
-    if network_alone:
-        return
-    less = other.layer.get("int8", False) and not mine.layer.get("int8", False)
+    less = not network_alone and other.layer.get("int8", False) and not mine.layer.get("int8", False)
     require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
 
 

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -44,6 +44,7 @@ from scene2spad.studies.tdc.plan import (
     sensor_of,
 )
 from scenes.files import finite, whole_file, write_csv
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.formats.histogram import Histogram
@@ -86,7 +87,7 @@ def run(command: Study, progress: Progress) -> dict:
     test = rendered(TEST_SET, folder / "sets", count=plan.views, size=plan.size, progress=progress)
     rows = measured(subjects, test, plan, command.seed, progress)
     compared = compared_rows(rows, subjects)
-    numbers: dict[str, Any] = {
+    numbers: JsonObject = {
         **models.described(),
         "preset": command.preset,
         "views": len(test.views.transients),
@@ -106,8 +107,8 @@ def run(command: Study, progress: Progress) -> dict:
     return {**shown, "figures": [str(figure)], "csv": [str(one) for one in made], "numbers": str(path)}
 
 
-def clock_rows() -> list[dict[str, Any]]:
-    """Mean and rms error of each clock [ps], bin width included, and the bits of its correction a pixel."""
+def clock_rows() -> list[JsonObject]:
+    """Return mean and rms error of each clock [ps], bin width included, and the bits of its correction a pixel."""
     rows = []
     for clock in SENSED:
         sensor = sensor_of(clock)
@@ -185,9 +186,7 @@ def recorded_by_clock(test: TestSet, view: int, level: tuple[float, float], seed
     return {**found, FOLDED: Recorded(real, recalibrated(real.counts, converter, edges)), TRAINED: Recorded(real)}
 
 
-def measured(
-    subjects: Sequence[Subject], test: TestSet, plan: Plan, seed: int, progress: Progress
-) -> list[dict[str, Any]]:
+def measured(subjects: Sequence[Subject], test: TestSet, plan: Plan, seed: int, progress: Progress) -> list[JsonObject]:
     """Return a row a method, clock, view and level: MAE [mm] and the share within 10 mm."""
     rows, total, delay_m = [], len(test.views.transients) * len(plan.levels), mean_delay_m()
     for view, scene in enumerate(test.views.scenes):
@@ -214,7 +213,7 @@ def mean_delay_m() -> float:
     return clock_error(sensor.code_edges).mean * sensor.bin_depth_m
 
 
-def compared_rows(rows: Sequence[dict[str, Any]], subjects: Sequence[Subject]) -> list[dict[str, Any]]:
+def compared_rows(rows: Sequence[JsonObject], subjects: Sequence[Subject]) -> list[JsonObject]:
     """Return a row a method and clock: means, the paired difference of MAE from the perfect clock as a fraction of its
     MAE with its 95 % interval over views, and bits a pixel. `holds` where the interval's end is at most WITHIN."""
     sensed = {row["clock"]: row["correction_bits"] for row in clock_rows()}
@@ -226,7 +225,7 @@ def compared_rows(rows: Sequence[dict[str, Any]], subjects: Sequence[Subject]) -
         for clock in dict.fromkeys(row["clock"] for row in rows if row["method"] == method):
             values = _by_view(rows, method, clock, "mae_mm")
             apart = paired_difference(values, perfect)
-            share, low, high = (part / mae for part in apart)
+            fraction, low, high = (part / mae for part in apart)
             stored = mine[0].folded if clock == FOLDED else mine[0].stored
             within = _by_view(rows, method, clock, "within_10mm")
             found.append(
@@ -235,7 +234,7 @@ def compared_rows(rows: Sequence[dict[str, Any]], subjects: Sequence[Subject]) -
                     "clock": clock,
                     "mae_mm": float(np.mean([np.mean(v) for v in values.values()])),
                     "within_10mm": float(np.mean([np.mean(v) for v in within.values()])),
-                    "difference": share,
+                    "difference": fraction,
                     "low": low,
                     "high": high,
                     "holds": bool(high <= WITHIN) if math.isfinite(high) else None,
@@ -246,7 +245,7 @@ def compared_rows(rows: Sequence[dict[str, Any]], subjects: Sequence[Subject]) -
     return found
 
 
-def _by_view(rows: Sequence[dict[str, Any]], method: str, clock: str, figure: str) -> dict[str, np.ndarray]:
+def _by_view(rows: Sequence[JsonObject], method: str, clock: str, figure: str) -> dict[str, np.ndarray]:
     found: dict[str, list[float]] = {}
     for row in rows:
         if (row["method"], row["clock"]) == (method, clock):
@@ -254,7 +253,7 @@ def _by_view(rows: Sequence[dict[str, Any]], method: str, clock: str, figure: st
     return {view: np.array(values) for view, values in found.items()}
 
 
-def draw(compared: Sequence[dict[str, Any]], path: Path) -> Path:
+def draw(compared: Sequence[JsonObject], path: Path) -> Path:
     """Draw MAE of every method behind every clock, and the difference from the perfect clock where codes are
     corrected."""
     methods = [*dict.fromkeys(row["method"] for row in compared)]
@@ -284,7 +283,7 @@ def draw(compared: Sequence[dict[str, Any]], path: Path) -> Path:
     return save(figure, path)
 
 
-def _in_words(numbers: dict[str, Any]) -> dict[str, Any]:
+def _in_words(numbers: JsonObject) -> JsonObject:
     lines = [
         f"{row['method']}, {row['clock']}: {row['mae_mm']:.1f} mm, {row['within_10mm']:.1%} within 10 mm, "
         f"{row['difference']:+.1%} ({row['low']:+.1%} to {row['high']:+.1%}), "
