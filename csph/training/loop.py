@@ -250,7 +250,7 @@ def _claim(folder: Path, config: TrainConfig) -> None:
 
 
 def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
-    """Raise InputError unless a trained model has tensors (or network) and sensor, but for converters, of the new one."""
+    """Raise InputError unless a trained model fits the one to be trained, but for converters of its sensor."""
     network_alone = isinstance(init, NetworkOf)
     mine, other = config.model, (init.model if isinstance(init, NetworkOf) else init).config
     names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
