@@ -39,7 +39,7 @@ from render.pipeline import (
     most_spp,
     trace,
 )
-from render.planning import finer_pilot, make_plan, pilot_pixels
+from render.planning import finer_pilot, make_plan, pilot_pixels, refracting
 from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, MAX_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
 from render.transient import Transient
@@ -78,7 +78,7 @@ def render(
     report = progress or (lambda what, fraction: None)
     camera = scene.camera
     require_memory(MIN_PIXEL_BYTES * camera.width * camera.height, f"a render of {camera.width} x {camera.height}")
-    world = TracedScene(scene) if world is None else world
+    world = refracting(TracedScene(scene) if world is None else world, settings)
     report("plan", 0.0)
     plan = planned(world, settings, seed) if plan is None else plan
     plan, traced, error = _traced_to_target(world, plan, settings, seed, report)
@@ -145,7 +145,7 @@ def _standard_error(traced: LightSamples) -> np.ndarray:
 
 def planned(world: TracedScene, settings: RenderSettings, seed: int = 0) -> Plan:
     """Return the plan that `render` makes with these settings and this seed."""
-    return make_plan(world, settings, derived_seed(seed, Stream.PLAN))
+    return make_plan(refracting(world, settings), settings, derived_seed(seed, Stream.PLAN))
 
 
 def _additional_schedule(

@@ -102,6 +102,19 @@ def _direct_fraction(settings: RenderSettings, direct_alone: bool) -> float:
     return math.sqrt(settings.target_fraction) if direct_alone else DIRECT_FRACTION
 
 
+def refracting(world: TracedScene, settings: RenderSettings) -> TracedScene:
+    """Return the world whose solid glass bends direct light if `settings` ask for it, or leave it open and it can.
+
+    Raises InputError where it is asked for beside a displaced laser: its light comes by another way than the camera's.
+    """
+    at_camera = world.scene.laser.is_colocated
+    if settings.refraction == "bent" and not at_camera:
+        raise InputError(
+            "render: refraction is bent for a laser at the camera, this one is displaced: leave it straight"
+        )
+    return world.refracting(bool(world.solid_indices) and at_camera and settings.refraction != "straight")
+
+
 def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
     """Plan a render: every choice that `settings` leaves open follows from a pilot; every choice gets a reason.
 
@@ -147,6 +160,7 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
         filter=settings.filter,
         ambient_noise=ambient_noise,
         clamp=settings.clamp,
+        refraction="bent" if world.refracts else "straight",
     )
 
 
@@ -178,6 +192,9 @@ def _limits(world: TracedScene) -> list[str]:
     lines = []
     if world.has_cutouts:
         lines.append("cut-outs: solid where their opacity is 1/2 or more")
+    if world.solid_indices:
+        way = "direct light is refracted, all other light crosses it in a straight line"
+        lines.append(f"thick glass: {way if world.refracts else 'crossed in a straight line'}")
     if any(m.kind == "roughdiffuse" for m in materials):
         lines.append("rough diffuse surfaces: rendered as Lambertian")
     return lines

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from typing import Literal, get_args
 
 from scenes.errors import InputError
 
@@ -17,6 +18,8 @@ FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of 
 GRIDS = (2, 4, 8, 16)
 MAX_AMBIENT_SPP = 1 << 12
 FILTERED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours share it: as little noise as 45 alone
+
+Refraction = Literal["straight", "bent"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class RenderSettings:
                 0 follows all of them
     direct_tolerance_m, indirect_tolerance_m   returns of one pixel closer than this in path length merge; direct ones
                 do not with 0
+    refraction  whether solid glass bends direct light; open: where there is any, and the laser is at the camera
     indirect_growth  that width grows by this share of the path behind the direct light
     """
 
@@ -60,6 +64,7 @@ class RenderSettings:
     direct_tolerance_m: float | None = None
     indirect_tolerance_m: float = 0.03
     indirect_growth: float = 0.05
+    refraction: Refraction | None = None
 
     def __post_init__(self) -> None:
         limits = (
@@ -76,6 +81,8 @@ class RenderSettings:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise InputError(f"render: {name} {value} is outside {low} to {high}")
+        if self.refraction is not None and self.refraction not in get_args(Refraction):
+            raise InputError(f"render: refraction {self.refraction!r}, expected {' or '.join(get_args(Refraction))}")
         if self.budget is not None:
             signal, background = self.budget
             if not (math.isfinite(signal) and math.isfinite(background) and signal > 0 and background >= 0):
@@ -100,6 +107,7 @@ class Plan:
     spp         work on indirect light in paths per pixel; None: whatever `noise` takes
     noise       target of the Monte-Carlo part of the error where spp is open
     target      that of the whole error
+    refraction  of solid glass: direct light by Snell's law, or everything in a straight line
     ambient_noise  where the paths of ambient light are open: the noise at which they end
     """
 
@@ -116,6 +124,7 @@ class Plan:
     filter: bool = False
     ambient_noise: float = 0.0
     clamp: float | None = None
+    refraction: Refraction = "straight"
 
     def to_dict(self) -> dict:
         return asdict(self)

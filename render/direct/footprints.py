@@ -18,6 +18,7 @@ import numpy as np
 
 from render.backend.drjit_types import Array, Floats, Interactions, Masks, Rays, UInts, Vectors
 from render.scene.rays import camera_rays, first_opaque, laser_leg, shape_index, to_camera
+from render.scene.refraction import bundle_of, refracted_hit
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
 SMALL = 1 / 32
@@ -63,8 +64,8 @@ def trace(
     packed = row.astype(np.uint32) | level.astype(np.uint32) << LEVEL_BIT
     count, lanes = len(column), _lanes(len(column))
     columns = [upload(UInt32, values, lanes) for values in (column, packed)]
-    work = partial(_footprints, clip=clip)
-    found = world.recordings.call(world, ("footprints", clip), work, *columns, dr.opaque(UInt32, grid))
+    work = partial(_refracted_footprints if world.refracts else _footprints, clip=clip)
+    found = world.recordings.call(world, ("footprints", clip, world.refracts), work, *columns, dr.opaque(UInt32, grid))
     dr.eval(found)
     return Footprints(*(values.numpy()[:count] for values in found))
 
@@ -79,7 +80,19 @@ def _lanes(count: int) -> int:
     return next(more for more in range(lanes, lanes + 4) if more % 2 and more % 3)
 
 
-def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *, clip: bool) -> tuple:
+class _Cell(NamedTuple):
+    """Centre of a cell in pixels, its width in pixels and at z = 1, its pixel, and its ray's offset in cell widths."""
+
+    x: Array
+    y: Array
+    pitch: Array
+    step: Array
+    pixel: Array
+    aside: Array
+    down: Array
+
+
+def _cell(world: TracedScene, column: UInts, packed: UInts, grid: UInts) -> _Cell:
     level = packed >> LEVEL_BIT
     side = grid << level
     row = packed & ((1 << LEVEL_BIT) - 1)
@@ -87,8 +100,11 @@ def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *
     x, y = (Float(column) + 0.5) * pitch, (Float(row) + 0.5) * pitch
     # not by integer division: lanes that pad the last packet hold anything, and a division by their 0 is fatal
     pixel = UInt32(y) * world.width + UInt32(x)
-    step = pitch / world.focal_px
-    aside, down = _off_centre(column, row, level)
+    return _Cell(x, y, pitch, pitch / world.focal_px, pixel, *_off_centre(column, row, level))
+
+
+def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *, clip: bool) -> tuple:
+    x, y, pitch, step, pixel, aside, down = _cell(world, column, packed, grid)
     ray, aim = camera_rays(world, x + aside * pitch, y + down * pitch)
     si, transmission, optical, distance = _first_hit(world, ray)
     hit = si.is_valid()
@@ -138,6 +154,51 @@ def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *
         flags,
         *(_glint(world, si, ray, to_laser, hit, irradiance * transmission) if world.has_glints else ()),
     )
+
+
+def _refracted_footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *, clip: bool) -> tuple:
+    """Footprints whose rays solid glass bends (`render.scene.refraction`); all others as they are without."""
+    straight = _footprints(world, column, packed, grid, clip=clip)
+    x, y, pitch, step, pixel, aside, down = _cell(world, column, packed, grid)
+    ray, aim = camera_rays(world, x + aside * pitch, y + down * pitch)
+    bent = refracted_hit(world, ray, Bool(True))
+    si = bent.interaction
+    glass = bent.interfaces > 0
+    hit = glass & si.is_valid()
+    bundle = bundle_of(world, bent, x + aside * pitch, y + down * pitch, step, hit)
+    lit = hit
+    if world.scene.laser.mode == "flood":
+        lit &= dr.atan2(dr.norm(mi.Vector2f(aim.x, aim.y)), aim.z) <= world.half_angle
+    si.wi = si.to_local(-bent.direction)
+    intensity = dr.gather(Float, world.intensity, pixel, lit)
+    irradiance = dr.select(lit, intensity * bent.transmission * bundle.irradiance, 0)
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.wi, hit)[0] * irradiance
+    # radiance over the square of the index is what glass does not change
+    passed = bent.transmission / dr.square(bent.medium)
+    radiance = dr.select(hit & dr.isfinite(value), value * passed, 0)
+    # from where the ray is to the centre of the cell
+    slope = mi.Vector2f(bundle.slope_x_m, bundle.slope_y_m)
+    optical = bent.optical_m - (slope.x * aside + slope.y * down) * step
+    half_x, half_y = dr.abs(slope.x) * step, dr.abs(slope.y) * step
+    half = dr.sqrt(dr.square(half_x) + dr.square(half_y))
+    small = hit & bundle.even & (half <= SMALL * optical)
+    flags = dr.select(hit, HIT | LIT, UInt32(0)) | dr.select(hit & ~small, LARGE, UInt32(0))
+    per_pixel = dr.rcp(world.focal_px)
+    found = (
+        2 * optical,
+        half,
+        dr.select(small, dr.minimum(half_x, half_y), 0),
+        radiance,
+        optical,
+        slope.x * per_pixel,
+        slope.y * per_pixel,
+        dr.abs(dr.dot(si.sh_frame.n, bent.direction)),
+    )
+    glints: tuple = ()
+    if world.has_glints:
+        glints = _glint(world, si, mi.Ray3f(si.p, bent.direction), -bent.direction, hit, irradiance * passed)
+    by_glass = (*(dr.select(hit, part, 0) for part in found), flags, *glints)
+    return tuple(dr.select(glass, new, old) for new, old in zip(by_glass, straight, strict=True))
 
 
 def _first_hit(world: TracedScene, ray: Rays) -> tuple[Array, Array, Array, Array]:

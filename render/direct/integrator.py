@@ -11,6 +11,7 @@ from render.backend.drjit_types import Array, UInts
 from render.direct.cell_tree import MAX_CELLS, CellTree
 from render.direct.footprints import albedo
 from render.scene.rays import camera_rays, first_opaque
+from render.scene.refraction import refracted_hit
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr
 from render.transient.samples import Samples, concatenate, merge, no_samples, packed
 
@@ -180,7 +181,7 @@ def centre_layers(world: TracedScene) -> Layers:
     shape = (world.scene.camera.height, world.scene.camera.width)
     pixel = dr.arange(UInt32, shape[0] * shape[1])
     dr.eval(pixel)
-    found = world.recordings.call(world, "centre layers", _centres, pixel)
+    found = world.recordings.call(world, ("centre layers", world.refracts), _centres, pixel)
     dr.eval(found)
     depth, x, y, z, reflectance = (values.numpy().reshape(shape) for values in found)
     normal = np.stack((x, y, z), axis=-1)
@@ -189,7 +190,12 @@ def centre_layers(world: TracedScene) -> Layers:
 
 def _centres(world: TracedScene, pixel: UInts) -> tuple[Array, ...]:
     ray, _ = camera_rays(world, Float(pixel % world.width) + 0.5, Float(pixel // world.width) + 0.5)
-    si, _, _, distance = first_opaque(world, ray, Bool(True))
+    if world.refracts:
+        bent = refracted_hit(world, ray, Bool(True))
+        si, direction, distance = bent.interaction, bent.direction, dr.norm(bent.interaction.p - world.eye)
+    else:
+        si, _, _, distance = first_opaque(world, ray, Bool(True))
+        direction = ray.d
     hit = si.is_valid()
-    normal = si.n * dr.select(hit, dr.select(dr.dot(si.n, ray.d) > 0, Float(-1), Float(1)), 0)
+    normal = si.n * dr.select(hit, dr.select(dr.dot(si.n, direction) > 0, Float(-1), Float(1)), 0)
     return dr.select(hit, distance, dr.nan), *normal, albedo(world, si, hit)

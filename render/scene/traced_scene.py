@@ -97,12 +97,18 @@ class TracedScene:
         self.roughness = self.table([m.roughness for m in materials])
         self.solid_indices = sorted({m.ior for m in materials if m.kind == "dielectric"})
         self.solid_index = dr.opaque(Float, max(self.solid_indices, default=1.0))
+        self.refracts = False  # `render.scene.refraction`
         self.recordings = Recordings()
         self._bind_camera(scene)
 
+    def refracting(self, bent: bool) -> TracedScene:
+        """Return the same world in which solid glass bends direct light, or does not."""
+        other = copy.copy(self)
+        other.refracts, other.responses = bent, self.responses if bent == self.refracts else {}
+        return other
+
     def with_camera(self, camera: Camera) -> TracedScene:
-        """Return the same surfaces and lights before another camera, its laser with it: nothing is built or recorded
-        again."""
+        """Return the same surfaces and lights before another camera and laser; nothing is built or recorded again."""
         other = copy.copy(self)
         other._bind_camera(replace(self.scene, camera=camera))
         return other

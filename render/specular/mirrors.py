@@ -206,8 +206,9 @@ def check_slabs(world: TracedScene) -> list[str]:
     errors = slab_error_m(world)
     lenses, slabs = [e.name for e in errors if not e.flat], [e for e in errors if e.flat]
     notes = []
+    what = "indirect light crosses it" if world.refracts else "crossed"
     if lenses:
-        notes.append(f"glass {_gathered(lenses)}: bends light as a lens does, crossed here in a straight line")
+        notes.append(f"glass {_gathered(lenses)}: bends light as a lens does, {what} here in a straight line")
     if not slabs:
         return notes
     worst = max(slabs, key=lambda error: error.path_m)
@@ -216,7 +217,7 @@ def check_slabs(world: TracedScene) -> list[str]:
     limit = f"the limit with a displaced laser is {1e3 * MAX_SLAB_ERROR_M:.0f} mm"
     require(allowed, f"glass {worst.name}: a straight line through it is up to {off} off the refracted one; {limit}")
     names = _gathered([error.name for error in slabs])
-    return [*notes, f"glass {names}: crossed in a straight line, up to {off} off the refracted one"]
+    return [*notes, f"glass {names}: {what} in a straight line, up to {off} off the refracted one"]
 
 
 def _gathered(names: list[str]) -> str:

@@ -107,6 +107,8 @@ class Render(Long):
     """Focal length of the depth image, pixels; an RGB-D pair needs it."""
     cosine: bool = False
     """RGB-D: apply the cosine of the surface to the photograph, which already holds shading of its own."""
+    refraction: Literal["auto", "straight", "bent"] = "auto"
+    """Thick glass: bent refracts direct light of a laser at the camera; auto does where there is any."""
     figure: bool = True
     """Draw a picture of the layers beside the file."""
 
@@ -163,6 +165,7 @@ def _settings(command: Render) -> RenderSettings:
         spp=command.spp,
         filter=command.filter,
         clamp=command.clamp,
+        refraction={"auto": None, "straight": "straight", "bent": "bent"}[command.refraction],
         grid=command.grid,
         ambient={"auto": None, "on": True, "off": False}[command.ambient],
         ambient_spp=command.ambient_spp,
