@@ -91,7 +91,7 @@ def test_launches_of_any_size_are_recorded_once():
     for size in sorted({*range(1, 70), *sizes, *(2 * len(s.vertices) for s in world.scene.surfaces)}):
         column = np.arange(size) % 24
         trace(world, column, np.zeros(size, int), np.zeros(size, int), 1)
-    assert world.recordings.calls["footprints", False].n_recordings == 1
+    assert world.recordings.calls["footprints", False, False].n_recordings == 1
 
 
 @pytest.mark.parametrize("laser", [Laser(), Laser(cone_deg=360)], ids=["flash", "lamp"])
