@@ -15,6 +15,7 @@ memory as much as into arithmetic, hence the two functions with derivatives of t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
 
@@ -26,6 +27,7 @@ from csph.autograd import Context
 from csph.networks.published import check_input
 
 FOLD = 16  # fine bins of one coarse bin
+Step = Callable[[Tensor], Tensor]
 VIEWS = 3  # of the back-projection: as it is, and two averages
 
 
@@ -87,17 +89,24 @@ class Compact(nn.Module):
                 module.to(memory_format=order)  # type: ignore[call-overload]  # not in torch's stubs
 
     def forward(self, x: Tensor) -> Tensor:
+        return self.logits(x)
+
+    def logits(self, x: Tensor, early: Step | None = None, late: Step | None = None) -> Tensor:
+        """Return the logits of a back-projection; `early` and `late` change the features (B T/16, channels, R, C) after
+        the first and before the last convolution."""
         check_input(x, FOLD)
         batch, _, bins, rows, columns = x.shape
         slices = x.reshape(-1, FOLD, rows, columns)
-        near = self.near(_over_time(self.stem, fold(slices), batch), batch)
+        first = _over_time(self.stem, fold(slices), batch)
+        near = self.near(early(first) if early else first, batch)
         middle = self.halved(near).relu_()
         for step in self.middle:
             middle = step(middle, batch)
         volume = middle.unflatten(0, (batch, -1)).transpose(1, 2)
         volume = enlarged(_linear(self.from_far, self.far(self.quartered(volume).relu_())), volume, (2, 3, 4))
         middle = volume.transpose(1, 2).flatten(0, 1)
-        features = self.last(enlarged(_linear(self.from_middle, middle), near, (2, 3)), batch)
+        features = enlarged(_linear(self.from_middle, middle), near, (2, 3))
+        features = self.last(late(features) if late else features, batch)
         weights = (*self.fine.parameters(), *self.trust.parameters())
         logits = read_out(features.flatten(2).transpose(1, 2), slices, *weights)
         return logits.view(batch, bins, rows, columns)

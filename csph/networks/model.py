@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from csph.codes.blocks import encode_blocks
 from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8
 from csph.layer import CompressiveLayer
+from csph.networks.blockwise import Blockwise
 from csph.networks.compact import Compact
 from csph.networks.grid import published_position
 from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
@@ -51,6 +52,12 @@ def _inside(span: Span) -> slice:
     return slice(span.inner, span.inner + span.own.stop - span.own.start)
 
 
+def _network(config: ModelConfig) -> nn.Module:
+    if config.network == "blockwise" and config.design is not None:
+        return Blockwise(config.design.block, config.design.codes)
+    return Compact() if config.network == "compact" else DeepBoosting(can_die=config.network == "published")
+
+
 class DepthModel(nn.Module):
     """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin."""
 
@@ -64,17 +71,25 @@ class DepthModel(nn.Module):
             )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            compact = config.network == "compact"
-            self.network = Compact() if compact else DeepBoosting(can_die=config.network == "published")
+            self.network = _network(config)
 
     def begin_with(self, other: DepthModel) -> None:
         """Take the weights of a model of the same design and network; clipping ranges of int8 that it has not are
         fitted to them."""
         mine, theirs = self.layer, other.layer
         fits = mine is not None and theirs is not None and mine.options.int8 and not theirs.options.int8
-        self.load_state_dict(other.state_dict(), strict=not fits)
+        weights = {name: value for name, value in other.state_dict().items() if not name.startswith("network.")}
+        self.begin_with_network(other)
+        own = {name: value for name, value in self.state_dict().items() if name.startswith("network.")}
+        self.load_state_dict({**weights, **own}, strict=not fits)
         if mine is not None and fits:
             mine.fit_ranges()
+
+    def begin_with_network(self, other: DepthModel) -> None:
+        """Take the weights of another model's network alone; what a blockwise network has beyond a compact one keeps
+        its start, which adds nothing."""
+        grown = self.config.network == "blockwise" and other.config.network == "compact"
+        self.network.load_state_dict(other.network.state_dict(), strict=not grown)
 
     @property
     def parameters_count(self) -> int:
@@ -96,9 +111,16 @@ class DepthModel(nn.Module):
         whole = counts if self.layer is not None else self.seen(counts)
         firsts = first_bin.tolist()
         cut = torch.stack([one[:, first : first + window] for one, first in zip(whole, firsts, strict=True)])
-        return self.network(self.layer(cut) if self.layer is not None else cut)
+        return self.logits_of_codes(self.layer.encode(cut)) if self.layer is not None else self.network(cut)
+
+    def logits_of_codes(self, codes: Tensor) -> Tensor:
+        """Return logits (B, T, R, C) of codes (B, K, T/Mt, R/Mr, C/Mc)."""
+        x = self.layer.decode(codes)
+        return self.network(x, codes.to(x.dtype)) if isinstance(self.network, Blockwise) else self.network(x)
 
     def forward(self, counts: Tensor) -> Tensor:
+        if self.layer is not None:
+            return self.logits_of_codes(self.layer.encode(counts))
         return self.network(self.seen(counts))
 
     def position(self, logits: Tensor, decoder: Decoder | None = None) -> Tensor:
@@ -121,7 +143,7 @@ class DepthModel(nn.Module):
         """
         if self.layer is None:
             raise InputError(f"{self.config.name}: has no codes to find depth from")
-        logits = self.network(self.layer.decode(codes))
+        logits = self.logits_of_codes(codes)
         return self.position(logits, decoder) * self.config.sensor.bin_depth_m
 
     def check_histogram(self, histogram: Histogram) -> None:
@@ -191,10 +213,10 @@ class DepthModel(nn.Module):
         coding = self.layer.coding()
         if rule == "published":
             weights = published_int8(coding).tensor.to(self.layer.temporal.device)
-            return self.network(self.layer.decode(encode_blocks(counts.to(weights.device), weights))), 0
+            return self.logits_of_codes(encode_blocks(counts.to(weights.device), weights)), 0
         tensor = self.layer.quantised()
         codes, _ = encode_int16(counts, tensor)
-        logits = self.network(self.layer.decode(codes.to(self.layer.temporal.device).float() * tensor.scale))
+        logits = self.logits_of_codes(codes.to(self.layer.temporal.device).float() * tensor.scale)
         rows, columns = (
             slice(one.start, -(-one.stop // side) * side)
             for one, side in zip(inside, self.config.block[1:], strict=True)

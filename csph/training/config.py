@@ -16,9 +16,9 @@ from scenes.errors import InputError, require
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
 
-Network = Literal["compact", "published", "published-signed"]
+Network = Literal["compact", "blockwise", "published", "published-signed"]
 Front = Literal["codes", "counts", "matched", "peak"]
-NETWORKS: tuple[str, ...] = ("compact", "published", "published-signed")
+NETWORKS: tuple[str, ...] = ("compact", "blockwise", "published", "published-signed")
 FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
 Schedule = Literal["steps", "cosine"]
 SCHEDULES: tuple[str, ...] = ("steps", "cosine")
@@ -37,7 +37,8 @@ class ModelConfig:
              with the pulse (`spad.estimators.matching.normalised_correlation`); or one-hot argmax
     design   the codes, with `front` = "codes"
     layer    switches of `csph.layer.LayerOptions` that differ from the published layer
-    network  compact; published; or published with logits of any sign, which cannot die
+    network  compact; blockwise, the compact one that sees codes and places in a block, too; published; or published
+             with logits of any sign, which cannot die
     sensor   whose histograms it takes
     grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with print
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
@@ -61,8 +62,11 @@ class ModelConfig:
         require(known, f"spatial start {self.spatial_start!r} is unknown, expected one of {', '.join(STARTS)}")
         coded = self.front == "codes"
         require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
+        require(coded or self.network != "blockwise", "network blockwise: is for codes, and there are none")
         if self.design is not None:
             bins, block = self.sensor.bins, self.design.block
+            folded = self.network != "blockwise" or block[0] % 16 == 0
+            require(folded, f"network blockwise: blocks of {block[0]} bins, expected a multiple of 16")
             require(bins % block[0] == 0, f"blocks of {block[0]} bins do not divide the sensor's {bins}")
             counted = self.design.code == "coarse" or self.design.full
             rounded = f"{self.design.name}: int8 is for codes with a table of their own, not counters or full tensors"

@@ -81,7 +81,7 @@ class DepthTraining(pl.LightningModule):
         self.config = config
         self.model = DepthModel(config.model, config.seed)
         if isinstance(init, NetworkOf):
-            self.model.network.load_state_dict(init.model.network.state_dict())
+            self.model.begin_with_network(init.model)
         elif init is not None:
             self.model.begin_with(init)
         self.averaged: DepthModel | None = None
@@ -255,7 +255,8 @@ def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
     mine, other = config.model, (init.model if isinstance(init, NetworkOf) else init).config
     names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
     bare = [replace(one, sensor=replace(one.sensor, name="", tdc=None)) for one in (mine, other)]
-    alike = all(getattr(bare[0], name) == getattr(bare[1], name) for name in names)
+    alike = all(getattr(bare[0], name) == getattr(bare[1], name) for name in names if name != "network")
+    alike = alike and (mine.network, other.network) in {(mine.network, mine.network), ("blockwise", "compact")}
     message = (
         f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
     )

@@ -39,8 +39,8 @@ class Train(Long):
     network with three times workstation's pixels, sensed on the GPU; paper: the published network and schedule (GPU);
     laptop-v1: the recipe of the first models."""
     network: Annotated[
-        Literal["compact", "published", "published-signed"] | None,
-        may_stay_open("{compact,published,published-signed}"),
+        Literal["compact", "blockwise", "published", "published-signed"] | None,
+        may_stay_open("{compact,blockwise,published,published-signed}"),
     ] = None
     """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
     sensor: str = "reference"

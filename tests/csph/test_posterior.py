@@ -120,6 +120,7 @@ def test_mirrored_and_spans():
     "model",
     [
         ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL),
+        ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL, network="blockwise"),
         ModelConfig(front="matched", sensor=SMALL),
         ModelConfig(front="counts", network="published-signed", sensor=SMALL),
     ],
