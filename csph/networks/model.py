@@ -52,7 +52,7 @@ def _inside(span: Span) -> slice:
     return slice(span.inner, span.inner + span.own.stop - span.own.start)
 
 
-def _network(config: ModelConfig) -> nn.Module:
+def _network(config: ModelConfig) -> Compact | DeepBoosting:
     if config.network == "blockwise" and config.design is not None:
         return Blockwise(config.design.block, config.design.codes)
     return Compact() if config.network == "compact" else DeepBoosting(can_die=config.network == "published")
@@ -115,6 +115,7 @@ class DepthModel(nn.Module):
 
     def logits_of_codes(self, codes: Tensor) -> Tensor:
         """Return logits (B, T, R, C) of codes (B, K, T/Mt, R/Mr, C/Mc)."""
+        assert self.layer is not None
         x = self.layer.decode(codes)
         return self.network(x, codes.to(x.dtype)) if isinstance(self.network, Blockwise) else self.network(x)
 
