@@ -1,8 +1,7 @@
 """Many cores in step, as NumPy arrays: an image's worth of cores, 2 x 2 cores with links, or one timestamp a core.
 
-Every turn takes the lowest word that a runnable core stands at, and does its instruction on all cores that stand there:
-cores that branched apart meet again where their ways join. The few that are left with many timestamps when all others
-are done (bright pixels) go on as a `Core` each, which is faster and does the same.
+Every turn takes the lowest word that a runnable core stands at, and does its instruction on all cores that stand there.
+Cores that branched apart meet again. The few with many timestamps left at the end go on as a `Core` each: faster.
 """
 
 from __future__ import annotations

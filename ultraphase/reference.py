@@ -58,10 +58,8 @@ def interpret(
     -------
     registers `r`, bytes of `ram`, words sent `out`, instructions done `n`, 16-bit and 8-bit wraps `w`, saturations `s`
     """
-    r, ram = np.zeros(16, np.int32), np.zeros(ram_bytes, np.uint8)
-    out: list[int] = []
-    halves, port, at, done = ram.view(np.int16), list(timestamps), 0, 0
-    wraps = saturations = 0
+    r, ram, out = np.zeros(16, np.int32), np.zeros(ram_bytes, np.uint8), list[int]()
+    halves, port, at, done, wraps, saturations = ram.view(np.int16), list(timestamps), 0, 0, 0, 0
     with np.errstate(over="ignore"):
         while True:
             one = instructions[at]

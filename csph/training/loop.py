@@ -357,14 +357,11 @@ def train(
     config.check_memory()
     if init is not None:
         _check_init(init, config)
-    training_sets, validation_sets = ([packed_views(one) for one in _listed(views)] for views in (training, validation))
-    config = _with_hashes(config, (training_sets, validation_sets), init)
+    sets = [[packed_views(one) for one in _listed(views)] for views in (training, validation)]
+    config = _with_hashes(config, sets, init)
     if config.model.grid == "published":
-        training_sets, validation_sets = (
-            [on_published_grid(packed, config.model.sensor) for packed in packs]
-            for packs in (training_sets, validation_sets)
-        )
-    module_data = SetData(training_sets, validation_sets, config, hardware.workers)
+        sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
+    module_data = SetData(sets[0], sets[1], config, hardware.workers)
     record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():
         runner = _trainer(config, record, hardware)

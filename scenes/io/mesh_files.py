@@ -1,9 +1,11 @@
-"""Mesh files by way of trimesh: what they declare is checked first, what they name lies in their folder."""
+"""Mesh files by way of trimesh, and material libraries: what they declare is checked first, what they name lies in
+their folder."""
 
 from __future__ import annotations
 
 import io
 import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,7 @@ import numpy as np
 from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_declarations import check_glb, check_ply, check_stl
+from scenes.io.textures import luminance, srgb_to_linear
 
 if TYPE_CHECKING:
     import trimesh
@@ -108,3 +111,71 @@ def check_vertices(vertices: np.ndarray, name: str) -> None:
     largest = float(np.abs(vertices).max(initial=0.0))
     message = f"a coordinate of {name} is {largest:g}, expected {MAX_COORDINATE:g} at the most"
     require(largest <= MAX_COORDINATE, message)
+
+
+@dataclass(frozen=True)
+class MaterialEntry:
+    """Entry of an .mtl file for one material: linear luminance of Kd, file of map_Kd."""
+
+    colour: float | None = None
+    image: Path | None = None
+
+
+def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEntry]:
+    """Read the material library of an OBJ; InputError for a texture that it names and that is not there.
+
+    trimesh reads the library too, but silently drops such textures and rounds Kd to 8 bits.
+    """
+    text = lenient_text(path)
+    lines = [line.split(maxsplit=1) for line in text.splitlines() if line.startswith("mtllib")]
+    named = [words[1].strip() for words in lines if len(words) == 2 and words[0] == "mtllib"]
+    if not named:
+        return {}
+    if len(named) > 1:
+        notes.append(f"of {len(named)} material files only {named[0]} is read")
+    if not (path.parent / named[0].replace("\\", "/")).exists():
+        notes.append(f"material file {named[0]} not found")
+        return {}
+    try:
+        library = file_inside(path.parent, named[0], "material file")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return _read_library(library)
+
+
+def lenient_text(path: Path) -> str:
+    """Read a text file: names and comments in any encoding, numbers never."""
+    return read_bytes(path).decode("utf-8", errors="replace")
+
+
+def _read_library(library: Path) -> dict[str, MaterialEntry]:
+    entries: dict[str, MaterialEntry] = {}
+    name = ""
+    for line in lenient_text(library).splitlines():
+        key, rest = (*line.split(maxsplit=1), "", "")[:2]
+        if key.lower() == "newmtl":
+            name = " ".join(rest.split())
+            entries[name] = MaterialEntry()
+        elif key.lower() == "kd" and name:
+            entries[name] = replace(entries[name], colour=_kd(library, rest))
+        elif key.lower() == "map_kd" and name:
+            entries[name] = replace(entries[name], image=_map_kd(library, name, rest))
+    return entries
+
+
+def _kd(library: Path, text: str) -> float:
+    try:
+        colour = [float(word) for word in text.split()[:3]]
+        return float(luminance(srgb_to_linear(np.clip(colour * 3 if len(colour) == 1 else colour, 0, 1))))
+    except ValueError:
+        raise InputError(f"{library}: Kd {text.strip()!r}, expected three numbers") from None
+
+
+def _map_kd(library: Path, name: str, text: str) -> Path:
+    """Return the texture file of a map_Kd line, whose options (-s 1 1 1 ...) are left out."""
+    file = text.strip()
+    file = file.split()[-1] if file.startswith("-") else file
+    try:
+        return file_inside(library.parent, file, f"texture of material {name}")
+    except InputError as error:
+        raise InputError(f"{library}: {error}") from None

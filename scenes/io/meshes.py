@@ -16,8 +16,13 @@ import numpy as np
 
 from scenes.arrays import check_faces
 from scenes.errors import InputError
-from scenes.io.inputs import file_inside, read_bytes
-from scenes.io.mesh_files import MAX_COORDINATE, check_vertices, load_trimesh
+from scenes.io.mesh_files import (
+    MAX_COORDINATE,
+    MaterialEntry,
+    check_vertices,
+    load_trimesh,
+    read_material_library,
+)
 from scenes.io.textures import load_texture, luminance, srgb_to_linear
 from scenes.library.things import shapes
 from scenes.model import Camera, Material, Scene, Surface, Texture
@@ -281,7 +286,7 @@ class _Paint:
 
     def __init__(self, path: Path, notes: list[str]) -> None:
         self.path, self.notes = path, notes
-        self.library = _read_mtl(path, notes) if path.suffix.lower() == ".obj" else {}
+        self.library = read_material_library(path, notes) if path.suffix.lower() == ".obj" else {}
         self.made: dict[object, Material] = {}
 
     def material(self, part: _Part) -> Material:
@@ -303,7 +308,7 @@ class _Paint:
         if source is None:
             value = self._vertex_colour(part)
         elif self.path.suffix.lower() == ".obj":
-            entry = self.library.get(str(source.name), _Entry())
+            entry = self.library.get(str(source.name), MaterialEntry())
             if entry.image is not None and part.uv is not None:
                 return entry.image, lambda: load_texture(entry.image)
             value = entry.colour
@@ -334,71 +339,3 @@ def _image_albedo(image: Image.Image, tint: np.ndarray) -> Texture:
     """The texture of an sRGB image held in memory, times a linear colour."""
     pixels = srgb_to_linear(np.asarray(image.convert("RGB")) / 255)
     return Texture(np.minimum(luminance(pixels * tint[:3]), 1.0), "base colour")
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """Entry of an .mtl file for one material: linear luminance of Kd, file of map_Kd."""
-
-    colour: float | None = None
-    image: Path | None = None
-
-
-def _read_mtl(path: Path, notes: list[str]) -> dict[str, _Entry]:
-    """The material library of an OBJ; a texture that it names and that is not there is an InputError.
-
-    trimesh reads the library too, but silently drops such textures and rounds Kd to 8 bits.
-    """
-    text = _lenient_text(path)
-    lines = [line.split(maxsplit=1) for line in text.splitlines() if line.startswith("mtllib")]
-    named = [words[1].strip() for words in lines if len(words) == 2 and words[0] == "mtllib"]
-    if not named:
-        return {}
-    if len(named) > 1:
-        notes.append(f"of {len(named)} material files only {named[0]} is read")
-    if not (path.parent / named[0].replace("\\", "/")).exists():
-        notes.append(f"material file {named[0]} not found")
-        return {}
-    try:
-        library = file_inside(path.parent, named[0], "material file")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return _read_library(library)
-
-
-def _lenient_text(path: Path) -> str:
-    """Names and comments in any encoding, numbers never."""
-    return read_bytes(path).decode("utf-8", errors="replace")
-
-
-def _read_library(library: Path) -> dict[str, _Entry]:
-    entries: dict[str, _Entry] = {}
-    name = ""
-    for line in _lenient_text(library).splitlines():
-        key, rest = (*line.split(maxsplit=1), "", "")[:2]
-        if key.lower() == "newmtl":
-            name = " ".join(rest.split())
-            entries[name] = _Entry()
-        elif key.lower() == "kd" and name:
-            entries[name] = replace(entries[name], colour=_kd(library, rest))
-        elif key.lower() == "map_kd" and name:
-            entries[name] = replace(entries[name], image=_map_kd(library, name, rest))
-    return entries
-
-
-def _kd(library: Path, text: str) -> float:
-    try:
-        colour = [float(word) for word in text.split()[:3]]
-        return float(luminance(srgb_to_linear(np.clip(colour * 3 if len(colour) == 1 else colour, 0, 1))))
-    except ValueError:
-        raise InputError(f"{library}: Kd {text.strip()!r}, expected three numbers") from None
-
-
-def _map_kd(library: Path, name: str, text: str) -> Path:
-    """The texture file of a map_Kd line, whose options (-s 1 1 1 ...) are left out."""
-    file = text.strip()
-    file = file.split()[-1] if file.startswith("-") else file
-    try:
-        return file_inside(library.parent, file, f"texture of material {name}")
-    except InputError as error:
-        raise InputError(f"{library}: {error}") from None
