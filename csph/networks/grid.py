@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from spad.detection.training_patches import PackedTransients
+from spad.detection.training_patches import PackedViews
 from spad.formats.rgbd import published_taps
 from spad.sensor.model import Sensor
 
@@ -26,7 +26,7 @@ def published_centroid_bins(sensor: Sensor) -> float:
     return float(taps @ np.arange(len(taps)) - taps.argmax())
 
 
-def on_published_grid(packed: PackedTransients, sensor: Sensor) -> PackedTransients:
+def on_published_grid(packed: PackedViews, sensor: Sensor) -> PackedViews:
     """Return one return a pixel as in the published simulation: all its light arrives so that the pulse's fullest bin
     is round(depth / bin) - 1, and the label is that bin's centre. Pixels without a depth within the range are dark."""
     depth = packed.depth_m.astype(np.float64)
@@ -38,7 +38,7 @@ def on_published_grid(packed: PackedTransients, sensor: Sensor) -> PackedTransie
     # a pulse that begins before the first bin has gone round
     arrival = (fullest + 0.5 + published_centroid_bins(sensor)) % sensor.bins_per_period
     path = (2 * sensor.bin_depth_m * arrival)[kept].astype(np.float32)
-    return PackedTransients(
+    return PackedViews(
         offsets=np.concatenate([[0], np.cumsum(kept.ravel(), dtype=np.int64)]),
         path_near_m=path,
         path_far_m=path,

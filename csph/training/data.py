@@ -22,7 +22,7 @@ from csph.training.levels import draw_level
 from scenes.errors import require
 from scenes.random_streams import Stream
 from spad.detection.device_patches import DevicePatches
-from spad.detection.training_patches import Batch, PackedTransients, Patch, joined, sense_patches
+from spad.detection.training_patches import Batch, PackedViews, Patch, joined, sense_patches
 from spad.sensor.model import Sensor
 
 FULL_LENGTH_FRACTION = 0.1  # of a run with windows, its last: on all bins
@@ -47,7 +47,7 @@ class TrainBatch(NamedTuple):
 class Samples(Dataset):
     """Requests for the patches of one epoch; drawing one is cheap, `sense` of a batch is the work."""
 
-    def __init__(self, sets: Sequence[PackedTransients], config: TrainConfig, epoch: int) -> None:
+    def __init__(self, sets: Sequence[PackedViews], config: TrainConfig, epoch: int) -> None:
         self.shapes, self.config, self.epoch = [packed.depth_m.shape for packed in sets], config, epoch
         for shape in self.shapes:
             most = min(shape[1:])
@@ -84,9 +84,7 @@ class Frames(Dataset):
     """Whole validation frames of one set, as far as blocks tile them: view after view, each at one level, levels in
     turn; the 16 test levels where training draws from a continuous range."""
 
-    def __init__(
-        self, packed: PackedTransients, config: TrainConfig, views: int | None = None, source: int = 0
-    ) -> None:
+    def __init__(self, packed: PackedViews, config: TrainConfig, views: int | None = None, source: int = 0) -> None:
         scenes, rows, columns = packed.depth_m.shape
         _, height, width = config.model.block
         self.size = (rows // height * height, columns // width * width)
@@ -110,7 +108,7 @@ class Frames(Dataset):
 
 
 def _sensed(
-    sets: Sequence[PackedTransients], sensor: Sensor, size: tuple[int, int], window: int, requests: Sequence[Request]
+    sets: Sequence[PackedViews], sensor: Sensor, size: tuple[int, int], window: int, requests: Sequence[Request]
 ) -> TrainBatch:
     """Sense a batch whose patches keep their order; patches of one set are sensed together."""
     sources = [request.source for request in requests]
@@ -155,7 +153,7 @@ def _asked(window: int, requests: Sequence[Request]) -> Requests:
 class DeviceSensing:
     """Senses the batches of several training sets on one device, all sets in one; validation stays on the CPU."""
 
-    def __init__(self, sets: Sequence[PackedTransients], config: TrainConfig, device: torch.device) -> None:
+    def __init__(self, sets: Sequence[PackedViews], config: TrainConfig, device: torch.device) -> None:
         self.config, self.packed = config, joined(sets)
         self.firsts = np.cumsum([0, *(packed.scenes for packed in sets)])
         self.resident = DevicePatches(self.packed, config.model.sensor, device)
@@ -184,8 +182,8 @@ class SetData(pl.LightningDataModule):
 
     def __init__(
         self,
-        training: Sequence[PackedTransients],
-        validation: Sequence[PackedTransients],
+        training: Sequence[PackedViews],
+        validation: Sequence[PackedViews],
         config: TrainConfig,
         workers: int = 0,
     ) -> None:
@@ -219,7 +217,7 @@ class SetData(pl.LightningDataModule):
         return [self._loader(frames, self.validation, 1, frames.size, 0) for frames in self.frames]
 
     def _loader(
-        self, samples: Dataset, sets: Sequence[PackedTransients], batch: int, size: tuple[int, int], window: int
+        self, samples: Dataset, sets: Sequence[PackedViews], batch: int, size: tuple[int, int], window: int
     ) -> DataLoader:
         collate = partial(_sensed, sets, self.config.model.sensor, size, window)
         if isinstance(samples, Samples) and self.config.sense_on == "device":

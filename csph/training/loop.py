@@ -44,7 +44,7 @@ from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.resume import WholeFileCheckpoints, check_resume
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
-from csph.training.views import Views, packed_sha256, packed_views
+from csph.training.views import Views, packed_sha256
 from csph.weights.shipped import RESUME, TIMINGS
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import InputError, require
@@ -52,7 +52,7 @@ from scenes.files import append_line, is_unclaimed, whole_file, write_csv
 from scenes.io.inputs import read_json_object
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
-from spad.detection.training_patches import PackedTransients
+from spad.detection.training_patches import PackedViews, pack_views
 
 log = logging.getLogger("csph")
 
@@ -283,7 +283,7 @@ def _listed(views: Views | Sequence[Views]) -> list[Views]:
 
 
 def _with_hashes(
-    config: TrainConfig, sets: Sequence[Sequence[PackedTransients]], init: DepthModel | NetworkOf | None
+    config: TrainConfig, sets: Sequence[Sequence[PackedViews]], init: DepthModel | NetworkOf | None
 ) -> TrainConfig:
     """Return the configuration with the SHA-256 of its sets and of the weights it begins with: a run that goes on must
     have begun with the same."""
@@ -357,7 +357,7 @@ def train(
     config.check_memory()
     if init is not None:
         _check_init(init, config)
-    sets = [[packed_views(one) for one in _listed(views)] for views in (training, validation)]
+    sets = [[pack_views(one.transients) for one in _listed(views)] for views in (training, validation)]
     config = _with_hashes(config, sets, init)
     if config.model.grid == "published":
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]

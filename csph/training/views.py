@@ -12,7 +12,7 @@ from render.transient import Transient, read_transient
 from render.transient.packs import read_pack
 from scenes.errors import require
 from scenes.io.set_index import read_set_index
-from spad.detection.training_patches import PackedTransients, packed_transients
+from spad.detection.training_patches import PackedViews
 
 VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
 
@@ -66,14 +66,9 @@ def split_views(views: Views, fraction: float = VALIDATION_FRACTION) -> tuple[Vi
     return parts[0], parts[1]
 
 
-def packed_sha256(packed: PackedTransients) -> str:
+def packed_sha256(packed: PackedViews) -> str:
     """Return SHA-256 over what is sensed: a run that goes on must go on with the same set."""
     sha = hashlib.sha256(str(packed.depth_m.shape).encode())
     for name in ("offsets", "path_near_m", "path_far_m", "radiance", "depth_m", "ambient", "mixed"):
         sha.update(np.ascontiguousarray(getattr(packed, name)).tobytes())
     return sha.hexdigest()
-
-
-def packed_views(views: Views) -> PackedTransients:
-    """Return one packed set; InputError where views are of different sizes."""
-    return packed_transients(views.transients)

@@ -40,7 +40,7 @@ PACKED = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "track_
 
 
 @dataclass(frozen=True, eq=False)
-class Pack:
+class ViewPack:
     """A read pack: `len(pack)` views, `pack[i]` the i-th as a `Transient`, `metas[i]` its record.
 
     Normals and errors are 0. The compact arrays stay in memory as they are in the file; floats are made on demand.
@@ -210,7 +210,7 @@ def _summed(stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def write_pack(views: Iterable[tuple[Transient, dict]], path: Path) -> int:
-    """Write views of one image size, each with the record that `Pack.metas` is to give back; returns how many.
+    """Write views of one image size, each with the record that `ViewPack.metas` is to give back; returns how many.
 
     One view is in memory at a time. Raises InputError for views of different sizes, or none.
     """
@@ -287,7 +287,7 @@ def _all_views(file: h5py.File) -> dict[str, np.ndarray]:
     return arrays | {name: np.concatenate([view[name] for view in views]) for name in PER_RETURN}
 
 
-def read_pack(path: Path) -> Pack:
+def read_pack(path: Path) -> ViewPack:
     """Read a pack whole and check it: schema, shapes, and the SHA-256 over all arrays and records.
 
     Raises InputError in one line for a missing, foreign, truncated or altered file, or one of a newer schema.
@@ -315,7 +315,7 @@ def read_pack(path: Path) -> Pack:
         raise InputError(f"{path}: not a readable pack ({message or type(error).__name__})") from None
     for array in arrays.values():
         array.setflags(write=False)
-    return Pack(arrays, starts, metas)
+    return ViewPack(arrays, starts, metas)
 
 
 def _sha256(arrays: dict[str, np.ndarray], starts: np.ndarray, metas: tuple[dict, ...]) -> str:

@@ -22,14 +22,14 @@ from csph.networks.model import DepthModel
 from csph.networks.published import DeepBoosting, parameters_of
 from csph.training.config import NETWORKS, ModelConfig, preset
 from csph.training.loss import kl_divergence
-from csph.training.views import packed_views, split_views
+from csph.training.views import split_views
 from render.backend.malloc import retain_freed_memory
 from scene2spad.datasets.planes import random_planes
 from scene2spad.options.experiments import Bench
 from scenes.errors import require
 from scenes.files import write_csv
 from scenes.progress import Progress
-from spad.detection.training_patches import sense_patches
+from spad.detection.training_patches import pack_views, sense_patches
 
 PATCH = (1, 1, 1024, 32, 32)  # what multiply-accumulates are counted for
 FRAME = (1, 1, 1024, 72, 88)  # a published test frame
@@ -139,7 +139,7 @@ def train_for(model: DepthModel, limit_s: float, seed: int) -> tuple[int, float,
     """Return steps, seconds and final error [mm] of training on random planes until the time is up, at least one
     step."""
     training, rest = split_views(random_planes(SCENES, size=VIEW_PIXELS, seed=seed))
-    packed, sensor = packed_views(training), model.config.sensor
+    packed, sensor = pack_views(training.transients), model.config.sensor
     config = preset(PRESET, model.config, seed=seed)
     adam = torch.optim.Adam(model.parameters(), lr=config.rate, fused=True)
     from csph.training.data import Samples  # and Lightning, which takes seconds to import

@@ -24,7 +24,7 @@ from scenes.progress import Progress
 from spad.detection.detect import sense, sense_timestamps
 from spad.detection.flux import expected_counts, rates_for
 from spad.detection.laws import first_photon_counts
-from spad.detection.training_patches import Patch, packed_transients, sense_patches
+from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 
@@ -157,7 +157,7 @@ def _with_cycles(cycles: int) -> Sensor:
 
 def training(seed: int, repeats: int) -> dict:
     """Return one batch: 4 patches of 32 x 32 x 1024 at two photon levels, from 64 x 64 transients in memory."""
-    packed = packed_transients([relief(64, 64)] * 4)
+    packed = pack_views([relief(64, 64)] * 4)
     sensor = sensor_by_name("reference")
     patches = [Patch(i, 8 * i, 30 - 8 * i, *PATCHES[i % 2], seed=(seed, i)) for i in range(4)]
     seconds = alternating({"batch": lambda: sense_patches(packed, sensor, patches, size=(32, 32))}, 3 * repeats)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from render.settings import FILTERED_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
-from scene2spad.datasets.set_folder import Done, Folder, file_name
+from scene2spad.datasets.set_folder import Done, SetFolder, file_name
 from scene2spad.datasets.workers import Run, check_workers, executor
 from scenes.errors import InputError, require
 from scenes.files import whole_file
@@ -279,7 +279,7 @@ def check_asked(job: Job, count: int, workers: int) -> None:
         require_memory(workers * MIN_PIXEL_BYTES * width * height, message)
 
 
-def _with_grid(job: Job, folder: Folder, run: Run, report: Progress) -> Job:
+def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
     """The job with as many rays for all views, by the errors of some of the first places', however many are asked."""
     from render.planning import rays_for_all
 
@@ -312,7 +312,7 @@ def make_set(
     files back, so that no file system need be shared. Returns numbers for the command line.
     """
     check_asked(job, count, workers)
-    folder = Folder(out, job.made())
+    folder = SetFolder(out, job.made())
     missing = count - sum(view < count for view in folder.records)
     todo = (view for view in range(count) if view not in folder.records)
     report = progress or (lambda what, fraction: None)

@@ -70,7 +70,7 @@ def _stands(folder: Path, record: dict) -> bool:
     return path.is_file() and path.stat().st_size == record.get("bytes")
 
 
-class Folder:
+class SetFolder:
     """A set's folder: what is there already, and where finished views go. `made` is all that decides their bytes."""
 
     def __init__(self, path: Path, made: dict) -> None:

@@ -21,7 +21,7 @@ from scenes.errors import require
 from scenes.random_streams import Stream
 from spad.detection.flux import background_scales
 from spad.detection.photons import paths_in_bins
-from spad.detection.training_patches import Batch, PackedTransients, Patch
+from spad.detection.training_patches import Batch, PackedViews, Patch
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, pulse_table
 from spad.sensor.tdc import rising_edges
@@ -44,7 +44,7 @@ class DevicePatches:
     Positions are in float32: 6e-5 of a bin at bin 1,024.
     """
 
-    def __init__(self, packed: PackedTransients, sensor: Sensor, device: str | torch.device) -> None:
+    def __init__(self, packed: PackedViews, sensor: Sensor, device: str | torch.device) -> None:
         self.sensor, self.device, self.shape = sensor, torch.device(device), packed.depth_m.shape
         start, length = paths_in_bins(packed.path_near_m, packed.path_far_m, sensor)
         self.offsets = torch.from_numpy(packed.offsets).to(self.device)

@@ -1,6 +1,6 @@
 """Fresh detections for training, from transients in memory: photon level, crop and noise drawn anew for every patch.
 
-    packed = packed_transients(transients)                          # once; a read pack file serves as `transients`
+    packed = pack_views(transients)                          # once; a read pack file serves as `transients`
     batch = sense_patches(packed, sensor, requests, size=(32, 32))  # every step
     batch.counts                                                    # (B, 1, T, h, w) float32, for the network
 
@@ -30,8 +30,8 @@ from spad.sensor.tdc import time_codes
 
 
 @dataclass(frozen=True, eq=False)
-class PackedTransients:
-    """Transients of one size, one after the other, as a pack file holds them (numpy, read only).
+class PackedViews:
+    """Views of one size, one after the other, as a pack file holds them (numpy, read only).
 
     offsets       (S*H*W + 1,) int64: pixel p = (s H + i) W + j has the returns [offsets[p], offsets[p + 1])
     path_near_m, path_far_m, radiance   (N,) float32, as in `Transient`
@@ -57,7 +57,7 @@ class PackedTransients:
         good = good and self.offsets.shape == (self.depth_m.size + 1,) and int(self.offsets[-1]) == returns
         if not (good and len(self.path_near_m) == len(self.path_far_m) == returns):
             raise InputError(
-                f"packed transients: layers {shape}, {self.ambient.shape}, {self.mixed.shape}, {self.offsets.shape} "
+                f"packed views: layers {shape}, {self.ambient.shape}, {self.mixed.shape}, {self.offsets.shape} "
                 f"offsets and {returns} returns do not belong together"
             )
         sums = np.add.reduceat(np.append(self.radiance, 0), self.offsets[:: shape[1] * shape[2]][:-1], dtype=np.float64)
@@ -71,7 +71,7 @@ class PackedTransients:
         return self.depth_m.shape[0]
 
 
-def packed_transients(transients: Iterable[Transient]) -> PackedTransients:
+def pack_views(transients: Iterable[Transient]) -> PackedViews:
     """Return transients of one size in one; InputError for none, or of different sizes."""
     transients = list(transients)
     sizes = {(transient.height, transient.width) for transient in transients}
@@ -87,10 +87,10 @@ def packed_transients(transients: Iterable[Transient]) -> PackedTransients:
         name: np.stack([getattr(transient, name) for transient in transients])
         for name in ("depth_m", "ambient", "mixed")
     }
-    return PackedTransients(np.concatenate([*offsets, starts[-1:]]), **columns, **layers)
+    return PackedViews(np.concatenate([*offsets, starts[-1:]]), **columns, **layers)
 
 
-def joined(packs: Sequence[PackedTransients]) -> PackedTransients:
+def joined(packs: Sequence[PackedViews]) -> PackedViews:
     """Return several packed sets in one, scene after scene; InputError for none, or views of different sizes."""
     sizes = {packed.depth_m.shape[1:] for packed in packs}
     if len(sizes) != 1:
@@ -99,7 +99,7 @@ def joined(packs: Sequence[PackedTransients]) -> PackedTransients:
     offsets = [packed.offsets[:-1] + first for packed, first in zip(packs, firsts[:-1], strict=True)]
     layers = ("path_near_m", "path_far_m", "radiance", "depth_m", "ambient", "mixed")
     columns = {name: np.concatenate([getattr(packed, name) for packed in packs]) for name in layers}
-    return PackedTransients(np.concatenate([*offsets, firsts[-1:]]), **columns)
+    return PackedViews(np.concatenate([*offsets, firsts[-1:]]), **columns)
 
 
 class Patch(NamedTuple):
@@ -124,7 +124,7 @@ class Batch(NamedTuple):
 
 
 def sense_patches(
-    packed: PackedTransients,
+    packed: PackedViews,
     sensor: Sensor,
     patches: Sequence[Patch],
     *,
@@ -189,7 +189,7 @@ def _count(events: PhotonEvents, counts: Tensor) -> None:
     np.copyto(counts.numpy(), narrow)
 
 
-def _light_of_patch(packed: PackedTransients, sensor: Sensor, patch: Patch, height: int, width: int) -> PixelFlux:
+def _light_of_patch(packed: PackedViews, sensor: Sensor, patch: Patch, height: int, width: int) -> PixelFlux:
     scenes, rows, columns = packed.depth_m.shape
     inside = 0 <= patch.scene < scenes and 0 <= patch.row <= rows - height and 0 <= patch.column <= columns - width
     if not inside:

@@ -20,9 +20,10 @@ from csph.training.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
 from csph.training.loop import DepthTraining, NetworkOf, train
 from csph.training.loss import decoded_error
 from csph.training.schedule import rate_factor
-from csph.training.views import packed_views, split_views
+from csph.training.views import split_views
 from scene2spad.datasets.planes import random_planes
 from scenes import InputError
+from spad.detection.training_patches import pack_views
 from spad.sensor.model import Sensor
 
 CODED = ModelConfig(design=Design("learned", (256, 2, 2), 8))
@@ -90,7 +91,7 @@ def test_windows_are_left_out_where_they_would_lie():
 )
 def test_a_window_is_a_cut_of_the_whole(model):
     """What the network sees of a window is that part of what it sees of all bins, and its labels move with it."""
-    packs = [packed_views(random_planes(2, size=16, seed=5))]
+    packs = [pack_views(random_planes(2, size=16, seed=5).transients)]
     config = preset("smoke", model)
     batch = _sensed(packs, model.sensor, (8, 8), 512, [Samples(packs, config, 0)[i] for i in range(4)])
     start = batch.first_bin
@@ -108,7 +109,7 @@ def test_a_window_is_a_cut_of_the_whole(model):
 
 
 def test_the_last_tenth_is_at_full_length():
-    packs = [packed_views(random_planes(3, size=16, seed=5))]
+    packs = [pack_views(random_planes(3, size=16, seed=5).transients)]
     data = SetData(packs, packs, preset("smoke", CODED, epochs=10, steps_per_epoch=1))
 
     class At:
@@ -122,7 +123,10 @@ def test_the_last_tenth_is_at_full_length():
 
 def test_sets_are_mixed_by_their_weights():
     """Of different sizes; a batch keeps the order of its samples."""
-    packs = [packed_views(random_planes(3, size=16, seed=1)), packed_views(random_planes(2, size=24, seed=2))]
+    packs = [
+        pack_views(random_planes(3, size=16, seed=1).transients),
+        pack_views(random_planes(2, size=24, seed=2).transients),
+    ]
     config = preset("smoke", CODED, weights=(1.0, 3.0), steps_per_epoch=1000)
     samples = Samples(packs, config, 0)
     second = np.array([samples[i].source for i in range(2000)])
@@ -220,7 +224,7 @@ def test_training_senses_on_the_device_when_asked(tmp_path):
         train(config, training, validation, tmp_path / name)
     one, two = (load_model(tmp_path / name)[0] for name in ("one", "two"))
     assert weights_sha256(one) == weights_sha256(two)
-    packs = [packed_views(views) for views in training]
+    packs = [pack_views(views.transients) for views in training]
     window = 512 if config.model.sensor.bins > 512 else 0
     requests = [Samples(packs, config, 0)[i] for i in range(4)]
     here = DeviceSensing(packs, config, torch.device("cpu")).sense(Requests(tuple(requests), window))
@@ -233,7 +237,7 @@ def test_training_senses_on_the_device_when_asked(tmp_path):
 
 def test_the_published_grid_puts_one_return_where_print_has_it():
     sensor = Sensor()
-    packed = packed_views(random_planes(2, size=16, seed=3))
+    packed = pack_views(random_planes(2, size=16, seed=3).transients)
     grid = on_published_grid(packed, sensor)
     known = np.isfinite(packed.depth_m) & (packed.depth_m < sensor.range_m)
     fullest = np.rint(packed.depth_m[known] / sensor.bin_depth_m) - 1

@@ -19,11 +19,12 @@ from csph.training.config import PUBLISHED_TV, ModelConfig, TrainConfig, preset
 from csph.training.data import Frames, Samples, SetData
 from csph.training.loop import Hardware, train
 from csph.training.loss import kl_divergence, pulse_target, total_variation
-from csph.training.views import Views, packed_views, split_views
+from csph.training.views import Views, split_views
 from scene2spad.datasets.planes import random_planes
 from scenes import Camera, InputError
 from scenes.files import ATTRIBUTE
 from spad.detection.detect import sense
+from spad.detection.training_patches import pack_views
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 from spad.sensor.pulse import Pulse
 from spad.sensor.template import binned_pulse
@@ -105,7 +106,7 @@ def test_total_variation_by_hand():
 
 
 def test_samples_depend_on_their_key_alone():
-    packed = [packed_views(near_planes(4))]
+    packed = [pack_views(near_planes(4).transients)]
     config = preset("smoke", MODEL, **FEW, levels="paper")
     first, again, later = (Samples(packed, config, epoch) for epoch in (0, 0, 1))
     assert [first[i] for i in range(6)] == [again[i] for i in range(6)] != [later[i] for i in range(6)]
@@ -118,7 +119,7 @@ def test_samples_depend_on_their_key_alone():
 
 
 def test_validation_frames_are_whole_and_spread():
-    packed = packed_views(near_planes(5))
+    packed = pack_views(near_planes(5).transients)
     frames = Frames(packed, preset("smoke", MODEL, **{**FEW, "validation_views": 45}))
     requests = [frames[i] for i in range(45)]
     assert frames.size == (16, 16) and {r.patch.scene for r in requests} == set(range(5))

@@ -6,7 +6,7 @@ import os
 import pytest
 
 from scene2spad.cli import main
-from scene2spad.datasets.set_folder import Done, Folder, file_name
+from scene2spad.datasets.set_folder import Done, SetFolder, file_name
 from scene2spad.studies.results import Store
 from scenes.errors import InputError
 
@@ -21,30 +21,30 @@ def record(view: int) -> dict:
 @pytest.mark.parametrize("junk", [b"\xff\xfe", b"{", DEEP, b'{"view": 1e400}\n', b'{"view": [], "file": {}}\n'])
 @pytest.mark.parametrize("name", ["journal.jsonl", "index.jsonl"])
 def test_damaged_lines_of_a_journal_cost_their_view_alone(tmp_path, name, junk):
-    folder = Folder(tmp_path, MADE)
+    folder = SetFolder(tmp_path, MADE)
     for view in range(3):
         folder.add(Done(record(view), b"exr", 0.1, "here"))
     lines = (tmp_path / "journal.jsonl").read_bytes().splitlines(keepends=True)
     (tmp_path / "journal.jsonl").unlink()
     (tmp_path / name).write_bytes(lines[0] + junk.rstrip(b"\n") + b"\n" + lines[2])
-    assert sorted(Folder(tmp_path, MADE).records) == [0, 2]
+    assert sorted(SetFolder(tmp_path, MADE).records) == [0, 2]
 
 
 def test_a_journal_vouches_for_no_file_elsewhere(tmp_path):
     (tmp_path / "out.exr").write_bytes(b"exr")
-    Folder(tmp_path / "set", MADE)
+    SetFolder(tmp_path / "set", MADE)
     stolen = [record(0) | {"file": "../out.exr"}, record(1) | {"file": None}, record(2) | {"error": None}]
     (tmp_path / "set" / "views" / "000002.exr").write_bytes(b"exr")
     (tmp_path / "set" / "journal.jsonl").write_text("".join(json.dumps(one) + "\n" for one in stolen))
-    assert Folder(tmp_path / "set", MADE).records == {}
+    assert SetFolder(tmp_path / "set", MADE).records == {}
 
 
 @pytest.mark.parametrize("junk", [b"\xff\xfe", b"", DEEP])
 def test_a_damaged_set_json_is_refused(tmp_path, junk):
-    Folder(tmp_path, MADE)
+    SetFolder(tmp_path, MADE)
     (tmp_path / "set.json").write_bytes(junk)
     with pytest.raises(InputError):
-        Folder(tmp_path, MADE)
+        SetFolder(tmp_path, MADE)
 
 
 def test_damaged_lines_of_a_store_are_passed_over(tmp_path):

@@ -21,7 +21,7 @@ from render.transient.packs import PATH_STEP_M, read_pack
 from scene2spad.cli import main
 from scene2spad.datasets import rendering as dataset
 from scene2spad.datasets.rendering import Job, make_set, pack_set, render_view
-from scene2spad.datasets.set_folder import Folder
+from scene2spad.datasets.set_folder import SetFolder
 from scene2spad.datasets.workers import executor
 from scenes import InputError
 from scenes.io.set_index import read_set_index
@@ -77,7 +77,7 @@ def test_a_set_has_its_files_and_an_index_in_order(whole):
 def test_a_run_stopped_anywhere_and_resumed_gives_the_same_bytes(whole, tmp_path):
     """Stopped after some views, with a cut line in the journal, a stray half file and a missing one."""
     out = tmp_path / "set"
-    folder = Folder(out, CLI_JOB.made())
+    folder = SetFolder(out, CLI_JOB.made())
     for view in (5, 0, 3):
         folder.add(render_view(CLI_JOB, view))
     with (out / "journal.jsonl").open("a") as file:

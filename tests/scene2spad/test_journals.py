@@ -18,7 +18,7 @@ from csph.training.loop import _claim
 from csph.weights.shipped import cpu_minutes
 from render.transient.packs import read_pack, write_pack
 from scene2spad.datasets.planes import random_planes
-from scene2spad.datasets.set_folder import Done, Folder, file_name
+from scene2spad.datasets.set_folder import Done, SetFolder, file_name
 from scene2spad.studies.results import Store
 from scenes import InputError
 from scenes.files import append_line, is_unclaimed, whole_file
@@ -58,7 +58,7 @@ def test_a_journal_cut_at_any_byte_of_its_last_line_loses_that_entry_alone(tmp_p
 
 def test_a_set_goes_on_from_a_journal_cut_at_any_byte(tmp_path):
     done = [Done({"view": i, "file": file_name(i), "bytes": 4, "error": 0.1}, b"view", 0.5, "here/1") for i in range(3)]
-    whole = Folder(tmp_path / "whole", MADE)
+    whole = SetFolder(tmp_path / "whole", MADE)
     for one in done:
         whole.add(one)
     journal = (tmp_path / "whole/journal.jsonl").read_bytes()
@@ -67,11 +67,11 @@ def test_a_set_goes_on_from_a_journal_cut_at_any_byte(tmp_path):
     for kept in range(len(journal) - start):
         path = tmp_path / f"cut {kept}"
         for one in done:
-            Folder(path, MADE).add(one)
+            SetFolder(path, MADE).add(one)
         for name in ("journal.jsonl", "timings.jsonl"):
             data = (path / name).read_bytes()
             (path / name).write_bytes(data[: start + kept] if name == "journal.jsonl" else data[: -(kept % 20) or None])
-        folder = Folder(path, MADE)
+        folder = SetFolder(path, MADE)
         assert {0, 1} <= set(folder.records)
         if 2 not in folder.records:
             folder.add(done[2])
@@ -119,7 +119,7 @@ def test_temporary_files_of_ended_processes_are_removed_and_those_of_others_stay
 def test_a_folder_that_was_killed_while_it_was_begun_is_begun_again(tmp_path):
     config = TrainConfig(model=ModelConfig(design=Design()))
     for claim, name in (
-        (lambda path: Folder(path, MADE), "set.json"),
+        (lambda path: SetFolder(path, MADE), "set.json"),
         (lambda path: _claim(path, config), "config.json"),
     ):
         path = tmp_path / name

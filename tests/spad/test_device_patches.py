@@ -10,7 +10,7 @@ from scipy import stats
 from scenes.errors import InputError
 from spad.detection.device_patches import DevicePatches
 from spad.detection.flux import expected_counts, rates_for
-from spad.detection.training_patches import Patch, joined, packed_transients, sense_patches
+from spad.detection.training_patches import Patch, joined, pack_views, sense_patches
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
@@ -42,7 +42,7 @@ def scenes(count: int = 3, height: int = 12, width: int = 10) -> list:
 def test_counts_follow_the_full_frames_rates(sensor: Sensor) -> None:
     """Means and dispersion of 1500 draws of a crop, against the expected counts of the whole scene."""
     transients = scenes()
-    resident = DevicePatches(packed_transients(transients), sensor, "cpu")
+    resident = DevicePatches(pack_views(transients), sensor, "cpu")
     counts = resident.sense([Patch(1, 3, 4, 6.0, 4.0, seed=0)] * 1500, size=(4, 5), seed=9).counts
     assert counts.shape == (1500, 1, 128, 4, 5) and counts.dtype == torch.float32
     rates = rates_for(transients[1], sensor, PhotonBudget(6, 4))
@@ -57,7 +57,7 @@ def test_counts_follow_the_full_frames_rates(sensor: Sensor) -> None:
 
 
 def test_labels_masks_and_offsets_are_the_plain_twins() -> None:
-    packed = packed_transients(scenes())
+    packed = pack_views(scenes())
     patches = [Patch(2, 1, 2, 5, 5, 0, 0.3), Patch(0, 4, 1, 5, 5, 1)]
     mine = DevicePatches(packed, SENSOR, "cpu").sense(patches, size=(6, 7), seed=0)
     plain = sense_patches(packed, SENSOR, patches, size=(6, 7))
@@ -66,7 +66,7 @@ def test_labels_masks_and_offsets_are_the_plain_twins() -> None:
 
 
 def test_one_seed_gives_one_batch() -> None:
-    resident = DevicePatches(packed_transients(scenes()), SENSOR, "cpu")
+    resident = DevicePatches(pack_views(scenes()), SENSOR, "cpu")
     patches = [Patch(1, 0, 0, 20, 10, 0)] * 2
     first, again, other = (resident.sense(patches, size=(5, 5), seed=seed).counts for seed in ((1, 2), (1, 2), (1, 3)))
     assert torch.equal(first, again) and not torch.equal(first, other)
@@ -74,22 +74,22 @@ def test_one_seed_gives_one_batch() -> None:
 
 
 def test_joined_sets_keep_their_scenes() -> None:
-    first, second = packed_transients(scenes(2)), packed_transients(scenes(3)[2:])
+    first, second = pack_views(scenes(2)), pack_views(scenes(3)[2:])
     both = joined([first, second])
     assert both.scenes == 3 and np.array_equal(both.depth_m[2], second.depth_m[0], equal_nan=True)
     patch = Patch(0, 0, 0, 20, 3, seed=4)
     alone = sense_patches(second, SENSOR, [patch], size=(12, 10)).counts
     assert torch.equal(sense_patches(both, SENSOR, [patch._replace(scene=2)], size=(12, 10)).counts, alone)
     with pytest.raises(InputError, match="cannot be joined"):
-        joined([first, packed_transients(scenes(1, height=8))])
+        joined([first, pack_views(scenes(1, height=8))])
 
 
 def test_refusals_name_the_patch_and_the_scene() -> None:
     transients = scenes()
-    resident = DevicePatches(packed_transients(transients), SENSOR, "cpu")
+    resident = DevicePatches(pack_views(transients), SENSOR, "cpu")
     with pytest.raises(InputError, match="patch of 4 x 4 at scene 0, row 9, column 0 is outside 3 scenes of 12 x 10"):
         resident.sense([Patch(0, 9, 0, 1, 1, 0)], size=(4, 4), seed=0)
-    packed = packed_transients(transients)
+    packed = pack_views(transients)
     dark = replace(packed, radiance=np.zeros_like(packed.radiance))
     with pytest.raises(InputError, match="scene 1: no light returns, 3 signal photons cannot be had"):
         DevicePatches(dark, SENSOR, "cpu").sense([Patch(1, 0, 0, 3, 1, 0)], size=(4, 4), seed=0)

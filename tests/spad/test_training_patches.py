@@ -9,7 +9,7 @@ from scipy import stats
 
 from scenes.errors import InputError
 from spad.detection.flux import expected_counts, rates_for
-from spad.detection.training_patches import Patch, packed_transients, sense_patches
+from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor
 
@@ -30,7 +30,7 @@ def scenes(count: int = 3, height: int = 12, width: int = 10) -> list:
 def test_counts_follow_the_full_frames_rates() -> None:
     """Means and dispersion of 1500 draws of a crop, against the expected counts of the whole scene."""
     transients = scenes()
-    packed = packed_transients(transients)
+    packed = pack_views(transients)
     patches = [Patch(1, 3, 4, 6.0, 4.0, seed=(9, i)) for i in range(1500)]
     counts = sense_patches(packed, SENSOR, patches, size=(4, 5)).counts
     assert counts.shape == (1500, 1, 128, 4, 5) and counts.dtype == torch.float32
@@ -47,7 +47,7 @@ def test_counts_follow_the_full_frames_rates() -> None:
 
 def test_labels_and_masks_are_the_crops() -> None:
     transients = scenes()
-    batch = sense_patches(packed_transients(iter(transients)), SENSOR, [Patch(2, 1, 2, 5, 5, 0)], size=(6, 7))
+    batch = sense_patches(pack_views(iter(transients)), SENSOR, [Patch(2, 1, 2, 5, 5, 0)], size=(6, 7))
     depth = transients[2].depth_m[1:7, 2:9]
     assert np.array_equal(batch.depth_m[0].numpy(), depth, equal_nan=True)
     assert np.array_equal(batch.mixed[0].numpy(), transients[2].mixed[1:7, 2:9])
@@ -55,7 +55,7 @@ def test_labels_and_masks_are_the_crops() -> None:
 
 
 def test_the_seed_decides_and_nothing_else() -> None:
-    packed = packed_transients(scenes())
+    packed = pack_views(scenes())
     patches = [Patch(i % 3, i % 5, i % 4, 20, 10, seed=(1, i)) for i in range(8)]
     threads = torch.get_num_threads()
     try:
@@ -71,7 +71,7 @@ def test_the_seed_decides_and_nothing_else() -> None:
 
 
 def test_time_offset_moves_counts_and_label_only_when_asked() -> None:
-    packed = packed_transients(scenes())
+    packed = pack_views(scenes())
     sensor = replace(SENSOR, bins=1024, period_s=None)
     offset = 300 * sensor.bin_depth_m
     here, there = (
@@ -85,7 +85,7 @@ def test_time_offset_moves_counts_and_label_only_when_asked() -> None:
 @pytest.mark.parametrize("signal", [300.0, 40_000.0])
 def test_full_pixels_are_counted_in_wider_types(signal: float) -> None:
     """More detections a pixel than a byte and than 16 bits hold: the totals stay."""
-    packed = packed_transients(scenes())
+    packed = pack_views(scenes())
     counts = sense_patches(packed, SENSOR, [Patch(0, 0, 0, signal, 0.0, 6)], size=(12, 10)).counts
     expected = signal * 120
     assert abs(float(counts.sum(dtype=torch.float64)) - expected) < 4.5 * np.sqrt(expected)
@@ -93,21 +93,21 @@ def test_full_pixels_are_counted_in_wider_types(signal: float) -> None:
 
 
 def test_bad_patches_are_refused() -> None:
-    packed = packed_transients(scenes())
+    packed = pack_views(scenes())
     for patch in (Patch(3, 0, 0, 1, 1, 0), Patch(0, 9, 0, 1, 1, 0), Patch(0, 0, -1, 1, 1, 0)):
         with pytest.raises(InputError, match="outside"):
             sense_patches(packed, SENSOR, [patch], size=(4, 4))
     with pytest.raises(InputError, match="cannot be packed"):
-        packed_transients([scenes(1)[0], scenes(1, 4, 4)[0]])
+        pack_views([scenes(1)[0], scenes(1, 4, 4)[0]])
     dark = replace(scenes(1)[0], radiance=np.zeros_like(scenes(1)[0].radiance))
     with pytest.raises(InputError, match="no light"):
-        sense_patches(packed_transients([dark]), SENSOR, [Patch(0, 0, 0, 1, 1, 0)], size=(4, 4))
+        sense_patches(pack_views([dark]), SENSOR, [Patch(0, 0, 0, 1, 1, 0)], size=(4, 4))
     with pytest.raises(InputError, match="belong together"):
         replace(packed, ambient=packed.ambient[:1])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_a_gpu_gives_the_same_counts() -> None:
-    packed, patches = packed_transients(scenes()), [Patch(0, 1, 1, 30, 20, 4)]
+    packed, patches = pack_views(scenes()), [Patch(0, 1, 1, 30, 20, 4)]
     ours, theirs = (sense_patches(packed, SENSOR, patches, size=(8, 8), device=d).counts for d in ("cpu", "cuda"))
     assert torch.equal(ours, theirs.cpu())
