@@ -15,7 +15,7 @@ from scenes.errors import InputError
 from spad.detection.detect import expected_in_pixel, sense, sense_timestamps
 from spad.detection.device_patches import DevicePatches
 from spad.detection.flux import expected_counts, rates_for
-from spad.detection.training_patches import Patch, packed_transients, sense_patches
+from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.formats.histogram import read_histogram, write_histogram
 from spad.reference import arrivals, code_overlap, detect_free_running, detect_synchronous, time_bin
 from spad.sensor import tdc as converters
@@ -152,7 +152,7 @@ def test_crosstalk_happens_at_a_time_and_every_pixel_names_it_by_its_own_convert
 @pytest.mark.parametrize("on", ["host", "device"])
 def test_training_patches_pass_the_converters_of_their_pixels(on: str) -> None:
     transients, sensor = scenes(), SENSOR
-    packed, patches = packed_transients(transients), [Patch(1, 3, 4, 6.0, 4.0, seed=(9, i)) for i in range(1500)]
+    packed, patches = pack_views(transients), [Patch(1, 3, 4, 6.0, 4.0, seed=(9, i)) for i in range(1500)]
     if on == "host":
         counts = sense_patches(packed, sensor, patches, size=(4, 5)).counts
     else:
