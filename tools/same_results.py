@@ -57,7 +57,7 @@ RUNS: dict[str, tuple[str, ...]] = {
         " --decoder soft-argmax --out evaluated",
     ),
     "train": ("train --preset smoke --design learned --block 256 4 4 --compression 128 --threads 1 --out run",),
-    "ultraphase": ("ultraphase table", "ultraphase verify fourier"),
+    "ultraphase": ("ultraphase table", "ultraphase verify fourier-8"),
     "study tensors": ("study tensors --out tensors",),
     "study memory": ("study memory --out memory",),
     "study codes": ("study codes --width 16 --height 16 --out codes",),
