@@ -111,7 +111,7 @@ class DepthModel(nn.Module):
         whole = counts if self.layer is not None else self.seen(counts)
         firsts = first_bin.tolist()
         cut = torch.stack([one[:, first : first + window] for one, first in zip(whole, firsts, strict=True)])
-        return self.logits_of_codes(self.layer.encode(cut)) if self.layer is not None else self.network(cut)
+        return self(cut) if self.layer is not None else self.network(cut)
 
     def logits_of_codes(self, codes: Tensor) -> Tensor:
         """Return logits (B, T, R, C) of codes (B, K, T/Mt, R/Mr, C/Mc)."""
@@ -120,7 +120,7 @@ class DepthModel(nn.Module):
         return self.network(x, codes.to(x.dtype)) if isinstance(self.network, Blockwise) else self.network(x)
 
     def forward(self, counts: Tensor) -> Tensor:
-        if self.layer is not None:
+        if isinstance(self.network, Blockwise) and self.layer is not None:
             return self.logits_of_codes(self.layer.encode(counts))
         return self.network(self.seen(counts))
 

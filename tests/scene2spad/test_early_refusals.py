@@ -38,7 +38,7 @@ def test_absurd_sizes_are_refused_before_any_work(tmp_path, capsys, monkeypatch,
 
     monkeypatch.setenv(VARIABLE, "8")
     monkeypatch.setattr("scene2spad.networks.training.views_of", work)
-    monkeypatch.setattr("scene2spad.datasets.rendering.Folder", work)
+    monkeypatch.setattr("scene2spad.datasets.rendering.SetFolder", work)
     assert main([*argv, "--out", str(tmp_path / "out")]) == 2
     message = capsys.readouterr().err
     assert why in message and message.count("\n") == 1 and not (tmp_path / "out").exists()
