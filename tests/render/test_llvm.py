@@ -49,6 +49,7 @@ def test_ctrl_c_while_dr_jit_is_imported_waits_for_its_end():
     """Imported by half, Dr.Jit would abort the process (status -6)."""
     interrupting = """
 import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 class Interrupting:
     def find_spec(self, name, path, target=None):
         if name == "drjit.detail":
