@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scenes.errors import InputError
 from ultraphase import method
-from ultraphase.products import equal_blocks, photon_sums
+from ultraphase.products import _bytes_are_exact, equal_blocks, photon_sums
 from ultraphase.reference import add_photons
 from ultraphase.tables import block_matrix, coarse_matrix, fourier_matrix, int8_codes, wave_matrix
 
@@ -29,7 +30,9 @@ def test_sums_are_those_of_one_photon_after_the_other(name):
     table, random = TABLES[name], np.random.default_rng(2)
     histograms = random.poisson(0.3, (3, len(table))).astype(np.uint8)
     histograms[1, 7] = 127
-    assert photon_sums(histograms, table).tolist() == [add_photons(one, table) for one in histograms]
+    expected = [add_photons(one, table) for one in histograms]
+    for in_bytes in (True, False):  # bytes only where the processor has them
+        assert photon_sums(histograms, table, in_bytes=in_bytes).tolist() == expected
 
 
 @settings(deadline=None, derandomize=True, max_examples=10)
@@ -42,7 +45,8 @@ def test_every_type_and_brightness_is_exact(seed, name, high):
     bright = random.integers(0, len(histograms), 5)
     histograms[bright, random.integers(0, len(table), 5)] = random.integers(high // 2, high, 5)
     expected = histograms.astype(np.int64) @ table
-    assert np.array_equal(photon_sums(histograms, table), expected)
+    for in_bytes in (True, False):
+        assert np.array_equal(photon_sums(histograms, table, in_bytes=in_bytes), expected)
     assert np.array_equal(photon_sums(histograms[::2], table), expected[::2])  # not contiguous
     assert np.array_equal(photon_sums(np.asfortranarray(histograms), table), expected)
 
@@ -53,6 +57,23 @@ def test_structure_is_found_where_it_is_and_nowhere_else():
     spoilt[700, 0] += 1
     assert equal_blocks(spoilt) == 1
     assert np.array_equal(method("separable-8").matrix(BLOCK).T[:256, :8], BLOCK.T)
+
+
+def test_products_of_bytes_are_tried_before_they_are_used():
+    """The largest products there are, all of one sign: 16-bit sums of pairs would saturate. Equal with and without."""
+    counts, table = np.full((70, 1024), 127, np.uint8), np.full((1024, 16), 127)
+    table[:, 1::2] = -127
+    expected = counts.astype(np.int64) @ table
+    assert np.array_equal(photon_sums(counts, table), expected)
+    assert np.array_equal(photon_sums(counts + np.uint8(1), table), expected // 127 * 128)  # no byte any more
+    vnni = getattr(torch.cpu, "_is_vnni_supported", lambda: False)()
+    assert _bytes_are_exact() <= vnni
+
+
+def test_tables_beyond_bytes_and_32_bits_are_exact():
+    counts = np.full((3, 1 << 18), 127, np.uint8)
+    for table in (np.full((1 << 18, 2), 127), np.full((1 << 18, 2), 128), np.full((1 << 18, 2), -128)):
+        assert np.array_equal(photon_sums(counts, table), counts.astype(np.int64) @ table)
 
 
 def test_negative_counts_are_refused():
