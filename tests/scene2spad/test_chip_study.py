@@ -8,7 +8,7 @@ import pytest
 from csph.evaluation.metrics import PHOTON_LEVELS
 from scene2spad.cli import main
 from scene2spad.studies.chip.plan import MAIN, Plan
-from scene2spad.studies.chip.study import compared_rows
+from scene2spad.studies.chip.study import compared_rows, in_words
 from scene2spad.studies.power.front import LOST_LIMIT, loss_rows, lost, most_photons_per_s, printed_rows
 from scene2spad.studies.power.front import designs as designs_of
 from scene2spad.studies.power.front_figure import front
@@ -27,7 +27,9 @@ def test_models_are_compared_in_pairs():
     assert first["low"] < first["difference"] < first["high"] and (first["scenes"], first["levels"]) == (8, 16)
     assert second["difference"] == pytest.approx(0.03, abs=1e-6) and second["holds"] is False
     alone = {name: {"only": next(iter(v.values()))} for name, v in values.items()}
-    assert compared_rows("set", {"a": "a"}, alone)[0]["holds"] is None  # one scene has no interval
+    (single,) = compared_rows("set", {"a": "a"}, alone)
+    assert single["holds"] is None and "no interval: one scene" in in_words(single)
+    assert "nan" not in in_words(single) and " to +" in in_words(first)
 
 
 def test_the_plan_is_the_papers_levels_and_four_designs():

@@ -68,7 +68,7 @@ def run(command: Study, progress: Progress) -> dict:
     path = command.out / "chip.json"
     with whole_file(path) as beside:
         beside.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
-    shown = numbers if command.json else _in_words(numbers)
+    shown = numbers if command.json else _all_in_words(numbers)
     return {**shown, "csv": [str(each) for each in made], "numbers": str(path)}
 
 
@@ -164,12 +164,16 @@ def _interpreted(one: ModelSpec, chip: ChipDepth, test: TestSet, seed: int) -> d
     }
 
 
-def _in_words(numbers: dict[str, Any]) -> dict[str, Any]:
-    lines = []
-    for row in numbers["compared"]:
-        message = f"{row['float_mae_mm']:.1f} mm in float, {row['chip_mae_mm']:.1f} on the chip"
-        apart = f"{row['difference']:+.2%} ({row['low']:+.2%} to {row['high']:+.2%})"
-        lines.append(f"{row['set']}, {row['model'].rstrip(',')}: {message}, {apart}")
+def in_words(row: Mapping[str, Any]) -> str:
+    """Write a row of `compared_rows` as a line; one scene has no interval."""
+    message = f"{row['float_mae_mm']:.1f} mm in float, {row['chip_mae_mm']:.1f} on the chip"
+    known = np.isfinite(row["low"])
+    interval = f"{row['low']:+.2%} to {row['high']:+.2%}" if known else "no interval: one scene"
+    return f"{row['set']}, {row['model'].rstrip(',')}: {message}, {row['difference']:+.2%} ({interval})"
+
+
+def _all_in_words(numbers: dict[str, Any]) -> dict[str, Any]:
+    lines = [in_words(row) for row in numbers["compared"]]
     emulated = [
         f"{row['model']}: {row['photons']:,} photons interpreted, {row['wraps']} wraps, {row['differs_from_torch']} "
         f"integers differ from torch, {row['differs_from_fast']} from the fast array"
