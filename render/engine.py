@@ -19,7 +19,6 @@ from render.error import (
     estimate,
     is_met,
     noise_of_responses,
-    noise_power,
     response,
     target_verdict,
     worst_fraction_of,
@@ -233,12 +232,9 @@ def _estimated(
         changes.append(response(concatenate([merged, kept._replace(radiance=-kept.radiance)]), place))
     merging = (changes[0] * changes[1]).sum(axis=1)
     bias: np.ndarray | float = 0.0
-    if traced.indirect.unfiltered is None:
-        indirect = response(seen.samples(), place)
-        noise = noise_power(seen.radiance, seen.cells.width_of_m)
-    else:
-        batches = [response(seen.samples(slice(b, b + 1)), place) for b in range(seen.radiance.shape[1])]
-        indirect, noise = np.mean(batches, axis=0), noise_of_responses(batches)
+    batches = [response(seen.samples(slice(b, b + 1)), place) for b in range(seen.radiance.shape[1])]
+    indirect, noise = np.mean(batches, axis=0), noise_of_responses(batches)
+    if traced.indirect.unfiltered is not None:
         bias = _filter_bias(batches, traced.indirect.unfiltered, place)
     # few pixels hold the rare bright paths: the noise of all pixels' totals says how typical the checked ones are
     variance = traced.indirect.noise**2

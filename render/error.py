@@ -168,26 +168,11 @@ def target_verdict(error: ErrorEstimate, target: float, pixels: int) -> str:
     return message
 
 
-def noise_power(batches: np.ndarray, width_m: np.ndarray) -> np.ndarray:
-    """Return expected squared error of the mean of independent batches after the pulse, per pixel.
-
-    batches (pixels, batches, cells) radiance; cells of width w. A cell's variance of the mean is
-    sum_b (r_b - mean)^2 / (n (n - 1)); spread over the cell and the pulse, a Gaussian of variance
-    s^2 = sigma^2 + w^2 / 12, an energy has the squared sum bin / (2 sqrt(pi) s) over bins. The cells' errors are taken
-    as uncorrelated, as those of different paths are.
-    """
-    count = batches.shape[1]
-    if count < 2:
-        return np.zeros(len(batches))
-    variance = batches.var(axis=1, ddof=1) / count
-    sigma = np.sqrt(SIGMA_M**2 + width_m**2 / 12)
-    return variance @ (BIN_M / (2 * math.sqrt(math.pi) * sigma))
-
-
 def noise_of_responses(responses: list[np.ndarray]) -> np.ndarray:
     """Return expected squared error of the mean of independent batches, per pixel, from each one's response.
 
-    Takes what cells have in common into account, as `noise_power` does not: filtered light spreads over some.
+    Takes what bins have in common into account: filtered light spreads over some, and errors of a low-discrepancy set
+    cancel between some.
     """
     if len(responses) < 2:
         return np.zeros(len(responses[0]))

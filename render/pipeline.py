@@ -24,7 +24,7 @@ from render.indirect.light_vertices import is_wide
 from render.indirect.path_space_filter import Octaves, octaves
 from render.indirect.schedule import Schedule, allocate, pilot_noise, uniform
 from render.scene.traced_scene import TracedScene
-from render.settings import BATCHES, FILTERED_BATCHES, Plan, RenderSettings
+from render.settings import BATCHES, FILTERED_BATCHES, MIN_SPP, Plan, RenderSettings
 from render.specular.image_method import specular_light
 from render.transient.samples import SampleBuffer, Samples, concatenate, no_samples, select
 from scenes.progress import Progress
@@ -210,13 +210,13 @@ def _allocated(
         if plan.adaptive and spp >= FIRST_FILTERED_SPP and not is_wide(world):
             from_m = float(filter_octaves.from_m[0])
             noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT), from_m, clamp)
-            schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES)
+            schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES, min_spp=FILTERED_BATCHES)
         least, most = schedule.spp.min(), schedule.spp.max()
         least_m, most_m = filter_octaves.size_m[0], filter_octaves.size_m[-1]
         message = f"indirect light: filtered, later than {filter_octaves.from_m[0]:.2g} m behind direct light, over "
         message += f"regions of surfaces {least_m:.2g} to {most_m:.2g} m wide; {least} to {most} paths a pixel"
         return schedule._replace(filter_octaves=filter_octaves), (message,)
-    if plan.spp is not None and (not plan.adaptive or plan.spp < BATCHES):
+    if plan.spp is not None and (not plan.adaptive or plan.spp < MIN_SPP):
         rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
         return uniform(blocks, rounds, reuses_paths=False), ()
     own, reused = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT), clamp=clamp)

@@ -11,7 +11,7 @@ from render.direct.integrator import default_edge_threshold, direct_light
 from render.error import PULSE_POWER, error_for_budget, error_of_background, estimate, response
 from render.indirect.camera_paths import energy_by_bounces
 from render.scene.traced_scene import TracedScene
-from render.settings import BATCHES, GRIDS, MAX_BOUNCES, Plan, RenderSettings
+from render.settings import GRIDS, MAX_BOUNCES, MIN_SPP, Plan, RenderSettings
 from render.transient.samples import select_pixels
 from scenes.errors import InputError
 from scenes.model import Material
@@ -263,11 +263,11 @@ def _indirect(
         why = "indirect light: left out, also of the error, under a scanning laser unless bounces ask for it"
         return 1, 0, 0.0, [why]
     most = PILOT_BOUNCES if settings.bounces is None else settings.bounces
-    energy, noise = energy_by_bounces(world, pixels, BATCHES, most, seed)
+    energy, noise = energy_by_bounces(world, pixels, MIN_SPP, most, seed)
     assert fine is not None
     energy[1] = fine.sum()
     if energy.sum() <= 0:
-        return settings.bounces or 1, settings.spp or BATCHES, 0.0, ["indirect light: nothing is lit"]
+        return settings.bounces or 1, settings.spp or MIN_SPP, 0.0, ["indirect light: nothing is lit"]
     lines = []
     bounces = settings.bounces
     if bounces is None:

@@ -13,7 +13,10 @@ MAX_BOUNCES = 63
 # of some 120 bytes each when it is written.
 MIN_PIXEL_BYTES = 170 + 4 * 120
 MAX_SAMPLES = 1 << 26
-BATCHES = 16  # independent batches of indirect light, whose spread is the error estimate
+# Independent batches of indirect light, whose spread is the error estimate. Low-discrepancy sets run within a batch:
+# fewer batches mean longer sets and less noise.
+BATCHES = 4
+MIN_SPP = 16  # paths a pixel of the darkest block, since pilots are short; fewer are traced only where forced
 FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
 MAX_AMBIENT_SPP = 1 << 12

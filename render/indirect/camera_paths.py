@@ -131,10 +131,12 @@ def _paths(
     lane_key = mi.sample_tea_32(stream * BLOCK + member, sample_index ^ keys[1])
     random = mi.PCG32(initstate=mi.UInt64(lane_key[0]), initseq=mi.UInt64(lane_key[1]))
     if reuses_paths:
-        # one random shift a block and sample index; the members share a low-discrepancy set of first directions, and
-        # their light vertices: rays to these are neighbours
-        shift = mi.sample_tea_32(stream, sample_index ^ keys[0])
-        spread: Array = [Float((s + member * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
+        # one random shift a block and batch of an additive recurrence that goes on from sample to sample: first
+        # directions of all members and samples are one low-discrepancy set. The members share their light vertices:
+        # rays to these are neighbours
+        shift = mi.sample_tea_32(stream, batch ^ keys[0])
+        number = member + BLOCK * (sample_index // given.batches)
+        spread: Array = [Float((s + number * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
         first = mi.sample_tea_32(stream, sample_index ^ keys[1])[0]
     else:
         # one randomised (0, 2)-sequence a block and batch (Sobol 1967): the samples of each member are an aligned run

@@ -11,7 +11,7 @@ from render.indirect.launch_layout import BLOCK, make_launch
 from render.indirect.path_space_filter import GATHER_POINTS, Octaves
 from render.indirect.reuse import CONNECTIONS_PER_LAUNCH, noise_of_filtered_paths, noise_of_paths
 from render.scene.traced_scene import TracedScene
-from render.settings import BATCHES, FILTERED_BATCHES
+from render.settings import BATCHES, FILTERED_BATCHES, MIN_SPP
 
 # Seconds of one path with its suffix in units of one connection, on 2 cores. Which blocks reuse paths depends on it.
 PATH_COST = 9.0
@@ -106,22 +106,23 @@ def allocate(
     cost: float = np.inf,
     squared_error: float = 0.0,
     batches: int = BATCHES,
+    min_spp: int = MIN_SPP,
 ) -> Schedule:
     """Allocate work where it lowers the summed squared error most, until the error is met or `cost` paths a pixel
     spent.
 
     R samples with noise N and work c add N / R to the error and R c to the work, in one block and one way (own paths or
-    reused ones); N / R + L R c is least at R = sqrt(N / (L c)), at least `batches` (Neyman 1934). L comes by bisection.
+    reused ones); N / R + L R c is least at R = sqrt(N / (L c)), at least `min_spp` (Neyman 1934). L comes by bisection.
     A block's noise is at least 2 % of the mean, since a short pilot sees no rare path.
     """
     noise = np.stack((own,) if reused is None else (own, reused))
     each = np.array((1.0, 1 + BLOCK / PATH_COST))[: len(noise), None]
     least = noise.min(axis=0).mean()
     noise = np.maximum(noise, 0.02 * least) if least > 0 else np.ones_like(noise)
-    most = max(batches, 256 * cost) if np.isfinite(cost) else np.inf
+    most = max(min_spp, 256 * cost) if np.isfinite(cost) else np.inf
 
     def spent(price: float) -> tuple[np.ndarray, np.ndarray]:
-        spp = np.clip(np.sqrt(noise / (price * each)), batches, most)
+        spp = np.clip(np.sqrt(noise / (price * each)), min_spp, most)
         spp = np.ceil(spp / batches) * batches
         best = np.argmin(noise / spp + price * spp * each, axis=0)
         return best, np.take_along_axis(spp, best[None], 0)[0]

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from render.engine import render
+from render.error import response
+from render.indirect.integrator import IndirectTask, indirect_light, path_grid
+from render.indirect.launch_layout import block_order
+from render.indirect.schedule import uniform
+from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
 from render.transient import Transient
+from render.transient.samples import SampleBuffer, Samples
 from scene2spad.bench.hard import oracles
 from scenes import Ambient, Camera, Laser, Material, Scene, Surface, Texture
 from scenes.library.things.shapes import box, sphere
@@ -86,6 +92,45 @@ def test_first_interreflection_of_a_groove():
     got = np.histogram(centre, bins=edges, weights=transient.radiance[second])[0] / (16 * 12)
     assert abs(got.sum() / expected.sum() - 1) < 5e-3
     assert np.linalg.norm(got - expected) / np.linalg.norm(expected) < 1e-2
+
+
+@pytest.mark.slow
+def test_more_paths_of_a_block_are_one_low_discrepancy_set():
+    """Sixteen times the paths of blocks that share lower the squared error more than 16 times, and do not move the
+    mean. (15 times where every sample has a set of its own.)"""
+    world, pixels = TracedScene(oracles.groove_scene(16, 12, albedo=0.6)), np.arange(16 * 12)
+    blocks, grid = block_order(pixels, 16), path_grid(world, np.full(16 * 12, 5.0), 1.0, 2, 0.01, 0.0)
+    found = []
+    for spp in (16, 256):
+        images = []
+        for seed in range(10):
+            light = SampleBuffer()
+            indirect_light(
+                IndirectTask(world, uniform(blocks, spp, reuses_paths=True), 2, seed, grid), pixels[:0], light.add
+            )
+            images.append(response(light.finished(), pixels))
+        energy = np.sum(images, axis=(1, 2))
+        found.append((np.var(images, axis=0, ddof=1).sum(), energy.mean(), energy.var(ddof=1) / len(energy)))
+    (few, mean_few, off_few), (many, mean_many, off_many) = found
+    # 12 blocks and 9 degrees of freedom: each variance is known to 14 %
+    assert few / many > 1.3 * 16
+    assert abs(mean_few - mean_many) < 4 * np.sqrt(off_few + off_many)
+
+
+def test_stated_noise_is_that_of_different_seeds():
+    """Four batches of a low-discrepancy set each state the noise that renders of other seeds have."""
+    scene, pixels = oracles.groove_scene(16, 12, albedo=0.6), np.arange(16 * 12)
+    found = [render(scene, RenderSettings(bounces=2, spp=64, grid=2), seed=seed) for seed in range(8)]
+    images = np.array([response(samples_of(transient), pixels) for transient in found])
+    squared = images.var(axis=0, ddof=1).sum() / (images.mean(axis=0) ** 2).sum()
+    stated = np.mean([transient.meta["relative_error"]["monte_carlo"] ** 2 for transient in found])
+    # 12 blocks: 3 degrees of freedom in each of 8 renders, and 7 between these: 8 and 15 % of the squares
+    assert 1 / 1.3 < np.sqrt(stated / squared) < 1.3
+
+
+def samples_of(transient: Transient) -> Samples:
+    near, far = transient.path_near_m.astype(float), transient.path_far_m.astype(float)
+    return Samples(transient.return_pixel, (near + far) / 2, (far - near) / 2, transient.radiance, transient.bounces)
 
 
 def diffuse_room(laser: Laser) -> Scene:
