@@ -120,7 +120,8 @@ def _traced_to_target(
     """Trace what the plan says, and more where its error misses the target; the plan then says so."""
     checked = pilot_pixels(world, derived_seed(seed, Stream.PLAN))
     traced = trace(world, plan, settings, seed=seed, checked=checked, progress=report)
-    plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, *traced.reasons))
+    filtered = plan.filter and (traced.schedule is None or traced.schedule.filter_octaves is not None)
+    plan = replace(plan, spp=traced.spp, filter=filtered, reasons=(*plan.reasons, *traced.reasons))
     error = _estimated(world, plan, settings, traced, checked)
     for number in range(MAX_FILTERED_PASSES if plan.filter else 1):
         more = _additional_schedule(world, plan, settings, traced, error)

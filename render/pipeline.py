@@ -35,7 +35,9 @@ MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
 # Beyond so many times the work that a plan may spend, or that it planned, there is no more than a first try.
 HOPELESS = 10
 PROPOSAL = "trade fireflies for a stated bias with --clamp 10"
-FIRST_FILTERED_SPP = 16  # filtered light has no pilot: it starts with few paths
+FIRST_FILTERED_SPP = 16  # filtered light starts with few paths, whatever it needs
+# A filter takes up to twice the time and has a bias: it has to lower the squared error at least so many times.
+FILTER_GAIN = 2.0
 
 
 class LightSamples(NamedTuple):
@@ -201,25 +203,69 @@ def _allocated(
     """Allocate paths, and say why: the schedule but for its clamp, with which the pilot's paths are clamped, too."""
     camera = world.scene.camera
     blocks = block_order(np.arange(camera.height * camera.width), camera.width)
-    if plan.filter:
-        spp = FIRST_FILTERED_SPP if plan.spp is None else plan.spp
-        filter_octaves = filter_octaves_of(world, plan, settings, origin_m, spp)
-        rounds = spp if spp < FILTERED_BATCHES else -(-spp // FILTERED_BATCHES) * FILTERED_BATCHES
-        schedule = uniform(blocks, rounds, reuses_paths=False)
-        # under a lamp the noise that the filter leaves is even, and a pilot costs more than it saves
-        if plan.adaptive and spp >= FIRST_FILTERED_SPP and not is_wide(world):
-            from_m = float(filter_octaves.from_m[0])
-            noise = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT), from_m, clamp)
-            schedule = allocate(blocks, *noise, cost=spp, batches=FILTERED_BATCHES, min_spp=FILTERED_BATCHES)
-        least, most = schedule.spp.min(), schedule.spp.max()
-        least_m, most_m = filter_octaves.size_m[0], filter_octaves.size_m[-1]
-        message = f"indirect light: filtered, later than {filter_octaves.from_m[0]:.2g} m behind direct light, over "
-        message += f"regions of surfaces {least_m:.2g} to {most_m:.2g} m wide; {least} to {most} paths a pixel"
-        return schedule._replace(filter_octaves=filter_octaves), (message,)
-    if plan.spp is not None and (not plan.adaptive or plan.spp < MIN_SPP):
+    pilot_seed, few = derived_seed(seed, Stream.PILOT), plan.spp is not None and plan.spp < MIN_SPP
+    # under a lamp much light is late, and the noise that the filter leaves is even: a pilot costs more than it saves
+    if plan.filter and (not plan.adaptive or few or is_wide(world)):
+        return _filtered(world, plan, settings, blocks, origin_m)
+    if plan.spp is not None and (not plan.adaptive or few):
         rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
         return uniform(blocks, rounds, reuses_paths=False), ()
-    own, reused = pilot_noise(world, blocks, plan.bounces, derived_seed(seed, Stream.PILOT), clamp=clamp)
+    own, reused = pilot_noise(world, blocks, plan.bounces, pilot_seed, clamp=clamp)
+    schedule, reasons = _unfiltered(plan, settings, blocks, (own, reused), direct)
+    if not plan.filter:
+        return schedule, reasons
+    spp = max(schedule.cost, FIRST_FILTERED_SPP)
+    from_m = float(filter_octaves_of(world, plan, settings, origin_m, spp).from_m[0])
+    (noise,) = pilot_noise(world, blocks, plan.bounces, pilot_seed, from_m, clamp)
+    gain = gain_of_filter(blocks, (own, reused), noise, spp)
+    if gain < FILTER_GAIN:
+        message = f"filter: left out, as it would lower the squared error {gain:.2g} times, not {FILTER_GAIN:g} or more"
+        return schedule, (f"{message}; force it with adaptive off", *reasons)
+    return _filtered(world, plan, settings, blocks, origin_m, noise)
+
+
+def gain_of_filter(blocks: np.ndarray, plain: tuple[np.ndarray, np.ndarray], filtered: np.ndarray, spp: float) -> float:
+    """Estimate how many times a filter lowers the squared error of `spp` paths a pixel, from the pilot's noise of every
+    block without it (each path for its own pixel, and for all of the block) and with it."""
+    own, reused = plain
+    shared = allocate(blocks, own, reused, cost=spp)
+    without = float((np.where(shared.reuses_paths, reused, own) / shared.spp).sum())
+    alone = allocate(blocks, filtered, cost=spp, batches=FILTERED_BATCHES, min_spp=FILTERED_BATCHES)
+    with_filter = float((filtered / alone.spp).sum())
+    return without / with_filter if with_filter > 0 else 1.0
+
+
+def _filtered(
+    world: TracedScene,
+    plan: Plan,
+    settings: RenderSettings,
+    blocks: np.ndarray,
+    origin_m: np.ndarray,
+    noise: np.ndarray | None = None,
+) -> tuple[Schedule, tuple[str, ...]]:
+    """Allocate paths of filtered light by the pilot's noise of every block, or without it evenly."""
+    spp = FIRST_FILTERED_SPP if plan.spp is None else plan.spp
+    filter_octaves = filter_octaves_of(world, plan, settings, origin_m, spp)
+    rounds = spp if spp < FILTERED_BATCHES else -(-spp // FILTERED_BATCHES) * FILTERED_BATCHES
+    schedule = uniform(blocks, rounds, reuses_paths=False)
+    if noise is not None:
+        schedule = allocate(blocks, noise, cost=spp, batches=FILTERED_BATCHES, min_spp=FILTERED_BATCHES)
+    least, most = schedule.spp.min(), schedule.spp.max()
+    least_m, most_m = filter_octaves.size_m[0], filter_octaves.size_m[-1]
+    message = f"indirect light: filtered, later than {filter_octaves.from_m[0]:.2g} m behind direct light, over "
+    message += f"regions of surfaces {least_m:.2g} to {most_m:.2g} m wide; {least} to {most} paths a pixel"
+    return schedule._replace(filter_octaves=filter_octaves), (message,)
+
+
+def _unfiltered(
+    plan: Plan,
+    settings: RenderSettings,
+    blocks: np.ndarray,
+    noise: tuple[np.ndarray, np.ndarray],
+    direct: Samples,
+) -> tuple[Schedule, tuple[str, ...]]:
+    """Allocate paths by the pilot's noise of every block: each path for its own pixel, and for all of the block."""
+    own, reused = noise
     if not plan.adaptive:
         own, reused = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
     if plan.spp is not None:
@@ -233,7 +279,7 @@ def _allocated(
         hopeless = wanted > HOPELESS * limit
         schedule = allocate(blocks, own, reused, cost=min(limit, MAX_SPP_BY_DEFAULT) if hopeless else limit)
         remedy = "force more with spp" if asked else "ask for more with an error target"
-        if hopeless and clamp is None:
+        if hopeless and plan.clamp is None:
             remedy = f"{remedy}, or {PROPOSAL}"
         reasons.append(f"indirect light: the work of {wanted:.0f} paths a pixel would meet the target; {remedy}")
     spread = f"{schedule.spp.min()} to {schedule.spp.max()} paths a pixel, {schedule.reuses_paths.mean():.0%} shared"

@@ -111,7 +111,7 @@ def noise_of_filtered_paths(
     noise = own.by_block(BLOCK)
     pairs = _pairs(paths, reuses_paths=False, early=reuses_early_paths(world))
     if pairs is not None:
-        early = _Squares(dr.gather(Float, late_m, pairs.vertex), start, most)
+        early = _Squares(limit=most)
         _add(_pair_lanes(world, paths, pairs), paths, early, own=False)
         block = dr.gather(UInt32, pairs.suffix, dr.arange(UInt32, dr.width(pairs.suffix) // BLOCK) * BLOCK) // BLOCK
         np.add.at(noise, block.numpy(), early.by_block(BLOCK))
@@ -119,8 +119,8 @@ def noise_of_filtered_paths(
 
 
 class _Squares:
-    """In place of `IndirectAccumulator`: the sum of squares of what every lane adds, late light counted as little as
-    its noise.
+    """In place of `IndirectAccumulator`: the sum of squares of what every lane adds; with `from_m`, late light that a
+    filter takes counts as little as its noise.
 
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
@@ -140,11 +140,13 @@ class _Squares:
 
     def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
         """Compute the square of an added radiance."""
-        square = dr.select(active & dr.isfinite(radiance), dr.square(radiance), 0)
-        if self._late_m is None:
-            return square
+        return dr.select(active & dr.isfinite(radiance), dr.square(radiance), 0)
+
+    def filtered(self, path: Floats, radiance: Floats, diffuse: Masks) -> Array:
+        """Return radiance of one path over the root of the number of pixels whose paths a region has; a filter takes no
+        other than diffuse light."""
         behind_m = dr.maximum(path - self._late_m, 0)
-        return square / dr.square(1 + behind_m / self._from_m)
+        return radiance / dr.select(diffuse, 1 + behind_m / self._from_m, 1)
 
     def add_total(self, pixel: UInts, batch: UInts, total: Floats) -> None:
         """Keep every lane's sum."""
@@ -387,6 +389,8 @@ def _add(
                     ArrivingLight(primary.late_m, towards, diffuse, batch, path, radiance, weight),
                     adding,
                 )
+            elif dr.hint(paths.primary.point is not None, mode="scalar"):
+                radiance = sums.filtered(path1 + path, radiance, diffuse & (paths.primary.point.reflectance > 0))
         else:
             adding = going & (path < early_m)
             radiance = sums.clamped(receiver, batch, path1 + path, radiance, going, adding)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from render import pipeline
 from render.engine import render
 from render.error import response
 from render.indirect.path_space_filter import GATHER_POINTS, SHRINKING, octaves
@@ -21,6 +22,7 @@ from scene2spad.bench.rendering import settings
 from scene2spad.bench.rendering.binning import binned
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
 from scenes.library import hard_cases
+from scenes.library.catalog import load_scene
 from scenes.library.hard_cases import hard_case
 from scenes.library.things.shapes import box, sphere
 
@@ -172,6 +174,32 @@ def test_one_pixel_nothing_in_view_and_glass():
     for name in ("window", "leaf", "mirror"):
         found = render(hard_case(name), RenderSettings(bounces=3, spp=16, filter=True), seed=1)
         assert np.isfinite(found.radiance).all() and (found.radiance >= 0).all()
+
+
+@pytest.mark.parametrize("name", ["hall", "room"])
+def test_left_out_where_it_hurts(name):
+    """A stairwell under a flash owes its noise to gloss, which no filter takes: with 64 paths it had 0.15 instead of
+    0.07 of error. In a diffuse room the squared error falls to less than half."""
+    if name == "hall":
+        scene = load_scene("hall", width=32, height=24)
+        scene = replace(scene, camera=replace(scene.camera, fov_deg=settings.FLASH_FOV_DEG), laser=Laser("flood"))
+    else:
+        scene = replace(room(32), laser=Laser("flood"))
+    world, given = TracedScene(scene), RenderSettings(bounces=4, spp=64, grid=2, filter=True)
+    traced = trace(world, make_plan(world, given, 1), given, seed=1)
+    assert (traced.schedule.filter_octaves is not None) == (name == "room")
+    assert ("filter: left out" in traced.reasons[0]) == (name == "hall")
+
+
+def test_left_out_the_plan_and_the_error_are_those_of_unfiltered_light(monkeypatch):
+    scene, given = replace(room(8), laser=Laser("flood")), RenderSettings(bounces=3, spp=16, grid=2)
+    monkeypatch.setattr(pipeline, "FILTER_GAIN", math.inf)
+    without, asked = (render(scene, replace(given, filter=f), seed=4) for f in (False, True))
+    forced = render(scene, replace(given, filter=True, adaptive=False), seed=4)
+    assert not asked.meta["plan"]["filter"] and forced.meta["plan"]["filter"]
+    assert asked.meta["relative_error"] == without.meta["relative_error"]
+    assert np.array_equal(asked.radiance, without.radiance)
+    assert "filter: left out" in " ".join(asked.meta["plan"]["reasons"])
 
 
 @pytest.mark.parametrize("mode", ["scan", "line"])
