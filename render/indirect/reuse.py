@@ -104,9 +104,8 @@ def noise_of_filtered_paths(
     area, and with it the number of paths in them, grows with the square of its excess path."""
     start, most = dr.opaque(Float, from_m), None if limit is None else upload(Float, limit)
     paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, from_m=start))
-    primary = paths.primary
-    late_m = primary.path + primary.late_m
-    own = _Squares(late_m, start, most)
+    primary: Array = paths.primary
+    own = _Squares(primary.path + primary.late_m, start, most, primary.point.reflectance > 0)
     _add(_own_lanes(paths), paths, own, own=True)
     noise = own.by_block(BLOCK)
     pairs = _pairs(paths, reuses_paths=False, early=reuses_early_paths(world))
@@ -125,8 +124,10 @@ class _Squares:
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
-    def __init__(self, late_m: Floats = None, from_m: Floats = None, limit: Floats = None) -> None:
-        self._late_m, self._from_m, self._limit = late_m, from_m, limit
+    def __init__(
+        self, late_m: Floats = None, from_m: Floats = None, limit: Floats = None, taking: Masks = None
+    ) -> None:
+        self._late_m, self._from_m, self._limit, self._taking = late_m, from_m, limit, taking
         self._lanes: Floats = None
 
     def clamped(
@@ -143,10 +144,11 @@ class _Squares:
         return dr.select(active & dr.isfinite(radiance), dr.square(radiance), 0)
 
     def filtered(self, path: Floats, radiance: Floats, diffuse: Masks) -> Array:
-        """Return radiance of one path over the root of the number of pixels whose paths a region has; a filter takes no
-        other than diffuse light."""
+        """Return radiance of one path; what a filter takes over the root of the number of pixels that share a region."""
+        if self._from_m is None:
+            return radiance
         behind_m = dr.maximum(path - self._late_m, 0)
-        return radiance / dr.select(diffuse, 1 + behind_m / self._from_m, 1)
+        return radiance / dr.select(diffuse & self._taking, 1 + behind_m / self._from_m, 1)
 
     def add_total(self, pixel: UInts, batch: UInts, total: Floats) -> None:
         """Keep every lane's sum."""
@@ -383,14 +385,10 @@ def _add(
             if dr.hint(path_filter is not None, mode="scalar"):
                 sums.add_unfiltered(receiver, batch, path1 + path, radiance, going)
                 primary, weight = paths.primary, _weight(paths, sums)
-                adding = path_filter.add(
-                    primary.point,
-                    rows,
-                    ArrivingLight(primary.late_m, towards, diffuse, batch, path, radiance, weight),
-                    adding,
-                )
-            elif dr.hint(paths.primary.point is not None, mode="scalar"):
-                radiance = sums.filtered(path1 + path, radiance, diffuse & (paths.primary.point.reflectance > 0))
+                arriving = ArrivingLight(primary.late_m, towards, diffuse, batch, path, radiance, weight)
+                adding = path_filter.add(primary.point, rows, arriving, adding)
+            elif dr.hint(isinstance(sums, _Squares), mode="scalar"):
+                radiance = sums.filtered(path1 + path, radiance, diffuse)  # type: ignore[attr-defined]  # _Squares has
         else:
             adding = going & (path < early_m)
             radiance = sums.clamped(receiver, batch, path1 + path, radiance, going, adding)
