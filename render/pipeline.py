@@ -220,7 +220,7 @@ def _allocated(
     gain = gain_of_filter(blocks, (own, reused), noise, spp)
     if gain < FILTER_GAIN:
         message = f"filter: left out, as it would lower the squared error {gain:.2g} times, not {FILTER_GAIN:g} or more"
-        return schedule, (f"{message}; force it with adaptive off", *reasons)
+        return schedule, (f"{message}; adaptive=False forces it", *reasons)
     return _filtered(world, plan, settings, blocks, origin_m, noise)
 
 

@@ -32,7 +32,8 @@ class RenderSettings:
     bounces     surfaces that light may meet, 1 = direct light only
     spp         work on indirect light, in paths per pixel; spent where the noise is, and partly on sharing paths
     adaptive    whether it is spent so, or evenly and without sharing
-    filter      whether late indirect light is averaged over regions of surfaces instead: far less noise, and a bias
+    filter      whether late indirect light is averaged over regions of surfaces instead: far less noise, and a bias;
+                left out where a pilot sees little gain, but without `adaptive`
     clamp       the most that one path of indirect light may add to a pixel, in units of the direct light around it:
                 fireflies go, and some energy, which is measured and counted as an error
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each

@@ -83,7 +83,7 @@ def noise_of_paths(
     """
     most = None if limit is None else upload(Float, limit)
     paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, reuses_paths=True))
-    own, alone, reused = (_Squares(limit=most) for _ in range(3))
+    own, alone, reused = (_Squares(most) for _ in range(3))
     lanes = _own_lanes(paths)
     _add(lanes._replace(early_m=Float(0)), paths, own, own=True)
     _add(lanes, paths, alone, own=True)
@@ -105,12 +105,12 @@ def noise_of_filtered_paths(
     start, most = dr.opaque(Float, from_m), None if limit is None else upload(Float, limit)
     paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, from_m=start))
     primary: Array = paths.primary
-    own = _Squares(primary.path + primary.late_m, start, most, primary.point.reflectance > 0)
+    own = _Squares(most, primary.path + primary.late_m, start, primary.point.reflectance > 0)
     _add(_own_lanes(paths), paths, own, own=True)
     noise = own.by_block(BLOCK)
     pairs = _pairs(paths, reuses_paths=False, early=reuses_early_paths(world))
     if pairs is not None:
-        early = _Squares(limit=most)
+        early = _Squares(most)
         _add(_pair_lanes(world, paths, pairs), paths, early, own=False)
         block = dr.gather(UInt32, pairs.suffix, dr.arange(UInt32, dr.width(pairs.suffix) // BLOCK) * BLOCK) // BLOCK
         np.add.at(noise, block.numpy(), early.by_block(BLOCK))
@@ -124,10 +124,8 @@ class _Squares:
     Not a dataclass: Dr.Jit would take its fields for variables of a loop.
     """
 
-    def __init__(
-        self, late_m: Floats = None, from_m: Floats = None, limit: Floats = None, taking: Masks = None
-    ) -> None:
-        self._late_m, self._from_m, self._limit, self._taking = late_m, from_m, limit, taking
+    def __init__(self, limit: Floats = None, late_m: Floats = None, from_m: Floats = None, taken: Masks = None) -> None:
+        self._limit, self._late_m, self._from_m, self._taken = limit, late_m, from_m, taken
         self._lanes: Floats = None
 
     def clamped(
@@ -144,11 +142,11 @@ class _Squares:
         return dr.select(active & dr.isfinite(radiance), dr.square(radiance), 0)
 
     def filtered(self, path: Floats, radiance: Floats, diffuse: Masks) -> Array:
-        """Return radiance of one path; what a filter takes over the root of the number of pixels that share a region."""
+        """Return radiance of one path; what a filter takes, over the root of the number of pixels in a region."""
         if self._from_m is None:
             return radiance
         behind_m = dr.maximum(path - self._late_m, 0)
-        return radiance / dr.select(diffuse & self._taking, 1 + behind_m / self._from_m, 1)
+        return radiance / dr.select(diffuse & self._taken, 1 + behind_m / self._from_m, 1)
 
     def add_total(self, pixel: UInts, batch: UInts, total: Floats) -> None:
         """Keep every lane's sum."""

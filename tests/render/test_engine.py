@@ -180,6 +180,13 @@ def test_different_seeds_agree_within_the_estimated_error():
     assert (np.abs(difference) / np.sqrt(squared)).max() < 12
 
 
+@pytest.mark.parametrize(("asked", "traced"), [(1, 1), (3, 3), (5, 8), (18, 20)])
+def test_batches_are_of_one_size(asked, traced):
+    """Batches of different sizes would add their difference to the stated error."""
+    settings = RenderSettings(bounces=2, spp=asked, grid=2, adaptive=False)
+    assert render(room(width=4, height=4), settings, seed=1).meta["plan"]["spp"] == traced
+
+
 def test_wide_returns_beside_each_other_respond_as_one():
     """What is even over a metre is so in any number of returns, 1/1 to 1/16 of it wide, and in every bin within."""
     whole = Samples(*(np.array([value]) for value in (0, 6.0, 0.5, 1.0, 2)))

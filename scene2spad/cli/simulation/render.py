@@ -81,7 +81,7 @@ class Render(Long):
     """Indirect light paths per pixel (default: planned from a pilot)."""
     filter: bool = False
     """Average late indirect light over small regions of surfaces: far less noise for the same paths, and a bias, which
-    is measured and stated."""
+    is measured and stated. Left out where a pilot sees little gain."""
     clamp: Number = None
     """Fireflies: one indirect path adds at most this many times the direct light around it (10, say); what that removes
     is measured and counted as an error (default: nothing is removed)."""
