@@ -24,7 +24,11 @@ np.save("chirp-8.npy", matrix)  # for: scene2spad compare my.h5 --methods chirp-
 
 # %%
 network = "learned-256x4x4-128x-mixed-s0"
-methods = {"chirp-8": mine, "fourier-8": s2s.coding_tensor("fourier", 8), "learned, 128x": network}
+methods: dict[str, s2s.CodingTensor | str] = {
+    "chirp-8": mine,
+    "fourier-8": s2s.coding_tensor("fourier", 8),
+    "learned, 128x": network,
+}
 for name, method in methods.items():
     errors = s2s.depth_errors(s2s.estimate_depth(histogram, method), histogram)
     print(f"{name}: {errors['mae_mm']:.1f} mm mean error, {errors['within_10mm']:.0%} within 10 mm")

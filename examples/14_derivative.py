@@ -40,6 +40,7 @@ def moved(back_m: float) -> s2s.Scene:
 
 # %%
 step, albedo = 0.01, wall.surfaces[0].material.albedo
+assert isinstance(albedo, float)  # and no texture
 slope = (expected_counts(with_albedo(albedo + step)) - expected_counts(with_albedo(albedo - step))) / (2 * step)
 here = expected_counts(wall)
 print(f"by albedo: largest error of a bin {np.abs(slope - here / albedo).max() / slope.max():.1e} of the largest slope")

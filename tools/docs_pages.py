@@ -59,10 +59,12 @@ def option_docs(options: type) -> dict[str, str]:
     """Return the string that stands below each field, of a class and its bases."""
     found: dict[str, str] = {}
     for one in reversed(options.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(one))).body[0].body
-        for above, below in pairwise(body):
-            named = isinstance(above, ast.AnnAssign) and isinstance(below, ast.Expr)
-            if named and isinstance(below.value, ast.Constant):
+        defined = ast.parse(textwrap.dedent(inspect.getsource(one))).body[0]
+        assert isinstance(defined, ast.ClassDef)
+        for above, below in pairwise(defined.body):
+            if not (isinstance(above, ast.AnnAssign) and isinstance(below, ast.Expr)):
+                continue
+            if isinstance(above.target, ast.Name) and isinstance(below.value, ast.Constant):
                 found[above.target.id] = " ".join(str(below.value.value).split())
     return found
 

@@ -92,6 +92,13 @@ class DepthModel(nn.Module):
         self.network.load_state_dict(other.network.state_dict(), strict=not grown)
 
     @property
+    def codes_layer(self) -> CompressiveLayer:
+        """The layer that makes the codes. Raises InputError for a network without codes."""
+        if self.layer is None:
+            raise InputError(f"{self.config.name}: has no codes, its network sees all bins")
+        return self.layer
+
+    @property
     def parameters_count(self) -> int:
         return parameters_of(self)
 
@@ -115,8 +122,7 @@ class DepthModel(nn.Module):
 
     def logits_of_codes(self, codes: Tensor) -> Tensor:
         """Return logits (B, T, R, C) of codes (B, K, T/Mt, R/Mr, C/Mc)."""
-        assert self.layer is not None
-        x = self.layer.decode(codes)
+        x = self.codes_layer.decode(codes)
         return self.network(x, codes.to(x.dtype)) if isinstance(self.network, Blockwise) else self.network(x)
 
     def forward(self, counts: Tensor) -> Tensor:

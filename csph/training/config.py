@@ -75,6 +75,13 @@ class ModelConfig:
             require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{message}, or --layer keep_mean")
 
     @property
+    def codes_design(self) -> Design:
+        """The design of the codes. Raises InputError for a model without codes."""
+        if self.design is None:
+            raise InputError(f"{self.name}: has no codes")
+        return self.design
+
+    @property
     def block(self) -> tuple[int, int, int]:
         """Return the size of a block, (Mt, Mr, Mc); one pixel and bin without codes."""
         return (1, 1, 1) if self.design is None else self.design.block

@@ -5,10 +5,10 @@ from __future__ import annotations
 import csv
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 
+from scene2spad.options.experiments import Bench
 from scene2spad.studies.power.emulated_chain import timestamps_of
 from scene2spad.studies.power.program_tables import int8_temporal
 from scenes.errors import require
@@ -29,7 +29,7 @@ _MEGAPIXEL_PROGRAMS = ("fourier-16", "separable-16")
 _BLOCK = 1 << 15  # pixels of fresh counts; a megapixel holds them 32 times, each time shifted in time
 
 
-def run(command: Any, progress: Progress) -> dict:
+def run(command: Bench, progress: Progress) -> dict:
     """Run the bench: rows of `name`, `seconds`, `cpu_seconds` (of all threads: what one free core takes), `error`
     (numbers that differ from the interpreted program's) and rates; CSV in `command.out`. `command.quick` leaves out the
     megapixel frames; `command.only` names programs."""

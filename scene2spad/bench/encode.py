@@ -11,9 +11,11 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -130,23 +132,26 @@ def convolved(layer: CompressiveLayer, counts: Tensor) -> tuple[Tensor, Tensor]:
     return codes, conv_transpose3d(normalised(codes, 1), normalised(weights, 0), stride=weights.shape[2:])
 
 
+Form: TypeAlias = Callable[[CompressiveLayer, Tensor], Tensor]
+
+
 def measure_layer(design: Design, counts: Tensor, rounds: int, seed: int) -> list[Row]:
     """Encode and decode, forward and backward with respect to the weights."""
     layer = CompressiveLayer.of(design, seed=seed)
     gradient = torch.randn(counts.shape, generator=torch.Generator().manual_seed(seed))
-    forms: dict[str, Callable] = {
+    forms: dict[str, Form] = {
         "strided convolutions": lambda layer, counts: convolved(layer, counts)[1],
         "matrix products": lambda layer, counts: layer(counts),
     }
 
-    def once(form: Callable, layer: CompressiveLayer, counts: Tensor) -> list[Tensor]:
+    def once(form: Form, layer: CompressiveLayer, counts: Tensor) -> list[Tensor]:
         layer.zero_grad(set_to_none=True)
         output = form(layer, counts)
         output.backward(gradient.to(output.dtype))
-        return [output.detach(), *(part.grad for part in layer.parameters())]
+        return [output.detach(), *(part.grad for part in layer.parameters() if part.grad is not None)]
 
     exact = once(forms["strided convolutions"], CompressiveLayer.of(design, seed=seed).double(), counts.double())
-    calls = {name: lambda form=form: once(form, layer, counts) for name, form in forms.items()}
+    calls = {name: partial(once, form, layer, counts) for name, form in forms.items()}
     return _measured(calls, "layer", design, exact, rounds)
 
 
@@ -169,15 +174,20 @@ def measure_encoding(design: Design, stamps: Tensor, offsets: Tensor, rounds: in
         }
         exact = fixed.double().encode(dense(stamps, offsets, SIZE))
         fixed.float()
-        calls = {name: lambda form=form: [form()] for name, form in forms.items()}
+        calls = {name: partial(_as_list, form) for name, form in forms.items()}
         return _measured(calls, "encode", design, [exact], rounds)
 
 
+def _as_list(form: Callable[[], Tensor]) -> list[Tensor]:
+    return [form()]
+
+
 def _measured(
-    calls: dict[str, Callable[[], list[Tensor]]], part: str, design: Design, exact: list[Tensor], rounds: int
+    calls: Mapping[str, Callable[[], list[Tensor]]], part: str, design: Design, exact: list[Tensor], rounds: int
 ) -> list[Row]:
-    """Median and least seconds of each call, taken in turn so that a busy machine is busy for all of them."""
-    errors, seconds = {}, {name: [] for name in calls}
+    """Measure median and least seconds of each call, taken in turn so that a busy machine is busy for all of them."""
+    errors: dict[str, float] = {}
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
     for name, call in calls.items():  # the first run warms up, and is the one that is judged
         errors[name] = max(_deviation(*pair) for pair in zip(call(), exact, strict=True))
     for _ in range(rounds):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from PIL import Image
 from csph.evaluation.metrics import PHOTON_LEVELS as LEVELS
 from csph.training.views import read_views
 from render.transient import Transient
+from scene2spad.options.experiments import Bench
 from scene2spad.plots.figures import save
 from spad.detection.detect import sense
 from spad.estimators.depth import METHODS, depth_errors, estimate_depth
@@ -73,7 +73,7 @@ def table(
     return rows
 
 
-def scenes_of(command: Any) -> list[tuple[str, Transient]]:
+def scenes_of(command: Bench) -> list[tuple[str, Transient]]:
     """Return views of the rendered set that is asked for, else the Middlebury images of the data folder; none without
     both.
 

@@ -10,12 +10,12 @@ import math
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from scene2spad.bench.hard import direct as hard_cases_direct
 from scene2spad.bench.hard import indirect as hard_cases_indirect
 from scene2spad.bench.hard import optics as hard_cases_optics
 from scene2spad.bench.hard.case import Case, Measured
+from scene2spad.options.experiments import Bench
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.progress import Progress
@@ -26,7 +26,7 @@ CASES: dict[str, Case] = {
 COLUMNS = ("name", "passed", "quantity", "error", "limit", "seconds", "clipped", "oracle")
 
 
-def run(command: Any, progress: Progress) -> dict:
+def run(command: Bench, progress: Progress) -> dict:
     """Measure every case, or those that `command.only` names, and write the table as CSV where `command.out` is set.
 
     `command` has `seed` and may have `out` (a folder), `only` (names) and `quick` (leave out slow ones).
@@ -81,7 +81,7 @@ def row(case: Case, seed: int) -> dict:
 
 
 def _write(out: Path, rows: list[dict]) -> Path:
-    """The table as CSV, one line a quantity; whole or not at all."""
+    """Write the table as CSV, one line a quantity; whole or not at all."""
     out.mkdir(parents=True, exist_ok=True)
     path = out / "bench-hard-cases.csv"
     with whole_file(path) as beside, beside.open("w", newline="") as file:

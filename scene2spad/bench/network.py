@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +19,7 @@ from csph.codes.design import Design
 from csph.evaluation.methods import EvaluationPlan, evaluate
 from csph.networks.model import DepthModel
 from csph.networks.published import DeepBoosting, parameters_of
-from csph.training.config import NETWORKS, ModelConfig, preset
+from csph.training.config import NETWORKS, ModelConfig, Network, preset
 from csph.training.loss import kl_divergence
 from csph.training.views import split_views
 from render.backend.malloc import retain_freed_memory
@@ -35,6 +34,7 @@ PATCH = (1, 1, 1024, 32, 32)  # what multiply-accumulates are counted for
 FRAME = (1, 1, 1024, 72, 88)  # a published test frame
 PRESET = "laptop"  # whose batch, crop and learning rate a step has
 DESIGN = Design("learned", (256, 4, 4), 32)
+MEASURED: tuple[Network, ...] = ("compact", "published")
 SCENES, VIEW_PIXELS, TEST_SCENES = 200, 64, 4
 LEVELS = ((10.0, 10.0), (10.0, 200.0))
 SECONDS, QUICK_SECONDS = 180.0, 20.0  # of training
@@ -75,7 +75,7 @@ def gmac(network: nn.Module, size: tuple[int, ...] = PATCH) -> float:
     return counter.get_total_flops() / 2e9
 
 
-def seconds_of(work: Callable[[], Any], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
+def seconds_of(work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
     """Return median of warm runs."""
     work()
     taken = []
@@ -100,7 +100,7 @@ def run(command: Bench, progress: Progress) -> dict:
     retain_freed_memory()  # as training does
     limit = QUICK_SECONDS if command.quick else SECONDS
     rows = []
-    for number, name in enumerate(("compact", "published")):
+    for number, name in enumerate(MEASURED):
         progress(f"{name} network", number / 3)
         rows.append(measure(name, limit, command.repeats, command.seed))
     progress("plain layers", 2 / 3)
@@ -115,7 +115,7 @@ def run(command: Bench, progress: Progress) -> dict:
     return {"rows": [asdict(row) for row in rows], **result} if command.json else {"rows": _lines(rows), **result}
 
 
-def measure(name: str, limit_s: float, repeats: int, seed: int) -> Row:
+def measure(name: Network, limit_s: float, repeats: int, seed: int) -> Row:
     """Return one network behind learned 256x4x4 codes at 128x: its costs, and its error after `limit_s` of training."""
     require(name in NETWORKS, f"network {name!r} is unknown")
     config = preset(PRESET, ModelConfig(design=DESIGN, network=name), seed=seed)

@@ -69,7 +69,7 @@ def run(command: Bench, progress: Progress) -> dict:
         checks.append(check)
         log.info("%s", _check_line(check))
     ratios = _ratios(rows)
-    result = {"rows": [row.to_dict() for row in rows], "ratios": ratios, "checks": checks}
+    result: dict[str, object] = {"rows": [row.to_dict() for row in rows], "ratios": ratios, "checks": checks}
     result |= _write(rows, command)
     with whole_file(command.out / "bench-render.json") as beside:
         text = json.dumps(_plain({**result, "machine": _machine(with_peer)}), indent=1, allow_nan=False)
@@ -94,7 +94,8 @@ def _cases(command: Bench) -> list[Case]:
         if not 1 <= size <= 512:
             raise InputError(f"bench: size {size} is outside 1 to 512 pixels")
     cases = []
-    for name in command.scenes or tuple(settings.SCENES):
+    chosen: tuple[str, ...] = command.scenes or (*settings.SCENES,)
+    for name in chosen:
         sizes = command.sizes or (settings.QUICK_SIZES if command.quick else settings.SIZES)[name]
         try:
             cases += [Case(name, size, settings.bench_scene(name, size, command.data)) for size in sizes]
@@ -175,7 +176,7 @@ def _reference(
 
 
 def _check(case: Case, transport: str, truth: Reference, rows: list[Row]) -> dict:
-    """The reference's own noise, and how the best of ours agrees with it: energy ratio and cross nRMSE.
+    """Return the reference's own noise, and how the best of ours agrees with it: energy ratio and cross nRMSE.
 
     Cross nRMSE is the distance between the two codes' means: two seeds of ours times two halves of theirs, all noise
     cancelling; of deterministic light, the error itself.

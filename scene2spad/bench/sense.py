@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from scipy import stats
 
 from render.transient import Transient
 from scene2spad.bench import estimators
+from scene2spad.options.experiments import Bench
 from scenes.errors import require
 from scenes.files import whole_file, write_csv
 from scenes.progress import Progress
@@ -29,6 +31,7 @@ from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 
 SIZE = (72, 88)
+Way = TypeVar("Way", str, int)  # what ways are named by
 BUDGETS = ((10.0, 50.0), (10.0, 1000.0))
 CYCLES = (1_000, 1_000_000)
 FLUX_PER_CYCLE = 0.05
@@ -43,7 +46,7 @@ def relief(height: int, width: int) -> Transient:
     return transient_from_rgbd(depth, albedo, albedo, fov_deg=21.0, block=2)
 
 
-def run(command: Any, progress: Progress) -> dict:
+def run(command: Bench, progress: Progress) -> dict:
     """Run the bench: rows of `name`, `seconds`, `error` and what they are compared with; tables and picture in
     `command.out`.
 
@@ -79,9 +82,9 @@ def run(command: Any, progress: Progress) -> dict:
     return result
 
 
-def alternating(ways: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+def alternating(ways: Mapping[Way, Callable[[], object]], repeats: int) -> dict[Way, float]:
     """Return median seconds of each way, warmed up once, run in turn."""
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    seconds: dict[Way, list[float]] = {name: [] for name in ways}
     for way in ways.values():
         way()
     for _ in range(repeats):
@@ -108,9 +111,9 @@ def against_dense(seed: int, repeats: int) -> list[dict]:
         rng = np.random.default_rng(seed)
         seconds = alternating(
             {
-                "numpy": lambda rng=rng, rates=rates: rng.poisson(rates),
-                "timestamps": lambda budget=budget: sense_timestamps(transient, sensor, budget, seed=seed),
-                "histogram": lambda budget=budget: sense(transient, sensor, budget, seed=seed),
+                "numpy": partial(rng.poisson, rates),
+                "timestamps": partial(sense_timestamps, transient, sensor, budget, seed=seed),
+                "histogram": partial(sense, transient, sensor, budget, seed=seed),
             },
             repeats,
         )
@@ -130,7 +133,7 @@ def first_photons(seed: int, repeats: int) -> list[dict]:
     transient, budget = relief(*SIZE), PhotonBudget(10.0, 50.0)
     sensors = {cycles: _with_cycles(cycles) for cycles in CYCLES}
     ways = {
-        cycles: lambda sensor=sensor: sense(transient, sensor, budget, seed=seed, model="first-photon")
+        cycles: partial(sense, transient, sensor, budget, seed=seed, model="first-photon")
         for cycles, sensor in sensors.items()
     }
     seconds = alternating(ways, repeats)
@@ -140,10 +143,10 @@ def first_photons(seed: int, repeats: int) -> list[dict]:
         rows.append(
             _row(f"first photon, {cycles:,} cycles, the same 10 + 50 photons an exposure", seconds[cycles], speed)
         )
-    flux = expected_counts(transient, sensors[CYCLES[0]], rates_for(transient, Sensor(), budget), slice(0, 1024))[0]
-    flux = flux.numpy() * (FLUX_PER_CYCLE / flux.sum(dim=1).mean().item())
+    rates = expected_counts(transient, sensors[CYCLES[0]], rates_for(transient, Sensor(), budget), slice(0, 1024))[0]
+    flux = rates.numpy() * (FLUX_PER_CYCLE / rates.sum(dim=1).mean().item())
     rng = np.random.default_rng(seed)
-    dense = alternating({n: lambda n=n: first_photon_counts(flux, n, rng) for n in CYCLES}, repeats)
+    dense = alternating({n: partial(first_photon_counts, flux, n, rng) for n in CYCLES}, repeats)
     for cycles in CYCLES:
         name = f"first photon, {cycles:,} cycles, the same {FLUX_PER_CYCLE:g} photons a cycle, every bin"
         rows.append(_row(name, dense[cycles], dense[CYCLES[0]] / dense[cycles]))

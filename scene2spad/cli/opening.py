@@ -112,7 +112,8 @@ def open_coding(path: Path, kind: str) -> CodingTensor:
     from csph.weights.cards import checkpoint_of
 
     model = load_model(checkpoint_of(path))[0]
-    require(model.layer is not None, f"{path}: a network without codes, it takes the counts themselves")
+    if model.layer is None:
+        raise InputError(f"{path}: a network without codes, it takes the counts themselves")
     return model.layer.coding()
 
 

@@ -227,7 +227,7 @@ def errors_as_published(model: DepthEstimator, histogram: Histogram, decoder: De
     bins = depth.astype(np.float64) / sensor.bin_depth_m
     step_m = PUBLISHED_SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s / 2
     early = published_centroid_bins(sensor)  # in bins after the fullest
-    found = {}
+    found: dict[str, float] = {}
     for name, estimate in (("label", bins - 0.5), ("arrival", bins - 0.5 - early)):
         errors = image_errors(estimate * step_m, histogram.depth_m, range_m=np.inf)
         found |= {f"{figure}_{name}": errors[figure] for figure in ("mae_mm", "rmse_mm", "within_10mm")}

@@ -17,7 +17,7 @@ from scene2spad.datasets.rendering import Job, make_set, pack_set
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.networks.training import network_method
 from scene2spad.studies.results import Store
-from scenes.errors import require
+from scenes.errors import InputError, require
 from scenes.files import read_array
 from scenes.library.sets import scene_set
 from scenes.offsets import OffsetMode
@@ -52,7 +52,7 @@ class TestSet:
 
     def first(self, count: int | None) -> TestSet:
         """Return its first views."""
-        return replace(self, views=Views(*(part[:count] for part in self.views)))
+        return replace(self, views=Views(self.views.transients[:count], self.views.scenes[:count]))
 
     def delayed(self, delay_m: float) -> TestSet:
         """Return the same views `delay_m` farther away in time."""
@@ -86,7 +86,10 @@ def rendered(
     moved = f"-{mode}-{offset_m:g}m" if offset_m else ""
     path = folder / f"{name.replace('/', '-')}{moved}"
     folder.mkdir(parents=True, exist_ok=True)
-    result = make_set(job, of.size if count is None else count, path, progress=progress)
+    number = of.size if count is None else count
+    if number is None:
+        raise InputError(f"{name}: has no end, say how many views")
+    result = make_set(job, number, path, progress=progress)
     require(not result["failed"], f"{path}: views {result['failed']} could not be rendered")
     return TestSet(name, read_views(path), offset_m, mode).first(count)
 

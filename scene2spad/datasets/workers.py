@@ -11,16 +11,20 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, islice
 from multiprocessing import active_children, get_context
 from threading import Thread
-from typing import Any
+from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar
 
 from scenes.errors import InputError, require
+
+if TYPE_CHECKING:
+    from distributed import Client
+    from distributed import Future as DaskFuture
 
 log = logging.getLogger("scene2spad")
 
@@ -28,9 +32,15 @@ MAX_WORKERS = 256
 TRIES = 3  # of a number whose worker process died
 CONNECT_S, CLOSE_S = 10, 2  # until a scheduler that does not answer is given up, and one is left
 Numbers = tuple[int, ...]
-Work = Callable[[Numbers], list]  # one result a number; pickled to other processes
-Lost = Callable[[int, str], Any]  # the result of a number that nobody could do, and why
-Run = Callable[[Work, Iterable[Numbers], Lost], Iterator[Any]]
+Result = TypeVar("Result")
+Work: TypeAlias = Callable[[Numbers], list[Result]]  # one result a number; pickled to other processes
+Lost: TypeAlias = Callable[[int, str], Result]  # the result of a number that nobody could do, and why
+
+
+class Run(Protocol):
+    """What `executor` yields: call it with work and runs of numbers, and it gives the results."""
+
+    def __call__(self, work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]) -> Iterator[Result]: ...
 
 
 def check_workers(number: int, least: int = 1) -> None:
@@ -48,7 +58,8 @@ def executor(workers: int, scheduler: str | None) -> Iterator[Run]:
     with ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(_dask_client(scheduler))
 
-        def run(work: Work, runs: Iterable[Numbers], lost: Lost) -> Iterator[Any]:
+        def run(work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]) -> Iterator[Result]:
+            results: Generator[Result, None, None]
             if client is not None:
                 results = _on_dask(client, work, runs, lost)
             elif workers == 1:
@@ -61,7 +72,9 @@ def executor(workers: int, scheduler: str | None) -> Iterator[Run]:
         yield run
 
 
-def _on_processes(workers: int, work: Work, runs: Iterable[Numbers], lost: Lost) -> Iterator[Any]:
+def _on_processes(
+    workers: int, work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]
+) -> Generator[Result, None, None]:
     """Several processes of ours. One that dies takes the pool with it: a new one goes on, and retries what was lost."""
     runs = iter(runs)
     first = list(islice(runs, workers))
@@ -70,7 +83,7 @@ def _on_processes(workers: int, work: Work, runs: Iterable[Numbers], lost: Lost)
     workers = max(1, min(workers, len(first)))
     threads, others = max(1, (os.cpu_count() or 1) // workers), {*active_children()}
     while True:
-        running: dict[Future, Numbers] = {}
+        running: dict[Future[list[Result]], Numbers] = {}
         with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads, os.getpid())) as pool:
             try:
                 while True:
@@ -130,7 +143,7 @@ def _end_with(parent: int) -> None:
 
 
 @contextmanager
-def _dask_client(address: str) -> Iterator[Any]:
+def _dask_client(address: str) -> Iterator[Client]:
     try:
         from distributed import Client
     except ImportError:
@@ -163,8 +176,10 @@ def _cluster_logs_off() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _on_dask(client: Any, work: Work, runs: Iterable[Numbers], lost: Lost) -> Iterator[Any]:
-    """A cluster's workers, a few tasks each in flight, so that results do not heap up; a dead worker's move on.
+def _on_dask(
+    client: Client, work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]
+) -> Generator[Result, None, None]:
+    """Use a cluster's workers, a few tasks each in flight, so that results do not heap up; a dead worker's move on.
 
     Raises InputError where the scheduler goes away.
     """
@@ -176,7 +191,7 @@ def _on_dask(client: Any, work: Work, runs: Iterable[Numbers], lost: Lost) -> It
     if not workers:
         log.warning("scheduler %s has no workers yet: waiting for some", client.scheduler.address)
     lanes = max(1, len(workers))
-    submitted: dict[Any, Numbers] = {}
+    submitted: dict[DaskFuture, Numbers] = {}
     pending = as_completed()
     while True:
         for run in islice(waiting, 3 * lanes - len(submitted)):
@@ -201,7 +216,7 @@ def _on_dask(client: Any, work: Work, runs: Iterable[Numbers], lost: Lost) -> It
 
 
 @contextmanager
-def _explain_lost_scheduler(client: Any) -> Iterator[None]:
+def _explain_lost_scheduler(client: Client) -> Iterator[None]:
     """InputError in one line where the scheduler does not answer any more; it is told by errors of several types."""
     try:
         yield

@@ -113,7 +113,8 @@ def plane_scene(
     depth = distance_m + side @ np.tan(tilt_rad)
     require(bool((depth > 0).all()), f"plane at {distance_m:g} m: its tilt brings it behind the sensor")
     wall = Surface(np.column_stack((side, depth)), np.array([[0, 1, 2], [0, 2, 3]]), Material(albedo=0.5))
-    return Scene("plane", (wall,), camera, Laser("flood", tuple(zones.baseline_m), cone_deg=CONE_DEG))
+    across, down, forward = zones.baseline_m
+    return Scene("plane", (wall,), camera, Laser("flood", (across, down, forward), cone_deg=CONE_DEG))
 
 
 def render_plane(

@@ -11,6 +11,7 @@ from scene2spad.dry_runs.training import step_seconds
 from scene2spad.networks.registry import ModelSpec
 from scene2spad.networks.training import PLANES, config_of
 from scene2spad.options.experiments import ABLATIONS, Study
+from scene2spad.options.networks import TrainingPreset
 from scene2spad.studies.every import TIMINGS
 from scenes.io.inputs import read_whole_lines
 
@@ -91,7 +92,7 @@ def _is_there(one: ModelSpec, library: Path, *, shipped: bool) -> bool:
     return (library / one.name / "model.safetensors").is_file() or (shipped and shipped_file(one.name).is_file())
 
 
-def _training_seconds(one: ModelSpec, preset: str) -> float:
+def _training_seconds(one: ModelSpec, preset: TrainingPreset) -> float:
     config = config_of(one.command(preset, Path(PLANES), Path()))
     return step_seconds(config)[0] * config.steps
 

@@ -50,11 +50,11 @@ def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> M
         message = f"holds none of the {len(wanted)} models, nor does the package; give --models FOLDER or --retrain"
         raise InputError(f"{library.folder}: {message}")
     absent = [one for one in wanted if one not in found]
+    pack = training or Path("rooms.h5")
     if absent and training is None:
-        training = Path("rooms.h5")
-        log.warning("%s below: scene2spad dataset rooms --count 2000 --bounces 1 --pack %s", training, training)
+        log.warning("%s below: scene2spad dataset rooms --count 2000 --bounces 1 --pack %s", pack, pack)
     for one in absent:
-        log.warning("absent: %s; made by: %s", one.name, one.training_command(command.preset, training, library.folder))
+        log.warning("absent: %s; made by: %s", one.name, one.training_command(command.preset, pack, library.folder))
     _warn_if_unlike(found.values())
     return ModelLookup(found, absent)
 

@@ -20,7 +20,7 @@ from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training.config import ModelConfig, TrainConfig
 from csph.weights.shipped import RESUME, RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
 from scene2spad.networks.training import config_of, run_train
-from scene2spad.options.networks import Train
+from scene2spad.options.networks import Train, TrainingPreset
 from scenes.errors import require
 from scenes.progress import Progress
 
@@ -95,7 +95,7 @@ class ModelSpec:
             parts.append("tdc")
         return "-".join([*parts, f"s{self.seed}"])
 
-    def command(self, preset: str, training: Path, folder: Path) -> Train:
+    def command(self, preset: TrainingPreset, training: Path, folder: Path) -> Train:
         """Return the `train` command that makes it in `folder/name`."""
         begun = folder / self.plain.name
         return Train(
@@ -235,7 +235,7 @@ class ModelRegistry:
         found = {one: self.find(one) for one in wanted}
         return {one: model for one, model in found.items() if model is not None}
 
-    def train(self, wanted: Sequence[ModelSpec], preset: str, training: Path, progress: Progress) -> None:
+    def train(self, wanted: Sequence[ModelSpec], preset: TrainingPreset, training: Path, progress: Progress) -> None:
         """Train what is not finished in the folder; interrupted runs go on. Says how long it takes."""
         todo = [one for one in wanted if self.find(one) is None]
         start = time.perf_counter()

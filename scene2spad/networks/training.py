@@ -17,8 +17,9 @@ from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.codes.design import Design
 from csph.evaluation.methods import LEVEL_GROUPS, DepthEstimator, Evaluation, EvaluationPlan, Method, as_dicts, evaluate
 from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.layer import SpatialStart
 from csph.networks.model import DepthModel, load_model
-from csph.training.config import ModelConfig, TrainConfig, preset
+from csph.training.config import Front, ModelConfig, Network, TrainConfig, preset
 from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
@@ -45,21 +46,31 @@ def config_of(command: Train) -> TrainConfig:
     described = load_sensor(command.sensor)
     require(described.zones is None, f"train: sensor {command.sensor} has zones, networks are for pixels")
     sensor = described.sensor
-    network = command.network or ("published" if command.preset == "paper" else "compact")
+    network: Network = command.network or ("published" if command.preset == "paper" else "compact")
     # the published network finds the pulse in the counts by itself; ours, of few layers, is given them matched
-    front = {"none": "matched" if network == "compact" else "counts", "peak": "peak"}.get(command.design, "codes")
+    uncoded: dict[str, Front] = {"none": "matched" if network == "compact" else "counts", "peak": "peak"}
+    front = uncoded.get(command.design, "codes")
     design = None
     if front == "codes":
         compression = command.compression if command.codes is None else None
         design = Design.named(
             command.design, command.block, codes=command.codes, compression=compression, full=command.full
         )
-    layer = dict.fromkeys(command.layer, True)
+    switches: tuple[str, ...] = command.layer
+    layer = dict.fromkeys(switches, True)
     # the first models' and the published start, which their recipes reproduce
-    start = command.spatial_start or ("uniform" if command.preset in ("paper", "laptop-v1") else "orthogonal")
+    start: SpatialStart = "uniform" if command.preset in ("paper", "laptop-v1") else "orthogonal"
+    start = command.spatial_start or start
     start = start if design is not None and "spatial" in design.learned else "uniform"
-    made = {"network": network, "sensor": sensor, "grid": command.grid, "spatial_start": start}
-    model = ModelConfig(front=front, design=design, layer=layer, **made)
+    model = ModelConfig(
+        front=front,
+        design=design,
+        layer=layer,
+        network=network,
+        sensor=sensor,
+        grid=command.grid,
+        spatial_start=start,
+    )
     config = preset(
         command.preset,
         model,
@@ -110,7 +121,7 @@ def _views_of_set(path: Path, command: Train) -> Views:
 
 
 def _paths(paths: Sequence[Path]) -> str | list[str]:
-    """A set's path as it was given; a list of several."""
+    """Return a set's path as it was given; a list of several."""
     lines = [str(path) for path in paths]
     return lines if len(lines) > 1 else "".join(lines)
 

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 from scene2spad.options.common import Common, Count, Long, Number, Pixels, Positional, may_stay_open
 
+TrainingPreset = Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Train(Long):
@@ -34,7 +36,7 @@ class Train(Long):
     """Relative frequency at which patches are drawn from each set (default: alike)."""
     validation: tuple[Path, ...] = ()
     """Sets to validate on (default: the last tenth of the scenes)."""
-    preset: Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"] = "laptop"
+    preset: TrainingPreset = "laptop"
     """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; gpu: our
     network with three times workstation's pixels, sensed on the GPU; paper: the published network and schedule (GPU);
     laptop-v1: the recipe of the first models."""

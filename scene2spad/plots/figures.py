@@ -311,7 +311,8 @@ def _telling_pixel(transient: Transient) -> tuple[int, int]:
     bright = known & (total >= np.median(total[known])) & ~transient.mixed
     candidates = np.flatnonzero(bright if bright.any() else known)
     ranked = candidates[np.argsort(fraction[candidates], kind="stable")]
-    return np.unravel_index(int(ranked[int(0.9 * (len(ranked) - 1))]), total.shape)
+    row, column = np.unravel_index(int(ranked[int(0.9 * (len(ranked) - 1))]), total.shape)
+    return int(row), int(column)
 
 
 def _one_pixel(above: Axes, below: Axes, transient: Transient, histogram: Histogram, row: int, column: int) -> None:

@@ -10,12 +10,13 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from PIL import Image
 
 from scenes.errors import printable, require
 from scenes.io.inputs import read_json_object
+from scenes.json_types import JsonObject
 
 # What studies keep for themselves: renders, sets, captures, kept results, trained models.
 INSIDE = ("sets", "renders", "captures", "results", "maps", "models", "emulated")
@@ -34,6 +35,8 @@ UNREADABLE = (
     OSError, ValueError, TypeError, KeyError, SyntaxError, RecursionError, csv.Error, struct.error, zlib.error,
     Image.DecompressionBombError,
 )  # fmt: skip
+
+Content = TypeVar("Content")
 
 
 @dataclass
@@ -62,7 +65,7 @@ class Found:
         older = len(self.files.get(path.name, [])) - 1
         return f"{path.relative_to(self.root)}, {day}{f'; {older} older of that name not shown' if older > 0 else ''}"
 
-    def read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
+    def read(self, path: Path, reader: Callable[[Path], Content]) -> Content | None:
         """Return what a reader makes of a file; None, and a problem, where it cannot."""
         try:
             return reader(path)
@@ -126,7 +129,7 @@ def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
         return data, image.size
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path) -> list[dict[str, int | float | str]]:
     """Return rows of a table; ValueError where lines are cut."""
     with path.open(newline="", encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines, strict=True))
@@ -136,7 +139,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _number(text: str) -> int | float | str:
-    """A table's cell as the number that it spells, if it does."""
+    """Return a table's cell as the number that it spells, if it does."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -145,6 +148,6 @@ def _number(text: str) -> int | float | str:
     return text
 
 
-def rows_in(value: Any) -> Sequence[Mapping[str, Any]]:
+def rows_in(value: object) -> Sequence[JsonObject]:
     """Return the rows of a table in a JSON object; none where there is no table."""
-    return [row for row in value if isinstance(row, Mapping)] if isinstance(value, list) else []
+    return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []

@@ -6,7 +6,6 @@ import base64
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import Any
 
 GENERATOR = '<meta name="generator" content="scene2spad report">'
 # nothing may be loaded, whatever a result's text says
@@ -109,7 +108,7 @@ def picture(anchor: str, png: bytes, size: tuple[int, int], alt: str, caption: s
     return f'<figure id="{escape(anchor)}">\n{image}\n<figcaption>{escape(caption)}</figcaption>\n</figure>'
 
 
-def table(rows: Sequence[Mapping[str, Any]], caption: str, most: int = 60) -> str:
+def table(rows: Sequence[Mapping[str, object]], caption: str, most: int = 60) -> str:
     """Return rows of any keys, the union of them as columns; at most `most`, and what is left out is said."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     head = "".join(f'<th scope="col">{escape(name.replace("_", " "))}</th>' for name in columns)
@@ -122,13 +121,13 @@ def table(rows: Sequence[Mapping[str, Any]], caption: str, most: int = 60) -> st
     )
 
 
-def _cell(value: Any) -> str:
+def _cell(value: object) -> str:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     kind = ' class="n"' if number else ""
     return f"<td{kind}>{escape(format_value(value))}</td>"
 
 
-def format_value(value: Any) -> str:
+def format_value(value: object) -> str:
     """Return four digits of a number, yes or no, a dash for none; lists and dictionaries in a line."""
     if isinstance(value, bool):
         return "yes" if value else "no"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,8 @@ def run(command: Report, progress: Progress) -> dict:
 
 def compose(found: Found) -> str:
     """Return the page."""
-    body, contents = [], []
+    body: list[str] = []
+    contents: list[html.Entry] = []
     for part in SECTIONS:
         items = [(item, text) for item in part.items if (text := _item(item, found))]
         if items:
@@ -104,12 +105,12 @@ def _notes(item: Item, found: Found) -> Iterator[str]:
     """Describe the models that a study rests on, as its own JSON states them."""
     for name in dict.fromkeys(one.file for one in item.tables if one.file.endswith(".json")):
         path = found.newest(name)
-        numbers = None if path is None else found.read(path, read_json_object)
-        models = rows_in((numbers or {}).get("models"))
+        numbers = (None if path is None else found.read(path, read_json_object)) or {}
+        models = rows_in(numbers.get("models"))
         kinds = dict.fromkeys(f"{m.get('preset')}, {m.get('steps')} steps on {m.get('trained_on')}" for m in models)
         if kinds:
             yield f"{len(models)} trained models: {'; '.join(kinds)}."
-        if (numbers or {}).get("absent"):
+        if numbers.get("absent"):
             yield f"Models that were absent: {html.format_value(numbers['absent'])}."
 
 
@@ -126,13 +127,13 @@ def _absent(file: str, command: str, path: Path | None, absent: dict[str, list[s
 def _picture(one: Picture, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
     path = found.newest(one.file)
     read = None if path is None else found.read(path, read_png)
-    if read is None:
+    if path is None or read is None:
         return _absent(one.file, one.command or item.command, path, absent)
     return _figure(read, f"{one.shows}.", f"{one.shows}. ({found.caption(path)})", found)
 
 
 def _figure(read: tuple[bytes, tuple[int, int]], alt: str, caption: str, found: Found) -> str:
-    """The picture, or where the same stands already, a link to it."""
+    """Return the picture, or where the same stands already, a link to it."""
     data, size = read
     anchor = f"picture-{hashlib.sha256(data).hexdigest()[:16]}"
     if anchor in found.shown:
@@ -143,13 +144,15 @@ def _figure(read: tuple[bytes, tuple[int, int]], alt: str, caption: str, found: 
 
 def _rows_of(one: Table, found: Found) -> tuple[list[dict] | None, Path | None]:
     path = found.newest(one.file)
-    read = None if path is None else found.read(path, read_json_object if one.file.endswith(".json") else read_rows)
+    reader: Callable[[Path], object] = read_json_object if one.file.endswith(".json") else read_rows
+    read = None if path is None else found.read(path, reader)
+    if path is None or read is None:
+        return None, path
     rows = read.get(one.key) if isinstance(read, dict) else read
-    good = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
-    if read is not None and not good:
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         found.problem(f"{path.relative_to(found.root)}: has no table {one.key}")
         return None, path
-    if rows and one.columns:
+    if one.columns:
         rows = [{name: row.get(name) for name in one.columns} for row in rows if row.get("chief", True)]
     return rows, path
 
@@ -165,10 +168,10 @@ def _table(one: Table, item: Item, found: Found, absent: dict[str, list[str]]) -
 
 
 def _named(name: str, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
-    """A table too long to show: its name and length."""
+    """Name a table too long to show: its name and length."""
     path = found.newest(name)
     rows = None if path is None else found.read(path, read_rows)
-    if rows is None:
+    if path is None or rows is None:
         return _absent(name, item.command, path, absent)
     return f"<p>In full: {html.code(found.caption(path))}, {len(rows)} rows.</p>"
 

@@ -73,9 +73,11 @@ def _ratio(found: float | None, published: float | None) -> str:
 
 def power_rows(measured: Sequence[dict]) -> list[dict[str, object]]:
     """Return a row a measured program: every published number, and the emulated one."""
-    ours, rows = {row.get("name"): row for row in measured}, []
+    ours = {row.get("name"): row for row in measured}
+    rows: list[dict[str, object]] = []
     for name, published in PUBLISHED.items():
-        mine, row = ours.get(name), {"program": name}
+        mine = ours.get(name)
+        row: dict[str, object] = {"program": name}
         if mine is None:
             continue
         for column in POWER_COLUMNS:

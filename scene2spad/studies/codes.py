@@ -102,6 +102,8 @@ def decoded_table(
         truth = _truth(histogram)
         kept.append((truth, [encode(counts, coding) for _, coding in codings]))
         rows.append(_row(UNCOMPRESSED, 0, truth, estimate_depth(counts, sensor, UNCOMPRESSED), sensor))
+    if sensor is None:
+        return rows
     for number, (name, coding) in enumerate(codings):  # one code after the other: its templates are made once
         for truth, encoded in kept:
             depth = decode_depth(encoded[number], coding, sensor)
@@ -151,7 +153,7 @@ def _row(method: str, codes: int, truth: _Truth, depth_m: Tensor, sensor: Sensor
         median_abs_mm=median,
         within_10mm=errors["within_10mm"],
         bound_mm=truth.bound_mm,
-        pixels=errors["pixels"],
+        pixels=int(errors["pixels"]),
     )
 
 

@@ -53,7 +53,7 @@ def run_all(command: Study, progress: Progress) -> dict:
     """
     rows: list[dict[str, Any]] = []
     for number, name in enumerate(STUDIES):
-        one = replace(command, name=name)  # type: ignore[arg-type]  # STUDIES are the names of the option
+        one = replace(command, name=name)
         row = _finished(one)
         if row is None:
             log.info("study %s (%d of %d)", name, number + 1, len(STUDIES))
@@ -82,8 +82,7 @@ def _attempt(command: Study, progress: Progress) -> dict:
 
 def _asked(command: Study) -> str:
     """All that decides a study's results, but for what it finds in folders."""
-    ignored = {"json": False, "dry_run": False, "ship": False}
-    options = asdict(replace(command, **ignored))
+    options = asdict(replace(command, json=False, dry_run=False, ship=False))
     return json.dumps({**options, "version": version("scene2spad")}, sort_keys=True, default=str)
 
 

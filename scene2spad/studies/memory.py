@@ -32,7 +32,8 @@ NAMED_BLOCKS = ((256, 4, 4), (1024, 4, 4), (256, 8, 8), (256, 2, 2), (64, 4, 4))
 def run(command: Study, progress: Progress) -> dict:
     """Run the study: both figures; their numbers, by K and then by N and B; the section's statements."""
     command.out.mkdir(parents=True, exist_ok=True)
-    tables, drawn = {}, []
+    tables: dict[str, dict[int, dict[str, np.ndarray]]] = {}
+    drawn: list[str] = []
     for name, factor, title in (
         ("memory-full", 1.0, "full coding tensors (Figure 15)"),
         ("memory-separable", SEPARABLE_FACTOR, f"separable coding tensors, {SEPARABLE_FACTOR:g} x smaller (Figure 16)"),

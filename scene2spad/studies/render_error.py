@@ -125,7 +125,8 @@ def _view(job: Job, view: int, again: int, cache: Path, progress: Progress) -> T
             log.warning("%s: unreadable, made again", path)
     progress(f"{job.set} {view}: grid {job.grid}, {job.spp} paths", 0.0)
     done = render_view(job, view, again)
-    require(done.exr is not None, f"view {view} of {job.set} cannot be rendered: {done.record.get('failed')}")
+    if done.exr is None:
+        raise InputError(f"view {view} of {job.set} cannot be rendered: {done.record.get('failed')}")
     cache.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as beside:
         beside.write_bytes(done.exr)

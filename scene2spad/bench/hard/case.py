@@ -84,7 +84,7 @@ def worst(got: np.ndarray, expected: np.ndarray) -> float:
     return float(np.nan_to_num(np.abs(got / expected - 1), nan=np.inf).max())
 
 
-def farthest_m(got: np.ndarray, expected: np.ndarray) -> float:
+def farthest_m(got: np.ndarray, expected: np.ndarray | float) -> float:
     """Return largest difference; infinite where something is missing."""
     return float(np.nan_to_num(np.abs(got - expected), nan=np.inf).max())
 

@@ -114,15 +114,19 @@ def _horizon(seed: int) -> Outcome:
 
 def _silhouette(seed: int) -> Outcome:
     scene = hard_case("silhouette")
-    ball = {"distance_m": scenes.BALL_M, "radius_m": scenes.BALL_RADIUS_M}
     transient = render(scene, EDGES, seed=seed)
-    coverage = oracles.sphere_coverage(scene.camera, **ball, per_side=32)
+    coverage = oracles.sphere_coverage(
+        scene.camera, distance_m=scenes.BALL_M, radius_m=scenes.BALL_RADIUS_M, per_side=32
+    )
     got = moments_of(transient)
     # at the limb cos = sqrt(2 s / r): a pixel covered by less than a tenth holds under 1 % of a full one's light
     limb = (coverage > 0.1) & (coverage < 1)
     paint = partial(oracles.paint, albedo=0.7)
-    expected = oracles.sphere_moments(scene, **ball, reflected=paint, per_side=192, pixels=limb)
-    whole = oracles.sphere_moments(scene, **ball, reflected=paint, per_side=32).total.sum()
+    ball = partial(
+        oracles.sphere_moments, scene, distance_m=scenes.BALL_M, radius_m=scenes.BALL_RADIUS_M, reflected=paint
+    )
+    expected = ball(per_side=192, pixels=limb)
+    whole = ball(per_side=32).total.sum()
     errors = {
         "limb energy": Measured(worst(got.total[limb], expected.total), 1e-2),
         # a limb pixel's path deviates by 2.5 to 6 cm, and changes fastest in the last cell
@@ -135,15 +139,16 @@ def _silhouette(seed: int) -> Outcome:
 def _glint(seed: int) -> Outcome:
     scene = hard_case("glint")
     steel = partial(oracles.metal, roughness=scenes.GLINT_ROUGHNESS, eta=scenes.GLINT_ETA, k=scenes.GLINT_K)
-    ball = {"distance_m": scenes.GLINT_M, "radius_m": scenes.GLINT_RADIUS_M, "reflected": steel}
-    errors, notes = {}, 0
+    ball = partial(oracles.sphere_moments, distance_m=scenes.GLINT_M, radius_m=scenes.GLINT_RADIUS_M, reflected=steel)
+    errors: dict[str, Measured] = {}
+    notes = 0
     # the highlight lies on a corner of four pixels, which share it as cells a third as wide can tell; or within one
     for width, height in ((16, 12), (15, 11)):
         seen = replace(scene, camera=scenes.camera(width, height))
         transient = render(seen, SMOOTH, seed=seed)
         middle = np.zeros((height, width), bool)
         middle[height // 2 - 2 : height // 2 + 2, width // 2 - 2 : width // 2 + 2] = True
-        expected = oracles.sphere_moments(seen, **ball, per_side=512, pixels=middle)
+        expected = ball(seen, per_side=512, pixels=middle)
         got = Moments(*(values[middle] for values in moments_of(transient)))
         bright = expected.total > 1e-2 * expected.total.max()
         where = f"{width} x {height}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
@@ -30,8 +31,9 @@ from scenes.library.hard_cases import hard_case
 from scenes.model import Scene
 
 # Merging keeps a pixel's energy, mean and variance; 1 cm lets a histogram of 5 cm bins be compared, too.
-SHARP = {"direct_tolerance_m": 1e-4, "indirect_tolerance_m": 1e-2, "indirect_growth": 0}
-MERGED = {**SHARP, "indirect_tolerance_m": 5e-2}
+SHARP_M = (1e-4, 1e-2)  # of direct and indirect returns
+SHARP = RenderSettings(direct_tolerance_m=SHARP_M[0], indirect_tolerance_m=SHARP_M[1], indirect_growth=0)
+MERGED = replace(SHARP, indirect_tolerance_m=5e-2)
 GROOVE_SPP, SPHERE_SPP = 512, 16  # of each of several independent renders
 BOUNCES = (2, 4, 8, 20)
 MANY = 1 << 26
@@ -41,8 +43,8 @@ TESSELLATION = 2e-4
 
 @lru_cache(maxsize=2)
 def _two_bounces(name: str, seed: int) -> Transient:
-    """A groove with its first interreflection; kept, since several cases are held against the same one."""
-    settings = RenderSettings(bounces=2, spp=4 * GROOVE_SPP, adaptive=False, grid=4, **SHARP)
+    """Render a groove with its first interreflection; kept, since several cases are held against the same one."""
+    settings = replace(SHARP, bounces=2, spp=4 * GROOVE_SPP, adaptive=False, grid=4)
     return render(hard_case(name), settings, seed=seed)
 
 
@@ -51,7 +53,7 @@ def _groove(opening_deg: float, seed: int) -> Outcome:
     expected = oracles.groove_interreflection(
         scene, albedo=scenes.GROOVE_ALBEDO, edges_m=edges, opening_deg=opening_deg
     )
-    renders = independent(scene, RenderSettings(bounces=2, spp=GROOVE_SPP, grid=4, **SHARP), seed)
+    renders = independent(scene, replace(SHARP, bounces=2, spp=GROOVE_SPP, grid=4), seed)
     histograms = np.array([_path_histogram(transient, edges) for transient in renders])
     size = float(np.linalg.norm(expected))
     noise = float(np.linalg.norm(histograms.std(axis=0, ddof=1))) / np.sqrt(len(renders)) / size
@@ -88,9 +90,10 @@ def _furnace(albedo: float, seed: int) -> Outcome:
 
 def _integrating_sphere(albedo: float, seed: int) -> Outcome:
     scene = hard_case(f"sphere-{albedo:g}")
-    errors, cut = {}, 0
+    errors: dict[str, Measured] = {}
+    cut = 0
     for bounces in BOUNCES:
-        renders = independent(scene, RenderSettings(bounces=bounces, spp=SPHERE_SPP, grid=2, **MERGED), seed)
+        renders = independent(scene, replace(MERGED, bounces=bounces, spp=SPHERE_SPP, grid=2), seed)
         errors |= _against_sphere(scene, renders, albedo, bounces, f" at {bounces} bounces")
         cut += clipped(*renders)
     return Outcome(errors, cut)
@@ -121,12 +124,14 @@ def _against_sphere(
 def _dark_sphere(seed: int) -> Outcome:
     """Albedo 0.001: the second surface's light is albedo^2, the third's albedo^3, and nothing is lost to rounding."""
     albedo, scene = 0.001, hard_case("sphere-0.001")
-    renders = independent(scene, RenderSettings(bounces=3, spp=SPHERE_SPP, grid=2, **MERGED), seed)
+    renders = independent(scene, replace(MERGED, bounces=3, spp=SPHERE_SPP, grid=2), seed)
     errors = _against_sphere(scene, renders, albedo, 3)
     # one chord is no longer than 2 r: what comes 5 cm later or more met a third surface, over two chords
     longest = 2 * scenes.SPHERE_RADIUS_M + 0.05
-    two = {"radius_m": scenes.SPHERE_RADIUS_M, "offset_m": scenes.SPHERE_OFFSET_M, "albedo": albedo, "bounces": 2}
-    legs = integrating_sphere(scene, **two).mean_path_m.ravel() - 4 * scenes.SPHERE_RADIUS_M / 3
+    two = integrating_sphere(
+        scene, radius_m=scenes.SPHERE_RADIUS_M, offset_m=scenes.SPHERE_OFFSET_M, albedo=albedo, bounces=2
+    )
+    legs = two.mean_path_m.ravel() - 4 * scenes.SPHERE_RADIUS_M / 3
     fraction = two_chords_longer_than(longest, scenes.SPHERE_RADIUS_M)
     expected = fraction * albedo**3 / (4 * np.pi**2 * scenes.SPHERE_RADIUS_M**2)
     third = []
@@ -156,10 +161,9 @@ def _odd_mesh(name: str, seed: int) -> Outcome:
 
 def _scaled(name: str, scale: float, seed: int) -> Outcome:
     """Radiance goes with scale^-2, paths with the scale: against the groove of 1 m."""
-    widths = {
-        key: float(np.clip(scale * SHARP[key], 1e-4, 10)) for key in ("direct_tolerance_m", "indirect_tolerance_m")
-    }
-    settings = RenderSettings(bounces=2, spp=4 * GROOVE_SPP, adaptive=False, grid=4, indirect_growth=0, **widths)
+    direct_m, indirect_m = (float(np.clip(scale * metres, 1e-4, 10)) for metres in SHARP_M)
+    sharp = replace(SHARP, direct_tolerance_m=direct_m, indirect_tolerance_m=indirect_m)
+    settings = replace(sharp, bounces=2, spp=4 * GROOVE_SPP, adaptive=False, grid=4)
     scaled, plain = render(hard_case(name), settings, seed=seed), _two_bounces("groove-90", seed)
     here, there = (moments_of(t, t.bounces == 1) for t in (scaled, plain))
     lit = (there.total > 0) & ~plain.mixed & ~scaled.mixed
@@ -180,7 +184,7 @@ def _scaled(name: str, scale: float, seed: int) -> Outcome:
 
 
 def _one_pixel(spp: int, seed: int) -> Outcome:
-    """The integrating sphere in one pixel of that many paths: all their energy falls into a few metres of path."""
+    """Measure the integrating sphere in one pixel of that many paths: their energy falls into a few metres of path."""
     scene, bounces = hard_case("one-pixel"), 4
     transient = render(scene, RenderSettings(bounces=bounces, spp=spp, grid=16), seed=seed)
     expected = integrating_sphere(

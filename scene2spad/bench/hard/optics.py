@@ -48,7 +48,7 @@ def _specular(
     got = moments_of(transient, kept)
     return {
         "energy": Measured(relative(got.total[pixel], expected), SPECULAR_ENERGY),
-        "path [m]": Measured(farthest_m(got.mean_m[pixel], np.float64(one_way_m)), SPECULAR_PATH_M),
+        "path [m]": Measured(farthest_m(got.mean_m[pixel], one_way_m), SPECULAR_PATH_M),
         "energy in other pixels": Measured(float((got.total.sum() - got.total[pixel]) / expected), SPECULAR_ENERGY),
     }
 

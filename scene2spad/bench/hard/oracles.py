@@ -231,12 +231,17 @@ def shadowed_wall(
     post = (x_post > low) & (x_post < high)
     radiance = np.where(post, on_post, np.where(dark, 0, on_wall))
     seen = moments(radiance, np.where(post, post_path, wall_path), weight)
-    fractions = ((covered * weight).sum(-1) for covered in (post, dark & ~post))
+    in_post, in_shadow = ((covered * weight).sum(-1) for covered in (post, dark & ~post))
     camera_x = [x / post_m for x in post_x_m]  # the edges in camera rays' x / z
     camera_x += [(laser[0] + (x - laser[0]) * wall_m / post_m) / wall_m for x in post_x_m]
     columns = np.floor(np.array(camera_x) * scene.camera.focal_px + scene.camera.width / 2)
     return Shadowed(
-        seen, (on_wall * weight).sum(-1), np.maximum(radiance, on_wall).max(-1), *fractions, columns.astype(int)
+        seen,
+        (on_wall * weight).sum(-1),
+        np.maximum(radiance, on_wall).max(-1),
+        post=in_post,
+        shadow=in_shadow,
+        columns=columns.astype(int),
     )
 
 

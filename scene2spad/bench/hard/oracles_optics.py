@@ -12,6 +12,7 @@ from scene2spad.bench.hard.oracles import Moments, moments, pixel_samples
 from scenes import Camera, Laser, Scene
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.sensor.model import Sensor
+from spad.sensor.pulse import Pulse
 
 
 def fresnel(cosine: np.ndarray | float, ior: float) -> np.ndarray:
@@ -155,14 +156,15 @@ def wall_on_sensor(scene: Scene, sensor: Sensor, *, distance_m: float, per_side:
     A ray at the cosine c from the axis has weight c^3 and path 2 d / c.
     """
     directions, weight = pixel_samples(scene.camera, per_side)
-    cosine = -directions[..., 2]
+    pulse, cosine = sensor.pulse, -directions[..., 2]
+    assert isinstance(pulse, Pulse)  # the integral below is a Gaussian's
     time = (2 * distance_m / cosine / SPEED_OF_LIGHT_M_PER_S).ravel()
     fraction = (cosine**3 * weight).ravel() / (cosine**3 * weight).sum()
     period = sensor.bins_per_period
-    first = math.floor((time.min() - sensor.pulse.reach_s) / sensor.bin_width_s)
-    last = math.ceil((time.max() + sensor.pulse.reach_s) / sensor.bin_width_s)
+    first = math.floor((time.min() - pulse.reach_s) / sensor.bin_width_s)
+    last = math.ceil((time.max() + pulse.reach_s) / sensor.bin_width_s)
     edges = np.arange(first, last + 1)
-    arrived = ndtr((edges[:, None] * sensor.bin_width_s - time) / sensor.pulse.sigma_s) @ fraction
+    arrived = ndtr((edges[:, None] * sensor.bin_width_s - time) / pulse.sigma_s) @ fraction
     mass = np.diff(arrived)
     histogram = np.zeros(period)
     np.add.at(histogram, edges[:-1] % period, mass)

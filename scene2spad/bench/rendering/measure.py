@@ -76,7 +76,8 @@ def our_runner(world: TracedScene, method: Method, transport: str) -> Runner:
     The last histogram is dropped right before the next is made, in its place. Tracing gives freed memory back to the
     system, and the peer does not: to map a histogram's pages anew can take as long as tracing.
     """
-    camera, kept = world.scene.camera, []
+    camera = world.scene.camera
+    kept: list[np.ndarray] = []
 
     def run(quality: int, seed: int) -> np.ndarray:
         samples = ours.trace(world, method, BOUNCES[transport], quality, seed)

@@ -21,5 +21,5 @@ def run(command: Study, progress: Progress) -> dict:
 
     if command.name != "all":
         return dry_run(command)
-    found = [dry_run(replace(command, name=name)) for name in STUDIES]  # type: ignore[arg-type]
+    found = [dry_run(replace(command, name=name)) for name in STUDIES]
     return {"dry_run": True, "studies": found, "out": str(command.out)}

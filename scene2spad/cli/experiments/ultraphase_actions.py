@@ -50,7 +50,8 @@ def load(command: Ultraphase) -> tuple[Program, Method | None]:
     constants = {}
     for text in command.define:
         found = re.fullmatch(r"([A-Za-z_]\w*)=(-?\d{1,9})", text)
-        require(found is not None, f"--define {text!r}: expected NAME=VALUE with a whole number")
+        if found is None:
+            raise InputError(f"--define {text!r}: expected NAME=VALUE with a whole number")
         constants[found[1]] = int(found[2])
     return assemble_file(Path(command.program), constants), None
 
@@ -107,7 +108,7 @@ def _asm(command: Ultraphase, progress: Progress) -> dict:
 
 
 def _compile(command: Ultraphase, progress: Progress) -> dict:
-    """A trained model's program: what it takes, what it costs, and that it computes the torch path's integers."""
+    """Show a trained model's program: what it takes, what it costs, and that it computes the torch path's integers."""
     from csph.networks.model import load_model
     from csph.weights.cards import checkpoint_of
     from csph.weights.shipped import RUN_WEIGHTS

@@ -64,7 +64,7 @@ def _import(command: Models) -> dict:
     source = Path(command.file)
     folder = command.out or Path("out/models") / source.stem
     made = import_checkpoint(source, folder, load_sensor(command.sensor or TRAINED_ON).sensor)
-    model, design = made.config.model, made.config.model.design
+    model, design = made.config.model, made.config.model.codes_design
     log.info("depths of this model are on the published grid: bin i of T is i/(T - 1) of the range, labels whole bins")
     return {
         "model": model.name,

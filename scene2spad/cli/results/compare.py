@@ -59,13 +59,13 @@ def run(command: Compare, progress: Progress) -> dict:
         errors = depth_errors(depths[name], histogram.depth_m, range_m=histogram.sensor.range_m, exclude=exclude)
         rows.append({"method": name, **{key: errors[key] for key in FIGURES}, "seconds": round(seconds, 3)})
     write_csv(rows, out)
-    drawn = draw_comparison(histogram, depths, {row["method"]: row for row in rows}, figure)
+    drawn = draw_comparison(histogram, depths, dict(zip(methods, rows, strict=True)), figure)
     shown = rows if command.json else _table(rows)
     return {"methods": shown, "table": str(out), "figure": str(drawn)}
 
 
 def _table(rows: list[dict]) -> list[str]:
-    """The rows as aligned lines."""
+    """Return the rows as aligned lines."""
     width = max(len(row["method"]) for row in rows)
     lines = [f"{'method':<{width}}  {'MAE mm':>8} {'RMSE mm':>8} {'< 10 mm':>8} {'missing':>8} {'seconds':>8}"]
     for row in rows:

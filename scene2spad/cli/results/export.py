@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient
 from scene2spad.options.common import Common, File, Positional, may_stay_open
 from scenes.errors import InputError, require
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 DENSE = (".npz", ".h5", ".hdf5")
@@ -82,7 +83,8 @@ def _points(command: Export, kind: str) -> int:
 
     depth_m, intensity, confidence, camera = _depth_of(command, kind)
     points = camera_points(depth_m, camera)
-    require(points is not None, f"{command.file}: does not say which camera it was seen with, so there are no points")
+    if points is None:
+        raise InputError(f"{command.file}: does not say which camera it was seen with, so there are no points")
     known = np.isfinite(depth_m)
     top = float(np.quantile(intensity[known], 0.995)) if known.any() else 1.0
     fraction = np.clip(intensity[known] / (top or 1.0), 0, 1)
@@ -90,7 +92,7 @@ def _points(command: Export, kind: str) -> int:
     return int(known.sum())
 
 
-def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
+def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, JsonObject | None]:
     """Return depth, intensity and confidence (H, W), and the camera."""
     if kind == "depth":
         found = open_depth(command.file)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scene2spad.datasets.zone_captures import read_plane_captures, shipped_captures, within, zone_captures
-from scenes.errors import require
+from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.sensor.files import load_sensor, write_sensor
 from spad.zones.calibration import Calibration, calibrate, calibrated_file, check_effects, poisson_deviance
@@ -30,7 +30,8 @@ def run(command: Calibrate, progress: Progress) -> dict:
     require(0 <= command.model_error < 1, f"--model-error {command.model_error:g} is outside 0 to 1")
     check_effects(command.effects)
     start = load_sensor(command.sensor)
-    require(start.zones is not None, f"sensor {start.sensor.name} has no zones: its file needs a table [zones]")
+    if start.zones is None:
+        raise InputError(f"sensor {start.sensor.name} has no zones: its file needs a table [zones]")
     path = shipped_captures() if str(command.captures) == "shipped" else command.captures
     chosen = within(read_plane_captures(path), command.nearest)
     number = len(chosen.distance_m)
@@ -46,7 +47,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
     span = f"{chosen.distance_m[0]:g} to {chosen.distance_m[-1]:g} m"
     how = f"calibrated from {len(used)} captures of {path.name}, {span}"
     write_sensor(calibrated_file(start, fitted, command.out.stem, how), command.out)
-    zones = fitted.zones
+    trials, recovery, compression = (values.tolist() for values in fitted.zones.saturation)
     return {
         "seconds": time.perf_counter() - began,
         "captures": len(used),
@@ -54,10 +55,10 @@ def run(command: Calibrate, progress: Progress) -> dict:
         "deviance": fitted.deviance,
         "held_out_deviance": mean_deviance(held, fitted),
         "bin_width_ps": fitted.sensor.bin_width_s * 1e12,
-        "trials": list(zones.trials),
-        "recovery": list(zones.recovery),
-        "compression": list(zones.compression),
-        "crosstalk": zones.crosstalk,
+        "trials": trials,
+        "recovery": recovery,
+        "compression": compression,
+        "crosstalk": fitted.zones.crosstalk,
         "standard_errors": {name: float(np.max(error)) for name, error in fitted.errors.items()},
         "out": str(command.out),
     }

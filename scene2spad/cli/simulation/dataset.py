@@ -71,8 +71,7 @@ def run(command: Dataset, progress: Progress) -> dict:
         from scene2spad.dry_runs.sets import dry_run
 
         return dry_run(job, count, out, command.workers)
-    options = {"workers": command.workers, "scheduler": command.scheduler, "progress": progress}
-    result = make_set(job, count, out, **options)
+    result = make_set(job, count, out, workers=command.workers, scheduler=command.scheduler, progress=progress)
     if command.pack is not None:
         result |= {"pack_bytes": pack_set(out, command.pack, progress), "pack": str(command.pack)}
     return result

@@ -240,4 +240,6 @@ def _network(command: Depth) -> DepthModel | None:
     from csph.networks.model import load_model
     from csph.weights.cards import shipped_model
 
-    return load_model(command.checkpoint or shipped_model(command.model))[0]
+    if command.model is not None:
+        return load_model(shipped_model(command.model))[0]
+    return None if command.checkpoint is None else load_model(command.checkpoint)[0]

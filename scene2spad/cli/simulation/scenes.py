@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from scene2spad.options.common import Common, File, Pixels, Positional
 from scenes.errors import InputError
@@ -28,7 +29,7 @@ class Scenes(Common):
 def run(command: Scenes, progress: Progress) -> dict:
     """List or describe."""
     if command.sheet is not None:
-        return _sheet(command, progress)
+        return _sheet(command, command.sheet, progress)
     if not command.scene:
         return {"scenes": dict(SCENES), "sets": dict(SETS)}
     scene = load_scene(command.scene, seed=command.seed)
@@ -51,19 +52,20 @@ def run(command: Scenes, progress: Progress) -> dict:
     return {"scenes": {scene.name: described}}
 
 
-def _sheet(command: Scenes, progress: Progress) -> dict:
-    """A contact sheet of a set."""
+def _sheet(command: Scenes, path: Path, progress: Progress) -> dict:
+    """Draw a contact sheet of a set."""
     from scene2spad.datasets.contact_sheets import draw_sheet
 
-    path = command.sheet
     if path.suffix.lower() != ".png" or not path.parent.is_dir():
         raise InputError(f"{path}: expected a .png in a folder that exists")
     of = scene_set(command.scene or "rooms")
     if command.count < 1:
         raise InputError(f"count {command.count} is less than 1")
     count = command.count if of.size is None else min(of.size, command.count)
-    width, height = (command.width or 128, None) if of.size is None else (command.width, None)
-    height = round(0.75 * width) if of.size is None else None
+    width, height = command.width, None
+    if of.size is None:
+        width = command.width or 128
+        height = round(0.75 * width)
     scenes = [of.view(i, seed=command.seed, width=width, height=height) for i in range(count)]
     draw_sheet(scenes, path, progress=progress)
     return {"scenes": [scene.name for scene in scenes], "figure": str(path)}

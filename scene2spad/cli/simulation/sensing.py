@@ -8,7 +8,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -59,7 +59,7 @@ def changed_sensor(sensor: Sensor, command: Sense) -> Sensor:
         "hot_rate_hz": command.hot_rate,
         "dead_share": command.dead_pixels,
     }
-    changes = {name: value for name, value in asked.items() if value is not None}
+    changes: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     if ("bins" in changes or "bin_width_s" in changes) and command.period is None:
         changes["period_s"] = None
     if command.hot_pixels and command.hot_rate is None and not sensor.hot_rate_hz:
@@ -68,7 +68,9 @@ def changed_sensor(sensor: Sensor, command: Sense) -> Sensor:
         changes["jitter"] = Pulse(command.jitter, command.jitter_tail)
     require(command.jitter is not None or not command.jitter_tail, "--jitter-tail needs --jitter")
     pulse = _asked_pulse(command)
-    return replace(sensor, **changes, **({} if pulse is None else {"pulse": pulse}))
+    if pulse is not None:
+        changes["pulse"] = pulse
+    return replace(sensor, **changes)
 
 
 def _asked_pulse(command: Sense) -> AnyPulse | None:
@@ -76,7 +78,7 @@ def _asked_pulse(command: Sense) -> AnyPulse | None:
     require((command.pulse is None) == (command.pulse_step is None), "--pulse and --pulse-step go together")
     require(command.pulse is None or command.pulse_fwhm is None, "give --pulse or --pulse-fwhm, not both")
     require(command.pulse_fwhm is not None or not command.pulse_tail, "--pulse-tail needs --pulse-fwhm")
-    if command.pulse is not None:
+    if command.pulse is not None and command.pulse_step is not None:
         return read_pulse(command.pulse, command.pulse_step)
     return None if command.pulse_fwhm is None else Pulse(command.pulse_fwhm / FWHM_PER_SIGMA, command.pulse_tail)
 
@@ -112,7 +114,7 @@ def run(command: Sense, progress: Progress) -> dict:
     if zones is not None:
         return _run_zones(command, zones)
     sensor, optics = sensor_of(command), optics_of(command)
-    budget = budget_of(command) if optics is None else None
+    budget = budget_of(command)
     source, out = _files(command)
     transient = read_transient(source)
     dark_map = None if command.dark_map is None else read_dark_map(command.dark_map, transient)

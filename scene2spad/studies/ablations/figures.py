@@ -21,7 +21,7 @@ WIDTH = 0.36  # of a model's cloud of points
 
 def label_of(trained: Trained) -> str:
     """Return design, block and parameters, as in the paper: Fourier codes by the quarter wave that generates them."""
-    design = trained.config.model.design
+    design = trained.config.model.codes_design
     kind = design.name.rsplit(" ", 2)[0]
     mark = GENERATED if design.computed is not None else ""
     return f"{kind}\n{design.block_name}, K = {design.codes}\n({design.storage:,} params{mark})"

@@ -7,6 +7,7 @@ Models, results and rendered sets are shared with `study depth-offset` in one fo
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,25 +38,28 @@ def run(command: Study, progress: Progress) -> dict:
     wanted = list(dict.fromkeys(one for sheet in sheets for one in sheet.wanted))
     models = obtain(wanted, command, progress)
     shipped = ship_all([*models.found.values()]) if command.ship else []
-    store, options = Store(folder / "results"), {"seed": command.seed, "progress": progress}
-    shape = {"count": SMOKE.views, "size": SMOKE.size} if smoke else {}
-    test = rendered(TEST_SET, folder / "sets", progress=progress, **shape)
+    store, seed = Store(folder / "results"), command.seed
+    count, size = (SMOKE.views, SMOKE.size) if smoke else (None, None)
+    test = rendered(TEST_SET, folder / "sets", count=count, size=size, progress=progress)
     subjects = {one: model.subject for one, model in models.found.items()}
     claims = CLAIMS[command.name]
     again = other_seeds(dict.fromkeys(one for claim in claims for one in (claim.first, claim.second)), command)
     levels = sorted({level for sheet in sheets for level in sheet.shown}) if smoke else LEVELS
     shown = [view for view in SHOWN_VIEWS if view < len(test.views.scenes)]
-    rows = evaluated(store, [*subjects.values()], test, levels, maps=shown, **options)
-    repeated = evaluated(store, [model.subject for model in again.values()], test, levels, **options)
+    rows = evaluated(store, [*subjects.values()], test, levels, maps=shown, seed=seed, progress=progress)
+    others = [model.subject for model in again.values()]
+    repeated = evaluated(store, others, test, levels, seed=seed, progress=progress)
     # with print, models of print's grid are compared as well; published numbers are means of all test levels
     twins = where_trained([replace(one, trained_on="published") for one in models.found], command)
-    beside = subjects | {one: model.subject for one, model in twins.items()}
-    pair_options = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, PHOTON_LEVELS)
+    beside = {one: model.subject for one, model in twins.items()}
+    pairs, pair_levels = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, PHOTON_LEVELS)
     numbers: dict[str, Any] = {
         "preset": command.preset,
         **models.described(),
         "conclusions": [decided(claim, [*rows, *repeated], {**models.found, **again}) for claim in claims],
-        "published": published.compared(store, beside, *pair_options, (0.0,), **options),
+        "published": published.compared(
+            store, subjects | beside, pairs, pair_levels, (0.0,), seed=seed, progress=progress
+        ),
         "summary": summary_rows(rows, models.found, {"set": TEST_SET}),
     }
     drawn = [
@@ -66,8 +70,8 @@ def run(command: Study, progress: Progress) -> dict:
     written = {"": as_dicts(rows), "-summary": numbers["summary"], "-published": numbers["published"]}
     made = [write_csv(table, command.out / f"{command.name}{name}.csv") for name, table in written.items() if table]
     path = command.out / f"{command.name}.json"
-    with whole_file(path) as beside:
-        beside.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
+    with whole_file(path) as unfinished:
+        unfinished.write_text(json.dumps(finite(numbers), indent=1, allow_nan=False) + "\n")
     files = {"figures": [str(each) for each in drawn], "csv": [str(each) for each in made], "numbers": str(path)}
     return {**(numbers if command.json else _summary(numbers)), **files, "shipped": shipped}
 
@@ -86,9 +90,9 @@ def decided(claim: Claim, rows: Sequence[Row], models: Mapping[ModelSpec, Traine
     if missing:
         return {**common, "levels": claim.levels, "verdict": "not decided", "why": f"absent: {', '.join(missing)}"}
     evaluation = Evaluation(list(rows))
-    first, second = (evaluation.interval(names, levels=claim.levels).mean for names in seeds)
-    apart = evaluation.difference(*seeds, claim.levels)
-    each = [[evaluation.interval([name], levels=claim.levels).mean for name in names] for names in seeds]
+    first, second = (_mean_mm(evaluation, names, claim.levels) for names in seeds)
+    apart = evaluation.difference(seeds[0], seeds[1], claim.levels)
+    each = [[_mean_mm(evaluation, [name], claim.levels) for name in names] for names in seeds]
     numbers = {"first_mm": first, "second_mm": second, "difference_mm": list(apart)}
     numbers |= {"first_seeds_mm": each[0], "second_seeds_mm": each[1]}
     found = verdict(claim.relation, apart, second)
@@ -96,6 +100,12 @@ def decided(claim: Claim, rows: Sequence[Row], models: Mapping[ModelSpec, Traine
     if any(verdict(claim.relation, pair, second) != found for pair in pairs):
         found = "not decided"
     return {**common, "levels": claim.levels, **numbers, "verdict": found}
+
+
+def _mean_mm(evaluation: Evaluation, names: Sequence[str], levels: str) -> float:
+    """Return the MAE [mm] over scenes; NaN where there is no finite value."""
+    interval = evaluation.interval(names, levels=levels)
+    return math.nan if interval is None else interval.mean
 
 
 def verdict(relation: str, apart: Sequence[float], second_mm: float) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 import torch
@@ -50,14 +52,14 @@ def interpret(counts: np.ndarray, compiled: Compiled) -> ChipFrame:
     integers."""
     height, width = counts.shape[:2]
     rows = max(_CORES // width // compiled.block[0], 1) * compiled.block[0]
-    parts, total = [], None
+    parts, counters = [], []
     for top in range(0, height, rows):
         part = counts[top : top + rows]
         array = CoreArray(compiled.program, part.shape[:2], compiled.tables(part.shape[:2]), chip=compiled.chip)
         frame = array.frame(*timestamps_of(part))
         parts.append(frame.out.reshape(part.shape[0] // compiled.block[0], width // compiled.block[1], -1))
-        total = frame.counters if total is None else total + frame.counters
-    return ChipFrame(np.concatenate(parts), total)
+        counters.append(frame.counters)
+    return ChipFrame(np.concatenate(parts), reduce(add, counters))
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,11 +51,12 @@ def compile_model(model: DepthModel, name: str) -> ChipModel:
     require(model.layer is not None, f"model {name}: has no codes to compile, its network sees all bins")
     bins = model.config.sensor.bins
     require(bins == TIMESTAMPS, f"model {name}: sensor of {bins} bins, the chip's timestamps count {TIMESTAMPS}")
-    design, coding = model.config.design, model.layer.coding()
+    layer, design = model.codes_layer, model.config.codes_design
+    coding = layer.coding()
     if _is_histogram(design, coding):
         code = IntegerCode(name, coding.temporal.round().to(torch.int8).numpy(), counters=True)
         return ChipModel(model, compile_code(code), 1.0, model)
-    steps = model.layer.quantised()
+    steps = layer.quantised()
     spatial = steps.spatial if coding.rows * coding.columns > 1 else None
     temporal = steps.temporal
     if temporal.ndim == 4 and temporal.shape[2:] == (1, 1):
@@ -63,9 +64,13 @@ def compile_model(model: DepthModel, name: str) -> ChipModel:
     code = IntegerCode(name, temporal, spatial, harmonics_of(design, temporal, model.config.sensor))
     scale = steps.temporal_scale * (1.0 if spatial is None else steps.spatial_scale) * (1 << code.output_shift)
     own = folded_temporal(code) if code.harmonics else temporal
-    parts = [(own, steps.temporal_scale), (spatial, steps.spatial_scale)]
-    floats = [None if part is None else torch.from_numpy(part.astype(np.float32) * np.float32(s)) for part, s in parts]
-    return ChipModel(model, compile_code(code), scale, _reader(model, CodingTensor(name, *floats)))
+    weights = None if spatial is None else _as_float(spatial, steps.spatial_scale)
+    chip_coding = CodingTensor(name, _as_float(own, steps.temporal_scale), weights)
+    return ChipModel(model, compile_code(code), scale, _reader(model, chip_coding))
+
+
+def _as_float(steps: np.ndarray, scale: float) -> torch.Tensor:
+    return torch.from_numpy(steps.astype(np.float32) * np.float32(scale))
 
 
 def with_headroom(model: DepthModel, bits: int) -> DepthModel:
@@ -80,7 +85,9 @@ def with_headroom(model: DepthModel, bits: int) -> DepthModel:
     wide = DepthModel(replace(model.config, layer={**model.config.layer, "int8": True}))
     wide.begin_with(model)
     with torch.no_grad():
-        wide.layer.temporal_range += bits * math.log(2)
+        logarithms = wide.codes_layer.temporal_range
+        assert logarithms is not None  # an int8 layer has it
+        logarithms.add_(bits * math.log(2))
     return wide.eval()
 
 
@@ -91,14 +98,14 @@ def headroom_of(model: DepthModel) -> int:
     trained for the chip has its own ranges, gates only count, and full
     tensors are too large for the chip.
     """
-    design = model.config.design
-    fixed = model.layer is None or model.layer.options.int8 or design.code == "coarse" or design.full
+    layer, design = model.layer, model.config.design
+    fixed = layer is None or design is None or layer.options.int8 or design.code == "coarse" or design.full
     return 0 if fixed else HEADROOM_BITS
 
 
 def _reader(model: DepthModel, coding: CodingTensor) -> DepthModel:
-    """The model with another coding tensor, taken as it is, in the place of its own."""
-    options = replace(model.layer.options, zero_mean=False, pulse_in_codes=False, int8=False)
+    """Return the model with another coding tensor, taken as it is, in the place of its own."""
+    options = replace(model.codes_layer.options, zero_mean=False, pulse_in_codes=False, int8=False)
     reader = deepcopy(model)
     reader.layer = CompressiveLayer(coding, options=options, sensor=model.config.sensor)
     return reader

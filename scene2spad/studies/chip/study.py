@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from scene2spad.studies.chip.plan import HEADROOM_BITS, ROOM_SIZE, TEST_SET, WIT
 from scene2spad.studies.results import Store
 from scenes.errors import InputError
 from scenes.files import finite, whole_file, write_csv
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.sensor.model import PhotonBudget, Sensor
@@ -44,22 +44,22 @@ def run(command: Study, progress: Progress) -> dict:
     models = obtain(plan.models, command, progress)
     chips = {one: ChipDepth.of(compile_model(found.model, one.name)) for one, found in models.found.items()}
     subjects = [one for found in models.found.values() for one in _subjects(found, chips[found.wanted])]
-    store, options = Store(folder / "results"), {"seed": command.seed, "progress": progress}
+    store, seed = Store(folder / "results"), command.seed
     still = rendered(TEST_SET, folder / "sets", count=plan.views, size=plan.size, progress=progress)
     rooms = rendered("rooms/test", folder / "sets", count=plan.rooms, size=plan.size or ROOM_SIZE, progress=progress)
     sets = {
-        TEST_SET: evaluated(store, subjects, still, plan.levels, **options),
-        "rooms": evaluated(store, subjects, rooms, plan.other_levels, **options),
+        TEST_SET: evaluated(store, subjects, still, plan.levels, seed=seed, progress=progress),
+        "rooms": evaluated(store, subjects, rooms, plan.other_levels, seed=seed, progress=progress),
     }
-    pair_rows = _pairs(store, subjects, plan, options)
+    pair_rows = _pairs(store, subjects, plan, seed, progress)
     peers = {one.name: one.plain.name for one in models.found if one.plain in models.found}
     peers |= {f"{one.name}{_HEADROOM}": one.name for one in models.found if not one.int8}
     compared = [line for name, rows in sets.items() for line in compared_rows(name, peers, _by_scene(rows))]
     compared += compared_rows("published pairs", peers, _by_pair(pair_rows)) if pair_rows else []
-    numbers: dict[str, Any] = {
+    numbers: JsonObject = {
         **models.described(),
         "compared": compared,
-        "interpreted": [_interpreted(one, chips[one], still, command.seed) for one in models.found],
+        "interpreted": [_interpreted(one, chips[one], still, seed) for one in models.found],
         "pairs": "measured" if pair_rows else "left out: no photographs beside the project",
     }
     tables = {"": [{"set": name, **row} for name, rows in sets.items() for row in as_dicts(rows)]}
@@ -73,7 +73,7 @@ def run(command: Study, progress: Progress) -> dict:
 
 
 def _subjects(found: Trained, chip: ChipDepth) -> tuple[EvaluatedModel, ...]:
-    """The model on the chip; a float model also as it is, and on the chip with HEADROOM_BITS."""
+    """Return the model on the chip; a float model also as it is, and on the chip with HEADROOM_BITS."""
     name = found.wanted.name
     by_chip = _by_chip(found, name, chip)
     if found.wanted.int8:
@@ -83,7 +83,7 @@ def _subjects(found: Trained, chip: ChipDepth) -> tuple[EvaluatedModel, ...]:
 
 
 def _by_chip(found: Trained, name: str, chip: ChipDepth) -> EvaluatedModel:
-    """A model on the chip under a name: what its program and tables are is part of the digest."""
+    """Return a model on the chip under a name: what its program and tables are is part of the digest."""
     compiled = chip.chip.compiled
     sha = hashlib.sha256(f"{found.subject.digest} {compiled.source}".encode())
     for values in compiled.tables(compiled.block).values():
@@ -92,14 +92,14 @@ def _by_chip(found: Trained, name: str, chip: ChipDepth) -> EvaluatedModel:
 
 
 def _pairs(
-    store: Store, subjects: Sequence[EvaluatedModel], plan: Plan, options: dict[str, Any]
-) -> list[dict[str, Any]]:
-    """Rows on the published pairs; none where the photographs are not at hand."""
+    store: Store, subjects: Sequence[EvaluatedModel], plan: Plan, seed: int, progress: Progress
+) -> list[JsonObject]:
+    """Return rows on the published pairs; none where the photographs are not at hand."""
     try:
         photographs = published.pairs(plan.pairs)
     except InputError:
         return []
-    return published.errors_of(store, subjects, photographs, plan.other_levels, 0.0, **options)
+    return published.errors_of(store, subjects, photographs, plan.other_levels, 0.0, seed=seed, progress=progress)
 
 
 def _by_scene(rows: Sequence[Row]) -> dict[str, dict[str, np.ndarray]]:
@@ -108,7 +108,7 @@ def _by_scene(rows: Sequence[Row]) -> dict[str, dict[str, np.ndarray]]:
     return {name: evaluation.values([name]) for name in dict.fromkeys(row.method for row in rows)}
 
 
-def _by_pair(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, np.ndarray]]:
+def _by_pair(rows: Sequence[JsonObject]) -> dict[str, dict[str, np.ndarray]]:
     found: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         found.setdefault(row["model"], {}).setdefault(row["pair"], []).append(row["mae_mm_arrival"])
@@ -117,7 +117,7 @@ def _by_pair(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, np.ndarra
 
 def compared_rows(
     name: str, peers: Mapping[str, str], values: Mapping[str, Mapping[str, np.ndarray]]
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Return a row a model on the chip, beside its float peer: MAE of both, and the paired difference as a fraction of
     the peer's, with its 95 % interval (bootstrap over scenes and levels). `holds` where no more than WITHIN is lost."""
     rows = []
@@ -144,8 +144,8 @@ def compared_rows(
     return rows
 
 
-def _interpreted(one: ModelSpec, chip: ChipDepth, test: TestSet, seed: int) -> dict[str, Any]:
-    """A view, interpreted to its last photon: what the cores counted, and how its integers differ from two others."""
+def _interpreted(one: ModelSpec, chip: ChipDepth, test: TestSet, seed: int) -> JsonObject:
+    """Interpret a view to its last photon: what the cores counted, and how its integers differ from two others."""
     compiled = chip.chip.compiled
     histogram = sense(test.views.transients[0], Sensor(), PhotonBudget(*_INTERPRETED), seed=seed)
     (down, right), (height, width) = compiled.block, histogram.depth_m.shape
@@ -164,7 +164,7 @@ def _interpreted(one: ModelSpec, chip: ChipDepth, test: TestSet, seed: int) -> d
     }
 
 
-def in_words(row: Mapping[str, Any]) -> str:
+def in_words(row: JsonObject) -> str:
     """Write a row of `compared_rows` as a line; one scene has no interval."""
     message = f"{row['float_mae_mm']:.1f} mm in float, {row['chip_mae_mm']:.1f} on the chip"
     known = np.isfinite(row["low"])
@@ -172,7 +172,7 @@ def in_words(row: Mapping[str, Any]) -> str:
     return f"{row['set']}, {row['model'].rstrip(',')}: {message}, {row['difference']:+.2%} ({interval})"
 
 
-def _all_in_words(numbers: dict[str, Any]) -> dict[str, Any]:
+def _all_in_words(numbers: JsonObject) -> dict[str, list[str]]:
     lines = [in_words(row) for row in numbers["compared"]]
     emulated = [
         f"{row['model']}: {row['photons']:,} photons interpreted, {row['wraps']} wraps, {row['differs_from_torch']} "

@@ -46,7 +46,7 @@ def tensors(models: Sequence[Trained], compressions: Sequence[int], out: Path) -
         fixed = [Design.named(code, (1024, 1, 1), compression=ratio) for code in ("fourier", "gray") if ratio <= 256]
         codings: list[CodingTensor] = [make_coding(design) for design in fixed]
         codings += [
-            _on_cpu(t.model.layer.coding())
+            _on_cpu(t.model.codes_layer.coding())
             for t in models
             if t.wanted.coded and t.wanted.compression == ratio and t.wanted.seed == 0 and t.wanted.design == "learned"
         ]

@@ -98,5 +98,11 @@ def plan_of(preset: str, full: bool) -> Plan:
         return SMOKE
     if not full:
         return Plan()
-    more = dict.fromkeys(("levels", "relief_levels", "pair_levels"), PHOTON_LEVELS)
-    return Plan(compressions=(32, 64, 128, 256), sweep_levels=SHOWN_LEVELS, sweep_views=None, **more)
+    return Plan(
+        compressions=(32, 64, 128, 256),
+        levels=PHOTON_LEVELS,
+        sweep_levels=SHOWN_LEVELS,
+        sweep_views=None,
+        relief_levels=PHOTON_LEVELS,
+        pair_levels=PHOTON_LEVELS,
+    )

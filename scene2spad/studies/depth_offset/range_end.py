@@ -32,8 +32,9 @@ from spad.sensor.model import PhotonBudget, Sensor
 
 WALL_PIXELS = 32  # on a side
 # What is changed between photons and depth: the key of a result, and what it says.
+AS_TRAINED = "as trained"
 ARMS: dict[str, str] = {
-    "as trained": "the model as it is",
+    AS_TRAINED: "the model as it is",
     "near input, far place": "back-projection of the counts moved back, then moved to where they were",
     "far input, near place": "back-projection of the counts as they are, moved back before the network",
     "mean kept": "back-projection without removal of the mean over K",
@@ -91,19 +92,22 @@ class Correlated:
 def arm(trained: Trained, name: str, offset_m: float = 0.0) -> EvaluatedModel:
     """Return the model with one thing changed, by its key in ARMS; `offset_m` is how far inputs are moved back."""
     bins = round(offset_m / trained.config.model.sensor.bin_depth_m)
-    layer, network = trained.model.layer, trained.model.network
+    if name not in ARMS or name == AS_TRAINED:
+        return trained.subject
+    codes = trained.model.codes_layer
+    layer: nn.Module = codes
+    network: nn.Module = trained.model.network
     if name == "correlation":
-        return EvaluatedModel(f"{trained.wanted.name}, {name}", Correlated(layer.coding()), _digest(trained, name))
+        return EvaluatedModel(f"{trained.wanted.name}, {name}", Correlated(codes.coding()), _digest(trained, name))
     if name == "near input, far place":
         layer, name = NearInput(layer, bins), f"{name} {bins}"
     elif name == "far input, near place":
-        network, name = NearPlace(network, bins), f"{name} {bins}"
-    elif name == "mean kept":
-        layer = MeanKept(layer)
+        network, name = NearPlace(trained.model.network, bins), f"{name} {bins}"
     else:
-        return trained.subject
+        layer = MeanKept(codes)
     model = DepthModel(trained.config.model)
-    model.layer, model.network = layer, network
+    model.add_module("layer", layer)
+    model.add_module("network", network)
     return EvaluatedModel(f"{trained.wanted.name}, {name}", model.eval(), _digest(trained, name))
 
 

@@ -39,6 +39,7 @@ from scene2spad.studies.depth_offset.plan import (
 from scene2spad.studies.results import Store
 from scenes.errors import InputError, require
 from scenes.files import finite, whole_file, write_csv
+from scenes.offsets import OffsetMode
 from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
@@ -91,7 +92,7 @@ class Session:
         self.rows += [{**common, **row} for row in as_dicts(found)]
         return found
 
-    def rendered(self, name: str, offset_m: float = 0.0, mode: str = "time") -> TestSet:
+    def rendered(self, name: str, offset_m: float = 0.0, mode: OffsetMode = "time") -> TestSet:
         plan = self.plan
         return rendered(
             name, self.sets, offset_m=offset_m, mode=mode, count=plan.views, size=plan.size, progress=self.progress
@@ -295,7 +296,7 @@ def swapped(codes: Trained, network: Trained) -> EvaluatedModel:
     alike = codes.config.model == network.config.model
     require(alike, f"{codes.wanted.name} and {network.wanted.name} are of different designs: nothing to swap")
     model = DepthModel(codes.config.model)
-    model.layer.load_state_dict(codes.model.layer.state_dict())
+    model.codes_layer.load_state_dict(codes.model.codes_layer.state_dict())
     model.network.load_state_dict(network.model.network.state_dict())
     model = model.to(next(codes.model.parameters()).device).eval()
     return EvaluatedModel(
@@ -323,8 +324,9 @@ def _published(study: Session) -> list[dict]:
     """Our models on the Middlebury photographs in the published convention, beside what was published."""
     plan = study.plan
     mine = {w: study.models[w].subject for w in plan.headline if w.seed == 0 and w in study.models}
-    offsets, options = (0.0, OFFSET_M), {"seed": study.seed, "progress": study.progress}
-    return published.compared(study.store, mine, plan.pairs, plan.pair_levels, offsets, **options)
+    return published.compared(
+        study.store, mine, plan.pairs, plan.pair_levels, (0.0, OFFSET_M), seed=study.seed, progress=study.progress
+    )
 
 
 def _depth_images(study: Session, base: TestSet, shown: Sequence[int], out: Path) -> list[Path]:

@@ -85,7 +85,7 @@ def verdicts(ratios: Sequence[dict], wanted: Sequence[ModelSpec]) -> list[dict]:
     return found
 
 
-def summary_rows(rows: Sequence[Row], wanted: Sequence[ModelSpec], common: Mapping[str, object]) -> list[dict]:
+def summary_rows(rows: Sequence[Row], wanted: Iterable[ModelSpec], common: Mapping[str, object]) -> list[dict]:
     """Return per design and compression, seeds together: mean and 95 % interval over scenes and seeds, by level
     group."""
     evaluation, found = Evaluation(list(rows)), []
@@ -133,8 +133,9 @@ def energy_of(trained: Trained, reach_m: float) -> Energy | None:
     if not 0 < boundary < sensor.bins:
         return None
     start = make_coding(design, sensor, trained.config.seed).temporal
-    ratios = [energy_ratio(bin_energy(code), sensor.bins, boundary) for code in (start, trained.model.layer.temporal)]
-    return Energy(trained.wanted.name, reach_m, *ratios)
+    codes = (start, trained.model.codes_layer.temporal)
+    at_start, now = (energy_ratio(bin_energy(code), sensor.bins, boundary) for code in codes)
+    return Energy(trained.wanted.name, reach_m, at_start, now)
 
 
 def energy_history(trained: Trained) -> tuple[np.ndarray, np.ndarray]:
@@ -144,8 +145,8 @@ def energy_history(trained: Trained) -> tuple[np.ndarray, np.ndarray]:
     if rows:
         return np.array([row["step"] for row in rows]), np.array([[*row.values()][1:] for row in rows])
     config = trained.config
-    start = make_coding(config.model.design, config.model.sensor, config.seed).temporal
-    ends = [grouped_energy(code) for code in (start, trained.model.layer.temporal)]
+    start = make_coding(config.model.codes_design, config.model.sensor, config.seed).temporal
+    ends = [grouped_energy(code) for code in (start, trained.model.codes_layer.temporal)]
     return np.array([0, trained.state.get("step", config.steps)]), np.array(ends)
 
 

@@ -6,6 +6,8 @@ One core is one pixel, as in S.2; `shared_core_depths` is the exception, 4 x 4 S
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 import torch
@@ -48,7 +50,7 @@ def emulate(counts: np.ndarray, method: Method, spatial: np.ndarray | None = Non
     spatial = fixed_spatial(method) if spatial is None else spatial
     program, tables = method.program(), method.tables(int8_temporal(method))
     rows = max(_CORES // width // method.block[0], 1) * method.block[0]
-    codes, total, bits = [], None, 0
+    codes, counters, bits = [], [], 0
     for top in range(0, height, rows):
         part = counts[top : top + rows]
         shape = part.shape[:2]
@@ -57,9 +59,9 @@ def emulate(counts: np.ndarray, method: Method, spatial: np.ndarray | None = Non
         stamps, offsets = timestamps_of(part)
         frame = CoreArray(program, shape, tables).frame(stamps, offsets)
         codes.append(frame.out.reshape(shape[0] // method.block[0], shape[1] // method.block[1], -1))
-        total = frame.counters if total is None else total + frame.counters
+        counters.append(frame.counters)
         bits += int(frame.out_bits.sum())
-    return Emulated(np.concatenate(codes), total, bits)
+    return Emulated(np.concatenate(codes), reduce(add, counters), bits)
 
 
 def timestamps_of(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +97,7 @@ def by_torch(counts: np.ndarray, method: Method, spatial: np.ndarray | None = No
     if method.family == "coarse":
         return np.minimum(sums, 255)
     sums = (sums + INT16) % (2 * INT16) - INT16
-    if method.block == (1, 1):
+    if spatial is None:
         return sums
     down, right = method.block
     cores = sums.reshape(height // down, down, width // right, right, -1, method.codes).swapaxes(1, 2)
@@ -118,7 +120,7 @@ def decode(codes: np.ndarray, method: Method, sensor: Sensor, spatial: np.ndarra
     for row in range(down):
         for column in range(right):
             seen = matrix
-            if method.block != (1, 1):
+            if spatial is not None:
                 seen = (matrix.reshape(-1, method.codes, matrix.shape[1]) * spatial[row, column][:, None]) / 128
             seen = seen.reshape(matrix.shape)
             if seen.tobytes() not in answers:

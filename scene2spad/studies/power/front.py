@@ -64,6 +64,7 @@ class Design:
         """Return depth (H, W) [m] from the integers that leave the sensor."""
         if self.chip is not None:
             return self.chip.depth_of(histogram)[0]
+        assert self.coarse is not None  # what has no codes counts coarsely
         return decode(by_torch(histogram.counts, self.coarse), self.coarse, histogram.sensor)
 
 

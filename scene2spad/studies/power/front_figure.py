@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +13,7 @@ from matplotlib.axes import Axes
 from scene2spad.plots import figures
 from scene2spad.plots.figures import plt
 from scene2spad.studies.power.front import HEADLINE, LOST_LIMIT, Design, lost
+from scenes.json_types import JsonObject
 from ultraphase.catalog import SPADS
 
 _MARKERS = "ospDv^<Phx>*8d"
@@ -19,9 +21,9 @@ _MARKERS = "ospDv^<Phx>*8d"
 
 def draw_front(
     found: Sequence[Design],
-    rows: Sequence[dict[str, Any]],
-    losses: Sequence[dict[str, Any]],
-    printed: Sequence[dict[str, Any]],
+    rows: Sequence[JsonObject],
+    losses: Sequence[JsonObject],
+    printed: Sequence[JsonObject],
     path: Path,
 ) -> Path:
     """Draw six panels: MAE against both readings of power, bytes a pixel, clocks a photon and photons; lost photons."""
@@ -33,13 +35,13 @@ def draw_front(
         (axes[0, 1], "processing_uw_published", "as published (Joules x duty, called Watts)"),
     )
     for one, field, title in readings:
-        _points(one, at, styles, lambda row, field=field: row[field] + row["readout_uw"], printed)
+        _points(one, at, styles, partial(_with_readout, field), printed)
         one.set(xlabel="processing + readout of a pixel [µW]", title=f"power, {title}")
     for one, field, label in (
         (axes[0, 2], "bytes_per_pixel", "bytes a pixel and frame"),
         (axes[1, 0], "clocks_per_photon", "clocks a photon"),
     ):
-        _points(one, at, styles, lambda row, field=field: row[field], printed)
+        _points(one, at, styles, itemgetter(field), printed)
         one.set(xlabel=label, title=label)
     _by_photons(axes[1, 1], rows, styles)
     _losses(axes[1, 2], found, losses, styles)
@@ -53,8 +55,16 @@ def draw_front(
     return figures.save(figure, path)
 
 
+def _with_readout(field: str, row: JsonObject) -> float:
+    return row[field] + row["readout_uw"]
+
+
 def _points(
-    axes: Axes, rows: Sequence[dict], styles: dict, measure: Callable[[dict], float], printed: Sequence[dict]
+    axes: Axes,
+    rows: Sequence[JsonObject],
+    styles: dict,
+    measure: Callable[[JsonObject], float],
+    printed: Sequence[JsonObject],
 ) -> None:
     places = np.array([[measure(row), row["mae_mm"]] for row in rows])
     best = front(places)

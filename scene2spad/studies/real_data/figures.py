@@ -114,10 +114,11 @@ def draw_clouds(views: list[View], labels: list[str], depths: Depths, title: str
 
 
 def _points(view: View, depth: np.ndarray | None) -> np.ndarray:
-    """A depth image as points (N, 3) [m]."""
+    """Return a depth image as points (N, 3) [m]."""
     if depth is None:
         return np.zeros((0, 3))
-    return (directions(*view.counts.shape[:2], view.fov_deg) * depth[..., None])[np.isfinite(depth)]
+    height, width = view.counts.shape[:2]
+    return (directions(height, width, view.fov_deg) * depth[..., None])[np.isfinite(depth)]
 
 
 def projected(points: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ COLOURS = ("tab:blue", "tab:orange", "tab:green")
 
 
 def draw_histograms(
-    distances_m: Sequence[float], counts: np.ndarray, expected: np.ndarray, order: np.ndarray, columns: int, path: Path
+    distances_m: np.ndarray, counts: np.ndarray, expected: np.ndarray, order: np.ndarray, columns: int, path: Path
 ) -> Path:
     """Measured counts (N, Z, T) as dots and predicted ones as lines: a panel a zone, as the chip sees them."""
     rows = -(-len(order) // columns)

@@ -11,6 +11,7 @@ from scipy.stats import poisson
 
 from scene2spad.studies.sim_to_real.plan import FULL_BIN
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.json_types import JsonObject
 from spad.zones.calibration import poisson_deviance
 
 WINDOW = (-4, 8)  # bins around the fullest that a range is the centroid of
@@ -92,7 +93,7 @@ def centroid(histograms: np.ndarray) -> np.ndarray:
     return window @ (bins + 0.5) / np.maximum(window.sum(axis=-1), 1e-9)
 
 
-def summary(of: Comparison, which: np.ndarray) -> dict[str, list[float] | float]:
+def summary(of: Comparison, which: np.ndarray) -> JsonObject:
     """Summarise some captures (a mask or indices) by zone: the numbers that bars are set on."""
     chosen = Comparison(*(values[which] for values in of))
     return {

@@ -10,7 +10,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,12 +26,13 @@ from scene2spad.studies.sim_to_real.measures import Comparison, compare, summary
 from scene2spad.studies.sim_to_real.plan import FITTED, GEOMETRY, MODEL_ERROR, SENSOR, Plan, plan_of
 from scene2spad.studies.sim_to_real.pose import Pose, find_pose, model_covariance, nearest_start
 from scenes.files import finite, whole_file, write_csv
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.sensor.files import SensorFile, load_sensor, write_sensor
 from spad.zones.calibration import Calibration, calibrate, calibrated_file
 from spad.zones.expected_counts import ZoneCapture
 from spad.zones.histogram import zone_grid
-from spad.zones.sensor import expected_zone_counts
+from spad.zones.sensor import ZoneArray, expected_zone_counts
 
 SPANS = ((0.0, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.4), (0.1, 0.4))  # metres: what is told apart
 
@@ -81,7 +81,7 @@ def run(command: Study, progress: Progress) -> dict:
     # a pose weighs with the model's error as the captures calibrated on show it
     model_error = summary(of.errors, of.used)["model_error"]
     poses = pose_rows(of, model_error)
-    numbers: dict[str, Any] = {
+    numbers: JsonObject = {
         "preset": command.preset,
         "captures": {"calibrated_on": len(of.used), "held_out": int(of.held.sum())},
         "prediction": spans,
@@ -112,12 +112,18 @@ def predict(plan: Plan, seed: int, progress: Progress) -> Prediction:
     start, captures = load_sensor(SENSOR), read_plane_captures(shipped_captures())
     used = np.flatnonzero(captures.distance_m >= plan.nearest_m)[:: plan.every]
     progress("render the plane", 0.0)
-    lit = zone_captures(captures, start.sensor, start.zones)
+    zones = _zones(start)
+    lit = zone_captures(captures, start.sensor, zones)
     progress("calibrate", 0.05)
-    fitted = calibrate([lit[at] for at in used], start.sensor, start.zones, free=FITTED, model_error=MODEL_ERROR)
+    fitted = calibrate([lit[at] for at in used], start.sensor, zones, free=FITTED, model_error=MODEL_ERROR)
     expected = expected_of(lit, fitted)
     errors = compare(captures.counts, expected, fitted.sensor.bin_width_s, seed)
     return Prediction(plan, start, captures, lit, used, fitted, expected, errors)
+
+
+def _zones(start: SensorFile) -> ZoneArray:
+    assert start.zones is not None  # SENSOR is a chip of zones
+    return start.zones
 
 
 def write_calibrated(of: Prediction, out: Path) -> Path:
@@ -128,8 +134,8 @@ def write_calibrated(of: Prediction, out: Path) -> Path:
     return write_sensor(calibrated_file(of.start, of.fitted, name, how), out / f"{name}.toml")
 
 
-def span_rows(of: Prediction) -> list[dict[str, Any]]:
-    """Errors of the captures held out, a row a span of distances that has any."""
+def span_rows(of: Prediction) -> list[JsonObject]:
+    """Return errors of the captures held out, a row a span of distances that has any."""
     rows = []
     for low, high in SPANS:
         inside = of.held & (of.captures.distance_m >= low) & (of.captures.distance_m < high)
@@ -143,13 +149,14 @@ def expected_of(captures: Sequence[ZoneCapture], fitted: Calibration) -> np.ndar
     return np.array([expected_zone_counts(c.returns, fitted.sensor, fitted.zones, c.drift_s) for c in captures])
 
 
-def ablated(of: Prediction, progress: Progress) -> list[dict[str, Any]]:
+def ablated(of: Prediction, progress: Progress) -> list[JsonObject]:
     """Return a row for the whole model, then one for each effect that is off while the rest is calibrated again."""
-    rows = [{"off": "none", **summary(of.errors, of.judged)}]
+    rows: list[JsonObject] = [{"off": "none", **summary(of.errors, of.judged)}]
     for number, effect in enumerate(of.plan.ablated):
-        off = of.start.zones.without(effect)
+        on = _zones(of.start)
+        off = on.without(effect)
         parameter = {"saturation": "trials"}.get(effect, effect)
-        if effect in GEOMETRY and off != of.start.zones:
+        if effect in GEOMETRY and off != on:
             lit = zone_captures(of.captures, of.start.sensor, off)
         elif parameter in FITTED:
             lit = of.lit
@@ -157,8 +164,8 @@ def ablated(of: Prediction, progress: Progress) -> list[dict[str, Any]]:
             continue  # off in the preset
         progress(f"without {effect}", 0.3 + 0.5 * number / len(of.plan.ablated))
         free = tuple(name for name in FITTED if name not in _gone_with(parameter))
-        options = {"free": free, "model_error": MODEL_ERROR, "start": of.fitted}
-        without = calibrate([lit[at] for at in of.used], of.start.sensor, off, **options)
+        used = [lit[at] for at in of.used]
+        without = calibrate(used, of.start.sensor, off, free=free, model_error=MODEL_ERROR, start=of.fitted)
         expected = expected_of([lit[at] for at in of.judged], without)
         errors = compare(of.captures.counts[of.judged], expected, without.sensor.bin_width_s)
         rows.append({"off": effect, **summary(errors, np.arange(len(expected)))})
@@ -189,8 +196,8 @@ def pose_rows(of: Prediction, model_error: float) -> list[dict[str, float]]:
         counts = of.captures.counts[at].astype(np.float64)
         drift_s = float(of.captures.drift_bins[at]) * of.fitted.sensor.bin_width_s
         start_m = nearest_start(counts, of.captures.distance_m[of.used], of.expected[of.used])
-        options = {"drift_s": drift_s, "model_error": model_error}
-        pose = find_pose(counts, of.fitted.sensor, of.fitted.zones, start_m, **options)
+        sensor, zones = of.fitted.sensor, of.fitted.zones
+        pose = find_pose(counts, sensor, zones, start_m, drift_s=drift_s, model_error=model_error)
         return pose, pose.values - np.array([of.captures.distance_m[at], 0.0, 0.0, 1.0])
 
     known = [found(at) for at in of.used[:: of.plan.pose_every]]
@@ -209,9 +216,9 @@ def pose_rows(of: Prediction, model_error: float) -> list[dict[str, float]]:
     return rows
 
 
-def pose_summary(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
-    """Median absolute error, its mean, and the share of 95 % intervals that hold the arm's pose, of each quantity."""
-    found: dict[str, Any] = {"captures": len(rows)}
+def pose_summary(rows: Sequence[dict[str, float]]) -> JsonObject:
+    """Return of each quantity the median error, its mean, and the share of 95 % intervals that hold the arm's pose."""
+    found: JsonObject = {"captures": len(rows)}
     for name in ("distance_mm", "about_y_deg", "about_x_deg"):
         columns = ("error", "photon_sigma", "sigma", "interval")
         error, photons, sigma, half = (np.array([row[f"{name}_{what}"] for row in rows]) for what in columns)
@@ -233,19 +240,21 @@ def draw_all(of: Prediction, poses: Sequence[dict[str, float]], out: Path) -> li
     _, columns, order = zone_grid(of.fitted.zones)
     distance_m, left_out = of.captures.distance_m, np.flatnonzero(of.held)
     shown = [left_out[np.abs(distance_m[left_out] - metres).argmin()] for metres in of.plan.shown_m]
-    pairs = (of.captures.counts[shown], of.expected[shown])
+    counts, expected = of.captures.counts[shown], of.expected[shown]
     return [
-        figures.draw_histograms(distance_m[shown], *pairs, order, columns, out / "sim-to-real-histograms.png"),
+        figures.draw_histograms(
+            distance_m[shown], counts, expected, order, columns, out / "sim-to-real-histograms.png"
+        ),
         figures.draw_errors(distance_m, of.held, of.errors, out / "sim-to-real-errors.png"),
         figures.draw_poses(poses, out / "sim-to-real-pose.png"),
     ]
 
 
-def _flat(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _flat(rows: Sequence[JsonObject]) -> list[JsonObject]:
     """Rows for a table: of a list over zones its median and its worst."""
     found = []
     for row in rows:
-        line: dict[str, Any] = {}
+        line: JsonObject = {}
         for key, value in row.items():
             if isinstance(value, list):
                 line |= {f"{key} median zone": float(np.median(value)), f"{key} worst zone": max(value, key=abs)}
@@ -255,7 +264,7 @@ def _flat(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def in_words(numbers: dict[str, Any]) -> dict[str, Any]:
+def in_words(numbers: JsonObject) -> dict[str, list[str]]:
     """Return what the terminal shows."""
     spans = [
         f"{s['from_m']:g} to {s['to_m']:g} m, {s['captures']} captures: shape nRMSE "

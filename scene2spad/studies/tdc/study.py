@@ -181,7 +181,8 @@ def recorded_by_clock(test: TestSet, view: int, level: tuple[float, float], seed
     draw = int(np.random.SeedSequence((seed, view, *(round(1000 * part) for part in level))).generate_state(1)[0])
     found = {clock: Recorded(sense(transient, sensor_of(clock), budget, seed=draw)) for clock in SENSED}
     real = found[REAL].histogram
-    converter, edges = real.sensor.converter_map(*real.counts.shape[:2], draw), real.sensor.code_edges
+    height, width = real.counts.shape[:2]
+    converter, edges = real.sensor.converter_map(height, width, draw), real.sensor.code_edges
     assert converter is not None and edges is not None
     return {**found, FOLDED: Recorded(real, recalibrated(real.counts, converter, edges)), TRAINED: Recorded(real)}
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from render.settings import RenderSettings
 from scene2spad.networks.registry import ModelSpec
+from scenes.model import LaserMode
 
 # Each step adds one thing to the one before it; all see the same surfaces and are scaled to the same mean counts.
 STEPS: dict[str, str] = {
@@ -16,7 +17,7 @@ STEPS: dict[str, str] = {
     "ambient": "+ rendered ambient",
 }
 FIRST, *LATER = STEPS
-LASERS = ("flood", "scan")
+LASERS: tuple[LaserMode, ...] = ("flood", "scan")
 LEVELS = ((10.0, 10.0), (10.0, 200.0), (50.0, 50.0))
 UNCOMPRESSED = "log-matched"
 # Of one pixel and all bins, at 128x and 64x, decoded by correlation.

@@ -108,14 +108,15 @@ def _both(
 ) -> list[list[list[float]]]:
     """[full, planned] MAE [mm] of each draw of photons and design; what the store has is not drawn again."""
     pair = f"{place.full.sha256()[:32]}-{place.planned.sha256()[:32]}"
-    sensor, budget, rates, found = Sensor(), PhotonBudget(*level), None, []
+    sensor, budget, found = Sensor(), PhotonBudget(*level), []
+    rates: tuple[Expected, Expected] | None = None
     for key in keys:
         named = {"pair": pair, "level": list(level), "draw": list(key)}
         missing = [one for one in checked if store.get(one.subject.digest, **named) is None]
         if missing:
-            rates = rates or [expected(one, sensor, budget) for one in (place.full, place.planned)]
+            rates = rates or (expected(place.full, sensor, budget), expected(place.planned, sensor, budget))
             rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(Stream.COUPLED,)))
-            histograms = coupled(*rates, sensor, budget, rng)
+            histograms = coupled(rates[0], rates[1], sensor, budget, rng)
             for one in missing:
                 depths = [one.subject.model.depth_of(histogram)[0] for histogram in histograms]
                 errors = [image_errors(depth, place.full.depth_m, sensor.range_m)["mae_mm"] for depth in depths]

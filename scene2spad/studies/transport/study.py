@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from csph.evaluation.methods import as_dicts
+from csph.evaluation.methods import Row, as_dicts
 from csph.networks.posterior import Decoder
 from csph.training.views import Views
 from render.engine import render
@@ -214,7 +214,8 @@ def _measured(
     places: Sequence[Place], contenders: Sequence[Contender], store: Store, seed: int, progress: Progress
 ) -> Rows:
     """Rows of every design, scene and level at each laser's steps; RGB-D steps know no laser and are measured once."""
-    found, subjects = {}, [contender.subject for contender in contenders]
+    found: dict[tuple[str, str], list[Row]] = {}
+    subjects = [contender.subject for contender in contenders]
     for laser in LASERS:
         mine = [place for place in places if place.laser == laser]
         names, steps = tuple(place.name for place in mine), [steps_of(place.full) for place in mine]

@@ -14,6 +14,7 @@ from csph.evaluation.methods import LEVEL_GROUPS, PIXELS, Evaluation, Row
 from csph.evaluation.metrics import Interval, paired_difference
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.studies.transport.plan import FIRST, KEPT, LASERS, LATER, OPEN, REVERSED, STEPS
+from scenes.json_types import JsonObject
 
 Rows = Mapping[tuple[str, str], Sequence[Row]]  # by laser and step
 
@@ -81,7 +82,7 @@ def _pair(values: Mapping[tuple[str, str], dict[str, np.ndarray]], first: str, s
     before = paired_difference(gaps[FIRST], nothing)
     for step in LATER:
         after, moved = paired_difference(gaps[step], nothing), paired_difference(gaps[step], gaps[FIRST])
-        common = {"step": step, "verdict": judged(before, after)}
+        common: JsonObject = {"step": step, "verdict": judged(before, after)}
         for name, interval in (("rgbd", before), ("here", after), ("moved", moved)):
             common |= {f"{name}_mm": interval.mean, f"{name}_low": interval.low, f"{name}_high": interval.high}
         yield common
