@@ -20,7 +20,8 @@ CONSTANT = re.compile(r"(MOST|LEAST)_")
 # First words of docstrings that are nouns, pronouns or another mood.
 NO_IMPERATIVE = re.compile(
     r"(The|A|An|One|What|Whether|Where|How|All|Every|Both|Those|These|Its|Some|Two|Returns|Raises|Reads|Writes|Makes|Gives"
-    r"|Mean|Depth|Radiance|Expected|Rows|Points|Counts|Codes|Numbers|Samples|InputError)\b"
+    r"|Mean|Depth|Radiance|Expected|Rows|Points|Counts|Codes|Numbers|Samples|InputError|Errors|Histograms|Measured"
+    r"|Probability|Shape|Whole|Thin|Log-log|Multiply-accumulates|Centroid|Number|Median|Energy)\b"
 )
 
 

@@ -112,8 +112,8 @@ class TimedCore(Core):
                 raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
 
     def _idle(self, word: int, now: int, until: float, before: _Idle | None) -> tuple[int, _Idle]:
-        """The time of the look at the port that comes next before `until`: turns of an idle loop that leave the core
-        as it was are counted, not run."""
+        """Return the time of the look at the port that comes next before `until`: turns of an idle loop that leave the
+        core as it was are counted, not run."""
         state = (word, tuple(self.registers), bytes(self.ram))
         if before is not None and before[0] == state and now > before[1]:
             turn = now - before[1]

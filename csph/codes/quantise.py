@@ -131,5 +131,5 @@ def encode_int16(counts: Tensor, tensor: Quantised) -> IntegerCodes:
 
 
 def wrapped_sums(sums: Tensor) -> Tensor:
-    """Whole numbers as a 16-bit accumulator holds them, of any type."""
+    """Wrap whole numbers as a 16-bit accumulator holds them, of any type."""
     return torch.remainder(sums + HALF_RANGE, 2 * HALF_RANGE) - HALF_RANGE

@@ -179,7 +179,7 @@ class PathSpaceFilter:
         return off - point.n * dr.dot(point.n, off)
 
     def _row(self, key: UInts, active: Masks) -> tuple[Array, Array]:
-        """Number of a region, and whether there is one."""
+        """Return the number of a region, and whether there is one."""
         found = dr.binary_search(0, self._searched - 1, lambda i: dr.gather(UInt64, self._keys, i, active) < key)
         return found, active & (dr.gather(UInt64, self._keys, found, active) == key)
 

@@ -129,8 +129,8 @@ def _row(name: str, spent: np.ndarray, differs: np.ndarray, pixels: int, instruc
 
 
 def _megapixel(chosen: Method, seed: int, repeats: int) -> dict:
-    """A frame of 2^20 pixels from uint8 histograms by the tabulated form, two threads, best of `repeats`; a block of it
-    is compared with the integer product."""
+    """Time a frame of 2^20 pixels from uint8 histograms by the tabulated form, two threads, best of `repeats`; a block
+    of it is compared with the integer product."""
     import torch  # noqa: F401  # products of bytes are used where it is loaded
 
     proof, block = _proof(chosen), _counts(_BLOCK, seed)

@@ -68,7 +68,7 @@ class PlainDeepBoosting(DeepBoosting):
 
 
 def gmac(network: nn.Module, size: tuple[int, ...] = PATCH) -> float:
-    """Multiply-accumulates of one forward pass, in 10^9; torch counts two operations for each."""
+    """Count multiply-accumulates of one forward pass, in 10^9; torch counts two operations for each."""
     shapes = deepcopy(network).to("meta")  # counting needs no numbers
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         shapes(torch.zeros(size, device="meta"))

@@ -211,7 +211,7 @@ def _log_to_stderr() -> None:
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Progress]:
-    """A progress bar on stderr, and the function that moves it; where stderr is piped, a line now and then."""
+    """Yield a progress bar on stderr, and the function that moves it; where stderr is piped, a line now and then."""
     if not sys.stderr.isatty():
         yield _progress_lines()
         return

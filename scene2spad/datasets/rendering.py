@@ -218,7 +218,7 @@ def _seed(job: Job, view: int, again: int = 0) -> int:
 
 
 def _world(job: Job, view: int, scene: Scene) -> TracedScene | None:
-    """The world of a place that several cameras look at, built once for all of them; None: the scene's own.
+    """Return the world of a place that several cameras look at, built once for all of them; None: the scene's own.
 
     Its origin is the place's, not a camera's, so a view's bytes are the same whether others were rendered before.
     """
@@ -236,7 +236,7 @@ def _world(job: Job, view: int, scene: Scene) -> TracedScene | None:
 
 
 def _plan(job: Job, view: int, world: TracedScene | None) -> Plan | None:
-    """The plan for the first camera of a place, which holds for the others too; None: the view's own."""
+    """Return the plan for the first camera of a place, which holds for the others too; None: the view's own."""
     from render.engine import planned
 
     if world is None:
@@ -259,7 +259,7 @@ def _forget() -> None:
 
 
 def _runs(job: Job, views: Iterable[int]) -> Iterator[tuple[int, ...]]:
-    """Views of one place together, in order."""
+    """Render views of one place together, in order."""
     chosen = scene_set(job.set)
     return (tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place))
 
@@ -280,7 +280,7 @@ def check_asked(job: Job, count: int, workers: int) -> None:
 
 
 def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
-    """The job with as many rays for all views, by the errors of some of the first places', however many are asked."""
+    """Give all views as many rays as the errors of some of the first places ask for, however many views are asked."""
     from render.planning import rays_for_all
 
     path = folder.path / "grid.json"

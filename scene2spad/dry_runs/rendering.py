@@ -54,7 +54,7 @@ def _estimate(trial: Transient, cost: Cost, start_s: float, times: float) -> dic
 
 
 def _smaller(scene: Scene, pixels: int) -> Scene:
-    """The same view in about so many pixels, or as it is where it has fewer."""
+    """Return the same view in about so many pixels, or as it is where it has fewer."""
     camera = scene.camera
     factor = min(1.0, math.sqrt(pixels / (camera.width * camera.height)))
     size = (max(1, round(side * factor)) for side in (camera.width, camera.height))

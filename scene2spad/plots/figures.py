@@ -175,7 +175,7 @@ def shown_pixels(histogram: Histogram) -> dict[str, tuple[int, int]]:
 def _pixel_counts(
     axes: Axes, histogram: Histogram, row: int, column: int, rate: np.ndarray | None, colour: str, name: str
 ) -> None:
-    """Counts of one pixel as bars, the expected rate as a line over them, its true depth dotted."""
+    """Draw counts of one pixel as bars, the expected rate as a line over them, its true depth dotted."""
     edges_ns = np.arange(histogram.sensor.bins + 1) * histogram.sensor.bin_width_s * 1e9
     depth_m, shown = float(histogram.depth_m[row, column]), slice(0, histogram.sensor.bins)
     true_ns = 2e9 * depth_m / SPEED_OF_LIGHT_M_PER_S % edges_ns[-1]
@@ -302,7 +302,7 @@ def draw_demo(
 
 
 def _telling_pixel(transient: Transient) -> tuple[int, int]:
-    """An unmixed pixel of at least median brightness whose indirect share is the 90th percentile of such pixels."""
+    """Pick an unmixed pixel of median brightness or more whose indirect share is the 90th percentile of such pixels."""
     total = transient.total_radiance()
     later = transient.bounces > 1
     indirect = np.bincount(transient.return_pixel[later], weights=transient.radiance[later], minlength=total.size)

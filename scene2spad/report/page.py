@@ -245,7 +245,7 @@ def _configurations(found: Found) -> Iterator[str]:
 
 
 def _views_of(folder: Path, found: Found) -> dict[str, Any]:
-    """Number of a set's views, and of those that end above their error target; nothing where there is no index."""
+    """Count a set's views, and those that end above their error target; nothing where there is no index."""
     index = folder / "index.jsonl"
     records = found.read(index, lambda path: read_set_index(path.parent)) if index.is_file() else None
     if records is None:

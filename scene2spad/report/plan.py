@@ -50,7 +50,7 @@ class Section:
 
 
 def _ablation(study: str, figure: str, title: str, names: tuple[str, ...], text: str = "") -> Item:
-    """A figure of designs beside each other; with `text`, the study's first: its tables stand there, once."""
+    """Plan a figure of designs beside each other; with `text`, the study's first: its tables stand there, once."""
     pictures = tuple(
         Picture(
             f"{study}-{name}x.png",

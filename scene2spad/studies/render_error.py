@@ -99,7 +99,7 @@ def run(command: Study, progress: Progress) -> dict:
 
 
 def _sensor_of(models: Mapping[str, DepthModel]) -> Sensor:
-    """The networks' sensor, or the reference; InputError where they differ."""
+    """Return the networks' sensor, or the reference; InputError where they differ."""
     found = {model.config.sensor.name: model.config.sensor for model in models.values()}
     names = ", ".join(found)
     require(len(set(found.values())) <= 1, f"checkpoints of sensors {names} see other photons")
@@ -147,7 +147,7 @@ def _nrmse(found: Transient, a: Transient, b: Transient) -> float:
 
 
 def _expected(transient: Transient) -> Iterator[np.ndarray]:
-    """Expected signal in every bin of the reference sensor, a block of pixels at a time."""
+    """Compute the expected signal in every bin of the reference sensor, a block of pixels at a time."""
     pixels = transient.height * transient.width
     for start in range(0, pixels, PIXEL_BLOCK):
         yield signal_per_bin(transient, Sensor(), slice(start, min(start + PIXEL_BLOCK, pixels)))[0].numpy()

@@ -80,7 +80,7 @@ def _sections(content: Content, payload: dict[str, Any]) -> list[str]:
 
 
 def _marks(content: Content) -> str:
-    """The legend: words beside the colours that the script draws in."""
+    """Write the legend: words beside the colours that the script draws in."""
     colours = {"detections": "#8b93a0", "expected": "#0072b2", "light": "#0072b2"}
     named = [(cube.name, colours.get(cube.name, "#0072b2")) for cube in content.cubes]
     if content.returns is not None:

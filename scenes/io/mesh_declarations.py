@@ -227,7 +227,7 @@ def check_glb(content: bytes, read: ReadImage) -> None:
 
 
 def _glb_chunks(content: bytes) -> tuple[JsonObject, bytes]:
-    """The JSON object and the first binary chunk."""
+    """Read the JSON object and the first binary chunk."""
     require(len(content) >= 20 and content[:4] == b"glTF", "is no GLB")
     version, length, size, kind = struct.unpack_from("<II I4s", content, 4)
     require(version == 2, f"glTF of version {version}, expected 2")

@@ -101,7 +101,7 @@ def _around(path: Path, camera: Camera, wall_z: float) -> list[Surface]:
 
 
 def _camera(centre: np.ndarray, radius: float, width: int, height: int) -> Camera:
-    """A camera before and a little above a sphere that is to fill 70 % of the smaller image dimension."""
+    """Place a camera before and a little above a sphere that is to fill 70 % of the smaller image dimension."""
     focal = Camera(np.eye(4), FOV_DEG, width, height).focal_px
     edge = FILL * min(width, height) / 2 / focal
     distance = radius * math.hypot(1, edge) / edge
@@ -144,7 +144,7 @@ def backdrop(camera: Camera, wall_z: float, least_m: float = 4.0) -> list[Surfac
 
 
 def _read(path: Path) -> list[_Part]:
-    """The file's triangle meshes, each moved by its node's transform, or an InputError in one line."""
+    """Read the file's triangle meshes, each moved by its node's transform, or an InputError in one line."""
     kind = path.suffix.lower()
     if kind not in EXTENSIONS:
         raise InputError(f"{path}: extension {kind or '(none)'}, expected one of {' '.join(EXTENSIONS)}")
@@ -200,7 +200,7 @@ def _check_pose(pose: np.ndarray, name: str) -> None:
 
 
 def _stand(path: Path, parts: list[_Part], notes: list[str], placing: Placing) -> list[_Part]:
-    """The parts y up, in metres, without useless faces, resting on y = 0 with their middle at x = z = 0."""
+    """Return the parts y up, in metres, without useless faces, resting on y = 0 with their middle at x = z = 0."""
     up = placing.up or ("z" if path.suffix.lower() == ".stl" else "y")
     turn = TURNS[up]
     if placing.up is None and up == "z":
@@ -252,7 +252,7 @@ def _moved(part: _Part, pose: np.ndarray) -> _Part:
 
 
 def _sound(part: _Part, notes: list[str]) -> _Part | None:
-    """The part without faces of no area, doubled faces and vertices that no face uses; None when nothing is left."""
+    """Drop faces of no area, doubled faces and vertices that no face uses; None when nothing is left."""
     a, b, c = part.vertices[part.faces].transpose(1, 0, 2)
     flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 <= ZERO_AREA
     # The same three points in any order are one face: its two sides reflect alike.
@@ -326,7 +326,7 @@ class _Paint:
         return value, lambda: value
 
     def _vertex_colour(self, part: _Part) -> float | None:
-        """The mean of colours stored per vertex or face (linear in glTF, sRGB elsewhere), None where there are none."""
+        """Average the colours stored per vertex or face (linear in glTF, sRGB elsewhere); None where there are none."""
         kind = getattr(part.visual, "kind", None)
         if kind not in ("vertex", "face"):
             return None
@@ -336,6 +336,6 @@ class _Paint:
 
 
 def _image_albedo(image: Image.Image, tint: np.ndarray) -> Texture:
-    """The texture of an sRGB image held in memory, times a linear colour."""
+    """Return the texture of an sRGB image held in memory, times a linear colour."""
     pixels = srgb_to_linear(np.asarray(image.convert("RGB")) / 255)
     return Texture(np.minimum(luminance(pixels * tint[:3]), 1.0), "base colour")

@@ -93,7 +93,7 @@ class Materials:
         return Look(material, uv.matrix, inside_out)
 
     def _unwrap(self, plugin: Plugin, uv: Uv) -> tuple[Plugin, float | Texture | None]:
-        """The innermost bsdf and the opacity of a mask around it."""
+        """Find the innermost bsdf and the opacity of a mask around it."""
         opacity = None
         for _ in range(MAX_NESTING):
             if plugin.type in ("bumpmap", "normalmap"):
@@ -212,7 +212,7 @@ def _to_uv(plugin: Plugin) -> np.ndarray:
 
 
 def _index(plugin: Plugin, name: str, default: str) -> float:
-    """A refractive index by number or by name."""
+    """Read a refractive index by number or by name."""
     element = plugin.value(name)
     if element is not None and element.tag != "string":
         return plugin.number(name)

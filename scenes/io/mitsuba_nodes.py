@@ -176,7 +176,7 @@ class Document:
 
 
 def _parse(path: Path) -> ElementTree.Element:
-    """The root element of an XML file without a document type."""
+    """Read the root element of an XML file without a document type."""
     try:
         data = read_bytes(path)
     except InputError as error:

@@ -297,7 +297,7 @@ def _positive(plugin: Plugin, name: str) -> float:
 
 
 def _placed(mesh: Mesh, plugin: Plugin) -> Mesh:
-    """The mesh moved by to_world, its faces counterclockwise seen from the side that Mitsuba calls outside."""
+    """Return the mesh moved by to_world, its faces counterclockwise seen from the side that Mitsuba calls outside."""
     matrix = plugin.transform("to_world")
     mirrored = np.linalg.det(matrix[:3, :3]) < 0
     vertices, faces, normals = shapes.transform(mesh.vertices, matrix), mesh.faces, mesh.normals

@@ -70,7 +70,7 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
 
 
 def _camera(document: Document, sensors: list[Plugin]) -> Camera:
-    """The first sensor as a pinhole camera."""
+    """Read the first sensor as a pinhole camera."""
     if not sensors:
         raise InputError('holds no sensor, expected a <sensor type="perspective">')
     sensor = sensors[0]
@@ -109,7 +109,7 @@ def _film_size(sensor: Plugin) -> tuple[int, int]:
 
 
 def _horizontal_fov(sensor: Plugin, width: int, height: int) -> float:
-    """The full horizontal angle in degrees, whichever way the file gives it."""
+    """Return the full horizontal angle in degrees, whichever way the file gives it."""
     if width < 1 or height < 1:
         raise sensor.fail(f"film of {width} x {height} pixels, expected at least 1 x 1")
     if sensor.has("fov"):
@@ -160,7 +160,7 @@ def _mirror_note(plugin: Plugin, what: str) -> bool:
 
 
 def _light_around(document: Document, emitters: list[Plugin]) -> Plugin | None:
-    """The one constant or mapped light around the scene; lights that are points are left out with a note."""
+    """Read the one constant or mapped light around the scene; lights that are points are left out with a note."""
     around = []
     for emitter in emitters:
         if emitter.type in ("constant", "envmap"):
@@ -183,7 +183,7 @@ def _light_around(document: Document, emitters: list[Plugin]) -> Plugin | None:
 
 
 def _ambient(document: Document, materials: Materials, emitters: list[Plugin]) -> Ambient:
-    """The light around the scene."""
+    """Read the light around the scene."""
     emitter = _light_around(document, emitters)
     if emitter is None:
         return Ambient()

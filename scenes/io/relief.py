@@ -283,7 +283,7 @@ def rgbd(files: RgbdFiles, *, width: int | None = None, height: int | None = Non
 
 
 def _albedo(path: Path, shape: tuple[int, int]) -> Texture:
-    """The photograph's linear luminance; its proportions must be the depth image's."""
+    """Read the photograph's linear luminance; its proportions must be the depth image's."""
     texture = load_texture(path)
     tall, wide = texture.image.shape
     same = abs(wide * shape[0] - tall * shape[1]) <= max(shape)

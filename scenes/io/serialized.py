@@ -81,7 +81,7 @@ class _Stream:
         self._inflate, self._packed, self._ready = zlib.decompressobj(), data, bytearray()
 
     def take(self, size: int) -> bytes:
-        """The next `size` bytes; InputError where the stream ends before."""
+        """Read the next `size` bytes; InputError where the stream ends before."""
         while len(self._ready) < size:
             more = self._inflate.decompress(self._packed, CHUNK)
             self._packed = self._inflate.unconsumed_tail

@@ -62,7 +62,7 @@ def load_scene(
 
 
 def _loaded(spec: str, seed: int, width: int | None, height: int | None) -> Scene:
-    """A scene that is no mesh file, as its name or its file has it."""
+    """Load a scene that is no mesh file, as its name or its file has it."""
     kind = Path(spec).suffix.lower()
     if spec.startswith(WALL):
         return _wall_at(spec, _looking_ahead(WIDTH, HEIGHT).resized(width, height))
@@ -105,7 +105,7 @@ def _wall_at(spec: str, camera: Camera) -> Scene:
 
 
 def _of_a_set(spec: str, seed: int, width: int | None, height: int | None) -> Scene:
-    """A scene by the name that its set gives it: `rooms/train/17`, `tabletop/spikes`, `middlebury/Art`."""
+    """Load a scene by the name that its set gives it: `rooms/train/17`, `tabletop/spikes`, `middlebury/Art`."""
     from scenes.io.relief import middlebury, middlebury_folder
     from scenes.library.sets import scene_set
     from scenes.library.tabletop import SCENES as TABLETOP
@@ -137,12 +137,12 @@ def _hard_case(name: str, width: int | None, height: int | None) -> Scene:
 
 
 def _looking_ahead(width: int, height: int, fov_deg: float = 40.0) -> Camera:
-    """A camera at the origin that looks along -z."""
+    """Build a camera at the origin that looks along -z."""
     return Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=fov_deg, width=width, height=height)
 
 
 def _plane(distance_m: float = 3.0, half_m: float = 8.0) -> tuple[Surface, ...]:
-    """A square large enough to fill an image up to 7 times as tall as wide."""
+    """Build a square large enough to fill an image up to 7 times as tall as wide."""
     square, faces, uv = shapes.rectangle()
     return (Surface(half_m * square - (0, 0, distance_m), faces, Material(name="grey"), uv=uv, name="wall"),)
 

@@ -115,7 +115,7 @@ def _skirting(palette: Palette) -> Surface:
 
 
 def _stairs(palette: Palette) -> list[Surface]:
-    """Steps along the right wall that rise away from the camera: treads on risers, and a string beside them."""
+    """Build steps along the right wall that rise away from the camera: treads on risers, and a string beside them."""
     treads, risers, strings = [], [], []
     for step in range(STEPS):
         top, front = (step + 1) * RISE_M, FIRST_STEP_Z - step * RUN_M
@@ -154,7 +154,7 @@ def _railing(palette: Palette) -> list[Surface]:
 
 
 def _door(palette: Palette) -> list[Surface]:
-    """A lacquered door with two raised fields, in its frame, with a metal handle; its back at z = 0."""
+    """Build a lacquered door with two raised fields, in its frame, with a metal handle; its back at z = 0."""
     half, tall = 0.42, 2.05
     frame = [box((s - 0.045, 0, 0), (s + 0.045, tall, 0.06)) for s in (-half - 0.045, half + 0.045)]
     frame.append(box((-half - 0.09, tall, 0), (half + 0.09, tall + 0.09, 0.06)))
@@ -172,7 +172,7 @@ def _door(palette: Palette) -> list[Surface]:
 
 
 def _cupboard(palette: Palette) -> list[Surface]:
-    """A tall dark lacquered cupboard with two doors and bar handles; its back at z = 0."""
+    """Build a tall dark lacquered cupboard with two doors and bar handles; its back at z = 0."""
     wide, tall, deep = 1.0, 1.85, 0.42
     body = box((-wide / 2, 0.06, 0.0), (wide / 2, tall, deep))
     base = box((-wide / 2 + 0.03, 0.0, 0.02), (wide / 2 - 0.03, 0.06, deep - 0.04))
@@ -194,7 +194,7 @@ def _cupboard(palette: Palette) -> list[Surface]:
 
 
 def _console(palette: Palette) -> list[Surface]:
-    """A varnished table along the wall with a china vase, a bowl of metal and two lacquered boxes on it."""
+    """Build a varnished table along the wall with a china vase, a bowl of metal and two lacquered boxes on it."""
     wide, tall, deep = 1.1, 0.8, 0.32
     top = box((-wide / 2, tall - 0.03, 0), (wide / 2, tall, deep))
     legs = [post(x, z, 0.02, 0, tall - 0.03) for x in (0.05 - wide / 2, wide / 2 - 0.05) for z in (0.04, deep - 0.04)]
@@ -216,7 +216,7 @@ def _console(palette: Palette) -> list[Surface]:
 
 
 def _picture(palette: Palette) -> list[Surface]:
-    """A varnished painting in a frame; its back at z = 0 and its lower edge at y = 0."""
+    """Build a varnished painting in a frame; its back at z = 0 and its lower edge at y = 0."""
     x, tall, bar = 0.45, 0.62, 0.04
     frame = [box((-x, y, 0), (x, y + bar, 0.03)) for y in (0.0, tall - bar)]
     frame += [box((left, bar, 0), (left + bar, tall - bar, 0.03)) for left in (-x, x - bar)]
@@ -225,7 +225,7 @@ def _picture(palette: Palette) -> list[Surface]:
 
 
 def _stand(palette: Palette) -> list[Surface]:
-    """A metal stand for umbrellas, and two of these in it."""
+    """Build a metal stand for umbrellas, and two of these in it."""
     body = [(0.0, 0.0), (0.11, 0.0), (0.11, 0.5), (0.105, 0.5), (0.105, 0.01), (0.0, 0.01)]
     sticks = [rod(np.array(((0.03 * s, 0.012, 0.02), (0.07 * s, 0.85, -0.05 * s))), 0.016) for s in (-1, 1)]
     return [
@@ -235,7 +235,7 @@ def _stand(palette: Palette) -> list[Surface]:
 
 
 def _lamp(palette: Palette) -> list[Surface]:
-    """A glowing ball under a lacquered shade that hangs from the ceiling."""
+    """Build a glowing ball under a lacquered shade that hangs from the ceiling."""
     y = HIGH[1] - 0.45
     rim = [(0.18, y), (0.15, y + 0.08), (0.05, y + 0.14), (0.012, y + 0.15)]
     inner = [(0.008, y + 0.146), (0.046, y + 0.136), (0.146, y + 0.076), (0.174, y)]

@@ -67,7 +67,7 @@ def _turn(points: np.ndarray, turn_deg: float, by: tuple[float, float]) -> np.nd
 
 
 def _onward(polygon: np.ndarray) -> np.ndarray:
-    """The corner after each corner (`np.roll`, whose generality takes longer than all else here)."""
+    """Return the corner after each corner (`np.roll`, whose generality takes longer than all else here)."""
     return np.concatenate((polygon[1:], polygon[:1]))
 
 

@@ -45,7 +45,7 @@ def living_room(seed: int = 0, *, width: int = 128, height: int = 96) -> Scene:
 
 
 def _streams(seed: int) -> Callable[[str], Random]:
-    """A function that gives each purpose its own random stream, so that one more draw here changes nothing there."""
+    """Return what gives each purpose its own random stream, so that one more draw here changes nothing there."""
     if not isinstance(seed, Integral) or seed < 0:
         raise InputError(f"living-room: seed {seed!r} is not a whole number of 0 or more")
     purposes = ("colours", "textures", "places", "books", "sculpture")
@@ -246,7 +246,7 @@ def sculpture(palette: Palette, rng: Random, height: float = 0.4) -> list[Surfac
 
 
 def _palette(colours: Random, textures: Random) -> Palette:
-    """The materials of one seed by name. Albedos span 0.05 (leather, dark covers) to 0.9 (ceiling)."""
+    """Mix the materials of one seed by name. Albedos span 0.05 (leather, dark covers) to 0.9 (ceiling)."""
 
     def plain(low: float, high: float) -> MaterialFields:
         return {"albedo": float(colours.uniform(low, high))}

@@ -100,7 +100,7 @@ def one_of_each(palette: Palette, y: float = -0.5) -> list[Surface]:
 
 
 def _outline(rng: Random) -> np.ndarray:
-    """A plan view, corners in order: rectangle, L, recess, cut corner, slanted wall or apse."""
+    """Draw a plan view, corners in order: rectangle, L, recess, cut corner, slanted wall or apse."""
     w, d = rng.uniform((2.8, 3.2), (5.6, 7.0))
     cut_w, cut_d = rng.uniform(0.25, 0.45) * w, rng.uniform(0.25, 0.45) * d
     kind = rng.choice(("rectangle", "L", "breast", "bevel", "slant", "apse"), p=(0.34, 0.2, 0.16, 0.12, 0.1, 0.08))
@@ -171,14 +171,14 @@ def _shell(palette: Palette, rng: Random, floor: Floor, ceiling: float) -> list[
 
 
 def _lumber(corners: np.ndarray, ceiling: float) -> Place:
-    """A box that is not there but keeps things out."""
+    """Return a box that is not there but keeps things out."""
     (x0, z0), (x1, z1) = corners
     plan = np.array(((x0, z0), (x1, z0), (x1, z1), (x0, z1)))
     return Place(Piece(()), (0.0, 0.0, 0.0), 0.0, plan, 0.0, ceiling)
 
 
 def _along(start: np.ndarray, end: np.ndarray, y: float, tall: float, thick: float) -> Shape:
-    """A board along a wall from start to end (x, z), on the inside."""
+    """Build a board along a wall from start to end (x, z), on the inside."""
     along = (end - start) / np.linalg.norm(end - start)
     inward = thick * np.array((-along[1], along[0]))
     line = np.array((start, start + inward, start + inward, start))

@@ -86,7 +86,7 @@ ENDLESS: dict[str, Callable[[str, str], SceneSet]] = {"rooms": _rooms, "clutter"
 
 
 def _named(name: str) -> tuple[list[str], Callable[[str], Scene]]:
-    """The scenes of a set of named ones, and what loads one of them."""
+    """Return the scenes of a set of named ones, and what loads one of them."""
     if name == "tabletop":
         from scenes.library.tabletop import SCENES, tabletop
 

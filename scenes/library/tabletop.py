@@ -66,7 +66,7 @@ def antlers(palette: Palette, rng: Random) -> Piece:
 
 
 def sticks(palette: Palette, rng: Random) -> Piece:
-    """Thin rods fallen over each other, as in the game."""
+    """Build thin rods fallen over each other, as in the game."""
     parts = []
     for _ in range(int(rng.integers(10, 22))):
         angle, long = rng.uniform(0, np.pi), rng.uniform(0.12, 0.2)
@@ -157,7 +157,7 @@ def tabletop(name: str, *, width: int = 88, height: int = 72) -> Scene:
 
 
 def _stand(piece: Piece, floor: Floor, rng: Random, tries: int = 30) -> None:
-    """The piece on the stage, tall things rather at the back, sometimes on top of what offers a place."""
+    """Place the piece on the stage, tall things rather at the back, sometimes on top of what offers a place."""
     tops = [top for place in floor.places for top in place.tops]
     if tops and rng.random() < 0.3:
         x, z, turn, half_x, half_z, y = tops[int(rng.integers(len(tops)))]

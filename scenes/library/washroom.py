@@ -109,7 +109,7 @@ def _arc(centre: tuple[float, float], radius: float, first_deg: float, last_deg:
 
 
 def _basin(palette: Palette) -> list[Surface]:
-    """A glazed bowl on the wall, a tap with two handles on its rim, a trap and two pipes below it."""
+    """Build a glazed bowl on the wall, a tap with two handles on its rim, a trap and two pipes below it."""
     depth, radius = 0.17, 0.25
     t = np.linspace(0, np.pi / 2, 11)
     outside = [(radius * math.sin(a), RIM_Y - depth * math.cos(a)) for a in t]
@@ -143,7 +143,7 @@ def _basin(palette: Palette) -> list[Surface]:
 
 
 def _mirror(palette: Palette) -> list[Surface]:
-    """A silvered plate in a chrome frame, its back on the wall."""
+    """Build a silvered plate in a chrome frame, its back on the wall."""
     x, low, high = 0.38, 1.15, 1.95
     frame = [box((s - 0.012, low, 0), (s + 0.012, high, 0.02)) for s in (-x - 0.012, x + 0.012)]
     frame += [box((-x - 0.024, y, 0), (x + 0.024, y + 0.024, 0.02)) for y in (low - 0.024, high)]
@@ -152,7 +152,7 @@ def _mirror(palette: Palette) -> list[Surface]:
 
 
 def _bulb(palette: Palette, glass: str) -> list[Surface]:
-    """A glowing ball in a bulb of glass, on an arm of chrome that leads back to the wall at z = -0.16."""
+    """Build a glowing ball in a bulb of glass, on an arm of chrome that leads back to the wall at z = -0.16."""
     outer, faces, uv = shapes.sphere(BULB_M, 4)
     shells = [(outer, faces, uv)]
     if palette[glass].kind == "dielectric":  # its hollow: air inside glass, so its faces look inwards
@@ -171,7 +171,7 @@ def _bulb(palette: Palette, glass: str) -> list[Surface]:
 
 
 def _door(palette: Palette) -> list[Surface]:
-    """A shower's glass door across the right half of the room, framed in chrome, with a handle through it."""
+    """Build a shower's glass door across the right half of the room, framed in chrome, with a handle through it."""
     left, z, top = 0.38, -0.55, 2.0
     middle, half = (left + HIGH[0]) / 2, (HIGH[0] - left) / 2 - 0.02
     posts = [post(x, z, 0.015, 0.0, top) for x in (left + 0.005, HIGH[0] - 0.015)]
@@ -185,7 +185,7 @@ def _door(palette: Palette) -> list[Surface]:
 
 
 def _shower(palette: Palette) -> list[Surface]:
-    """An upright pipe with a head that looks down, and a mixer, on the far wall behind the glass."""
+    """Build an upright pipe with a head that looks down, and a mixer, on the far wall behind the glass."""
     x, z = 0.85, LOW[2]
     bend = _arc((1.98, z + 0.16), 0.1, 180, 90) + (x, 0, 0)
     line = np.concatenate(([(x, 0.95, z + 0.06)], bend, [(x, 2.08, z + 0.34)]))
@@ -200,7 +200,7 @@ def _shower(palette: Palette) -> list[Surface]:
 
 
 def _towel_rail(palette: Palette) -> list[Surface]:
-    """A ladder of pipes on the left wall, and a towel over one of its rungs."""
+    """Build a ladder of pipes on the left wall, and a towel over one of its rungs."""
     x, near, far = LOW[0] + 0.07, -0.05, -0.6
     rails = [rod(np.array(((x, 0.45, z), (x, 1.45, z))), 0.014, 20) for z in (near, far)]
     rungs = [rod(np.array(((x, y, near), (x, y, far))), 0.009, 16) for y in np.linspace(0.5, 1.4, 9)]
@@ -225,7 +225,7 @@ def _towel_rail(palette: Palette) -> list[Surface]:
 
 
 def _stool(palette: Palette) -> list[Surface]:
-    """A round stool before the door, with a folded towel on it."""
+    """Build a round stool before the door, with a folded towel on it."""
     seat = solid([(0.0, 0.41), (0.16, 0.41), (0.165, 0.43), (0.16, 0.45), (0.0, 0.45)], 40)
     legs = [
         rod(np.array(((0.13 * c, 0.42, 0.13 * s), (0.17 * c, 0.0, 0.17 * s))), 0.014)

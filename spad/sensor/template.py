@@ -96,7 +96,9 @@ def pulse_cdf_integral(pulse: AnyPulse, t: Tensor) -> Tensor:
 
 
 def _gaussian_cdf_integral(sigma_s: float, t: Tensor) -> Tensor:
-    """The two terms cancel where t is very negative, so the tail is written with Mills' ratio M(a) = Phi(-a) / phi(a):
+    """Integrate the Gaussian's distribution function up to t.
+
+    The two terms cancel where t is very negative, so the tail is written with Mills' ratio M(a) = Phi(-a) / phi(a):
     H(-a s) = s phi(a) (1 - a M(a)); and H(t) = t + H(-t) takes it to positive t, where it tends to t.
     """
     x = t / sigma_s

@@ -98,7 +98,7 @@ def _leave(word: int, s: str, low: int, high: int) -> list[str]:
 
 
 def _memory(one: Instruction, word: int, ram_bytes: int) -> list[str]:
-    """The operand's cell `i`, checked unless it is a good constant, and what is done there."""
+    """Return the operand's cell `i`, checked unless it is a good constant, and what is done there."""
     d, size, last = f"r[{one.rd}]", one.op.size, ram_bytes - one.op.size
     cells = "ram" if size == 1 else "halves"
     if one.constant and 0 <= one.value <= last and one.value % size == 0:

@@ -52,7 +52,7 @@ def _frontal(name: str, distance_m: float, path_limit_m: float, seed: int) -> Ou
 
 
 def _on_sensor(name: str, distance_m: float, seed: int) -> Outcome:
-    """The frontal wall, and the counts of the reference sensor: where they lie and how many of them wrapped."""
+    """Measure the frontal wall, and the counts of the reference sensor: where they lie and how many of them wrapped."""
     outcome = _frontal(name, distance_m, 8 * FLOAT32 * distance_m, seed)
     scene = hard_case(name)
     transient, sensor, budget = render(scene, SMOOTH, seed=seed), sensor_by_name("reference"), PhotonBudget(50, 0)

@@ -28,7 +28,7 @@ def pulse_kernel(sigma_bins: float = PULSE_SIGMA_BINS) -> np.ndarray:
 
 @cache
 def _band() -> tuple[int, np.ndarray]:
-    """The kernel's reach r [bins] and its band matrix, (STEP + 2 r, STEP) float32."""
+    """Return the kernel's reach r [bins] and its band matrix, (STEP + 2 r, STEP) float32."""
     kernel = pulse_kernel()
     reach = len(kernel) - 1
     lag = np.abs(np.arange(STEP + 2 * reach)[:, None] - reach - np.arange(STEP))

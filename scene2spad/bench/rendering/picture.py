@@ -24,7 +24,10 @@ CODES = {method.name: style for method, style in STYLES.items()}
 
 
 def draw(rows: list[Row], kind: str, path: Path) -> Path:
-    """Log-log, error `kind` (raw or pulse); dotted lines and open marks are direct light, solid ones full transport."""
+    """Draw seconds against error of a `kind` (raw or pulse), log-log.
+
+    Dotted lines and open marks are direct light, solid ones full transport.
+    """
     scenes = list(dict.fromkeys(row.scene for row in rows))
     sizes = sorted({row.size for row in rows})
     shape = (len(scenes), len(sizes))

@@ -182,7 +182,7 @@ def drawn(counts: np.ndarray) -> str:
 
 
 def _as_text(pixel: dict[str, Any]) -> list[str]:
-    """The pixel as lines: what it is, then its table, no longer than MAX_LINES."""
+    """Return the pixel as lines: what it is, then its table, no longer than MAX_LINES."""
     table = "returns" if "returns" in pixel else "counts"
     lines = [", ".join(f"{name} {_value(value)}" for name, value in pixel.items() if name not in (table, "drawn"))]
     if "drawn" in pixel:

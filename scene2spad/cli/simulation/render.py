@@ -187,7 +187,7 @@ def _placing(command: Render) -> Placing:
 
 
 def _lit(scene: Scene, command: Render) -> Scene:
-    """The scene under the laser and the ambient light that are asked for."""
+    """Return the scene under the laser and the ambient light that are asked for."""
     laser = scene.laser
     if command.laser is not None:
         laser = Laser(command.laser, laser.baseline_m)
@@ -211,7 +211,7 @@ def _question_unit(transient: Transient, name: str) -> None:
 
 
 def _rgbd(command: Render) -> Scene:
-    """The relief of a photograph and its depth image."""
+    """Return the relief of a photograph and its depth image."""
     from scenes.io.relief import RgbdFiles, rgbd
 
     require(_placing(command) == Placing(), f"{command.scene}: an RGB-D pair has its own size and camera")

@@ -175,7 +175,7 @@ def _modes(study: Session, near: Sequence[Row], far: Sequence[Row]) -> list[dict
 
 
 def _relief(study: Session) -> list[dict]:
-    """The Middlebury reliefs as they are and 7 m farther in time: MAE [mm] of seed 0 at 128x."""
+    """Measure the Middlebury reliefs as they are and 7 m farther in time: MAE [mm] of seed 0 at 128x."""
     plan, subjects = study.plan, study.named(study.one_seed())
     if not (plan.relief and subjects):
         return []
@@ -274,7 +274,7 @@ def _near_and_far(study: Session, part: str, subjects: Sequence[EvaluatedModel],
 
 
 def _swap(study: Session, base: TestSet) -> list[dict]:
-    """The codes of a biased model before the network of an unbiased one, and the other way round."""
+    """Put the codes of a biased model before the network of an unbiased one, and the other way round."""
     found = []
     for cured in study.plan.cured:
         plain = replace(cured, time_offset_m=0.0)

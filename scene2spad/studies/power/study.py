@@ -202,7 +202,7 @@ def _draw_shared(histogram: Histogram, depths: dict, errors: dict, path: Path) -
 
 
 def _draw_maps(histogram: Histogram, maps: dict, titles: dict, title: str, columns: int, path: Path) -> Path:
-    """The truth, then maps on its scale."""
+    """Draw the truth, then maps on its scale."""
     all_maps = {"truth": histogram.depth_m, **maps}
     lines = -(-len(all_maps) // columns)
     figure, axes = plt.subplots(lines, columns, figsize=(3.4 * columns, 3.1 * lines), layout="constrained")

@@ -132,8 +132,8 @@ def projected(points: np.ndarray) -> np.ndarray:
 
 
 def _frame(view: View, depths: Depths) -> tuple[np.ndarray, np.ndarray]:
-    """The part of the viewer's plane that all clouds of a capture are shown in: that of the truth, or of the matched
-    filter where there is none."""
+    """Find the part of the viewer's plane that all clouds of a capture are shown in: that of the truth, or of the
+    matched filter where there is none."""
     low, high = limits(view, depths)
     points = _points(view, depths[view.name, "log-matched"] if view.depth_m is None else view.depth_m)
     distance = np.linalg.norm(points, axis=1)

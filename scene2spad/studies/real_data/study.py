@@ -199,7 +199,7 @@ def _key(values: dict) -> str:
 
 
 def _view(capture: Capture, name: str, fov_deg: float = FOV_DEG, truth: Transient | None = None) -> View:
-    """A capture as the methods see it: resampled and pooled, with the truth pooled alike where it is known."""
+    """Prepare a capture as the methods see it: resampled and pooled, with the truth pooled alike where it is known."""
     counts = resampled(capture, BINS, POOL)
     depth, mixed = (None, None) if truth is None else pooled_truth(truth)
     return View(name, counts, resampled_sensor(prototype(), BINS), capture.image, fov_deg, depth, mixed)

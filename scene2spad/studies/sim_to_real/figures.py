@@ -16,7 +16,7 @@ COLOURS = ("tab:blue", "tab:orange", "tab:green")
 def draw_histograms(
     distances_m: np.ndarray, counts: np.ndarray, expected: np.ndarray, order: np.ndarray, columns: int, path: Path
 ) -> Path:
-    """Measured counts (N, Z, T) as dots and predicted ones as lines: a panel a zone, as the chip sees them."""
+    """Draw measured counts (N, Z, T) as dots and predicted ones as lines: a panel a zone, as the chip sees them."""
     rows = -(-len(order) // columns)
     figure, panels = plt.subplots(
         rows, columns, figsize=(4 * columns, 2.6 * rows), sharex=True, layout="constrained", squeeze=False
@@ -41,7 +41,7 @@ def draw_histograms(
 
 
 def draw_errors(distance_m: np.ndarray, held: np.ndarray, of: Comparison, path: Path) -> Path:
-    """Shape, amplitude and range errors against distance, a line a zone; crosses: captures calibrated on."""
+    """Draw shape, amplitude and range errors against distance, a line a zone; crosses: captures calibrated on."""
     figure, panels = plt.subplots(3, 1, figsize=(8, 8), sharex=True, layout="constrained")
     shown = (
         (of.shape, "nRMSE of the shape"),
@@ -67,7 +67,7 @@ def draw_errors(distance_m: np.ndarray, held: np.ndarray, of: Comparison, path: 
 
 
 def draw_poses(rows: Sequence[dict], path: Path) -> Path:
-    """Errors of distance and tilt against distance, with 95 % intervals."""
+    """Draw errors of distance and tilt against distance, with 95 % intervals."""
     figure, panels = plt.subplots(3, 1, figsize=(8, 7), sharex=True, layout="constrained")
     distance = [1e3 * row["distance_m"] for row in rows]
     for panel, (key, label) in zip(

@@ -77,7 +77,7 @@ def _mean_where(values: np.ndarray, which: np.ndarray) -> np.ndarray:
 
 
 def randomised_pit(counts: np.ndarray, expected: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Probability integral transform P(N < n) + u P(N = n) of Poisson counts, u uniform: uniform for a true model."""
+    """Transform Poisson counts to P(N < n) + u P(N = n), u uniform, which is uniform for a true model."""
     below = np.where(counts > 0, pdtr(counts - 1.0, expected), 0.0)
     return below + np.random.default_rng(seed).random(counts.shape) * (
         pdtr(counts.astype(np.float64), expected) - below
@@ -85,7 +85,7 @@ def randomised_pit(counts: np.ndarray, expected: np.ndarray, seed: int = 0) -> n
 
 
 def centroid(histograms: np.ndarray) -> np.ndarray:
-    """Centroid in bins (...,) of WINDOW around the fullest bin of histograms (..., T), their median taken off."""
+    """Return the centroid in bins (...,) of WINDOW around the fullest bin of histograms (..., T) less their median."""
     signal = np.maximum(histograms - np.median(histograms, axis=-1, keepdims=True), 0.0)
     bins = np.arange(signal.shape[-1])
     after = bins - signal.argmax(axis=-1)[..., None]

@@ -185,7 +185,7 @@ def chip_range(captures: PlaneCaptures) -> dict[str, list[float]]:
 
 
 def pose_rows(of: Prediction, model_error: float) -> list[dict[str, float]]:
-    """Errors of distance and tilt of single captures held out, their standard errors, and half widths of 95 %
+    """Return errors of distance and tilt of single captures held out, their standard errors, and half widths of 95 %
     intervals.
 
     The arm's plane faces the sensor. What the model's errors add to the Fisher covariance is measured on poses of the
@@ -236,7 +236,7 @@ def pose_summary(rows: Sequence[dict[str, float]]) -> JsonObject:
 
 
 def draw_all(of: Prediction, poses: Sequence[dict[str, float]], out: Path) -> list[Path]:
-    """Histograms of the zones at three distances, errors against distance, and poses."""
+    """Draw histograms of the zones at three distances, errors against distance, and poses."""
     _, columns, order = zone_grid(of.fitted.zones)
     distance_m, left_out = of.captures.distance_m, np.flatnonzero(of.held)
     shown = [left_out[np.abs(distance_m[left_out] - metres).argmin()] for metres in of.plan.shown_m]

@@ -104,7 +104,7 @@ def lattice(rng: Random) -> shapes.Shape:
 
 
 def wires(rng: Random) -> shapes.Shape:
-    """Smooth random curves, as cables hang."""
+    """Build smooth random curves, as cables hang."""
     parts, s = [], np.linspace(0, 1, 40)
     for _ in range(int(rng.integers(1, 6))):
         waves = np.stack([np.sin(np.pi * k * s + rng.uniform(0, 6.3)) / k for k in range(1, 5)])

@@ -53,7 +53,7 @@ def flowers(palette: Palette, rng: Random) -> Piece:
 
 
 def _leaf(rng: Random, long: float, wide: float) -> shapes.Shape:
-    """A pointed leaf that grows along +x and bends down."""
+    """Build a pointed leaf that grows along +x and bends down."""
     s, t = np.linspace(0, 1, 8), np.array((-1.0, 0.0, 1.0))
     width = wide * np.sin(np.pi * np.clip(s, 0.02, 0.99)) ** 0.8
     droop = rng.uniform(0.1, 0.7)

@@ -146,7 +146,7 @@ def transform_normals(normals: np.ndarray, matrix4: np.ndarray) -> np.ndarray:
 
 
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit icosahedron with a vertex on each pole, every face split in four `subdivisions` times."""
+    """Build a unit icosahedron with a vertex on each pole, every face split in four `subdivisions` times."""
     longitude = np.arange(5) * 2 * np.pi / 5
     z = 1 / math.sqrt(5)
     upper = np.column_stack((2 * z * np.cos(longitude), 2 * z * np.sin(longitude), np.full(5, z)))
