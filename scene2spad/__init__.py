@@ -12,7 +12,7 @@ Arrays are NumPy's, lengths metres and times seconds. Names are imported when th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from scenes.lazy import lazy_names
 
@@ -142,7 +142,7 @@ __all__ = [  # noqa: RUF022 (in the order of the chain)
 _import_name, _names = lazy_names(__name__, _MODULE_OF)
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a public name when it is first asked for (PEP 562)."""
     if name == "__version__":
         from importlib.metadata import version

@@ -293,7 +293,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def preset(name: str, model: ModelConfig, **changes: Any) -> TrainConfig:
+def preset(name: str, model: ModelConfig, **changes: object) -> TrainConfig:
     """Return a preset's configuration with a model; `changes` that are None leave it as it is.
 
     smoke (seconds), laptop (compact, one core, 25 minutes at the most), workstation (compact, two cores, 2 hours at the
@@ -309,7 +309,7 @@ def preset(name: str, model: ModelConfig, **changes: Any) -> TrainConfig:
     oracle = {"rate": 1e-4, "tv_weight": PUBLISHED_TV} if name == "paper" and model.front != "codes" else {}
     if given.get("levels") == "paper":
         given["levels"] = TRAIN_LEVELS
-    values = {"model": model, "preset": name, **PRESETS[name], **oracle, **given}
+    values: dict[str, Any] = {"model": model, "preset": name, **PRESETS[name], **oracle, **given}
     if "window" not in given and (window_refused(model, values.get("window", 0)) or values.get("time_offset_m")):
         values["window"] = 0
         if values["window"] != PRESETS[name].get("window", 0) and "steps_per_epoch" not in given:

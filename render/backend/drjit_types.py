@@ -18,3 +18,4 @@ Rays: TypeAlias = Any  # mi.Ray3f
 Interactions: TypeAlias = Any  # mi.SurfaceInteraction3f
 LobeSamples: TypeAlias = Any  # mi.BSDFSample3f
 Generators: TypeAlias = Any  # mi.PCG32
+Tensors: TypeAlias = Any  # mi.TensorXf

@@ -16,7 +16,7 @@ from functools import reduce
 from importlib.metadata import version
 from operator import or_
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -101,9 +101,9 @@ def options_of(name: str) -> type[Common]:
     return options
 
 
-def runner_of(name: str) -> Callable[[Any, Progress], dict]:
+def runner_of(name: str) -> Callable[[Common, Progress], dict]:
     """Return the function that runs a command."""
-    run: Callable[[Any, Progress], dict] = _module_of(name).run
+    run: Callable[[Common, Progress], dict] = _module_of(name).run
     return run
 
 

@@ -28,6 +28,7 @@ from scene2spad.datasets.workers import check_workers
 from scene2spad.options.networks import Evaluate, Train
 from scenes.errors import InputError, require
 from scenes.files import write_csv
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
 from spad.formats.histogram import Histogram
@@ -101,7 +102,7 @@ def config_of(command: Train) -> TrainConfig:
     return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps, warmup=warmup)
 
 
-def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, Any]]:
+def views_of(command: Train) -> tuple[list[Views], list[Views], JsonObject]:
     """Return training and validation views of every set, and the words that say which they are."""
     sets = [_views_of_set(path, command) for path in command.set]
     common = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
@@ -283,10 +284,10 @@ def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[st
     return [f"{one[0]} ({firsts[one]})" if one[0] in several else one[0] for one in recipes]
 
 
-def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[dict[str, Any]]:
+def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[JsonObject]:
     """Return mean MAE [mm] and share within 10 mm of every level and group; as lines unless `full`."""
     rows = [row for row in found.rows if row.group == "all"]
-    lines: list[dict[str, Any]] = []
+    lines: list[JsonObject] = []
     for signal, background in dict.fromkeys((row.signal, row.background) for row in rows):
         here = [row for row in rows if (row.signal, row.background) == (signal, background)]
         for name, members in groups.items():
@@ -302,7 +303,7 @@ def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> lis
     ]
 
 
-def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> dict[str, Any]:
+def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> JsonObject:
     """Return headline figures of the `first` group, every group by levels, paired differences of MAE from the first."""
     summaries = {name: found.summary(members) for name, members in groups.items()}
     everything = summaries[first]["all"]["all"]

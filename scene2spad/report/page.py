@@ -23,6 +23,7 @@ from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.io.inputs import read_json_object
 from scenes.io.set_index import read_set_index
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 TITLE = "scene2spad: results"
@@ -244,7 +245,7 @@ def _configurations(found: Found) -> Iterator[str]:
             yield html.table(rows, f"{title} ({name} of each)", MAX_CONFIGURATIONS)
 
 
-def _views_of(folder: Path, found: Found) -> dict[str, Any]:
+def _views_of(folder: Path, found: Found) -> JsonObject:
     """Count a set's views, and those that end above their error target; nothing where there is no index."""
     index = folder / "index.jsonl"
     records = found.read(index, lambda path: read_set_index(path.parent)) if index.is_file() else None
@@ -265,9 +266,9 @@ def _models(found: Found) -> Iterator[dict]:
                 yield {**model, "sha256": digest[:12]}
 
 
-def _flat(numbers: Mapping[str, Any], columns: Sequence[str]) -> dict[str, Any]:
+def _flat(numbers: JsonObject, columns: Sequence[str]) -> JsonObject:
     """Plain values, and those one level beneath by both names; where columns are named, these alone."""
-    flat: dict[str, Any] = {}
+    flat: JsonObject = {}
     for key, value in numbers.items():
         if isinstance(value, Mapping):
             flat |= {f"{key} {inner}": one for inner, one in value.items() if not isinstance(one, (Mapping, list))}

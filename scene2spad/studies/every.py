@@ -10,12 +10,12 @@ from dataclasses import asdict, replace
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from scene2spad.options.experiments import ABLATIONS, STUDIES, Study
 from scenes.errors import InputError
 from scenes.files import append_line
 from scenes.io.inputs import read_whole_lines
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
@@ -51,7 +51,7 @@ def run_all(command: Study, progress: Progress) -> dict:
     Studies that came to their end with these options are not run again, as long as their figures are there. Returns a
     table of all: done, done before, or left out and why. Raises InputError where not one could be run.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[JsonObject] = []
     for number, name in enumerate(STUDIES):
         one = replace(command, name=name)
         row = _finished(one)

@@ -11,6 +11,7 @@ import numpy as np
 
 from scenes.files import append_line, whole_file
 from scenes.io.inputs import read_whole_lines
+from scenes.json_types import JsonObject
 
 
 class Store:
@@ -22,13 +23,13 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._known: dict[str, dict[str, Any]] = {}
+        self._known: dict[str, JsonObject] = {}
 
     def get(self, digest: str, **key: object) -> Any:
         """Return the value, or None."""
         return self._of(digest).get(_text(key))
 
-    def put(self, digest: str, value: Any, **key: object) -> None:
+    def put(self, digest: str, value: object, **key: object) -> None:
         known = self._of(digest)
         path = self.folder / f"{digest[:32]}.jsonl"
         append_line(path, json.dumps([_text(key), value]))
@@ -45,7 +46,7 @@ class Store:
         with whole_file(path) as beside:
             np.save(beside, depth_m.astype(np.float32))
 
-    def _of(self, digest: str) -> dict[str, Any]:
+    def _of(self, digest: str) -> JsonObject:
         if digest not in self._known:
             self._known[digest] = dict(_lines(self.folder / f"{digest[:32]}.jsonl"))
         return self._known[digest]
@@ -55,7 +56,7 @@ def _text(key: dict[str, object]) -> str:
     return json.dumps(key, sort_keys=True)
 
 
-def _lines(path: Path) -> list[tuple[str, Any]]:
+def _lines(path: Path) -> list[tuple[str, object]]:
     found = []
     for line in read_whole_lines(path):
         match line:

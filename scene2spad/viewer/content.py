@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 import zlib
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.json_types import JsonObject
 
 NS_PER_M = 1e9 / SPEED_OF_LIGHT_M_PER_S
 MAX_CELLS = 1 << 24  # of a cube: more than a browser draws at once are summed in time
@@ -66,7 +67,7 @@ class Content:
     points: np.ndarray | None = None  # (N, 3) float32 [m], x right, y down, z forward
     point_value: np.ndarray | None = None  # (N,) in [0, 1], what colours them
     figures: tuple[tuple[str, bytes], ...] = ()  # caption and PNG
-    tables: tuple[tuple[str, list[dict[str, Any]]], ...] = ()
+    tables: tuple[tuple[str, list[JsonObject]], ...] = ()
     text: str = ""
     notes: list[str] = field(default_factory=list)
 
@@ -85,7 +86,7 @@ def packed(values: np.ndarray) -> str:
     return base64.b64encode(zlib.compress(data.tobytes(), 6)).decode("ascii")
 
 
-def cube_payload(cube: Cube) -> dict[str, Any]:
+def cube_payload(cube: Cube) -> JsonObject:
     """Pack a cube: counts as they are in 8 or 16 bits, rates as square roots in LEVELS steps.
 
     A cube of more than MAX_CELLS is summed over neighbouring bins first; `summed` says over how many.

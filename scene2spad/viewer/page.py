@@ -8,7 +8,6 @@ import json
 import re
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from scene2spad.report.html import table
 from scene2spad.viewer.content import NS_PER_M, Content, Returns, cube_payload, packed
 from scenes.files import whole_file
+from scenes.json_types import JsonObject
 
 ROOM = Path(__file__).parent
 STOPS = 32  # of each colour scale
@@ -56,7 +56,7 @@ def page_html(content: Content) -> str:
     )
 
 
-def _sections(content: Content, payload: dict[str, Any]) -> list[str]:
+def _sections(content: Content, payload: JsonObject) -> list[str]:
     """Return the sections of the page that the content fills, in order."""
     markup = (ROOM / "viewer.html").read_text(encoding="utf-8")
     parts = dict(re.findall(r"<!-- (\w+) -->\n(.*?)(?=<!--|\Z)", markup, re.S))
@@ -88,7 +88,7 @@ def _marks(content: Content) -> str:
     return "".join(f'<span class="key" style="background:{colour}"></span>{escape(name)}' for name, colour in named)
 
 
-def _precision(content: Content, cubes: list[dict[str, Any]]) -> str:
+def _precision(content: Content, cubes: list[JsonObject]) -> str:
     """Say what the page rounds, in words."""
     lines = []
     for part in cubes:
@@ -102,7 +102,7 @@ def _precision(content: Content, cubes: list[dict[str, Any]]) -> str:
     return "; ".join(lines) + "."
 
 
-def _payload(content: Content) -> dict[str, Any]:
+def _payload(content: Content) -> JsonObject:
     height, width = content.layers[0].values.shape if content.layers else (0, 0)
     ramp = np.linspace(0, 1, STOPS)
     colours = {name: np.rint(255 * matplotlib.colormaps[mpl](ramp)[:, :3]).tolist() for name, mpl in PALETTES.items()}
@@ -129,7 +129,7 @@ def _payload(content: Content) -> dict[str, Any]:
     }
 
 
-def _returns(returns: Returns) -> dict[str, Any]:
+def _returns(returns: Returns) -> JsonObject:
     """Pack times as differences within a pixel, in steps of at least TIME_STEP_NS, and energies in 254 steps of a
     logarithmic scale of DECADES; 0 is what lies below."""
     last = float(returns.time_ns.max(initial=0))
@@ -153,7 +153,7 @@ def _returns(returns: Returns) -> dict[str, Any]:
     }
 
 
-def _cloud(content: Content) -> dict[str, Any] | None:
+def _cloud(content: Content) -> JsonObject | None:
     if content.points is None or len(content.points) < 2:
         return None
     every = -(-len(content.points) // MAX_POINTS)

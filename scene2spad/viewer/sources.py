@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from render.transient import Transient
 from scene2spad.viewer.content import NS_PER_M, Content, Cube, Layer, Returns, grey_layer
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.json_types import JsonObject
 from scenes.model import Camera
 from spad.detection.flux import Rates, rates_for
 from spad.formats.histogram import Histogram
@@ -77,7 +75,7 @@ def histogram_content(histogram: Histogram, title: str, transient: Transient | N
     return Content(title, histogram_facts(histogram), tuple(layers), tuple(cubes), returns, notes=notes, **cloud)
 
 
-def depth_content(depth_m: np.ndarray, confidence: np.ndarray | None, meta: Mapping[str, Any], title: str) -> Content:
+def depth_content(depth_m: np.ndarray, confidence: np.ndarray | None, meta: JsonObject, title: str) -> Content:
     """Show a depth map: depth, confidence where a network stated it, and the points."""
     layers = [depth_layer("depth", depth_m)]
     if confidence is not None:
@@ -93,7 +91,7 @@ def depth_layer(name: str, depth_m: np.ndarray) -> Layer:
     return Layer(name, "m", depth_m, "depth", limits["vmin"], limits["vmax"])
 
 
-def surface(depth_m: np.ndarray, camera: Mapping[str, Any] | None, value: np.ndarray | None) -> dict[str, Any]:
+def surface(depth_m: np.ndarray, camera: JsonObject | None, value: np.ndarray | None) -> JsonObject:
     """Return points (N, 3) in the camera's frame and their brightness; nothing where the field of view is unknown."""
     points = camera_points(depth_m, camera)
     if points is None:
@@ -106,7 +104,7 @@ def surface(depth_m: np.ndarray, camera: Mapping[str, Any] | None, value: np.nda
     return {"points": points[known].astype(np.float32), "point_value": np.clip(seen / (top or 1.0), 0, 1)}
 
 
-def camera_points(depth_m: np.ndarray, camera: Mapping[str, Any] | None) -> np.ndarray | None:
+def camera_points(depth_m: np.ndarray, camera: JsonObject | None) -> np.ndarray | None:
     """Return points (H, W, 3) [m] of radial depths (H, W), x right, y down, z forward; None without a camera of this
     size."""
     height, width = depth_m.shape

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -109,7 +109,7 @@ def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:
     return {name: np.asarray(pixels, np.float64) for name, pixels in channels.items()}
 
 
-def read_flat_exr(path: Path, what: str = "image file") -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_flat_exr(path: Path, what: str = "image file") -> tuple[dict[str, np.ndarray], dict[str, object]]:
     """Read a flat EXR's channels by name, and its header; the declared size is checked before any pixel is decoded.
 
     Raises InputError naming the file where it is missing, broken or too large.

@@ -39,9 +39,10 @@ def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray | None, JsonObject]:
     path = Path(path)
     channels, header = read_flat_exr(path, "file")
     try:
-        if ATTRIBUTE not in header or "Z" not in channels:
+        sealed = header.get(ATTRIBUTE)
+        if not isinstance(sealed, str) or "Z" not in channels:
             raise InputError("no depth map of scene2spad")
-        meta, sha256 = open_seal(header[ATTRIBUTE], "depth")
+        meta, sha256 = open_seal(sealed, "depth")
         meta = check_seal(meta, sha256, _sha256(channels))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

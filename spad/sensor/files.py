@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 from scenes.errors import InputError, did_you_mean, listed, require
 from scenes.files import whole_file
+from scenes.json_types import JsonObject
 from spad.sensor.budget import Optics
 from spad.sensor.model import PRESETS, Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse
@@ -242,7 +243,7 @@ def _field(value: object, key: Key, where: str) -> object:
     return parse_quantity(value, key.dimension, where, signed=key.signed)
 
 
-def _pulse(values: Mapping[str, Any], where: str) -> AnyPulse:
+def _pulse(values: JsonObject, where: str) -> AnyPulse:
     ways = [way for way in ("sigma_s", "fwhm_s", "samples") if way in values]
     require(len(ways) == 1, f"{where}: expected one of {KINDS_OF_PULSE}, there are {len(ways)}")
     if ways == ["samples"]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from render.backend.drjit_types import Floats, UInts
 from render.scene.traced_scene import Float, UInt32, dr, mi, upload
 from render.transient.samples import Samples
 
@@ -29,7 +28,7 @@ def binned(samples: Samples, pixels: int, bins: int, bin_m: float) -> np.ndarray
 
 @dr.freeze
 @dr.syntax
-def _scattered(pixel: Any, near: Any, far: Any, radiance: Any, bins: Any, size: int) -> Any:
+def _scattered(pixel: UInts, near: Floats, far: Floats, radiance: Floats, bins: UInts, size: int) -> Floats:
     out = dr.zeros(Float, size)
     place = dr.maximum(mi.Int32(dr.floor(near)), 0)
     last = dr.minimum(mi.Int32(dr.floor(far)), mi.Int32(bins) - 1)

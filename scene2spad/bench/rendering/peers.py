@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from typing import Any
 
 import numpy as np
 
+from render.backend.drjit_types import Tensors
 from render.scene.traced_scene import TracedScene, dr, mi
 from scenes.errors import InputError
 from scenes.files import silenced
@@ -67,19 +67,19 @@ class Peer:
         self.integrator = mi.load_dict({"type": "transient_path", "max_depth": bounces + 1})
         self.shape = (camera.height * camera.width, bins)
 
-    def render(self, spp: int, seed: int) -> Any:
+    def render(self, spp: int, seed: int) -> Tensors:
         """Return the evaluated tensor, (H, W, bins, 1): radiance per pixel and bin."""
         _, tensor = mi.render(self.scene, integrator=self.integrator, spp=spp, seed=seed)
         dr.eval(tensor)
         dr.sync_thread()
         return tensor
 
-    def histogram(self, tensor: Any) -> np.ndarray:
+    def histogram(self, tensor: Tensors) -> np.ndarray:
         """Return the tensor's own memory as (pixels, bins) float32."""
         return np.array(tensor.array, copy=False).reshape(self.shape)
 
 
-def _laser(scene: Scene) -> dict[str, Any]:
+def _laser(scene: Scene) -> dict[str, object]:
     camera, laser = scene.camera, scene.laser
     intensity = {"type": "rgb", "value": float(laser.intensity(camera)[0, 0])}
     if laser.cone_deg == 360:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scene2spad.studies.power.program_tables import all_costs, fixed_spatial, int8_temporal, verified
 from scenes.errors import InputError, require
 from scenes.files import whole_file
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from ultraphase import ChipSpec, Core, CoreArray, Method, Program, assemble_file, listing, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
@@ -67,7 +68,7 @@ def _write(path: Path | None, text: str) -> dict[str, str]:
 def _table(command: Ultraphase, progress: Progress) -> dict:
     rows = table(all_costs(progress))
     step = method("coarse-16-shift-2")
-    shown: dict[str, Any] = {
+    shown: JsonObject = {
         "rows": rows,
         "references": {
             name: {"bytes_per_pixel": bits / 8, "readout_uw": 1e6 * power(Cost(0, 0, bits), Load()).readout_w}

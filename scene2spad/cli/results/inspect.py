@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from scene2spad.cli.paths import holds_kind, input_file
 from scene2spad.options.common import Common, Positional, may_stay_open
 from scenes.errors import InputError, require
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def run(command: Inspect, progress: Progress) -> dict:
         from spad.formats.histogram import read_histogram
 
         histogram = read_histogram(path)
-        found = {"kind": kind, **_of_histogram(histogram)}
+        found: JsonObject = {"kind": kind, **_of_histogram(histogram)}
         pixel = None if command.pixel is None else _counts_of(histogram, _checked(command, histogram.depth_m.shape))
     else:
         found, transient = _transient(command, path, kind)
@@ -64,7 +65,7 @@ def run(command: Inspect, progress: Progress) -> dict:
     return found | ({} if pixel is None else {"pixel": _as_text(pixel)})
 
 
-def _transient(command: Inspect, path: Path, kind: str) -> tuple[dict[str, Any], Transient]:
+def _transient(command: Inspect, path: Path, kind: str) -> tuple[JsonObject, Transient]:
     """Read the facts that a file states of itself, and its transient; in a pack those of the view asked for."""
     if kind == "transient":
         from render.transient import read_transient
@@ -88,7 +89,7 @@ def _checked(command: Inspect, shape: tuple[int, int]) -> tuple[int, int]:
     return row, column
 
 
-def _of_transient(transient: Transient) -> dict[str, Any]:
+def _of_transient(transient: Transient) -> dict[str, object]:
     meta = transient.meta
     paths = [float(transient.path_near_m.min()), float(transient.path_far_m.max())] if transient.returns else []
     return {
@@ -105,7 +106,7 @@ def _of_transient(transient: Transient) -> dict[str, Any]:
     }
 
 
-def _of_histogram(histogram: Histogram) -> dict[str, Any]:
+def _of_histogram(histogram: Histogram) -> dict[str, object]:
     sensor, budget = histogram.sensor, histogram.budget
     rows, columns, bins = histogram.counts.shape
     return {
@@ -122,7 +123,7 @@ def _of_histogram(histogram: Histogram) -> dict[str, Any]:
     }
 
 
-def _known(meta: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+def _known(meta: JsonObject, names: Sequence[str]) -> dict[str, object]:
     return {name: meta[name] for name in names if name in meta}
 
 
@@ -132,7 +133,7 @@ def _range(layer: np.ndarray) -> list[float]:
     return [float(finite.min()), float(finite.max())] if finite.size else []
 
 
-def _returns_of(transient: Transient, pixel: tuple[int, int]) -> dict[str, Any]:
+def _returns_of(transient: Transient, pixel: tuple[int, int]) -> JsonObject:
     row, column = pixel
     flat = row * transient.width + column
     mine = slice(int(transient.offsets[flat]), int(transient.offsets[flat + 1]))
@@ -152,7 +153,7 @@ def _returns_of(transient: Transient, pixel: tuple[int, int]) -> dict[str, Any]:
     }
 
 
-def _counts_of(histogram: Histogram, pixel: tuple[int, int]) -> dict[str, Any]:
+def _counts_of(histogram: Histogram, pixel: tuple[int, int]) -> JsonObject:
     counts = histogram.counts[pixel]
     filled = np.flatnonzero(counts)
     return {
@@ -181,7 +182,7 @@ def drawn(counts: np.ndarray) -> str:
     return "".join(BARS[int(np.ceil(value / most * (len(BARS) - 1)))] for value in sums)
 
 
-def _as_text(pixel: dict[str, Any]) -> list[str]:
+def _as_text(pixel: JsonObject) -> list[str]:
     """Return the pixel as lines: what it is, then its table, no longer than MAX_LINES."""
     table = "returns" if "returns" in pixel else "counts"
     lines = [", ".join(f"{name} {_value(value)}" for name, value in pixel.items() if name not in (table, "drawn"))]
@@ -194,5 +195,5 @@ def _as_text(pixel: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _value(value: Any) -> str:
+def _value(value: object) -> str:
     return "none" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -8,12 +8,13 @@ import logging
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient, transient_of
 from scene2spad.options.common import Common, File, Positional
 from scenes.errors import InputError, require
 from scenes.io.inputs import read_text, read_whole_lines
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ def _content(command: Show, kind: str) -> Content:
     return Content(path.name, {"kind": kind, **facts}, figures=((path.name, figure),), tables=tables)
 
 
-def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, list[dict[str, Any]]], ...]]:
+def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, list[JsonObject]], ...]]:
     """Read the facts that a sensor, a code, a model or a set states of itself: short facts, and tables."""
     path = command.file
     if kind == "sensor":
@@ -119,7 +120,7 @@ def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, l
     if kind == "set":
         records = [r for r in _index(path) if isinstance(r, dict)]
         return {"views": str(len(records))}, (("Views", [_flat(r) for r in records]),)
-    facts: list[dict[str, Any]] = []
+    facts: list[JsonObject] = []
     if kind == "network":
         from csph.weights.cards import checkpoint_of
 
@@ -129,7 +130,7 @@ def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, l
     return {}, ((("What made it", facts),) if facts else ())
 
 
-def _model_facts(source: Path, card: Path) -> dict[str, Any]:
+def _model_facts(source: Path, card: Path) -> JsonObject:
     if card.is_file():
         from csph.weights.cards import read_card
 
@@ -140,11 +141,11 @@ def _model_facts(source: Path, card: Path) -> dict[str, Any]:
     return {"name": config.model.name, "parameters": model.parameters_count, **state, **_flat(config.to_dict())}
 
 
-def _flat(record: dict[str, Any]) -> dict[str, Any]:
+def _flat(record: JsonObject) -> JsonObject:
     return {key: json.dumps(value) if isinstance(value, (dict, list)) else value for key, value in record.items()}
 
 
-def _index(folder: Path) -> list[Any]:
+def _index(folder: Path) -> list[object]:
     lines = [line for name in ("index.jsonl", "journal.jsonl") for line in read_whole_lines(folder / name)]
     require(bool(lines), f"{folder}: a set without a view")
     return lines

@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from scene2spad.studies.depth_offset.plan import SHOWN_VIEWS, SMOKE, TEST_SET
 from scene2spad.studies.depth_offset.tables import summary_rows
 from scene2spad.studies.results import Store
 from scenes.files import finite, whole_file, write_csv
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 
@@ -53,7 +53,7 @@ def run(command: Study, progress: Progress) -> dict:
     twins = where_trained([replace(one, trained_on="published") for one in models.found], command)
     beside = {one: model.subject for one, model in twins.items()}
     pairs, pair_levels = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, PHOTON_LEVELS)
-    numbers: dict[str, Any] = {
+    numbers: JsonObject = {
         "preset": command.preset,
         **models.described(),
         "conclusions": [decided(claim, [*rows, *repeated], {**models.found, **again}) for claim in claims],
@@ -76,7 +76,7 @@ def run(command: Study, progress: Progress) -> dict:
     return {**(numbers if command.json else _summary(numbers)), **files, "shipped": shipped}
 
 
-def decided(claim: Claim, rows: Sequence[Row], models: Mapping[ModelSpec, Trained]) -> dict[str, Any]:
+def decided(claim: Claim, rows: Sequence[Row], models: Mapping[ModelSpec, Trained]) -> JsonObject:
     """Return a conclusion with its numbers: holds, does not hold, or not decided.
 
     The paired difference of MAE over scenes and levels decides, by its 95 % interval: `better` holds where it lies
@@ -141,7 +141,7 @@ def _drawn(
     return figures.draw(title, labels, [one.name for one in mine], rows, lines, path)
 
 
-def _summary(numbers: dict[str, Any]) -> dict[str, list[str]]:
+def _summary(numbers: JsonObject) -> dict[str, list[str]]:
     """Summarise the study for the terminal: conclusions, MAE of every model, and the published numbers beside ours."""
     conclusions = []
     for one in numbers["conclusions"]:

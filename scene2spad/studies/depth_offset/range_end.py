@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +25,7 @@ from scene2spad.datasets.planes import wall
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained
 from scene2spad.studies.depth_offset.tables import by_design, mean_error
 from scene2spad.studies.results import Store
+from scenes.json_types import JsonObject
 from spad.detection.detect import sense
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -115,12 +115,12 @@ def _digest(trained: Trained, how: str) -> str:
     return hashlib.sha256(f"{trained.digest} {how}".encode()).hexdigest()
 
 
-def arm_rows(errors: Mapping[tuple[str, float], Sequence[float]]) -> list[dict[str, Any]]:
+def arm_rows(errors: Mapping[tuple[str, float], Sequence[float]]) -> list[JsonObject]:
     """Return a row an arm and offset from the MAE [mm] of every seed: mean, least and largest."""
     return [{"arm": name, "offset_m": metres, **_over_seeds(values)} for (name, metres), values in errors.items()]
 
 
-def seed_rows(rows: Mapping[float, Sequence[Row]], wanted: Iterable[ModelSpec]) -> list[dict[str, Any]]:
+def seed_rows(rows: Mapping[float, Sequence[Row]], wanted: Iterable[ModelSpec]) -> list[JsonObject]:
     """Return a row a design and offset: MAE [mm] over its seeds, from rows by offset."""
     designs = by_design(wanted)
     return [
@@ -131,7 +131,7 @@ def seed_rows(rows: Mapping[float, Sequence[Row]], wanted: Iterable[ModelSpec]) 
     ]
 
 
-def _over_seeds(values: Sequence[float]) -> dict[str, Any]:
+def _over_seeds(values: Sequence[float]) -> JsonObject:
     """Mean of the seeds, and the least and the largest of them: an interval of so few is no more."""
     spread = {"mae_mm": float(np.mean(values)), "least_mm": float(min(values)), "largest_mm": float(max(values))}
     return {**spread, "every_seed_mm": [float(value) for value in values]}
@@ -155,7 +155,7 @@ def wall_errors(
     return found
 
 
-def observation(arms: Sequence[Mapping[str, Any]], factor: float) -> list[str]:
+def observation(arms: Sequence[JsonObject], factor: float) -> list[str]:
     """Say of every arm how far its largest error lies over that at no offset; `factor` times is called a failure."""
     lines = []
     for name in dict.fromkeys(row["arm"] for row in arms):

@@ -14,7 +14,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from csph.evaluation.methods import Row, as_dicts
 from csph.networks.model import DepthModel, weights_sha256
@@ -39,6 +38,7 @@ from scene2spad.studies.depth_offset.plan import (
 from scene2spad.studies.results import Store
 from scenes.errors import InputError, require
 from scenes.files import finite, whole_file, write_csv
+from scenes.json_types import JsonObject
 from scenes.offsets import OffsetMode
 from scenes.progress import Progress
 
@@ -117,7 +117,7 @@ def run(command: Study, progress: Progress) -> dict:
     return {**shown, **files, "numbers": str(command.out / "depth-offset.json"), "shipped": shipped}
 
 
-def _measured_and_drawn(study: Session, out: Path) -> tuple[dict[str, Any], list[Path]]:
+def _measured_and_drawn(study: Session, out: Path) -> tuple[JsonObject, list[Path]]:
     plan, here = study.plan, [w for w in study.plan.headline if w in study.models]
     base = study.rendered(TEST_SET)
     shown = [view for view in SHOWN_VIEWS if view < len(base.views.scenes)]
@@ -127,7 +127,7 @@ def _measured_and_drawn(study: Session, out: Path) -> tuple[dict[str, Any], list
     summary = tables.summary_rows(near, here, {"set": TEST_SET, "mode": "time", "offset_m": 0.0})
     summary += tables.summary_rows(far, here, {"set": TEST_SET, "mode": "time", "offset_m": OFFSET_M})
     ratios = tables.ratio_rows(near, far, here)
-    numbers: dict[str, Any] = {
+    numbers: JsonObject = {
         "bars": tables.verdicts(ratios, here),
         "ratios": ratios,
         "modes": _modes(study, near, far),
@@ -192,7 +192,7 @@ def _relief(study: Session) -> list[dict]:
     ]
 
 
-def _sweep(study: Session, base: TestSet) -> dict[str, Any]:
+def _sweep(study: Session, base: TestSet) -> JsonObject:
     """MAE [mm] against the offset, where each design breaks, and where its training depths ended."""
     plan, test = study.plan, base.first(study.plan.sweep_views)
     mine = [w for w in (*study.one_seed(), ModelSpec("none"), *plan.cured) if w in study.models]
@@ -211,7 +211,7 @@ def _sweep(study: Session, base: TestSet) -> dict[str, Any]:
     return {"offsets_m": [*plan.sweep_m], "curves": curves, **ends, **common}
 
 
-def _range_end(study: Session, base: TestSet) -> dict[str, Any]:
+def _range_end(study: Session, base: TestSet) -> JsonObject:
     """Beyond what was decided beforehand: every seed up to the end of the range, which step fails there, and walls."""
     plan, test = study.plan, base.first(study.plan.sweep_views)
     mine = [w for w in (*plan.every_seed, *plan.cured) if w in study.models]
@@ -353,7 +353,7 @@ def _depth_images(study: Session, base: TestSet, shown: Sequence[int], out: Path
     return drawn
 
 
-def _summary(numbers: dict[str, Any]) -> dict[str, list[str]]:
+def _summary(numbers: JsonObject) -> dict[str, list[str]]:
     """Summarise the study for the terminal: the bars, every seed's ratio, the energies, where designs break, what fails
     far out."""
     holds = {True: "holds", False: "does not hold", None: "not decided"}

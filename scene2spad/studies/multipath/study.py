@@ -12,7 +12,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from scene2spad.studies.multipath.plan import FILTER, HEADLINE, LIGHTS, MIXED, M
 from scene2spad.studies.results import Store
 from scene2spad.studies.transport.study import direct_alone, rendered_once, without_network
 from scenes.files import finite, whole_file, write_csv
+from scenes.json_types import JsonObject
 from scenes.library.catalog import load_scene
 from scenes.model import Laser
 from scenes.progress import Progress
@@ -57,7 +57,7 @@ def run(command: Study, progress: Progress) -> dict:
         )
         for light, some in lights.items()
     }  # fmt: skip
-    numbers: dict[str, Any] = {
+    numbers: JsonObject = {
         "preset": command.preset,
         **ModelLookup(trained, models.absent).described(),
         "lights": LIGHTS,
@@ -88,7 +88,7 @@ def rendered_rooms(plan: Plan, folder: Path, progress: Progress) -> tuple[Transi
     return tuple(found)
 
 
-def _described(name: str, transient: Transient) -> dict[str, Any]:
+def _described(name: str, transient: Transient) -> JsonObject:
     error = transient.meta["relative_error"]["total"]
     return {"scene": name, "indirect_share": transient.indirect_fraction, "render_error": error}
 
@@ -149,7 +149,7 @@ def conclusions(means: Sequence[Mapping], scenes: Sequence[Mapping]) -> list[dic
     return found
 
 
-def _summary(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
+def _summary(numbers: JsonObject) -> dict[str, list[str]]:
     """Summarise the study for the terminal: conclusions, indirect light of every scene, absent models."""
     lines = [
         f"{LIGHTS[c['light']]}, {c['network']}: {c['mae_mm']:.0f} mm at 50 + 50 photons, {FILTER} "

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from scene2spad.studies.chip.chain import ChipDepth, core_tables, measured
 from scene2spad.studies.chip.code import compile_model
 from scene2spad.studies.chip.plan import MAIN, OTHERS, TRAINED_FOR_CHIP
 from scene2spad.studies.power.emulated_chain import by_torch, decode
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.estimators.depth import depth_errors
@@ -90,7 +90,7 @@ def designs(folder: Path) -> tuple[list[Design], list[str]]:
     return found, absent
 
 
-def front_rows(found: list[Design], transient: Transient, seed: int, progress: Progress) -> list[dict[str, Any]]:
+def front_rows(found: list[Design], transient: Transient, seed: int, progress: Progress) -> list[JsonObject]:
     """Return a row for every design, number of photons and frame rate: error, power of a pixel, bytes, clocks, lost
     photons.
 
@@ -140,7 +140,7 @@ def most_photons_per_s(clocks: np.ndarray, limit: float = LOST_LIMIT) -> float:
     return low
 
 
-def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[dict[str, Any]]:
+def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[JsonObject]:
     """Return photons lost at S.2's photons and frame rate, a SPAD a core and 16, emulated with arrival times and in
     closed form; and the rates at which LOST_LIMIT of them are lost."""
     rows, chip = [], ChipSpec()
@@ -148,7 +148,7 @@ def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[dict[s
     for number, one in enumerate(found):
         progress(f"{one.name}: arrival times", number / len(found))
         core = TimedCore(one.program, one.tables, chip=chip)
-        row: dict[str, Any] = {"name": one.name, "clocks_per_photon": one.cost.clocks_per_photon}
+        row: JsonObject = {"name": one.name, "clocks_per_photon": one.cost.clocks_per_photon}
         for spads in (1, SPADS):
             rate = photons * spads * frames_per_s * chip.clock_s
             clocks = poisson_arrivals(rate, int(_EMULATED_PHOTONS / rate), seed)
@@ -164,7 +164,7 @@ def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[dict[s
     return rows
 
 
-def printed_rows() -> list[dict[str, Any]]:
+def printed_rows() -> list[JsonObject]:
     """Return the published points: power from printed clocks, and the MAE that was printed for the design (8 pairs, 16
     levels, without the chip's 8 bits)."""
     rows = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,6 +13,7 @@ from csph.evaluation.methods import Evaluation, Row
 from scene2spad.plots.figures import plain_log, plt, save
 from scene2spad.plots.style import COLOURS
 from scene2spad.studies.transport.plan import KEPT, LASERS, LATER, LEVELS, LIMIT, OPEN, REVERSED, STEPS
+from scenes.json_types import JsonObject
 
 LABELS = [label.replace(", ", ",\n") for label in STEPS.values()]
 VERDICTS = {KEPT: COLOURS["blue"], REVERSED: COLOURS["vermilion"], OPEN: "0.6"}
@@ -21,7 +21,7 @@ MARKS = "os^DvP*X<>hd"
 MAX_PAIRS = 24  # of a panel
 
 
-def draw_steps(summary: Sequence[Mapping[str, Any]], rows: Mapping[tuple[str, str], Sequence[Row]], path: Path) -> Path:
+def draw_steps(summary: Sequence[JsonObject], rows: Mapping[tuple[str, str], Sequence[Row]], path: Path) -> Path:
     """Draw MAE of every design at each step, a row a laser and a column a photon level; bars: 95 % over scenes."""
     designs = list(dict.fromkeys(line["design"] for line in summary))
     figure, panels = plt.subplots(
@@ -59,7 +59,7 @@ def _curve(axes: Axes, intervals: Sequence[tuple[float, float, float]], number: 
     axes.errorbar(place, mean, reach, ms=4.5, lw=1, capsize=2, elinewidth=0.8, label=label, **look)
 
 
-def draw_ranking(ranked: Sequence[Mapping[str, Any]], path: Path) -> Path:
+def draw_ranking(ranked: Sequence[JsonObject], path: Path) -> Path:
     """Draw gap of each pair of codes with RGB-D rates (hollow) and at each later step (filled), all levels together."""
     mine = [r for r in ranked if r["levels"] == "all"]
     pairs = list(dict.fromkeys((r["first"], r["second"]) for r in mine))[:MAX_PAIRS]
@@ -89,7 +89,7 @@ def draw_ranking(ranked: Sequence[Mapping[str, Any]], path: Path) -> Path:
     return save(figure, path)
 
 
-def _gap(axes: Axes, r: Mapping[str, Any], place: int) -> None:
+def _gap(axes: Axes, r: JsonObject, place: int) -> None:
     for name, shift, look in (
         ("rgbd", -0.16, {"color": "k", "mfc": "white", "lw": 0.8}),
         ("here", 0.16, {"color": VERDICTS[r["verdict"]], "lw": 1.4}),
@@ -98,7 +98,7 @@ def _gap(axes: Axes, r: Mapping[str, Any], place: int) -> None:
         axes.plot(r[f"{name}_mm"], place + shift, "o", ms=4, color=look["color"], mfc=look.get("mfc", look["color"]))
 
 
-def draw_planned(planned: Sequence[Mapping[str, Any]], scenes: Sequence[Mapping[str, Any]], path: Path) -> Path:
+def draw_planned(planned: Sequence[JsonObject], scenes: Sequence[JsonObject], path: Path) -> Path:
     """Draw relative difference of the MAE on planned renders from that on full ones, and the rays that plans saved."""
     names = [(one["scene"], one["laser"]) for one in scenes]
     designs = list(dict.fromkeys(row["design"] for row in planned))

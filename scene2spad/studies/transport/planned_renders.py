@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -15,6 +15,7 @@ from render.transient import Transient
 from scene2spad.studies.results import Store
 from scene2spad.studies.transport.plan import FAILS, HOLDS, LEVELS, LIMIT, OPEN
 from scene2spad.studies.transport.tables import Contender
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.flux import expected_counts, rates_for
@@ -74,13 +75,13 @@ def planned_rows(
     store: Store,
     seed: int,
     progress: Progress,
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Return a row of every scene, laser and design: MAE [mm] on both renders, their relative difference and its
     interval.
 
     `draws` of photons are made, by rising number, until every design of a scene is decided.
     """
-    found: list[dict[str, Any]] = []
+    found: list[JsonObject] = []
     for number, place in enumerate(places):
         progress(f"planned and full, {place.name}, {place.laser}", number / len(places))
         for count in draws:
@@ -94,7 +95,7 @@ def planned_rows(
     return found
 
 
-def _row(place: Place, one: Contender, errors: np.ndarray) -> dict[str, Any]:
+def _row(place: Place, one: Contender, errors: np.ndarray) -> JsonObject:
     """Compare the (levels, draws, full and planned) errors [mm] of a design."""
     full, planned = errors[..., 0].mean(0), errors[..., 1].mean(0)
     fraction, wide = compared(full, planned)
@@ -140,7 +141,7 @@ def within(fraction: float, wide: float) -> str:
     return FAILS if abs(fraction) - wide > LIMIT else OPEN
 
 
-def planned_conclusions(planned: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def planned_conclusions(planned: Sequence[JsonObject]) -> list[JsonObject]:
     """Return by scene and laser: the largest difference of a design; under LIMIT where that is so of every design."""
     found = []
     for scene, laser in dict.fromkeys((row["scene"], row["laser"]) for row in planned):

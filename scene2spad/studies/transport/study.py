@@ -16,7 +16,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -41,6 +40,7 @@ from scene2spad.studies.transport.tables import Contender, Rows, conclusions, ra
 from scenes.errors import InputError, require
 from scenes.files import append_line, finite, whole_file, write_csv
 from scenes.io.inputs import read_whole_lines
+from scenes.json_types import JsonObject
 from scenes.library.sets import scene_set
 from scenes.model import Ambient, Laser, Scene
 from scenes.progress import Progress
@@ -79,7 +79,7 @@ def run(command: Study, progress: Progress) -> dict:
     ranked = ranking(rows, contenders)
     checked = [one for one in contenders if one.name in CHECKED]
     planned = planned_rows(places, checked, (plan.draws, plan.most_draws), store, command.seed, progress)
-    numbers: dict[str, Any] = {
+    numbers: JsonObject = {
         "preset": command.preset,
         **models.described(),
         "steps": STEPS,
@@ -225,7 +225,7 @@ def _measured(
     return found
 
 
-def _described(place: Place) -> dict[str, Any]:
+def _described(place: Place) -> JsonObject:
     """Describe a scene, and the rays of laser light that both renders traced."""
     full, planned = place.full.meta, place.planned.meta
     return {
@@ -263,7 +263,7 @@ def _log_saved(scenes: Sequence[dict], seconds: Mapping[tuple[str, str], Mapping
         log.info("%s, %s: the plan: %s; %s", one["scene"], one["laser"], rays, message)
 
 
-def _summary(numbers: Mapping[str, Any]) -> dict[str, list[str]]:
+def _summary(numbers: JsonObject) -> dict[str, list[str]]:
     """Summarise the study for the terminal: how the codes rank, MAE of every design, planned renders, absent models."""
     changes = [
         f"{c['laser']}, {STEPS[c['step']]}: {c['ranking']} ({c['kept']} of {c['pairs']} pairs kept, {c['reversed']} "

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, groupby
-from typing import Any
 
 import numpy as np
 
@@ -49,7 +48,7 @@ def _mine(rows: Sequence[Row], name: str, levels: str) -> dict[str, np.ndarray]:
     return Evaluation(list(rows)).values([name], levels=levels)
 
 
-def ranking(rows: Rows, contenders: Sequence[Contender]) -> list[dict[str, Any]]:
+def ranking(rows: Rows, contenders: Sequence[Contender]) -> list[JsonObject]:
     """Return every pair of codes of one decoder and compression: the paired difference of MAE [mm], first - second,
     with RGB-D rates and at each later step, how far it moved, and whether the two stay in order; 95 % intervals over
     scenes."""
@@ -73,7 +72,7 @@ def _kind(contender: Contender) -> tuple[str, int]:
     return contender.decoder, contender.compression
 
 
-def _pair(values: Mapping[tuple[str, str], dict[str, np.ndarray]], first: str, second: str) -> Iterator[dict[str, Any]]:
+def _pair(values: Mapping[tuple[str, str], dict[str, np.ndarray]], first: str, second: str) -> Iterator[JsonObject]:
     gaps = {
         step: {scene: mine - values[step, second][scene] for scene, mine in values[step, first].items()}
         for step in STEPS
@@ -88,7 +87,7 @@ def _pair(values: Mapping[tuple[str, str], dict[str, np.ndarray]], first: str, s
         yield common
 
 
-def conclusions(ranked: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def conclusions(ranked: Sequence[JsonObject]) -> list[JsonObject]:
     """Return by laser, step and photon levels: whether what was added up to there changes the ranking of codes.
 
     It does where one pair is decidedly reversed, it does not where all are decidedly kept, and is else not decided.
@@ -107,13 +106,13 @@ def conclusions(ranked: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def _reversal(r: Mapping[str, Any]) -> str:
+def _reversal(r: JsonObject) -> str:
     before, after = ("{:+.1f} ({:+.1f} to {:+.1f}) mm".format(*(r[f"{name}_{part}"] for part in ("mm", "low", "high")))
                      for name in ("rgbd", "here"))  # fmt: skip
     return f"{r['first']} - {r['second']}: {before} with RGB-D rates, {after}"
 
 
-def summary(rows: Rows, contenders: Sequence[Contender]) -> list[dict[str, Any]]:
+def summary(rows: Rows, contenders: Sequence[Contender]) -> list[JsonObject]:
     """Return MAE [mm] of every design at each laser and step with its interval over scenes, and its change by that
     step."""
     found = []
@@ -129,7 +128,7 @@ def summary(rows: Rows, contenders: Sequence[Contender]) -> list[dict[str, Any]]
     return found
 
 
-def _lines(here: Sequence[Row], before: Sequence[Row] | None, name: str) -> Iterator[dict[str, Any]]:
+def _lines(here: Sequence[Row], before: Sequence[Row] | None, name: str) -> Iterator[JsonObject]:
     for levels in LEVEL_GROUPS:
         for pixels in PIXELS:
             values = Evaluation(list(here))
