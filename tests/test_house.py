@@ -13,7 +13,9 @@ MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_MODULES = 400, 60, 7, 14
 # What is larger still, at its size: it may shrink, not grow, and nothing may join it.
 LARGER: dict[str, int] = {}
 MORE_PARAMETERS: dict[str, int] = {}
-MAX_ANY = 10  # in signatures; Dr.Jit's types and JSON objects have names of their own (`drjit_types`, `scenes.json_types`)
+MAX_ANY = (
+    10  # in signatures; Dr.Jit's types and JSON objects have names of their own (`drjit_types`, `scenes.json_types`)
+)
 # Private words for which the field has terms.
 NOT_OURS = {"told", "said", "whys", "share", "shares", "tails", "watched", "thrown", "spelled", "least_share"}
 CONSTANT = re.compile(r"(MOST|LEAST)_")

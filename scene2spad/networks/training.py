@@ -102,7 +102,7 @@ def config_of(command: Train) -> TrainConfig:
     return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps, warmup=warmup)
 
 
-def views_of(command: Train) -> tuple[list[Views], list[Views], JsonObject]:
+def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, object]]:
     """Return training and validation views of every set, and the words that say which they are."""
     sets = [_views_of_set(path, command) for path in command.set]
     common = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
@@ -284,7 +284,7 @@ def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[st
     return [f"{one[0]} ({firsts[one]})" if one[0] in several else one[0] for one in recipes]
 
 
-def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[JsonObject]:
+def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[dict[str, object]]:
     """Return mean MAE [mm] and share within 10 mm of every level and group; as lines unless `full`."""
     rows = [row for row in found.rows if row.group == "all"]
     lines: list[JsonObject] = []
@@ -303,7 +303,7 @@ def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> lis
     ]
 
 
-def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> JsonObject:
+def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> dict[str, object]:
     """Return headline figures of the `first` group, every group by levels, paired differences of MAE from the first."""
     summaries = {name: found.summary(members) for name, members in groups.items()}
     everything = summaries[first]["all"]["all"]

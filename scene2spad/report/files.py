@@ -16,7 +16,6 @@ from PIL import Image
 
 from scenes.errors import printable, require
 from scenes.io.inputs import read_json_object
-from scenes.json_types import JsonObject
 
 # What studies keep for themselves: renders, sets, captures, kept results, trained models.
 INSIDE = ("sets", "renders", "captures", "results", "maps", "models", "emulated")
@@ -148,6 +147,6 @@ def _number(text: str) -> int | float | str:
     return text
 
 
-def rows_in(value: object) -> Sequence[JsonObject]:
+def rows_in(value: object) -> Sequence[dict[str, object]]:
     """Return the rows of a table in a JSON object; none where there is no table."""
     return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []

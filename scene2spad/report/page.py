@@ -245,7 +245,7 @@ def _configurations(found: Found) -> Iterator[str]:
             yield html.table(rows, f"{title} ({name} of each)", MAX_CONFIGURATIONS)
 
 
-def _views_of(folder: Path, found: Found) -> JsonObject:
+def _views_of(folder: Path, found: Found) -> dict[str, object]:
     """Count a set's views, and those that end above their error target; nothing where there is no index."""
     index = folder / "index.jsonl"
     records = found.read(index, lambda path: read_set_index(path.parent)) if index.is_file() else None
@@ -266,7 +266,7 @@ def _models(found: Found) -> Iterator[dict]:
                 yield {**model, "sha256": digest[:12]}
 
 
-def _flat(numbers: JsonObject, columns: Sequence[str]) -> JsonObject:
+def _flat(numbers: Mapping[str, object], columns: Sequence[str]) -> dict[str, object]:
     """Plain values, and those one level beneath by both names; where columns are named, these alone."""
     flat: JsonObject = {}
     for key, value in numbers.items():

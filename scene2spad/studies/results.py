@@ -46,7 +46,7 @@ class Store:
         with whole_file(path) as beside:
             np.save(beside, depth_m.astype(np.float32))
 
-    def _of(self, digest: str) -> JsonObject:
+    def _of(self, digest: str) -> dict[str, object]:
         if digest not in self._known:
             self._known[digest] = dict(_lines(self.folder / f"{digest[:32]}.jsonl"))
         return self._known[digest]

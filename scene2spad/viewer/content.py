@@ -86,7 +86,7 @@ def packed(values: np.ndarray) -> str:
     return base64.b64encode(zlib.compress(data.tobytes(), 6)).decode("ascii")
 
 
-def cube_payload(cube: Cube) -> JsonObject:
+def cube_payload(cube: Cube) -> dict[str, object]:
     """Pack a cube: counts as they are in 8 or 16 bits, rates as square roots in LEVELS steps.
 
     A cube of more than MAX_CELLS is summed over neighbouring bins first; `summed` says over how many.

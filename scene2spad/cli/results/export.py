@@ -11,7 +11,6 @@ import numpy as np
 from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient
 from scene2spad.options.common import Common, File, Positional, may_stay_open
 from scenes.errors import InputError, require
-from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 DENSE = (".npz", ".h5", ".hdf5")
@@ -92,7 +91,7 @@ def _points(command: Export, kind: str) -> int:
     return int(known.sum())
 
 
-def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, JsonObject | None]:
+def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, object] | None]:
     """Return depth, intensity and confidence (H, W), and the camera."""
     if kind == "depth":
         found = open_depth(command.file)

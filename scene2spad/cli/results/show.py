@@ -6,6 +6,7 @@ import csv
 import json
 import logging
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -103,7 +104,7 @@ def _content(command: Show, kind: str) -> Content:
     return Content(path.name, {"kind": kind, **facts}, figures=((path.name, figure),), tables=tables)
 
 
-def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, list[JsonObject]], ...]]:
+def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, list[dict[str, object]]], ...]]:
     """Read the facts that a sensor, a code, a model or a set states of itself: short facts, and tables."""
     path = command.file
     if kind == "sensor":
@@ -130,7 +131,7 @@ def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, l
     return {}, ((("What made it", facts),) if facts else ())
 
 
-def _model_facts(source: Path, card: Path) -> JsonObject:
+def _model_facts(source: Path, card: Path) -> dict[str, object]:
     if card.is_file():
         from csph.weights.cards import read_card
 
@@ -141,7 +142,7 @@ def _model_facts(source: Path, card: Path) -> JsonObject:
     return {"name": config.model.name, "parameters": model.parameters_count, **state, **_flat(config.to_dict())}
 
 
-def _flat(record: JsonObject) -> JsonObject:
+def _flat(record: Mapping[str, object]) -> dict[str, object]:
     return {key: json.dumps(value) if isinstance(value, (dict, list)) else value for key, value in record.items()}
 
 

@@ -90,7 +90,7 @@ def designs(folder: Path) -> tuple[list[Design], list[str]]:
     return found, absent
 
 
-def front_rows(found: list[Design], transient: Transient, seed: int, progress: Progress) -> list[JsonObject]:
+def front_rows(found: list[Design], transient: Transient, seed: int, progress: Progress) -> list[dict[str, object]]:
     """Return a row for every design, number of photons and frame rate: error, power of a pixel, bytes, clocks, lost
     photons.
 
@@ -140,7 +140,7 @@ def most_photons_per_s(clocks: np.ndarray, limit: float = LOST_LIMIT) -> float:
     return low
 
 
-def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[JsonObject]:
+def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[dict[str, object]]:
     """Return photons lost at S.2's photons and frame rate, a SPAD a core and 16, emulated with arrival times and in
     closed form; and the rates at which LOST_LIMIT of them are lost."""
     rows, chip = [], ChipSpec()
@@ -164,7 +164,7 @@ def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[JsonOb
     return rows
 
 
-def printed_rows() -> list[JsonObject]:
+def printed_rows() -> list[dict[str, object]]:
     """Return the published points: power from printed clocks, and the MAE that was printed for the design (8 pairs, 16
     levels, without the chip's 8 bits)."""
     rows = []
