@@ -43,6 +43,7 @@ from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, MAX_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
 from render.transient import Transient
 from render.transient.samples import concatenate, no_samples, select_pixels, to_returns
+from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.model import Scene
 from scenes.progress import Progress
@@ -272,7 +273,7 @@ def _filter_bias(filtered: list[np.ndarray], unfiltered: ProbePixels, place: np.
     return squared if squared.sum() > CLEAR * math.sqrt((squared**2).sum()) else 0.0
 
 
-def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> dict:
+def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> JsonObject:
     if not plan.ambient:
         return {}
     paths = {"ambient_spp": ambient.spp, "ambient_filtered": settings.ambient_filtered}
@@ -281,7 +282,7 @@ def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> 
 
 def _meta(
     scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: ErrorEstimate, traced: LightSamples
-) -> dict:
+) -> JsonObject:
     camera, laser = scene.camera, scene.laser
     return {
         "scene": scene.name,

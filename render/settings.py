@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
 from scenes.errors import InputError
+from scenes.json_types import JsonObject
 
 MAX_BOUNCES = 63
 # A plane under direct light, the least there is, takes 170 bytes a pixel (measured); its file holds four arrays a pixel
@@ -130,5 +131,5 @@ class Plan:
     clamp: float | None = None
     refraction: Refraction = "straight"
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> JsonObject:
         return asdict(self)

@@ -26,6 +26,7 @@ from csph.training.config import ModelConfig, TrainConfig
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.inputs import regular_file
+from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.estimators.depth import radial_depth_of
 from spad.estimators.matching import normalised_correlation
@@ -257,7 +258,7 @@ def weights_sha256(model: nn.Module) -> str:
     return _weights_sha256(model.state_dict())
 
 
-def save_model(model: DepthModel, config: TrainConfig, state: dict, path: Path, *, half: bool = False) -> None:
+def save_model(model: DepthModel, config: TrainConfig, state: JsonObject, path: Path, *, half: bool = False) -> None:
     """Write weights as safetensors, whole or not at all; configuration and `state` (step, validation) in its header.
 
     `half` keeps them in float16, in half the space; `load_model` gives float32 again, 11 bits of each.
@@ -277,7 +278,7 @@ def checkpoint_file(path: Path) -> Path:
     return regular_file(path / "model.safetensors" if path.is_dir() else path)
 
 
-def load_model(path: Path) -> tuple[DepthModel, TrainConfig, dict]:
+def load_model(path: Path) -> tuple[DepthModel, TrainConfig, JsonObject]:
     """Return a model as it was saved, in evaluation mode, its configuration, and the state it was saved in.
 
     Weights in float16 or bfloat16 become float32. Raises InputError in one line for a missing, foreign or altered

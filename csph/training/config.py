@@ -13,6 +13,7 @@ from csph.networks.grid import GRIDS, Grid
 from csph.networks.posterior import Decoder
 from csph.training.levels import CONTINUOUS, Levels
 from scenes.errors import InputError, require
+from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
 
@@ -206,11 +207,11 @@ class TrainConfig:
         )
         require_memory(COUNT_BYTES * counts, message)
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> JsonObject:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, values: dict) -> TrainConfig:
+    def from_dict(cls, values: JsonObject) -> TrainConfig:
         """Raise InputError for an entry that is missing or unknown."""
         try:
             model = dict(values["model"])

@@ -12,6 +12,7 @@ from render.transient import Transient, read_transient
 from render.transient.packs import read_pack
 from scenes.errors import require
 from scenes.io.set_index import read_set_index
+from scenes.json_types import JsonObject
 from spad.detection.training_patches import PackedViews
 
 VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
@@ -48,7 +49,7 @@ def _from_folder(path: Path) -> tuple[list[Transient], list[str]]:
     return transients, [_scene(record, i) for i, record in enumerate(records)]
 
 
-def _scene(meta: dict, number: int) -> str:
+def _scene(meta: JsonObject, number: int) -> str:
     """Return the scene that a view shows: views of one place are not independent, whatever their numbers."""
     return str(meta.get("place", meta.get("scene", number)))
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
+from scenes.json_types import JsonObject
 from scenes.notebook import html_card
 
 RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bounces": "bounces"}
@@ -58,7 +59,7 @@ class Transient:
     ambient: np.ndarray
     mixed: np.ndarray
     error: np.ndarray
-    meta: dict = field(default_factory=dict)
+    meta: JsonObject = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         pixels, shape = self.height * self.width, (self.height, self.width)

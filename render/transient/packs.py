@@ -23,6 +23,7 @@ from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.hdf5 import Sink, add_checksum, new_hdf5, open_checked, read_dataset
 from scenes.io.inputs import parse_json
+from scenes.json_types import JsonObject
 
 PATH_STEP_M, WIDTH_STEP_M, DEPTH_STEP_M = 2.0**-10, 2.0**-8, 2.0**-12
 RADIANCE_STEPS, AMBIENT_STEPS = 125, 4  # per octave
@@ -48,7 +49,7 @@ class ViewPack:
 
     arrays: dict[str, np.ndarray]
     starts: np.ndarray
-    metas: tuple[dict, ...]
+    metas: tuple[JsonObject, ...]
 
     def __len__(self) -> int:
         return len(self.metas)
@@ -209,7 +210,7 @@ def _summed(stored: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def write_pack(views: Iterable[tuple[Transient, dict]], path: Path) -> int:
+def write_pack(views: Iterable[tuple[Transient, JsonObject]], path: Path) -> int:
     """Write views of one image size, each with the record that `ViewPack.metas` is to give back; returns how many.
 
     One view is in memory at a time. Raises InputError for views of different sizes, or none.
@@ -221,9 +222,9 @@ def write_pack(views: Iterable[tuple[Transient, dict]], path: Path) -> int:
     return count
 
 
-def _append_views(views: Iterable[tuple[Transient, dict]], file: h5py.File, sink: Sink) -> int:
+def _append_views(views: Iterable[tuple[Transient, JsonObject]], file: h5py.File, sink: Sink) -> int:
     """Append view after view, then their records and the seal; return the number of views."""
-    metas: list[dict] = []
+    metas: list[JsonObject] = []
     starts = [0]
     sha = hashlib.sha256()
     sets: dict[str, h5py.Dataset] = {}
@@ -318,7 +319,7 @@ def read_pack(path: Path) -> ViewPack:
     return ViewPack(arrays, starts, metas)
 
 
-def _sha256(arrays: dict[str, np.ndarray], starts: np.ndarray, metas: tuple[dict, ...]) -> str:
+def _sha256(arrays: dict[str, np.ndarray], starts: np.ndarray, metas: tuple[JsonObject, ...]) -> str:
     sha = hashlib.sha256()
     for i in range(len(metas)):
         for name in PER_VIEW:

@@ -224,13 +224,13 @@ def _progress() -> Iterator[Progress]:
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
 
 
-def _progress_lines() -> Progress:
-    """Return a progress that prints a line where the last one, or the start, is PIPED_S seconds ago."""
+def _progress_lines(every_s: float = PIPED_S) -> Progress:
+    """Return a progress that prints a line where the last one, or the start, is `every_s` ago."""
     last_s = time.monotonic()
 
     def report(what: str, fraction: float) -> None:
         nonlocal last_s
-        if time.monotonic() - last_s >= PIPED_S:
+        if time.monotonic() - last_s >= every_s:
             last_s = time.monotonic()
             print(f"{what}: {fraction:.0%}", file=sys.stderr, flush=True)
 

@@ -176,12 +176,8 @@ def test_the_shell_completes_commands_and_options(tmp_path, capsys):
         assert run(capsys, *words)[::2] == (2, line)
 
 
-def test_progress_also_speaks_when_piped(capsys, monkeypatch):
-    module = sys.modules["scene2spad.cli.main"]
-    monkeypatch.setattr(module, "PIPED_S", 0.0)
-    report = _progress_lines()
-    report("direct light", 0.05)
+def test_progress_also_speaks_when_piped(capsys):
+    _progress_lines(every_s=0.0)("direct light", 0.05)
     assert capsys.readouterr() == ("", "direct light: 5%\n")
-    monkeypatch.setattr(module, "PIPED_S", 1e9)
-    report("direct light", 0.06)
+    _progress_lines(every_s=1e9)("direct light", 0.06)
     assert capsys.readouterr() == ("", "")

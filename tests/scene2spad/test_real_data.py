@@ -99,20 +99,17 @@ def test_rendered_captures_show_the_prototypes_rows_sun_and_counts(folder):
     assert depth[3, 5] == pytest.approx(truth.depth_m[6:8, 10:12].mean()) and mixed.any() and not mixed.all()
 
 
-def test_networks_see_bins_and_tiles(folder, monkeypatch):
+def test_networks_see_bins_and_tiles(folder):
     """One tile is the model itself, in bins of this sensor; several tiles cover the image."""
     model = checkpoint(folder / "m.safetensors").eval()
     sensor = resampled_sensor(real_data.prototype())
     counts = torch.from_numpy(np.random.default_rng(0).poisson(0.2, (24, 20, 1024)).astype(np.float32))
     with torch.no_grad():
         whole = model.depth_m(counts.permute(2, 0, 1)[None, None])[0] * (sensor.bin_depth_m / Sensor().bin_depth_m)
-    method = real_data.network(model)
-    assert torch.allclose(method(counts, sensor), whole, atol=1e-5)
-    monkeypatch.setattr(real_data, "TILE", 8)
-    monkeypatch.setattr(real_data, "MARGIN", 24)  # so wide that every tile sees the whole image
-    assert torch.allclose(method(counts, sensor), whole, atol=1e-5)
-    monkeypatch.setattr(real_data, "MARGIN", 2)
-    assert method(counts, sensor).isfinite().all()
+    assert torch.allclose(real_data.network(model)(counts, sensor), whole, atol=1e-5)
+    wide = real_data.network(model, tile=8, margin=24)  # so wide that every tile sees the whole image
+    assert torch.allclose(wide(counts, sensor), whole, atol=1e-5)
+    assert real_data.network(model, tile=8, margin=2)(counts, sensor).isfinite().all()
 
 
 def test_clouds_lie_where_the_camera_looks():

@@ -230,10 +230,10 @@ def methods_of(models: list[DepthModel]) -> dict[int, dict[str, Method]]:
     return found
 
 
-def network(model: DepthModel) -> Method:
+def network(model: DepthModel, tile: int = TILE, margin: int = MARGIN) -> Method:
     """Return depth by a trained network, whose bins stand for the capture's: what it learned of a pulse was in bins.
 
-    Tile by tile, each with `MARGIN` pixels around it, so that an image needs no more memory than a tile.
+    Tile by tile, each with `margin` pixels around it, so that an image needs no more memory than a tile.
     """
 
     @torch.no_grad()
@@ -243,13 +243,13 @@ def network(model: DepthModel) -> Method:
         fits = height % down == 0 and width % right == 0
         require(fits, f"image of {width} x {height} pixels is not tiled by the network's blocks of {right} x {down}")
         depth = torch.empty(height, width)
-        for top in range(0, height, TILE):
-            for left in range(0, width, TILE):
-                rows, columns = (slice(max(at - MARGIN, 0), at + TILE + MARGIN) for at in (top, left))
+        for top in range(0, height, tile):
+            for left in range(0, width, tile):
+                rows, columns = (slice(max(at - margin, 0), at + tile + margin) for at in (top, left))
                 seen = counts[rows, columns].permute(2, 0, 1)[None, None].contiguous()
                 found = model.position(model(seen))[0] * sensor.bin_depth_m
-                inner = found[top - rows.start :, left - columns.start :][:TILE, :TILE]
-                depth[top : top + TILE, left : left + TILE] = inner
+                inner = found[top - rows.start :, left - columns.start :][:tile, :tile]
+                depth[top : top + tile, left : left + tile] = inner
         return depth
 
     return depth_of
