@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 
@@ -11,6 +12,8 @@ from scene2spad.interrupts import STOPPED, comes_of_interrupt, interrupt_again
 def script() -> None:
     """Run the command line and exit with its status; 130 for Ctrl-C, also while libraries are being imported."""
     _open_standard_streams()
+    # Libraries make a million objects that stay: searching them for garbage is a tenth of the time of their import.
+    gc.set_threshold(50_000)
     sys.unraisablehook = interrupt_again
     try:
         from scene2spad.cli import main

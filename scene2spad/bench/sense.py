@@ -24,8 +24,9 @@ from scenes.errors import require
 from scenes.files import whole_file, write_csv
 from scenes.progress import Progress
 from spad.detection.detect import sense, sense_timestamps
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
 from spad.detection.laws import first_photon_counts
+from spad.detection.rates import rates_for
 from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name

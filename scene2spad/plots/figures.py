@@ -22,6 +22,8 @@ DEPTH_COLOURS = matplotlib.colormaps["viridis_r"].with_extremes(bad="lightgrey")
 ERROR_COLOURS = matplotlib.colormaps["magma"].with_extremes(bad="lightgrey")
 # What lies further beyond these quantiles than so many times their distance does not decide a colour scale.
 COMMON, FAR_BEYOND = (0.005, 0.995), 0.5
+BAR = 0.04  # width of a colour bar, of its image's
+PANEL_INCHES = 3.6  # the longer side of an image in the pictures of `sense` and `depth`
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -53,8 +55,8 @@ def _image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: obje
     axes.set_title(title, fontsize=10)
     axes.set_xticks([])
     axes.set_yticks([])
-    size = {"fraction": 0.046 * image.shape[0] / image.shape[1] + 0.01, "pad": 0.02}
-    bar = axes.figure.colorbar(shown, ax=axes, extend=_beyond(image, *shown.get_clim()), **size)
+    beside = axes.inset_axes((1.02, 0.0, BAR, 1.0))  # as high as the image, whatever its shape
+    bar = axes.figure.colorbar(shown, cax=beside, extend=_beyond(image, *shown.get_clim()))
     bar.set_label(unit, fontsize=8)
     bar.ax.tick_params(labelsize=8)
 
@@ -138,8 +140,8 @@ def draw_histogram(
     `expected(row, column)` gives the rates (T,) that a pixel's counts were drawn from: a line over the counts, without
     which a pixel of few photons tells nothing.
     """
-    figure = plt.figure(figsize=(15, 4.8), layout="constrained")
-    panels = figure.subplot_mosaic([["A", "B", name] for name in SHOWN_RANKS], width_ratios=(1, 1, 1.15))
+    figure, images, right = _image_row(histogram.depth_m.shape, 2, right=4.4)
+    panels = dict(zip("AB", images, strict=True)) | dict(zip(SHOWN_RANKS, right, strict=True))
     counts = histogram.counts.sum(axis=2, dtype=np.int64)
     ratio = histogram.expected_signal / np.maximum(histogram.expected_background, 1e-12)
     bright = max(np.quantile(counts, 0.995), 1)
@@ -152,13 +154,34 @@ def draw_histogram(
             panels[key].plot(column, row, "o", mfc="none", mec=f"C{number + 1}", ms=8, mew=1.5)
         rate = None if expected is None else expected(row, column)
         _pixel_counts(panels[name], histogram, row, column, rate, f"C{number + 1}", name)
-    panels[[*SHOWN_RANKS][-1]].set_xlabel("time since the laser's emission [ns]")
+    panels[[*SHOWN_RANKS][-1]].set_xlabel("time since the laser's emission [ns]", fontsize=9)
     budget = histogram.budget
     figure.suptitle(
         f"{histogram.sensor.name} sensor, {budget.signal:g} + {budget.background:g} photons per pixel on average; "
-        "right: pixels whose expected signal is above that of 10, 50 and 90 % of pixels"
+        "right: pixels whose expected signal is above that of 10, 50 and 90 % of pixels",
+        fontsize=11,
     )
     return save(figure, path)
+
+
+def _image_row(shape: tuple[int, ...], images: int, right: float = 0.0) -> tuple[Figure, list[Axes], list[Axes]]:
+    """Make a figure of a row of images, and with `right` three panels of that width [inches] one below another.
+
+    Places are computed here: matplotlib's layouts draw everything once more, half of what a picture costs.
+    """
+    high, wide = (max(PANEL_INCHES * side / max(shape), 0.4 * PANEL_INCHES) for side in shape)
+    edge, bar, below, above = 0.25, 0.95, 0.45 if right else 0.2, 0.75 if right else 0.4
+    size = (edge + images * (wide + bar) + (right + 0.7 if right else 0.0), below + high + above)
+    figure = plt.figure(figsize=size)
+
+    def place(left: float, bottom: float, width: float, height: float) -> Axes:
+        return figure.add_axes((left / size[0], bottom / size[1], width / size[0], height / size[1]))
+
+    row = [place(edge + number * (wide + bar), below, wide, high) for number in range(images)]
+    left, gap = edge + images * (wide + bar) + 0.4, 0.5
+    each = (high - 2 * gap) / 3
+    column = [place(left, below + (2 - number) * (each + gap), right, each) for number in range(3)] if right else []
+    return figure, row, column
 
 
 def shown_pixels(histogram: Histogram) -> dict[str, tuple[int, int]]:
@@ -200,10 +223,10 @@ def _pixel_counts(
 def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: dict, path: Path) -> Path:
     """Draw truth, estimate and absolute error; the estimate alone where no truth is known."""
     if np.isnan(histogram.depth_m).all():
-        figure, axes = plt.subplots(figsize=(6, 5), layout="constrained")
-        _image(axes, depth_m, f"{method}, no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
+        figure, (only,), _ = _image_row(depth_m.shape, 1)
+        _image(only, depth_m, f"{method}, no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
         return save(figure, path)
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    figure, axes, _ = _image_row(depth_m.shape, 3)
     limits = depth_limits(histogram.depth_m)
     _image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     title = f"{method}: MAE {errors['mae_mm']:.1f} mm, {errors['within_10mm']:.0%} within 10 mm"

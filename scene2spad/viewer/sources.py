@@ -9,7 +9,7 @@ from scene2spad.viewer.content import NS_PER_M, Content, Cube, Layer, Returns, g
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.json_types import JsonObject
 from scenes.model import Camera
-from spad.detection.flux import Rates, rates_for
+from spad.detection.rates import Rates, rates_for
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 

@@ -16,10 +16,10 @@ from scenes.errors import InputError
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.exposure import Exposure, counts_of, timestamps_of
-from spad.detection.flux import expected_counts, rates_for
 from spad.detection.glints import glint_warning, signal_fractions
 from spad.detection.laws import LOW_FLUX
 from spad.detection.photons import expected_signal, light_of
+from spad.detection.rates import rates_for
 from spad.formats.histogram import Histogram
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import PhotonBudget, Sensor
@@ -102,6 +102,8 @@ def expected_in_pixel(
     transient: Transient, sensor: Sensor, budget: PhotonBudget, row: int, column: int, *, seed: int = 0
 ) -> np.ndarray:
     """Return expected primary detections per bin of one pixel, (T,) float64: the rates that `sense` draws from."""
+    from spad.detection.flux import expected_counts  # with torch, whose import takes a second
+
     pixel = row * transient.width + column
     rates = rates_for(transient, sensor, budget, seed=seed)
     rate, _ = expected_counts(transient, sensor, rates, slice(pixel, pixel + 1))

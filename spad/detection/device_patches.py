@@ -19,8 +19,8 @@ from torch import Tensor
 
 from scenes.errors import require
 from scenes.random_streams import Stream
-from spad.detection.flux import background_scales
 from spad.detection.photons import paths_in_bins
+from spad.detection.rates import background_scales
 from spad.detection.training_patches import Batch, PackedViews, Patch
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, pulse_table
@@ -59,7 +59,7 @@ class DevicePatches:
         edges, converter = sensor.code_edges, sensor.converter_map(rows, columns)
         self.edges = None if edges is None else torch.from_numpy(rising_edges(edges)).to(self.device)
         self.converter = None if converter is None else torch.from_numpy(converter).to(self.device).flatten()
-        # uniform where a scene has no ambient light, as in `flux.fill_background`
+        # uniform where a scene has no ambient light, as in `rates.fill_background`
         unlit = packed.mean_ambient <= 0
         self.mean_ambient = np.where(unlit, 1.0, packed.mean_ambient)
         self.ambient = self._moved(np.where(unlit[:, None, None], 1.0, packed.ambient)).flatten()

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError
-from spad.sensor.model import PhotonBudget, Sensor
+from spad.detection.rates import Rates
+from spad.sensor.model import Sensor
 from spad.sensor.pulse import AnyPulse
 from spad.sensor.template import pulse_cdf, pulse_cdf_integral
 
@@ -21,119 +21,6 @@ POINT_RETURN_SIGMAS = 1e-3
 WINDOW_SIGMAS = 7  # outside lies less than 1e-11 of a Gaussian pulse
 LENGTH_STEP = 8
 BLOCK_ENTRIES = 1 << 18
-
-
-class Rates(NamedTuple):
-    """Scale from radiance to expected signal detections; background detections per pixel and exposure (H, W) and why.
-
-    dark_share is the share of the mean background that is dark counts; `reasons` belong into the plan. `alive` (H, W)
-    is 0 in dead pixels, whose background is 0 too, and 1 elsewhere. `converter` (H, W) says which of a sensor's
-    time-to-digital converters each pixel has, None where all bins are equal.
-    """
-
-    signal_scale: float
-    background: np.ndarray
-    dark_fraction: float
-    reasons: tuple[str, ...]
-    alive: np.ndarray
-    converter: np.ndarray | None = None
-
-
-def rates_for(
-    transient: Transient,
-    sensor: Sensor,
-    budget: PhotonBudget,
-    *,
-    dark_map_hz: np.ndarray | None = None,
-    seed: int = 0,
-) -> Rates:
-    """Scale a transient to a photon budget by means.
-
-    Signal: all returns times one factor, so that their mean over the image is `budget.signal`. Background: dark counts
-    are what the sensor says (or a measured map (H, W) in Hz, NaN in dead pixels), ambient light fills the mean up to
-    `budget.background`; dark counts alone above it are scaled down to it, and the reason says so. Dead pixels lose
-    their share afterwards: the others are not brighter for it. The seed places hot and dead pixels. Raises InputError
-    when there is no light to scale, and for a map of another shape or below 0.
-    """
-    shape = (transient.height, transient.width)
-    total = float(transient.radiance.sum(dtype=np.float64))
-    if total <= 0 and budget.signal > 0:
-        raise InputError(f"no light returns to the camera: {budget.signal:g} signal photons a pixel cannot be had")
-    scale = budget.signal * transient.height * transient.width / total if total > 0 else 0.0
-    dark_hz, dead = detector_maps(sensor, shape, dark_map_hz, seed)
-    filled = fill_background(transient.ambient, dark_hz * sensor.exposure_s, budget.background)
-    reasons = (filled.reason, *_odd_pixels(sensor, dead))
-    background, alive = np.where(dead, 0.0, filled.background), np.where(dead, 0.0, 1.0)
-    return Rates(scale, background, filled.dark_fraction, reasons, alive, sensor.converter_map(*shape, seed))
-
-
-def detector_maps(
-    sensor: Sensor, shape: tuple[int, int], dark_map_hz: np.ndarray | None, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return dark counts per second (H, W) and dead pixels (H, W) bool: a measured map's, or the sensor's."""
-    if dark_map_hz is None:
-        return sensor.dark_rate_map_hz(*shape, seed), sensor.dead_pixels(*shape, seed)
-    return check_dark_map(dark_map_hz, shape)
-
-
-def check_dark_map(measured_hz: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a measured map's dark counts per second (H, W), 0 in dead pixels, and which are dead (NaN).
-
-    Raises InputError for another shape, and for rates that are negative or infinite.
-    """
-    measured = np.asarray(measured_hz, dtype=np.float64)
-    if measured.shape != shape:
-        raise InputError(f"dark count map is {measured.shape}, the image {shape}")
-    dead = np.isnan(measured)
-    measured = np.where(dead, 0.0, measured)
-    if not (np.isfinite(measured).all() and measured.min(initial=0) >= 0):
-        raise InputError("dark count map: rates must be finite and 0 or more, NaN for a dead pixel")
-    return measured, dead
-
-
-class Filled(NamedTuple):
-    """Background detections of every pixel (H, W), how much of their mean is dark counts, and why."""
-
-    background: np.ndarray
-    dark_fraction: float
-    reason: str
-
-
-def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Filled:
-    """Return dark counts (H, W) as they are and ambient light (H, W, any scale) up to the asked mean; uniform without
-    any.
-
-    Dark counts whose mean is above the asked one are scaled down to it, and their share is 1.
-    """
-    ambient, counted = ambient.astype(np.float64), float(dark.mean())
-    if counted > asked:
-        reason = f"background: {counted:g} dark counts a pixel exceed the asked {asked:g}, scaled down to it"
-        _, dark_scale = background_scales(1.0, counted, asked)
-        return Filled(dark * dark_scale, 1.0 if asked > 0 else 0.0, reason)
-    fraction = counted / asked if asked > 0 else 0.0
-    if counted > 0:
-        reason = f"background: {fraction:.1%} dark counts ({counted:g} a pixel), the rest ambient light"
-    elif ambient.sum() > 0:
-        reason = "background: the scene's ambient light"
-    else:
-        reason = "background: uniform over the image, the scene has no ambient light"
-    if ambient.sum() <= 0:
-        ambient = np.ones_like(ambient)
-    ambient_scale, _ = background_scales(float(ambient.mean()), counted, asked)
-    return Filled(dark + ambient * ambient_scale, fraction, reason)
-
-
-def background_scales(ambient_mean: float, dark_mean: float, asked: float) -> tuple[float, float]:
-    """Return factors of ambient light and of dark counts, whose means are given, that bring their sum to the asked
-    mean."""
-    if dark_mean > asked:
-        return 0.0, asked / dark_mean
-    return (asked - dark_mean) / ambient_mean, 1.0
-
-
-def _odd_pixels(sensor: Sensor, dead: np.ndarray) -> tuple[str, ...]:
-    hot = (f"hot pixels: {sensor.hot_share:.2%} at {sensor.hot_rate_hz:g} Hz",) if sensor.hot_share else ()
-    return (*hot, f"dead pixels: {int(dead.sum())} of {dead.size}") if dead.any() else hot
 
 
 def interval_cdf(pulse: AnyPulse, after_near: Tensor, length: Tensor) -> Tensor:

@@ -10,11 +10,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from spad.detection.flux import Rates, expected_counts, interval_cdf
+from spad.detection.rates import Rates
 from spad.sensor.model import Sensor
 
 GATED_PIXELS = 1024  # whose rates are held at once
@@ -127,6 +126,8 @@ def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: P
     shape = (transient.height, transient.width)
     if sensor.bins == sensor.bins_per_period:
         return light.signal_per_pixel().reshape(shape), _wrapped(light, sensor)
+    from spad.detection.flux import expected_counts
+
     inside = np.empty(light.pixels)
     for first in range(0, light.pixels, GATED_PIXELS):
         pixels = slice(first, min(first + GATED_PIXELS, light.pixels))
@@ -141,6 +142,10 @@ def _wrapped(light: PixelFlux, sensor: Sensor) -> float:
     late = light.start + light.length + sensor.response.window_s(8.5)[1] / width > period
     if not late.any():
         return 0.0
+    import torch  # takes a second: here, where light wraps
+
+    from spad.detection.flux import interval_cdf
+
     start, length = (torch.from_numpy(column[late] * width) for column in (light.start, light.length))
     arrived = interval_cdf(sensor.response, sensor.period_s - start, length).numpy()
     return float(light.signal[late] @ (1 - arrived))

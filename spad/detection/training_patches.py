@@ -23,8 +23,8 @@ from torch import Tensor
 from render.transient import Transient
 from scenes.errors import InputError
 from scenes.random_streams import Stream
-from spad.detection.flux import background_scales
 from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries, paths_in_bins
+from spad.detection.rates import background_scales
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.tdc import time_codes
 
@@ -133,7 +133,7 @@ def sense_patches(
 ) -> Batch:
     """Return counts and labels of patches (h, w) of stored transients.
 
-    Mean signal and background are fixed on the scene's full frame before the crop, by means as in `flux.rates_for`.
+    Mean signal and background are fixed on the scene's full frame before the crop, by means as in `rates.rates_for`.
     Labels stay continuous. Raises InputError for a patch outside its scene, and a scene without light to scale.
     """
     height, width = size
@@ -205,7 +205,7 @@ def _light_of_patch(packed: PackedViews, sensor: Sensor, patch: Patch, height: i
     dark, ambient = _dark_counts(sensor, rows, columns), packed.ambient[patch.scene][crop].astype(np.float64)
     mean_ambient = float(packed.mean_ambient[patch.scene])
     if mean_ambient <= 0:
-        ambient, mean_ambient = np.ones_like(ambient), 1.0  # uniform, as in `flux.fill_background`
+        ambient, mean_ambient = np.ones_like(ambient), 1.0  # uniform, as in `rates.fill_background`
     ambient_scale, dark_scale = background_scales(mean_ambient, float(dark.mean()), budget.background)
     pixel = (patch.scene * rows + patch.row + np.arange(height)[:, None]) * columns + patch.column + np.arange(width)
     first = packed.offsets[pixel].ravel()

@@ -26,7 +26,6 @@ from torch import Tensor
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, did_you_mean
 from scenes.model import Camera
-from spad.detection.laws import linearised
 from spad.estimators.matching import (
     argmax_bins,
     correlate,
@@ -38,6 +37,7 @@ from spad.estimators.matching import (
     matched_bins,
     published_log_matched_bins,
 )
+from spad.estimators.pile_up import linearised
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse, binned_pulse_slope, pulse_taps
@@ -56,6 +56,7 @@ __all__ = [
     "grid_peak",
     "histogram_depth_m",
     "laser_baseline_m",
+    "mean_confidence",
     "noise_free_bias_m",
     "radial_depth_m",
     "radial_depth_of",
@@ -175,20 +176,28 @@ def confidence(counts: Tensor, depth_m: Tensor, sensor: Sensor) -> Tensor:
     reach = taps.shifts[taps.window]
     estimate = (depth_m.reshape(-1, 1).double() / sensor.bin_depth_m).floor().nan_to_num(0).clamp(0, sensor.bins - 1)
 
-    def one(part: Tensor) -> Tensor:
-        part = part if part.dtype == torch.float64 else part.float()
-        return likelihood(part, sensor).double().softmax(-1)
-
     def near(part: Tensor) -> Tensor:
-        posterior, index = one(part[:, :-1]), part[:, -1:].long() + reach
+        posterior, index = likelihood(part[:, :-1], sensor).softmax(-1), part[:, -1:].long() + reach
         inside = (
             torch.ones_like(index, dtype=torch.bool) if is_circular(sensor) else (index >= 0) & (index < sensor.bins)
         )
         # no bin twice, where the window is as wide as the period
         return (posterior.gather(-1, index.remainder(sensor.bins)) * inside).sum(-1).clamp(max=1)
 
-    fraction = by_pixels(near, torch.cat([rows.double(), estimate], dim=-1)).float()
+    kind = rows.dtype if rows.dtype == torch.float64 else torch.float32  # which counts bins to 16 million
+    fraction = by_pixels(near, torch.cat([rows.to(kind), estimate.to(kind)], dim=-1)).float()
     return torch.where(depth_m.isnan(), math.nan, fraction.reshape(depth_m.shape))
+
+
+def mean_confidence(histogram: Histogram, depth_m: np.ndarray) -> float:
+    """Return mean probability that an estimate is no chance peak, over the pixels that have one; NaN with a baseline.
+
+    There the distance is not the arrival time that the probability is of.
+    """
+    if any(laser_baseline_m(histogram)) or np.isnan(depth_m).all():
+        return math.nan
+    fraction = confidence(torch.from_numpy(histogram.counts), torch.from_numpy(depth_m), histogram.sensor)
+    return float(fraction.nanmean())
 
 
 def cramer_rao_m(arrival_s: Tensor, signal: Tensor, background_per_bin: Tensor, sensor: Sensor) -> Tensor:

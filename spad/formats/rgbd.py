@@ -15,7 +15,8 @@ import numpy as np
 from render.transient import Transient
 from scenes.errors import InputError, require
 from scenes.json_types import JsonObject
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
+from spad.detection.rates import rates_for
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
 

@@ -15,7 +15,7 @@ from render.transient import Transient
 from scenes.constants import DEFAULT_WAVELENGTH_M, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
 from scenes.optics.blackbody import PLANCK_J_S
-from spad.detection.flux import detector_maps
+from spad.detection.rates import detector_maps
 from spad.sensor.model import PhotonBudget, Sensor
 
 # Mean ambient radiance [W/(m^2 sr nm)] above which it is no radiance of daylight. White paper facing the sun: 100 klux

@@ -11,13 +11,11 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
 from scenes.random_streams import Stream
-from spad.detection.flux import interval_cdf
 from spad.detection.saturation import draw_saturated, saturated
 from spad.sensor.model import Sensor
 
@@ -255,6 +253,10 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
     What arrives outside of the bins is not counted: the period of such a sensor is longer than its histogram.
     `drift_s` delays all zones, as a laser that warms up does.
     """
+    import torch  # takes a second, and sensors of pixels need none of it
+
+    from spad.detection.flux import interval_cdf
+
     own = np.zeros((zones.count, sensor.bins))
     edges = torch.arange(sensor.bins + 1, dtype=torch.float64) * sensor.bin_width_s
     for zone, seen in enumerate(returns):

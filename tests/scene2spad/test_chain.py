@@ -14,7 +14,8 @@ from scenes import InputError, Laser
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.library.living_room import living_room
 from spad.detection.detect import sense
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
+from spad.detection.rates import rates_for
 from spad.estimators.depth import depth_errors, estimate_depth
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor

@@ -55,13 +55,19 @@ def test_a_light_command_loads_nothing_heavy(command, allowed):
     assert done.stderr.splitlines()[-1] == f"{list(allowed)} 0", done.stderr
 
 
-def test_depth_and_sense_load_no_renderer(tmp_path):
+@pytest.mark.parametrize(
+    ("options", "absent"),
+    [(("depth", "--no-figure"), "matplotlib"), (("sense",), "torch")],
+    ids=("depth without a picture", "sense with one"),
+)
+def test_depth_and_sense_load_no_renderer_and_sense_no_torch(tmp_path, options, absent):
     image = np.full((4, 4), 0.5)
     write_transient(transient_from_rgbd(2 * image + 1, image, image), tmp_path / "a.exr")
+    last = [options[0], "a.h5" if options[0] == "depth" else "a.exr", *options[1:]]
     code = (
         "import sys; from scene2spad.cli import main\n"
-        "assert main(['sense', 'a.exr', '--no-figure']) == 0 == main(['depth', 'a.h5', '--no-figure'])\n"
-        "heavy = ('mitsuba', 'drjit', 'matplotlib', 'pytorch_lightning', 'distributed')\n"
+        f"assert main(['sense', 'a.exr', '--no-figure']) == 0 == main({last!r})\n"
+        f"heavy = ('mitsuba', 'drjit', 'pytorch_lightning', 'distributed', {absent!r})\n"
         "print([name for name in heavy if name in sys.modules], file=sys.stderr)"
     )
     surroundings = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -21,7 +21,8 @@ from scene2spad.studies.transport import planned_renders as transport_planned
 from scene2spad.studies.transport import study as transport
 from scene2spad.studies.transport import tables as transport_tables
 from scene2spad.studies.transport.plan import FIRST, KEPT, LASERS, LEVELS, OPEN, PLANS, REVERSED, STEPS
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
+from spad.detection.rates import rates_for
 from spad.formats.rgbd import from_rgbd, transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor
 

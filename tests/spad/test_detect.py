@@ -13,7 +13,8 @@ from test_flux import transient_of
 from scenes import InputError
 from scenes.io.hdf5 import add_checksum
 from spad.detection.detect import expected_in_pixel, sense
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
+from spad.detection.rates import rates_for
 from spad.formats.histogram import Histogram, read_histogram, write_histogram
 from spad.formats.timestamps import counts_from_timestamps
 from spad.sensor.model import PhotonBudget, Sensor

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from render.transient import Transient
 from scenes import InputError
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
-from spad.detection.flux import expected_counts, rates_for, signal_per_bin
+from spad.detection.flux import expected_counts, signal_per_bin
+from spad.detection.rates import rates_for
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 from spad.sensor.template import binned_pulse, pulse_cdf
 

@@ -13,15 +13,13 @@ from spad.detection.detect import expected_in_pixel, sense, sense_timestamps, st
 from spad.detection.laws import (
     Detections,
     add_crosstalk,
-    coates,
     crosstalk_events,
     first_of_each_cycle,
     first_photon_counts,
     first_photon_masses,
-    free_running_flux,
-    linearised,
     live_detections,
 )
+from spad.estimators.pile_up import coates, free_running_flux, linearised
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 

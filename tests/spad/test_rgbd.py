@@ -14,7 +14,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from scenes.optics.blackbody import sunlight_w_per_m2_nm
 from spad.detection.detect import sense
-from spad.detection.flux import rates_for
+from spad.detection.rates import rates_for
 from spad.formats.mat import read_mat, write_mat
 from spad.formats.rgbd import cosine_of_incidence, from_rgbd, published_from_rgbd, published_taps, transient_from_rgbd
 from spad.sensor.budget import Optics

@@ -14,7 +14,8 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from spad.detection.detect import expected_in_pixel, sense, sense_timestamps
 from spad.detection.device_patches import DevicePatches
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
+from spad.detection.rates import rates_for
 from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.formats.histogram import read_histogram, write_histogram
 from spad.reference import arrivals, code_overlap, detect_free_running, detect_synchronous, time_bin

@@ -8,7 +8,8 @@ import torch
 from scipy import stats
 
 from scenes.errors import InputError
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
+from spad.detection.rates import rates_for
 from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor

@@ -28,7 +28,8 @@ from scene2spad.bench.hard.oracles_optics import wall_on_sensor
 from scenes.library import hard_cases as scenes
 from scenes.library.hard_cases import hard_case
 from spad.detection.detect import sense
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
+from spad.detection.rates import rates_for
 from spad.sensor.model import PhotonBudget, sensor_by_name
 
 SMOOTH = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)

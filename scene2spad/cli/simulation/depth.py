@@ -150,8 +150,7 @@ def _mean(values: list[float]) -> float:
 
 def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram, source: Path, out: Path) -> dict:
     """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
-    from scene2spad.cli.simulation.sensing import mean_confidence
-    from spad.estimators.depth import depth_errors
+    from spad.estimators.depth import depth_errors, mean_confidence
 
     label, fraction = depth_label(command), None
     start = time.perf_counter()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from dataclasses import replace
 from functools import partial
@@ -11,16 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from render.transient import Transient, read_transient
 from scene2spad.cli.paths import input_file, output_file, picture
 from scenes.errors import InputError, require
 from scenes.files import read_array
 from scenes.progress import Progress
-from spad.detection.detect import expected_in_pixel, sense
-from spad.detection.flux import check_dark_map
-from spad.estimators.depth import confidence, laser_baseline_m
+from spad.detection.detect import sense
+from spad.detection.one_pixel import quadrature_in_pixel
+from spad.detection.rates import check_dark_map
 from spad.formats.histogram import Histogram, write_histogram
 from spad.sensor.budget import Optics
 from spad.sensor.files import FWHM_PER_SIGMA, load_sensor
@@ -138,7 +136,7 @@ def run(command: Sense, progress: Progress) -> dict:
         from scene2spad.plots import figures
 
         # a map of dark counts is not part of the rates that the figure could draw
-        rate = partial(expected_in_pixel, transient, sensor, budget, seed=command.seed) if dark_map is None else None
+        rate = partial(quadrature_in_pixel, transient, sensor, budget, seed=command.seed) if dark_map is None else None
         result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram"), expected=rate))
     return result
 
@@ -205,14 +203,3 @@ def read_dark_map(path: Path, transient: Transient) -> np.ndarray:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return rates
-
-
-def mean_confidence(histogram: Histogram, depth_m: np.ndarray) -> float:
-    """Return mean probability that an estimate is no chance peak, over the pixels that have one; NaN with a baseline.
-
-    There the distance is not the arrival time that the probability is of.
-    """
-    if any(laser_baseline_m(histogram)) or np.isnan(depth_m).all():
-        return math.nan
-    fraction = confidence(torch.from_numpy(histogram.counts), torch.from_numpy(depth_m), histogram.sensor)
-    return float(fraction.nanmean())

@@ -18,7 +18,8 @@ from scene2spad.studies.transport.tables import Contender
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from scenes.random_streams import Stream
-from spad.detection.flux import expected_counts, rates_for
+from spad.detection.flux import expected_counts
+from spad.detection.rates import rates_for
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 

@@ -1,0 +1,81 @@
+"""Undo what a detector that is blind for a while makes of its primary detections: the inverses of `detection.laws`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from scenes.errors import InputError
+from spad.detection.laws import LOW_FLUX
+from spad.sensor.model import Sensor
+
+
+def coates(counts: Tensor, cycles: float) -> Tensor:
+    """Return flux per cycle from a synchronous detector's counts (Coates 1968), the maximum-likelihood estimate:
+
+    mu_k = ln[(N - sum_(j<k) n_j) / (N - sum_(j<=k) n_j)], (..., T) -> (..., T) float64. Where no cycle is left after
+    bin k, its count is taken half a count lower; where none is left before, nothing is known and mu_k is 0. Raises
+    InputError for more counts than cycles.
+    """
+    arrived = counts.double().cumsum(-1)
+    if arrived.numel() and float(arrived[..., -1].max()) > cycles * (1 + 1e-9) + 0.5:
+        raise InputError(
+            f"a pixel has {float(arrived[..., -1].max()):g} detections in {cycles:g} cycles: "
+            "not a synchronous detector's histogram of first photons"
+        )
+    after = cycles - arrived
+    before = after + counts.double()
+    return torch.where(before > 0.5, torch.log(before.clamp(min=0.5) / after.clamp(min=0.5)), 0.0).clamp(min=0)
+
+
+def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
+    """Return flux per cycle from a free-running detector's counts: each bin's count over the cycles that were live in
+    it.
+
+    In the steady state the detector is blind in bin k of those cycles in which it detected something less than a dead
+    time earlier: blind_k = sum_j a_j n_(k-j) over the bins of one dead time before, whole periods of it counting
+    every detection (Rapp 2019). mu_k = -ln(1 - n_k / (N - blind_k)) where the dead time is longer than a bin, as only
+    one detection a cycle fits; n_k / (N - blind_k) below. (..., T) -> (..., T) float64. A sensor whose bins do not
+    cover its period is refused by InputError.
+    """
+    if sensor.bins != sensor.bins_per_period:
+        raise InputError(f"sensor {sensor.name}: the dead-time correction needs bins that cover the period")
+    counts = counts.double()
+    dead = sensor.dead_time_s / sensor.bin_width_s
+    if dead == 0:
+        return counts / cycles
+    # A detection is at a uniform place in its bin, and so is the photon: the share of pairs at a distance under the
+    # dead time is the integral of a triangle. It is 1 up to `whole`, of which each period holds one of every bin: a
+    # dead time of many periods takes no more memory than a short one. Bin k itself is the logarithm's part.
+    whole = max(int(dead - 1), 0)
+    bins = torch.arange(sensor.bins, device=counts.device)
+    kernel = ((whole - bins) // sensor.bins + (bins > 0)).double()
+    for distance in range(whole + 1, int(dead) + 2):
+        near = dead - distance
+        kernel[distance % sensor.bins] += 1 - (1 - near) ** 2 / 2 if near >= 0 else (1 + near) ** 2 / 2
+    if dead < 1:
+        kernel[0] += dead - dead**2 / 2
+    spectrum = torch.fft.rfft(counts) * torch.fft.rfft(kernel)
+    blind = torch.fft.irfft(spectrum, n=sensor.bins)
+    live = (cycles - blind).clamp(min=0.5)
+    ratio = counts / live
+    if dead < 1:
+        return ratio
+    return -torch.log1p(-ratio.clamp(max=1 - 0.5 / cycles))
+
+
+def linearised(counts: Tensor, sensor: Sensor) -> Tensor:
+    """Return counts as they would be without pile-up, (..., T) float64: `coates`, or `free_running_flux`, times the
+    cycles.
+
+    Pixels with at most 1 % detections per cycle (or dead time, if longer) keep their counts: what would change is a
+    hundredth of one, which does nothing but decide between equal maxima.
+    """
+    counts = counts.double()
+    if sensor.reset == "synchronous":
+        corrected = coates(counts, sensor.cycles) * sensor.cycles
+    else:
+        corrected = free_running_flux(counts, sensor.cycles, sensor) * sensor.cycles
+    blind = max(1.0, sensor.dead_time_s / sensor.period_s)
+    few = counts.sum(-1, keepdim=True) * blind <= LOW_FLUX * sensor.cycles
+    return torch.where(few, counts, corrected)

@@ -1,0 +1,32 @@
+"""Rates of one pixel by quadrature in numpy against the closed form in torch."""
+
+import numpy as np
+import pytest
+from test_flux import transient_of
+
+from spad.detection.detect import expected_in_pixel
+from spad.detection.one_pixel import quadrature_in_pixel
+from spad.sensor.files import load_sensor
+from spad.sensor.model import PhotonBudget, Pulse, Sensor
+
+# a point, a short and a long return, one before the camera's first bin is over, one that wraps around the period
+RETURNS = [(0.01, 0.01, 0.2), (4.0, 4.03, 1.0), (5.0, 7.5, 0.6), (29.97, 30.3, 0.4), (9.0, 9.0, 1e-3)]
+# panels are as long as a pulse is wide with its tail, and the steps of a measured one have corners
+SENSORS = {
+    "reference": (Sensor(), 1e-6),
+    "tail": (Sensor(pulse=Pulse(1e-10, 4e-10)), 1e-4),
+    "gated": (Sensor(bins=700, period_s=Sensor().period_s), 1e-6),
+    "iccv2023-train": (load_sensor("iccv2023-train").sensor, 1e-3),
+    "linospad2": (load_sensor("linospad2").sensor, 1e-6),
+    "reference-tdc": (load_sensor("reference-tdc").sensor, 1e-6),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_quadrature_is_the_closed_form(name):
+    sensor, tolerance = SENSORS[name]
+    transient, budget = transient_of(RETURNS, RETURNS[1:3], []), PhotonBudget(40, 25)
+    for column in range(3):
+        exact = expected_in_pixel(transient, sensor, budget, 0, column, seed=3)
+        found = quadrature_in_pixel(transient, sensor, budget, 0, column, seed=3)
+        assert found.shape == exact.shape and np.abs(found - exact).max() < tolerance * exact.max(), name
