@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("scene2spad")
 
 MAX_WORKERS = 256
-TRIES = 3  # of a number whose worker process died
+TRIES = 3  # of a number whose worker process died, among others; then once by itself
 CONNECT_S, CLOSE_S = 10, 2  # until a scheduler that does not answer is given up, and one is left
 Numbers = tuple[int, ...]
 Result = TypeVar("Result")
@@ -84,8 +84,8 @@ def _on_processes(
     threads, others = max(1, (os.cpu_count() or 1) // workers), {*active_children()}
     while True:
         running: dict[Future[list[Result]], Numbers] = {}
-        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads, os.getpid())) as pool:
-            try:
+        try:
+            with _pool(workers, threads, others) as pool:
                 while True:
                     for run in islice(waiting, 2 * workers - len(running)):
                         try:
@@ -100,18 +100,36 @@ def _on_processes(
                         done = future.result()
                         del running[future]
                         yield from done
-            except BrokenProcessPool:
-                log.warning("a worker process died; starting others")
-            except BaseException:  # Ctrl-C, a full disk
-                for child in {*active_children()} - others:
-                    child.kill()
-                raise
+        except BrokenProcessPool:
+            log.warning("a worker process died; starting others")
         numbers = sorted(number for run in running.values() for number in run)
         tries.update(numbers)
         for number in numbers:
             if tries[number] >= TRIES:
-                yield lost(number, f"its process died {TRIES} times")
+                try:
+                    with _pool(1, threads, others) as pool:
+                        with _interrupts_blocked():
+                            alone = pool.submit(work, (number,))
+                        done = alone.result()
+                    yield from done
+                except BrokenProcessPool:
+                    yield lost(number, f"its process died {TRIES + 1} times, at last by itself")
         waiting = chain([(number,) for number in numbers if tries[number] < TRIES], waiting)
+
+
+@contextmanager
+def _pool(workers: int, threads: int, others: set[Any]) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool whose processes are ended at once where something else than their own death ends the work: all
+    children but `others`."""
+    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads, os.getpid())) as pool:
+        try:
+            yield pool
+        except BrokenProcessPool:
+            raise
+        except BaseException:  # Ctrl-C, a full disk
+            for child in {*active_children()} - others:
+                child.kill()
+            raise
 
 
 @contextmanager

@@ -15,11 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import end_at_three
 
 from render.transient import read_transient
 from render.transient.packs import PATH_STEP_M, read_pack
 from scene2spad.cli import main
 from scene2spad.datasets import rendering as dataset
+from scene2spad.datasets import workers
 from scene2spad.datasets.rendering import Job, make_set, pack_set, render_view
 from scene2spad.datasets.set_folder import SetFolder
 from scene2spad.datasets.workers import executor
@@ -324,6 +326,16 @@ def test_a_run_that_a_broken_pool_refuses_is_not_lost(monkeypatch):
     with executor(2, None) as run:
         found = list(run(list, [(number,) for number in range(6)], lambda number, why: -1))
     assert refused and sorted(found) == list(range(6))
+
+
+def test_only_what_ends_its_process_by_itself_is_lost(monkeypatch):
+    """Others that were under way when number 3 ended the processes, three times and more, are done."""
+    monkeypatch.setattr(workers, "_start_worker", max)  # a worker of no renderer
+    with executor(3, None) as run:
+        found = list(run(end_at_three, [(number,) for number in range(8)], lambda number, why: (number, why)))
+    lost = [one for one in found if isinstance(one, tuple)]
+    assert lost == [(3, "its process died 4 times, at last by itself")]
+    assert sorted(one for one in found if one not in lost) == [0, 1, 2, 4, 5, 6, 7]
 
 
 @pytest.mark.slow

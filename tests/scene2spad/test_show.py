@@ -14,6 +14,7 @@ from PIL import Image
 
 from render.transient import read_transient
 from scene2spad.cli import main
+from scene2spad.cli.results.show import PAGE_MARK
 from scene2spad.viewer.content import LEVELS, Cube, cube_payload
 from scene2spad.viewer.sources import expected_cube, light_over_path, merged_returns
 from spad.detection.detect import expected_in_pixel, rates_for
@@ -150,9 +151,17 @@ def test_a_transient_beside_is_used_only_if_it_is_the_right_one(tmp_path, capfd)
                  str(other)]) == 0  # fmt: skip
     (tmp_path / "gallery.h5").write_bytes(Path("gallery.h5").read_bytes())
     told(capfd, "show", tmp_path / "gallery.h5")
-    assert payload(tmp_path / "gallery.html")["returns"] is None
+    assert payload(tmp_path / "gallery.histogram.html")["returns"] is None
     assert main(["show", "gallery.h5", "--transient", str(other)]) == 2
     assert "is not the transient" in capfd.readouterr().err
+
+
+def test_pages_of_a_transient_and_of_its_histogram_do_not_overwrite_one_another(tmp_path, capfd):
+    for name in ("gallery.exr", "gallery.h5"):
+        (tmp_path / name).write_bytes(Path(name).read_bytes())
+    written = [told(capfd, "show", tmp_path / name)["out"] for name in ("gallery.exr", "gallery.h5")]
+    assert written == [str(tmp_path / f"gallery.{kind}.html") for kind in ("transient", "histogram")]
+    assert all(PAGE_MARK in Path(one).read_bytes() for one in written)
 
 
 def test_comparisons_are_one_table_and_one_figure(capfd):

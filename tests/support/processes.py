@@ -13,6 +13,15 @@ from typing import Any
 CPU_S, ASLEEP_S = 300.0, 300.0  # no group of a test uses so much, or sleeps so long without using any
 
 
+def end_at_three(numbers: tuple[int, ...]) -> list[int]:
+    """Work whose process dies at number 3, and not before others have had the time to begin."""
+    if 3 in numbers:
+        time.sleep(0.3)
+        os._exit(1)
+    time.sleep(0.1)
+    return [*numbers]
+
+
 def members(group: int) -> Iterator[list[str]]:
     """Yield what /proc tells of a group's living processes, from their state on."""
     for stat in Path("/proc").glob("[0-9]*/stat"):

@@ -36,7 +36,7 @@ class Show(Common):
     file: Positional[Path]
     """The file, the folder of a set or of a run, or a model's name."""
     out: File = None
-    """File to write: .html, .png, .pdf or .gif (default: the file's name with .html)."""
+    """File to write: .html, .png, .pdf or .gif (default: the file's name and kind, such as room.histogram.html)."""
     transient: File = None
     """The transient that a histogram was sensed from (default: the .exr beside it, if it is that one)."""
     view: int = 0
@@ -49,7 +49,8 @@ def run(command: Show, progress: Progress) -> dict:
     """Open the file, and write its page or picture."""
     path = command.file
     kind = kind_of(path)
-    out = command.out or Path(f"{path.resolve().name if path.is_dir() else path.stem}.html")
+    # with the kind, as pictures have it: a transient and its histogram have one name
+    out = command.out or Path(f"{path.resolve().name if path.is_dir() else path.stem}.{kind}.html")
     if command.out is None and path.parent != Path() and not path.is_dir():
         out = path.parent / out
     require(out.suffix.lower() in SUFFIXES, f"{out}: the output must end in {', '.join(SUFFIXES)}")
