@@ -34,6 +34,13 @@ SMALLER_POWER = """
 from scene2spad.studies.power import front
 front.PHOTONS, front._EMULATED_PHOTONS, front._COARSE = (550.0,), 1_000, ("coarse-64",)
 """
+# One model of the smoke plan's two, on fewer pixels.
+SMALLER_TDC = """
+from dataclasses import replace
+from scene2spad.studies.tdc import plan, study
+small = replace(plan.SMOKE, models=plan.MODELS[1:2], tuned=(), on_chip=None, size=(12, 8))
+study.plan_of = lambda preset: small
+"""
 RENDER_ERROR = ("study", "render-error", "--width", "12", "--height", "8", "--views", "1")
 RUNS = {
     "dataset": Run(command("dataset", "hard-cases", *SET)),
@@ -48,6 +55,7 @@ RUNS = {
     "power": Run(
         command("study", "power", "--scene", "plane", "--width", "8", "--height", "8", *SMOKE, before=SMALLER_POWER)
     ),
+    "tdc": Run(command("study", "tdc", *SMOKE, before=SMALLER_TDC), UNLIKE),
 }
 RUNS |= {
     name: Run(command("study", name, *SMOKE), UNLIKE)

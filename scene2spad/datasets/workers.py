@@ -17,6 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, islice
 from multiprocessing import active_children, get_context
+from multiprocessing.process import BaseProcess
 from threading import Thread
 from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar
 
@@ -118,7 +119,7 @@ def _on_processes(
 
 
 @contextmanager
-def _pool(workers: int, threads: int, others: set[Any]) -> Iterator[ProcessPoolExecutor]:
+def _pool(workers: int, threads: int, others: set[BaseProcess]) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool whose processes are ended at once where something else than their own death ends the work: all
     children but `others`."""
     with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads, os.getpid())) as pool:

@@ -39,7 +39,7 @@ def test_bits_of_a_pixel() -> None:
 
 
 def test_a_difference_from_the_perfect_clock_is_told_with_its_interval() -> None:
-    subject = study.Subject("m", lambda one: one.counts, (PERFECT, TABLE), 8, 64)
+    subject = study.Subject("m", lambda one: one.counts, (PERFECT, TABLE), 8, 64, "")
     errors = {PERFECT: (10.0, 20.0), TABLE: (10.5, 20.5)}
     rows = [
         {"method": "m", "clock": clock, "view": str(n), "mae_mm": mae, "within_10mm": 0.5}

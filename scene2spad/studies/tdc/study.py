@@ -8,6 +8,7 @@ clock, in pairs by view and level.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -29,6 +30,7 @@ from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import plt, save
 from scene2spad.studies.chip.chain import ChipDepth
 from scene2spad.studies.chip.code import compile_model
+from scene2spad.studies.results import Store
 from scene2spad.studies.tdc.plan import (
     CLOCKS,
     DELAY,
@@ -55,6 +57,7 @@ SENSED = tuple(clock for clock in CLOCKS if clock not in (DELAY, FOLDED, TRAINED
 CHIP = ", int8 on the chip"
 FIGURES = ("mae_mm", "within_10mm")
 CODE_BITS = 8  # of an entry of C
+FORMAT = 1  # of results kept from run to run: another number forgets them
 
 
 class Recorded(NamedTuple):
@@ -77,6 +80,7 @@ class Subject(NamedTuple):
     clocks: tuple[str, ...]
     stored: int | None
     folded: int | None
+    digest: str  # that results are kept by
 
 
 def run(command: Study, progress: Progress) -> dict:
@@ -85,7 +89,7 @@ def run(command: Study, progress: Progress) -> dict:
     models = obtain(plan.wanted, command, progress)
     subjects = [*_networks(plan, models.found), *map(_classical, plan.classical)]
     test = rendered(TEST_SET, folder / "sets", count=plan.views, size=plan.size, progress=progress)
-    rows = measured(subjects, test, plan, command.seed, progress)
+    rows = measured(Store(folder / "results"), subjects, test, plan, command.seed, progress)
     compared = compared_rows(rows, subjects)
     numbers: JsonObject = {
         **models.described(),
@@ -138,14 +142,20 @@ def _networks(plan: Plan, found: dict[ModelSpec, Trained]) -> list[Subject]:
         if one not in found:
             continue
         model, bits = found[one].model.cpu(), code_bits(found[one].config.model.design)
-        subjects.append(Subject(one.label, partial(_by_network, model), (*SENSED, FOLDED), *bits))
+        subjects.append(Subject(one.label, partial(_by_network, model), (*SENSED, FOLDED), *bits, found[one].digest))
         if one in tuned:
             own = tuned[one].model.cpu()
-            subjects.append(Subject(one.label, partial(_by_network, own), (TRAINED,), *bits))
+            subjects.append(Subject(one.label, partial(_by_network, own), (TRAINED,), *bits, tuned[one].digest))
         if one == plan.on_chip:
-            chip = ChipDepth.of(compile_model(model, one.name))
-            subjects.append(Subject(f"{one.label}{CHIP}", partial(_by_chip, chip), SENSED, *bits))
+            compiled = compile_model(model, one.name)
+            digest = _digest(found[one].digest, compiled.source)
+            chip = ChipDepth.of(compiled)
+            subjects.append(Subject(f"{one.label}{CHIP}", partial(_by_chip, chip), SENSED, *bits, digest))
     return subjects
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256(" ".join(map(str, (FORMAT, *parts))).encode()).hexdigest()
 
 
 def _classical(name: str) -> Subject:
@@ -156,10 +166,10 @@ def _classical(name: str) -> Subject:
 
     clocks = (*SENSED, FOLDED)
     if name == FILTER:
-        return Subject(f"{name}, all bins", depth_of, clocks, None, None)
+        return Subject(f"{name}, all bins", depth_of, clocks, None, None, _digest(name))
     code, _, number = name.rpartition("-")
     design = Design.named(code, (sensor.bins, 1, 1), codes=int(number), compression=None, full=False)
-    return Subject(f"{code} 1024x1x1 K{number}, correlation", depth_of, clocks, *code_bits(design))
+    return Subject(f"{code} 1024x1x1 K{number}, correlation", depth_of, clocks, *code_bits(design), _digest(name))
 
 
 def code_bits(design: Design | None) -> tuple[int | None, int | None]:
@@ -187,23 +197,38 @@ def recorded_by_clock(test: TestSet, view: int, level: tuple[float, float], seed
     return {**found, FOLDED: Recorded(real, recalibrated(real.counts, converter, edges)), TRAINED: Recorded(real)}
 
 
-def measured(subjects: Sequence[Subject], test: TestSet, plan: Plan, seed: int, progress: Progress) -> list[JsonObject]:
-    """Return a row a method, clock, view and level: MAE [mm] and the share within 10 mm."""
-    rows, total, delay_m = [], len(test.views.transients) * len(plan.levels), mean_delay_m()
+def measured(
+    store: Store, subjects: Sequence[Subject], test: TestSet, plan: Plan, seed: int, progress: Progress
+) -> list[JsonObject]:
+    """Return a row a method, clock, view and level: MAE [mm] and the share within 10 mm. What the store has is not
+    computed again."""
+    rows, total = [], len(test.views.transients) * len(plan.levels)
     for view, scene in enumerate(test.views.scenes):
-        truth = test.truth_m(view)
         for number, level in enumerate(plan.levels):
             progress(f"{scene}, {level[0]:g} + {level[1]:g}", (view * len(plan.levels) + number) / total)
-            recorded = recorded_by_clock(test, view, level, seed)
+            key = {"view": f"{view}-{test.digests[view]}", "level": level, "seed": seed}
+            recorded: dict[str, Recorded] = {}
             for subject in subjects:
-                for clock in subject.clocks:
-                    depth = subject.depth_of(recorded[clock])[: truth.shape[0], : truth.shape[1]]
-                    estimates = {clock: depth} | ({DELAY: depth - delay_m} if clock == REAL else {})
-                    for name, estimate in estimates.items():
-                        key = {"method": subject.name, "clock": name, "view": f"{view}-{scene}"}
-                        levels = {"signal": level[0], "background": level[1]}
-                        errors = image_errors(estimate, truth, Sensor().range_m)
-                        rows.append({**key, **levels, **{figure: errors[figure] for figure in FIGURES}})
+                asked = {**key, "method": subject.name, "clocks": subject.clocks}
+                kept = store.get(subject.digest, **asked)
+                if kept is None:
+                    recorded = recorded or recorded_by_clock(test, view, level, seed)
+                    kept = _behind_clocks(subject, recorded, test.truth_m(view))
+                    store.put(subject.digest, kept, **asked)
+                named = {"view": f"{view}-{scene}", "signal": level[0], "background": level[1]}
+                rows += [{"method": subject.name, "clock": one["clock"], **named, **one} for one in kept]
+    return rows
+
+
+def _behind_clocks(subject: Subject, recorded: dict[str, Recorded], truth: np.ndarray) -> list[JsonObject]:
+    """Return a row a clock of one method, view and level."""
+    rows, delay_m = [], mean_delay_m()
+    for clock in subject.clocks:
+        depth = subject.depth_of(recorded[clock])[: truth.shape[0], : truth.shape[1]]
+        estimates = {clock: depth} | ({DELAY: depth - delay_m} if clock == REAL else {})
+        for name, estimate in estimates.items():
+            errors = image_errors(estimate, truth, Sensor().range_m)
+            rows.append({"clock": name, **{figure: errors[figure] for figure in FIGURES}})
     return rows
 
 
