@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -43,6 +44,13 @@ class ChipModel:
     compiled: Compiled
     scale: float
     reader: DepthModel
+
+    def digest(self, of_model: str) -> str:
+        """Return what results are kept by: the model's own digest, with the program and the tables on the chip."""
+        sha = hashlib.sha256(f"{of_model} {self.compiled.source}".encode())
+        for values in self.compiled.tables(self.compiled.block).values():
+            sha.update(np.ascontiguousarray(values).tobytes())
+        return sha.hexdigest()
 
 
 def compile_model(model: DepthModel, name: str) -> ChipModel:

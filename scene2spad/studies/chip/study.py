@@ -9,7 +9,6 @@ with the fast array's and torch's.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 
@@ -84,11 +83,7 @@ def _subjects(found: Trained, chip: ChipDepth) -> tuple[EvaluatedModel, ...]:
 
 def _by_chip(found: Trained, name: str, chip: ChipDepth) -> EvaluatedModel:
     """Return a model on the chip under a name: what its program and tables are is part of the digest."""
-    compiled = chip.chip.compiled
-    sha = hashlib.sha256(f"{found.subject.digest} {compiled.source}".encode())
-    for values in compiled.tables(compiled.block).values():
-        sha.update(np.ascontiguousarray(values).tobytes())
-    return EvaluatedModel(f"{name}{_CHIP}", chip, sha.hexdigest())
+    return EvaluatedModel(f"{name}{_CHIP}", chip, chip.chip.digest(found.subject.digest))
 
 
 def _pairs(

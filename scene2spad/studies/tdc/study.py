@@ -148,8 +148,7 @@ def _networks(plan: Plan, found: dict[ModelSpec, Trained]) -> list[Subject]:
             subjects.append(Subject(one.label, partial(_by_network, own), (TRAINED,), *bits, tuned[one].digest))
         if one == plan.on_chip:
             compiled = compile_model(model, one.name)
-            digest = _digest(found[one].digest, compiled.source)
-            chip = ChipDepth.of(compiled)
+            chip, digest = ChipDepth.of(compiled), compiled.digest(found[one].digest)
             subjects.append(Subject(f"{one.label}{CHIP}", partial(_by_chip, chip), SENSED, *bits, digest))
     return subjects
 
