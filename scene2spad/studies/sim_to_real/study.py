@@ -6,9 +6,10 @@ it buys. Last, distance and tilt of the plane are found from single captures, an
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from scene2spad.datasets.zone_captures import (
     zone_captures,
 )
 from scene2spad.options.experiments import Study
+from scene2spad.studies.results import Store
 from scene2spad.studies.sim_to_real import figures
 from scene2spad.studies.sim_to_real.measures import Comparison, compare, summary
 from scene2spad.studies.sim_to_real.plan import FITTED, GEOMETRY, MODEL_ERROR, SENSOR, Plan, plan_of
@@ -34,6 +36,7 @@ from spad.zones.expected_counts import ZoneCapture
 from spad.zones.histogram import zone_grid
 from spad.zones.sensor import ZoneArray, expected_zone_counts
 
+FORMAT = 1  # of results kept from run to run: another number forgets them
 SPANS = ((0.0, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.4), (0.1, 0.4))  # metres: what is told apart
 
 
@@ -76,11 +79,12 @@ def run(command: Study, progress: Progress) -> dict:
     command.out.mkdir(parents=True, exist_ok=True)
     of = predict(plan_of(command.preset), command.seed, progress)
     spans = span_rows(of)
-    ablation = ablated(of, progress)
+    store, digest = Store(command.out / "results"), digest_of(of)
+    ablation = ablated(of, store, digest, progress)
     progress("poses", 0.8)
     # a pose weighs with the model's error as the captures calibrated on show it
     model_error = summary(of.errors, of.used)["model_error"]
-    poses = pose_rows(of, model_error)
+    poses = pose_rows(of, store, digest, model_error)
     numbers: JsonObject = {
         "preset": command.preset,
         "captures": {"calibrated_on": len(of.used), "held_out": int(of.held.sum())},
@@ -149,13 +153,26 @@ def expected_of(captures: Sequence[ZoneCapture], fitted: Calibration) -> np.ndar
     return np.array([expected_zone_counts(c.returns, fitted.sensor, fitted.zones, c.drift_s) for c in captures])
 
 
-def ablated(of: Prediction, progress: Progress) -> list[JsonObject]:
-    """Return a row for the whole model, then one for each effect that is off while the rest is calibrated again."""
+def digest_of(of: Prediction) -> str:
+    """Return what results are kept by: captures, plan, the sensor begun with and the calibrated one."""
+    sha = hashlib.sha256(repr((FORMAT, asdict(of.plan), FITTED, of.start.sensor, of.start.zones)).encode())
+    for values in (of.captures.distance_m, of.captures.counts, of.expected, *of.fitted.values.values()):
+        sha.update(np.ascontiguousarray(values).tobytes())
+    return sha.hexdigest()
+
+
+def ablated(of: Prediction, store: Store, digest: str, progress: Progress) -> list[JsonObject]:
+    """Return a row for the whole model, then one for each effect that is off while the rest is calibrated again. What
+    the store has is not computed again."""
     rows: list[JsonObject] = [{"off": "none", **summary(of.errors, of.judged)}]
     for number, effect in enumerate(of.plan.ablated):
         on = _zones(of.start)
         off = on.without(effect)
         parameter = {"saturation": "trials"}.get(effect, effect)
+        kept = store.get(digest, off=effect)
+        if kept is not None:
+            rows.append(kept)
+            continue
         if effect in GEOMETRY and off != on:
             lit = zone_captures(of.captures, of.start.sensor, off)
         elif parameter in FITTED:
@@ -169,6 +186,7 @@ def ablated(of: Prediction, progress: Progress) -> list[JsonObject]:
         expected = expected_of([lit[at] for at in of.judged], without)
         errors = compare(of.captures.counts[of.judged], expected, without.sensor.bin_width_s)
         rows.append({"off": effect, **summary(errors, np.arange(len(expected)))})
+        store.put(digest, rows[-1], off=effect)
     return rows
 
 
@@ -184,7 +202,7 @@ def chip_range(captures: PlaneCaptures) -> dict[str, list[float]]:
     return {"bias_mm": np.nanmean(error, axis=0).tolist(), "spread_mm": np.nanstd(error, axis=0).tolist()}
 
 
-def pose_rows(of: Prediction, model_error: float) -> list[dict[str, float]]:
+def pose_rows(of: Prediction, store: Store, digest: str, model_error: float) -> list[dict[str, float]]:
     """Return errors of distance and tilt of single captures held out, their standard errors, and half widths of 95 %
     intervals.
 
@@ -193,12 +211,18 @@ def pose_rows(of: Prediction, model_error: float) -> list[dict[str, float]]:
     """
 
     def found(at: int) -> tuple[Pose, np.ndarray]:
+        kept = store.get(digest, pose=int(at), model_error=model_error)
+        pose = search(at) if kept is None else Pose(*map(np.array, kept))
+        if kept is None:
+            store.put(digest, [part.tolist() for part in pose], pose=int(at), model_error=model_error)
+        return pose, pose.values - np.array([of.captures.distance_m[at], 0.0, 0.0, 1.0])
+
+    def search(at: int) -> Pose:
         counts = of.captures.counts[at].astype(np.float64)
         drift_s = float(of.captures.drift_bins[at]) * of.fitted.sensor.bin_width_s
         start_m = nearest_start(counts, of.captures.distance_m[of.used], of.expected[of.used])
         sensor, zones = of.fitted.sensor, of.fitted.zones
-        pose = find_pose(counts, sensor, zones, start_m, drift_s=drift_s, model_error=model_error)
-        return pose, pose.values - np.array([of.captures.distance_m[at], 0.0, 0.0, 1.0])
+        return find_pose(counts, sensor, zones, start_m, drift_s=drift_s, model_error=model_error)
 
     known = [found(at) for at in of.used[:: of.plan.pose_every]]
     model = model_covariance(np.array([error for _, error in known]), np.array([pose.covariance for pose, _ in known]))
