@@ -98,7 +98,7 @@ def limits(config: TrainConfig) -> tuple[str, ...]:
     reach, design = config.data.get("training_reach_m"), model.design
     long = design is not None and "temporal" in design.learned and design.block[0] > LONG_BLOCK
     if long and reach and not config.time_offset_m:
-        found.append(f"depths beyond those of its training set, {reach:g} m")
+        found.append(f"depths beyond those of its training set, {reach:g} m, or such as it rarely shows")
     if model.grid == "published":
         found.append("absolute depth: its labels are the published ones, for comparison with print")
     return tuple(found)
