@@ -275,11 +275,14 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
 def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[str]:
     """Name the group of each checkpoint: trainings of one design and recipe by different seeds are one group.
 
-    Recipes differ in preset or training sets. Where one design was trained by several, a group is named after its first
-    checkpoint, too.
+    Recipes differ in preset, training sets, steps, photon levels, random delays or the weight of coherence. Where one
+    design was trained by several, a group is named after its first checkpoint, too.
     """
-    recipes = [(c.model.name, c.preset, str(c.data.get("training_sha256"))) for c in configs]
-    several = {name for name, _, _ in recipes if len({one for one in recipes if one[0] == name}) > 1}
+    recipes = [
+        (c.model.name, c.preset, str(c.data.get("training_sha256")), c.steps, c.levels, c.time_offset_m, c.coherence)
+        for c in configs
+    ]
+    several = {name for name, *_ in recipes if len({one for one in recipes if one[0] == name}) > 1}
     firsts = dict(reversed([*zip(recipes, names, strict=True)]))
     return [f"{one[0]} ({firsts[one]})" if one[0] in several else one[0] for one in recipes]
 
