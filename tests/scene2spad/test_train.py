@@ -140,7 +140,7 @@ def test_trainings_by_other_recipes_are_groups_of_their_own():
     assert group_names([config, again], ["a", "b"]) == ["no compression, compact"] * 2
     named = group_names([config, again, other], ["a", "b", "c"])
     assert named == ["no compression, compact (a)"] * 2 + ["no compression, compact (c)"]
-    delayed = replace(config, time_offset_m=12.0)
+    delayed = replace(config, time_offset_m=12.0, window=0)
     assert group_names([config, delayed], ["a", "t12"]) == [
         "no compression, compact (a)",
         "no compression, compact (t12)",
