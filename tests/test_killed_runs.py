@@ -34,12 +34,23 @@ SMALLER_POWER = """
 from scene2spad.studies.power import front
 front.PHOTONS, front._EMULATED_PHOTONS, front._COARSE = (550.0,), 1_000, ("coarse-64",)
 """
-# One model of the smoke plan's two, on fewer pixels.
+# Fewer models, captures, effects and poses than the smoke plans have.
 SMALLER_TDC = """
 from dataclasses import replace
 from scene2spad.studies.tdc import plan, study
 small = replace(plan.SMOKE, models=plan.MODELS[1:2], tuned=(), on_chip=None, size=(12, 8))
 study.plan_of = lambda preset: small
+"""
+SMALLER_SIM_TO_REAL = """
+import numpy as np
+from dataclasses import replace
+from scene2spad.studies.sim_to_real import plan, pose, study
+whole = study.read_plane_captures
+study.read_plane_captures = lambda path: whole(path).chosen(np.arange(-18, 0))
+small = replace(plan.SMOKE, every=2, pose_every=6, shown_m=(0.35,), nearest_m=0.0)
+study.plan_of = lambda preset: small
+study.FITTED = ("delay", "background")
+study.SPANS, pose.ITERATIONS = ((0.1, 1.0),), 1
 """
 RENDER_ERROR = ("study", "render-error", "--width", "12", "--height", "8", "--views", "1")
 RUNS = {
@@ -56,6 +67,7 @@ RUNS = {
         command("study", "power", "--scene", "plane", "--width", "8", "--height", "8", *SMOKE, before=SMALLER_POWER)
     ),
     "tdc": Run(command("study", "tdc", *SMOKE, before=SMALLER_TDC), UNLIKE),
+    "sim-to-real": Run(command("study", "sim-to-real", *SMOKE, before=SMALLER_SIM_TO_REAL)),
 }
 RUNS |= {
     name: Run(command("study", name, *SMOKE), UNLIKE)
