@@ -34,7 +34,7 @@ SMALLER_POWER = """
 from scene2spad.studies.power import front
 front.PHOTONS, front._EMULATED_PHOTONS, front._COARSE = (550.0,), 1_000, ("coarse-64",)
 """
-# Fewer models, captures, effects and poses than the smoke plans have.
+# Fewer models, captures, effects, poses and studies than the smoke plans have.
 SMALLER_TDC = """
 from dataclasses import replace
 from scene2spad.studies.tdc import plan, study
@@ -52,6 +52,10 @@ study.plan_of = lambda preset: small
 study.FITTED = ("delay", "background")
 study.SPANS, pose.ITERATIONS = ((0.1, 1.0),), 1
 """
+SMALLER_ALL = """
+from scene2spad.studies import every
+every.STUDIES = ("memory", "codes", "fourier", "tensors")
+"""
 RENDER_ERROR = ("study", "render-error", "--width", "12", "--height", "8", "--views", "1")
 RUNS = {
     "dataset": Run(command("dataset", "hard-cases", *SET)),
@@ -68,6 +72,10 @@ RUNS = {
     ),
     "tdc": Run(command("study", "tdc", *SMOKE, before=SMALLER_TDC), UNLIKE),
     "sim-to-real": Run(command("study", "sim-to-real", *SMOKE, before=SMALLER_SIM_TO_REAL)),
+    "all": Run(
+        command("study", "all", "--width", "12", "--height", "8", *SMOKE, before=SMALLER_ALL),
+        (*UNLIKE, "study-all.jsonl"),
+    ),
 }
 RUNS |= {
     name: Run(command("study", name, *SMOKE), UNLIKE)

@@ -13,12 +13,12 @@ from scenes.errors import InputError
 from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 
-NETWORK = "learned-256x4x4-128x-mixed-s0"
+NETWORK = "learned-1024x2x2-128x-t12-mixed-s0"
 METHODS = {
     "argmax, all bins": "argmax",
     "log-matched, all bins": "log-matched",
     "Fourier, 128x": "fourier-8",
-    "learned 256x4x4, 128x": NETWORK,
+    "learned 1024x2x2, 128x": NETWORK,
 }
 ON_THE_CHIP = ("fourier-1024x1x1-128x-s0", "fourier-learned-256x2x2-128x-s0", NETWORK)
 
