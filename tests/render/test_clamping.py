@@ -91,7 +91,7 @@ def test_removed_energy_is_what_an_independent_reference_has_more():
 def test_stated_error_of_a_clamp_is_the_true_one():
     """The light that many clamped renders lack, squared after the pulse, against what they state in the mean.
 
-    Rare bright paths make single statements uneven: half of them lie below two thirds of the truth, a few at its double.
+    Rare bright paths make single statements uneven: half of them lie below two thirds of the truth.
     """
     count = 40
     runs, free = ([light(first + s, clamp, spp=64) for s in range(count)] for first, clamp in ((0, 0.5), (100, None)))
