@@ -1,11 +1,13 @@
-"""Saturation of many detectors that share one histogram: the exact first-photon law with a recovery that takes cycles.
+"""Saturation of a converter that many detectors share: the exact first-photon law, behind detectors that take cycles to
+recover.
 
-A zone sums detectors and laser cycles: `trials` pairs of the two. In a trial an armed detector counts its first photon
-and none after it. A detection also costs the detector `recovery` of its next cycles on average: floor(recovery), and
-one more by chance. Of all trials the share 1 / (1 + recovery q) is armed, q = 1 - exp(-flux per trial): renewal theory.
+A zone sums converters and laser cycles: `trials` pairs of the two. In a trial a converter times the first detection
+of its detectors and none after it. A detection, timed or not, also blinds its detector for r further cycles. Each of K
+detectors sees a K-th of the light, and of its cycles the share 1 / (1 + r q) is armed, q = 1 - exp(-flux / K): renewal
+theory. Of many detectors armed = 1 / (1 + recovery flux), recovery = r / K and the flux that of one trial: all light,
+background as well, is detected less by this factor, and then the first photon is taken.
 
-`compression` is no law but a description: a bin of n counts keeps n / (1 + compression n / trials). A TMF8820 near a
-plane loses more in its fullest bins than first photons explain.
+`compression` is no law but a description: a bin of n counts keeps n / (1 + compression n / trials).
 """
 
 from __future__ import annotations
@@ -18,44 +20,39 @@ PerZone = float | np.ndarray  # one number, or one of each zone (Z,)
 
 
 def armed_fraction(flux: np.ndarray, trials: np.ndarray, recovery: PerZone) -> np.ndarray:
-    """Return the share of trials that begin armed: flux (Z, T) detections a histogram -> (Z,)."""
-    return 1 / (1 - recovery * np.expm1(-flux.sum(axis=-1) / trials))
+    """Return the share of a zone's detectors that are armed: flux (Z, T) detections a histogram -> (Z,)."""
+    return 1 / (1 + recovery * flux.sum(axis=-1) / trials)
 
 
 def saturated(flux: np.ndarray, trials: np.ndarray, recovery: PerZone, compression: PerZone = 0.0) -> np.ndarray:
     """Return counts (Z, T) expected of a flux (Z, T) of primary detections; `trials` (Z,), infinite for none lost.
 
-    n_k = trials x armed x exp(-sum_(j<k) mu_j) (1 - exp(-mu_k)), mu the flux of one trial; then the compression.
+    n_k = trials x exp(-sum_(j<k) mu_j) (1 - exp(-mu_k)), mu = armed x flux / trials; then the compression.
     """
-    mu = flux / trials[:, None]
+    mu = flux * (armed_fraction(flux, trials, recovery) / trials)[:, None]
     before = np.cumsum(mu, axis=-1) - mu
-    armed = armed_fraction(flux, trials, recovery)[:, None]
     finite = np.isfinite(trials)[:, None]
     scale = np.where(finite, trials[:, None], 1.0)
-    first = np.where(finite, scale * armed * np.exp(-before) * -np.expm1(-mu), flux)
+    first = np.where(finite, scale * np.exp(-before) * -np.expm1(-mu), flux)
     return first / (1 + np.reshape(compression, (-1, 1)) * first / trials[:, None])
 
 
 def draw_saturated(
     flux: np.ndarray, trials: np.ndarray, recovery: PerZone, rng: np.random.Generator, compression: PerZone = 0.0
 ) -> np.ndarray:
-    """Draw counts (Z, T) int64 of one exposure.
+    """Draw counts (Z, T) int64 of one exposure: Poisson without saturation, with it the multinomial of all trials.
 
-    Without saturation Poisson. With it the number of detections is drawn from the renewal process in its central limit
-    (mean N a q, variance N a^3 q (1 - q), a the armed share), and their bins from the law's shares, exactly; what the
-    compression takes is thinned from the bins.
+    What the compression takes is thinned from the bins.
     """
     counts = np.empty(flux.shape, dtype=np.int64)
     expected = saturated(flux, trials, recovery)
-    armed = armed_fraction(flux, trials, recovery)
     for zone, mean in enumerate(expected):
         if not math.isfinite(trials[zone]):
             counts[zone] = rng.poisson(flux[zone])
             continue
-        q = -math.expm1(-flux[zone].sum() / trials[zone])
-        free = rng.binomial(max(1, round(trials[zone] * armed[zone])), q)
-        total = max(0, round(mean.sum() + (free - mean.sum()) * armed[zone]))
-        counts[zone] = rng.multinomial(total, mean / mean.sum()) if mean.sum() > 0 else 0
+        cycles = max(1, round(trials[zone]))
+        share = mean / trials[zone]
+        counts[zone] = rng.multinomial(cycles, np.append(share, max(0.0, 1 - share.sum())))[:-1]
     if not np.any(compression):
         return counts
     return rng.binomial(counts, 1 / (1 + np.reshape(compression, (-1, 1)) * expected / trials[:, None]))
@@ -65,15 +62,14 @@ def saturated_jacobian(
     flux: np.ndarray, jacobian: np.ndarray, trials: np.ndarray, recovery: PerZone, compression: PerZone = 0.0
 ) -> np.ndarray:
     """Apply the chain rule through `saturated` to a flux (Z, T) and its derivatives (Z, T, P)."""
-    mu, dmu = flux / trials[:, None], jacobian / trials[:, None, None]
-    after, dafter = np.cumsum(mu, axis=1), np.cumsum(dmu, axis=1)
-    before, dbefore = after - mu, dafter - dmu
     armed = armed_fraction(flux, trials, recovery)
+    mu = flux * (armed / trials)[:, None]
+    blinded = (recovery * armed**2 / trials)[:, None] * jacobian.sum(axis=1)  # of `armed`: (Z, P), falling
+    dmu = (armed[:, None, None] * jacobian - flux[..., None] * blinded[:, None]) / trials[:, None, None]
+    after, dafter = np.cumsum(mu, axis=1), np.cumsum(dmu, axis=1)
+    left, right = np.exp(mu - after)[..., None], np.exp(-after)[..., None]
+    finite = np.isfinite(trials)[:, None, None]
+    scale = np.where(finite, trials[:, None, None], 1.0)
+    slope = np.where(finite, scale * (right * dafter - left * (dafter - dmu)), jacobian)
     first = saturated(flux, trials, recovery)
-    finite = np.isfinite(trials)
-    scale = np.where(finite, trials, 1.0) * armed
-    left, right = np.exp(-before)[..., None], np.exp(-after)[..., None]
-    slope = scale[:, None, None] * (right * dafter - left * dbefore)
-    slope -= (recovery * armed * np.exp(-after[:, -1]))[:, None, None] * first[..., None] * dafter[:, -1:, :]
-    slope = np.where(finite[:, None, None], slope, jacobian)
     return slope / (1 + np.reshape(compression, (-1, 1)) * first / trials[:, None])[..., None] ** 2

@@ -91,6 +91,7 @@ ZONES = {
     "delay": Key("delay_s", "time", signed=True, many="must"),
     "skew": Key("skew_s", "time", many="must"),
     "clock": Key("clock", many="must"),
+    "chirp": Key("chirp_hz", "rate", signed=True),
     "background": Key("background", many="must"),
     "leak": Key("leak", many="must"),
     "echo": Key("echo_m2", "area", many="must"),

@@ -14,7 +14,7 @@ import numpy as np
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.saturation import saturated, saturated_jacobian
-from spad.zones.sensor import ZoneReturns, stray_returns, with_skew
+from spad.zones.sensor import ZoneReturns, chirped, stray_returns, with_skew
 
 FINE = 6  # steps of the pulse in a bin
 TAIL = 2  # the same in the tail
@@ -23,13 +23,15 @@ _STEPS = {
     "skew": 1e-4,
     "clock": 1e-6,
     "bin_width": 1e-6,
+    "chirp": 1e-6,
     "trials": 1e-5,
     "recovery": 1e-5,
     "compression": 1e-5,
     "leak": 1e-3,
     "echo": 1e-5,
 }
-LIGHT = ("delay", "skew", "clock", "bin_width", "leak", "echo")
+LIGHT = ("delay", "skew", "clock", "bin_width", "chirp", "leak", "echo")
+COMMON = ("bin_width", "chirp")  # numbers that all zones have in common
 SATURATION = ("trials", "recovery", "compression")
 
 
@@ -57,7 +59,7 @@ class PulseBasis(NamedTuple):
         return cls(first_bin * FINE, matrix)
 
 
-# By name: pulse (K,); bin_width and crosstalk (1,); all others (Z,), delay and skew in bins.
+# By name: pulse (K,); bin_width, chirp [per bin] and crosstalk (1,); all others (Z,), delay and skew in bins.
 Values = dict[str, np.ndarray]
 
 
@@ -102,12 +104,12 @@ class ZoneModel:
         step_s = values["bin_width"][0] / FINE
         scale = 1 / (SPEED_OF_LIGHT_M_PER_S * values["clock"][zone] * step_s)
         late = values["delay"][zone] * FINE + capture.drift_s / step_s
-        skew_m = values["skew"][zone] * FINE / scale
+        skew_m, chirp = values["skew"][zone] * FINE / scale, values["chirp"][0] / FINE
         stray = stray_returns(capture.returns[zone], values["leak"][zone], values["echo"][zone])
-        parts = [_masses(with_skew(capture.returns[zone], skew_m), scale, late)]
+        parts = [_masses(with_skew(capture.returns[zone], skew_m), scale, late, chirp)]
         for at in range(len(stray.light)):
             alone = ZoneReturns(*(column[at : at + 1] for column in stray))
-            parts.append(_masses(with_skew(alone, skew_m), scale, late))
+            parts.append(_masses(with_skew(alone, skew_m), scale, late, chirp))
         first = min(start for start, _ in parts)
         mass = np.zeros(max(start + len(part) for start, part in parts) - first)
         for start, part in parts:
@@ -140,7 +142,7 @@ class ZoneModel:
             if name == "gain":
                 slope[at, :, column] = own[at] / values["gain"][at]
             elif name in LIGHT:
-                for zone in range(self.zones) if name == "bin_width" else (at,):
+                for zone in range(self.zones) if name in COMMON else (at,):
                     slope[zone, :, column] = self._difference(values, capture, name, at, zone)
         crosstalk = values["crosstalk"][0]
         slope += crosstalk * slope.sum(axis=0)
@@ -162,11 +164,12 @@ class ZoneModel:
         return (self.own(up, capture, zone) - self.own(down, capture, zone)) / width
 
 
-def _masses(returns: ZoneReturns, scale: float, late: float) -> tuple[int, np.ndarray]:
+def _masses(returns: ZoneReturns, scale: float, late: float, chirp: float) -> tuple[int, np.ndarray]:
     """Return the light that a bin would catch, by its start: the first fine step, and masses; `scale` steps a metre."""
     near_m, far_m, light = returns
-    near = near_m * scale + late
-    length = np.maximum((far_m - near_m) * scale, 1e-6)
+    near, far = (chirped(path * scale, chirp) for path in (near_m, far_m))
+    length = np.maximum(far - near, 1e-6)
+    near = near + late
     first, last = math.floor(near.min()) - 1, math.ceil((near + length).max()) + 2
     after = np.arange(first - 1, last + 2)[:, None] - near
     area = (np.maximum(after, 0) ** 2 - np.maximum(after - length, 0) ** 2) @ (light / (2 * length))

@@ -15,8 +15,18 @@ _TOLERANCE = 1e-6
 _ACTIVE_SETS = 12
 _FLAT = 1e-6  # squared relative precision below which nothing is known of a number
 # The most that one step may change of what moves the light in time [bins], and relatively of clocks.
-_REACH = {"delay": 0.5, "skew": 0.5, "clock": 0.02}
+_REACH = {"delay": 0.5, "skew": 0.5, "clock": 0.02, "chirp": 1e-3}
 _REACH_RELATIVE = {"bin_width": 0.02, "trials": 1.0}
+# Sizes of what can be 0 at the start: a number at 0 of which the captures say much must be free to grow.
+_SCALE = {
+    "leak": 1e-3,
+    "echo": 1e-5,
+    "compression": 0.1,
+    "recovery": 0.1,
+    "crosstalk": 1e-3,
+    "skew": 0.01,
+    "chirp": 1e-4,
+}
 _POSITIVE = ("pulse", "gain", "background", "trials")
 _NOT_NEGATIVE = ("recovery", "compression", "crosstalk", "skew", "leak", "echo")
 
@@ -85,7 +95,7 @@ def _step_bounds(
     """
     low, high = np.full(len(names), -math.inf), np.full(len(names), math.inf)
     for column, (name, at) in enumerate(names):
-        value, size = values[name][at], float(np.abs(values[name]).max())
+        value, size = values[name][at], max(float(np.abs(values[name]).max()), _SCALE.get(name, 0.0))
         reach = _REACH.get(name, math.inf)
         if name in _REACH_RELATIVE:
             reach = _REACH_RELATIVE[name] * abs(value)

@@ -1,7 +1,8 @@
 """A multi-zone sensor: a few histograms, each of a field of view of several physical pixels, at close range.
 
 Every effect is one switch with a unit; with all off it is the identity sensor, which only sums each zone's light.
-Tangents are camera coordinates over depth: x right, y down. A histogram's time t is measured as t / clock + delay.
+Tangents are camera coordinates over depth: x right, y down. A time t is measured as t / clock + delay, and with
+a chirp that all converters share as u + chirp u^2 + delay, u = t / clock.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ EFFECTS = (
     "aperture",
     "illumination",
     "clock",
+    "chirp",
     "delay",
     "skew",
     "leak",
@@ -50,6 +52,9 @@ _OFF = {
 }
 
 
+_SIGNED = ("centre_x", "centre_y", "delay_s", "chirp_hz", "baseline_m", "illumination_x", "illumination_y")
+
+
 @dataclass(frozen=True)
 class ZoneArray:
     """Zones and the switches of what happens to their light.
@@ -59,13 +64,15 @@ class ZoneArray:
     delay_s       electronic delay of each zone's converter [s]; off 0
     skew_s        of the delays of a zone's detectors: half of them are late by half of it, half early; off 0
     clock         real seconds per second of each zone's converter; off 1
+    chirp_hz      of all converters' clock, which slows down or speeds up after the laser has fired: see above; off 0
     background    primary detections an exposure and bin of each zone, dark counts and ambient light; off 0
     leak          light that the module itself reflects at a path of 0, in units of a zone's light; off 0
     echo_m2       of light that goes from the scene to the module, and once more to the scene and back: at twice the
                   path, this over the squared distance of the light that came back first; off 0
     crosstalk     share of the sum of all zones' signal that every zone sees besides, light scattered in the lens; off 0
     trials        detectors times laser cycles of each zone, which saturate (`spad.detection.saturation`); off infinite
-    recovery      further cycles that a detection costs its detectors, one number a zone or one for all; off 0
+    recovery      further trials that a detection costs its detector, over the zone's detectors, one number a zone or
+                  one for all; off 0
     compression   of full bins, n / (1 + compression n / trials), the same; no law but a description; off 0
     illumination_x, illumination_y   direction in which the emitter is brightest [tangent]
     curvature_x, curvature_y         of the emitter's intensity exp(-(k_x u^2 + k_y v^2) / 2); off 0, uniform
@@ -81,6 +88,7 @@ class ZoneArray:
     delay_s: tuple[float, ...] = ()
     skew_s: tuple[float, ...] = ()
     clock: tuple[float, ...] = ()
+    chirp_hz: float = 0.0
     background: tuple[float, ...] = ()
     leak: tuple[float, ...] = ()
     echo_m2: tuple[float, ...] = ()
@@ -113,7 +121,7 @@ class ZoneArray:
             good = all(math.isfinite(value) or spec.name == "trials" for value in values)
             require(good, f"zones: {spec.name} is not finite")
             positive = spec.name in ("width", "height", "clock", "trials")
-            free = spec.name in ("centre_x", "centre_y", "delay_s", "baseline_m", "illumination_x", "illumination_y")
+            free = spec.name in _SIGNED
             low = min(values)
             good = free or (low > 0 if positive else low >= 0)
             require(good, f"zones: {spec.name} {low:g} is below 0" + (" or 0" if positive else ""))
@@ -136,6 +144,7 @@ class ZoneArray:
             "aperture": {"aperture_m": 0.0},
             "illumination": {"curvature_x": 0.0, "curvature_y": 0.0},
             "clock": {"clock": (float(np.mean(self.clock)),) * even},
+            "chirp": {"chirp_hz": 0.0},
             "delay": {"delay_s": (float(np.mean(self.delay_s)),) * even},
             "skew": {"skew_s": (0.0,) * even},
             "leak": {"leak": (0.0,) * even},
@@ -223,6 +232,11 @@ def _ramp(at: np.ndarray, blur: np.ndarray) -> np.ndarray:
     return np.where(np.abs(at) < half, (at + half) ** 2 / (4 * half), np.maximum(at, 0.0))
 
 
+def chirped(time: np.ndarray, chirp: float) -> np.ndarray:
+    """Return times as a clock measures them whose rate changes by 2 `chirp` a unit of time."""
+    return time * (1 + chirp * time)
+
+
 def with_skew(returns: ZoneReturns, skew_m: float) -> ZoneReturns:
     """Split returns into halves, half of `skew_m` [m of path] before and behind."""
     if not skew_m:
@@ -266,8 +280,9 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
         every = zip(seen, stray_returns(seen, zones.leak[zone], zones.echo_m2[zone]), strict=True)
         all_light = ZoneReturns(*(np.concatenate(pair) for pair in every))
         near_m, far_m, light = with_skew(all_light, zones.skew_s[zone] / scale)
-        start = torch.from_numpy(near_m * scale + zones.delay_s[zone] + drift_s)[:, None]
-        length = torch.from_numpy((far_m - near_m) * scale)[:, None]
+        near_s, far_s = (chirped(path * scale, zones.chirp_hz) for path in (near_m, far_m))
+        start = torch.from_numpy(near_s + zones.delay_s[zone] + drift_s)[:, None]
+        length = torch.from_numpy(far_s - near_s)[:, None]
         arrived = interval_cdf(sensor.response, edges - start, length.expand(-1, len(edges)))
         own[zone] = np.diff(torch.from_numpy(light) @ arrived) * zones.gain[zone]
     own = np.maximum(own, 0.0)

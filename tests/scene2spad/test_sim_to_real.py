@@ -111,7 +111,7 @@ def test_the_study_runs_at_toy_size(tmp_path, capfd):
     told = json.loads(capfd.readouterr().out.splitlines()[-1])
     near = [span for span in told["prediction"] if span["from_m"] == 0.2]
     assert near[0]["captures"] > 10 and max(near[0]["shape_median"]) < 0.2
-    assert [row["off"] for row in told["ablation"]] == ["none", "background"]
+    assert [row["effect"] for row in told["ablation"]] == ["none", "without background"]
     assert told["ablation"][1]["deviance"] > told["ablation"][0]["deviance"]
     assert told["pose"]["distance_mm"]["median_error"] < 5
     assert load_sensor(told["sensor"]).zones.count == 9

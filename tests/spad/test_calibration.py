@@ -17,9 +17,12 @@ from spad.zones.sensor import ZoneArray, ZoneReturns, expected_zone_counts, zone
 
 ZONES = ZoneArray((-0.2, 0.0, 0.2), (0.0, 0.0, 0.0), (0.1,) * 3, (0.1,) * 3)
 SENSOR = Sensor(name="s", bins=40, bin_width_s=1e-10, pulse=Pulse(1e-10))
-FREE = ("pulse", "gain", "delay", "skew", "clock", "bin_width", "background", "leak", "echo", "trials", "recovery")
+FREE = (
+    "pulse", "gain", "delay", "skew", "clock", "bin_width", "chirp", "background", "leak", "echo", "trials", "recovery",
+)  # fmt: skip
 NATURAL = (
-    "gain", "delay_s", "skew_s", "clock", "bin_width_s", "background", "leak", "echo_m2", "trials", "recovery",
+    "gain", "delay_s", "skew_s", "clock", "bin_width_s", "chirp_hz", "background", "leak", "echo_m2", "trials",
+    "recovery",
 )  # fmt: skip
 
 
@@ -44,6 +47,7 @@ def truth() -> tuple[ZoneModel, dict[str, np.ndarray]]:
         "skew": np.array([0.9, 0.0, 1.3]),
         "clock": np.array([1.01, 1.0, 0.99]),
         "bin_width": 1e-10 * one,
+        "chirp": -6e-4 * one,
         "background": np.array([600.0, 800.0, 500.0]),
         "leak": np.array([0.2, 0.1, 0.3]),
         "echo": np.array([1e-4, 2e-4, 0.5e-4]),
@@ -155,3 +159,13 @@ def test_a_fit_with_numbers_at_their_bounds_reaches_the_optimum():
         sum(poisson_deviance(one.counts, model.expected(at, one)) for one in shown) for at in (found, values)
     )
     assert deviance < best
+
+
+def test_what_starts_at_0_is_fitted_where_the_captures_show_it():
+    """Leaks and echoes start at 0, where a size that is relative to their own says nothing of them."""
+    model, values = truth()
+    shown = captures(model, values, 8, 5)
+    start = {**values, "leak": np.zeros(3), "echo": np.zeros(3)}
+    found, _, _ = fit(model, shown, start, FREE, steps=12)
+    assert found["leak"] == pytest.approx(values["leak"], rel=0.3)
+    assert found["echo"] == pytest.approx(values["echo"], rel=0.3)

@@ -62,6 +62,7 @@ ZONES = ZoneArray(
     gain=(1e9 / 7, 2.0),
     delay_s=(-1e-9 / 3, 1.2e-9),
     clock=(1.01, 1 / 1.01),
+    chirp_hz=-5.4e6 / 7,
     background=(190.0, 0.0),
     crosstalk=1e-3,
     trials=(5e6, 4e6),

@@ -8,7 +8,7 @@ from pathlib import Path
 from scene2spad.options.common import Common, Positional
 from scenes.progress import Progress
 
-FITTED = ("delay", "skew", "clock", "bin_width", "background", "leak", "echo", "trials", "recovery", "compression")
+FITTED = ("delay", "skew", "clock", "bin_width", "chirp", "background", "leak", "echo", "trials", "recovery")
 
 
 @dataclass(frozen=True, kw_only=True)

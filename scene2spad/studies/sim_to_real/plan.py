@@ -8,7 +8,9 @@ from spad.zones.sensor import EFFECTS
 
 SENSOR = "tmf8820"
 # What is calibrated. Crosstalk is not: a plane that fills all zones hardly tells it from the zones' own light.
-FITTED = ("delay", "skew", "clock", "bin_width", "background", "leak", "echo", "trials", "recovery", "compression")
+FITTED = ("delay", "skew", "clock", "bin_width", "chirp", "background", "leak", "echo", "trials", "recovery")
+# A description without a law, off: what it would buy stands in the table of effects.
+TRIED = ("compression",)
 # Effects of the light's geometry: the plane is rendered again without them.
 GEOMETRY = ("parallax", "aperture", "illumination")
 FULL_BIN = 10_000  # counts from which on a bin's misfit is the model's, not the photons'
@@ -21,7 +23,8 @@ class Plan:
 
     nearest_m   captures nearer than this are predicted, but not calibrated on
     every       of the captures from there on, each that many-th is calibrated on; the others are held out
-    ablated     effects that are switched off in turn
+    ablated     effects that are switched off, or on, in turn
+    folds       of the captures calibrated on: each effect is judged on folds that its calibration did not see
     pose_every  of the captures of either half, each that many-th gives a pose
     shown_m     distances of the first figure
     """
@@ -29,6 +32,7 @@ class Plan:
     nearest_m: float = 0.1
     every: int = 2
     ablated: tuple[str, ...] = EFFECTS
+    folds: int = 2
     pose_every: int = 2
     shown_m: tuple[float, ...] = (0.105, 0.2, 0.3825)
 

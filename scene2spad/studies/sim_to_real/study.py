@@ -1,7 +1,8 @@
 """`study sim-to-real`: calibrate a chip on half of its captures of a plane, and predict the others with the renderer.
 
-Then every effect of the sensor is switched off in turn and the rest calibrated again: what likelihood and which error
-it buys. Last, distance and tilt of the plane are found from single captures, and compared with the arm's.
+Every effect of the sensor is switched off in turn and the rest calibrated again: what likelihood and which error it
+buys, by cross-validation within the half calibrated on. Last, distance and tilt of the plane are found from single
+captures, and compared with the arm's.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import binomtest
 
 from scene2spad.datasets.zone_captures import (
     PlaneCaptures,
@@ -25,7 +27,7 @@ from scene2spad.options.experiments import Study
 from scene2spad.studies.results import Store
 from scene2spad.studies.sim_to_real import figures
 from scene2spad.studies.sim_to_real.measures import Comparison, compare, summary
-from scene2spad.studies.sim_to_real.plan import FITTED, GEOMETRY, MODEL_ERROR, SENSOR, Plan, plan_of
+from scene2spad.studies.sim_to_real.plan import FITTED, GEOMETRY, MODEL_ERROR, SENSOR, TRIED, Plan, plan_of
 from scene2spad.studies.sim_to_real.pose import Pose, find_pose, model_covariance, nearest_start
 from scenes.files import finite, whole_file, write_csv
 from scenes.json_types import JsonObject
@@ -162,38 +164,51 @@ def digest_of(of: Prediction) -> str:
 
 
 def ablated(of: Prediction, store: Store, digest: str, progress: Progress) -> list[JsonObject]:
-    """Return a row for the whole model, then one for each effect that is off while the rest is calibrated again. What
-    the store has is not computed again."""
-    rows: list[JsonObject] = [{"off": "none", **summary(of.errors, of.judged)}]
-    for number, effect in enumerate(of.plan.ablated):
-        on = _zones(of.start)
-        off = on.without(effect)
+    """Return a row for the whole model, then one for each effect that is off, or of TRIED on, while the rest is
+    calibrated again. What the store has is not computed again.
+
+    All by cross-validation within the captures calibrated on: those held out have no say in what the model holds.
+    """
+    zones = _zones(of.start)
+    rows: list[JsonObject] = []
+    for number, effect in enumerate(("none", *of.plan.ablated)):
+        off, lit = zones if effect in ("none", *TRIED) else zones.without(effect), of.lit
         parameter = {"saturation": "trials"}.get(effect, effect)
-        kept = store.get(digest, off=effect)
-        if kept is not None:
-            rows.append(kept)
-            continue
-        if effect in GEOMETRY and off != on:
+        name, free = f"without {effect}", tuple(one for one in FITTED if one not in _gone_with(parameter))
+        if effect == "none":
+            name = effect
+        elif effect in TRIED:
+            name, free = f"with {effect}", (*FITTED, effect)
+        elif effect in GEOMETRY and off != zones:
             lit = zone_captures(of.captures, of.start.sensor, off)
-        elif parameter in FITTED:
-            lit = of.lit
-        else:
+        elif parameter not in FITTED:
             continue  # off in the preset
-        progress(f"without {effect}", 0.3 + 0.5 * number / len(of.plan.ablated))
-        free = tuple(name for name in FITTED if name not in _gone_with(parameter))
-        used = [lit[at] for at in of.used]
-        without = calibrate(used, of.start.sensor, off, free=free, model_error=MODEL_ERROR, start=of.fitted)
-        expected = expected_of([lit[at] for at in of.judged], without)
-        errors = compare(of.captures.counts[of.judged], expected, without.sensor.bin_width_s)
-        rows.append({"off": effect, **summary(errors, np.arange(len(expected)))})
-        store.put(digest, rows[-1], off=effect)
+        kept = store.get(digest, off=effect)
+        if kept is None:
+            progress(name, 0.3 + 0.5 * number / (1 + len(of.plan.ablated)))
+            kept = {"effect": name, **cross_validated(of, lit, off, free)}
+            store.put(digest, kept, off=effect)
+        rows.append(kept)
     return rows
 
 
+def cross_validated(
+    of: Prediction, lit: Sequence[ZoneCapture], zones: ZoneArray, free: tuple[str, ...]
+) -> dict[str, list[float] | float]:
+    """Summarise the errors of the captures calibrated on, each predicted by the folds that it is not in."""
+    expected, width = np.zeros(of.captures.counts[of.used].shape), 0.0
+    for fold in range(of.plan.folds):
+        out = np.arange(len(of.used)) % of.plan.folds == fold
+        seen = [lit[at] for at in of.used[~out]]
+        fitted = calibrate(seen, of.start.sensor, zones, free=free, model_error=MODEL_ERROR, start=of.fitted)
+        expected[out] = expected_of([lit[at] for at in of.used[out]], fitted)
+        width += fitted.sensor.bin_width_s / of.plan.folds
+    return summary(compare(of.captures.counts[of.used], expected, width), np.arange(len(expected)))
+
+
 def _gone_with(parameter: str) -> tuple[str, ...]:
-    """Return the parameters that are off together with `parameter`: nothing recovers or is compressed where nothing
-    saturates."""
-    return ("trials", "recovery", "compression") if parameter == "trials" else (parameter,)
+    """Return the parameters that are off together with `parameter`: nothing recovers where nothing saturates."""
+    return ("trials", "recovery") if parameter == "trials" else (parameter,)
 
 
 def chip_range(captures: PlaneCaptures) -> dict[str, list[float]]:
@@ -254,9 +269,16 @@ def pose_summary(rows: Sequence[dict[str, float]]) -> JsonObject:
             "median_photon_sigma": float(np.median(photons)),
             "median_sigma": float(np.median(sigma)),
             "covered": float((np.abs(error) < half).mean()),
+            "covered_interval": binomial_interval(int((np.abs(error) < half).sum()), len(rows)),
             "covered_by_photons_alone": float((np.abs(error) < 1.96 * photons).mean()),
         }
     return found
+
+
+def binomial_interval(held: int, number: int) -> list[float]:
+    """Return the exact 95 % interval of a share, `held` of `number` (Clopper and Pearson, 1934)."""
+    found = binomtest(held, number).proportion_ci(0.95, "exact")
+    return [float(found.low), float(found.high)]
 
 
 def draw_all(of: Prediction, poses: Sequence[dict[str, float]], out: Path) -> list[Path]:
@@ -298,7 +320,7 @@ def in_words(numbers: JsonObject) -> dict[str, list[str]]:
         if s["from_m"] >= 0.05
     ]
     without = [
-        f"without {row['off']}: deviance {row['deviance']:.1f} a bin, shape {max(row['shape_median']):.3f}, amplitude "
+        f"{row['effect']}: deviance {row['deviance']:.1f} a bin, shape {max(row['shape_median']):.3f}, amplitude "
         f"{max(row['amplitude_worst']):.1%}, range bias {max(map(abs, row['range_bias_mm'])):.2f} mm"
         for row in numbers["ablation"]
     ]
