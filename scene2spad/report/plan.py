@@ -310,12 +310,13 @@ _BEYOND = Section(
                 Picture("sim-to-real-histograms.png", "Measured and predicted histograms of nine zones"),
                 Picture("sim-to-real-errors.png", "Errors of shape, amplitude and range against distance"),
                 Picture("sim-to-real-pose.png", "Errors of the plane's distance and tilt from single captures"),
+                Picture("sim-to-real-pile-up.png", "Measured pulses at low and high flux, and the law of pile-up"),
             ),
             (
                 Table("sim-to-real.csv", "Errors of the prediction by distance"),
                 Table("sim-to-real-ablation.csv", "What each effect buys: it is off, the rest calibrated again"),
             ),
-            ("sim-to-real-pose.csv",),
+            ("sim-to-real-pose.csv", "sim-to-real-pile-up.csv"),
         ),
         Item(
             "render-error",

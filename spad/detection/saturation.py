@@ -51,8 +51,8 @@ def draw_saturated(
             counts[zone] = rng.poisson(flux[zone])
             continue
         cycles = max(1, round(trials[zone]))
-        share = mean / trials[zone]
-        counts[zone] = rng.multinomial(cycles, np.append(share, max(0.0, 1 - share.sum())))[:-1]
+        masses = mean / trials[zone]
+        counts[zone] = rng.multinomial(cycles, np.append(masses, max(0.0, 1 - masses.sum())))[:-1]
     if not np.any(compression):
         return counts
     return rng.binomial(counts, 1 / (1 + np.reshape(compression, (-1, 1)) * expected / trials[:, None]))

@@ -115,4 +115,4 @@ def test_the_study_runs_at_toy_size(tmp_path, capfd):
     assert told["ablation"][1]["deviance"] > told["ablation"][0]["deviance"]
     assert told["pose"]["distance_mm"]["median_error"] < 5
     assert load_sensor(told["sensor"]).zones.count == 9
-    assert all((tmp_path / f"sim-to-real-{name}.png").is_file() for name in ("histograms", "errors", "pose"))
+    assert all((tmp_path / f"sim-to-real-{name}.png").is_file() for name in ("histograms", "errors", "pose", "pile-up"))

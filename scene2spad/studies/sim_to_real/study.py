@@ -27,6 +27,7 @@ from scene2spad.options.experiments import Study
 from scene2spad.studies.results import Store
 from scene2spad.studies.sim_to_real import figures
 from scene2spad.studies.sim_to_real.measures import Comparison, compare, summary
+from scene2spad.studies.sim_to_real.pile_up import HIGH, best_of, draw_pile_up, pile_up_rows
 from scene2spad.studies.sim_to_real.plan import FITTED, GEOMETRY, MODEL_ERROR, SENSOR, TRIED, Plan, plan_of
 from scene2spad.studies.sim_to_real.pose import Pose, find_pose, model_covariance, nearest_start
 from scenes.files import finite, whole_file, write_csv
@@ -87,6 +88,7 @@ def run(command: Study, progress: Progress) -> dict:
     # a pose weighs with the model's error as the captures calibrated on show it
     model_error = summary(of.errors, of.used)["model_error"]
     poses = pose_rows(of, store, digest, model_error)
+    pile_up = pile_up_rows()
     numbers: JsonObject = {
         "preset": command.preset,
         "captures": {"calibrated_on": len(of.used), "held_out": int(of.held.sum())},
@@ -94,11 +96,13 @@ def run(command: Study, progress: Progress) -> dict:
         "chip": chip_range(within(of.captures, of.plan.nearest_m)),
         "ablation": ablation,
         "pose": {**pose_summary(poses), "model_error": model_error},
+        "pile_up": best_of(pile_up),
         "standard_errors": {name: np.asarray(error).tolist() for name, error in of.fitted.errors.items()},
     }
     made = [
         write_csv(_flat(ablation), command.out / "sim-to-real-ablation.csv"),
         write_csv(poses, command.out / "sim-to-real-pose.csv"),
+        write_csv(pile_up, command.out / "sim-to-real-pile-up.csv"),
         write_csv(_flat(spans), command.out / "sim-to-real.csv"),
     ]
     path = command.out / "sim-to-real.json"
@@ -293,6 +297,7 @@ def draw_all(of: Prediction, poses: Sequence[dict[str, float]], out: Path) -> li
         ),
         figures.draw_errors(distance_m, of.held, of.errors, out / "sim-to-real-errors.png"),
         figures.draw_poses(poses, out / "sim-to-real-pose.png"),
+        draw_pile_up(out / "sim-to-real-pile-up.png"),
     ]
 
 
@@ -329,4 +334,5 @@ def in_words(numbers: JsonObject) -> dict[str, list[str]]:
         f"({of['covered_by_photons_alone']:.0%} of those by photons alone)"
         for name, of in ((name, numbers["pose"][name]) for name in ("distance_mm", "about_y_deg", "about_x_deg"))
     ]
-    return {"prediction": spans, "ablation": without, "pose": pose}
+    laws = [f"{of['from']} to {HIGH}, {of['law']} {of['number']:g}: {of['nrmse']:.3f}" for of in numbers["pile_up"]]
+    return {"prediction": spans, "ablation": without, "pose": pose, "nRMSE of pulses": laws}
