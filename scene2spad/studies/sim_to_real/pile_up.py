@@ -61,7 +61,7 @@ def second_lobe(pulse: np.ndarray) -> float:
 
 
 def pile_up_rows() -> list[Row]:
-    """Misfit of the measured pulse at high flux, a row a pulse at low flux and a law's number."""
+    """Return the misfit of the measured pulse at high flux, a row a pulse at low flux and a law's number."""
     pulses = measured_pulses()
     rows: list[Row] = []
     for name in LOW:
@@ -88,7 +88,7 @@ def best_of(rows: Sequence[Row]) -> list[Row]:
 
 
 def draw_pile_up(path: Path) -> Path:
-    """Measured pulses, and what the first-photon law makes of the one at low flux."""
+    """Draw the measured pulses, and what the first-photon law makes of the one at low flux."""
     pulses = measured_pulses()
     time = (np.arange(BEFORE + AFTER) - BEFORE) * STEP_PS / 1e3
     figure, panel = plt.subplots(figsize=(8, 4), layout="constrained")
