@@ -53,6 +53,7 @@ def fit(
     over = np.maximum(start["pulse"], 1e-6 * start["pulse"].max())
     rough = np.diff(np.eye(len(over)), 2, axis=0) / over * math.sqrt(smoothing)
     information = np.zeros((len(names), len(names)))
+    detected = np.max([capture.counts.sum(axis=1) for capture in captures], axis=0)
     for _ in range(steps):
         information[:], gradient, weights = 0, np.zeros(len(names)), []
         for capture in captures:
@@ -64,7 +65,8 @@ def fit(
             gradient += weighted.T @ (capture.counts - expected).ravel()
         information[np.ix_(pulse, pulse)] += rough.T @ rough
         gradient[pulse] -= rough.T @ (rough @ values["pulse"])
-        direction = _bounded_step(information, gradient, *_step_bounds(values, names, np.diag(information)))
+        bounds = _step_bounds(values, names, np.diag(information), detected)
+        direction = _bounded_step(information, gradient, *bounds)
 
         def squares(at: Values, weights: list[np.ndarray] = weights) -> float:
             total = float(((rough @ at["pulse"]) ** 2).sum())
@@ -86,10 +88,10 @@ def fit(
 
 
 def _step_bounds(
-    values: Values, names: Sequence[tuple[str, int]], curvature: np.ndarray
+    values: Values, names: Sequence[tuple[str, int]], curvature: np.ndarray, detected: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute how far each parameter may fall and rise in a step, (P,): within the linearisation, and what is positive
-    stays so.
+    stays so. No zone has fewer trials than detections, `detected` (Z,).
 
     What the captures say nothing about, as a skew of 0 whose derivative is 0, stays where it is.
     """
@@ -102,6 +104,8 @@ def _step_bounds(
         if curvature[column] * size * size < _FLAT:
             reach = 0.0
         room = 0.95 * value if name in _POSITIVE else value if name in _NOT_NEGATIVE else math.inf
+        if name == "trials":
+            room = max(0.0, value - 1.02 * detected[at])
         low[column], high[column] = -min(reach, room), reach
     return low, high
 
