@@ -104,7 +104,8 @@ def standard_errors(
         moved = {key: value.copy() for key, value in values.items()}
         moved[name][at] += step
         for key, value in natural(model, moved).items():
-            slopes[key][:, column] = (value - centre[key]) / step
+            known = np.isfinite(centre[key])  # trials of a zone that does not saturate stay infinite
+            slopes[key][known, column] = (value[known] - centre[key][known]) / step
     return {key: np.sqrt(np.einsum("ij,jk,ik->i", slope, covariance, slope)) for key, slope in slopes.items()}
 
 

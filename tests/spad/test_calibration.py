@@ -121,6 +121,15 @@ def test_a_calibration_of_simulated_captures_is_near_the_truth():
     assert min(repeated(6).values()) > 0.6
 
 
+def test_zones_that_do_not_saturate_have_finite_standard_errors():
+    model, values = truth()
+    values |= {"trials": np.full(3, np.inf), "recovery": np.zeros(3)}
+    names = [(name, at) for name in ("gain", "background") for at in range(3)]
+    with np.errstate(invalid="raise"):
+        errors = standard_errors(model, values, np.eye(len(names)), names)
+    assert all(np.isfinite(error).all() for error in errors.values()) and (errors["trials"] == 0).all()
+
+
 @pytest.mark.slow
 def test_standard_errors_cover_the_truth():
     """200 repetitions. Saturation spreads counts a little less than Poisson does: intervals cover a little more."""
