@@ -11,12 +11,11 @@ import math
 import numpy as np
 
 from render.transient import Transient
-from spad.detection.photons import PixelFlux, light_of
+from spad.detection.photons import light_of, quadrature_points
 from spad.detection.rates import rates_for
 from spad.sensor.model import PhotonBudget, Sensor
 
 WINDOW_SIGMAS = 6.0
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 def quadrature_in_pixel(
@@ -31,7 +30,7 @@ def quadrature_in_pixel(
     if rates.converter is not None and sensor.code_edges is not None:
         edges = sensor.code_edges[rates.converter.reshape(-1)[pixel]]
     width, pulse = sensor.bin_width_s, sensor.response
-    arrival, energy = _points(light, pulse.std_s / width)
+    arrival, energy = quadrature_points(light.start, light.length, light.signal, sensor)
     # an edge may lie some bins from where it is meant to be
     reach = math.ceil(float(np.abs(edges - np.arange(period + 1)).max())) + 1
     before, after = (math.ceil(part / width) + reach for part in pulse.window_s(WINDOW_SIGMAS))
@@ -40,14 +39,3 @@ def quadrature_in_pixel(
     mass = pulse.bin_masses((at - arrival[:, None]) * width) * energy[:, None]
     signal = np.bincount((number[:, :-1] % period).ravel(), mass.ravel(), minlength=period)
     return (signal + light.background[0] / period * np.diff(edges))[: sensor.bins]
-
-
-def _points(light: PixelFlux, panel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return places [bins] and shares of the signal that stand for returns, in panels no longer than `panel`."""
-    count = np.maximum(np.ceil(light.length / panel).astype(int), 1)
-    step = np.repeat(light.length / count, count)
-    nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    middle = np.repeat(light.start, count) + (nth + 0.5) * step
-    arrival = middle[:, None] + step[:, None] / 2 * _NODES
-    energy = np.repeat(light.signal / count, count)[:, None] * _WEIGHTS / 2
-    return arrival.ravel(), np.broadcast_to(energy, arrival.shape).ravel()

@@ -17,6 +17,7 @@ from spad.detection.rates import Rates
 from spad.sensor.model import Sensor
 
 GATED_PIXELS = 1024  # whose rates are held at once
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 class PixelFlux(NamedTuple):
@@ -125,7 +126,7 @@ def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: P
     wrapped."""
     shape = (transient.height, transient.width)
     if sensor.bins == sensor.bins_per_period:
-        return light.signal_per_pixel().reshape(shape), _wrapped(light, sensor)
+        return light.signal_per_pixel().reshape(shape), late_signal(light, sensor)
     from spad.detection.flux import expected_counts
 
     inside = np.empty(light.pixels)
@@ -133,19 +134,30 @@ def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: P
         pixels = slice(first, min(first + GATED_PIXELS, light.pixels))
         steady = light.background[pixels] * (sensor.bins / sensor.bins_per_period)
         inside[pixels] = expected_counts(transient, sensor, rates, pixels)[0].sum(dim=1).numpy() - steady
-    return np.clip(inside, 0, None).reshape(shape), _wrapped(light, sensor)
+    return np.clip(inside, 0, None).reshape(shape), late_signal(light, sensor)
 
 
-def _wrapped(light: PixelFlux, sensor: Sensor) -> float:
+def late_signal(light: PixelFlux, sensor: Sensor) -> float:
     """Compute the expected signal that arrives later than one period after the laser's emission."""
     period, width = sensor.bins_per_period, sensor.bin_width_s
     late = light.start + light.length + sensor.response.window_s(8.5)[1] / width > period
     if not late.any():
         return 0.0
-    import torch  # takes a second: here, where light wraps
+    arrival, energy = quadrature_points(light.start[late], light.length[late], light.signal[late], sensor)
+    left_s = (period - arrival) * width  # of the period, from the pulse's arrival on
+    end_s = np.maximum(left_s, sensor.response.window_s(8.5)[1])
+    return float(energy @ sensor.response.bin_masses(np.stack((left_s, end_s), axis=1))[:, 0])
 
-    from spad.detection.flux import interval_cdf
 
-    start, length = (torch.from_numpy(column[late] * width) for column in (light.start, light.length))
-    arrived = interval_cdf(sensor.response, sensor.period_s - start, length).numpy()
-    return float(light.signal[late] @ (1 - arrived))
+def quadrature_points(
+    start: np.ndarray, length: np.ndarray, signal: np.ndarray, sensor: Sensor
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return places [bins] and parts of the signal that stand for returns of a length, all (N,): Gauss-Legendre
+    quadrature over panels no longer than the pulse is wide."""
+    count = np.maximum(np.ceil(length * sensor.bin_width_s / sensor.response.std_s).astype(int), 1)
+    step = np.repeat(length / count, count)
+    nth = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    middle = np.repeat(start, count) + (nth + 0.5) * step
+    arrival = middle[:, None] + step[:, None] / 2 * _NODES
+    energy = np.repeat(signal / count, count)[:, None] * _WEIGHTS / 2
+    return arrival.ravel(), np.broadcast_to(energy, arrival.shape).ravel()

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from test_flux import transient_of
 
 from spad.detection.detect import expected_in_pixel
+from spad.detection.flux import interval_cdf
 from spad.detection.one_pixel import quadrature_in_pixel
+from spad.detection.photons import PixelFlux, late_signal
 from spad.sensor.files import load_sensor
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 
@@ -30,3 +33,20 @@ def test_quadrature_is_the_closed_form(name):
         exact = expected_in_pixel(transient, sensor, budget, 0, column, seed=3)
         found = quadrature_in_pixel(transient, sensor, budget, 0, column, seed=3)
         assert found.shape == exact.shape and np.abs(found - exact).max() < tolerance * exact.max(), name
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_light_after_the_period_is_the_closed_forms(name):
+    """Returns about the end of the period, before and behind it, points and long ones."""
+    sensor, tolerance = SENSORS[name]
+    random, count = np.random.default_rng(2), 400
+    width, period = sensor.bin_width_s, sensor.bins_per_period
+    start = period + random.normal(0, 3 * sensor.response.std_s / width, count)
+    length = np.where(random.random(count) < 0.3, 0.0, random.exponential(20, count))
+    signal = random.exponential(1, count)
+    start[:3], length[:3] = (3.0, period + 500.0, period - 400.0), (0.0, 0.0, 800.0)
+    light = PixelFlux(np.zeros(count, np.int32), start, length, signal, np.zeros(1))
+    arrived = interval_cdf(
+        sensor.response, torch.from_numpy(sensor.period_s - start * width), torch.from_numpy(length * width)
+    ).numpy()
+    assert late_signal(light, sensor) == pytest.approx(float(signal @ (1 - arrived)), rel=max(tolerance, 1e-6))
