@@ -22,7 +22,7 @@ from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse
 from spad.sensor.quantities import format_quantity, parse_quantity
 from spad.sensor.tdc import Tdc
 from spad.sensor.toml import format_toml, read_toml
-from spad.zones.sensor import ZoneArray
+from spad.zones.sensor import ZoneArray, check_chirp
 
 SCHEMA = "1.0"
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
@@ -134,6 +134,10 @@ class SensorFile:
     zones: ZoneArray | None = None
     description: str = ""
     sources: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.zones is not None:
+            check_chirp(self.sensor, self.zones)
 
 
 def preset_files() -> dict[str, Path]:

@@ -233,8 +233,18 @@ def _ramp(at: np.ndarray, blur: np.ndarray) -> np.ndarray:
 
 
 def chirped(time: np.ndarray, chirp: float) -> np.ndarray:
-    """Return times as a clock measures them whose rate changes by 2 `chirp` a unit of time."""
+    """Return times as a clock measures them whose rate changes by 2 `chirp` a unit of time; a clock that slows down
+    stands still in the end, and does not run back."""
+    if chirp < 0:
+        time = np.minimum(time, -0.5 / chirp)
     return time * (1 + chirp * time)
+
+
+def check_chirp(sensor: Sensor, zones: ZoneArray) -> None:
+    """Raise InputError for a clock whose rate changes by more than a half within the histogram: nobody means that."""
+    most = 0.25 / (sensor.bins * sensor.bin_width_s)
+    message = f"zones: chirp {zones.chirp_hz:g} Hz, at most {most:.3g} Hz lets a clock of {sensor.bins} bins "
+    require(abs(zones.chirp_hz) <= most, f"{message}of {sensor.bin_width_s * 1e12:.4g} ps keep half of its rate")
 
 
 def with_skew(returns: ZoneReturns, skew_m: float) -> ZoneReturns:
@@ -267,6 +277,7 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
     What arrives outside of the bins is not counted: the period of such a sensor is longer than its histogram.
     `drift_s` delays all zones, as a laser that warms up does.
     """
+    check_chirp(sensor, zones)
     import torch  # takes a second, and sensors of pixels need none of it
 
     from spad.detection.flux import interval_cdf

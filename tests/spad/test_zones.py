@@ -10,10 +10,19 @@ from scipy.stats import chi2
 from render.transient import Transient
 from scenes.errors import InputError
 from spad.detection.saturation import draw_saturated, saturated, saturated_jacobian
+from spad.sensor.files import SensorFile
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse
 from spad.zones.histogram import sense_zones, with_budget, zone_grid
-from spad.zones.sensor import EFFECTS, ZoneArray, ZoneReturns, expected_zone_counts, zone_returns, zone_signal
+from spad.zones.sensor import (
+    EFFECTS,
+    ZoneArray,
+    ZoneReturns,
+    chirped,
+    expected_zone_counts,
+    zone_returns,
+    zone_signal,
+)
 
 SENSOR = Sensor(name="s", bins=64, bin_width_s=1e-10, pulse=Pulse(1e-10))
 TWO = ZoneArray((-0.2, 0.2), (0.0, 0.0), (0.3, 0.3), (0.5, 0.5))
@@ -112,6 +121,21 @@ def test_aperture_and_parallax_are_those_of_photons_followed_one_by_one(aperture
     found = zone_returns(view(depth, 200, baseline=baseline_m), zones)
     expected = np.array([count * one.light.sum() / (2 * edge) ** 2 for one in found])  # light by area in tangents
     assert ((seen - expected) ** 2 / expected).sum() < chi2.ppf(1 - 1e-3 / 3, 2)
+
+
+def test_a_clock_that_slows_down_does_not_run_back_and_a_wild_one_is_refused():
+    time = np.linspace(0, 4, 50)
+    slowed = chirped(time, -0.25)
+    assert (np.diff(slowed) >= 0).all() and slowed[-1] == pytest.approx(1.0)
+    assert chirped(time, 0.1) == pytest.approx(time + 0.1 * time**2)
+    limit = 0.25 / (SENSOR.bins * SENSOR.bin_width_s)
+    for chirp in (0.99 * limit, -0.99 * limit):
+        SensorFile(SENSOR, zones=replace(TWO, chirp_hz=chirp))
+    for chirp in (1e300, -1.01 * limit):
+        with pytest.raises(InputError, match=r"zones: chirp .* Hz, at most 3\.91e\+07 Hz"):
+            SensorFile(SENSOR, zones=replace(TWO, chirp_hz=chirp))
+        with pytest.raises(InputError, match="of 64 bins of 100 ps keep half of its rate"):
+            expected_zone_counts(zone_returns(view(), TWO), SENSOR, replace(TWO, chirp_hz=chirp))
 
 
 def test_the_emitters_profile_moves_with_parallax():
