@@ -27,8 +27,9 @@ def photon_sums(histograms: np.ndarray, table: np.ndarray, *, in_bytes: bool = T
     """Multiply counts (pixels, timestamps) of any integer type with a table (timestamps, numbers) of integers.
 
     `in_bytes` False keeps to products of floating point. Returns (pixels, numbers) int64, exact. Raises InputError for
-    negative counts.
+    negative counts, and for counts that are no integers.
     """
+    require(histograms.dtype.kind in "iub", f"histograms of {histograms.dtype}, expected whole numbers")
     (count, bins), numbers = histograms.shape, table.shape[1]
     blocks = equal_blocks(table)
     if blocks > 1:

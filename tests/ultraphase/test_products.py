@@ -79,3 +79,6 @@ def test_tables_beyond_bytes_and_32_bits_are_exact():
 def test_negative_counts_are_refused():
     with pytest.raises(InputError, match="-1 counts"):
         photon_sums(np.full((2, 1024), -1), TABLES["fourier-8"])
+    with pytest.raises(InputError, match="float32, expected whole numbers"):
+        photon_sums(np.full((2, 1024), np.nan, np.float32), TABLES["fourier-8"])
+    assert photon_sums(np.zeros((0, 1024), np.uint8), TABLES["fourier-8"]).shape == (0, 8)
