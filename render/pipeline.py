@@ -208,8 +208,7 @@ def _allocated(
     if plan.filter and (not plan.adaptive or few or is_wide(world)):
         return _filtered(world, plan, settings, blocks, origin_m)
     if plan.spp is not None and (not plan.adaptive or few):
-        rounds = plan.spp if plan.spp < BATCHES else -(-plan.spp // BATCHES) * BATCHES
-        return uniform(blocks, rounds, reuses_paths=False), ()
+        return uniform(blocks, _in_batches(plan.spp, BATCHES), reuses_paths=False), ()
     own, reused = pilot_noise(world, blocks, plan.bounces, pilot_seed, clamp=clamp)
     schedule, reasons = _unfiltered(plan, settings, blocks, (own, reused), direct)
     if not plan.filter:
@@ -222,6 +221,11 @@ def _allocated(
         message = f"filter: left out, as it would lower the squared error {gain:.2g} times, not {FILTER_GAIN:g} or more"
         return schedule, (f"{message}; adaptive=False forces it", *reasons)
     return _filtered(world, plan, settings, blocks, origin_m, noise)
+
+
+def _in_batches(spp: int, batches: int) -> int:
+    """Round paths of a pixel up to batches of one size; fewer than there are batches stay as they are."""
+    return spp if spp < batches else -(-spp // batches) * batches
 
 
 def gain_of_filter(blocks: np.ndarray, plain: tuple[np.ndarray, np.ndarray], filtered: np.ndarray, spp: float) -> float:
@@ -246,8 +250,7 @@ def _filtered(
     """Allocate paths of filtered light by the pilot's noise of every block, or without it evenly."""
     spp = FIRST_FILTERED_SPP if plan.spp is None else plan.spp
     filter_octaves = filter_octaves_of(world, plan, settings, origin_m, spp)
-    rounds = spp if spp < FILTERED_BATCHES else -(-spp // FILTERED_BATCHES) * FILTERED_BATCHES
-    schedule = uniform(blocks, rounds, reuses_paths=False)
+    schedule = uniform(blocks, _in_batches(spp, FILTERED_BATCHES), reuses_paths=False)
     if noise is not None:
         schedule = allocate(blocks, noise, cost=spp, batches=FILTERED_BATCHES, min_spp=FILTERED_BATCHES)
     least, most = schedule.spp.min(), schedule.spp.max()

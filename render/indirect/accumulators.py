@@ -54,6 +54,10 @@ class IndirectAccumulator:
         self.clamp.add(pixel, batch, x, excess, over)
         return allowed
 
+    def filtered(self, path: Floats, radiance: Floats, diffuse: Masks) -> Array:
+        """Return radiance of one path as it is: the filter itself takes what is its own."""
+        return radiance
+
     def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
         """Add samples to the pixels' and the probe rows; returns what was added, for `add_total`."""
         x, radiance, active = self._given(pixel, path, radiance, active)

@@ -385,8 +385,8 @@ def _add(
                 primary, weight = paths.primary, _weight(paths, sums)
                 arriving = ArrivingLight(primary.late_m, towards, diffuse, batch, path, radiance, weight)
                 adding = path_filter.add(primary.point, rows, arriving, adding)
-            elif dr.hint(isinstance(sums, _Squares), mode="scalar"):
-                radiance = sums.filtered(path1 + path, radiance, diffuse)  # type: ignore[attr-defined]  # _Squares has
+            else:
+                radiance = sums.filtered(path1 + path, radiance, diffuse)
         else:
             adding = going & (path < early_m)
             radiance = sums.clamped(receiver, batch, path1 + path, radiance, going, adding)

@@ -39,7 +39,7 @@ Lost: TypeAlias = Callable[[int, str], Result]  # the result of a number that no
 
 
 class Run(Protocol):
-    """What `executor` yields: call it with work and runs of numbers, and it gives the results."""
+    """Do runs of numbers by a function and give their results: what `executor` yields."""
 
     def __call__(self, work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]) -> Iterator[Result]: ...
 

@@ -38,7 +38,7 @@ def test_the_shape_is_compared_up_to_scale_and_shift():
 
 
 def test_first_photons_do_not_explain_the_shipped_pulse_at_high_flux(tmp_path):
-    """Its second lobe is not weaker than at low flux, as a law that loses later photons has it."""
+    """Compare second lobes: a law that loses later photons makes it weaker than at low flux, measured it is not."""
     rows = pile_up_rows()
     law = [row for row in best_of(rows) if row["law"] == "first photon"]
     assert [row["number"] for row in law] == [0.0, 0.0]

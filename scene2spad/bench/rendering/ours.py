@@ -15,22 +15,14 @@ MERGED_M = 0.0  # nothing is merged: a histogram follows at once
 def trace(world: TracedScene, method: Method, bounces: int, quality: int, seed: int) -> Samples:
     """Return merged samples of all pixels, nothing planned or estimated: every setting is forced."""
     grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality), quality)
+    threshold = default_edge_threshold(grid)
+    plan = Plan(bounces, spp, grid, False, (), threshold, MERGED_M, filter=method.filter)
     settings = RenderSettings(
         bounces=bounces,
         spp=spp,
         grid=grid,
         filter=method.filter,
-        edge_threshold=default_edge_threshold(grid),
+        edge_threshold=threshold,
         direct_tolerance_m=MERGED_M,
-    )
-    plan = Plan(
-        bounces=bounces,
-        spp=spp,
-        grid=grid,
-        filter=method.filter,
-        edge_threshold=default_edge_threshold(grid),
-        direct_tolerance_m=MERGED_M,
-        ambient=False,
-        reasons=(),
     )
     return trace_light(world, plan, settings, seed=seed).samples
