@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spad.zones.expected_counts import Values, ZoneCapture, ZoneModel
+from spad.zones.sensor import largest_chirp
 
 _RIDGE = 1e-11
 _HALVINGS = 8
@@ -27,6 +28,7 @@ _SCALE = {
     "skew": 0.01,
     "chirp": 1e-4,
 }
+_ROUNDING = 1 - 1e-9  # a chirp at its largest must be one that the sensor file takes
 _POSITIVE = ("pulse", "gain", "background", "trials")
 _NOT_NEGATIVE = ("recovery", "compression", "crosstalk", "skew", "leak", "echo")
 
@@ -54,6 +56,7 @@ def fit(
     rough = np.diff(np.eye(len(over)), 2, axis=0) / over * math.sqrt(smoothing)
     information = np.zeros((len(names), len(names)))
     detected = np.max([capture.counts.sum(axis=1) for capture in captures], axis=0)
+    chirp = _ROUNDING * largest_chirp(captures[0].counts.shape[1])
     for _ in range(steps):
         information[:], gradient, weights = 0, np.zeros(len(names)), []
         for capture in captures:
@@ -65,7 +68,7 @@ def fit(
             gradient += weighted.T @ (capture.counts - expected).ravel()
         information[np.ix_(pulse, pulse)] += rough.T @ rough
         gradient[pulse] -= rough.T @ (rough @ values["pulse"])
-        bounds = _step_bounds(values, names, np.diag(information), detected)
+        bounds = _step_bounds(values, names, np.diag(information), detected, chirp)
         direction = _bounded_step(information, gradient, *bounds)
 
         def squares(at: Values, weights: list[np.ndarray] = weights) -> float:
@@ -88,10 +91,10 @@ def fit(
 
 
 def _step_bounds(
-    values: Values, names: Sequence[tuple[str, int]], curvature: np.ndarray, detected: np.ndarray
+    values: Values, names: Sequence[tuple[str, int]], curvature: np.ndarray, detected: np.ndarray, chirp: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute how far each parameter may fall and rise in a step, (P,): within the linearisation, and what is positive
-    stays so. No zone has fewer trials than detections, `detected` (Z,).
+    stays so. No zone has fewer trials than detections, `detected` (Z,), and no clock a larger chirp than `chirp`.
 
     What the captures say nothing about, as a skew of 0 whose derivative is 0, stays where it is.
     """
@@ -107,6 +110,8 @@ def _step_bounds(
         if name == "trials":
             room = max(0.0, value - 1.02 * detected[at])
         low[column], high[column] = -min(reach, room), reach
+        if name == "chirp":
+            low[column], high[column] = max(-reach, -chirp - value), min(reach, chirp - value)
     return low, high
 
 

@@ -240,9 +240,14 @@ def chirped(time: np.ndarray, chirp: float) -> np.ndarray:
     return time * (1 + chirp * time)
 
 
+def largest_chirp(bins: int) -> float:
+    """Return the chirp [per bin] that changes the rate of a clock by a half within `bins` bins."""
+    return 0.25 / bins
+
+
 def check_chirp(sensor: Sensor, zones: ZoneArray) -> None:
     """Raise InputError for a clock whose rate changes by more than a half within the histogram: nobody means that."""
-    most = 0.25 / (sensor.bins * sensor.bin_width_s)
+    most = largest_chirp(sensor.bins) / sensor.bin_width_s
     message = f"zones: chirp {zones.chirp_hz:g} Hz, at most {most:.3g} Hz lets a clock of {sensor.bins} bins "
     require(abs(zones.chirp_hz) <= most, f"{message}of {sensor.bin_width_s * 1e12:.4g} ps keep half of its rate")
 

@@ -41,6 +41,9 @@ class Sum:
     def clamped(self, pixel, batch, path, radiance, active, adding):
         return radiance
 
+    def filtered(self, path, radiance, diffuse):
+        return radiance
+
     def add(self, pixel, batch, path, radiance, active):
         return dr.select(active & dr.isfinite(radiance), radiance, 0)
 

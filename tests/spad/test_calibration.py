@@ -13,7 +13,14 @@ from spad.sensor.pulse import Pulse
 from spad.zones.calibration import as_sensor, calibrate, natural, poisson_deviance, standard_errors
 from spad.zones.expected_counts import PulseBasis, ZoneCapture, ZoneModel
 from spad.zones.fit import fit
-from spad.zones.sensor import ZoneArray, ZoneReturns, expected_zone_counts, zone_flux
+from spad.zones.sensor import (
+    ZoneArray,
+    ZoneReturns,
+    check_chirp,
+    expected_zone_counts,
+    largest_chirp,
+    zone_flux,
+)
 
 ZONES = ZoneArray((-0.2, 0.0, 0.2), (0.0, 0.0, 0.0), (0.1,) * 3, (0.1,) * 3)
 SENSOR = Sensor(name="s", bins=40, bin_width_s=1e-10, pulse=Pulse(1e-10))
@@ -178,3 +185,24 @@ def test_what_starts_at_0_is_fitted_where_the_captures_show_it():
     found, _, _ = fit(model, shown, start, FREE, steps=12)
     assert found["leak"] == pytest.approx(values["leak"], rel=0.3)
     assert found["echo"] == pytest.approx(values["echo"], rel=0.3)
+
+
+def test_a_fitted_chirp_is_one_that_a_sensor_file_takes():
+    """Two captures of nearly one distance leave the chirp free, and a step of 1e-3 a bin can run away with it."""
+    model, values = truth()
+    shown = captures(model, values, 40, 7)[:2]
+    limit = largest_chirp(SENSOR.bins)
+    for start in (0.9 * limit, -0.9 * limit):
+        found, _, _ = fit(model, shown, {**values, "chirp": np.array([start])}, ("pulse", "gain", "delay", "chirp"))
+        assert abs(found["chirp"][0]) <= limit
+        check_chirp(*as_sensor(model, found, SENSOR, ZONES))
+
+
+def test_a_chirp_beyond_its_limit_is_fitted_as_the_largest():
+    model, values = truth()
+    limit = largest_chirp(SENSOR.bins)
+    wild = {**values, "chirp": np.array([-1.5 * limit])}
+    shown = [ZoneCapture(one.returns, model.expected(wild, one)) for one in captures(model, values, 8, 7)]
+    found, _, _ = fit(model, shown, {**values, "chirp": np.array([0.0])}, ("pulse", "gain", "chirp"), steps=80)
+    assert found["chirp"][0] == pytest.approx(-limit, rel=1e-6)
+    check_chirp(*as_sensor(model, found, SENSOR, ZONES))
