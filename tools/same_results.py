@@ -111,7 +111,8 @@ def in_words_of(module: str, words: list[str], tree: Path) -> list[str]:
     if "--decoder" in words:
         at = words.index("--decoder")
         words = words[:at] + words[at + 2 :]
-    files = {name: str(tree / "csph" / "weights" / f"{name}.safetensors") for name in MODELS}
+    weights = tree / "csph" / "weights"  # flat in older trees, today a folder a model
+    files = {name: str(weights / f"{name}.safetensors") for name in MODELS}
     return [files.get(word, "--checkpoint" if word == "--model" and "network" in words else word) for word in words]
 
 

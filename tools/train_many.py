@@ -40,7 +40,7 @@ def train_one(job: dict, out: Path) -> None:
 def run_job(job: dict, arguments: argparse.Namespace) -> str:
     """Run one job in a process of its own, with its log beside the run; returns a line about it."""
     name, out = job["name"], arguments.out
-    if (out / "shipped" / f"{name}.json").is_file():
+    if (out / "shipped" / name / "model.safetensors").is_file():
         return f"{name}: was finished"
     start = time.monotonic()
     with (out / f"{name}.log").open("a") as log:

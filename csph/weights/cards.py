@@ -1,7 +1,7 @@
 """Cards of the models that come with the package: what each is, what made it, how far it errs, what it is not for.
 
-A card is read from the model's JSON: configuration and state are always there, CPU-minutes and errors where `ship` was
-told them.
+A card is read from the model's `card.json`: configuration and state are always there, CPU-minutes and errors where
+`ship` was told them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from csph.training.config import TrainConfig
 from csph.training.levels import BACKGROUND, CONTINUOUS, SIGNAL
-from csph.weights.shipped import WEIGHTS
+from csph.weights.shipped import CARD, WEIGHTS, shipped_file, shipped_names
 from scenes.errors import InputError, require
 from scenes.json_types import JsonObject
 
@@ -50,7 +50,7 @@ class Card:
 
 
 def read_card(path: Path) -> Card:
-    """Return the card of a shipped model's JSON file; InputError in one line where it cannot be read."""
+    """Return the card that a shipped model's card.json holds; InputError in one line where it cannot be read."""
     try:
         stored = json.loads(path.read_text())
         config, state = TrainConfig.from_dict(stored["config"]), stored["state"]
@@ -58,7 +58,7 @@ def read_card(path: Path) -> Card:
         raise InputError(f"{path}: is no card of a model ({' '.join(str(error).split())[:80]})") from None
     design = config.model.design
     return Card(
-        name=path.stem,
+        name=path.absolute().parent.name,
         model=config.model.name,
         compression=1.0 if design is None else design.compression_ratio,
         training=_several(config.data.get("training", ())),
@@ -75,7 +75,7 @@ def read_card(path: Path) -> Card:
 
 def cards(folder: Path = WEIGHTS) -> list[Card]:
     """Return cards of all models of a folder, by name."""
-    return [read_card(path) for path in sorted(folder.glob("*.json")) if path.with_suffix(".safetensors").is_file()]
+    return [read_card(folder / name / CARD) for name in shipped_names(folder)]
 
 
 def _several(value: str | list[str] | tuple[str, ...]) -> tuple[str, ...]:
@@ -106,12 +106,11 @@ def limits(config: TrainConfig) -> tuple[str, ...]:
 
 def shipped_model(name: str, folder: Path = WEIGHTS) -> Path:
     """Return the file of a shipped model by its name; InputError that names the nearest ones for another."""
-    path = folder / f"{name}.safetensors"
+    path = shipped_file(name, folder)
     if not path.is_file():
         import difflib
 
-        names = sorted(one.stem for one in folder.glob("*.safetensors"))
-        near = difflib.get_close_matches(name, names, 3, 0.4)
+        near = difflib.get_close_matches(name, shipped_names(folder), 3, 0.4)
         require(False, f"model {name!r} is unknown{', like ' + ', '.join(near) if near else ''}; see scene2spad models")
     return path
 

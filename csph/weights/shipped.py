@@ -1,8 +1,9 @@
-"""Trained models that come with the package: `weights/NAME.safetensors` in half precision, with what made them beside.
+"""Trained models that come with the package, a folder each: `weights/NAME`, with what made them beside the weights.
 
-NAME.json         the run's configuration and seed, and the state that its weights were kept in
-NAME.csv          its training log
-NAME.energy.csv   the energy of its temporal code while it was trained, where one is learned
+model.safetensors   its weights in half precision
+card.json           the run's configuration and seed, the state that its weights were kept in, its errors
+log.csv             its training log
+energy.csv          the energy of its temporal code while it was trained, where one is learned
 """
 
 from __future__ import annotations
@@ -18,15 +19,33 @@ from scenes.files import whole_file
 from scenes.io.inputs import read_whole_lines
 
 WEIGHTS = Path(__file__).parent
-RUN_WEIGHTS = ("model", "last")  # files of a run; shipped ones have the models' names
+WEIGHTS_FILE, CARD = "model.safetensors", "card.json"
+RUN_WEIGHTS = ("model", "last")  # files of a run, which is named after its folder
 RESUME = "resume.ckpt"  # of a run: what it goes on from
 TIMINGS = "timings.jsonl"  # of a run: seconds of each epoch, wall clock and CPU
-_BESIDE = {"log.csv": ".csv", "energy.csv": ".energy.csv"}
+_TABLES = ("log.csv", "energy.csv")
 
 
 def shipped_file(name: str, folder: Path = WEIGHTS) -> Path:
     """Return where the shipped model of that name lies, if it does."""
-    return folder / f"{name}.safetensors"
+    return folder / name / WEIGHTS_FILE
+
+
+def shipped_names(folder: Path = WEIGHTS) -> list[str]:
+    """Return names of the models that a folder of shipped ones holds, sorted."""
+    return sorted(path.parent.name for path in folder.glob(f"*/{WEIGHTS_FILE}"))
+
+
+def checkpoint_name(path: Path) -> str:
+    """Return what a checkpoint is called: its folder's name for the files of a run or of a shipped model."""
+    path = path.resolve()
+    inside = path.suffix == ".safetensors" and path.stem in RUN_WEIGHTS
+    return path.parent.name if inside else path.name if path.is_dir() else path.stem
+
+
+def is_shipped(checkpoint: Path) -> bool:
+    """Return whether a checkpoint lies as shipped ones do, its card beside it."""
+    return checkpoint.with_name(CARD).is_file()
 
 
 def file_names(paths: str | Sequence[str]) -> str | list[str]:
@@ -35,7 +54,7 @@ def file_names(paths: str | Sequence[str]) -> str | list[str]:
 
 
 def ship(run: Path, name: str, folder: Path = WEIGHTS, *, errors: dict[str, dict[str, float]] | None = None) -> Path:
-    """Make the shipped form of a finished run's best weights; returns the file.
+    """Make the shipped form of a finished run's best weights, `folder`/NAME; returns the file of the weights.
 
     Its card (`csph.weights.cards`) gets the CPU-minutes of the run's timings and `errors`, MAE [mm] by set and level.
 
@@ -47,16 +66,16 @@ def ship(run: Path, name: str, folder: Path = WEIGHTS, *, errors: dict[str, dict
     require(log.is_file(), f"{log}: file not found, a shipped model needs its training log")
     data = {key: file_names(v) if key in ("training", "validation") else v for key, v in config.data.items()}
     config = replace(config, data=data)
-    folder.mkdir(parents=True, exist_ok=True)
-    for source, suffix in _BESIDE.items():
-        if log.with_name(source).is_file():
-            with whole_file(folder / f"{name}{suffix}") as beside:
-                beside.write_bytes(log.with_name(source).read_bytes())
-    with whole_file(folder / f"{name}.json") as beside:
+    path = shipped_file(name, folder)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for table in _TABLES:
+        if log.with_name(table).is_file():
+            with whole_file(path.with_name(table)) as beside:
+                beside.write_bytes(log.with_name(table).read_bytes())
+    with whole_file(path.with_name(CARD)) as beside:
         card = {"config": config.to_dict(), "state": state, "cpu_minutes": cpu_minutes(log.parent)}
         card |= {"errors": errors} if errors else {}
         beside.write_text(json.dumps(card, indent=1, sort_keys=True) + "\n")
-    path = shipped_file(name, folder)
     save_model(model, config, state, path, half=True)
     return path
 
@@ -75,8 +94,3 @@ def cpu_minutes(run: Path) -> float | None:
             case {"epoch": int(epoch), "cpu_s": float(cpu) | int(cpu)}:
                 seconds[epoch] = cpu
     return round(sum(seconds.values()) / 60, 1)
-
-
-def beside(checkpoint: Path, kind: str) -> Path:
-    """Return `log.csv` or `energy.csv` of a checkpoint, in its run's folder or as shipped; it need not exist."""
-    return checkpoint.with_name(kind if checkpoint.stem in RUN_WEIGHTS else f"{checkpoint.stem}{_BESIDE[kind]}")

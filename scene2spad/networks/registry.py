@@ -18,7 +18,7 @@ from csph.codes.design import Design
 from csph.evaluation.methods import DepthEstimator
 from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training.config import ModelConfig, TrainConfig
-from csph.weights.shipped import RESUME, RUN_WEIGHTS, WEIGHTS, beside, file_names, ship, shipped_file
+from csph.weights.shipped import RESUME, WEIGHTS, file_names, is_shipped, ship, shipped_file
 from scene2spad.networks.training import config_of, run_train
 from scene2spad.options.networks import Train, TrainingPreset
 from scenes.errors import require
@@ -80,7 +80,7 @@ class ModelSpec:
 
     @property
     def name(self) -> str:
-        """Return the name of the run's folder and of the shipped file: learned-1024x4x4-128x-s0, none-mixed-s0,
+        """Return the name of the run's folder and of the shipped one: learned-1024x4x4-128x-s0, none-mixed-s0,
         ...-t8-s0."""
         parts = [f"{'full-' if self.full else ''}{self.design.replace('+', '-')}"]
         if self.coded:
@@ -158,11 +158,11 @@ class Trained:
 
     @property
     def shipped(self) -> bool:
-        return self.path.stem not in RUN_WEIGHTS
+        return is_shipped(self.path)
 
     def table(self, kind: str) -> list[dict[str, float]]:
         """Return `log.csv` or `energy.csv` of its training; empty where there is none."""
-        path = beside(self.path, kind)
+        path = self.path.with_name(kind)
         if not path.is_file():
             return []
         with path.open(newline="") as lines:

@@ -22,6 +22,7 @@ from csph.networks.model import DepthModel, load_model
 from csph.training.config import Front, ModelConfig, Network, TrainConfig, preset
 from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
+from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.renders import views_at
 from scene2spad.datasets.workers import check_workers
@@ -237,7 +238,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     loaded = [load_model(checkpoint_of(path)) for path in command.checkpoints]
     require(bool(loaded), "evaluate: give at least one checkpoint")
     models = [model for model, _, _ in loaded]
-    designs = group_names([config for _, config, _ in loaded], [path.stem for path in command.checkpoints])
+    designs = group_names([config for _, config, _ in loaded], [*map(checkpoint_name, command.checkpoints)])
     require(command.int8 or command.int8_rule is None, "evaluate: --int8-rule goes with --int8")
     rule = command.int8_rule or "calibrated"
     in_8_bits = " int8" if rule == "calibrated" else f" int8 {rule}"

@@ -11,13 +11,13 @@ from csph.training.config import preset
 from csph.training.loop import train
 from csph.training.views import split_views
 from csph.weights.cards import cards, checkpoint_of, read_card, shipped_model
-from csph.weights.shipped import WEIGHTS, ship
+from csph.weights.shipped import WEIGHTS, ship, shipped_names
 from scenes import InputError
 
 
 def test_every_shipped_model_has_a_card():
     found = cards()
-    assert {card.name for card in found} == {path.stem for path in WEIGHTS.glob("*.safetensors")}
+    assert {card.name for card in found} == set(shipped_names())
     for card in found:
         assert card.training and all(len(one) == 64 for one in card.training_sha256) and card.val_mae_mm > 0
         assert card.levels.startswith("signal ") and len(card.not_for) >= 2
@@ -30,13 +30,13 @@ def test_a_shipped_run_tells_its_cpu_minutes_and_errors(tmp_path):
     epochs = [json.loads(line) for line in (tmp_path / "run/timings.jsonl").read_text().splitlines()]
     assert [one["epoch"] for one in epochs] == [1, 2, 3] and all(one["cpu_s"] > 0 for one in epochs)
     ship(tmp_path / "run", "small", tmp_path / "weights", errors={"rooms/test": {"10 + 10": 21.5}})
-    card = read_card(tmp_path / "weights/small.json")
+    card = read_card(tmp_path / "weights/small/card.json")
     assert card.cpu_minutes == pytest.approx(sum(one["cpu_s"] for one in epochs) / 60, abs=0.06)
     assert card.errors == {"rooms/test": {"10 + 10": 21.5}} and card.levels == "signal 1 to 100, background 0.5 to 1200"
 
 
 def test_models_are_found_by_name_or_path(tmp_path):
-    assert checkpoint_of("none-s0") == shipped_model("none-s0") == WEIGHTS / "none-s0.safetensors"
+    assert checkpoint_of("none-s0") == shipped_model("none-s0") == WEIGHTS / "none-s0/model.safetensors"
     assert checkpoint_of(tmp_path) == tmp_path
     with pytest.raises(InputError, match="nonee-s0: file not found, and model 'nonee-s0' is unknown, like none-s0"):
         checkpoint_of("nonee-s0")

@@ -14,7 +14,7 @@ from csph.networks.model import load_model
 from csph.training.config import ModelConfig, preset
 from csph.training.loop import train
 from csph.training.views import split_views
-from csph.weights.shipped import beside, ship, shipped_file
+from csph.weights.shipped import checkpoint_name, is_shipped, ship, shipped_file, shipped_names
 from scene2spad.datasets.planes import random_planes
 from scenes import InputError
 from spad.detection.detect import sense
@@ -57,9 +57,12 @@ def test_shipped_is_small_whole_and_tells_no_folder(trained, tmp_path):
     path = ship(trained, "some-name", tmp_path)
     assert path == shipped_file("some-name", tmp_path)
     assert path.stat().st_size < 0.55 * (trained / "model.safetensors").stat().st_size
-    assert beside(path, "log.csv").read_bytes() == (trained / "log.csv").read_bytes()
-    assert beside(path, "energy.csv").read_bytes() == beside(trained / "model.safetensors", "energy.csv").read_bytes()
-    message = json.loads((tmp_path / "some-name.json").read_text())
+    assert {one.name for one in path.parent.iterdir()} == {"model.safetensors", "card.json", "log.csv", "energy.csv"}
+    assert shipped_names(tmp_path) == ["some-name"] and is_shipped(path)
+    assert not is_shipped(trained / "model.safetensors")
+    for table in ("log.csv", "energy.csv"):
+        assert path.with_name(table).read_bytes() == (trained / table).read_bytes()
+    message = json.loads(path.with_name("card.json").read_text())
     model, config, state = load_model(path)
     assert json.loads(json.dumps(config.to_dict())) == message["config"] and state == message["state"]
     assert config.seed == 0 and len(config.data["training_sha256"]) == 64
@@ -83,7 +86,7 @@ def test_shipping_forgets_where_the_set_lay(trained, tmp_path):
     (tmp_path / "run/log.csv").write_text("step\n8\n")
     data = load_model(ship(tmp_path / "run", "x", tmp_path))[1].data
     assert (data["training"], data["validation"]) == ("rooms.h5", "v.h5")
-    assert b"somewhere" not in (tmp_path / "x.safetensors").read_bytes()
+    assert b"somewhere" not in shipped_file("x", tmp_path).read_bytes()
 
 
 def test_half_precision_changes_depths_by_far_less_than_they_err(tmp_path):
@@ -97,3 +100,9 @@ def test_half_precision_changes_depths_by_far_less_than_they_err(tmp_path):
     errors_m = [np.abs(depth - histogram.depth_m[known]).mean() for depth in depths]
     assert errors_m[0] < 0.2 and errors_m[1] == pytest.approx(errors_m[0], rel=0.01)
     assert 0 < np.abs(depths[1] - depths[0]).mean() < 0.02 * errors_m[0]
+
+
+def test_checkpoints_are_called_after_their_run_or_model(trained):
+    named = {checkpoint_name(path) for path in (trained, trained / "model.safetensors", trained / "last.safetensors")}
+    assert named == {"a-run"} and checkpoint_name(shipped_file("none-s0")) == "none-s0"
+    assert checkpoint_name(trained / "other.safetensors") == "other"

@@ -75,7 +75,7 @@ def test_found_trained_shipped_or_absent(folder, tmp_path, caplog):
     assert found.described()["trained_on"] == "planes" and not found.shipped and found.table("energy.csv")
     assert ModelRegistry(tmp_path, None).find(LEARNED) is None
     names = ship_all([found], tmp_path / "weights")
-    assert names == [str(tmp_path / "weights" / f"{LEARNED.name}.safetensors")]
+    assert names == [str(tmp_path / "weights" / LEARNED.name / "model.safetensors")]
     shipped = ModelRegistry(tmp_path, tmp_path / "weights").find(LEARNED)
     assert shipped.shipped and shipped.digest != found.digest and len(shipped.table("log.csv")) == 2
     assert shipped.config.data["training_reach_m"] == found.config.data["training_reach_m"]

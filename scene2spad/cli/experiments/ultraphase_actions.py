@@ -112,17 +112,16 @@ def _compile(command: Ultraphase, progress: Progress) -> dict:
     """Show a trained model's program: what it takes, what it costs, and that it computes the torch path's integers."""
     from csph.networks.model import load_model
     from csph.weights.cards import checkpoint_of
-    from csph.weights.shipped import RUN_WEIGHTS
+    from csph.weights.shipped import checkpoint_name
     from scene2spad.studies.chip.chain import measured, trial
     from scene2spad.studies.chip.code import compile_model, headroom_of, listing_with_tables, with_headroom
 
     require(not command.define, "constants by --define are for source files")
     path = checkpoint_of(command.program)
-    run = path if path.is_dir() else path.parent if path.stem in RUN_WEIGHTS else path.with_suffix("")
     model = load_model(path)[0]
     headroom = headroom_of(model) if command.headroom is None else command.headroom
     model = with_headroom(model, headroom) if headroom else model
-    compiled = compile_model(model, run.resolve().name).compiled
+    compiled = compile_model(model, checkpoint_name(path)).compiled
     cost, text = measured(compiled), listing_with_tables(compiled)
     result = {
         "model": compiled.name,

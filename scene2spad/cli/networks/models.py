@@ -39,9 +39,10 @@ def run(command: Models, progress: Progress) -> dict:
     if command.file or command.sensor or command.out:
         raise InputError("models: FILE, --sensor and --out go with import, as in `models import FILE.ckpt`")
     from csph.weights.cards import cards, read_card, shipped_model
+    from csph.weights.shipped import CARD
 
     if command.name:
-        return read_card(shipped_model(command.name).with_suffix(".json")).to_dict()
+        return read_card(shipped_model(command.name).with_name(CARD)).to_dict()
     found = cards()
     if command.json:
         return {"models": [card.to_dict() for card in found]}

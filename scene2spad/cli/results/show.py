@@ -125,9 +125,10 @@ def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, l
     facts: list[JsonObject] = []
     if kind == "network":
         from csph.weights.cards import checkpoint_of
+        from csph.weights.shipped import CARD
 
         source = checkpoint_of(path)
-        card = source.with_suffix(".json")
+        card = source / CARD if source.is_dir() else source.with_name(CARD)
         facts = [{"key": k, "value": v} for k, v in _model_facts(source, card).items()]
     return {}, ((("What made it", facts),) if facts else ())
 
