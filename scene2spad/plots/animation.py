@@ -1,4 +1,4 @@
-"""Light over time as an animated GIF: what a cube (H, W, T) of one page looks like, frame by frame."""
+"""Light over time as an animation, GIF or MP4: what a cube (H, W, T) of one page looks like, frame by frame."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from scene2spad.viewer.content import NS_PER_M, Cube
+from scenes.errors import InputError
 from scenes.files import whole_file
 
 FRAMES = 48  # at the most
@@ -19,18 +20,8 @@ MILLISECONDS = 80
 
 
 def write_gif(cube: Cube, path: Path, *, frames: int = FRAMES, side: int = SIDE) -> Path:
-    """Write the animation, whole or not at all: from the first light on, until a hundredth of it is left."""
-    first, last = _lit(cube.values)
-    chosen = np.linspace(first, last, min(frames, last - first + 1)).round().astype(int)
-    width = max(int(np.median(np.diff(chosen))) if len(chosen) > 1 else 1, 1)
-    shown = np.stack([cube.values[..., t : t + width].sum(axis=2, dtype=float) for t in chosen])
-    steady = float(np.median(cube.values.mean(axis=(0, 1)))) * width
-    lit = np.clip(shown - steady, 0, None)
-    white = float(np.quantile(lit.max(axis=0), WHITE)) or 1.0
-    pictures = [
-        _picture(np.clip(frame / white, 0, 1), cube.start_ns + (t + width / 2) * cube.step_ns, side)
-        for frame, t in zip(lit, chosen, strict=True)
-    ]
+    """Write the animation as GIF, whole or not at all; it repeats."""
+    pictures = [one.quantize(COLOURS, dither=Image.Dither.NONE) for one in _pictures(cube, frames, side)]
     with whole_file(path) as beside:
         pictures[0].save(
             beside,
@@ -42,6 +33,45 @@ def write_gif(cube: Cube, path: Path, *, frames: int = FRAMES, side: int = SIDE)
             optimize=True,
         )
     return path
+
+
+def write_mp4(cube: Cube, path: Path, *, frames: int = FRAMES, side: int = SIDE) -> Path:
+    """Write the animation as MP4 (H.264), whole or not at all.
+
+    The encoder comes with `pip install 'scene2spad[video]'`; raises InputError that says so where it is missing.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        message = "needs a video encoder: pip install 'scene2spad[video]', or write a .gif"
+        raise InputError(f"{path}: {message}") from None
+    pictures = [np.asarray(one) for one in _pictures(cube, frames, side)]
+    rows, columns = (length + length % 2 for length in pictures[0].shape[:2])  # H.264 takes even sizes alone
+    with whole_file(path) as beside:
+        film = imageio_ffmpeg.write_frames(
+            str(beside), (columns, rows), fps=1000 / MILLISECONDS, macro_block_size=2, output_params=["-f", "mp4"]
+        )
+        film.send(None)
+        for rgb in pictures:
+            more = ((0, rows - rgb.shape[0]), (0, columns - rgb.shape[1]), (0, 0))
+            film.send(np.ascontiguousarray(np.pad(rgb, more, mode="edge")))
+        film.close()
+    return path
+
+
+def _pictures(cube: Cube, frames: int, side: int) -> list[Image.Image]:
+    """Draw the frames: from the first light on, until a hundredth of it is left."""
+    first, last = _lit(cube.values)
+    chosen = np.linspace(first, last, min(frames, last - first + 1)).round().astype(int)
+    width = max(int(np.median(np.diff(chosen))) if len(chosen) > 1 else 1, 1)
+    shown = np.stack([cube.values[..., t : t + width].sum(axis=2, dtype=float) for t in chosen])
+    steady = float(np.median(cube.values.mean(axis=(0, 1)))) * width
+    lit = np.clip(shown - steady, 0, None)
+    white = float(np.quantile(lit.max(axis=0), WHITE)) or 1.0
+    return [
+        _picture(np.clip(frame / white, 0, 1), cube.start_ns + (t + width / 2) * cube.step_ns, side)
+        for frame, t in zip(lit, chosen, strict=True)
+    ]
 
 
 def _lit(values: np.ndarray) -> tuple[int, int]:
@@ -61,4 +91,4 @@ def _picture(fraction: np.ndarray, at_ns: float, side: int) -> Image.Image:
         ImageDraw.Draw(image).text(
             (6, image.height - 16), f"{at_ns:5.1f} ns, {at_ns / NS_PER_M / 2:.2f} m", fill="white"
         )
-    return image.quantize(COLOURS, dither=Image.Dither.NONE)
+    return image

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import sys
 import zlib
 from pathlib import Path
 
@@ -143,6 +144,25 @@ def test_pictures_and_animations(suffix, capfd):
         else:
             with Image.open(out) as image:
                 assert image.size > (100, 100) and (suffix == "png" or image.n_frames > 3)
+
+
+def test_a_film_needs_its_extra(capfd, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # what an import of a missing package meets
+    capfd.readouterr()
+    assert main(["show", "gallery.h5", "--out", "film.mp4"]) == 2
+    error = capfd.readouterr().err
+    assert error == "scene2spad: film.mp4: needs a video encoder: pip install 'scene2spad[video]', or write a .gif\n"
+    assert not Path("film.mp4").exists()
+
+
+def test_a_film_has_the_frames_of_the_gif(capfd):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
+    for suffix in ("gif", "mp4"):
+        told(capfd, "show", "gallery.exr", "--out", f"film.{suffix}")
+    with Image.open("film.gif") as image:
+        size, count = tuple(length + length % 2 for length in image.size), image.n_frames
+    film = ffmpeg.read_frames("film.mp4")
+    assert tuple(next(film)["source_size"]) == size and sum(1 for _ in film) == count
 
 
 def test_a_transient_beside_is_used_only_if_it_is_the_right_one(tmp_path, capfd):

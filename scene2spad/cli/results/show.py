@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from scene2spad.viewer.content import Content, Cube
 
 log = logging.getLogger("scene2spad")
-SUFFIXES = (".html", ".png", ".pdf", ".gif")
+SUFFIXES = (".html", ".png", ".pdf", ".gif", ".mp4")
 MAX_SHEET = 24  # views of a set on its sheet
 PAGE_MARK = b'content="scene2spad show"'
 
@@ -31,12 +31,12 @@ PAGE_MARK = b'content="scene2spad show"'
 class Show(Common):
     """Make a page of a file: point at a pixel and see its returns, expected counts and detections, turn the point
     cloud, play the light. The page is one file and loads nothing. Or make a picture (.png, .pdf) or an animation
-    (.gif). FILE is anything that a command writes, or the name of a model that comes with the package."""
+    (.gif, .mp4). FILE is anything that a command writes, or the name of a model that comes with the package."""
 
     file: Positional[Path]
     """The file, the folder of a set or of a run, or a model's name."""
     out: File = None
-    """File to write: .html, .png, .pdf or .gif (default: the file's name and kind, such as room.histogram.html)."""
+    """File to write: .html, .png, .pdf, .gif or .mp4 (default: name and kind, such as room.histogram.html)."""
     transient: File = None
     """The transient that a histogram was sensed from (default: the .exr beside it, if it is that one)."""
     view: int = 0
@@ -58,10 +58,11 @@ def run(command: Show, progress: Progress) -> dict:
     require(command.transient is None or kind == "histogram", f"{path}: --transient goes with a histogram")
     if out.suffix.lower() in (".png", ".pdf"):
         drawn = _picture(command, kind, out)
-    elif out.suffix.lower() == ".gif":
-        from scene2spad.plots.animation import write_gif
+    elif out.suffix.lower() in (".gif", ".mp4"):
+        from scene2spad.plots.animation import write_gif, write_mp4
 
-        drawn = write_gif(_cube(command, kind), out)
+        write = write_gif if out.suffix.lower() == ".gif" else write_mp4
+        drawn = write(_cube(command, kind), out)
     else:
         from scene2spad.viewer.page import write_page
 
