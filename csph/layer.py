@@ -37,7 +37,6 @@ from spad.sensor.template import binned_pulse
 
 SpatialStart = Literal["uniform", "orthogonal"]
 STARTS: tuple[str, ...] = ("uniform", "orthogonal")
-KEEP_MEAN_UP_TO = 4  # codes; see LayerOptions
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,8 @@ class LayerOptions:
     zero_mean         rows of C are held to sum to zero over Mt: a uniform background then encodes to zero
     per_pixel_norm    one norm for all time blocks of a pixel (or block of pixels): which time block holds the return
                       is then not lost, and blocks without signal are not amplified
-    keep_mean         no removal of the mean over K from 1 to 4 codes: of K = 2 it leaves one sign bit, of K = 1 nothing
+    keep_mean         no removal of the mean over K: of K = 2 it leaves one sign bit, of K = 1 nothing, and the
+                      back-projection of Fourier series no longer moves with a delay
     pulse_in_decoder  back-project with the codes of a returning pulse, C h(tau), instead of those of one bin
     pulse_in_codes    encode and back-project with codes smoothed by the pulse
     int8              train for the chip: each factor in 255 steps within a range that is learned, sums of 16 bits that
@@ -299,7 +299,7 @@ class CompressiveLayer(nn.Module):
             return self._projected(self.encode(counts))
 
     def _projected(self, codes: Tensor) -> Tensor:
-        centre = not (self.options.keep_mean and self.codes <= KEEP_MEAN_UP_TO)
+        centre = not self.options.keep_mean
         over = (2,) if self.options.per_pixel_norm else ()
         counts = codes.numel() * math.prod(self.block) // self.codes
         if self.background is None and self.spatial is not None and not self._forms(counts):
