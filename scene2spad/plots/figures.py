@@ -27,7 +27,11 @@ PANEL_INCHES = 3.6  # the longer side of an image in the pictures of `sense` and
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, or as PDF where the path ends so, whole or not at all; the same figure, the same bytes."""
+    """Letter a figure's panels and write it as PNG, or as PDF where the path ends so, whole or not at all.
+
+    The same figure has the same bytes.
+    """
+    letter_panels(figure)
     pdf = path.suffix.lower() == ".pdf"
     kind, metadata = ("pdf", {"CreationDate": None}) if pdf else ("png", {"Software": None})
     with whole_file(path) as beside:
@@ -231,7 +235,6 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
     _image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     title = f"{method}: MAE {errors['mae_mm']:.1f} mm, {errors['within_10mm']:.0%} within 10 mm"
     _image(axes[1], depth_m, title, "m", cmap=DEPTH_COLOURS, **limits)
-    letter_panels(axes)
     error_mm = 1000 * np.abs(depth_m - histogram.depth_m)
     _image(axes[2], error_mm, "absolute error (colours end at 100 mm)", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
     return save(figure, path)
@@ -311,7 +314,7 @@ def draw_demo(
         _image(panels[key], depth, message, "m", cmap=DEPTH_COLOURS, **limits)
     row, column = _telling_pixel(transient)
     for key in "ABCDEF":
-        panels[key].plot(column, row, "o", mfc="none", mec="red", ms=9)
+        panels[key].plot(column, row, "o", mfc="none", mec=COLOURS["vermilion"], ms=9)
     _one_pixel(panels["G"], panels["H"], transient, histogram, row, column)
     costs = "\n".join(f"{model}: {cost}" for model, cost in chip.items())
     figure.supxlabel(f"The codes on emulated in-pixel cores\n{costs}", fontsize=8.5)

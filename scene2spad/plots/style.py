@@ -1,14 +1,14 @@
-"""The one style of all figures: colours that colour-blind readers tell apart (Okabe and Ito), sizes, fonts."""
+"""The one style of all figures: colours that colour-blind readers tell apart (Okabe and Ito), markers, letters."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from typing import Any
 
 import matplotlib
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 # Okabe and Ito, Color Universal Design (2008), in the order that lines take; a grey and a brown after them.
 COLOURS = {
@@ -23,14 +23,30 @@ COLOURS = {
     "grey": "#999999",
     "brown": "#665544",
 }
-COLUMN_INCHES, PAGE_INCHES = 3.5, 7.16  # of a two-column paper
+MARKERS = "os^DvP*X<>hdp"  # of lines, so that they differ without colour, too
+MOST_LETTERS = 26
 
 plt.rcParams["axes.prop_cycle"] = plt.cycler(color=[*COLOURS.values()])
 plt.rcParams["pdf.fonttype"] = 42  # text in a PDF stays text
 plt.rcParams["svg.fonttype"] = "none"
 
 
-def letter_panels(panels: Iterable[Axes]) -> None:
-    """Letter panels a, b, c at their upper left."""
+def look(number: int) -> dict[str, Any]:
+    """Return colour and marker of the line of that number; dashes once the colours have come round."""
+    colour = [*COLOURS.values()][number % len(COLOURS)]
+    return {"color": colour, "marker": MARKERS[number % len(MARKERS)], "ls": "--" if number >= len(COLOURS) else "-"}
+
+
+def letter_panels(figure: Figure) -> None:
+    """Letter the panels of a figure a, b, c left of their upper corners; colour bars and panels of text have none.
+
+    A single panel stays without, and so do sheets of more than `MOST_LETTERS` pictures.
+    """
+    panels = [one for one in figure.axes if one.axison and one.get_label() != "<colorbar>"]
+    if not 1 < len(panels) <= MOST_LETTERS:
+        return
     for number, panel in enumerate(panels):
-        panel.set_title(chr(ord("a") + number), loc="left", fontsize=10, fontweight="bold")
+        panel.annotate(
+            chr(ord("a") + number), (0, 1), (-4, 3), xycoords="axes fraction", textcoords="offset points", ha="right",
+            va="bottom", fontsize=10, fontweight="bold", annotation_clip=False,
+        )  # fmt: skip

@@ -4,12 +4,14 @@ import base64
 import io
 import re
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 import scene2spad as s2s
-from scene2spad.plots.style import COLOURS, plt
+from scene2spad.plots.figures import save
+from scene2spad.plots.style import COLOURS, look, plt
 from scenes.notebook import html_card
 
 
@@ -37,3 +39,24 @@ def test_figures_take_colours_that_differ_in_lightness_too():
     rgb = [[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in cycle[:4]]
     grey = [float(np.dot(one, (0.2126, 0.7152, 0.0722))) for one in rgb]
     assert min(abs(a - b) for a, b in pairwise(grey)) > 0.02
+
+
+def test_lines_differ_without_colour_too():
+    looks = [look(number) for number in range(len(COLOURS) + 3)]
+    assert len({(one["marker"], one["ls"]) for one in looks}) == len(looks)
+    assert len({one["marker"] for one in looks[: len(COLOURS)]}) == len(COLOURS)
+
+
+def test_several_panels_are_lettered_and_colour_bars_are_not(tmp_path):
+    for count, letters in ((1, []), (3, ["a", "b", "c"])):
+        figure, panels = plt.subplots(1, count, squeeze=False)
+        figure.colorbar(panels[0, 0].imshow(np.zeros((2, 2))), ax=panels[0, 0])
+        save(figure, tmp_path / "figure.png")
+        assert [text.get_text() for panel in figure.axes for text in panel.texts] == letters
+
+
+def test_no_figure_names_colours_of_another_palette():
+    """Colours come from the style, or are black, white and greys."""
+    other = re.compile(r"tab:|tab10|(?:color|mec|mfc|c)=\"(?:red|blue|green|orange|purple|brown|pink|cyan|yellow)\"")
+    root = Path(__file__).parents[2] / "scene2spad"
+    assert [str(path) for path in root.rglob("*.py") if other.search(path.read_text(encoding="utf-8"))] == []

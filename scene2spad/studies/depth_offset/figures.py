@@ -17,6 +17,7 @@ from csph.evaluation.metrics import is_low_sbr
 from scene2spad.networks.registry import ModelSpec, Trained
 from scene2spad.plots.figures import DEPTH_COLOURS, plain_log, plt, save
 from scene2spad.plots.style import COLOURS as OKABE_ITO
+from scene2spad.plots.style import MARKERS, look
 from scene2spad.studies import tensors as tensor_figures
 from scene2spad.studies.depth_offset.tables import ENERGY_BAR, LEAST, boundary_bin, energy_history, energy_ratio
 from spad.sensor.model import Sensor
@@ -30,13 +31,18 @@ COLOURS = {
     "no compression": "black",
     "peak": OKABE_ITO["grey"],
 }
-MARKERS = {128: "o", 64: "s"}  # by compression; others ^
+MARKS = dict(zip(COLOURS, MARKERS, strict=False))  # where designs are lines
+BY_COMPRESSION = {128: "o", 64: "s"}  # others ^
 PAPER_FIGURE = {128: "1", 64: "17"}
 NO_OFFSETS = ", trained with offsets"
 
 
 def colour_of(label: str) -> str:
     return COLOURS.get(label.split(NO_OFFSETS)[0], OKABE_ITO["purple"])
+
+
+def mark_of(label: str) -> str:
+    return MARKS.get(label.split(NO_OFFSETS)[0], "X")
 
 
 def tensors(models: Sequence[Trained], compressions: Sequence[int], out: Path) -> list[Path]:
@@ -62,7 +68,7 @@ def every_seed(ratios: Sequence[dict], bars: Sequence[dict], path: Path) -> Path
     for at, label in enumerate(labels):
         for row in (row for row in ratios if row["design"] == label):
             shift = 0.16 * (np.log2(row["compression"]) - 6.5) + 0.05 * (row["seed"] - 1)
-            marker = MARKERS.get(row["compression"], "^")
+            marker = BY_COMPRESSION.get(row["compression"], "^")
             panel.plot(at + shift, row["ratio"], marker, color=colour_of(label), ms=6, alpha=0.8)
         bar = next((b for b in bars if b["design"] == label), None)
         if bar is not None:
@@ -126,7 +132,7 @@ def _lines(panel: Axes, rows: Sequence[dict], figure_of: str, compressions: Sequ
         # a little beside each other, so that intervals do not hide one another
         place = np.array([r["compression"] for r in mine]) * 1.03 ** (number - (len(designs) - 1) / 2)
         spread = np.nan_to_num(np.abs(values[:, 1:] - values[:, :1]).T)
-        options = {"color": colour_of(design), "marker": "o", "ms": 4, "capsize": 3, "label": design}
+        options = {"color": colour_of(design), "marker": mark_of(design), "ms": 5, "capsize": 3, "label": design}
         panel.errorbar(place, values[:, 0], spread, **options)
     panel.set_xscale("log", base=2)
     panel.set_xticks(compressions, [f"{ratio}x" for ratio in compressions])
@@ -167,7 +173,8 @@ def sweep(found: dict, path: Path) -> Path:
     figure, panel = plt.subplots(figsize=(8.5, 5.5), layout="constrained")
     for curve in found["curves"]:
         cured = NO_OFFSETS in curve["label"]
-        options = {"color": colour_of(curve["label"]), "ls": "--" if cured else "-", "marker": "o", "ms": 3.5}
+        options = {"color": colour_of(curve["label"]), "ls": "--" if cured else "-", "ms": 5}
+        options |= {"marker": mark_of(curve["label"]), "mfc": "white" if cured else colour_of(curve["label"])}
         panel.plot(found["offsets_m"], curve["mae_mm"], label=curve["label"], **options)
     reach, (low, middle, high) = found["training_reach_m"], found["test_depths_m"]
     if reach is not None:
@@ -196,7 +203,7 @@ def range_end(found: dict, path: Path) -> Path:
         mine = [row for row in found["arms"] if row["arm"] == name]
         low, mean, high = ([row[key] for row in mine] for key in ("least_mm", "mae_mm", "largest_mm"))
         at = [row["offset_m"] for row in mine]
-        left.plot(at, mean, marker="o", ms=4, color=f"C{number}", label=name)
+        left.plot(at, mean, ms=5, label=name, **look(number))
         left.fill_between(at, low, high, color=f"C{number}", alpha=0.15)
     if found["arms"]:
         plain_log(left)
@@ -206,7 +213,7 @@ def range_end(found: dict, path: Path) -> Path:
         mine = [row for row in found["walls"] if row["model"] == model]
         name, _, changed = model.partition(", ")
         dashes = {"": "-", "mean kept": ":", "correlation": "-."}[changed]
-        style = {"ls": dashes, "lw": 1.2, "color": _model_colour(name)}
+        style = {"ls": dashes, "lw": 1.2, "color": _model_colour(name), "marker": _model_mark(name), "ms": 4}
         right.plot([r["depth_m"] for r in mine], [r["bias_mm"] for r in mine], label=model, **style)
     right.set_yscale("symlog", linthresh=10)
     right.set(xlabel="depth of the wall [m]", ylabel="mean signed error [mm], linear within 10 mm")
@@ -224,6 +231,12 @@ def _model_colour(name: str) -> str:
     designs = {label.replace(" ", "-"): colour for label, colour in COLOURS.items()}
     designs["none"] = COLOURS["no compression"]
     return next(colour for start, colour in designs.items() if name.startswith(start))
+
+
+def _model_mark(name: str) -> str:
+    if "-t" in name:
+        return "X" if "1x1" in name else "P"
+    return MARKS[next(label for label, colour in COLOURS.items() if colour == _model_colour(name))]
 
 
 def bars_of(cure: Sequence[dict], swap: Sequence[dict], offset_m: float, path: Path) -> Path:
@@ -254,7 +267,8 @@ def _levels(rows: Sequence[dict]) -> str:
 def _pairs(panel: Axes, names: Sequence[str], rows: Sequence[dict], offset_m: float) -> None:
     at = np.arange(len(rows))
     for shift, key, label in ((-0.2, "near_mm", "as it is"), (0.2, "far_mm", f"{offset_m:g} m farther in time")):
-        shown = panel.bar(at + shift, [row[key] for row in rows], 0.4, label=label)
+        hatch = "//" if key == "far_mm" else None  # two bars that differ without colour, too
+        shown = panel.bar(at + shift, [row[key] for row in rows], 0.4, label=label, hatch=hatch, edgecolor="white")
         panel.bar_label(shown, fmt="{:,.0f}", fontsize=7)
     panel.set_xticks(at, names, fontsize=7.5)
     plain_log(panel)
@@ -274,7 +288,7 @@ def energy(models: Mapping[ModelSpec, Trained], ratios: Sequence[dict], path: Pa
     top = max(float(histories[w][1].max()) for w in shown)
     for panel, one in zip(panels, shown, strict=True):
         picture = _heat(panel, *histories[one], models[one].config.model.sensor, top)
-        panel.axvline(reach, color="cyan", ls="--", lw=1.2)
+        panel.axvline(reach, color="white", ls="--", lw=1.2)
         panel.set_title(one.label.replace(", ", ",\n"), fontsize=9)
         panel.set_xlabel("depth of the time bin [m]")
     panels[0].set_ylabel("training step")
@@ -285,7 +299,7 @@ def energy(models: Mapping[ModelSpec, Trained], ratios: Sequence[dict], path: Pa
         boundary = boundary_bin(reach, sensor)
         values = [energy_ratio(line, sensor.bins, boundary) for line in energies]
         style = {"color": colour_of(one.label), "ls": "--" if one.time_offset_m else "-"}
-        marker = MARKERS.get(one.compression, "^")
+        marker = BY_COMPRESSION.get(one.compression, "^")
         axes.plot(steps, values, lw=1, marker=marker, ms=3, **style)
     axes.axhline(ENERGY_BAR, color="0.5", lw=1, ls=":")
     plain_log(axes)

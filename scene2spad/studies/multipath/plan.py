@@ -20,6 +20,7 @@ MODELS = (
 )
 # The same designs trained with indirect light, too
 MIXED = tuple(replace(one, trained_on="mixed") for one in MODELS)
+DELAYED = ModelSpec("learned", (1024, 2, 2), time_offset_m=12, trained_on="mixed")  # right at every depth
 # What of a render is sensed: the same surfaces, truth and mean counts.
 LIGHTS: dict[str, str] = {"flood": "direct and indirect light", "direct": "direct light alone"}
 

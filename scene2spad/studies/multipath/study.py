@@ -23,8 +23,8 @@ from scene2spad.networks.lookup import ModelLookup, obtain, where_trained
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import plain_log, plt, save
-from scene2spad.plots.style import COLOURS as OKABE_ITO
-from scene2spad.studies.multipath.plan import FILTER, HEADLINE, LIGHTS, MIXED, MODELS, PEAK, PLANS, Plan
+from scene2spad.plots.style import COLOURS, look
+from scene2spad.studies.multipath.plan import DELAYED, FILTER, HEADLINE, LIGHTS, MIXED, MODELS, PEAK, PLANS, Plan
 from scene2spad.studies.results import Store
 from scene2spad.studies.transport.study import direct_alone, rendered_once, without_network
 from scenes.files import finite, whole_file, write_csv
@@ -35,8 +35,9 @@ from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 
-COLOURS = {FILTER: "black", PEAK: OKABE_ITO["grey"]}
-COLOURS |= {one.name: f"C{n}" for models in (MODELS, MIXED) for n, one in enumerate(models)}
+LOOKS = {FILTER: look(0) | {"color": "black", "marker": "*"}, PEAK: look(0) | {"color": COLOURS["grey"], "marker": "X"}}
+LOOKS |= {one.name: look(n) for models in (MODELS, MIXED) for n, one in enumerate(models)}
+LOOKS[DELAYED.name] = look(len(MODELS))
 # a model trained on direct light -> the same design trained with indirect light
 MIXED_NAMES = {plain.name: mixed.name for plain, mixed in zip(MODELS, MIXED, strict=True)}
 
@@ -45,7 +46,7 @@ def run(command: Study, progress: Progress) -> dict:
     """Render, measure every method on both kinds of light, compare; table, JSON and figure in `command.out`."""
     plan, folder = PLANS[command.preset], command.out / command.preset
     models = obtain(MODELS, command, progress)
-    trained = models.found | where_trained(MIXED, command)
+    trained = models.found | where_trained((*MIXED, DELAYED), command)
     subjects = [without_network(name) for name in (FILTER, PEAK)] + [one.subject for one in trained.values()]
     full = rendered_rooms(plan, folder, progress)
     names = tuple(name for name, _ in plan.scenes)
@@ -176,8 +177,8 @@ def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
                 [m[key] for m in mine if (m["method"], m["signal"]) == (method, signal)]
                 for key in ("background", "mae_mm")
             ]
-            style = "--" if MIXED_NAMES.get(method) in methods else "-"
-            axes.plot(*points, style, marker="o", ms=3.5, color=COLOURS[method], label=method)
+            direct = {"ls": "--", "mfc": "white"} if MIXED_NAMES.get(method) in methods else {}
+            axes.plot(*points, ms=5, label=method, **LOOKS[method] | direct)
         axes.set_xscale("log")
         plain_log(axes)
         ticks = sorted({m["background"] for m in mine})
@@ -187,7 +188,7 @@ def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
         axes.grid(alpha=0.3)
     panels[0, 0].set_ylabel("mean absolute depth error [mm]")
     handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8)
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
     rooms = f"{scenes} room{'s' if scenes != 1 else ''}"
     dashed = ". Dashed: trained on direct light alone" if set(MIXED_NAMES.values()) & set(methods) else ""
     figure.suptitle(f"Multipath: {rooms} under a flood laser, mean of scenes{dashed}", fontsize=11)

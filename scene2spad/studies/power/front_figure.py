@@ -12,11 +12,10 @@ from matplotlib.axes import Axes
 
 from scene2spad.plots import figures
 from scene2spad.plots.figures import plt
+from scene2spad.plots.style import look
 from scene2spad.studies.power.front import HEADLINE, LOST_LIMIT, Design, lost
 from scenes.json_types import JsonObject
 from ultraphase.catalog import SPADS
-
-_MARKERS = "ospDv^<Phx>*8d"
 
 
 def draw_front(
@@ -29,7 +28,7 @@ def draw_front(
     """Draw six panels: MAE against both readings of power, bytes a pixel, clocks a photon and photons; lost photons."""
     figure, axes = plt.subplots(2, 3, figsize=(17, 10.5), layout="constrained")
     at = [row for row in rows if (row["photons"], row["frames_per_s"]) == HEADLINE]
-    styles = {one.name: {"color": f"C{n}", "marker": _MARKERS[n]} for n, one in enumerate(found)}
+    styles = {one.name: look(n) for n, one in enumerate(found)}
     readings = (
         (axes[0, 0], "processing_uw_energy", "energy x rate (94.6 GOPS/W; inferred)"),
         (axes[0, 1], "processing_uw_published", "as published (Joules x duty, called Watts)"),
@@ -70,7 +69,7 @@ def _points(
     best = front(places)
     axes.plot(*best.T, color="0.6", zorder=0)
     for row, (x, y) in zip(rows, places, strict=True):
-        axes.plot(x, y, linestyle="", markersize=9, label=row["name"], **styles[row["name"]])
+        axes.plot(x, y, markersize=9, label=row["name"], **styles[row["name"]] | {"ls": ""})
     for row in printed:
         label = "print: its clocks, MAE of 8 pairs at 16 levels" if row is printed[0] else None
         axes.plot(measure(row), row["mae_mm"], "k*", markerfacecolor="none", markersize=11, label=label)
@@ -105,7 +104,7 @@ def _by_photons(axes: Axes, rows: Sequence[dict], styles: dict) -> None:
         mine = [row for row in rows if row["name"] == name and row["frames_per_s"] == HEADLINE[1]]
         axes.plot([row["photons"] for row in mine], [row["mae_mm"] for row in mine], **style)
     axes.set(xscale="log", yscale="log", xlabel="photons a pixel and frame, 1 of 11 signal", ylabel="MAE [mm]")
-    axes.set_title("error against photons; 16-bit sums wrap from 259 in one bin on")
+    axes.set_title("error against photons (16-bit sums wrap)")
     _plain(axes)
 
 
@@ -113,12 +112,11 @@ def _losses(axes: Axes, found: Sequence[Design], losses: Sequence[dict], styles:
     photons = np.geomspace(20, 2e5, 120)
     rate = HEADLINE[1]
     for one, row in zip(found, losses, strict=True):
-        colour = styles[one.name]["color"]
-        axes.plot(photons, [lost(one.clocks, n * rate) for n in photons], color=colour)
+        axes.plot(photons, [lost(one.clocks, n * rate) for n in photons], **styles[one.name] | {"marker": ""})
         for spads, name in ((1, "one_spad"), (SPADS, "16_spads")):
             fraction = row[f"emulated_{name}"]
             if fraction > 0:
-                axes.plot(HEADLINE[0] * spads, fraction, linestyle="", markersize=7, **styles[one.name])
+                axes.plot(HEADLINE[0] * spads, fraction, markersize=7, **styles[one.name] | {"ls": ""})
     axes.axhline(LOST_LIMIT, color="0.6", linestyle="--")
     for spads, text in ((1, "S.2: one SPAD"), (SPADS, "S.2: 4 x 4 SPADs")):
         axes.axvline(HEADLINE[0] * spads, color="0.8", zorder=0)

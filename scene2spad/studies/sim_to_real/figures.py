@@ -8,35 +8,34 @@ from pathlib import Path
 import numpy as np
 
 from scene2spad.plots.figures import plt, save
+from scene2spad.plots.style import look
 from scene2spad.studies.sim_to_real.measures import Comparison
-
-COLOURS = ("tab:blue", "tab:orange", "tab:green")
 
 
 def draw_histograms(
     distances_m: np.ndarray, counts: np.ndarray, expected: np.ndarray, order: np.ndarray, columns: int, path: Path
 ) -> Path:
-    """Draw measured counts (N, Z, T) as dots and predicted ones as lines: a panel a zone, as the chip sees them."""
+    """Draw measured counts (N, Z, T) as marks and predicted ones as lines: a panel a zone, as the chip sees them."""
     rows = -(-len(order) // columns)
     figure, panels = plt.subplots(
         rows, columns, figsize=(4 * columns, 2.6 * rows), sharex=True, layout="constrained", squeeze=False
     )
     for panel, zone in zip(panels.ravel(), order, strict=False):
         for number, distance in enumerate(distances_m):
-            colour, peak = COLOURS[number % len(COLOURS)], int(expected[number, zone].argmax())
+            style, peak = look(number), int(expected[number, zone].argmax())
             shown = slice(max(0, peak - 6), peak + 30)
             bins = np.arange(counts.shape[2])[shown] + 0.5
-            panel.semilogy(bins, np.maximum(expected[number, zone, shown], 1), color=colour, lw=1)
+            panel.semilogy(bins, np.maximum(expected[number, zone, shown], 1), color=style["color"], lw=1)
             measured = np.maximum(counts[number, zone, shown], 1)
-            panel.semilogy(bins, measured, ".", color=colour, ms=4, label=f"{1e3 * distance:g} mm")
+            panel.semilogy(bins, measured, **style | {"ls": ""}, ms=3, label=f"{1e3 * distance:g} mm")
         panel.set_title(f"zone {zone}", fontsize=9)
         panel.grid(alpha=0.3)
     for panel in panels[-1]:
-        panel.set_xlabel("bin")
+        panel.set_xlabel("time bin")
     for panel in panels[:, 0]:
-        panel.set_ylabel("counts")
+        panel.set_ylabel("counts per bin")
     panels[0, 0].legend(fontsize=8)
-    figure.suptitle("Captures held out of the calibration: measured (dots) and predicted (lines)", fontsize=11)
+    figure.suptitle("Captures held out of the calibration: measured (marks) and predicted (lines)", fontsize=11)
     return save(figure, path)
 
 

@@ -28,6 +28,7 @@ from scene2spad.networks.registry import ModelSpec, Trained
 from scene2spad.networks.training import classical
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import plt, save
+from scene2spad.plots.style import look
 from scene2spad.studies.chip.chain import ChipDepth
 from scene2spad.studies.chip.code import compile_model
 from scene2spad.studies.results import Store
@@ -286,13 +287,13 @@ def draw(compared: Sequence[JsonObject], path: Path) -> Path:
     for number, clock in enumerate(CLOCKS):
         mine = [row for row in compared if row["clock"] == clock]
         place = np.array([methods.index(row["method"]) for row in mine]) + (number - 3) * 0.12
-        panels[0].plot([row["mae_mm"] for row in mine], place, "o", ms=5, color=f"C{number}", label=clock)
+        panels[0].plot([row["mae_mm"] for row in mine], place, ms=5, label=clock, **look(number) | {"ls": ""})
         if clock in (PERFECT, REAL):
             continue
         middle = np.array([100 * row["difference"] for row in mine])
         ends = np.array([[100 * row[end] for row in mine] for end in ("low", "high")])
         bars = np.abs(ends - middle) if len(mine) else np.zeros((2, 0))
-        panels[1].errorbar(middle, place, xerr=bars, fmt="o", ms=4, lw=1, color=f"C{number}")
+        panels[1].errorbar(middle, place, xerr=bars, ms=4, lw=1, **look(number) | {"ls": ""})
     panels[0].set_xscale("log")
     panels[0].set(xlabel="mean absolute depth error [mm]", yticks=range(len(methods)), yticklabels=methods)
     panels[0].invert_yaxis()

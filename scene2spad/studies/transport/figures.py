@@ -11,13 +11,12 @@ from matplotlib.ticker import PercentFormatter
 
 from csph.evaluation.methods import Evaluation, Row
 from scene2spad.plots.figures import plain_log, plt, save
-from scene2spad.plots.style import COLOURS
+from scene2spad.plots.style import COLOURS, look
 from scene2spad.studies.transport.plan import KEPT, LASERS, LATER, LEVELS, LIMIT, OPEN, REVERSED, STEPS
 from scenes.json_types import JsonObject
 
 LABELS = [label.replace(", ", ",\n") for label in STEPS.values()]
-VERDICTS = {KEPT: COLOURS["blue"], REVERSED: COLOURS["vermilion"], OPEN: "0.6"}
-MARKS = "os^DvP*X<>hd"
+VERDICTS = {KEPT: (COLOURS["blue"], "o"), REVERSED: (COLOURS["vermilion"], "s"), OPEN: ("0.6", "^")}
 MAX_PAIRS = 24  # of a panel
 
 
@@ -55,8 +54,7 @@ def _curve(axes: Axes, intervals: Sequence[tuple[float, float, float]], number: 
     mean, low, high = np.array(intervals).T
     place = np.arange(len(mean)) + 0.3 * ((number + 0.5) / of - 0.5)  # side by side, so that bars do not hide bars
     reach = np.nan_to_num([mean - low, high - mean]).clip(0)
-    look = {"marker": MARKS[number % len(MARKS)], "color": f"C{number % 10}", "ls": "-" if number < 10 else "--"}
-    axes.errorbar(place, mean, reach, ms=4.5, lw=1, capsize=2, elinewidth=0.8, label=label, **look)
+    axes.errorbar(place, mean, reach, ms=4.5, lw=1, capsize=2, elinewidth=0.8, label=label, **look(number))
 
 
 def draw_ranking(ranked: Sequence[JsonObject], path: Path) -> Path:
@@ -81,7 +79,7 @@ def draw_ranking(ranked: Sequence[JsonObject], path: Path) -> Path:
     for axes in panels[-1]:
         axes.set_xlabel("difference of MAE [mm]", fontsize=9)
         axes.tick_params(axis="x", labelsize=8)
-    handles = [plt.Line2D([], [], color=colour, marker="o", label=f"order {what}") for what, colour in VERDICTS.items()]
+    handles = [plt.Line2D([], [], color=c, marker=m, label=f"order {what}") for what, (c, m) in VERDICTS.items()]
     handles.append(plt.Line2D([], [], color="k", marker="o", mfc="white", lw=0.8, label="with RGB-D rates"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
     asked = "Does the ranking of codes change? Paired differences, 95 % intervals over scenes"
@@ -90,12 +88,13 @@ def draw_ranking(ranked: Sequence[JsonObject], path: Path) -> Path:
 
 
 def _gap(axes: Axes, r: JsonObject, place: int) -> None:
-    for name, shift, look in (
-        ("rgbd", -0.16, {"color": "k", "mfc": "white", "lw": 0.8}),
-        ("here", 0.16, {"color": VERDICTS[r["verdict"]], "lw": 1.4}),
+    colour, mark = VERDICTS[r["verdict"]]
+    for name, shift, style in (
+        ("rgbd", -0.16, {"color": "k", "marker": "o", "mfc": "white", "lw": 0.8}),
+        ("here", 0.16, {"color": colour, "marker": mark, "lw": 1.4}),
     ):
-        axes.plot([r[f"{name}_low"], r[f"{name}_high"]], [place + shift] * 2, color=look["color"], lw=look["lw"])
-        axes.plot(r[f"{name}_mm"], place + shift, "o", ms=4, color=look["color"], mfc=look.get("mfc", look["color"]))
+        axes.plot([r[f"{name}_low"], r[f"{name}_high"]], [place + shift] * 2, color=style["color"], lw=style["lw"])
+        axes.plot(r[f"{name}_mm"], place + shift, ms=4, **style)
 
 
 def draw_planned(planned: Sequence[JsonObject], scenes: Sequence[JsonObject], path: Path) -> Path:
@@ -113,7 +112,7 @@ def draw_planned(planned: Sequence[JsonObject], scenes: Sequence[JsonObject], pa
         off = place + 0.5 * ((number + 0.5) / len(designs) - 0.5)
         reach = np.nan_to_num([row["uncertain"] for row in mine])
         fraction = [row["difference"] for row in mine]
-        left.errorbar(fraction, off, xerr=reach, fmt=MARKS[number], ms=4, lw=1, capsize=2, label=design)
+        left.errorbar(fraction, off, xerr=reach, ms=4, lw=1, capsize=2, label=design, **look(number) | {"ls": ""})
     left.set_yticks(range(len(names)), [f"{scene}, {laser}" for scene, laser in names], fontsize=8)
     left.invert_yaxis()
     left.set_xlabel("MAE on the planned render over that on the full one, - 1")
