@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import matplotlib
 
 matplotlib.use("Agg")
@@ -24,14 +22,14 @@ COLOURS = {
     "brown": "#665544",
 }
 MARKERS = "os^DvP*X<>hdp"  # of lines, so that they differ without colour, too
-MOST_LETTERS = 26
+LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 plt.rcParams["axes.prop_cycle"] = plt.cycler(color=[*COLOURS.values()])
 plt.rcParams["pdf.fonttype"] = 42  # text in a PDF stays text
 plt.rcParams["svg.fonttype"] = "none"
 
 
-def look(number: int) -> dict[str, Any]:
+def look(number: int) -> dict[str, str]:
     """Return colour and marker of the line of that number; dashes once the colours have come round."""
     colour = [*COLOURS.values()][number % len(COLOURS)]
     return {"color": colour, "marker": MARKERS[number % len(MARKERS)], "ls": "--" if number >= len(COLOURS) else "-"}
@@ -40,13 +38,13 @@ def look(number: int) -> dict[str, Any]:
 def letter_panels(figure: Figure) -> None:
     """Letter the panels of a figure a, b, c left of their upper corners; colour bars and panels of text have none.
 
-    A single panel stays without, and so do sheets of more than `MOST_LETTERS` pictures.
+    A single panel stays without, and so do sheets of more pictures than letters.
     """
     panels = [one for one in figure.axes if one.axison and one.get_label() != "<colorbar>"]
-    if not 1 < len(panels) <= MOST_LETTERS:
+    if not 1 < len(panels) <= len(LETTERS):
         return
     for number, panel in enumerate(panels):
         panel.annotate(
-            chr(ord("a") + number), (0, 1), (-4, 3), xycoords="axes fraction", textcoords="offset points", ha="right",
+            LETTERS[number], (0, 1), (-4, 3), xycoords="axes fraction", textcoords="offset points", ha="right",
             va="bottom", fontsize=10, fontweight="bold", annotation_clip=False,
         )  # fmt: skip
