@@ -13,7 +13,7 @@ from scene2spad.cli.main import main
 from spad.sensor.files import read_sensor
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = {*NAMES}
 WORDS = 1000
 IN_CODE = re.compile(r"`[^`\n]+`|^    .*$|```.*?```", re.M | re.S)

@@ -33,7 +33,7 @@ def front_page() -> str:
     """Return README.md with links as they are seen from the folder of the documentation."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     text = text.replace("](docs/", "](")
-    return re.sub(r"\]\((examples|CONTRIBUTING\.md|LICENSE)[^)]*\)", "]", text).replace("[", "[", 1)
+    return re.sub(r"\[([^\]]*)\]\((?:examples|CONTRIBUTING\.md|LICENSE)[^)]*\)", r"\1", text)
 
 
 def command_line_page() -> str:
