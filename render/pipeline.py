@@ -273,14 +273,17 @@ def _unfiltered(
         own, reused = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
     if plan.spp is not None:
         return allocate(blocks, own, reused, cost=plan.spp), ()
+    least = settings.min_spp
     power, per_sample = power_of(direct)
     allowed = plan.noise**2 * power / per_sample
-    schedule = allocate(blocks, own, reused, squared_error=allowed)
+    schedule = allocate(blocks, own, reused, squared_error=allowed, min_spp=least)
     limit, asked = most_spp(settings)
     wanted, reasons = schedule.cost, []
     if wanted > limit:
         hopeless = wanted > HOPELESS * limit
-        schedule = allocate(blocks, own, reused, cost=min(limit, MAX_SPP_BY_DEFAULT) if hopeless else limit)
+        schedule = allocate(
+            blocks, own, reused, cost=min(limit, MAX_SPP_BY_DEFAULT) if hopeless else limit, min_spp=least
+        )
         remedy = "force more with spp" if asked else "ask for more with an error target"
         if hopeless and plan.clamp is None:
             remedy = f"{remedy}, or {PROPOSAL}"

@@ -17,9 +17,8 @@ from scenes.errors import InputError
 from scenes.model import Material
 
 DEFAULT_ERROR = 0.02
-# What direct light may be off, in shares of the target, where there is other light; and what is planned for of the
-# square that is aimed at: the rest is for merged returns and what twice as many rays a side still miss.
-DIRECT_FRACTION, PLANNED = 0.4, 0.96
+# Of the square that is aimed at: the rest is for merged returns and what twice as many rays a side still miss.
+PLANNED = 0.96
 # Time of a cell in that of a path: where many paths are to come, finer cells leave them more of the error.
 CELL_COST = 0.25
 # The pilot's pixels are not compared with those beside them, so that it shows 1.3 to 1.4 times the error of cells at
@@ -97,9 +96,9 @@ def rays_for_all(errors: Sequence[float], settings: RenderSettings) -> tuple[int
 
 
 def _direct_fraction(settings: RenderSettings, direct_alone: bool) -> float:
-    """Return the part of the target nRMSE that direct light may use: DIRECT_FRACTION, or all that is planned where
-    there is no other light."""
-    return math.sqrt(settings.target_fraction) if direct_alone else DIRECT_FRACTION
+    """Return the part of the target nRMSE that direct light may use: its own, or all that is planned where there is no
+    other light."""
+    return math.sqrt(settings.target_fraction) if direct_alone else settings.direct_fraction
 
 
 def refracting(world: TracedScene, settings: RenderSettings) -> TracedScene:

@@ -17,7 +17,7 @@ MAX_SAMPLES = 1 << 26
 # Independent batches of indirect light, whose spread is the error estimate. Low-discrepancy sets run within a batch:
 # fewer batches mean longer sets and less noise.
 BATCHES = 4
-MIN_SPP = 16  # paths a pixel of the darkest block, since pilots are short; fewer are traced only where forced
+MIN_SPP = 16  # paths a pixel of the darkest block, since pilots are short; fewer are traced only where asked for
 FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
 MAX_AMBIENT_SPP = 1 << 12
@@ -43,7 +43,9 @@ class RenderSettings:
     ambient_filtered  whether neighbouring pixels share the ambient light they reflect: far less noise, edges of shadows
                 and reflections in it are blurred by some pixels
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
+    min_spp     least paths per pixel of indirect light where `spp` is open, also where a pilot sees little noise
     target_fraction  part of the squared target that is planned for; the rest is for what pilots miss
+    direct_fraction  part of the target that direct light may be off where there is other light
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
     edge_threshold  edges of surfaces and shadows are followed where they could change this share of a cell or more;
                 0 follows all of them
@@ -63,7 +65,9 @@ class RenderSettings:
     ambient_spp: int | None = None
     ambient_filtered: bool = False
     error: float | None = None
+    min_spp: int = MIN_SPP
     target_fraction: float = 0.75
+    direct_fraction: float = 0.4
     budget: tuple[float, float] | None = None
     edge_threshold: float | None = None
     direct_tolerance_m: float | None = None
@@ -78,7 +82,9 @@ class RenderSettings:
             ("clamp", 1e-3, 1e6),
             ("grid", 1, 64),
             ("error", 1e-4, 1.0),
+            ("min_spp", 1, MAX_SAMPLES),
             ("target_fraction", 0.1, 2.0),
+            ("direct_fraction", 0.05, 0.95),
             ("edge_threshold", 0, 1),
             ("ambient_spp", 1, 1 << 16),
         )

@@ -114,16 +114,16 @@ class TracedScene:
         return other
 
     def _bind_camera(self, scene: Scene) -> None:
-        # What differs between the views of a set is opaque: a literal would compile every kernel again.
         self.scene, camera = scene, scene.camera
         self.responses: dict[tuple, np.ndarray] = {}  # `render.planning.pilot_response`
         self.glossy: Any = None  # `render.indirect.glossy.glossy_of`
-        self.intensity = upload(Float, scene.laser.intensity(camera))
+        size = camera.width * camera.height + 5  # of no launch's size: pilots have a lane a pixel (`_Given`)
+        self.intensity = upload(Float, scene.laser.intensity(camera), size)
         self.eye_m = camera.origin - self.origin
         self.eye = _opaque(self.eye_m)
         self.laser = _opaque(scene.laser.position(camera) - self.origin)
         self.axes = tuple(_opaque(column) for column in camera.rotation.T)
-        self.focal_px = dr.opaque(Float, camera.focal_px)
+        self.focal_px = dr.opaque(Float, camera.focal_px)  # a literal would compile every kernel again for each view
         self.width, self.height = dr.opaque(UInt32, camera.width), dr.opaque(UInt32, camera.height)
         # the corner pixels' rays lie on the rim of the smallest cone
         self.half_angle = dr.opaque(Float, math.acos(scene.laser.cos_half_angle(camera)) * (1 + 1e-5))

@@ -64,6 +64,13 @@ def test_many_views_get_the_rays_that_their_mean_squared_error_asks_for():
     grid, fraction = rays_for_all([0.012], alone)
     assert grid == 4 and 0.012 * (fraction / 0.5) ** 0.7 == pytest.approx(0.01)
     assert rays_for_all([0.01], RenderSettings(error=0.01, target_fraction=1.0))[0] > 4
+    half = RenderSettings(error=0.01, direct_fraction=0.5)
+    assert rays_for_all([0.005 * 2**1.3 * 1.001], half)[0] == 8
+
+
+def test_the_least_paths_of_an_open_plan_can_be_asked_for():
+    schedules = [render(room(), RenderSettings(error=0.3, bounces=2, grid=2, min_spp=least)) for least in (4, 16)]
+    assert [transient.meta["plan"]["spp"] for transient in schedules] == [4, 16]
 
 
 def test_plan_gives_a_reason_for_every_choice_and_can_be_forced():
