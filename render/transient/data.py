@@ -170,7 +170,7 @@ class Transient:
 
 
 def write_transient(transient: Transient, path: Path) -> None:
-    """Write the multi-part EXR, whole or not at all."""
+    """Write the multi-part EXR, whole or not at all. Raises InputError where the path cannot be written."""
     with whole_file(path) as beside:
         _write_exr(transient, beside)
 

@@ -141,7 +141,10 @@ def _are_whole(counts: np.ndarray) -> bool:
 
 
 def write_histogram(histogram: Histogram, path: Path) -> None:
-    """Write HDF5, whole or not at all: timestamps where they are the smaller form, else dense counts."""
+    """Write HDF5, whole or not at all: timestamps where they are the smaller form, else dense counts.
+
+    Raises InputError where the path cannot be written.
+    """
     import h5py
 
     meta = {**histogram.meta, "sensor": histogram.sensor.to_dict(), "budget": histogram.budget.to_dict()}

@@ -100,6 +100,8 @@ def transient_from_rgbd(
     at the pixel's centre, ambient light is the mean. `fov_deg` is the full horizontal angle that the cosine of
     incidence is taken with, from the depth image itself; None for surfaces that face the camera. Samples without
     depth (NaN or 0) return nothing; a pixel whose samples lie more than 50 mm apart, or partly nowhere, is mixed.
+    `depth_m` [m], `albedo` and `ambient` [W/(m2 sr nm)] are (H, W). Raises InputError for images of other shapes, sides
+    that `block` does not divide, and albedo or ambient light that is negative or not finite.
     """
     depth, albedo, ambient = _alike(depth_m, albedo, ambient)
     require(

@@ -1,6 +1,7 @@
 """The public names: they exist, they start nothing, and their examples run."""
 
 import doctest
+import inspect
 import sys
 
 import numpy as np
@@ -10,6 +11,7 @@ from processes import run_process
 import scene2spad as s2s
 from spad.estimators.depth import histogram_depth_m
 
+WITHOUT_ERRORS = ("models",)
 HEAVY = ("mitsuba", "drjit", "torch", "matplotlib", "scipy", "h5py", "OpenEXR", "trimesh")
 
 
@@ -23,7 +25,10 @@ def test_every_public_name_is_there_and_listed_once():
     assert len(set(s2s.__all__)) == len(s2s.__all__)
     assert set(s2s.__all__) == {name for names in s2s._MODULE_OF.values() for name in names} <= set(dir(s2s))
     for name in s2s.__all__:
-        assert getattr(s2s, name).__doc__, name
+        words = inspect.getdoc(getattr(s2s, name)) or ""
+        assert words, name
+        if inspect.isfunction(getattr(s2s, name)) and name not in WITHOUT_ERRORS:
+            assert "Raises" in words or "InputError" in words, f"{name} names no error"
     assert s2s.__version__.count(".") == 2
 
 
