@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from functools import cache
 from pathlib import Path
 
 from scenes.errors import InputError
@@ -49,6 +50,7 @@ def _physical() -> float:
         return math.inf
 
 
+@cache  # the limit is asked for at every exposure
 def _container(path: Path) -> float:
     try:
         return float(path.read_text())

@@ -38,7 +38,8 @@ def signal_fractions(signal: np.ndarray) -> SignalShares:
         return SignalShares(0.0, 0.0, few, 0.0, 0.0, 0.0)
     others = float(flat[:-few].mean()) if few < flat.size else total / flat.size
     fractions = float(flat[-1]) / total, float(flat[-few:].sum()) / total
-    return SignalShares(*fractions, few, others, float(np.median(flat)), total / flat.size)
+    median = float(flat[(flat.size - 1) // 2 : flat.size // 2 + 1].mean())
+    return SignalShares(*fractions, few, others, median, total / flat.size)
 
 
 def glint_warning(fractions: SignalShares) -> str | None:
