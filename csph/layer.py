@@ -46,7 +46,7 @@ class LayerOptions:
     zero_mean         rows of C are held to sum to zero over Mt: a uniform background then encodes to zero
     per_pixel_norm    one norm for all time blocks of a pixel (or block of pixels): which time block holds the return
                       is then not lost, and blocks without signal are not amplified
-    keep_mean         no removal of the mean over K: of K = 2 it leaves one sign bit, of K = 1 nothing, and the
+    keep_mean         the mean over K stays. Taken away, it leaves one sign bit of K = 2 and nothing of K = 1, and the
                       back-projection of Fourier series no longer moves with a delay
     pulse_in_decoder  back-project with the codes of a returning pulse, C h(tau), instead of those of one bin
     pulse_in_codes    encode and back-project with codes smoothed by the pulse

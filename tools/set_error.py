@@ -61,12 +61,16 @@ def fine_job(folder: Path, paths: int, grid: int) -> Job:
 
 
 def table(rows: list[tuple[int, float, float]]) -> str:
-    """Return one line a view (number, stated, true, stated / true), and one of medians and root mean squares."""
+    """Return one line a view (number, stated, true, stated / true), and one of medians and root mean squares.
+
+    The references' noise can make a small true error 0; its ratio is infinite.
+    """
     out = io.StringIO()
-    for view, stated, true in rows:
-        out.write(f"view {view:>6}: stated {stated:.2%}, true {true:.2%}, ratio {stated / true:.3f}\n")
-    all_stated, all_true = (np.array(column) for column in list(zip(*rows, strict=True))[1:])
-    medians = (np.median(values) for values in (all_stated, all_true, all_stated / all_true))
+    all_stated, all_true = (np.array(column, dtype=float) for column in list(zip(*rows, strict=True))[1:])
+    ratios = np.divide(all_stated, all_true, out=np.full(len(rows), np.inf), where=all_true > 0)
+    for (view, stated, true), ratio in zip(rows, ratios, strict=True):
+        out.write(f"view {view:>6}: stated {stated:.2%}, true {true:.2%}, ratio {ratio:.3f}\n")
+    medians = (np.median(values) for values in (all_stated, all_true, ratios))
     rms = (math.sqrt(np.mean(values**2)) for values in (all_stated, all_true))
     out.write("median stated {:.2%}, true {:.2%}, ratio {:.3f}; ".format(*medians))
     out.write("root mean square {:.2%}, {:.2%}\n".format(*rms))
@@ -74,6 +78,7 @@ def table(rows: list[tuple[int, float, float]]) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
+    """Run the script; return its exit status, 2 for what cannot be compared."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--views", type=int, default=16)

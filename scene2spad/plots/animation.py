@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from scene2spad.viewer.content import NS_PER_M, Cube
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.files import whole_file
 
 FRAMES = 48  # at the most
@@ -38,7 +38,8 @@ def write_gif(cube: Cube, path: Path, *, frames: int = FRAMES, side: int = SIDE)
 def write_mp4(cube: Cube, path: Path, *, frames: int = FRAMES, side: int = SIDE) -> Path:
     """Write the animation as MP4 (H.264), whole or not at all.
 
-    The encoder comes with `pip install 'scene2spad[video]'`; raises InputError that says so where it is missing.
+    The encoder comes with `pip install 'scene2spad[video]'`; raises InputError that says so where it is missing, and
+    where it cannot write all frames, as on a full disk.
     """
     try:
         import imageio_ffmpeg
@@ -49,13 +50,24 @@ def write_mp4(cube: Cube, path: Path, *, frames: int = FRAMES, side: int = SIDE)
     rows, columns = (length + length % 2 for length in pictures[0].shape[:2])  # H.264 takes even sizes alone
     with whole_file(path) as beside:
         film = imageio_ffmpeg.write_frames(
-            str(beside), (columns, rows), fps=1000 / MILLISECONDS, macro_block_size=2, output_params=["-f", "mp4"]
+            str(beside),
+            (columns, rows),
+            fps=1000 / MILLISECONDS,
+            macro_block_size=2,
+            output_params=["-f", "mp4"],
+            ffmpeg_log_level="quiet",
         )
         film.send(None)
-        for rgb in pictures:
-            more = ((0, rows - rgb.shape[0]), (0, columns - rgb.shape[1]), (0, 0))
-            film.send(np.ascontiguousarray(np.pad(rgb, more, mode="edge")))
-        film.close()
+        try:
+            for rgb in pictures:
+                more = ((0, rows - rgb.shape[0]), (0, columns - rgb.shape[1]), (0, 0))
+                film.send(np.ascontiguousarray(np.pad(rgb, more, mode="edge")))
+            film.close()
+            # the encoder ends without a word on a full disk: what it wrote is read again
+            written, _ = imageio_ffmpeg.count_frames_and_secs(str(beside))
+        except (OSError, RuntimeError):
+            written = 0
+        require(written == len(pictures), f"{path}: could not be written whole; is the disk full?")
     return path
 
 

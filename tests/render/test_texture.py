@@ -50,7 +50,7 @@ def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def points(scene: Scene) -> np.ndarray:
-    """Where POINTS x POINTS rays of every pixel meet the plane [m], (H, W, POINTS, POINTS, 3) float64."""
+    """Return where POINTS x POINTS rays of each pixel meet the plane [m], (H, W, POINTS, POINTS, 3) float64."""
     offset = (np.arange(POINTS) + 0.5) / POINTS
     row, column, down, aside = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), offset, offset, indexing="ij")
     rays = scene.camera.rays(column + aside, row + down)

@@ -6,6 +6,7 @@ import re
 import sys
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -152,6 +153,22 @@ def test_a_film_needs_its_extra(capfd, monkeypatch):
     assert main(["show", "gallery.h5", "--out", "film.mp4"]) == 2
     error = capfd.readouterr().err
     assert error == "scene2spad: film.mp4: needs a video encoder: pip install 'scene2spad[video]', or write a .gif\n"
+    assert not Path("film.mp4").exists()
+
+
+def test_a_film_that_the_encoder_leaves_cut_short_is_refused(capfd, monkeypatch):
+    """As on a full disk, where the encoder ends without an error."""
+
+    def takes_frames(path, size, **_):
+        Path(path).write_bytes(b"cut short")
+        while True:
+            yield
+
+    encoder = SimpleNamespace(write_frames=takes_frames, count_frames_and_secs=lambda path: (3, 0.24))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", encoder)
+    capfd.readouterr()
+    assert main(["show", "gallery.h5", "--out", "film.mp4"]) == 2
+    assert capfd.readouterr().err == "scene2spad: film.mp4: could not be written whole; is the disk full?\n"
     assert not Path("film.mp4").exists()
 
 
