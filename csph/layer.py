@@ -247,11 +247,21 @@ class CompressiveLayer(nn.Module):
         """Return codes of a histogram. Raises InputError for counts of another shape or type, or that blocks do not
         tile."""
         with torch.autocast(counts.device.type, enabled=False):
-            if self.options.int8:
-                return self._encode_int8(counts)
-            if self.spatial is not None and not self._forms(counts.numel()):
-                return blocks.encode_separable(counts, self._temporal_part(), self.spatial)
-            return blocks.encode_blocks(counts, self.weights())
+            return self._encode_int8(counts) if self.options.int8 else self._encode_exactly(counts)
+
+    def encode_mean(self, mean_counts: Tensor) -> Tensor:
+        """Return the mean codes of mean counts of any scale: `encode`, but with `int8` no sum wraps.
+
+        Raises InputError as `encode`.
+        """
+        with torch.autocast(mean_counts.device.type, enabled=False):
+            return self._encode_exactly(mean_counts)
+
+    def _encode_exactly(self, counts: Tensor) -> Tensor:
+        spatial = self._spatial_part()
+        if spatial is not None and not self._forms(counts.numel()):
+            return blocks.encode_separable(counts, self._temporal_part(), spatial)
+        return blocks.encode_blocks(counts, self.weights())
 
     def _core_sums(self, counts: Tensor) -> tuple[Tensor, Tensor]:
         """Return sums of int8 steps that each pixel's core makes, (B, K, T/Mt, R, C) exact, and the value of a step."""
@@ -288,28 +298,44 @@ class CompressiveLayer(nn.Module):
 
     def decode(self, codes: Tensor) -> Tensor:
         """Return ZN(C~)^T ZN(y). Raises InputError for codes of another shape."""
+        with torch.autocast(codes.device.type, enabled=False):
+            return self._projected(self._checked(codes))
+
+    def back_project(self, codes: Tensor) -> Tensor:
+        """Return ZN(C~)^T y: `decode` of codes whose scale counts, as that of a residual does.
+
+        Raises InputError for codes of another shape.
+        """
+        with torch.autocast(codes.device.type, enabled=False):
+            return self._projected(self._checked(codes), normalise=False)
+
+    def _checked(self, codes: Tensor) -> Tensor:
         good = codes.ndim == 5 and codes.shape[1] == self.codes
         require(good, f"codes of shape {tuple(codes.shape)}: expected (batch, {self.codes}, time, rows, columns)")
-        with torch.autocast(codes.device.type, enabled=False):
-            return self._projected(codes.to(self.temporal.dtype))
+        return codes.to(self.temporal.dtype)
 
     def forward(self, counts: Tensor) -> Tensor:
         """Return `decode(encode(counts))`, the input of the depth network."""
         with torch.autocast(counts.device.type, enabled=False):
             return self._projected(self.encode(counts))
 
-    def _projected(self, codes: Tensor) -> Tensor:
+    def _unit(self, codes: Tensor, normalise: bool) -> Tensor:
+        """Return ZN(y), or y less its mean over K where ZN would take it."""
         centre = not self.options.keep_mean
-        over = (2,) if self.options.per_pixel_norm else ()
+        if normalise:
+            return blocks.zero_normalised(codes, 1, centre=centre, over=(2,) if self.options.per_pixel_norm else ())
+        return blocks.centred(codes, 1) if centre else codes
+
+    def _projected(self, codes: Tensor, normalise: bool = True) -> Tensor:
+        centre = not self.options.keep_mean
         counts = codes.numel() * math.prod(self.block) // self.codes
         if self.background is None and self.spatial is not None and not self._forms(counts):
-            unit = blocks.zero_normalised(codes, 1, centre=centre, over=over)
             temporal = self._temporal_part()
             if self.options.pulse_in_decoder:
                 temporal = self._blurred(temporal)
             spatial = self._spatial_part()
             assert spatial is not None
-            return blocks.correlate_separable(unit, temporal, spatial, centre=centre)
+            return blocks.correlate_separable(self._unit(codes, normalise), temporal, spatial, centre=centre)
         weights = self.weights()
         direction = None if self.background is None else self._direction(self.background, weights, codes.shape[2])
         if self.options.pulse_in_decoder:
@@ -319,7 +345,7 @@ class CompressiveLayer(nn.Module):
             codes = codes - (codes * along).sum(1, keepdim=True) * along
             flat = weights.flatten(1)
             weights = (flat - direction.unsqueeze(-1) * (direction @ flat).unsqueeze(1)).view(-1, *weights.shape)
-        unit = blocks.zero_normalised(codes, 1, centre=centre, over=over)
+        unit = self._unit(codes, normalise)
         axis = 0 if direction is None else 1
         return blocks.back_project(unit, blocks.zero_normalised(weights, axis, centre=centre))
 

@@ -31,7 +31,15 @@ Step = Callable[[Tensor], Tensor]
 VIEWS = 3  # of the back-projection: as it is, and two averages
 
 
-class _FactorisedConv(nn.Module):
+def channels_last(network: nn.Module) -> None:
+    """Lay all convolutions out with channels last in memory: half the time of small ones on a CPU."""
+    for module in network.modules():
+        if isinstance(module, (nn.Conv2d, nn.Conv3d)):
+            order = torch.channels_last if isinstance(module, nn.Conv2d) else torch.channels_last_3d
+            module.to(memory_format=order)  # type: ignore[call-overload]  # not in torch's stubs
+
+
+class FactorisedConv(nn.Module):
     """x + relu(convolution over time of relu(convolution over space)): 12 taps instead of 27."""
 
     def __init__(self, channels: int) -> None:
@@ -40,7 +48,7 @@ class _FactorisedConv(nn.Module):
         self.time = nn.Conv2d(channels, channels, (3, 1), padding=(1, 0))
 
     def forward(self, x: Tensor, batch: int) -> Tensor:
-        return x + _over_time(self.time, self.space(x).relu_(), batch)
+        return x + over_time(self.time, self.space(x).relu_(), batch)
 
 
 class _ResidualConv3d(nn.Module):
@@ -67,37 +75,39 @@ class Compact(nn.Module):
         super().__init__()
         near, middle, far = 16, 32, 48
         self.stem = nn.Conv2d(FOLD, near, (3, 1), padding=(1, 0))
-        self.near = _FactorisedConv(near)
+        self.near = FactorisedConv(near)
         self.halved = nn.Conv2d(near, middle, 3, stride=2, padding=1)
-        self.middle = nn.ModuleList([_FactorisedConv(middle), _FactorisedConv(middle)])
+        self.middle = nn.ModuleList([FactorisedConv(middle), FactorisedConv(middle)])
         self.quartered = nn.Conv3d(middle, far, 3, stride=2, padding=1)
         self.far = nn.Sequential(*(_ResidualConv3d(far) for _ in range(2)))
         self.from_far = nn.Linear(far, middle)
         self.from_middle = nn.Linear(middle, near)
-        self.last = _FactorisedConv(near)
+        self.last = FactorisedConv(near)
         self.fine = nn.Linear(near, FOLD)
         self.trust = nn.Linear(near, VIEWS)
         with torch.no_grad():  # begin with what the back-projection says
             self.fine.weight.mul_(0.1)
             self.trust.weight.mul_(0.1)
             self.trust.bias.fill_(4.0)
-        # channels last in memory: half the time of small convolutions on a CPU
-        for module in self.modules():
-            if isinstance(module, (nn.Conv2d, nn.Conv3d)):
-                flat = isinstance(module, nn.Conv2d)
-                order = torch.channels_last if flat else torch.channels_last_3d
-                module.to(memory_format=order)  # type: ignore[call-overload]  # not in torch's stubs
+        channels_last(self)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.logits(x)
 
     def logits(self, x: Tensor, early: Step | None = None, late: Step | None = None) -> Tensor:
-        """Return the logits of a back-projection; `early` and `late` change the features (B T/16, channels, R, C) after
-        the first and before the last convolution."""
+        """Return the logits of a back-projection; `early` and `late` as in `features`."""
+        features, slices = self.features(x, early, late)
+        return logits_of(features, slices, self.fine, self.trust, x)
+
+    def features(self, x: Tensor, early: Step | None = None, late: Step | None = None) -> tuple[Tensor, Tensor]:
+        """Return the last features (B T/16, channels, R, C) and the back-projection as slices (B T/16, 16, R, C).
+
+        `early` and `late` change the features after the first and before the last convolution.
+        """
         check_input(x, FOLD)
-        batch, _, bins, rows, columns = x.shape
+        batch, _, _, rows, columns = x.shape
         slices = x.reshape(-1, FOLD, rows, columns)
-        first = _over_time(self.stem, fold(slices), batch)
+        first = over_time(self.stem, fold(slices), batch)
         near = self.near(early(first) if early else first, batch)
         middle = self.halved(near).relu_()
         for step in self.middle:
@@ -106,10 +116,7 @@ class Compact(nn.Module):
         volume = enlarged(_linear(self.from_far, self.far(self.quartered(volume).relu_())), volume, (2, 3, 4))
         middle = volume.transpose(1, 2).flatten(0, 1)
         features = enlarged(_linear(self.from_middle, middle), near, (2, 3))
-        features = self.last(late(features) if late else features, batch)
-        weights = (*self.fine.parameters(), *self.trust.parameters())
-        logits = read_out(features.flatten(2).transpose(1, 2), slices, *weights)
-        return logits.view(batch, bins, rows, columns)
+        return self.last(late(features) if late else features, batch), slices
 
 
 class _Fold(torch.autograd.Function):
@@ -131,7 +138,7 @@ def fold(slices: Tensor) -> Tensor:
     return _Fold.apply(slices.flatten(2)).transpose(1, 2).unflatten(2, slices.shape[2:])
 
 
-def _over_time(convolution: nn.Conv2d, x: Tensor, batch: int) -> Tensor:
+def over_time(convolution: nn.Conv2d, x: Tensor, batch: int) -> Tensor:
     """Convolve features (B T, channels, R, C) with a kernel 3 x 1 over (T, R C), followed by relu."""
     rows, columns = x.shape[2:]
     stretched = x.permute(0, 2, 3, 1).reshape(batch, -1, rows * columns, x.shape[1]).permute(0, 3, 1, 2)
@@ -182,6 +189,12 @@ def read_out(
     slice and its averages. features (N, P, channels), slices (N, F, R, C), P = R C; weights (F, channels), (F,), (3,
     channels) and (3,) -> (N, F, P), in memory as the histogram lies."""
     return _ReadOut.apply(features, slices, fine, fine_bias, trust, trust_bias)
+
+
+def logits_of(features: Tensor, slices: Tensor, fine: nn.Linear, gates: nn.Linear, like: Tensor) -> Tensor:
+    """Return `read_out` of features (N, channels, R, C) as logits (B, T, R, C) of a histogram (B, 1, T, R, C)."""
+    flat = features.flatten(2).transpose(1, 2)
+    return read_out(flat, slices, fine.weight, fine.bias, gates.weight, gates.bias).view(like.shape[0], *like.shape[2:])
 
 
 def averages(slices: Tensor) -> tuple[Tensor, Tensor]:

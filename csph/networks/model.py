@@ -22,7 +22,8 @@ from csph.networks.grid import published_position
 from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
 from csph.networks.posterior import Decoder, confidence, decoded
 from csph.networks.published import DeepBoosting, parameters_of
-from csph.training.config import ModelConfig, TrainConfig
+from csph.networks.refined import Refined
+from csph.training.config import ModelConfig, TrainConfig, grows
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.inputs import regular_file
@@ -54,8 +55,9 @@ def _inside(span: Span) -> slice:
 
 
 def _network(config: ModelConfig) -> Compact | DeepBoosting:
-    if config.network == "blockwise" and config.design is not None:
-        return Blockwise(config.design.block, config.design.codes)
+    if config.sees_codes:
+        kind = Refined if config.network == "refined" else Blockwise
+        return kind(config.codes_design.block, config.codes_design.codes)
     return Compact() if config.network == "compact" else DeepBoosting(can_die=config.network == "published")
 
 
@@ -87,9 +89,9 @@ class DepthModel(nn.Module):
             mine.fit_ranges()
 
     def begin_with_network(self, other: DepthModel) -> None:
-        """Take the weights of another model's network alone; what a blockwise network has beyond a compact one keeps
-        its start, which adds nothing."""
-        grown = self.config.network == "blockwise" and other.config.network == "compact"
+        """Take the weights of another model's network alone; what a larger network has beyond a smaller one
+        (`training.config.GROWING`) keeps its start, which adds nothing."""
+        grown = self.config.network != other.config.network and grows(other.config.network, self.config.network)
         self.network.load_state_dict(other.network.state_dict(), strict=not grown)
 
     @property
@@ -124,10 +126,12 @@ class DepthModel(nn.Module):
     def logits_of_codes(self, codes: Tensor) -> Tensor:
         """Return logits (B, T, R, C) of codes (B, K, T/Mt, R/Mr, C/Mc)."""
         x = self.codes_layer.decode(codes)
+        if isinstance(self.network, Refined):
+            return self.network(x, codes.to(x.dtype), self.codes_layer)
         return self.network(x, codes.to(x.dtype)) if isinstance(self.network, Blockwise) else self.network(x)
 
     def forward(self, counts: Tensor) -> Tensor:
-        if isinstance(self.network, Blockwise) and self.layer is not None:
+        if self.config.sees_codes and self.layer is not None:
             return self.logits_of_codes(self.layer.encode(counts))
         return self.network(self.seen(counts))
 

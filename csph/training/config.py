@@ -17,9 +17,10 @@ from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
 
-Network = Literal["compact", "blockwise", "published", "published-signed"]
+Network = Literal["compact", "blockwise", "refined", "published", "published-signed"]
 Front = Literal["codes", "counts", "matched", "peak"]
-NETWORKS: tuple[str, ...] = ("compact", "blockwise", "published", "published-signed")
+GROWING: tuple[Network, ...] = ("compact", "blockwise", "refined")  # each holds the weights of the one before
+NETWORKS: tuple[str, ...] = (*GROWING, "published", "published-signed")
 FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
 Schedule = Literal["steps", "cosine"]
 SCHEDULES: tuple[str, ...] = ("steps", "cosine")
@@ -30,6 +31,14 @@ MAX_STEPS, MAX_THREADS = 10**8, 1024
 COUNT_BYTES = 4 * 4  # of a batch: counts, logits, their gradient and the target, in float32
 
 
+def grows(smaller: str, larger: str) -> bool:
+    """Tell whether a network holds all weights of another: the same kind, or one further in `GROWING`."""
+    order: tuple[str, ...] = GROWING
+    if smaller in order and larger in order:
+        return order.index(smaller) <= order.index(larger)
+    return smaller == larger
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """Configuration of a depth model: all that stands between counts and depth.
@@ -38,8 +47,8 @@ class ModelConfig:
              with the pulse (`spad.estimators.matching.normalised_correlation`); or one-hot argmax
     design   the codes, with `front` = "codes"
     layer    switches of `csph.layer.LayerOptions` that differ from the published layer
-    network  compact; blockwise, the compact one that sees codes and places in a block, too; published; or published
-             with logits of any sign, which cannot die
+    network  compact; blockwise, the compact one that sees codes and places in a block, too; refined, the blockwise one
+             that looks at the codes a second time; published; or published with logits of any sign, which cannot die
     sensor   whose histograms it takes
     grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with print
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
@@ -63,17 +72,22 @@ class ModelConfig:
         require(known, f"spatial start {self.spatial_start!r} is unknown, expected one of {', '.join(STARTS)}")
         coded = self.front == "codes"
         require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
-        require(coded or self.network != "blockwise", "network blockwise: is for codes, and there are none")
+        require(coded or not self.sees_codes, f"network {self.network}: is for codes, and there are none")
         if self.design is not None:
             bins, block = self.sensor.bins, self.design.block
-            folded = self.network != "blockwise" or block[0] % 16 == 0
-            require(folded, f"network blockwise: blocks of {block[0]} bins, expected a multiple of 16")
+            folded = not self.sees_codes or block[0] % 16 == 0
+            require(folded, f"network {self.network}: blocks of {block[0]} bins, expected a multiple of 16")
             require(bins % block[0] == 0, f"blocks of {block[0]} bins do not divide the sensor's {bins}")
             counted = self.design.code == "coarse" or self.design.full
             rounded = f"{self.design.name}: int8 is for codes with a table of their own, not counters or full tensors"
             require(not (counted and self.layer.get("int8")), rounded)
             message = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
             require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{message}, or --layer keep_mean")
+
+    @property
+    def sees_codes(self) -> bool:
+        """Tell whether the network sees the codes themselves beside their back-projection."""
+        return self.network in ("blockwise", "refined")
 
     @property
     def codes_design(self) -> Design:

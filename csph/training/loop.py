@@ -38,7 +38,7 @@ from csph.networks.grid import on_published_grid, published_target
 from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
 from csph.networks.posterior import DECODERS
 from csph.networks.published import soft_argmax
-from csph.training.config import TrainConfig
+from csph.training.config import TrainConfig, grows
 from csph.training.data import SetData, TrainBatch
 from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.resume import WholeFileCheckpoints, check_resume
@@ -256,7 +256,7 @@ def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
     names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
     bare = [replace(one, sensor=replace(one.sensor, name="", tdc=None)) for one in (mine, other)]
     alike = all(getattr(bare[0], name) == getattr(bare[1], name) for name in names if name != "network")
-    alike = alike and (mine.network, other.network) in {(mine.network, mine.network), ("blockwise", "compact")}
+    alike = alike and grows(other.network, mine.network)
     message = (
         f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
     )

@@ -41,10 +41,11 @@ class Train(Long):
     network with three times workstation's pixels, sensed on the GPU; paper: the published network and schedule (GPU);
     laptop-v1: the recipe of the first models."""
     network: Annotated[
-        Literal["compact", "blockwise", "published", "published-signed"] | None,
-        may_stay_open("{compact,blockwise,published,published-signed}"),
+        Literal["compact", "blockwise", "refined", "published", "published-signed"] | None,
+        may_stay_open("{compact,blockwise,refined,published,published-signed}"),
     ] = None
-    """Our own, the published, or the published without its final ReLU, which can die (default: the preset's)."""
+    """Our own (compact; blockwise sees the codes, too; refined looks at them twice), the published, or the published
+    without its final ReLU, which can die (default: the preset's)."""
     sensor: str = "reference"
     """Sensor preset or sensor file (.toml), as in `sense`; with a time-to-digital converter patches are drawn through
     it."""

@@ -121,6 +121,7 @@ def test_mirrored_and_spans():
     [
         ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL),
         ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL, network="blockwise"),
+        ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL, network="refined"),
         ModelConfig(front="matched", sensor=SMALL),
         ModelConfig(front="counts", network="published-signed", sensor=SMALL),
     ],
