@@ -53,6 +53,8 @@ class RenderSettings:
                 do not with 0
     refraction  whether solid glass bends direct light; open: where there is any, and the laser is at the camera
     indirect_growth  that width grows by this share of the path behind the direct light
+
+    Raises InputError for values out of range.
     """
 
     bounces: int | None = None

@@ -12,6 +12,12 @@ from scenes.errors import InputError, require
 MAX_RADIANCE = 1e9
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Compute the cross product of two vectors; numpy's takes longer to see that there are two."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+
+
 def frozen_array(value: object, dtype: type, shape_tail: tuple[int, ...], what: str) -> np.ndarray:
     """Return `value` as a read-only array of `dtype` whose trailing dimensions are `shape_tail`, or an InputError.
 

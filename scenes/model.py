@@ -14,7 +14,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from scenes.arrays import check_faces, checked_radiance, finite_number, frozen_array, rigid_pose
+from scenes.arrays import check_faces, checked_radiance, cross, finite_number, frozen_array, rigid_pose
 from scenes.errors import InputError, require
 from scenes.notebook import html_card
 
@@ -37,7 +37,7 @@ MAX_IMAGE_SIDE = 16384  # pixels
 class Texture:
     """A single-channel linear image mapped by texture coordinates: u to the right, v upwards, both repeating.
 
-    image: (h, w) float32, row 0 on top. `name` says where it came from.
+    image: (h, w) float32, row 0 on top. `name` says where it came from. Raises InputError for values below 0.
     """
 
     image: np.ndarray
@@ -52,12 +52,6 @@ class Texture:
         object.__setattr__(self, "image", image)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Compute the cross product of two vectors; numpy's takes longer to see that there are two."""
-    (ax, ay, az), (bx, by, bz) = a, b
-    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
-
-
 def _fraction(value: float | Texture, what: str) -> float | Texture:
     """`value`, a number or a texture, if it lies in [0, 1], as a reflectance or an opacity does."""
     if not isinstance(value, Texture):
@@ -69,7 +63,7 @@ def _fraction(value: float | Texture, what: str) -> float | Texture:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Material of a surface: how it reflects at the laser's wavelength.
+    """Material of a surface: how it reflects at the laser's wavelength. Raises InputError for values out of range.
 
     kind        the reflectance model; names and meaning are those of Mitsuba 3
     albedo      diffuse reflectance, number or texture (diffuse, roughdiffuse, plastic, roughplastic)
@@ -95,9 +89,8 @@ class Material:
 
     def __post_init__(self) -> None:
         where = f"material {self.name}"
-        require(
-            self.kind in MATERIAL_KINDS, f"{where}: kind {self.kind!r}, expected one of {', '.join(MATERIAL_KINDS)}"
-        )
+        known = self.kind in MATERIAL_KINDS
+        require(known, f"{where}: kind {self.kind!r}, expected one of {', '.join(MATERIAL_KINDS)}")
         known = self.distribution in DISTRIBUTIONS
         require(known, f"{where}: distribution {self.distribution!r}, expected one of {', '.join(DISTRIBUTIONS)}")
         for label in ("albedo", "specular", "opacity"):
@@ -116,6 +109,7 @@ class Material:
 
     @property
     def lets_light_through(self) -> bool:
+        """Return whether light goes through the surface, or through holes cut in it."""
         opaque = self.opacity.image.min() >= 1 if isinstance(self.opacity, Texture) else self.opacity >= 1
         return self.is_glass or not opaque
 
@@ -126,6 +120,7 @@ class Surface:
 
     vertices (n, 3) metres, faces (m, 3), optional uv (n, 2) and shading normals (n, 3) per vertex.
     `emission` is the steady spectral radiance of an area light [W/(m^2 sr nm)], on the side of the face normals.
+    Raises InputError for a mesh that does not hold together, and numbers that are not finite.
     """
 
     vertices: np.ndarray
@@ -165,7 +160,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera. `pose` is camera to world (4x4); `fov_deg` the full horizontal angle; pixels are square."""
+    """A pinhole camera: `pose` camera to world (4x4), `fov_deg` the full horizontal angle. InputError out of range."""
 
     pose: np.ndarray
     fov_deg: float
@@ -193,20 +188,21 @@ class Camera:
         height: int,
         up: Iterable[float] = (0.0, 1.0, 0.0),
     ) -> Camera:
-        """Return a camera at `origin` whose axis meets `target`, with `up` (world) upwards in the image."""
+        """Return a camera at `origin` [m] that looks at `target` [m], `up` upwards in the image, or an InputError."""
         origin, target, up = (np.asarray(tuple(v), float) for v in (origin, target, up))
         forward = target - origin
-        right = _cross(forward, up)
+        right = cross(forward, up)
         far_enough = np.linalg.norm(forward) > 1e-9 and np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward)
         require(bool(far_enough), f"camera at {origin.tolist()} cannot look at {target.tolist()} with up {up.tolist()}")
         forward = forward / np.linalg.norm(forward)
         right = right / np.linalg.norm(right)
         pose = np.eye(4)
-        pose[:3] = np.column_stack((right, _cross(forward, right), forward, origin))
+        pose[:3] = np.column_stack((right, cross(forward, right), forward, origin))
         return cls(pose, fov_deg, width, height)
 
     @property
     def origin(self) -> np.ndarray:
+        """Return the camera's position in the world [m], (3,)."""
         return self.pose[:3, 3]
 
     @property
@@ -230,7 +226,8 @@ class Camera:
         return replace(self, width=width, height=height)
 
     def rays(self, x: np.ndarray | None = None, y: np.ndarray | None = None) -> np.ndarray:
-        """Return unit directions in the world, float64, through raster positions x, y (default: all pixel centres)."""
+        """Return unit directions in the world, (..., 3) float64, through raster positions x, y (default: all pixel
+        centres, (H, W, 3)), which broadcast to (...,)."""
         if x is None or y is None:
             x, y = np.arange(self.width) + 0.5, np.arange(self.height)[:, None] + 0.5
         local = np.ones((*np.broadcast_shapes(np.shape(x), np.shape(y)), 3))
@@ -257,7 +254,7 @@ class Laser:
     cone_deg    full angle of the flood cone around the camera's axis; None: the smallest cone that holds the image
 
     Its profile I(w) [1/sr] integrates to 1 over its cone, row or pixel. A displaced line or scan beam keeps its solid
-    angle and is steered onto what the pixel sees.
+    angle and is steered onto what the pixel sees. Raises InputError for an unknown mode, and values out of range.
     """
 
     mode: LaserMode = "flood"
@@ -275,10 +272,11 @@ class Laser:
 
     @property
     def is_colocated(self) -> bool:
+        """Return whether the laser is at the camera."""
         return self.baseline_m == (0.0, 0.0, 0.0)
 
     def position(self, camera: Camera) -> np.ndarray:
-        """Return laser position in the world, metres."""
+        """Return the laser's position in the world [m], (3,)."""
         return camera.origin + camera.rotation @ np.asarray(self.baseline_m)
 
     def cos_half_angle(self, camera: Camera) -> float:
@@ -303,7 +301,8 @@ class Ambient:
     """Steady light that is not the laser's: a constant radiance or an environment map [W/(m^2 sr nm)].
 
     The map is equirectangular, placed as Mitsuba's `envmap` places it: its top row looks along +y of its own frame,
-    its left and right edges meet along -z; `pose` is environment to world. Area lights belong to their `Surface`.
+    its left and right edges meet along -z; `pose` is environment to world (4x4). Area lights belong to their `Surface`.
+    Raises InputError for radiances below 0, or both at once.
     """
 
     radiance: float = 0.0
@@ -321,7 +320,7 @@ class Ambient:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """Everything that is there. `notes` says, one line each, what a loader changed, assumed or left out."""
+    """Everything that is there; `notes` say what a loader changed or left out. Raises InputError without surfaces."""
 
     name: str
     surfaces: tuple[Surface, ...]
@@ -350,10 +349,12 @@ class Scene:
 
     @property
     def triangles(self) -> int:
+        """Return the number of triangles of all surfaces."""
         return sum(len(surface.faces) for surface in self.surfaces)
 
     @property
     def has_ambient(self) -> bool:
+        """Return whether any light but the laser's is there."""
         lit = self.ambient.radiance > 0 or self.ambient.environment is not None
         return lit or any(surface.emission > 0 for surface in self.surfaces)
 
@@ -362,7 +363,7 @@ class Scene:
         return replace(self, surfaces=tuple(replace(s, emission=0.0) for s in self.surfaces), ambient=Ambient())
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return lowest and highest corner of all surfaces, metres."""
+        """Return lowest and highest corner of all surfaces [m], (3,) each."""
         low = np.min([s.vertices.min(axis=0) for s in self.surfaces], axis=0)
         return low, np.max([s.vertices.max(axis=0) for s in self.surfaces], axis=0)
 

@@ -28,6 +28,7 @@ class ChipSpec:
     """Published numbers of the chip and of its readout interface (as on SwissSPAD2); below them, assumed ones.
 
     energy_per_instruction_j: 94.6 GOPS/W of the authors' script. S.2 prints its inverse as Watts; see `power`.
+    Raises InputError for a chip that cannot be emulated.
     """
 
     cores: tuple[int, int] = (3, 6)
@@ -52,6 +53,7 @@ class ChipSpec:
 
     @property
     def ram_bytes(self) -> int:
+        """Return the bytes of one core's RAM."""
         return self.ram_bits // 8
 
     @property
@@ -65,7 +67,7 @@ class ChipSpec:
         return 1 / (self.clock_s * self.clocks_per_instruction)
 
     def processing_time_s(self, photons: float, clocks_per_photon: float) -> float:
-        """Return time one core works on one frame."""
+        """Return the time [s] that one core works on a frame of so many `photons`, a number for the core."""
         return photons * clocks_per_photon * self.clock_s
 
     def energy_j(self, clocks: float) -> float:

@@ -206,7 +206,7 @@ class Core:
         return _BasicBlock(names["does"], end)
 
     def contents(self, region: str) -> np.ndarray:
-        """Return numbers in a region of RAM."""
+        """Return numbers in a region of RAM, (count,)."""
         return region_contents(self.program, np.frombuffer(bytes(self.ram), np.uint8)[None], region)[0]
 
     @property
@@ -231,6 +231,7 @@ class Core:
 
     @property
     def state(self) -> State:
+        """Return where the core is: its word, registers, RAM, what left the sensor, and the cost until here."""
         return State(self.word, tuple(self.registers), bytes(self.ram), tuple(self.out), self.counters)
 
     # What the compiled instructions call

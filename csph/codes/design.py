@@ -22,6 +22,8 @@ class Design:
     full             every entry a number of its own, instead of temporal x spatial (learned and random alone)
     spatial_learned  the spatial part of a fixed temporal code is learned ("fourier+learned")
     zero_mean        rows are held to sum to zero over Mt; None: all but coarse histograms, as published
+
+    Raises InputError for an unknown code, and more codes than it has.
     """
 
     code: str = "learned"
@@ -78,6 +80,7 @@ class Design:
 
     @property
     def block_name(self) -> str:
+        """Return the block in words, as in "256 x 4 x 4"."""
         return " x ".join(map(str, self.block))
 
     @property
@@ -104,6 +107,7 @@ class Design:
 
     @property
     def spatial_parameters(self) -> int:
+        """Count the parameters of the spatial factor, K Mr Mc; 0 without one."""
         return self.codes * math.prod(self.block[1:]) if self.has_spatial else 0
 
     @property

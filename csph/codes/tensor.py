@@ -27,6 +27,8 @@ class CodingTensor:
     spatial   (K, Mr, Mc) float32 of a separable tensor, C[k, t, r, c] = temporal[k, t] spatial[k, r, c]; else None
     computed  how many numbers generate the temporal part on the fly, whatever K (Fourier: Mt/4, a quarter wave);
               None where it is stored entry by entry
+
+    Raises InputError for other shapes, values that are not finite, and more codes than counts.
     """
 
     name: str
@@ -94,7 +96,7 @@ class CodingTensor:
 
     @cached_property
     def table(self) -> Tensor:
-        """Return the tensor as `encode_photons` wants it, one row of K a place in the block."""
+        """Return the tensor as `encode_photons` wants it, (Mt Mr Mc, K): a row for each place in the block."""
         return photon_table(self.tensor)
 
     @property

@@ -23,6 +23,7 @@ LONG_BLOCK = 256  # bins; learned codes over more of them know the depths of the
 class Card:
     """Card of a shipped model: its training, its errors, and its limits.
 
+    compression   counts of a block over its codes, a ratio; 1 without codes
     training, training_sha256   its sets' files and their SHA-256
     levels        photon levels of training, in words
     cpu_minutes   of its training; None where they were not recorded
@@ -46,6 +47,7 @@ class Card:
     not_for: tuple[str, ...]
 
     def to_dict(self) -> JsonObject:
+        """Return the card as JSON holds it."""
         return asdict(self)
 
 

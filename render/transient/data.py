@@ -34,16 +34,18 @@ class Transient:
     """Per-pixel time-resolved radiance as a ragged list of returns, and flat layers beside it.
 
     offsets       (H*W + 1,) int64: the returns of pixel p are [offsets[p], offsets[p+1])
-    path_near_m, path_far_m  float32: a return is uniform over this interval of optical path length, laser to surface to
-                  camera; sorted by `path_near_m` within a pixel
-    radiance      float32: radiance integrated over time, per joule emitted, pixel mean [1/(m^2 sr)]
-    bounces       uint8: surfaces met (1 = direct; of merged indirect light the fewest)
+    path_near_m, path_far_m  (N,) float32: a return is uniform over this interval of optical path length, laser to
+                  surface to camera; sorted by `path_near_m` within a pixel
+    radiance      (N,) float32: radiance integrated over time, per joule emitted, pixel mean [1/(m^2 sr)]
+    bounces       (N,) uint8: surfaces met (1 = direct; of merged indirect light the fewest)
     depth_m       (H, W) float32: radial distance to the first opaque surface at the pixel centre, NaN for none
     normal        (H, W, 3) float16, world, toward the camera; albedo (H, W) float16 at the pixel centre
     ambient       (H, W) float32: steady spectral radiance [W/(m^2 sr nm)]
     mixed         (H, W) bool: surfaces more than 50 mm apart, or a surface and nothing, in one pixel
     error         (H, W) float32: estimated standard error of the pixel's total radiance
     meta          scene, seed, plan, versions: anything JSON holds
+
+    Raises InputError for arrays of other types or shapes, and values that are no light.
     """
 
     height: int
@@ -119,11 +121,12 @@ class Transient:
 
     @property
     def returns(self) -> int:
+        """Return the number N of returns of all pixels."""
         return len(self.radiance)
 
     @property
     def return_pixel(self) -> np.ndarray:
-        """Return the flat pixel index of every return, int64."""
+        """Return the flat pixel index of every return, (N,) int64."""
         return np.repeat(np.arange(self.height * self.width), np.diff(self.offsets))
 
     def total_radiance(self) -> np.ndarray:

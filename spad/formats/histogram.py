@@ -32,6 +32,8 @@ class Histogram:
     albedo               (H, W) float16 truth at the pixel centre
     expected_signal, expected_background   (H, W) float32, detections per pixel and exposure
     meta                 seed, plan, what made the transient: anything JSON holds
+
+    Raises InputError for arrays of other types or shapes, and values below 0.
     """
 
     counts: np.ndarray

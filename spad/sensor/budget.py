@@ -35,6 +35,8 @@ class Optics:
     transmission      of lens and filter at the laser's wavelength
     filter_nm         width of the band that the filter lets through
     wavelength_m      of the laser
+
+    Raises InputError for values that are not above 0.
     """
 
     pulse_energy_j: float
@@ -82,7 +84,7 @@ class Optics:
     ) -> PhotonBudget:
         """Return mean signal and mean background of a scene: the budget by means that gives these very expected counts.
 
-        Background is ambient light through the filter and dark counts, the sensor's or a measured map's. Raises
+        Background is ambient light through the filter and dark counts, the sensor's or a measured map's (H, W). Raises
         InputError where the mean ambient radiance is above a bright sky's: then a scene file's lights are in units of
         their own, as those made for pictures are.
         """

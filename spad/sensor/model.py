@@ -39,6 +39,8 @@ class Sensor:
     dead_time_s           dead time after a detection, not prolonged by photons that arrive in it
     crosstalk             probability that a detection fires a given one of the four neighbours, at the same time
     tdc                   converters whose codes are not equally wide (`Tdc`); None: every bin is as wide as the others
+
+    Raises InputError for values out of range, naming the sensor.
     """
 
     name: str = "reference"
@@ -129,7 +131,7 @@ class Sensor:
 
     @property
     def code_edges(self) -> np.ndarray | None:
-        """Return edges of the bins in true time by converter, as `Tdc.edges`; None for equal bins."""
+        """Return edges of the bins in true time, (converters, bins + 1) in bins as `Tdc.edges`; None for equal bins."""
         return None if self.tdc is None else self.tdc.edges(self.bins, self.bin_width_s)
 
     def converter_map(self, height: int, width: int, seed: int = 0) -> np.ndarray | None:
@@ -141,6 +143,7 @@ class Sensor:
 
     @property
     def bins_per_period(self) -> int:
+        """Return the number of bins of one laser period, `bins` or more."""
         return round(self.period_s / self.bin_width_s)
 
     @property
@@ -191,6 +194,7 @@ class Sensor:
 
     @classmethod
     def from_dict(cls, values: JsonObject) -> Sensor:
+        """Return the sensor that `to_dict` described. Raises InputError as the class does."""
         parts = {"pulse": pulse_from_dict(values["pulse"]), "jitter": pulse_from_dict(values.get("jitter"))}
         tdc = values.get("tdc")
         return cls(**{**values, **parts, "tdc": None if tdc is None else Tdc(**tdc)})
@@ -225,6 +229,7 @@ class PhotonBudget:
 
     Primary: PDE included, dead time, pile-up and crosstalk not. Signal sums direct and indirect light, what wraps
     included. Background is dark counts, as the sensor has them, and ambient light scaled to fill the asked mean.
+    Raises InputError for numbers below 0 or above 1e9.
     """
 
     signal: float = 50.0
@@ -237,7 +242,9 @@ class PhotonBudget:
 
     @property
     def sbr(self) -> float:
+        """Return the ratio of signal to background, infinite without background."""
         return self.signal / self.background if self.background > 0 else math.inf
 
     def to_dict(self) -> JsonObject:
+        """Return both numbers as JSON holds them."""
         return asdict(self)

@@ -32,6 +32,8 @@ class Pulse:
 
     sigma_s   standard deviation of the Gaussian; its FWHM is 2 sqrt(2 ln 2) sigma
     tail_s    time constant of the decay, as of the carriers that diffuse into a SPAD's junction; 0 for none
+
+    Raises InputError for times out of range.
     """
 
     sigma_s: float = REFERENCE_PULSE_SIGMA_S
@@ -55,10 +57,12 @@ class Pulse:
 
     @property
     def std_s(self) -> float:
+        """Return the standard deviation of the whole pulse [s]."""
         return math.hypot(self.sigma_s, self.tail_s)
 
     def window_s(self, sigmas: float) -> tuple[float, float]:
-        """Return time before and after the centroid outside which lies about what a Gaussian has beyond `sigmas`."""
+        """Return time [s] before and after the centroid outside which lies about what a Gaussian has beyond so many
+        `sigmas`, a number of standard deviations."""
         decay = self.tail_s * sigmas**2 / 2  # exp(-sigmas^2 / 2) is left
         return sigmas * self.sigma_s + self.tail_s, sigmas * self.sigma_s + decay
 
