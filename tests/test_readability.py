@@ -1,19 +1,16 @@
-"""README and how-to pages are easy to read, and what they tell one to type is right."""
+"""README and how-to pages are easy to read, and what they tell one to type is right (test_page_commands runs it)."""
 
-import contextlib
 import re
 import shlex
 from pathlib import Path
 
 import pytest
 
-from scene2spad.cli.main import _parse, main
+from scene2spad.cli.main import _parse
 
 ROOT = Path(__file__).parents[1]
 HOW_TO = ("quickstart", "own-scenes", "scenes", "sensors", "own-data", "exports", "interchange")
 PAGES = [ROOT / "README.md", *(ROOT / f"docs/{name}.md" for name in HOW_TO)]
-RUN = ("quickstart", "own-data", "own-scenes", "exports")  # pages whose blocks are run from first to last
-MINUTES = ("dataset", "train", "evaluate")  # commands of these pages that are parsed alone
 MIN_READING_EASE, MAX_SENTENCE = 45, 35
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)
 
@@ -87,33 +84,7 @@ def test_every_command_of_a_page_parses(page):
             _parse(words)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", RUN)
-def test_the_blocks_of_a_page_run_from_first_to_last(name, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for kind, body in BLOCK.findall((ROOT / f"docs/{name}.md").read_text(encoding="utf-8")):
-        if kind == "python":
-            exec(compile(body, f"{name}.md", "exec"), {"__name__": "page"})
-        for line in body.splitlines() if kind == "sh" else ():
-            words = shlex.split(line, comments=True)[1:]
-            if words and words[0] not in MINUTES:
-                with contextlib.chdir(tmp_path):
-                    assert main(words) == 0, line
-
-
-def test_every_how_to_page_with_blocks_to_run_is_run():
-    kinds = {page.stem: {kind for kind, _ in BLOCK.findall(page.read_text(encoding="utf-8"))} for page in PAGES}
-    assert {name for name, found in kinds.items() if found & {"python", "sh"}} == {*RUN, "README"}
-
-
-@pytest.mark.slow
-def test_the_five_minutes_of_the_front_page_run(tmp_path):
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    (part,) = re.findall(r"^## Five minutes in the shell\n(.*?)^## ", text, re.M | re.S)
-    lines = [line.strip() for line in part.splitlines() if line.startswith("    scene2spad ")]
-    assert len(lines) >= 5
-    with contextlib.chdir(tmp_path):
-        for line in lines:
-            assert main(shlex.split(line, comments=True)[1:]) == 0, line
-    made = {path.name for path in tmp_path.iterdir()}
-    assert {"living-room.exr", "living-room.h5", "living-room.histogram.html"} <= made
+def test_how_to_pages_are_those_of_the_site():
+    site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    (part,) = re.findall(r"^  - How-to:\n((?:      .*\n)+)", site, re.M)
+    assert {"quickstart", *re.findall(r"(\S+)\.md$", part, re.M)} == {*HOW_TO}
