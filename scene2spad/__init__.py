@@ -18,6 +18,7 @@ from scenes.lazy import lazy_names
 
 if TYPE_CHECKING:
     from csph import CodingTensor, CompressiveLayer, Design, decode_depth, encode, encode_timestamps, make_coding
+    from csph.codes.physics import deepinv_physics
     from csph.networks.model import DepthModel
     from csph.training.config import ModelConfig, TrainConfig
     from csph.training.loop import train
@@ -75,6 +76,7 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
         "encode_timestamps",
         "make_coding",
     ),
+    "csph.codes.physics": ("deepinv_physics",),
     "csph.weights.cards": ("Card",),
     "csph.training.config": ("ModelConfig", "TrainConfig"),
     "csph.networks.model": ("DepthModel",),
@@ -120,6 +122,7 @@ __all__ = [  # noqa: RUF022 (in the order of the chain)
     "encode_timestamps",
     "decode_depth",
     "CompressiveLayer",
+    "deepinv_physics",
     "models",
     "Card",
     "load_model",

@@ -8,6 +8,8 @@ import contextlib
 import re
 import shlex
 import shutil
+import socket
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +22,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parent / "scene2spad"))
 
+from deepinv_stand_in import provide_deepinv
 from test_readability import PAGES, ROOT
 
 from scene2spad.cli.main import main
@@ -41,13 +44,16 @@ NOT_RUN = {
     "make docs": "needs the generator of the pages, which the tests do not install",
     "pip install --constraint constraints.txt .": "installs into the environment that runs the tests",
     "pip install 'scene2spad[video]'": "downloads 70 MB",
+    "pip install 'scene2spad[cluster]'": "installs what the tests have",
+    "pip install deepinv": "downloads gigabytes; the operator was tried with it, here a stand-in takes its place",
+    "scene2spad train --preset gpu --devices 2 --set rooms.h5 --out run-gpu": "needs two GPUs",
     "scene2spad study depth-offset": "trains networks for hours; test_depth_offset runs it small",
     "scene2spad study real-data --capture FILE": "test_real_data runs it; needs trained networks beside the capture",
     "jupytext --to notebook examples/01_first_photons.py": "jupytext is an extra; test_examples checks the cells",
     'eval "$(scene2spad --completion bash)"': "test_cli_words lets bash run the script",
     "python tools/set_error.py FOLDER": "renders with 256 paths a pixel; test_set_error runs it",
 }
-STARTS = ("scene2spad", "make", "pip", "python", "jupytext", "eval")
+STARTS = ("scene2spad", "dask", "make", "pip", "python", "jupytext", "eval")
 INLINE = re.compile(rf"`((?:{'|'.join(STARTS)}) [^`]+)`")
 FENCE = re.compile(r"^```(\w*)$")
 
@@ -155,18 +161,50 @@ def had(tmp_path_factory) -> Path:
     return folder
 
 
+class Cluster:
+    """Commands `dask` of a page as processes of this machine, which end with the page."""
+
+    def __init__(self) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.address = f"127.0.0.1:{free.getsockname()[1]}"
+        self.processes: list[subprocess.Popen] = []
+
+    def here(self, line: str) -> str:
+        return line.replace("HOST:8786", self.address).replace("--port 8786", f"--port {self.address[10:]}")
+
+    def start(self, line: str) -> None:
+        words = [sys.executable, "-m", *words_of(self.here(line)), "--no-dashboard"]
+        self.processes.append(subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+
+    def end(self) -> None:
+        for process in reversed(self.processes):
+            process.terminate()
+            process.wait()
+
+
+@pytest.fixture
+def cluster():
+    processes = Cluster()
+    yield processes
+    processes.end()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_what_a_page_says_runs(page, had, tmp_path):
+def test_what_a_page_says_runs(page, had, tmp_path, cluster, monkeypatch):
+    provide_deepinv(monkeypatch)
     folder = shutil.copytree(had, tmp_path / "reader")
     done = 0
     with contextlib.chdir(folder):
         for kind, text in steps(page):
             if kind == "python":
                 exec(compile(text, page.name, "exec"), {"__name__": "page"})
+            elif text.startswith("dask "):
+                cluster.start(text)
             elif kind == "command" and text.partition(" #")[0].strip() not in NOT_RUN:
                 assert text.startswith("scene2spad "), f"{page.name}: neither run nor in NOT_RUN: {text}"
-                run(text)
+                run(cluster.here(text))
             done += kind != "toml"
     assert done
 

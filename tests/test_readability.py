@@ -9,7 +9,7 @@ import pytest
 from scene2spad.cli.main import _parse
 
 ROOT = Path(__file__).parents[1]
-HOW_TO = ("quickstart", "own-scenes", "scenes", "sensors", "own-data", "exports", "interchange")
+HOW_TO = ("quickstart", "own-scenes", "scenes", "sensors", "own-data", "scale-out", "exports", "interchange")
 PAGES = [ROOT / "README.md", *(ROOT / f"docs/{name}.md" for name in HOW_TO)]
 MIN_READING_EASE, MAX_SENTENCE = 45, 35
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)

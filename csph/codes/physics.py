@@ -1,0 +1,48 @@
+"""Codes as a linear operator of deepinv, for its solvers and networks; the package is imported when it is asked for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from csph.codes.blocks import back_project, encode_blocks
+from csph.codes.tensor import CodingTensor
+from scenes.errors import InputError
+
+if TYPE_CHECKING:
+    from deepinv.physics import LinearPhysics
+
+
+def deepinv_physics(coding: CodingTensor) -> LinearPhysics:
+    """Make codes a linear operator of deepinv: A = C on every block, and its exact adjoint.
+
+    Parameters
+    ----------
+    coding : CodingTensor
+        K codes over blocks of Mt bins x Mr rows x Mc columns.
+
+    Returns
+    -------
+    deepinv.physics.LinearPhysics
+        Takes counts (B, 1, T, R, C), gives codes (B, K, T/Mt, R/Mr, C/Mc) in the type of the weights, float32. It adds
+        no noise: that of photons belongs to the counts.
+
+    Raises
+    ------
+    InputError
+        Where deepinv is not installed; and by the operator for counts that blocks do not tile.
+    """
+    try:
+        from deepinv.physics import LinearPhysics
+    except ImportError:
+        raise InputError("deepinv_physics: needs the package `deepinv`: pip install deepinv") from None
+    weights = coding.tensor
+
+    def encoded(counts: Tensor, **_: object) -> Tensor:
+        return encode_blocks(counts, weights.to(counts.device))
+
+    def projected(codes: Tensor, **_: object) -> Tensor:
+        return back_project(codes, weights.to(codes.device))
+
+    return LinearPhysics(A=encoded, A_adjoint=projected)
