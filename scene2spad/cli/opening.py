@@ -18,18 +18,22 @@ if TYPE_CHECKING:
 
 BY_SUFFIX = {
     ".exr": ("transient", "depth"),
-    ".h5": ("histogram", "pack"),
+    ".h5": ("histogram", "pack", "dense"),
+    ".npz": ("dense",),
+    ".ply": ("cloud",),
     ".mat": ("histogram",),
     ".safetensors": ("network",),
     ".npy": ("codes",),
     ".toml": ("sensor",),
     ".csv": ("table",),
     ".s": ("program",),
+    ".txt": ("text",),
 }
 SEALED = ("transient", "depth", "histogram", "pack", "network")
 KNOWN = (
     "a transient or depth map (.exr), a histogram or pack (.h5), a frame (.mat), a checkpoint (.safetensors) or a "
-    "model's name, codes (.npy), a sensor (.toml), a table (.csv), a program (.s), or the folder of a set or a run"
+    "model's name, codes (.npy, .txt), a sensor (.toml), a table (.csv), a program (.s, .txt), a dense array "
+    "(.npz, .h5), points (.ply), or the folder of a set or a run"
 )
 
 

@@ -11,6 +11,7 @@ async function unpacked(text, type) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new types[type](await new Response(stream).arrayBuffer());
 }
+const short = (v) => v && (Math.abs(v) < .01 || Math.abs(v) >= 1e5) ? v.toExponential(1) : number(v, 3);
 const number = (v, digits = 4) => !Number.isFinite(v) ? "none" : v === 0 ? "0" : Number(v.toPrecision(digits)).toString();
 const clamp = (v, low, high) => Math.min(Math.max(v, low), high);
 
@@ -93,7 +94,7 @@ function drawPlot() {
   }
   const deep = right - left > 380 ? `; 1 ns is ${number(page.metres_per_ns, 4)} m of depth` : "";
   c.fillText(`time since emission [ns]${deep}`, (left + right) / 2, height - 5);
-  c.textAlign = "right"; for (const v of [0, top]) c.fillText(number(v, 3), left - 4, y(v) + 4);
+  c.textAlign = "right"; for (const v of [0, top]) c.fillText(short(v), left - 4, y(v) + 4);
   c.save(); c.beginPath(); c.rect(left, 0, right - left, bottom + 1); c.clip();
   for (const cube of page.cubes) cube.drawn === "bars" ? bars(c, cube, pixel, x, y, low, high) : curve(c, cube, pixel, x, y, low, high);
   const shown = page.cubes[0];

@@ -1,7 +1,7 @@
 """Dense export `(H, W, T)` as .npz or HDF5, in the layouts that transient-imaging codes read.
 
-.npz  `counts` or `transient` (H, W, T), `bin_width_s`, `start_s`, `depth_m` and what else is known, each an array
-.h5   `data` (H, W, T), `tofs` (T,) bin centres [s] and the maps, each with its unit and a description as attributes.
+.npz  `data` (H, W, T), `tofs` (T,) bin centres [s], `bin_width_s`, `depth_m` and what else is known, each an array
+.h5   the same, each with its unit and a description as attributes.
       mitransient's arrays are (H, W, T) too; y-tal's captures hold H of shape (T, H, W), which `layout="thw"` gives
 """
 

@@ -61,8 +61,11 @@ def run(command: Export, progress: Progress) -> dict:
         return {"shape": list(arrays["data"].shape), "layout": command.layout, "out": str(out)}
     if suffix == ".ply" and kind in ("transient", "pack", "histogram", "depth"):
         return {"points": _points(command, kind), "out": str(out)}
-    wanted = {"codes": CODES, "network": CODES, "depth": (".ply",)}.get(kind, (".npz", ".h5", ".ply"))
-    raise InputError(f"{out}: a {kind} goes to {', '.join(wanted)}")
+    dense = (".npz", ".h5", ".ply")
+    wanted = {"codes": CODES, "network": CODES, "depth": (".ply",), "transient": dense, "pack": dense}
+    wanted["histogram"] = dense
+    require(kind in wanted, f"{path}: a {kind} is not exported")
+    raise InputError(f"{out}: a {kind} goes to {', '.join(wanted[kind])}")
 
 
 def _dense(command: Export, kind: str) -> dict[str, np.ndarray]:

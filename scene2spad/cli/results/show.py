@@ -95,8 +95,13 @@ def _content(command: Show, kind: str) -> Content:
     if kind == "depth":
         found = open_depth(path)
         return sources.depth_content(found.depth_m, found.confidence, found.meta, path.name)
-    if kind == "program":
-        return Content(path.name, {"kind": "program of the in-pixel core"}, text=read_text(path))
+    if kind in ("dense", "cloud"):
+        from scene2spad.viewer import exports
+
+        return exports.dense_content(path) if kind == "dense" else exports.cloud_content(path)
+    if kind in ("program", "text"):
+        said = {"program": "program of the in-pixel core", "text": "text: a program's listing, or codes"}
+        return Content(path.name, {"kind": said[kind]}, text=read_text(path))
     if kind == "table":
         rows = list(csv.DictReader(read_text(path).splitlines()))
         require(bool(rows), f"{path}: an empty table")

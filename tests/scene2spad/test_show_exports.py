@@ -1,0 +1,99 @@
+"""`show` of what `export` and `ultraphase` wrote: dense arrays, point clouds, codes and programs in text."""
+
+import base64
+import json
+import re
+import zlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from scene2spad.cli import main
+from scene2spad.viewer.exports import cloud_content, dense_content
+from scenes.errors import InputError
+from spad.formats.histogram import read_histogram
+
+MODEL = "fourier-1024x1x1-128x-s0"
+EXPORTS = ("counts.npz", "counts.h5", "counts-thw.h5", "light.npz", "cloud.ply")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("exports")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main(["render", "gallery", "--width", "16", "--height", "12", "--bounces", "1", "--no-figure"]) == 0
+        assert main(["sense", "gallery.exr", "--no-figure"]) == 0
+        for name in EXPORTS:
+            source = "gallery.exr" if name.startswith("light") else "gallery.h5"
+            layout = ["--layout", "thw"] if "thw" in name else []
+            assert main(["export", source, "--out", name, *layout]) == 0
+        assert main(["export", MODEL, "--out", "codes.txt", "--int8"]) == 0
+        assert main(["ultraphase", "compile", MODEL, "--out", "program.txt"]) == 0
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(files, monkeypatch):
+    monkeypatch.chdir(files)
+
+
+@pytest.mark.parametrize(
+    ("file", "word"),
+    [*((name, "") for name in EXPORTS), ("codes.txt", "one step is"), ("program.txt", "BNT")],
+)
+def test_every_export_has_a_page_that_loads_nothing(file, word):
+    assert main(["show", file, "--out", "page.html"]) == 0
+    text = Path("page.html").read_text(encoding="utf-8")
+    assert word in text and "default-src 'none'" in text and "https://" not in text
+    assert not re.search(r"<(link|script|img)[^>]*(src|href)=\"(?!data:)", text)
+
+
+@pytest.mark.parametrize("name", ["counts.npz", "counts.h5", "counts-thw.h5"])
+def test_a_dense_page_holds_the_counts_on_the_sensors_times(name):
+    histogram = read_histogram(Path("gallery.h5"))
+    assert main(["show", name, "--out", "page.html"]) == 0
+    found = json.loads(
+        re.search(r'id="payload">(.*?)</script>', Path("page.html").read_text(encoding="utf-8"), re.S)[1]
+    )
+    (cube,) = found["cubes"]
+    data = np.frombuffer(zlib.decompress(base64.b64decode(cube["data"])), cube["type"])
+    assert np.array_equal(data.reshape(histogram.counts.shape), histogram.counts)
+    assert cube["start_ns"] == pytest.approx(0, abs=1e-9)
+    assert cube["step_ns"] == pytest.approx(1e9 * histogram.sensor.bin_width_s, rel=1e-9)
+
+
+def test_a_cloud_page_holds_the_points():
+    content, depth_m = cloud_content(Path("cloud.ply")), read_histogram(Path("gallery.h5")).depth_m
+    assert np.linalg.norm(content.points, axis=1) == pytest.approx(depth_m[np.isfinite(depth_m)], rel=1e-6)
+    assert content.point_value.min() >= 0 and content.point_value.max() <= 1
+
+
+def test_files_of_others_are_refused_in_one_line(tmp_path, capfd):
+    np.savez(tmp_path / "a.npz", x=np.zeros(3))
+    np.savez(tmp_path / "b.npz", data=np.zeros((2, 2, 4)), tofs=np.arange(3.0), depth_m=np.ones((2, 2)))
+    np.savez(tmp_path / "c.npz", data=-np.ones((2, 2, 4)), tofs=np.arange(4.0), depth_m=np.ones((2, 2)))
+    with h5py.File(tmp_path / "d.h5", "w") as file:
+        file["other"] = np.zeros(3)
+    (tmp_path / "e.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    cut = Path("cloud.ply").read_bytes()[:-7]
+    (tmp_path / "f.ply").write_bytes(cut)
+    for name, words in (
+        ("a.npz", "holds no data"), ("b.npz", "data of shape"), ("c.npz", "negative"), ("d.h5", "no dense array"),
+        ("e.ply", "no point cloud"), ("f.ply", "f.ply"),
+    ):  # fmt: skip
+        assert main(["show", str(tmp_path / name), "--out", str(tmp_path / "page.html")]) == 2
+        told = capfd.readouterr().err
+        assert words in told and told.count("\n") == 1
+    assert not (tmp_path / "page.html").exists()
+    with pytest.raises(InputError, match="are no dense export"):
+        np.savez(tmp_path / "g.npz", data=np.zeros(4), tofs=np.arange(4.0), depth_m=np.ones((2, 2)))
+        dense_content(tmp_path / "g.npz")
+
+
+def test_what_is_not_exported_says_so(capfd):
+    for name, kind in (("cloud.ply", "cloud"), ("codes.txt", "text")):
+        assert main(["export", name, "--out", "x.npz"]) == 2
+        assert f"{name}: a {kind} is not exported" in capfd.readouterr().err
