@@ -74,9 +74,9 @@ def cloud_content(path: Path) -> Content:
     """Show a point cloud (.ply) that `export` wrote. Raises InputError for a file of other columns."""
     content = read_bytes(path, "point cloud")
     header, _, body = content.partition(b"end_header\n")
-    said = " ".join(header.decode("latin-1").split())
+    columns = " ".join(header.decode("latin-1").split())
     require(
-        HEADER in said, f"{path}: no point cloud that `export` wrote (x y z intensity confidence); a mesh is rendered"
+        HEADER in columns, f"{path}: no point cloud that `export` wrote (x y z intensity confidence); render a mesh"
     )
     try:
         check_ply(content)

@@ -100,8 +100,8 @@ def _content(command: Show, kind: str) -> Content:
 
         return exports.dense_content(path) if kind == "dense" else exports.cloud_content(path)
     if kind in ("program", "text"):
-        said = {"program": "program of the in-pixel core", "text": "text: a program's listing, or codes"}
-        return Content(path.name, {"kind": said[kind]}, text=read_text(path))
+        titles = {"program": "program of the in-pixel core", "text": "text: a program's listing, or codes"}
+        return Content(path.name, {"kind": titles[kind]}, text=read_text(path))
     if kind == "table":
         rows = list(csv.DictReader(read_text(path).splitlines()))
         require(bool(rows), f"{path}: an empty table")
