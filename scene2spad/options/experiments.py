@@ -96,6 +96,8 @@ class Study(Long):
     """Of studies of trained models: smoke trains two for seconds and tests them on two small views; laptop and paper
     say how models are trained with --retrain. Of `study real-data`, how captures are rendered: 32 x 32 pixels of direct
     light, 256 x 256 to 5 %, to 2 %. Of `study transport`, 2, 12 or 24 scenes, 24, 88 or 176 pixels wide."""
+    pdf: bool = False
+    """Write each figure as PDF as well, as wide as a paper's column (3.5 in) or page (7.16 in)."""
     models: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder of runs of `train`, each under its model's name, looked in before the models that come with the package
     (default: models in --out)."""

@@ -11,9 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from render.transient import Transient
-from scene2spad.plots.style import COLOURS, letter_panels, plt
+from scene2spad.plots.style import COLOURS, plt, save
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.files import whole_file
 from spad.detection.detect import expected_in_pixel
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
@@ -24,20 +23,6 @@ ERROR_COLOURS = matplotlib.colormaps["magma"].with_extremes(bad="lightgrey")
 COMMON, FAR_BEYOND = (0.005, 0.995), 0.5
 BAR = 0.04  # width of a colour bar, of its image's
 PANEL_INCHES = 3.6  # the longer side of an image in the pictures of `sense` and `depth`
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Letter a figure's panels and write it as PNG, or as PDF where the path ends so, whole or not at all.
-
-    The same figure has the same bytes.
-    """
-    letter_panels(figure)
-    pdf = path.suffix.lower() == ".pdf"
-    kind, metadata = ("pdf", {"CreationDate": None}) if pdf else ("png", {"Software": None})
-    with whole_file(path) as beside:
-        figure.savefig(beside, dpi=130, format=kind, metadata=metadata)
-    plt.close(figure)
-    return path
 
 
 def plain_log(axes: Axes) -> None:

@@ -83,6 +83,8 @@ def _attempt(command: Study, progress: Progress) -> dict:
 def _asked(command: Study) -> str:
     """All that decides a study's results, but for what it finds in folders."""
     options = asdict(replace(command, json=False, dry_run=False, ship=False))
+    if not command.pdf:  # older journals do not name it
+        del options["pdf"]
     return json.dumps({**options, "version": version("scene2spad")}, sort_keys=True, default=str)
 
 

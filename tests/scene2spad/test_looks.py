@@ -7,11 +7,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 import scene2spad as s2s
 from scene2spad.plots.figures import save
-from scene2spad.plots.style import COLOURS, look, plt
+from scene2spad.plots.style import COLOURS, MIN_POINTS, fit_column, look, plt, with_pdf
 from scenes.notebook import html_card
 
 
@@ -53,6 +54,40 @@ def test_several_panels_are_lettered_and_colour_bars_are_not(tmp_path):
         figure.colorbar(panels[0, 0].imshow(np.zeros((2, 2))), ax=panels[0, 0])
         save(figure, tmp_path / "figure.png")
         assert [text.get_text() for panel in figure.axes for text in panel.texts] == letters
+
+
+@pytest.mark.parametrize(("drawn", "inches"), [((6, 4), 3.5), ((14, 7), 7.16)])
+def test_a_pdf_is_as_wide_as_a_column_or_a_page(drawn, inches, tmp_path):
+    """The page's size is in the file, in points; the PNG beside it keeps the size for screens."""
+    figure, panels = plt.subplots(1, 2, figsize=drawn, layout="constrained")
+    panels[0].plot([1, 2], label="first")
+    with with_pdf():
+        save(figure, tmp_path / "figure.png")
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (tmp_path / "figure.pdf").read_bytes())
+    assert float(box[1]) == pytest.approx(72 * inches, abs=0.1)
+    with Image.open(tmp_path / "figure.png") as picture:
+        assert picture.size == (drawn[0] * 130, drawn[1] * 130)
+    save(plt.figure(figsize=drawn), tmp_path / "alone.png")
+    assert not (tmp_path / "alone.pdf").exists()
+
+
+def test_in_a_column_text_can_be_read_and_legends_fit():
+    """Ten long names do not fit beside each other: they stand in fewer columns, with the markers of their lines."""
+    figure, panel = plt.subplots(figsize=(16, 8), layout="constrained")
+    for number in range(10):
+        panel.errorbar([0, 1], [number, 0], 0.1, label=f"a method with a long name {number}", **look(number))
+    panel.set_title("a title", fontsize=6)
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=10, fontsize=9)
+    fit_column(figure)
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert legend.get_window_extent().width <= figure.bbox.width
+    markers = [line.get_marker() for line in legend.findobj(plt.Line2D) if line.get_marker() not in ("", "None", None)]
+    assert {*markers} >= {look(number)["marker"] for number in range(10)}
+    shown = [text for text in figure.findobj(plt.Text) if text.get_text() and text.get_visible()]
+    assert min(text.get_fontsize() for text in shown) >= MIN_POINTS - 1e-9
+    assert panel.lines[0].get_linewidth() < 1
+    plt.close(figure)
 
 
 def test_no_figure_names_colours_of_another_palette():

@@ -14,9 +14,11 @@ def run(command: Study, progress: Progress) -> dict:
     if command.out.is_file():
         raise InputError(f"{command.out}: is a file, expected a folder for the figures")
     if not command.dry_run:
+        from scene2spad.plots.style import with_pdf
         from scene2spad.studies import every
 
-        return every.run(command, progress)
+        with with_pdf(command.pdf):
+            return every.run(command, progress)
     from scene2spad.dry_runs.studies import dry_run
 
     if command.name != "all":
