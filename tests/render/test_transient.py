@@ -210,6 +210,16 @@ def test_mitsuba_reads_the_layers_without_rounding(tmp_path):
         np.testing.assert_allclose(values[..., names.index(name)], layer, rtol=1e-6)
 
 
+def test_a_viewers_library_reads_the_layers_without_rounding(tmp_path):
+    """OpenImageIO is no dependency: CI leaves this out where it is not installed."""
+    oiio = pytest.importorskip("OpenImageIO")
+    write_transient(make(), tmp_path / "t.exr")
+    image = oiio.ImageBuf(str(tmp_path / "t.exr"))
+    names, values = image.spec().channelnames, image.get_pixels(oiio.FLOAT)
+    for name, layer in layers_of(make()).items():
+        np.testing.assert_allclose(values[..., names.index(name)], layer, rtol=1e-6)
+
+
 def test_files_with_the_deep_part_first_still_open(tmp_path):
     """As version 1 of the file had it: the deep part, then one part of all layers."""
     import OpenEXR
