@@ -21,7 +21,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.errors import InputError, require
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
-from scenes.io.hdf5 import Sink, add_checksum, new_hdf5, open_checked, read_dataset
+from scenes.io.hdf5 import Sink, add_checksum, describe, new_hdf5, open_checked, read_dataset
 from scenes.io.inputs import parse_json
 from scenes.json_types import JsonObject
 
@@ -37,6 +37,22 @@ PARTS = ("first", "further")
 # differences have their sign in the lowest bit
 STORED_VIEW, STORED = PER_VIEW | {"depth": np.uint32}, PER_RETURN | {"centre": np.uint32}
 CHUNK = 1 << 16  # returns
+NOTES = {  # unit and description of every dataset of the file
+    "count": ("1", "returns of the pixel, view x row x column"),
+    "depth": (f"{DEPTH_STEP_M:g} m", "radial depth, as difference from the plane through its neighbours; sign lowest"),
+    "mixed": ("1", "whether the pixel sees surfaces more than 50 mm apart"),
+    "albedo": ("1/255", "diffuse reflectance at the pixel's centre"),
+    "ambient": ("W/(m^2 sr nm)", f"steady spectral radiance, logarithmic: {AMBIENT_STEPS} steps an octave"),
+    "start": ("1", "returns of view v are start[v] to start[v + 1]"),
+    "meta": ("1", "JSON of every view's record, UTF-8"),
+}
+OF_RETURNS = {
+    "centre": (f"{PATH_STEP_M:g} m", "middle of the interval of path length, as difference; sign lowest"),
+    "width": (f"{WIDTH_STEP_M:g} m", "length of the interval of path length"),
+    "radiance": ("1/(m^2 sr)", f"per joule, logarithmic as difference: {RADIANCE_STEPS} steps an octave"),
+    "bounces": ("1", "surfaces met, 1 for direct light"),
+}
+NOTES |= {f"{part} {name}": note for part in PARTS for name, note in OF_RETURNS.items()}
 PACKED = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "track_times": False}
 
 
@@ -249,6 +265,7 @@ def _append_views(views: Iterable[tuple[Transient, JsonObject]], file: h5py.File
     records = json.dumps(metas, sort_keys=True).encode()
     file.create_dataset("meta", data=np.frombuffer(records, np.uint8), **PACKED)
     sha.update(records)
+    describe(file, NOTES)
     file.attrs[ATTRIBUTE] = seal({"views": len(metas)}, "pack", sha.hexdigest())
     return len(metas)
 

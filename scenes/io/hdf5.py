@@ -16,7 +16,7 @@ import os
 import signal
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, NoReturn
@@ -94,6 +94,12 @@ def new_hdf5(path: Path) -> Iterator[tuple[h5py.File, Sink]]:
                 yield made, sink
         finally:
             sink.check()  # before what HDF5 made of it
+
+
+def describe(file: h5py.File, notes: Mapping[str, tuple[str, str]]) -> None:
+    """Give every dataset of a file its unit and its description, as attributes; `notes` has both by name."""
+    for name, dataset in file.items():
+        dataset.attrs["unit"], dataset.attrs["description"] = notes[name]
 
 
 def add_checksum(path: Path) -> None:

@@ -18,7 +18,7 @@ from scenes.errors import InputError
 from scenes.files import whole_file
 from scenes.limits import require_memory
 from spad.detection.flux import signal_per_bin
-from spad.formats.histogram import Histogram
+from spad.formats.histogram import NOTES, Histogram
 from spad.sensor.model import Sensor
 
 Layout = Literal["hwt", "thw"]
@@ -26,10 +26,7 @@ BLOCK = 1024  # pixels binned at once
 UNITS = {
     "data": ("detections per bin", "photon counts of every pixel and time bin"),
     "tofs": ("s", "centre of every time bin, from the laser's emission on"),
-    "depth_m": ("m", "true radial depth at the pixel's centre, NaN where nothing is or it is unknown"),
-    "expected_signal": ("detections", "expected signal detections of the pixel in one exposure"),
-    "expected_background": ("detections", "expected background detections of the pixel in one exposure"),
-    "albedo": ("1", "diffuse reflectance at the pixel's centre"),
+    **{name: NOTES[name] for name in ("depth_m", "expected_signal", "expected_background", "albedo")},
     "bin_width_s": ("s", "width of a time bin"),
 }
 RADIANCE = ("1/(m^2 sr)", "radiance that arrives in the bin, per joule of the pulse")

@@ -11,7 +11,7 @@ import numpy as np
 
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
-from scenes.io.hdf5 import USER_BLOCK, add_checksum, open_checked, read_dataset
+from scenes.io.hdf5 import USER_BLOCK, add_checksum, describe, open_checked, read_dataset
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.notebook import html_card
@@ -19,6 +19,16 @@ from spad.formats.timestamps import counts_from_timestamps, timestamps_from_coun
 from spad.sensor.model import PhotonBudget, Sensor
 
 TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
+NOTES = {  # unit and description of every dataset of the file
+    "timestamps": ("bins", "time bin of every detection from 0, ascending in a pixel, pixel after pixel in rows"),
+    "offsets": ("1", "detections of pixel p are timestamps[offsets[p]:offsets[p + 1]]"),
+    "counts": ("detections per bin", "photon counts, row x column x time bin"),
+    "depth_m": ("m", "true radial depth at the pixel's centre, NaN where nothing is or it is unknown"),
+    "mixed": ("1", "whether the pixel sees surfaces more than 50 mm apart"),
+    "albedo": ("1", "diffuse reflectance at the pixel's centre"),
+    "expected_signal": ("detections", "expected signal detections of the pixel in one exposure"),
+    "expected_background": ("detections", "expected background detections of the pixel in one exposure"),
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -164,6 +174,7 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
             file.create_dataset("counts", data=histogram.counts, **packed)
         for name in TRUTH:
             file.create_dataset(name, data=getattr(histogram, name), **packed)
+        describe(file, NOTES)
     with whole_file(path) as beside:
         beside.write_bytes(buffer.getbuffer())
         add_checksum(beside)

@@ -97,3 +97,14 @@ def test_what_is_not_exported_says_so(capfd):
     for name, kind in (("cloud.ply", "cloud"), ("codes.txt", "text")):
         assert main(["export", name, "--out", "x.npz"]) == 2
         assert f"{name}: a {kind} is not exported" in capfd.readouterr().err
+
+
+def test_every_dataset_of_our_hdf5_files_says_its_unit_and_what_it_is(tmp_path):
+    size = ("--width", "8", "--height", "6", "--bounces", "1", "--count", "2")
+    assert main(["dataset", "rooms", *size, "--out", str(tmp_path / "set"), "--pack", str(tmp_path / "set.h5")]) == 0
+    assert main(["sense", "gallery.exr", "--signal", "3000", "--out", str(tmp_path / "dense.h5"), "--no-figure"]) == 0
+    for path in (Path("gallery.h5"), Path("counts.h5"), tmp_path / "set.h5", tmp_path / "dense.h5"):
+        with h5py.File(path) as file:
+            assert len(file) >= 5
+            for name, dataset in file.items():
+                assert dataset.attrs["unit"] and len(dataset.attrs["description"]) > 10, f"{path}: {name}"
