@@ -38,7 +38,8 @@ def output_file(path: Path, suffix: str, kind: str) -> Path:
 
 def holds_kind(path: Path, kind: str) -> bool:
     """Tell whether a file carries the seal of one of our kinds of file."""
-    return _holds(path, f'"kind": "{kind}"'.encode())
+    seal = f'"kind": "{kind}"'.encode()
+    return _holds(path, seal) or _holds(path, seal.replace(b'"', b'\\"'))  # a checkpoint's is JSON within JSON
 
 
 def _holds(path: Path, words: bytes) -> bool:

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import shutil
 import zlib
 from pathlib import Path
 
@@ -49,6 +50,15 @@ def test_every_export_has_a_page_that_loads_nothing(file, word):
     text = Path("page.html").read_text(encoding="utf-8")
     assert word in text and "default-src 'none'" in text and "https://" not in text
     assert not re.search(r"<(link|script|img)[^>]*(src|href)=\"(?!data:)", text)
+
+
+def test_a_checkpoint_is_shown_and_exported_by_its_file(tmp_path):
+    from csph.weights.cards import checkpoint_of
+
+    shutil.copy(checkpoint_of(MODEL), tmp_path / "mine.safetensors")
+    assert main(["show", str(tmp_path / "mine.safetensors"), "--out", "page.html"]) == 0
+    assert "data:image/png" in Path("page.html").read_text(encoding="utf-8")
+    assert main(["export", str(tmp_path / "mine.safetensors"), "--out", "mine.txt"]) == 0
 
 
 @pytest.mark.parametrize("name", ["counts.npz", "counts.h5", "counts-thw.h5"])
