@@ -60,6 +60,11 @@ def kind_of(path: Path) -> str:
 
         shipped_model(path.name)
         return "network"
+    if path.suffix.lower() == ".mat":
+        from spad.formats.mat import PULSE_NAME
+
+        if input_file(path).name.startswith(PULSE_NAME):
+            return "pulse"
     kinds = BY_SUFFIX.get(input_file(path).suffix.lower(), ())
     unsealed = path.suffix.lower() == ".mat"
     found = next((kind for kind in kinds if kind not in SEALED or unsealed or holds_kind(path, kind)), None)

@@ -278,6 +278,14 @@ def draw_pulse(sensor: Sensor, path: Path) -> Path:
     return save(figure, path)
 
 
+def draw_taps(taps: np.ndarray, path: Path) -> Path:
+    """Draw the pulse that lies beside a published frame: shares (n,) of a detection by bins."""
+    figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    axes.stairs(taps, np.arange(len(taps) + 1))
+    axes.set(xlabel="bin of the frame's pulse", ylabel="share of a detection", title=f"pulse of {len(taps)} taps")
+    return save(figure, path)
+
+
 def draw_demo(
     transient: Transient,
     histogram: Histogram,

@@ -30,6 +30,7 @@ from spad.sensor.template import binned_pulse
 RATES_EPSILON = 1e-8
 NO_BIN = 1  # what MATLAB's maximum of an empty histogram answers
 PEAK_ARRIVALS = 64
+PULSE_NAME = "PSF_used_for_simulation_nr-"
 SAME_PULSE = 1e-3  # of a pulse's sum: taps that differ by less in every bin are of the same pulse
 ESTIMATES = {"argmax": "argmax", "lmf": "lmf-published", "zncc": "correlation"}
 
@@ -66,7 +67,7 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
 
 def _pulse_file(path: Path, height: int, width: int) -> Path:
     """Return the pulse's file beside a frame, as the family names it."""
-    return path.with_name(f"PSF_used_for_simulation_nr-{height}_nc-{width}.mat")
+    return path.with_name(f"{PULSE_NAME}{height}_nc-{width}.mat")
 
 
 def _frame(histogram: Histogram) -> dict[str, Matrix | float | dict[str, np.ndarray]]:
@@ -183,15 +184,20 @@ def _newer_sensor(contents: Mapping[str, Matrix], bins: int, pulse_file: Path) -
     plain = Sensor(name="mat", bins=bins, bin_width_s=float(contents["bin_size"].item()))
     if not pulse_file.is_file():
         return plain
-    taps = load_mat(pulse_file, ["psf"]).get("psf", np.zeros(0))
-    good = taps.dtype.kind in "uif" and 1 <= taps.size <= bins and bool(np.isfinite(taps).all())
-    require(good and taps.min() >= 0 and taps.sum() > 0, f"{pulse_file}: holds no pulse of 1 to {bins} taps (psf)")
-    taps = taps.ravel() / taps.sum(dtype=np.float64)
+    taps = read_taps(pulse_file, bins)
     train = replace(plain, pulse=sensor_by_name("iccv2023-train").pulse)
     for known, form in ((plain, _centred_taps), (plain, published_taps), (train, _centred_taps)):
         if _same_pulse(taps, form(known)):
             return known
     return replace(plain, pulse=SampledPulse(tuple(taps), plain.bin_width_s))
+
+
+def read_taps(pulse_file: Path, bins: int) -> np.ndarray:
+    """Read the pulse beside a frame: shares (n,) of at most so many bins, which sum to 1. Raises InputError."""
+    taps = load_mat(pulse_file, ["psf"]).get("psf", np.zeros(0))
+    good = taps.dtype.kind in "uif" and 1 <= taps.size <= bins and bool(np.isfinite(taps).all())
+    require(good and taps.min() >= 0 and taps.sum() > 0, f"{pulse_file}: holds no pulse of 1 to {bins} taps (psf)")
+    return taps.ravel() / taps.sum(dtype=np.float64)
 
 
 def _same_pulse(taps: np.ndarray, other: np.ndarray) -> bool:

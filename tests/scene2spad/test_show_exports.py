@@ -52,6 +52,19 @@ def test_every_export_has_a_page_that_loads_nothing(file, word):
     assert not re.search(r"<(link|script|img)[^>]*(src|href)=\"(?!data:)", text)
 
 
+def test_the_pulse_beside_a_published_frame_is_shown(capfd):
+    assert main(["sense", "gallery.exr", "--out", "frame.h5", "--export", "mat", "--no-figure"]) == 0
+    (pulse,) = Path().glob("PSF_*.mat")
+    assert main(["show", str(pulse), "--out", "pulse.html"]) == 0
+    assert "data:image/png" in Path("pulse.html").read_text(encoding="utf-8")
+    assert main(["show", "frame.mat", "--out", "frame.html"]) == 0
+    Path("PSF_used_for_simulation_nr-1_nc-1.mat").write_bytes(pulse.read_bytes()[:200])
+    capfd.readouterr()
+    assert main(["show", "PSF_used_for_simulation_nr-1_nc-1.mat", "--out", "bad.html"]) == 2
+    assert capfd.readouterr().err.count("\n") == 1 and not Path("bad.html").exists()
+    assert main(["export", str(pulse), "--out", "x.npz"]) == 2
+
+
 def test_a_checkpoint_is_shown_and_exported_by_its_file(tmp_path):
     from csph.weights.cards import checkpoint_of
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("scene2spad")
 SUFFIXES = (".html", ".png", ".pdf", ".gif", ".mp4")
+MAX_TAPS = 65536  # bins of a pulse
 MAX_SHEET = 24  # views of a set on its sheet
 PAGE_MARK = b'content="scene2spad show"'
 
@@ -188,6 +189,10 @@ def _picture(command: Show, kind: str, out: Path) -> Path:
         files = [path / r["file"] for r in _index(path) if isinstance(r, dict) and r.get("file")][:MAX_SHEET]
         require(bool(files), f"{path}: a set without a view that was rendered")
         return draw_views([read_transient(file) for file in files], out, columns=min(8, len(files)))
+    if kind == "pulse":
+        from spad.formats.mat import read_taps
+
+        return figures.draw_taps(read_taps(path, MAX_TAPS), out)
     if kind in ("network", "codes"):
         from scene2spad.studies.tensors import draw
 
