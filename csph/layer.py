@@ -101,6 +101,8 @@ class CompressiveLayer(nn.Module):
     begin at each factor's largest magnitude (`fit_ranges`).
 
     Sums are in float32 whatever the counts' type and autocast, in float64 where the weights are.
+
+    Raises InputError for options and parts that do not go together, and a background of another shape.
     """
 
     temporal: Tensor
@@ -244,13 +246,13 @@ class CompressiveLayer(nn.Module):
         return self.spatial is None or blocks.forms(self.codes, self.block, counts)
 
     def encode(self, counts: Tensor) -> Tensor:
-        """Return codes of a histogram. Raises InputError for counts of another shape or type, or that blocks do not
-        tile."""
+        """Return codes (B, K, T/Mt, R/Mr, C/Mc) of counts (B, 1, T, R, C). Raises InputError for counts of another
+        shape or type, or that blocks do not tile."""
         with torch.autocast(counts.device.type, enabled=False):
             return self._encode_int8(counts) if self.options.int8 else self._encode_exactly(counts)
 
     def encode_mean(self, mean_counts: Tensor) -> Tensor:
-        """Return the mean codes of mean counts of any scale: `encode`, but with `int8` no sum wraps.
+        """Return the mean codes of mean counts (B, 1, T, R, C) of any scale: `encode`, but with `int8` no sum wraps.
 
         Raises InputError as `encode`.
         """
@@ -281,8 +283,8 @@ class CompressiveLayer(nn.Module):
         return (of_blocks * spatial[:, None, None, :, None, :]).sum((4, 6))
 
     def sum_excess(self, counts: Tensor) -> Tensor:
-        """Return the mean excess of all cores' sums over 16 bits, in units of half that range, with `int8`; its
-        gradient widens the clipping range."""
+        """Return the mean excess () of all cores' sums over 16 bits, in units of half that range, of counts
+        (B, 1, T, R, C) with `int8`; its gradient widens the clipping range."""
         with torch.autocast(counts.device.type, enabled=False):
             sums, _ = self._core_sums(counts)
             return (sums.abs() / HALF_RANGE - 1).relu().mean()
@@ -297,12 +299,12 @@ class CompressiveLayer(nn.Module):
             return encode_photons(timestamps, offsets, photon_table(self.weights()), self.block, size, name=self.name)
 
     def decode(self, codes: Tensor) -> Tensor:
-        """Return ZN(C~)^T ZN(y). Raises InputError for codes of another shape."""
+        """Return ZN(C~)^T ZN(y), (B, 1, T, R, C), of codes (B, K, T/Mt, R/Mr, C/Mc), or an InputError for others."""
         with torch.autocast(codes.device.type, enabled=False):
             return self._projected(self._checked(codes))
 
     def back_project(self, codes: Tensor) -> Tensor:
-        """Return ZN(C~)^T y: `decode` of codes whose scale counts, as that of a residual does.
+        """Return ZN(C~)^T y, (B, 1, T, R, C): `decode` of codes whose scale counts, as that of a residual does.
 
         Raises InputError for codes of another shape.
         """
@@ -315,7 +317,7 @@ class CompressiveLayer(nn.Module):
         return codes.to(self.temporal.dtype)
 
     def forward(self, counts: Tensor) -> Tensor:
-        """Return `decode(encode(counts))`, the input of the depth network."""
+        """Return `decode(encode(counts))`, (B, 1, T, R, C), the input of the depth network. Raises as `encode`."""
         with torch.autocast(counts.device.type, enabled=False):
             return self._projected(self.encode(counts))
 

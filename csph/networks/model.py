@@ -103,6 +103,7 @@ class DepthModel(nn.Module):
 
     @property
     def parameters_count(self) -> int:
+        """Count the numbers that training changes."""
         return parameters_of(self)
 
     def seen(self, counts: Tensor) -> Tensor:
@@ -131,6 +132,7 @@ class DepthModel(nn.Module):
         return self.network(x, codes.to(x.dtype)) if isinstance(self.network, Blockwise) else self.network(x)
 
     def forward(self, counts: Tensor) -> Tensor:
+        """Return logits (B, T, R, C) of counts (B, 1, T, R, C) that blocks tile."""
         if self.config.sees_codes and self.layer is not None:
             return self.logits_of_codes(self.layer.encode(counts))
         return self.network(self.seen(counts))
@@ -243,7 +245,10 @@ class DepthModel(nn.Module):
         int8_rule: Int8Rule = "calibrated",
         decoder: Decoder | None = None,
     ) -> tuple[np.ndarray, int]:
-        """Return depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped (0 without int8)."""
+        """Return depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped (0 without int8).
+
+        Raises InputError as `estimate`.
+        """
         found = self.estimate(histogram, int8=int8, int8_rule=int8_rule, decoder=decoder)
         return found.depth_m, found.overflows
 

@@ -52,6 +52,8 @@ class ModelConfig:
     sensor   whose histograms it takes
     grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with print
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
+
+    Raises InputError for parts that do not go together.
     """
 
     front: Front = "codes"
@@ -109,6 +111,7 @@ class ModelConfig:
 
     @property
     def name(self) -> str:
+        """Return codes and network in words, as tables name the model."""
         uncoded = {"counts": "no compression", "matched": "no compression", "peak": "peak"}
         return f"{uncoded[self.front] if self.design is None else self.design.name}, {self.network}"
 
@@ -142,6 +145,8 @@ class TrainConfig:
     precision     Lightning's name; bf16-mixed on GPUs that have it
     threads       of a CPU (0: as many as there are); the same number gives the same bytes
     data          what it was trained on: path and SHA-256, filled in by `csph.training.loop.train`
+
+    Raises InputError for numbers out of range.
     """
 
     model: ModelConfig = field(default_factory=lambda: ModelConfig(design=Design()))
@@ -211,6 +216,7 @@ class TrainConfig:
 
     @property
     def steps(self) -> int:
+        """Return the number of steps of the whole run."""
         return self.epochs * self.steps_per_epoch
 
     def check_memory(self) -> None:
@@ -222,6 +228,7 @@ class TrainConfig:
         require_memory(COUNT_BYTES * counts, message)
 
     def to_dict(self) -> JsonObject:
+        """Return every number as JSON holds it."""
         return asdict(self)
 
     @classmethod
