@@ -78,13 +78,15 @@ def rendered(
     """Return a finite set with direct light alone, rendered into `folder` where it is not there; `size` is (width,
     height).
 
+    Each size and offset has a folder of its own there, so that studies of different extent can share `folder`.
     Raises InputError where a view cannot be rendered.
     """
     width, height = size or (None, None)
     job = Job(name, width=width, height=height, bounces=1, grid=4, error=0.01, offset_m=offset_m, offset_mode=mode)
     of = scene_set(name)
     moved = f"-{mode}-{offset_m:g}m" if offset_m else ""
-    path = folder / f"{name.replace('/', '-')}{moved}"
+    sized = f"-{width}x{height}" if size else ""
+    path = folder / f"{name.replace('/', '-')}{sized}{moved}"
     folder.mkdir(parents=True, exist_ok=True)
     number = of.size if count is None else count
     if number is None:

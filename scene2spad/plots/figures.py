@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import matplotlib
 import numpy as np
@@ -25,17 +26,18 @@ BAR = 0.04  # width of a colour bar, of its image's
 PANEL_INCHES = 3.6  # the longer side of an image in the pictures of `sense` and `depth`
 
 
-def plain_log(axes: Axes) -> None:
-    """Make the y axis logarithmic, with plain numbers; over less than three decades at 2 and 5 of each decade too."""
+def plain_log(axes: Axes, which: Literal["x", "y"] = "y") -> None:
+    """Make an axis logarithmic, with plain numbers; over less than three decades at 2 and 5 of each decade too."""
+    axis = axes.xaxis if which == "x" else axes.yaxis
 
     def label(value: float, _: int) -> str:
-        low, high = axes.get_ylim()
+        low, high = sorted(axis.get_view_interval())
         leading = round(value / 10 ** np.floor(np.log10(value)), 6)
         return f"{value:,g}" if leading == 1 or (high < 1000 * low and leading in (2, 5)) else ""
 
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(label)
-    axes.yaxis.set_minor_formatter(label)
+    axes.set(**{f"{which}scale": "log"})
+    axis.set_major_formatter(label)
+    axis.set_minor_formatter(label)
 
 
 def _image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: object) -> None:

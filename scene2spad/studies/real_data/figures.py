@@ -148,7 +148,7 @@ def _error(view: View, depth: np.ndarray | None, label: str) -> str:
     if view.depth_m is None or depth is None or label == "truth":
         return ""
     found = depth_errors(depth, view.depth_m, range_m=view.sensor.range_m, exclude=view.mixed)
-    return f"MAE {found['mae_mm']:.0f} mm, {found['within_10mm']:.0%} < 10 mm" if found["pixels"] else ""
+    return f"MAE {found['mae_mm']:.0f} mm,\n{found['within_10mm']:.0%} < 10 mm" if found["pixels"] else ""
 
 
 def _wrapped(label: str) -> str:

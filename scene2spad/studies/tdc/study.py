@@ -27,7 +27,7 @@ from scene2spad.networks.lookup import obtain
 from scene2spad.networks.registry import ModelSpec, Trained
 from scene2spad.networks.training import classical
 from scene2spad.options.experiments import Study
-from scene2spad.plots.figures import plt, save
+from scene2spad.plots.figures import plain_log, plt, save
 from scene2spad.plots.style import look
 from scene2spad.studies.chip.chain import ChipDepth
 from scene2spad.studies.chip.code import compile_model
@@ -294,7 +294,7 @@ def draw(compared: Sequence[JsonObject], path: Path) -> Path:
         ends = np.array([[100 * row[end] for row in mine] for end in ("low", "high")])
         bars = np.abs(ends - middle) if len(mine) else np.zeros((2, 0))
         panels[1].errorbar(middle, place, xerr=bars, ms=4, lw=1, **look(number) | {"ls": ""})
-    panels[0].set_xscale("log")
+    plain_log(panels[0], "x")
     panels[0].set(xlabel="mean absolute depth error [mm]", yticks=range(len(methods)), yticklabels=methods)
     panels[0].invert_yaxis()
     panels[1].axvline(100 * WITHIN, color="k", lw=1, ls=":")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import PercentFormatter, SymmetricalLogLocator
 
 from csph.evaluation.methods import Evaluation, Row
 from scene2spad.plots.figures import plain_log, plt, save
@@ -18,6 +18,7 @@ from scenes.json_types import JsonObject
 LABELS = [label.replace(", ", ",\n") for label in STEPS.values()]
 VERDICTS = {KEPT: (COLOURS["blue"], "o"), REVERSED: (COLOURS["vermilion"], "s"), OPEN: ("0.6", "^")}
 MAX_PAIRS = 24  # of a panel
+LINEAR_MM = 10  # gaps up to here are drawn on a linear scale, larger ones on a logarithmic one
 
 
 def draw_steps(summary: Sequence[JsonObject], rows: Mapping[tuple[str, str], Sequence[Row]], path: Path) -> Path:
@@ -61,7 +62,7 @@ def draw_ranking(ranked: Sequence[JsonObject], path: Path) -> Path:
     """Draw gap of each pair of codes with RGB-D rates (hollow) and at each later step (filled), all levels together."""
     mine = [r for r in ranked if r["levels"] == "all"]
     pairs = list(dict.fromkeys((r["first"], r["second"]) for r in mine))[:MAX_PAIRS]
-    size = (3.4 * len(LATER) + 1.5, len(LASERS) * (1.6 + 0.34 * len(pairs)))
+    size = (3.4 * len(LATER) + 1.5, len(LASERS) * (1.4 + 0.27 * len(pairs)))
     figure, panels = plt.subplots(
         len(LASERS), len(LATER), figsize=size, layout="constrained", squeeze=False, sharey=True, sharex=True
     )
@@ -71,12 +72,14 @@ def draw_ranking(ranked: Sequence[JsonObject], path: Path) -> Path:
                 if (r["laser"], r["step"]) == (laser, step) and (r["first"], r["second"]) in pairs:
                     _gap(axes, r, pairs.index((r["first"], r["second"])))
             axes.axvline(0, color="k", lw=0.8)
-            axes.set_xscale("symlog", linthresh=10)
+            axes.set_xscale("symlog", linthresh=LINEAR_MM)
             axes.grid(alpha=0.3, axis="x")
             axes.set_title(f"{laser}: {STEPS[step]}", fontsize=9)
         line[0].set_yticks(range(len(pairs)), [f"{a} - {b}" for a, b in pairs], fontsize=8)
     panels[0, 0].invert_yaxis()
     for axes in panels[-1]:
+        axes.xaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=LINEAR_MM))
+        axes.xaxis.get_major_locator().set_params(numticks=5)  # a tick a decade overlaps in a paper's column
         axes.set_xlabel("difference of MAE [mm]", fontsize=9)
         axes.tick_params(axis="x", labelsize=8)
     handles = [plt.Line2D([], [], color=c, marker=m, label=f"order {what}") for what, (c, m) in VERDICTS.items()]
