@@ -223,11 +223,14 @@ def transient_facts(transient: Transient) -> dict[str, str]:
 
 def histogram_facts(histogram: Histogram) -> dict[str, str]:
     sensor, budget = histogram.sensor, histogram.budget
+    photons = f"{budget.signal:g} signal + {budget.background:g} background detections a pixel"
+    if not np.isfinite(histogram.expected_signal).any():  # counts without a truth, of a capture say
+        photons = f"{budget.signal + budget.background:g} detections a pixel; how many are signal is unknown"
     return {
         "kind": "histogram",
         "sensor": f"{sensor.name}: {sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps",
         "pixels": _size(histogram.depth_m),
-        "photon budget": f"{budget.signal:g} signal + {budget.background:g} background detections a pixel",
+        "photon budget": photons,
         "detections": f"{int(histogram.counts.sum(dtype=np.int64)):,}",
         "detection law": str(histogram.meta.get("model", "not stated")),
         "seed": str(histogram.meta.get("seed", "none")),

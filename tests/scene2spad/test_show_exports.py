@@ -15,6 +15,8 @@ from scene2spad.cli import main
 from scene2spad.viewer.exports import cloud_content, dense_content
 from scenes.errors import InputError
 from spad.formats.histogram import read_histogram
+from spad.formats.linospad import capture_of, write_linospad
+from spad.formats.timestamps import Timestamps
 
 MODEL = "fourier-1024x1x1-128x-s0"
 EXPORTS = ("counts.npz", "counts.h5", "counts-thw.h5", "light.npz", "cloud.ply")
@@ -63,6 +65,19 @@ def test_the_pulse_beside_a_published_frame_is_shown(capfd):
     assert main(["show", "PSF_used_for_simulation_nr-1_nc-1.mat", "--out", "bad.html"]) == 2
     assert capfd.readouterr().err.count("\n") == 1 and not Path("bad.html").exists()
     assert main(["export", str(pulse), "--out", "x.npz"]) == 2
+
+
+def test_a_frame_of_a_capture_is_shown_by_its_number(capfd, tmp_path):
+    """A capture does not say which detections are signal, and the page does not make a split up."""
+    counts = np.random.default_rng(0).poisson(0.02, (2, 6, 6, 1536)).astype(np.int32)
+    write_linospad([capture_of(Timestamps.of_counts(one)) for one in counts], tmp_path / "capture.mat")
+    assert main(["show", str(tmp_path / "capture.mat"), "--frame", "1", "--out", "frame.html"]) == 0
+    text = Path("frame.html").read_text(encoding="utf-8")
+    assert "capture.mat, frame 1" in text and f"{int(counts[1].sum()):,}" in text
+    assert "how many are signal is unknown" in text and "background detections" not in text
+    capfd.readouterr()
+    assert main(["show", str(tmp_path / "capture.mat"), "--frame", "2", "--out", "none.html"]) == 2
+    assert "frame 2 is not one of its 2" in capfd.readouterr().err
 
 
 def test_a_checkpoint_is_shown_and_exported_by_its_file(tmp_path):

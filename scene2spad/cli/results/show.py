@@ -92,7 +92,8 @@ def _content(command: Show, kind: str) -> Content:
         return sources.transient_content(open_transient(path, kind, command.view), title)
     if kind == "histogram":
         histogram = open_histogram(path, command.frame)
-        return sources.histogram_content(histogram, path.name, transient_of(histogram, path, command.transient))
+        title = path.name + (f", frame {command.frame}" if command.frame else "")
+        return sources.histogram_content(histogram, title, transient_of(histogram, path, command.transient))
     if kind == "depth":
         found = open_depth(path)
         return sources.depth_content(found.depth_m, found.confidence, found.meta, path.name)
