@@ -13,7 +13,7 @@ import numpy as np
 from scenes.errors import InputError
 from scenes.io.mitsuba_nodes import Document
 from scenes.io.mitsuba_plugin import Plugin
-from scenes.io.textures import load_texture
+from scenes.io.textures import load_texture, with_sharp_texels
 from scenes.model import DISTRIBUTIONS, Material, Texture
 from scenes.optics.refractive_indices import CONDUCTORS, INDICES
 
@@ -62,6 +62,7 @@ class Materials:
         self._reads_images = reads_images
         self._looks: dict[Plugin, Look] = {}
         self._images: dict[tuple[Path, bool, str], Texture] = {}
+        self._sharp: dict[int, Texture] = {}  # by the id of the image that is enlarged
         self._default = Look(Material("diffuse", albedo=0.5, name="default"))
 
     def of_shape(self, shape: Plugin) -> Look:
@@ -145,12 +146,12 @@ class Materials:
             texture = _checkerboard(plugin)
         else:
             raise plugin.fail(f"texture {plugin.type!r} is not supported, bake it into a bitmap or checkerboard")
-        matrix = _to_uv(plugin)
+        matrix = plugin.texture_transform()
         plugin.note_unused()
         return texture, matrix
 
     def _bitmap(self, plugin: Plugin, channel: str) -> Texture:
-        plugin.ignore(("filter_type", "max_anisotropy", "cache", "format"))
+        plugin.ignore(("max_anisotropy", "cache", "format"))
         wrap = plugin.string("wrap_mode", "repeat")
         if wrap != "repeat":
             plugin.note(f"wrap_mode {wrap} is taken as repeat")
@@ -162,7 +163,18 @@ class Materials:
         # An opacity is a share, never light: its numbers are linear whatever the file says.
         linear = plugin.boolean("raw", False) or plugin.number("gamma", 0.0) == 1 or channel == "alpha"
         path = self._document.file(plugin.element, plugin.string("filename"), "texture")
-        return self.image(path, linear, channel)
+        read = self.image(path, linear, channel)
+        if plugin.string("filter_type", "bilinear") == "nearest" and self._reads_images:
+            return self._with_sharp_texels(plugin, read)
+        return read
+
+    def _with_sharp_texels(self, plugin: Plugin, read: Texture) -> Texture:
+        """Return a texture that is looked up by the nearest texel: each one enlarged, as lookup is bilinear here."""
+        if id(read) not in self._sharp:
+            self._sharp[id(read)] = with_sharp_texels(read)
+        if self._sharp[id(read)] is read and read.image.size > 1:
+            plugin.note("filter_type nearest is taken as bilinear, as the image is large")
+        return self._sharp[id(read)]
 
     def image(self, path: Path, linear: bool, channel: str) -> Texture:
         """Return a texture file, read once."""
@@ -194,21 +206,6 @@ def _checkerboard(plugin: Plugin) -> Texture:
         return Texture(np.kron([(dark, light), (light, dark)], half), "checkerboard")
     except InputError as error:
         raise plugin.fail(str(error)) from None
-
-
-def _to_uv(plugin: Plugin) -> np.ndarray:
-    """to_uv, or version 0.6's scales and offsets, as a 3x3 matrix."""
-    if plugin.has("to_uv"):
-        full = plugin.transform("to_uv")
-        matrix = np.eye(3)
-        matrix[:2, :2] = full[:2, :2]
-        # A 3x3 matrix keeps its shift in the third column, a 4x4 one in the fourth.
-        matrix[:2, 2] = full[:2, 3] + full[:2, 2]
-        return matrix
-    both = plugin.number("uvscale", 1.0)
-    scale = plugin.number("uscale", both), plugin.number("vscale", both)
-    offset = plugin.number("uoffset", 0.0), plugin.number("voffset", 0.0)
-    return np.array([(scale[0], 0, offset[0]), (0, scale[1], offset[1]), (0, 0, 1)])
 
 
 def _index(plugin: Plugin, name: str, default: str) -> float:

@@ -253,6 +253,20 @@ class Plugin:
             raise self.fail(f"{name} squashes space flat (its determinant is 0), expected an invertible transform")
         return matrix
 
+    def texture_transform(self) -> np.ndarray:
+        """Return a texture's to_uv, or version 0.6's scales and offsets, as a 3x3 matrix."""
+        if self.has("to_uv"):
+            full = self.transform("to_uv")
+            matrix = np.eye(3)
+            matrix[:2, :2] = full[:2, :2]
+            # A 3x3 matrix keeps its shift in the third column, a 4x4 one in the fourth.
+            matrix[:2, 2] = full[:2, 3] + full[:2, 2]
+            return matrix
+        both = self.number("uvscale", 1.0)
+        scale = self.number("uscale", both), self.number("vscale", both)
+        offset = self.number("uoffset", 0.0), self.number("voffset", 0.0)
+        return np.array([(scale[0], 0, offset[0]), (0, scale[1], offset[1]), (0, 0, 1)])
+
     def _step(self, name: str, step: Element) -> np.ndarray:
         matrix = np.eye(4)
         kind = step.tag.lower().replace("_", "")

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 MAX_PIXELS = 1 << 26
+SHARP_PIXELS = 1024  # side up to which images without interpolation are enlarged
 MAX_EXR_VALUES = 1 << 27  # of all channels: 8192 x 4096 RGBA, 1 GiB as float64
 
 
@@ -45,6 +46,18 @@ def load_texture(path: Path, *, linear: bool = False, channel: str = "luminance"
     if path.suffix.lower() == ".exr":
         return Texture(_exr_pixels(path, channel), path.name)
     return Texture(_image_pixels(path, linear, channel), path.name)
+
+
+def with_sharp_texels(texture: Texture) -> Texture:
+    """Return a texture whose texels have edges, as looked up by the nearest texel: each becomes a square of equal ones.
+
+    Lookup interpolates everywhere in this project; it then blends over one part in SHARP_PIXELS of the image. An image
+    of more than half as many pixels a side comes back as it is.
+    """
+    factor = SHARP_PIXELS // max(texture.image.shape)
+    if factor < 2:
+        return texture
+    return Texture(np.kron(texture.image, np.ones((factor, factor), np.float32)), texture.name)
 
 
 def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:

@@ -145,6 +145,24 @@ def test_to_uv_and_checkerboard_are_mitsubas(tmp_path: Path, mitsuba: object) ->
         assert texel(surface.material.albedo, first_hit(surface, *ray)[3]) == pytest.approx(hit[2][0])
 
 
+def test_the_nearest_texel_is_mitsubas(tmp_path: Path, mitsuba: object) -> None:
+    """A small image without interpolation keeps its edges; a large one is interpolated, and a note says so."""
+    levels = np.random.default_rng(0).integers(20, 250, (5, 3))
+    image(tmp_path, "t.png", levels)
+    file = '<string name="filename" value="{}"/><string name="filter_type" value="nearest"/>'
+    bsdf = '<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{}</texture></bsdf>'
+    path = write(tmp_path, f'<shape type="rectangle">{bsdf.format(file.format("t.png"))}</shape>')
+    scene = load_mitsuba_xml(path)
+    (surface,) = scene.surfaces
+    assert scene.notes == () and len(np.unique(surface.material.albedo.image)) == len(np.unique(levels))
+    rays = [((x, y, 3), (0, 0, -1)) for x in np.linspace(-0.9, 0.93, 9) for y in np.linspace(-0.93, 0.9, 9)]
+    for ray, hit in zip(rays, mitsuba(path, rays=rays)["hits"], strict=True):
+        assert texel(surface.material.albedo, first_hit(surface, *ray)[3]) == pytest.approx(hit[2][0], rel=1e-4)
+    image(tmp_path, "large.png", np.full((2, 800), 99))
+    notes = load(tmp_path, f'<shape type="rectangle">{bsdf.format(file.format("large.png"))}</shape>').notes
+    assert len(notes) == 1 and "nearest is taken as bilinear" in notes[0]
+
+
 def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
     image(tmp_path, "t.png", np.full((2, 2), 255))
     texture = '<texture type="bitmap" name="{}"><string name="filename" value="t.png"/>{}</texture>'
