@@ -123,16 +123,16 @@ def _traced_to_target(
     traced = trace(world, plan, settings, seed=seed, checked=checked, progress=report)
     filtered = plan.filter and (traced.schedule is None or traced.schedule.filter_octaves is not None)
     plan = replace(plan, spp=traced.spp, filter=filtered, reasons=(*plan.reasons, *traced.reasons))
-    error = _estimated(world, plan, settings, traced, checked)
+    error = estimated_error(world, plan, settings, traced, checked)
     for number in range(MAX_FILTERED_PASSES if plan.filter else 1):
-        more = _additional_schedule(world, plan, settings, traced, error)
+        more = additional_schedule(world, plan, settings, traced, error)
         if more is None:
             break
         extra = MoreSamples(more, derived_seed(seed, Stream.MORE, 0, number), checked)
         traced = add_samples(world, plan, settings, traced, extra, report)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
-        error = _estimated(world, plan, settings, traced, checked)
-    reasons = (*plan.reasons, *_bias_reasons(plan, traced, error), *_clamp_reasons(plan, settings, traced, error))
+        error = estimated_error(world, plan, settings, traced, checked)
+    reasons = (*plan.reasons, *_bias_reasons(plan, traced, error), *clamp_reasons(plan, settings, traced, error))
     return replace(plan, reasons=reasons), traced, error
 
 
@@ -149,7 +149,7 @@ def planned(world: TracedScene, settings: RenderSettings, seed: int = 0) -> Plan
     return make_plan(refracting(world, settings), settings, derived_seed(seed, Stream.PLAN))
 
 
-def _additional_schedule(
+def additional_schedule(
     world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate
 ) -> Schedule | None:
     """Return the schedule of extra samples if a planned render misses its target, else None. A short pilot sees few of
@@ -180,7 +180,7 @@ def _additional_schedule(
     return more
 
 
-def _clamp_reasons(plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
+def clamp_reasons(plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
     """State how much light a clamp removed; or that a clamp would help, where a few rare bright paths put the target
     out of reach."""
     if traced.indirect is None:
@@ -213,7 +213,7 @@ def _bias_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tup
     return (message,)
 
 
-def _estimated(
+def estimated_error(
     world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, checked: np.ndarray
 ) -> ErrorEstimate:
     """Estimate the error of a trace, from the checked pixels' batches and from finer direct light there."""

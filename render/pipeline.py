@@ -111,7 +111,7 @@ def trace(
     rays, indirect, schedule = direct.rays, None, None
     reasons: tuple[str, ...] = ()
     if plan.bounces > 1 and brightest > 0:
-        schedule, reasons = _schedule(world, plan, settings, direct.samples, origin_m, seed)
+        schedule, reasons = planned_schedule(world, plan, settings, direct.samples, origin_m, seed)
     light = SampleBuffer()
     light.add(direct.samples)
     direct = direct._replace(samples=no_samples())  # they are in the list now
@@ -177,7 +177,7 @@ def add_samples(
     )
 
 
-def _schedule(
+def planned_schedule(
     world: TracedScene, plan: Plan, settings: RenderSettings, direct: Samples, origin_m: np.ndarray, seed: int
 ) -> tuple[Schedule, tuple[str, ...]]:
     """Allocate paths to pixels by the noise of a pilot of a few paths, which is not used again; return the schedule and

@@ -270,7 +270,7 @@ def _indirect(
     lines = []
     bounces = settings.bounces
     if bounces is None:
-        bounces, left_out = _bounces(energy, min(target / 3, MAX_LEFT_OUT))
+        bounces, left_out = bounces_for(energy, min(target / 3, MAX_LEFT_OUT))
         fraction = energy[2:].sum() / energy.sum()
         lines.append(
             f"bounces: {bounces}; indirect light is {fraction:.2%} of the energy, {left_out:.2%} is left out beyond"
@@ -287,7 +287,7 @@ def _indirect(
     return bounces, None, 0.0 if settings.filter else paths, lines
 
 
-def _bounces(energy: np.ndarray, allowed: float) -> tuple[int, float]:
+def bounces_for(energy: np.ndarray, allowed: float) -> tuple[int, float]:
     """Find the fewest bounces that leave out at most the share `allowed` of the energy, and the share left out.
 
     What lies beyond the pilot's last bounce follows the geometric series of its later half: of two alone, a rare

@@ -372,18 +372,18 @@ class Scene:
 
         It is the hash of the parts' hashes, which textures, materials and surfaces keep: views share them.
         """
-        return _digest((self.surfaces, self.camera, self.laser, self.ambient)).hex()
+        return part_digest((self.surfaces, self.camera, self.laser, self.ambient)).hex()
 
 
-def _digest(value: object) -> bytes:
-    """SHA-256 of a part of a scene, kept in the objects that never change."""
+def part_digest(value: object) -> bytes:
+    """Return SHA-256 of a part of a scene, kept in the objects that never change."""
     kept = value.__dict__.get("_digest") if isinstance(value, (Texture, Material, Surface)) else None
     if kept is not None:
         return kept
     sha = hashlib.sha256(type(value).__name__.encode())
     if isinstance(value, tuple):
         for item in value:
-            sha.update(_digest(item))
+            sha.update(part_digest(item))
     elif isinstance(value, np.ndarray):
         sha.update(f"{value.dtype.str}{value.shape}".encode())
         sha.update(np.ascontiguousarray(value).data)
@@ -391,7 +391,7 @@ def _digest(value: object) -> bytes:
         for item in fields(value):
             part = getattr(value, item.name)
             if item.name != "name" and not (item.name in _ADDED_AT and part == _ADDED_AT[item.name]):
-                sha.update(_digest(part))
+                sha.update(part_digest(part))
         if isinstance(value, (Texture, Material, Surface)):
             object.__setattr__(value, "_digest", sha.digest())
     else:

@@ -121,6 +121,25 @@ def test_the_rule_of_docstrings_knows_what_is_none(name):
     assert NO_IMPERATIVE.match(name) or not name[0].isupper()
 
 
+def private(name: str) -> bool:
+    """Whether a name is private: of a named tuple and of notebooks some public ones begin with an underscore, too."""
+    return name.startswith("_") and not name.startswith("__") and name not in {"_replace", "_repr_html_"}
+
+
+def test_tests_use_public_names_only():
+    """Imports and attributes; `self` may have its own."""
+    bad = []
+    for path in (ROOT / "tests").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [one.name for one in node.names] if isinstance(node, ast.ImportFrom) else []
+            if isinstance(node, ast.ImportFrom):
+                names += (node.module or "").split(".")
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in ("self", "cls", "os"):
+                names.append(node.attr)
+            bad += [f"{of(path)}:{node.lineno} {name}" for name in names if private(name)]
+    assert not bad
+
+
 def test_random_streams_have_numbers_of_their_own():
     """But for three that had been given away twice: files follow from them."""
     from scenes.random_streams import Stream

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from scene2spad.cli.main import _parse
+from scene2spad.cli.main import parse_command
 
 ROOT = Path(__file__).parents[1]
 HOW_TO = ("quickstart", "own-scenes", "scenes", "sensors", "own-data", "scale-out", "exports", "interchange")
@@ -81,7 +81,7 @@ def test_every_command_of_a_page_parses(page):
     assert found
     for words in found:
         if words != ["COMMAND", "--help"]:
-            _parse(words)
+            parse_command(words)
 
 
 def test_how_to_pages_are_those_of_the_site():

@@ -74,7 +74,7 @@ class CoreArray:
         self._lane = np.arange(lanes)
         self._first_byte = self._lane * self.chip.ram_bytes
         row, column = np.divmod(self._lane, shape[1])
-        self._place = (column & 1) | (row & 1) << 1
+        self.place = (column & 1) | (row & 1) << 1
         self._neighbour = [_neighbours(row + down, column + right, shape) for down, right in STEPS]
 
     def frame(self, timestamps: np.ndarray, offsets: np.ndarray, *, park: bool = False) -> Frame:
@@ -90,7 +90,7 @@ class CoreArray:
         port = np.asarray(timestamps).astype(np.int64)
         in_range = not port.size or (port.min() >= 0 and port.max() < 1 << 16)
         require(bool(in_range), f"timestamps are outside 0 to {(1 << 16) - 1}")
-        return _Run(self, port, offsets, park).to_end()
+        return ArrayRun(self, port, offsets, park).to_end()
 
     def contents(self, region: str) -> np.ndarray:
         """Return numbers in a region of every core's RAM, (cores, count)."""
@@ -120,7 +120,7 @@ def _outside(value: np.ndarray, low: int, high: int) -> int:
     return int(np.count_nonzero(raised > high - low)) if int(raised.max(initial=0)) > high - low else 0
 
 
-class _Run:
+class ArrayRun:
     """One frame while it runs."""
 
     def __init__(self, array: CoreArray, port: np.ndarray, offsets: np.ndarray, park: bool) -> None:
@@ -155,7 +155,7 @@ class _Run:
                 look = self.events + _LOOK_EVERY
                 many = live[self.last[live] - self.next[live] >= _MANY_TIMESTAMPS]
                 if 0 < many.size <= _FEW:
-                    self._one_by_one(many)
+                    self.one_by_one(many)
             words = self.word[live]
             word = int(words.min())
             index = live[words == word]
@@ -182,7 +182,7 @@ class _Run:
         self.visits[end - 1] += index.size - (0 if held is None else held.size)
         self.instructions[went] += 1
 
-    def _one_by_one(self, lanes: np.ndarray) -> None:
+    def one_by_one(self, lanes: np.ndarray) -> None:
         """Run each core alone through its timestamps, to where it needs the array again."""
         blank = {region.name: np.zeros(region.count, np.int64) for region in self.program.regions if region.table}
         core = Core(self.program, blank, chip=self.array.chip)
@@ -190,7 +190,7 @@ class _Run:
             before = core.counters
             port = self.port[self.next[lane] : self.last[lane]].tolist()
             state = int(self.word[lane]), self.registers[:, lane].tolist(), self.ram[lane].tobytes()
-            core.resume(*state, port, int(self.array._place[lane]))
+            core.resume(*state, port, int(self.array.place[lane]))
             core.run()
             self.word[lane], self.registers[:, lane] = core.word, core.registers
             self.ram[lane] = np.frombuffer(core.ram, np.uint8)
@@ -223,7 +223,7 @@ class _Run:
         self.registers[one.rd][lanes] = self._value(one, lanes)
 
     def _id(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
-        self.registers[one.rd][lanes] = self.array._place[lanes]
+        self.registers[one.rd][lanes] = self.array.place[lanes]
 
     def _memory(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
         cells, place = self._cells(one, word, lanes, index)

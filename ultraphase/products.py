@@ -126,11 +126,11 @@ class _ByteProduct:
 def _bytes_are_multiplied() -> bool:
     """Return whether products of bytes are fast and exact here. PyTorch is not imported for it: that takes longer than
     a frame."""
-    return "torch" in sys.modules and _bytes_are_exact()
+    return "torch" in sys.modules and bytes_are_exact()
 
 
 @lru_cache(maxsize=1)
-def _bytes_are_exact() -> bool:
+def bytes_are_exact() -> bool:
     """Try the largest products there are. Without VNNI, libraries add pairs of products in 16 bits, which saturate."""
     import torch
 

@@ -253,7 +253,8 @@ class DepthModel(nn.Module):
         return found.depth_m, found.overflows
 
 
-def _weights_sha256(weights: dict[str, Tensor]) -> str:
+def tensors_sha256(weights: dict[str, Tensor]) -> str:
+    """Return SHA-256 over names, shapes and values of tensors by their names."""
     sha = hashlib.sha256()
     for name in sorted(weights):
         array = weights[name].detach().cpu().contiguous()
@@ -264,7 +265,7 @@ def _weights_sha256(weights: dict[str, Tensor]) -> str:
 
 def weights_sha256(model: nn.Module) -> str:
     """Return SHA-256 over names, shapes and values of all weights."""
-    return _weights_sha256(model.state_dict())
+    return tensors_sha256(model.state_dict())
 
 
 def save_model(model: DepthModel, config: TrainConfig, state: JsonObject, path: Path, *, half: bool = False) -> None:
@@ -276,7 +277,7 @@ def save_model(model: DepthModel, config: TrainConfig, state: JsonObject, path: 
 
     weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
     weights = {name: value.half() for name, value in weights.items()} if half else weights
-    header = seal({"config": config.to_dict(), "state": state}, KIND, _weights_sha256(weights))
+    header = seal({"config": config.to_dict(), "state": state}, KIND, tensors_sha256(weights))
     with whole_file(path) as beside:
         beside.write_bytes(save(weights, {ATTRIBUTE: header}))
 
@@ -303,7 +304,7 @@ def load_model(path: Path) -> tuple[DepthModel, TrainConfig, JsonObject]:
                 raise InputError("is no checkpoint of scene2spad")
             meta, sha256 = open_seal(header, KIND)
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
-        meta = check_seal(meta, sha256, _weights_sha256(weights))
+        meta = check_seal(meta, sha256, tensors_sha256(weights))
         config, state = TrainConfig.from_dict(meta["config"]), meta["state"]
         require(isinstance(state, dict), f"its state is a {type(state).__name__}, expected an object")
         _check_design(config.model, sum(value.numel() for value in weights.values()))

@@ -107,10 +107,13 @@ class Frames(Dataset):
         return Request(self.source, Patch(scene, 0, 0, signal, background, key))
 
 
-def _sensed(
+def sensed_batch(
     sets: Sequence[PackedViews], sensor: Sensor, size: tuple[int, int], window: int, requests: Sequence[Request]
 ) -> TrainBatch:
-    """Sense a batch whose patches keep their order; patches of one set are sensed together."""
+    """Sense a batch of patches of `size` (rows, columns), in the order of their requests; those of one set together.
+
+    `window` is the number of bins around the labels that training sees, 0 all.
+    """
     sources = [request.source for request in requests]
     parts, order = [], []
     for source in sorted(set(sources)):
@@ -219,7 +222,7 @@ class SetData(pl.LightningDataModule):
     def _loader(
         self, samples: Dataset, sets: Sequence[PackedViews], batch: int, size: tuple[int, int], window: int
     ) -> DataLoader:
-        collate = partial(_sensed, sets, self.config.model.sensor, size, window)
+        collate = partial(sensed_batch, sets, self.config.model.sensor, size, window)
         if isinstance(samples, Samples) and self.config.sense_on == "device":
             return DataLoader(samples, batch_size=batch, collate_fn=partial(_asked, window))
         return DataLoader(

@@ -231,8 +231,11 @@ def _validation_mm(module: DepthTraining) -> dict[str, float]:
     }
 
 
-def _claim(folder: Path, config: TrainConfig) -> None:
-    """Write the configuration, or see that the folder holds the same; InputError for another one's folder."""
+def claim_run(folder: Path, config: TrainConfig) -> None:
+    """Write the configuration, or see that the folder holds the same one.
+
+    Raises InputError for another run's folder, and one that holds other files.
+    """
     text = json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n"
     path = folder / "config.json"
     if path.is_file():
@@ -365,7 +368,7 @@ def train(
     record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():
         runner = _trainer(config, record, hardware)
-    _claim(folder, config)
+    claim_run(folder, config)
     if config.threads:
         torch.set_num_threads(config.threads)
     retain_freed_memory()

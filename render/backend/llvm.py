@@ -96,10 +96,10 @@ def backends() -> list[str]:
 
 def _found(library: str, variable: str) -> bool:
     explicit = os.environ.get(variable)
-    return Path(explicit).is_file() if explicit else _loads(f"lib{library}.so.1")
+    return Path(explicit).is_file() if explicit else loads(f"lib{library}.so.1")
 
 
-def _loads(library: str) -> bool:
+def loads(library: str) -> bool:
     """Return whether the dynamic linker loads a library. ctypes.util.find_library would run a compiler, whose files a
     kill leaves."""
     try:

@@ -45,7 +45,7 @@ def add_own_light(paths: PathBatch, sums: IndirectAccumulator, path_filter: Path
     if path_filter is not None:
         assert paths.primary.point is not None
         rows = path_filter.count_paths(paths.primary.point, _weight(paths, sums))
-    _add(_own_lanes(paths), paths, sums, path_filter, rows, own=True)
+    add_lanes(own_lanes(paths), paths, sums, path_filter, rows, own=True)
     if path_filter is not None:
         path_filter.evaluate()
 
@@ -57,9 +57,9 @@ def add_reused_light(
 
     Where late light is `filtered` they are reused for early light alone, where it matters (`reuses_early_paths`).
     """
-    pairs = _pairs(paths, reuses_paths=reuses_paths, early=filtered and reuses_early_paths(world))
+    pairs = select_pairs(paths, reuses_paths=reuses_paths, early=filtered and reuses_early_paths(world))
     if pairs is not None:
-        _add(_pair_lanes(world, paths, pairs), paths, sums, own=False)
+        add_lanes(pair_lanes(world, paths, pairs), paths, sums, own=False)
     sums.evaluate()
 
 
@@ -84,10 +84,10 @@ def noise_of_paths(
     most = None if limit is None else upload(Float, limit)
     paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, reuses_paths=True))
     own, alone, reused = (_Squares(most) for _ in range(3))
-    lanes = _own_lanes(paths)
-    _add(lanes._replace(early_m=Float(0)), paths, own, own=True)
-    _add(lanes, paths, alone, own=True)
-    _add(_pair_lanes(world, paths, _all_pairs(dr.width(paths.batch))), paths, reused, own=False)
+    lanes = own_lanes(paths)
+    add_lanes(lanes._replace(early_m=Float(0)), paths, own, own=True)
+    add_lanes(lanes, paths, alone, own=True)
+    add_lanes(pair_lanes(world, paths, _all_pairs(dr.width(paths.batch))), paths, reused, own=False)
     return own.by_block(BLOCK), alone.by_block(BLOCK) + reused.by_block(BLOCK**2)
 
 
@@ -106,12 +106,12 @@ def noise_of_filtered_paths(
     paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, from_m=start))
     primary: Array = paths.primary
     own = _Squares(most, primary.path + primary.late_m, start, primary.point.reflectance > 0)
-    _add(_own_lanes(paths), paths, own, own=True)
+    add_lanes(own_lanes(paths), paths, own, own=True)
     noise = own.by_block(BLOCK)
-    pairs = _pairs(paths, reuses_paths=False, early=reuses_early_paths(world))
+    pairs = select_pairs(paths, reuses_paths=False, early=reuses_early_paths(world))
     if pairs is not None:
         early = _Squares(most)
-        _add(_pair_lanes(world, paths, pairs), paths, early, own=False)
+        add_lanes(pair_lanes(world, paths, pairs), paths, early, own=False)
         block = dr.gather(UInt32, pairs.suffix, dr.arange(UInt32, dr.width(pairs.suffix) // BLOCK) * BLOCK) // BLOCK
         np.add.at(noise, block.numpy(), early.by_block(BLOCK))
     return noise
@@ -169,8 +169,7 @@ class _Pairs(NamedTuple):
 
 
 def _pairs_of(number: UInts, chosen: UInts = None) -> _Pairs:
-    """Make the pairs of these numbers. Neighbours in a block are neighbours in the launch, which keeps rays
-    coherent."""
+    """Make the pairs of these numbers. Neighbours in a block are neighbours in the launch: rays are coherent."""
     group = number // BLOCK
     suffix = group if chosen is None else dr.gather(UInt32, chosen, group)
     return _Pairs(suffix // BLOCK * BLOCK + number % BLOCK, suffix, group, number, chosen)
@@ -180,7 +179,7 @@ def _all_pairs(lanes: int) -> _Pairs:
     return _pairs_of(dr.arange(UInt32, lanes * BLOCK))
 
 
-def _pairs(paths: PathBatch, *, reuses_paths: bool, early: bool) -> _Pairs | None:
+def select_pairs(paths: PathBatch, *, reuses_paths: bool, early: bool) -> _Pairs | None:
     """Select the pairs of primary vertex and suffix that may have light for each other; None where there are none."""
     if reuses_paths:
         return _all_pairs(dr.width(paths.batch))
@@ -303,7 +302,7 @@ def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
     return _Weights(made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0))
 
 
-def _pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
+def pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
     """Return early light that every pixel of a block gets from every suffix of the block."""
     primary, weights = paths.primary, _weights(world, paths, pairs)
     return _Lanes(
@@ -318,8 +317,8 @@ def _pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
     )
 
 
-def _own_lanes(paths: PathBatch) -> _Lanes:
-    """Light that a pixel gets from its own path alone."""
+def own_lanes(paths: PathBatch) -> _Lanes:
+    """Return light that a pixel gets from its own path alone."""
     primary, suffixes = paths.primary, paths.suffixes
     suffix = dr.arange(UInt32, dr.width(paths.batch))
     return _Lanes(
@@ -349,7 +348,7 @@ class _Lanes(NamedTuple):
 
 
 @dr.syntax
-def _add(
+def add_lanes(
     lanes: _Lanes,
     paths: PathBatch,
     sums: IndirectAccumulator,
@@ -358,6 +357,7 @@ def _add(
     *,
     own: bool,
 ) -> None:
+    """Add the light of lanes to sums; `own`: that of a pixel's own path, connected at its first vertices too."""
     receiver, batch, suffix, path1, leg, early_m, first, onward = lanes
     connections, suffixes = paths.connections, paths.suffixes
     laser_path, last = (dr.gather(type(c), c, suffix) for c in (suffixes.laser_path, suffixes.length))

@@ -42,7 +42,7 @@ def run(command: Bench, progress: Progress) -> dict:
         rows += _one(method(name), command.seed)
     if not command.quick:
         progress("megapixel", 0.9)
-        rows += [_megapixel(method(name), command.seed, command.repeats) for name in _MEGAPIXEL_PROGRAMS]
+        rows += [time_megapixel(method(name), command.seed, command.repeats) for name in _MEGAPIXEL_PROGRAMS]
     out.mkdir(parents=True, exist_ok=True)
     path = out / "bench-emulate.csv"
     with whole_file(path) as beside, beside.open("w", newline="") as file:
@@ -128,7 +128,7 @@ def _row(name: str, spent: np.ndarray, differs: np.ndarray, pixels: int, instruc
     }
 
 
-def _megapixel(chosen: Method, seed: int, repeats: int) -> dict:
+def time_megapixel(chosen: Method, seed: int, repeats: int) -> dict:
     """Time a frame of 2^20 pixels from uint8 histograms by the tabulated form, two threads, best of `repeats`; a block
     of it is compared with the integer product."""
     import torch  # noqa: F401  # products of bytes are used where it is loaded

@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
             return 0
         if argv[:1] == ["--completion"]:
             return _print_completion(argv[1:])
-        command = _parse(argv or ["--help"])
+        command = parse_command(argv or ["--help"])
     except InputError as error:
         return _refuse(str(error))
     except SystemExit as stop:
@@ -145,7 +145,11 @@ def _print_completion(argv: list[str]) -> int:
     return 0
 
 
-def _parse(argv: list[str]) -> Common:
+def parse_command(argv: list[str]) -> Common:
+    """Return the command that words of the command line name, with its options.
+
+    Raises SystemExit: 2 after one line on stderr for words that are none, 0 after `--help`.
+    """
     _check_words(argv)
     usage = io.StringIO()
     try:
@@ -213,7 +217,7 @@ def _log_to_stderr() -> None:
 def _progress() -> Iterator[Progress]:
     """Yield a progress bar on stderr, and the function that moves it; where stderr is piped, a line now and then."""
     if not sys.stderr.isatty():
-        yield _progress_lines()
+        yield progress_lines()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -224,7 +228,7 @@ def _progress() -> Iterator[Progress]:
         yield lambda what, fraction: bar.update(task, description=what, completed=fraction)
 
 
-def _progress_lines(every_s: float = PIPED_S) -> Progress:
+def progress_lines(every_s: float = PIPED_S) -> Progress:
     """Return a progress that prints a line where the last one, or the start, is `every_s` ago."""
     last_s = time.monotonic()
 

@@ -188,16 +188,17 @@ def errors_of(
             key = {"pair": pair.digest, "level": list(level), "offset_m": offset_m, "seed": seed}
             missing = [one for one in subjects if store.get(one.digest, **key) is None]
             if missing:
-                histogram = _drawn(pair, level, offset_m, (seed, number, PHOTON_LEVELS.index(level)))
+                histogram = sensed_pair(pair, level, offset_m, (seed, number, PHOTON_LEVELS.index(level)))
                 for one in missing:
-                    store.put(one.digest, _errors(one, histogram), **key)
+                    store.put(one.digest, errors_as_published(one.model, histogram, "soft-argmax"), **key)
             for one in subjects:
                 common = {"model": one.name, "pair": pair.name, "offset_m": offset_m}
                 rows.append({**common, "signal": level[0], "background": level[1], **store.get(one.digest, **key)})
     return rows
 
 
-def _drawn(pair: Pair, level: tuple[float, float], offset_m: float, key: tuple[int, ...]) -> Histogram:
+def sensed_pair(pair: Pair, level: tuple[float, float], offset_m: float, key: tuple[int, ...]) -> Histogram:
+    """Sense a pair in the published simulation, `offset_m` farther away; `key` is the seed of its photons."""
     budget, sensor = PhotonBudget(*level), Sensor()
     expected = published_from_rgbd(pair.depth_m + offset_m, pair.luma, pair.luma, sensor, budget)
     rng = np.random.default_rng(np.random.SeedSequence(key, spawn_key=(Stream.PUBLISHED,)))
@@ -211,10 +212,6 @@ def _drawn(pair: Pair, level: tuple[float, float], offset_m: float, key: tuple[i
         expected.signal.astype(np.float32),
         expected.background.astype(np.float32),
     )
-
-
-def _errors(subject: EvaluatedModel, histogram: Histogram) -> dict[str, float]:
-    return errors_as_published(subject.model, histogram, "soft-argmax")
 
 
 def errors_as_published(model: DepthEstimator, histogram: Histogram, decoder: Decoder) -> dict[str, float]:
@@ -246,7 +243,7 @@ def evaluate_as_published(
     for number, pair in enumerate(photographs):
         for place, level in enumerate(PHOTON_LEVELS):
             progress(f"{pair.name}, {level[0]:g} + {level[1]:g}", number / len(photographs))
-            histogram = _drawn(pair, level, offset_m, (seed, number, place))
+            histogram = sensed_pair(pair, level, offset_m, (seed, number, place))
             for name, model in models.items():
                 reference = "label" if model.config.grid == "published" else "arrival"
                 for decoder in DECODERS:

@@ -126,12 +126,12 @@ def render_view(job: Job, view: int, again: int = 0) -> Done:
     where = f"{os.uname().nodename}/{os.getpid()}"
     with _ONE_AT_A_TIME, quiet():
         try:
-            record, exr = _rendered(job, view, again)
+            record, exr = record_and_exr(job, view, again)
         except Exception as error:  # one odd scene of thousands must not end the run
             message = " ".join(str(error).split()) or type(error).__name__
             name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
             record, exr = {"view": view, "failed": f"{name}{message}"[:500]}, None
-            _forget()  # what was recorded may be half done
+            forget_places()  # what was recorded may be half done
     return Done(record, exr, time.perf_counter() - start, where)
 
 
@@ -155,7 +155,7 @@ def _direct_errors(job: Job, views: Sequence[int]) -> list[float]:
             except Exception:  # as in `render_view`
                 log.debug("view %d cannot be planned", view, exc_info=True)
                 found.append(math.nan)
-                _forget()
+                forget_places()
     return found
 
 
@@ -175,7 +175,8 @@ def quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _rendered(job: Job, view: int, again: int) -> tuple[dict, bytes]:
+def record_and_exr(job: Job, view: int, again: int) -> tuple[dict, bytes]:
+    """Render a view: its record in the set's index, and its file; `again` from 1 on with other noise."""
     # heavy imports only where a view is really rendered: the process that collects needs none of them
     from render.engine import render
     from render.transient.data import exr_bytes
@@ -237,7 +238,7 @@ def _world(job: Job, view: int, scene: Scene) -> TracedScene | None:
     place = job.set, job.seed, job.ambient, chosen.place(view)
     if place not in _WORLDS:
         plastics = {key: made for world in _WORLDS.values() for key, made in world.plastics.items()}
-        _forget()  # before the next is built: calls are compiled for all materials that are there
+        forget_places()  # before the next is built: calls are compiled for all materials that are there
         _WORLDS[place] = TracedScene(scene, origin_in_scene=True, plastics=plastics)
     return _WORLDS[place].with_camera(scene.camera)
 
@@ -257,7 +258,8 @@ def _plan(job: Job, view: int, world: TracedScene | None) -> Plan | None:
     return _PLANS[key]
 
 
-def _forget() -> None:
+def forget_places() -> None:
+    """Forget traced worlds and plans of places that this process has rendered."""
     _WORLDS.clear()
     _PLANS.clear()
 
@@ -265,7 +267,7 @@ def _forget() -> None:
 # --- Running ---------------------------------------------------------------------------------------------------------
 
 
-def _runs(job: Job, views: Iterable[int]) -> Iterator[tuple[int, ...]]:
+def views_by_place(job: Job, views: Iterable[int]) -> Iterator[tuple[int, ...]]:
     """Render views of one place together, in order."""
     chosen = scene_set(job.set)
     return (tuple(run) for _, run in groupby(views, key=lambda view: view // chosen.views_per_place))
@@ -327,7 +329,7 @@ def make_set(
     with executor(workers if missing else 1, scheduler if missing else None) as run:
         endless = scene_set(job.set).size is None
         job = _with_grid(job, folder, run, report) if missing and endless and job.grid is None else job
-        for number, done in enumerate(run(partial(render_views, job), _runs(job, todo), _lost), 1):
+        for number, done in enumerate(run(partial(render_views, job), views_by_place(job, todo), _lost), 1):
             folder.add(done)
             if "failed" in done.record:
                 log.warning("view %d failed: %s", done.record["view"], done.record["failed"])

@@ -40,7 +40,7 @@ def plain_log(axes: Axes, which: Literal["x", "y"] = "y") -> None:
     axis.set_minor_formatter(label)
 
 
-def _image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: object) -> None:
+def draw_image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: object) -> None:
     """Show an image with its colour bar, whose ends are pointed where values lie beyond them."""
     shown = axes.imshow(image, interpolation="nearest", **options)
     axes.set_title(title, fontsize=10)
@@ -85,8 +85,8 @@ def draw_transient(transient: Transient, path: Path) -> Path:
     pixel = transient.return_pixel[later]
     indirect = np.bincount(pixel, weights=transient.radiance[later], minlength=total.size).reshape(total.shape)
     fraction = np.divide(indirect, total, out=np.full(total.shape, np.nan), where=total > 0)
-    _image(axes[0, 0], display(total), "laser light, all paths", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
-    _image(
+    draw_image(axes[0, 0], display(total), "laser light, all paths", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
+    draw_image(
         axes[0, 1],
         transient.depth_m,
         "depth at pixel centres",
@@ -94,11 +94,13 @@ def draw_transient(transient: Transient, path: Path) -> Path:
         cmap=DEPTH_COLOURS,
         **depth_limits(transient.depth_m),
     )
-    _image(axes[0, 2], 100 * fraction, "indirect share of the laser light", "%", cmap=ERROR_COLOURS, vmin=0)
+    draw_image(axes[0, 2], 100 * fraction, "indirect share of the laser light", "%", cmap=ERROR_COLOURS, vmin=0)
     axes[1, 0].imshow(np.abs(transient.normal.astype(float)))
     axes[1, 0].set(title="|normal|, world x y z as red green blue", xticks=[], yticks=[])
     axes[1, 0].title.set_fontsize(10)
-    _image(axes[1, 1], display(transient.ambient), "ambient light", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
+    draw_image(
+        axes[1, 1], display(transient.ambient), "ambient light", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1
+    )
     _mean_transient(axes[1, 2], transient)
     error = transient.meta.get("relative_error", {}).get("total", float("nan"))
     figure.suptitle(f"{transient.meta.get('scene', '')}: {transient.returns:,} returns, estimated error {error:.2%}")
@@ -136,10 +138,10 @@ def draw_histogram(
     counts = histogram.counts.sum(axis=2, dtype=np.int64)
     ratio = histogram.expected_signal / np.maximum(histogram.expected_background, 1e-12)
     bright = max(np.quantile(counts, 0.995), 1)
-    _image(panels["A"], counts, "detections per pixel", "photons", cmap="gray", vmin=0, vmax=bright)
+    draw_image(panels["A"], counts, "detections per pixel", "photons", cmap="gray", vmin=0, vmax=bright)
     decibels = 10 * np.log10(np.maximum(ratio, 1e-12))
     low, high = np.quantile(decibels[ratio > 0], (0.01, 0.99)) if (ratio > 0).any() else (0, 1)
-    _image(panels["B"], decibels, "expected signal to background", "dB", cmap=ERROR_COLOURS, vmin=low, vmax=high)
+    draw_image(panels["B"], decibels, "expected signal to background", "dB", cmap=ERROR_COLOURS, vmin=low, vmax=high)
     for number, (name, (row, column)) in enumerate(shown_pixels(histogram).items()):
         for key in "AB":
             panels[key].plot(column, row, "o", mfc="none", mec=f"C{number + 1}", ms=8, mew=1.5)
@@ -215,15 +217,15 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
     """Draw truth, estimate and absolute error; the estimate alone where no truth is known."""
     if np.isnan(histogram.depth_m).all():
         figure, (only,), _ = _image_row(depth_m.shape, 1)
-        _image(only, depth_m, f"{method}, no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
+        draw_image(only, depth_m, f"{method}, no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
         return save(figure, path)
     figure, axes, _ = _image_row(depth_m.shape, 3)
     limits = depth_limits(histogram.depth_m)
-    _image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
+    draw_image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     title = f"{method}: MAE {errors['mae_mm']:.1f} mm, {errors['within_10mm']:.0%} within 10 mm"
-    _image(axes[1], depth_m, title, "m", cmap=DEPTH_COLOURS, **limits)
+    draw_image(axes[1], depth_m, title, "m", cmap=DEPTH_COLOURS, **limits)
     error_mm = 1000 * np.abs(depth_m - histogram.depth_m)
-    _image(axes[2], error_mm, "absolute error (colours end at 100 mm)", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
+    draw_image(axes[2], error_mm, "absolute error (colours end at 100 mm)", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
     return save(figure, path)
 
 
@@ -231,9 +233,9 @@ def draw_depth_map(depth_m: np.ndarray, confidence: np.ndarray | None, title: st
     """Draw a depth map on its own, and the confidence where a network stated one."""
     columns = 1 if confidence is None else 2
     figure, axes = plt.subplots(1, columns, figsize=(6 * columns, 4.8), layout="constrained", squeeze=False)
-    _image(axes[0, 0], depth_m, title, "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
+    draw_image(axes[0, 0], depth_m, title, "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
     if confidence is not None:
-        _image(axes[0, 1], confidence, "confidence", "", cmap="gray", vmin=0, vmax=1)
+        draw_image(axes[0, 1], confidence, "confidence", "", cmap="gray", vmin=0, vmax=1)
     return save(figure, path)
 
 
@@ -256,12 +258,12 @@ def draw_comparison(
         above.set_axis_on()
         figures = errors.get(name)
         message = f"{name}\nMAE {figures['mae_mm']:.0f} mm" if figures and known else name
-        _image(above, depth, message, "m", cmap=DEPTH_COLOURS, **limits)
+        draw_image(above, depth, message, "m", cmap=DEPTH_COLOURS, **limits)
         if known and figures:
             below = axes[rows * band + 1, column]
             below.set_axis_on()
             error_mm = 1000 * np.abs(depth - histogram.depth_m)
-            _image(below, error_mm, "absolute error", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
+            draw_image(below, error_mm, "absolute error", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
     return save(figure, path)
 
 
@@ -301,12 +303,12 @@ def draw_demo(
     figure = plt.figure(figsize=(14, 11.5), layout="constrained")
     panels = figure.subplot_mosaic("ABC;DEF;GGG;HHH", height_ratios=(1, 1, 0.45, 0.6))
     limits = depth_limits(histogram.depth_m)
-    _image(panels["A"], histogram.expected_signal, "expected signal", "photons per pixel", cmap="gray", vmin=0,
+    draw_image(panels["A"], histogram.expected_signal, "expected signal", "photons per pixel", cmap="gray", vmin=0,
            vmax=np.quantile(histogram.expected_signal, 0.98))  # fmt: skip
-    _image(panels["B"], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
+    draw_image(panels["B"], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     for key, (name, depth) in zip("CDEF", depths.items(), strict=True):
         message = f"{name}\nMAE {errors[name]['mae_mm']:.0f} mm, {errors[name]['within_10mm']:.0%} within 10 mm"
-        _image(panels[key], depth, message, "m", cmap=DEPTH_COLOURS, **limits)
+        draw_image(panels[key], depth, message, "m", cmap=DEPTH_COLOURS, **limits)
     row, column = _telling_pixel(transient)
     for key in "ABCDEF":
         panels[key].plot(column, row, "o", mfc="none", mec=COLOURS["vermilion"], ms=9)

@@ -49,7 +49,7 @@ def room_view(index: int, split: str = "train", *, seed: int = 0, width: int = 6
     Splits draw from streams of their own and share no room. The last rooms are kept: their other views cost nothing.
     """
     number, which = divmod(index, VIEWS_PER_ROOM)
-    room = _room(split, number, seed)
+    room = room_of(split, number, seed)
     camera = replace(room.cameras[which], width=width, height=height)
     notes = (f"procedural, {split} view {index} of seed {seed}: camera {which} of room {number}",)
     return Scene(f"rooms/{split}/{index}", room.surfaces, camera, notes=notes)
@@ -61,7 +61,8 @@ def room_name(index: int, split: str) -> str:
 
 
 @lru_cache(maxsize=2)
-def _room(split: str, number: int, seed: int) -> Room:
+def room_of(split: str, number: int, seed: int) -> Room:
+    """Return a room of a split by its number; the same seed gives the same room. The last ones are kept in memory."""
     stream = np.random.SeedSequence(seed, spawn_key=(SPLITS.index(split), number))
     for attempt in stream.spawn(ATTEMPTS):
         room = _attempt(np.random.default_rng(attempt))

@@ -82,7 +82,7 @@ class Tdc:
         Raises InputError in one line for a table that is unknown or does not fit the clock.
         """
         if self.table:
-            return _measured(self.table, self.clock_period_s)
+            return measured_table(self.table, self.clock_period_s)
         return _drawn(self.codes, self.dnl, self.missing)
 
     def edges(self, bins: int, bin_width_s: float) -> np.ndarray:
@@ -104,7 +104,8 @@ def shipped_tables() -> dict[str, Path]:
 
 
 @lru_cache(maxsize=8)
-def _measured(table: str, clock_period_s: float) -> np.ndarray:
+def measured_table(table: str, clock_period_s: float) -> np.ndarray:
+    """Read a measured table of code widths, shipped or a file's, as ends of codes in clock periods; kept in memory."""
     shipped = shipped_tables()
     if table not in shipped:
         meant = did_you_mean(table, shipped)
@@ -163,7 +164,7 @@ def _edges(tdc: Tdc, bins: int, bin_width_s: float) -> np.ndarray:
     ends = tdc.ends()
     converters, codes = ends.shape
     turn = np.arange(periods)[:, None]
-    at = (turn + _reported(tdc)[:, None]).reshape(-1, periods * codes) * (bins / periods)
+    at = (turn + reported_times(tdc)[:, None]).reshape(-1, periods * codes) * (bins / periods)
     places = np.floor(at + _ROUNDING).astype(np.int64).clip(0, bins - 1)
     held = np.array([np.bincount(row + 1, minlength=bins + 1) for row in places])
     first = np.broadcast_to(held.cumsum(axis=1), (converters, bins + 1))  # code that each bin begins with
@@ -174,7 +175,7 @@ def _edges(tdc: Tdc, bins: int, bin_width_s: float) -> np.ndarray:
     return edges
 
 
-def _reported(tdc: Tdc) -> np.ndarray:
+def reported_times(tdc: Tdc) -> np.ndarray:
     """Return the time in clock periods that each fine code stands for, (converters, codes), or (1, codes) of all."""
     ends = tdc.ends()
     codes = ends.shape[1]

@@ -11,9 +11,9 @@ import torch
 from safetensors.torch import load_file, save
 
 from csph.codes.design import Design
-from csph.networks.model import KIND, DepthModel, _weights_sha256, load_model, save_model
+from csph.networks.model import KIND, DepthModel, load_model, save_model, tensors_sha256
 from csph.training.config import ModelConfig, TrainConfig
-from csph.training.loop import _claim
+from csph.training.loop import claim_run
 from csph.weights.torch_files import load_torch_file
 from scene2spad.studies.tensors import coding_of
 from scenes.errors import InputError
@@ -36,7 +36,7 @@ def resealed(path: Path, change=lambda weights: None, config: object = None) -> 
     weights = load_file(path)
     change(weights)
     meta = {"config": CONFIG.to_dict() if config is None else config, "state": {"step": 1}}
-    path.write_bytes(save(weights, {ATTRIBUTE: seal(meta, KIND, _weights_sha256(weights))}))
+    path.write_bytes(save(weights, {ATTRIBUTE: seal(meta, KIND, tensors_sha256(weights))}))
     return path
 
 
@@ -147,7 +147,7 @@ def test_a_deep_header_and_a_pipe_are_refused(checkpoint, tmp_path):
 def test_a_configuration_that_is_no_text_is_refused(tmp_path):
     (tmp_path / "config.json").write_bytes(b"\xff\xfe{")
     with pytest.raises(InputError, match=r"config\.json: is not text"):
-        _claim(tmp_path, CONFIG)
+        claim_run(tmp_path, CONFIG)
 
 
 # --- Files of torch.save ---------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from csph.evaluation.metrics import PHOTON_LEVELS, TRAIN_LEVELS
 from csph.networks.grid import on_published_grid, published_centroid_bins, published_position, published_target
 from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training.config import RECIPE, ModelConfig, TrainConfig, preset
-from csph.training.data import DeviceSensing, Requests, Samples, SetData, _sensed
+from csph.training.data import DeviceSensing, Requests, Samples, SetData, sensed_batch
 from csph.training.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
 from csph.training.loop import DepthTraining, NetworkOf, train
 from csph.training.loss import decoded_error
@@ -93,7 +93,7 @@ def test_a_window_is_a_cut_of_the_whole(model):
     """What the network sees of a window is that part of what it sees of all bins, and its labels move with it."""
     packs = [pack_views(random_planes(2, size=16, seed=5).transients)]
     config = preset("smoke", model)
-    batch = _sensed(packs, model.sensor, (8, 8), 512, [Samples(packs, config, 0)[i] for i in range(4)])
+    batch = sensed_batch(packs, model.sensor, (8, 8), 512, [Samples(packs, config, 0)[i] for i in range(4)])
     start = batch.first_bin
     assert (start % 256 == 0).all() and (start >= 0).all() and (start <= 512).all()
     training = DepthTraining(config)
@@ -133,9 +133,9 @@ def test_sets_are_mixed_by_their_weights():
     assert abs(second.mean() - 0.75) < 5 * math.sqrt(0.75 * 0.25 / 2000)
     requests = [samples[i] for i in range(8)]
     assert len({one.source for one in requests}) == 2
-    batch = _sensed(packs, config.model.sensor, (8, 8), 0, requests)
+    batch = sensed_batch(packs, config.model.sensor, (8, 8), 0, requests)
     for i, one in enumerate(requests):
-        alone = _sensed(packs, config.model.sensor, (8, 8), 0, [one])
+        alone = sensed_batch(packs, config.model.sensor, (8, 8), 0, [one])
         assert torch.equal(batch.counts[i], alone.counts[0]) and torch.equal(batch.valid[i], alone.valid[0])
     with pytest.raises(InputError, match="3 set weights for 2 training sets"):
         Samples(packs, replace(config, weights=(1.0, 1.0, 1.0)), 0)
@@ -228,7 +228,7 @@ def test_training_senses_on_the_device_when_asked(tmp_path):
     window = 512 if config.model.sensor.bins > 512 else 0
     requests = [Samples(packs, config, 0)[i] for i in range(4)]
     here = DeviceSensing(packs, config, torch.device("cpu")).sense(Requests(tuple(requests), window))
-    there = _sensed(packs, config.model.sensor, (config.crop, config.crop), window, requests)
+    there = sensed_batch(packs, config.model.sensor, (config.crop, config.crop), window, requests)
     assert torch.equal(here.depth_m.nan_to_num(-1), there.depth_m.nan_to_num(-1))
     assert torch.equal(here.valid, there.valid) and torch.equal(here.first_bin, there.first_bin)
     with pytest.raises(InputError, match="sense_on 'gpu', expected host or device"):

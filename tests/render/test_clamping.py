@@ -139,10 +139,10 @@ def test_a_target_out_of_reach_is_not_chased():
     plan, traced = make_plan(TracedScene(scene()), settings, 1), light(1, None)
     traced = traced._replace(schedule=traced.schedule._replace(spp=np.full(12, 16)))
     near, far = (ErrorEstimate(mc, 0.0, 0.0, mc, 0.0, 0.01, 0.05, worst_share=0.9) for mc in (0.03, 0.1))
-    assert engine._additional_schedule(TracedScene(scene()), plan, settings, traced, near) is not None
-    assert engine._additional_schedule(TracedScene(scene()), plan, settings, traced, far) is None
-    assert engine._clamp_reasons(plan, settings, traced, near) == ()
-    (told,) = engine._clamp_reasons(plan, settings, traced, far)
+    assert engine.additional_schedule(TracedScene(scene()), plan, settings, traced, near) is not None
+    assert engine.additional_schedule(TracedScene(scene()), plan, settings, traced, far) is None
+    assert engine.clamp_reasons(plan, settings, traced, near) == ()
+    (told,) = engine.clamp_reasons(plan, settings, traced, far)
     assert "stopped" in told and "25 times" in told and "--clamp" in told and "\n" not in told
 
 
@@ -157,7 +157,7 @@ def test_a_pilot_that_asks_too_much_spends_little(monkeypatch):
         power, each = power_of(direct)
         noise = times * plan.noise**2 * power / each * tracing.MAX_SPP / 12
         monkeypatch.setattr(tracing, "pilot_noise", lambda *_, **__: (np.full(12, noise), np.full(12, 1e9 * noise)))
-        found, reasons = tracing._schedule(world, plan, settings, direct, np.zeros(len(PIXELS)), 1)
+        found, reasons = tracing.planned_schedule(world, plan, settings, direct, np.zeros(len(PIXELS)), 1)
         return found.cost, " ".join(reasons)
 
     assert schedule(0.5)[0] == pytest.approx(tracing.MAX_SPP / 2, rel=0.05)

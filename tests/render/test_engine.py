@@ -11,7 +11,7 @@ from render import engine
 from render import pipeline as tracing
 from render.engine import render
 from render.error import BIN_M, PULSE_POWER, SIGMA_M, estimate, response, target_verdict, worst_fraction_of
-from render.planning import _bounces, make_plan, rays_for_all
+from render.planning import bounces_for, make_plan, rays_for_all
 from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
 from render.transient.samples import Samples
@@ -47,10 +47,10 @@ def test_same_seed_same_bytes_with_one_and_two_threads():
 def test_bounces_follow_a_geometric_series_and_not_one_bright_path():
     """Half of the energy goes on at each bounce: 2^-n is left out after n. A last bounce twice as bright adds few."""
     energy = np.array([0.0, *0.5 ** np.arange(1, 9)])
-    bounces, left_out = _bounces(energy, 0.011)
+    bounces, left_out = bounces_for(energy, 0.011)
     assert bounces == 7 and left_out == pytest.approx(0.5**7, rel=1e-9)
     energy[-1] *= 2
-    assert _bounces(energy, 0.011)[0] in (7, 8, 9)
+    assert bounces_for(energy, 0.011)[0] in (7, 8, 9)
 
 
 def test_many_views_get_the_rays_that_their_mean_squared_error_asks_for():
@@ -134,8 +134,8 @@ def test_a_missed_target_is_made_good():
     world, settings = TracedScene(scene), RenderSettings(bounces=4, error=0.02)
     plan = replace(make_plan(world, settings, 1), noise=0.05)  # a pilot that promises 2.5 times too much
     first = tracing.trace(world, plan, settings, seed=1, checked=pixels)
-    error = engine._estimated(world, plan, settings, first, pixels)
-    more = engine._additional_schedule(world, plan, settings, first, error)
+    error = engine.estimated_error(world, plan, settings, first, pixels)
+    more = engine.additional_schedule(world, plan, settings, first, error)
     assert error.total > 0.02 and more is not None
     both = tracing.add_samples(
         world, plan, settings, first, tracing.MoreSamples(more, 1, pixels), lambda what, fraction: None
@@ -146,7 +146,7 @@ def test_a_missed_target_is_made_good():
         return np.linalg.norm(response(traced.samples, pixels) - fine) / np.linalg.norm(fine)
 
     assert true(both) < true(first)
-    assert engine._estimated(world, plan, settings, both, pixels).total < error.total
+    assert engine.estimated_error(world, plan, settings, both, pixels).total < error.total
 
 
 def test_error_target_is_met_and_the_estimate_is_honest():

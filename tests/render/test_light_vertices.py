@@ -63,12 +63,12 @@ def totals(scene: Scene, seed: int, *, reuses_paths: bool, rounds: int = 64, fro
     start = None if from_m is None else dr.opaque(Float, from_m)
     traced = trace_paths(PathTask(world, blocks, turns, 4, seed, reuses_paths=reuses_paths, from_m=start))
     own = Sum()
-    sharing._add(sharing._own_lanes(traced), traced, own, own=True)
+    sharing.add_lanes(sharing.own_lanes(traced), traced, own, own=True)
     found = own.lanes.reshape(-1, BLOCK).sum(axis=1)
-    pairs = sharing._pairs(traced, reuses_paths=reuses_paths, early=from_m is not None)
+    pairs = sharing.select_pairs(traced, reuses_paths=reuses_paths, early=from_m is not None)
     if pairs is not None:
         of_pairs = Sum()
-        sharing._add(sharing._pair_lanes(world, traced, pairs), traced, of_pairs, own=False)
+        sharing.add_lanes(sharing.pair_lanes(world, traced, pairs), traced, of_pairs, own=False)
         np.add.at(found, pairs.vertex.numpy() // BLOCK, of_pairs.lanes)
     return found.reshape(count, rounds).T
 

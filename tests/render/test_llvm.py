@@ -182,7 +182,7 @@ def machine(monkeypatch):
             monkeypatch.delenv(name, raising=False)
         if backend is not None:
             monkeypatch.setenv(llvm.BACKEND_VARIABLE, backend)
-        monkeypatch.setattr(llvm, "_loads", lambda name: name in {f"lib{library}.so.1" for library in libraries})
+        monkeypatch.setattr(llvm, "loads", lambda name: name in {f"lib{library}.so.1" for library in libraries})
         drjit = types.ModuleType("drjit")
         drjit.detail = types.SimpleNamespace(llvm_version=lambda: version)
         mitsuba = FakeMitsuba(*works)
@@ -201,7 +201,7 @@ def test_a_library_is_looked_for_without_a_compiler(monkeypatch):
 
     monkeypatch.setattr("subprocess.Popen", started)
     monkeypatch.setattr("os.popen", started)
-    assert llvm._loads("libc.so.6") and not llvm._loads("libnobody-has-this.so.1")
+    assert llvm.loads("libc.so.6") and not llvm.loads("libnobody-has-this.so.1")
 
 
 BOTH = ("cuda", "nvoptix")

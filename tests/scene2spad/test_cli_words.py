@@ -15,7 +15,7 @@ from readers import READERS
 
 from csph import CodingTensor, encode, temporal_code
 from scene2spad.cli import main
-from scene2spad.cli.main import _progress_lines
+from scene2spad.cli.main import progress_lines
 from scenes.library.catalog import load_scene
 from spad.formats.histogram import read_histogram
 from spad.sensor.model import Sensor
@@ -177,7 +177,7 @@ def test_the_shell_completes_commands_and_options(tmp_path, capsys):
 
 
 def test_progress_also_speaks_when_piped(capsys):
-    _progress_lines(every_s=0.0)("direct light", 0.05)
+    progress_lines(every_s=0.0)("direct light", 0.05)
     assert capsys.readouterr() == ("", "direct light: 5%\n")
-    _progress_lines(every_s=1e9)("direct light", 0.06)
+    progress_lines(every_s=1e9)("direct light", 0.06)
     assert capsys.readouterr() == ("", "")

@@ -108,19 +108,19 @@ def test_other_options_need_another_folder(whole, tmp_path):
 
 
 def test_a_view_that_fails_is_recorded_skipped_and_tried_again(tmp_path, monkeypatch):
-    real = dataset._rendered
+    real = dataset.record_and_exr
 
     def odd(job, view, again):
         if view == 1:
             raise ValueError("an odd\nscene")
         return real(job, view, again)
 
-    monkeypatch.setattr(dataset, "_rendered", odd)
+    monkeypatch.setattr(dataset, "record_and_exr", odd)
     result = make_set(JOB, 3, tmp_path / "set")
     assert result["failed"] == [1] and result["scenes"] == 2
     lines = [json.loads(line) for line in (tmp_path / "set" / "index.jsonl").read_text().splitlines()]
     assert lines[1] == {"failed": "ValueError: an odd scene", "view": 1}
-    monkeypatch.setattr(dataset, "_rendered", real)
+    monkeypatch.setattr(dataset, "record_and_exr", real)
     again = make_set(JOB, 3, tmp_path / "set")
     assert again["rendered_now"] == 1 and again["failed"] == [] and again["scenes"] == 3
 
@@ -140,7 +140,7 @@ def test_a_view_does_not_depend_on_what_was_rendered_before_it(filtered):
     in_order = [render_view(job, view).exr for view in (0, 1, 2, 4)]
     assert all(in_order)
     assert [render_view(job, view).exr for view in (4, 2, 1, 0)] == in_order[::-1]
-    dataset._WORLDS.clear()
+    dataset.forget_places()
     assert render_view(job, 1).exr == in_order[1]
 
 

@@ -158,12 +158,12 @@ def test_arrival_lies_where_the_published_pulse_has_its_centroid(tmp_path):
     rng = np.random.default_rng(2)
     pair = published.Pair("ramp", rng.uniform(1.2, 2.5, (16, 24)), np.full((16, 24), 0.5))
     level = (50.0, 1000.0)
-    histogram = published._drawn(pair, level, 0.0, (0, 0, 0))
+    histogram = published.sensed_pair(pair, level, 0.0, (0, 0, 0))
     assert histogram.counts.mean() * SENSOR.bins == pytest.approx(1050, rel=0.01)
     bright = published_from_rgbd(pair.depth_m, pair.luma, pair.luma, SENSOR, PhotonBudget(1e5, 0))
     counts = np.round(bright.rates).astype(np.int32)
     clean = SimpleNamespace(counts=counts, sensor=SENSOR, depth_m=bright.depth_m.astype(np.float32))
-    errors = published._errors(EvaluatedModel("mean", Counting(), "x"), clean)
+    errors = published.errors_as_published(Counting(), clean, "soft-argmax")
     taps = published_taps(SENSOR)
     early_mm = 1e3 * (taps.argmax() - taps @ np.arange(len(taps))) * 3e8 * SENSOR.bin_width_s / 2
     assert errors["mae_mm_arrival"] < 0.1
@@ -220,7 +220,7 @@ def test_evaluate_on_the_published_pairs_reads_both_decoders(tmp_path, monkeypat
     soft, median = message["rows"]
     assert (soft["decoder"], median["decoder"]) == ("soft-argmax", "median") and soft["reference"] == "arrival"
     model = load_model(shipped_model(name))[0]
-    drawn = published._drawn(pair, (50.0, 50.0), 0.0, (0, 0, 0))
+    drawn = published.sensed_pair(pair, (50.0, 50.0), 0.0, (0, 0, 0))
     assert soft["mae_mm"] == published.errors_as_published(model, drawn, "soft-argmax")["mae_mm_arrival"]
     assert len(message["means"]) == 2 and (tmp_path / "evaluation-published.csv").is_file()
     assert 0 < median["mae_mm"] < 100

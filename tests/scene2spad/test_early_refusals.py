@@ -46,7 +46,7 @@ def test_absurd_sizes_are_refused_before_any_work(tmp_path, capsys, monkeypatch,
 
 def test_a_set_of_a_million_views_is_listed_as_it_is_rendered(tmp_path, monkeypatch):
     """The first run is taken before the second is known; so are the views of an endless list."""
-    first = next(dataset._runs(Job("rooms"), itertools.count()))
+    first = next(dataset.views_by_place(Job("rooms"), itertools.count()))
     assert first == tuple(range(6))
     taken = []
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 
-from scene2spad.plots.figures import DEPTH_COLOURS, _image, depth_limits
+from scene2spad.plots.figures import DEPTH_COLOURS, depth_limits, draw_image
 
 
 def room(pixels: int = 64) -> np.ndarray:
@@ -37,7 +37,7 @@ def test_the_colour_bar_points_to_what_lies_beyond_it(odd, extend):
     depth[3, 5] = odd
     figure, axes = plt.subplots()
     try:
-        _image(axes, depth, "depth", "m", cmap=DEPTH_COLOURS, **depth_limits(depth))
+        draw_image(axes, depth, "depth", "m", cmap=DEPTH_COLOURS, **depth_limits(depth))
         assert axes.images[0].colorbar.extend == extend
     finally:
         plt.close(figure)

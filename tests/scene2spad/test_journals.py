@@ -14,7 +14,7 @@ import pytest
 
 from csph.codes.design import Design
 from csph.training.config import ModelConfig, TrainConfig
-from csph.training.loop import _claim
+from csph.training.loop import claim_run
 from csph.weights.shipped import cpu_minutes
 from render.transient.packs import read_pack, write_pack
 from scene2spad.datasets.planes import random_planes
@@ -120,7 +120,7 @@ def test_a_folder_that_was_killed_while_it_was_begun_is_begun_again(tmp_path):
     config = TrainConfig(model=ModelConfig(design=Design()))
     for claim, name in (
         (lambda path: SetFolder(path, MADE), "set.json"),
-        (lambda path: _claim(path, config), "config.json"),
+        (lambda path: claim_run(path, config), "config.json"),
     ):
         path = tmp_path / name
         path.mkdir()

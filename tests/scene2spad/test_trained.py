@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from csph.networks.model import load_model, save_model
-from scene2spad.cli.main import _parse
+from scene2spad.cli.main import parse_command
 from scene2spad.datasets.planes import random_planes
 from scene2spad.networks.registry import ModelRegistry, ModelSpec, check, ship_all
 from scene2spad.networks.training import config_of, training_reach_m
@@ -64,7 +64,7 @@ def test_names_and_labels():
 )
 def test_spelled_command_is_the_command(wanted):
     spelled = shlex.split(wanted.training_command("laptop", Path("rooms.h5"), Path("runs")))
-    parsed = _parse(spelled[1:])
+    parsed = parse_command(spelled[1:])
     assert parsed.out == Path("runs") / wanted.name
     assert config_of(parsed) == config_of(wanted.command("laptop", Path("rooms.h5"), Path("runs")))
     check(config_of(parsed), wanted, Path("model"))

@@ -167,7 +167,7 @@ def test_bench_rows_agree_bit_for_bit(capfd, folder):
 
 @pytest.mark.slow
 def test_a_megapixel_frame_equals_the_integer_product():
-    row = bench._megapixel(method("fourier-16"), seed=0, repeats=1)
+    row = bench.time_megapixel(method("fourier-16"), seed=0, repeats=1)
     assert row["error"] == 0 and row["pixels"] == 1 << 20 and row["photons"] == pytest.approx(550 << 20, rel=1e-2)
 
 

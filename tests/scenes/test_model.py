@@ -355,7 +355,7 @@ def test_digest_is_of_before_there_were_distributions():
     older = hashlib.sha256(b"Material")
     for value in ("diffuse", 0.5, 0.1, 1.0, 1.5, 0.0, 1.0, 1.0):
         older.update(hashlib.sha256(type(value).__name__.encode() + repr(value).encode()).digest())
-    assert model._digest(Material()) == older.digest()
+    assert model.part_digest(Material()) == older.digest()
 
 
 def test_digest_is_repeatable_and_ignores_names_and_notes():

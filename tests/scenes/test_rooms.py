@@ -9,7 +9,7 @@ import pytest
 from scenes import InputError, Scene, Texture
 from scenes.library.catalog import load_scene
 from scenes.library.layout import Boxes, overlap, set_down
-from scenes.library.rooms import VIEWS_PER_ROOM, _room, pieces, room_view
+from scenes.library.rooms import VIEWS_PER_ROOM, pieces, room_of, room_view
 from scenes.library.sets import scene_set
 from scenes.library.things.parts import Piece, box, joined, panel
 from scenes.library.things.patterns import on_one_sheet
@@ -54,7 +54,7 @@ def test_a_room_is_seen_by_cameras_that_differ_clearly():
 
 
 def test_a_view_does_not_depend_on_what_was_made_before():
-    _room.cache_clear()
+    room_of.cache_clear()
     alone = room_view(6, width=16, height=12).digest()
     for i in (0, 9, 13):
         room_view(i, width=16, height=12)

@@ -46,7 +46,7 @@ def assert_poisson(total: np.ndarray, expected: np.ndarray) -> None:
 @pytest.mark.parametrize("bins", [128, 700])
 def test_edges_are_those_of_codes_taken_one_by_one(tdc: Tdc, bins: int) -> None:
     rng, width = np.random.default_rng(0), PERIOD_S / bins
-    ends, times = tdc.ends(), np.broadcast_to(converters._reported(tdc), tdc.ends().shape)
+    ends, times = tdc.ends(), np.broadcast_to(converters.reported_times(tdc), tdc.ends().shape)
     row, position = rng.integers(256, size=4000), rng.uniform(0, bins, 4000)
     found = time_codes(position, row, tdc.edges(bins, width))
     for n, code in enumerate(found):
@@ -73,7 +73,7 @@ def test_expected_counts_are_the_pulse_between_the_edges_of_each_pixels_converte
     expected = expected_counts(transient, SENSOR, rates, slice(0, 2))[0].numpy()
     assert expected.sum(1) == pytest.approx([7e4, 7e4])
     assert (expected[0] == 0).sum() == (np.diff(SENSOR.code_edges[rates.converter[0, 0]]) == 0).sum() > 0
-    rng, times = np.random.default_rng(3), np.broadcast_to(converters._reported(REAL), REAL.ends().shape)
+    rng, times = np.random.default_rng(3), np.broadcast_to(converters.reported_times(REAL), REAL.ends().shape)
     for pixel, row in enumerate(rates.converter[0]):
         at = [rng.uniform(0, PERIOD_S, rng.poisson(3e4))]
         for near, far, share in paths:
@@ -274,7 +274,7 @@ def test_tables_that_are_none_are_told_in_one_line(tmp_path) -> None:
         ("end_ps", np.array([[10.0, 5.0, 2500.0]]), "falls, or is negative"),
     ):
         np.savez(path, **{name: values})
-        converters._measured.cache_clear()
+        converters.measured_table.cache_clear()
         with pytest.raises(InputError, match=words):
             Tdc(2.5e-9, table=str(path))
     with pytest.raises(InputError, match="bins that cover the period"):

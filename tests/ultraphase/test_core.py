@@ -91,7 +91,7 @@ def test_core_and_array_equal_the_independent_model(instructions, streams):
         assert frame.out.reshape(-1).tolist() == want["out"]
     if len({len(want["out"]) for want in expected}) == 1:  # an array's cores put out as many words each
         together = CoreArray(code, (3, 1))  # their row's parity is what ID reads: let it be even
-        together._place[:] = 0
+        together.place[:] = 0
         offsets = np.concatenate([[0], np.cumsum([len(stream) for stream in streams])])
         frame = together.frame(np.concatenate([np.array(s, np.int64) for s in streams]), offsets)
         assert together.registers.T.tolist() == [want["r"] for want in expected]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from scenes.errors import InputError
 from ultraphase import method
-from ultraphase.products import _bytes_are_exact, equal_blocks, photon_sums
+from ultraphase.products import bytes_are_exact, equal_blocks, photon_sums
 from ultraphase.reference import add_photons
 from ultraphase.tables import block_matrix, coarse_matrix, fourier_matrix, int8_codes, wave_matrix
 
@@ -67,7 +67,7 @@ def test_products_of_bytes_are_tried_before_they_are_used():
     assert np.array_equal(photon_sums(counts, table), expected)
     assert np.array_equal(photon_sums(counts + np.uint8(1), table), expected // 127 * 128)  # no byte any more
     vnni = getattr(torch.cpu, "_is_vnni_supported", lambda: False)()
-    assert _bytes_are_exact() <= vnni
+    assert bytes_are_exact() <= vnni
 
 
 def test_tables_beyond_bytes_and_32_bits_are_exact():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from scenes.errors import InputError
 from ultraphase import Core, CoreArray, assemble, method, verify
-from ultraphase.array import _Run
+from ultraphase.array import ArrayRun
 from ultraphase.catalog import FOLDER, PUBLISHED
 from ultraphase.tables import block_matrix, fourier_matrix, int8_codes, quarter_wave, spatial_sum
 
@@ -207,8 +207,8 @@ def test_bright_cores_that_go_on_alone_leave_what_they_leave_in_step(name, monke
 def test_few_bright_cores_of_many_do_not_hold_up_the_others(monkeypatch):
     """300 cores begin in step, and the one with 500 photons goes on alone when the others' 70 are nearly done."""
     alone = []
-    ours = _Run._one_by_one
-    monkeypatch.setattr(_Run, "_one_by_one", lambda run, lanes: (alone.append(lanes.tolist()), ours(run, lanes)))
+    ours = ArrayRun.one_by_one
+    monkeypatch.setattr(ArrayRun, "one_by_one", lambda run, lanes: (alone.append(lanes.tolist()), ours(run, lanes)))
     lengths = np.full(300, 70)
     lengths[17] = 500
     stamps, chosen = np.random.default_rng(2).integers(0, 1024, lengths.sum()), method("fourier-8")
