@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, Rays, UInts, Vectors
+from render.backend.drjit_types import Array, Interactions, LobeSamples, Masks, Rays, UInts, Vectors
 from render.direct.integrator import Layers
 from render.scene.rays import MAX_LAYERS, camera_rays, shape_index, spawn
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, recorded, upload
@@ -21,6 +21,7 @@ MAX_LANES = 1 << 18  # paths of one launch, where an image is not larger by itse
 # Surfaces that every path may meet; from then on it goes on by chance where its weight has fallen below MIN_WEIGHT
 # (in rooms a tenth to a quarter of the noise's square, at 1.4 times the cost, of going on with the weight itself).
 CERTAIN, MIN_WEIGHT, MAX_LIKELY = 3, 1 / 6, 0.95
+SETS = 8  # of a pixel's paths: positions in the pixel are even within each, and the noise is told by their differences
 FIRST_SPP, MIN_MORE, MAX_MORE = 64, 1.25, 8  # paths a pixel whose noise tells how many times as many are needed
 # Pixels share reflected light: a Gaussian of so many pixels, ended at that radius, of points that lie within a share of
 # the distance of the tangent plane, weighted by the cosine between normals to this power of 2.
@@ -67,42 +68,46 @@ class _Sums:
     def __init__(self, world: TracedScene) -> None:
         self.world, self.camera, self.spp = world, world.scene.camera, 0
         pixels = self.camera.height * self.camera.width
-        self.emitted = np.zeros(pixels)
-        self.halves = np.zeros((2, pixels))  # of what is reflected: paths of even and of odd number
-        self.squares = np.zeros((2, pixels))  # of what is emitted where it is seen, and of all
+        # of what is emitted where it is seen, and of what is reflected: sample s belongs to set s modulo SETS
+        self.sets = np.zeros((2, SETS, pixels))
 
     def trace(self, spp: int, bounces: int, seed: int) -> None:
         """Trace until there are `spp` paths of each pixel."""
-        pixels = self.emitted.size
+        pixels = self.sets.shape[2]
         per_pass = max(1, MAX_LANES // pixels)
         while self.spp < spp:
             now = min(per_pass, spp - self.spp)
             lane = dr.arange(UInt32, pixels * now)
             dr.eval(lane)
-            numbers = [dr.opaque(UInt32, number) for number in ((seed + self.spp) & 0xFFFFFFFF, now, bounces)]
-            seen, light = self.world.recordings.call(self.world, "ambient", _of_paths, lane, *numbers)
-            seen, light = (np.array(values, np.float64).reshape(pixels, now) for values in (seen, light))
-            self.emitted += seen.sum(axis=1)
-            for half in (0, 1):
-                self.halves[half] += light[:, (half + self.spp) % 2 :: 2].sum(axis=1)
-            self.squares += np.square((seen, seen + light)).sum(axis=2)
+            numbers = [dr.opaque(UInt32, number) for number in (seed & 0xFFFFFFFF, self.spp, now, bounces)]
+            lights = self.world.recordings.call(self.world, "ambient", _of_paths, lane, *numbers)
+            for sums, light in zip(self.sets, lights, strict=True):
+                values = np.array(light, np.float64).reshape(pixels, now)
+                for sample in range(min(now, SETS)):
+                    sums[(self.spp + sample) % SETS] += values[:, sample::SETS].sum(axis=1)
             self.spp += now
 
     def light(self, guide_layers: Layers | None) -> AmbientLight:
         spp, shape = self.spp, (self.camera.height, self.camera.width)
-        emitted = self.emitted / spp
-        mean = emitted + self.halves.sum(axis=0) / spp
-        variance = np.maximum(self.squares / spp - np.square((emitted, mean)), 0)
-        of_emitted, noise2 = variance.mean(axis=1) / max(spp - 1, 1)
+        seen, reflected = self.sets
+        emitted = seen.sum(axis=0) / spp
+        mean = emitted + reflected.sum(axis=0) / spp
+        of_emitted, noise2 = (_variance(sums, spp) for sums in (seen, seen + reflected))
         if guide_layers is not None:
             number = np.array([[spp - spp // 2], [spp // 2]])
-            smooth = bilateral_filter(
-                (self.halves / np.maximum(number, 1)).reshape(2, *shape), guide_layers, self.camera
-            )
+            halves = np.stack([reflected[half::2].sum(axis=0) for half in (0, 1)])
+            smooth = bilateral_filter((halves / np.maximum(number, 1)).reshape(2, *shape), guide_layers, self.camera)
             mean = emitted + (smooth.reshape(2, -1) * number).sum(axis=0) / spp
             noise2 = of_emitted + np.square(smooth[0] - smooth[1]).mean() / 4
         error = float(np.sqrt(noise2) / mean.mean()) if mean.any() else 0.0
         return AmbientLight(mean.reshape(shape).astype(np.float32), error, spp)
+
+
+def _variance(sums: np.ndarray, spp: int) -> float:
+    """Estimate the variance of the mean of `spp` samples, averaged over pixels, from their sums (SETS, pixels)."""
+    count = np.array([len(range(one, spp, SETS)) for one in range(min(SETS, spp))])[:, None]
+    off = sums[: len(count)] / count - sums.sum(axis=0) / spp
+    return float((count * np.square(off)).sum(axis=0).mean() / (max(len(count) - 1, 1) * spp))
 
 
 def bilateral_filter(light: np.ndarray, layers: Layers, camera: Camera) -> np.ndarray:
@@ -171,13 +176,19 @@ def _with_neighbour(sums: list, pixel: UInts, columns: list, lights: list, way: 
     return [total + weight * more for total, more in zip(sums, (its_albedo, *its_lights), strict=True)]
 
 
-def _of_paths(world: TracedScene, lane: UInts, seed: UInts, paths: Floats, bounces: UInts) -> tuple[Array, Array]:
-    """Light of camera rays, `paths` in a row through random positions of each pixel: seen where emitted; reflected."""
-    pixel = lane // paths
+def _of_paths(
+    world: TracedScene, lane: UInts, seed: UInts, first: UInts, paths: UInts, bounces: UInts
+) -> tuple[Array, Array]:
+    """Light of camera rays, `paths` in a row of each pixel from number `first` on: seen where emitted; reflected.
+
+    Their positions in a pixel are a randomised (0, 2)-sequence in each set, as lamps may be smaller than a pixel.
+    """
+    pixel, sample = lane // paths, first + lane % paths
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, dr.width(lane))
-    shift = sampler.next_2d()
-    x, y = Float(pixel % world.width) + shift.x, Float(pixel // world.width) + shift.y
+    sampler.seed(seed + first, dr.width(lane))
+    key = mi.sample_tea_32(pixel * SETS + sample % SETS, seed)
+    right, down = mi.radical_inverse_2(sample // SETS, key[0]), mi.sobol_2(sample // SETS, key[1])
+    x, y = Float(pixel % world.width) + right, Float(pixel // world.width) + down
     found = _traced(world, sampler, camera_rays(world, x, y)[0], bounces)
     # a path across a face without a normal says nothing, as in `render.indirect.accumulators`
     return tuple(dr.select(dr.isfinite(light), light, 0) for light in found)

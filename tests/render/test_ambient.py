@@ -63,6 +63,24 @@ def test_the_stated_noise_is_that_of_repetitions():
     assert (again.radiance == runs[0].radiance).all() and again.error == runs[0].error
 
 
+def test_a_lamp_smaller_than_a_pixel_is_seen_evenly():
+    """A glowing square as large as a third of a pixel: its light is the share of the image that it covers, and the
+    noise falls faster than by one over the root of the number of paths, which would be 4 times here."""
+    camera = oracles.camera(8, 6, 70)
+    x, y, side = 0.31, -0.17, 0.21
+    corners = [(x, y, -2.0), (x + side, y, -2.0), (x + side, y + side, -2.0), (x, y + side, -2.0)]
+    lamp = Surface(np.array(corners), [[0, 1, 2], [0, 2, 3]], Material(albedo=0.0), emission=3.0)
+    world = TracedScene(Scene("speck", (lamp,), camera))
+    covered = (side / 2.0 * camera.focal_px) ** 2 / (camera.width * camera.height)
+    few, many = ([ambient_light(world, spp, 4, seed) for seed in range(8)] for spp in (64, 1024))
+    for runs in (few, many):
+        means = np.array([run.radiance.mean(dtype=np.float64) for run in runs])
+        error = means.std(ddof=1) / np.sqrt(len(means))
+        assert abs(means.mean() - 3.0 * covered) < 5 * error and error < 0.1 * means.mean()
+    ratio = np.mean([run.error**2 for run in few]) / np.mean([run.error**2 for run in many])
+    assert ratio > 5**2
+
+
 def test_paths_are_traced_until_the_noise_asked_for_and_no_further():
     """As good as that many at once; where the noise is out of reach, all that are allowed."""
     world = TracedScene(windowed_room())
