@@ -15,6 +15,7 @@ from render.transient import Transient
 from scenes.errors import InputError
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
+from spad.detection.detectors import LAWS
 from spad.detection.exposure import Exposure, counts_of, timestamps_of
 from spad.detection.glints import glint_warning, signal_fractions
 from spad.detection.laws import LOW_FLUX
@@ -25,7 +26,7 @@ from spad.formats.timestamps import Timestamps
 from spad.sensor.model import PhotonBudget, Sensor
 
 Model = Literal["auto", "poisson", "first-photon", "free-running"]
-MODELS: tuple[str, ...] = ("auto", "poisson", "first-photon", "free-running")
+MODELS: tuple[str, ...] = ("auto", *LAWS)
 _HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
 
 
@@ -126,7 +127,6 @@ def _planned(
         raise InputError(f"detection model {model!r} is unknown, expected one of {', '.join(MODELS)}")
     rates = rates_for(transient, sensor, budget, dark_map_hz=dark_map_hz, seed=seed)
     light = light_of(transient, sensor, rates, slice(0, transient.height * transient.width))
-    exposure = Exposure(transient, sensor, rates, light, model, seed)
     signal, wrapped = expected_signal(transient, sensor, rates, light)
     # background falls on the whole period, also where it has no bins
     background = rates.background * (sensor.bins / sensor.bins_per_period)
@@ -165,7 +165,7 @@ def _planned(
         "expected_background": background.astype(np.float32),
         "meta": meta,
     }
-    return replace(exposure, model=chosen), truth
+    return Exposure(transient, sensor, rates, light, LAWS[chosen], seed), truth
 
 
 def _sha256(transient: Transient) -> str:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -19,15 +17,9 @@ from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.progress import Progress
 from scenes.random_streams import Stream
-from spad.detection.laws import (
-    Detections,
-    add_crosstalk,
-    crosstalk_events,
-    first_of_each_cycle,
-    first_photon_counts,
-    live_detections,
-)
-from spad.detection.photons import PixelFlux, draw_primaries
+from spad.detection.detectors import BlockLight, DetectionLaw
+from spad.detection.laws import Detections, add_crosstalk, crosstalk_events
+from spad.detection.photons import PixelFlux
 from spad.detection.rates import Rates
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import Sensor
@@ -38,7 +30,6 @@ Finished = TypeVar("Finished")
 STREAM_PIXELS = 1024
 # From this many primary detections a bin on, drawing every bin is cheaper than drawing every photon (measured).
 DENSE_FROM = 4.0
-MAX_EVENTS = 1 << 22  # held at once by the event-by-event laws, about 200 MB
 MAX_CROSSTALK_EVENTS = 1 << 26
 
 
@@ -50,7 +41,7 @@ class Exposure:
     sensor: Sensor
     rates: Rates
     whole: PixelFlux
-    model: str
+    law: DetectionLaw
     seed: int
     part: int = 0
     parts: int = 1
@@ -88,16 +79,17 @@ class Exposure:
         mine = converter.reshape(-1)[events.pixel + first]
         return events._replace(position=time_codes(events.position, mine, edges))
 
-    def primaries(self, light: PixelFlux, rng: np.random.Generator) -> Detections:
-        """Draw primary detections and their laser cycles: times where a converter is to make bins of them."""
-        events = draw_primaries(light, self.sensor, rng, fraction=self.fraction, fractional=self.timed)
-        return Detections(events.pixel, np.zeros(len(events.pixel), np.int8), events.position)
+    @property
+    def adds_crosstalk(self) -> bool:
+        """Return whether crosstalk only adds to counts: no detection keeps another one from being made."""
+        return bool(self.sensor.crosstalk) and self.law.independent and not self.timed
 
-    def light(self, block: slice) -> PixelFlux:
+    def light(self, block: slice) -> BlockLight:
         first, last = self.transient.offsets[block.start], self.transient.offsets[block.stop]
         owner, start, length, signal, background = self.whole
         part = slice(first, last)
-        return PixelFlux(owner[part] - block.start, start[part], length[part], signal[part], background[block])
+        flux = PixelFlux(owner[part] - block.start, start[part], length[part], signal[part], background[block])
+        return BlockLight(flux, self.sensor, self.cycles, self.timed)
 
 
 def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
@@ -115,7 +107,7 @@ def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
 
     _draw(exposure, fill, progress, np.zeros(height * width))
     counts = counts.reshape(height, width, bins)
-    if exposure.sensor.crosstalk and exposure.model == "poisson" and not exposure.timed:
+    if exposure.adds_crosstalk:
         add_crosstalk(counts, exposure.sensor.crosstalk, exposure.rng(Stream.CROSSTALK, slice(0, 0)))
     return counts
 
@@ -131,7 +123,7 @@ def timestamps_of(
     exposure: Exposure, meta: JsonObject, progress: Progress | None, ready: np.ndarray | None = None
 ) -> Timestamps:
     height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
-    if exposure.sensor.crosstalk and exposure.model == "poisson" and not exposure.timed:
+    if exposure.adds_crosstalk:
         return Timestamps.of_counts(counts_of(exposure, progress), meta)
     ready = np.zeros(height * width) if ready is None else ready
 
@@ -161,7 +153,7 @@ def _draw(
 
     What was detected: counts (P, T), or places pixel x T + bin (N,) int32 in no order, pixels counted from the block's.
     """
-    if exposure.sensor.crosstalk and (exposure.timed or exposure.model != "poisson"):
+    if exposure.sensor.crosstalk and not exposure.adds_crosstalk:
         return [finish(block, places) for block, places in _with_crosstalk(exposure, ready)]
     blocks, workers = exposure.blocks, thread_count()
     finished: list[Finished] = []
@@ -175,60 +167,19 @@ def _draw(
 
 
 def _block(exposure: Exposure, block: slice, ready: np.ndarray) -> np.ndarray:
-    sensor, rng, light = exposure.sensor, exposure.rng(Stream.SENSE, block), exposure.light(block)
-    if exposure.model == "free-running":
-        parts = _free_running(exposure, light, rng, ready)
-        places = [_places(exposure.coded(part, block.start), sensor) for part in parts]
-        return np.concatenate(places)
-    primaries = float(light.signal.sum() + light.background.sum()) * exposure.fraction
-    if primaries > DENSE_FROM * sensor.bins * light.pixels:
-        return _dense(exposure, block, rng)
-    events = exposure.coded(exposure.primaries(light, rng), block.start)
-    if exposure.model == "poisson":
-        return _places(events, sensor)
-    # codes rise with time: the first photon is the one of the lowest code
-    return _places(_first_photons(exposure, events, rng), sensor)
+    """Draw the detections of a block: places, or counts (P, T) where every bin is drawn at once."""
+    law, rng, light = exposure.law, exposure.rng(Stream.SENSE, block), exposure.light(block)
+    if law.by_bins and light.primaries > DENSE_FROM * exposure.sensor.bins * light.flux.pixels:
+        from spad.detection.flux import expected_counts  # with torch, whose import takes a second
 
-
-def _dense(exposure: Exposure, block: slice, rng: np.random.Generator) -> np.ndarray:
-    """Draw every bin from its rate, (P, T)."""
-    from spad.detection.flux import expected_counts  # with torch, whose import takes a second
-
-    rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()
-    if exposure.model == "poisson":
-        return rng.poisson(rate * exposure.fraction)
-    first, last = exposure.cycles
-    return first_photon_counts(rate / round(exposure.sensor.cycles), last - first, rng)
+        rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()
+        return law.counts(rate, round(exposure.sensor.cycles), exposure.fraction, rng)
+    parts = law.detect(light, rng, ready)
+    return np.concatenate([_places(exposure.coded(part, block.start), exposure.sensor) for part in parts])
 
 
 def _places(detected: Detections, sensor: Sensor) -> np.ndarray:
     return detected.pixel.astype(np.int32) * np.int32(sensor.bins) + detected.position.astype(np.int32)
-
-
-def _first_photons(exposure: Exposure, events: Detections, rng: np.random.Generator) -> Detections:
-    cycle = rng.integers(*exposure.cycles, len(events.pixel))
-    return first_of_each_cycle(events._replace(cycle=cycle), exposure.sensor)
-
-
-def _free_running(
-    exposure: Exposure, light: PixelFlux, rng: np.random.Generator, ready: np.ndarray
-) -> Iterator[Detections]:
-    """Yield the detections of as many cycles at a time as memory allows; `ready` (P,) in bins is carried on."""
-    sensor, (first, last) = exposure.sensor, exposure.cycles
-    primaries = float(light.signal.sum() + light.background.sum()) * exposure.fraction
-    pieces = min(max(1, math.ceil(primaries / MAX_EVENTS)), last - first)
-    edges = [first + (last - first) * piece // pieces for piece in range(pieces + 1)]
-    for start, stop in pairwise(edges):
-        fraction = (stop - start) / round(sensor.cycles)
-        events = draw_primaries(light, sensor, rng, fraction=fraction, fractional=True)
-        primary = Detections(events.pixel, rng.integers(start, stop, len(events.pixel)), events.position)
-        yield _alive(primary, sensor, ready)
-
-
-def _alive(events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
-    time = events.cycle * float(sensor.bins_per_period) + events.position
-    kept = live_detections(events.pixel, time, sensor.dead_time_s / sensor.bin_width_s, ready)
-    return Detections(*(column[kept] for column in events))
 
 
 def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
@@ -242,12 +193,7 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
     total = 0
     for block in exposure.blocks:
         rng, light = exposure.rng(Stream.SENSE, block), exposure.light(block)
-        if exposure.model == "first-photon":
-            parts = [_first_photons(exposure, exposure.primaries(light, rng), rng)]
-        elif exposure.model == "poisson":
-            parts = [exposure.primaries(light, rng)]
-        else:
-            parts = list(_free_running(exposure, light, rng, before[block]))
+        parts = list(exposure.law.detect(light, rng, before[block]))
         everything += [part._replace(pixel=part.pixel + block.start) for part in parts]
         total += sum(len(part.pixel) for part in parts)
         if total > MAX_CROSSTALK_EVENTS:
@@ -260,21 +206,10 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
     cause, pixel = crosstalk_events(events.pixel, sensor.crosstalk, transient.height, transient.width, rng)
     fired = Detections(pixel, events.cycle[cause], events.position[cause])
     both = Detections(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
-    detected = exposure.coded(_detected(exposure, both, ready), 0)
+    detected = exposure.coded(exposure.law.keep(both, sensor, ready), 0)
     places = np.sort(detected.pixel * np.int64(sensor.bins) + detected.position.astype(np.int64))
     edges = [block.start * sensor.bins for block in exposure.blocks]
     edges.append(exposure.rates.alive.size * sensor.bins)
     cuts = np.searchsorted(places, edges)
     for number, block in enumerate(exposure.blocks):
         yield block, (places[cuts[number] : cuts[number + 1]] - edges[number]).astype(np.int32)
-
-
-def _detected(exposure: Exposure, both: Detections, ready: np.ndarray) -> Detections:
-    """Decide by the exposure's law which of photons and crosstalk are detected."""
-    if exposure.model == "poisson":
-        return both
-    return (
-        first_of_each_cycle(both, exposure.sensor)
-        if exposure.model == "first-photon"
-        else _alive(both, exposure.sensor, ready)
-    )
