@@ -242,7 +242,7 @@ class CompressiveLayer(nn.Module):
         temporal, spatial = self._temporal_part(), self._spatial_part()
         return rank.pixel_gram(temporal) if spatial is None else rank.separable_gram(temporal, spatial)
 
-    def _forms(self, counts: int) -> bool:
+    def _materialises_full_tensor(self, counts: int) -> bool:
         return self.spatial is None or blocks.forms(self.codes, self.block, counts)
 
     def encode(self, counts: Tensor) -> Tensor:
@@ -261,7 +261,7 @@ class CompressiveLayer(nn.Module):
 
     def _encode_exactly(self, counts: Tensor) -> Tensor:
         spatial = self._spatial_part()
-        if spatial is not None and not self._forms(counts.numel()):
+        if spatial is not None and not self._materialises_full_tensor(counts.numel()):
             return blocks.encode_separable(counts, self._temporal_part(), spatial)
         return blocks.encode_blocks(counts, self.weights())
 
@@ -331,7 +331,7 @@ class CompressiveLayer(nn.Module):
     def _projected(self, codes: Tensor, normalise: bool = True) -> Tensor:
         centre = not self.options.keep_mean
         counts = codes.numel() * math.prod(self.block) // self.codes
-        if self.background is None and self.spatial is not None and not self._forms(counts):
+        if self.background is None and self.spatial is not None and not self._materialises_full_tensor(counts):
             temporal = self._temporal_part()
             if self.options.pulse_in_decoder:
                 temporal = self._blurred(temporal)

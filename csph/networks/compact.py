@@ -73,18 +73,18 @@ class Compact(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        near, middle, far = 16, 32, 48
-        self.stem = nn.Conv2d(FOLD, near, (3, 1), padding=(1, 0))
-        self.near = FactorisedConv(near)
-        self.halved = nn.Conv2d(near, middle, 3, stride=2, padding=1)
-        self.middle = nn.ModuleList([FactorisedConv(middle), FactorisedConv(middle)])
-        self.quartered = nn.Conv3d(middle, far, 3, stride=2, padding=1)
-        self.far = nn.Sequential(*(_ResidualConv3d(far) for _ in range(2)))
-        self.from_far = nn.Linear(far, middle)
-        self.from_middle = nn.Linear(middle, near)
-        self.last = FactorisedConv(near)
-        self.fine = nn.Linear(near, FOLD)
-        self.trust = nn.Linear(near, VIEWS)
+        full, half, quarter = 16, 32, 48  # channels at each resolution; attributes keep the names in checkpoints
+        self.stem = nn.Conv2d(FOLD, full, (3, 1), padding=(1, 0))
+        self.near = FactorisedConv(full)
+        self.halved = nn.Conv2d(full, half, 3, stride=2, padding=1)
+        self.middle = nn.ModuleList([FactorisedConv(half), FactorisedConv(half)])
+        self.quartered = nn.Conv3d(half, quarter, 3, stride=2, padding=1)
+        self.far = nn.Sequential(*(_ResidualConv3d(quarter) for _ in range(2)))
+        self.from_far = nn.Linear(quarter, half)
+        self.from_middle = nn.Linear(half, full)
+        self.last = FactorisedConv(full)
+        self.fine = nn.Linear(full, FOLD)
+        self.trust = nn.Linear(full, VIEWS)
         with torch.no_grad():  # begin with what the back-projection says
             self.fine.weight.mul_(0.1)
             self.trust.weight.mul_(0.1)
@@ -107,19 +107,19 @@ class Compact(nn.Module):
         check_input(x, FOLD)
         batch, _, _, rows, columns = x.shape
         slices = x.reshape(-1, FOLD, rows, columns)
-        first = over_time(self.stem, fold(slices), batch)
-        near = self.near(early(first) if early else first, batch)
-        middle = self.halved(near).relu_()
+        first = over_time(self.stem, time_to_channels(slices), batch)
+        full = self.near(early(first) if early else first, batch)
+        half = self.halved(full).relu_()
         for step in self.middle:
-            middle = step(middle, batch)
-        volume = middle.unflatten(0, (batch, -1)).transpose(1, 2)
+            half = step(half, batch)
+        volume = half.unflatten(0, (batch, -1)).transpose(1, 2)
         volume = enlarged(_linear(self.from_far, self.far(self.quartered(volume).relu_())), volume, (2, 3, 4))
-        middle = volume.transpose(1, 2).flatten(0, 1)
-        features = enlarged(_linear(self.from_middle, middle), near, (2, 3))
+        half = volume.transpose(1, 2).flatten(0, 1)
+        features = enlarged(_linear(self.from_middle, half), full, (2, 3))
         return self.last(late(features) if late else features, batch), slices
 
 
-class _Fold(torch.autograd.Function):
+class _TimeToChannels(torch.autograd.Function):
     """(N, A, B) -> (N, B, A), by a product with the identity: half the time of a strided copy on a CPU."""
 
     @staticmethod
@@ -130,12 +130,12 @@ class _Fold(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Context, grad: Tensor) -> Tensor:
-        return _Fold.apply(grad.contiguous())
+        return _TimeToChannels.apply(grad.contiguous())
 
 
-def fold(slices: Tensor) -> Tensor:
+def time_to_channels(slices: Tensor) -> Tensor:
     """Return (N, 16, R, C) with channels last in memory: the fine bins of a coarse bin side by side."""
-    return _Fold.apply(slices.flatten(2)).transpose(1, 2).unflatten(2, slices.shape[2:])
+    return _TimeToChannels.apply(slices.flatten(2)).transpose(1, 2).unflatten(2, slices.shape[2:])
 
 
 def over_time(convolution: nn.Conv2d, x: Tensor, batch: int) -> Tensor:

@@ -58,7 +58,7 @@ def _network(config: ModelConfig) -> Compact | DeepBoosting:
     if config.sees_codes:
         kind = Refined if config.network == "refined" else Blockwise
         return kind(config.codes_design.block, config.codes_design.codes)
-    return Compact() if config.network == "compact" else DeepBoosting(can_die=config.network == "published")
+    return Compact() if config.network == "compact" else DeepBoosting(final_relu=config.network == "published")
 
 
 class DepthModel(nn.Module):

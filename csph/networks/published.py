@@ -42,7 +42,7 @@ class DenseBlock(nn.Module):
 class DeepBoosting(nn.Module):
     """(B, 1, T, R, C) -> logits (B, T, R, C); T a multiple of 16, R and C free.
 
-    can_die   the published final ReLU: where all logits are 0, so is every gradient, and the depth is mid-range for
+    final_relu   the published final ReLU: where all logits are 0, so is every gradient, and the depth is mid-range for
               good. False leaves the logits signed: the same parameters, and nothing that can die.
     Raises InputError for another number of bins.
     """
@@ -50,9 +50,9 @@ class DeepBoosting(nn.Module):
     reach = 41  # pixels around one that its answer depends on: 3 + 4 + 10 x 3 + 4
     coarsest = 1
 
-    def __init__(self, *, can_die: bool = True) -> None:
+    def __init__(self, *, final_relu: bool = True) -> None:
         super().__init__()
-        self.can_die = can_die
+        self.final_relu = final_relu
         self.a1 = nn.Conv3d(1, 2, 3, padding=1)
         self.a2 = nn.Conv3d(1, 2, 3, padding=2, dilation=2)
         self.a3 = nn.Conv3d(2, 2, 3, padding=1)
@@ -107,7 +107,7 @@ class DeepBoosting(nn.Module):
         joined = torch.einsum("ioxyz,o->ixyz", _weight(self.up[-1]), self.out.weight.flatten()).unsqueeze(1)
         assert self.out.bias is not None
         logits = doubled(x, joined).squeeze(1) + self.out.bias
-        return logits.relu_() if self.can_die else logits
+        return logits.relu_() if self.final_relu else logits
 
     def forward(self, x: Tensor) -> Tensor:
         check_input(x, TIME_FACTOR)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from csph.layer import CompressiveLayer
 from csph.networks.blockwise import BlockMixer, Blockwise, code_features
-from csph.networks.compact import FOLD, VIEWS, FactorisedConv, channels_last, fold, logits_of, over_time
+from csph.networks.compact import FOLD, VIEWS, FactorisedConv, channels_last, logits_of, over_time, time_to_channels
 
 NO_LIGHT = 1e-6  # length of codes, or of their square, below which they hold no signal
 MAX_LOG_AMPLITUDE = 4.0  # of a coarse bin: mean counts of a block's pixels differ by less than exp(8)
@@ -82,7 +82,7 @@ class Refined(Blockwise):
         """Compute what the second look adds to the logits, (B, T, R, C)."""
         batch, (rows, columns) = len(posterior), posterior.shape[-2:]
         slices = layer.back_project(residual).reshape(-1, FOLD, rows, columns)
-        both = torch.cat([fold(slices), fold(posterior.reshape(-1, FOLD, rows, columns))], 1)
+        both = torch.cat([time_to_channels(slices), time_to_channels(posterior.reshape(-1, FOLD, rows, columns))], 1)
         both = both.contiguous(memory_format=torch.channels_last)
         features = self.second(features + over_time(self.residual_stem, both, batch), batch)
         length = torch.linalg.vector_norm(residual, dim=1, keepdim=True)

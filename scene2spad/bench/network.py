@@ -64,7 +64,7 @@ class PlainDeepBoosting(DeepBoosting):
         for step in self.up[:-1]:
             x = step(x).relu()
         logits = self.out(self.up[-1](x)).squeeze(1)
-        return logits.relu() if self.can_die else logits
+        return logits.relu() if self.final_relu else logits
 
 
 def gmac(network: nn.Module, size: tuple[int, ...] = PATCH) -> float:
@@ -162,7 +162,7 @@ def train_for(model: DepthModel, limit_s: float, seed: int) -> tuple[int, float,
 def measure_plain(repeats: int, seed: int) -> Row:
     """Return the published layers as they stand, with the same weights as ours."""
     torch.manual_seed(seed)
-    ours, plain = DeepBoosting(can_die=False), PlainDeepBoosting(can_die=False)
+    ours, plain = DeepBoosting(final_relu=False), PlainDeepBoosting(final_relu=False)
     plain.load_state_dict(ours.state_dict())
     config = preset(PRESET, ModelConfig(design=DESIGN, network="published"))
     patches, frame = torch.rand(config.batch, 1, 1024, config.crop, config.crop), torch.rand(FRAME)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from csph.networks.compact import Compact, averages, enlarged, fold, read_out
+from csph.networks.compact import Compact, averages, enlarged, read_out, time_to_channels
 from csph.networks.published import DeepBoosting, doubled, parameters_of, soft_argmax
 from scene2spad.bench.network import PlainDeepBoosting, gmac
 from scenes import InputError
@@ -91,17 +91,17 @@ def gradient_size(network: nn.Module, x: torch.Tensor) -> float:
 
 def test_a_dead_network_stays_dead_and_ours_does_not():
     x = torch.rand(1, 1, 32, 4, 4)
-    for can_die in (True, False):
+    for final_relu in (True, False):
         torch.manual_seed(1)
-        network = DeepBoosting(can_die=can_die)
+        network = DeepBoosting(final_relu=final_relu)
         nn.init.constant_(network.out.bias, -100.0)
         size = gradient_size(network, x)
-        assert (size == 0) if can_die else (size > 0)
+        assert (size == 0) if final_relu else (size > 0)
         flat = soft_argmax(network(x)).detach()
-        assert can_die == bool((flat == 16).all())  # mid-range of 32 bins
+        assert final_relu == bool((flat == 16).all())  # mid-range of 32 bins
 
 
-@pytest.mark.parametrize("network", [DeepBoosting(), DeepBoosting(can_die=False), Compact()])
+@pytest.mark.parametrize("network", [DeepBoosting(), DeepBoosting(final_relu=False), Compact()])
 @pytest.mark.parametrize("size", [(16, 1, 1), (32, 3, 5), (48, 7, 2)])
 def test_any_image(network, size):
     network.zero_grad()
@@ -148,7 +148,7 @@ def test_soft_argmax_reads_bin_centres():
 
 def test_folding_and_averaging():
     slices = torch.randn(6, 16, 5, 6)
-    folded = fold(slices)
+    folded = time_to_channels(slices)
     assert torch.equal(folded, slices) and folded.is_contiguous(memory_format=torch.channels_last)
     near, wide = averages(slices)
     torch.testing.assert_close(near[1, 3, 2, 2], slices[1, 3, 1:4, 1:4].mean())
@@ -173,7 +173,7 @@ def test_derivatives_written_by_hand():
         return torch.randn(shape, dtype=torch.float64, generator=generator, requires_grad=True)
 
     check = torch.autograd.gradcheck
-    assert check(fold, (drawn(2, 16, 3, 2),)) and check(fold, (drawn(2, 16, 5, 4),))
+    assert check(time_to_channels, (drawn(2, 16, 3, 2),)) and check(time_to_channels, (drawn(2, 16, 5, 4),))
     assert check(lambda c, f: enlarged(c, f, (2, 3, 4)), (drawn(2, 2, 2, 1, 3), drawn(2, 2, 3, 2, 5)))
     assert check(read_out, (drawn(2, 6, 3), drawn(2, 4, 2, 3), drawn(4, 3), drawn(4), drawn(3, 3), drawn(3)))
 
