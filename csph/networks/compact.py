@@ -15,7 +15,7 @@ memory as much as into arithmetic, hence the two functions with derivatives of t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import product
 
@@ -62,6 +62,18 @@ class _ResidualConv3d(nn.Module):
         return x + self.whole(x).relu_()
 
 
+# What modules of `Compact` are called in checkpoints: files of before the modules had these names are read, and files
+# and their hashes stay what they were.
+IN_FILES = {
+    "full_resolution": "near",
+    "half_resolution": "middle",
+    "quarter_resolution": "far",
+    "quarter_to_half": "from_far",
+    "half_to_full": "from_middle",
+    "skip_gates": "trust",
+}
+
+
 class Compact(nn.Module):
     """(B, 1, T, R, C) -> logits (B, T, R, C), any sign; T a multiple of 16, R and C free.
 
@@ -73,23 +85,25 @@ class Compact(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        full, half, quarter = 16, 32, 48  # channels at each resolution; attributes keep the names in checkpoints
+        full, half, quarter = 16, 32, 48  # channels at each resolution
         self.stem = nn.Conv2d(FOLD, full, (3, 1), padding=(1, 0))
-        self.near = FactorisedConv(full)
+        self.full_resolution = FactorisedConv(full)
         self.halved = nn.Conv2d(full, half, 3, stride=2, padding=1)
-        self.middle = nn.ModuleList([FactorisedConv(half), FactorisedConv(half)])
+        self.half_resolution = nn.ModuleList([FactorisedConv(half), FactorisedConv(half)])
         self.quartered = nn.Conv3d(half, quarter, 3, stride=2, padding=1)
-        self.far = nn.Sequential(*(_ResidualConv3d(quarter) for _ in range(2)))
-        self.from_far = nn.Linear(quarter, half)
-        self.from_middle = nn.Linear(half, full)
+        self.quarter_resolution = nn.Sequential(*(_ResidualConv3d(quarter) for _ in range(2)))
+        self.quarter_to_half = nn.Linear(quarter, half)
+        self.half_to_full = nn.Linear(half, full)
         self.last = FactorisedConv(full)
         self.fine = nn.Linear(full, FOLD)
-        self.trust = nn.Linear(full, VIEWS)
+        self.skip_gates = nn.Linear(full, VIEWS)
         with torch.no_grad():  # begin with what the back-projection says
             self.fine.weight.mul_(0.1)
-            self.trust.weight.mul_(0.1)
-            self.trust.bias.fill_(4.0)
+            self.skip_gates.weight.mul_(0.1)
+            self.skip_gates.bias.fill_(4.0)
         channels_last(self)
+        self.register_state_dict_post_hook(_to_names_in_files)
+        self.register_load_state_dict_pre_hook(_from_names_in_files)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.logits(x)
@@ -97,7 +111,7 @@ class Compact(nn.Module):
     def logits(self, x: Tensor, early: Step | None = None, late: Step | None = None) -> Tensor:
         """Return the logits of a back-projection; `early` and `late` as in `features`."""
         features, slices = self.features(x, early, late)
-        return logits_of(features, slices, self.fine, self.trust, x)
+        return logits_of(features, slices, self.fine, self.skip_gates, x)
 
     def features(self, x: Tensor, early: Step | None = None, late: Step | None = None) -> tuple[Tensor, Tensor]:
         """Return the last features (B T/16, channels, R, C) and the back-projection as slices (B T/16, 16, R, C).
@@ -108,15 +122,35 @@ class Compact(nn.Module):
         batch, _, _, rows, columns = x.shape
         slices = x.reshape(-1, FOLD, rows, columns)
         first = over_time(self.stem, time_to_channels(slices), batch)
-        full = self.near(early(first) if early else first, batch)
+        full = self.full_resolution(early(first) if early else first, batch)
         half = self.halved(full).relu_()
-        for step in self.middle:
+        for step in self.half_resolution:
             half = step(half, batch)
         volume = half.unflatten(0, (batch, -1)).transpose(1, 2)
-        volume = enlarged(_linear(self.from_far, self.far(self.quartered(volume).relu_())), volume, (2, 3, 4))
+        volume = enlarged(
+            _linear(self.quarter_to_half, self.quarter_resolution(self.quartered(volume).relu_())), volume, (2, 3, 4)
+        )
         half = volume.transpose(1, 2).flatten(0, 1)
-        features = enlarged(_linear(self.from_middle, half), full, (2, 3))
+        features = enlarged(_linear(self.half_to_full, half), full, (2, 3))
         return self.last(late(features) if late else features, batch), slices
+
+
+def _renamed(state: dict[str, Tensor], prefix: str, names: Mapping[str, str]) -> None:
+    """Rename modules below `prefix` in a state, in place and in its order."""
+    held = list(state.items())
+    state.clear()
+    for key, value in held:
+        module, dot, rest = key.removeprefix(prefix).partition(".")
+        below = key.startswith(prefix) and module in names
+        state[f"{prefix}{names[module]}{dot}{rest}" if below else key] = value
+
+
+def _to_names_in_files(network: nn.Module, state: dict[str, Tensor], prefix: str, metadata: object) -> None:
+    _renamed(state, prefix, IN_FILES)
+
+
+def _from_names_in_files(network: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    _renamed(state, prefix, {old: new for new, old in IN_FILES.items()})
 
 
 class _TimeToChannels(torch.autograd.Function):
@@ -156,26 +190,28 @@ class _ReadOut(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Context, features: Tensor, slices: Tensor, *weights: Tensor) -> Tensor:
-        matrix, bias, trust, trust_bias = weights
+        matrix, bias, gate_weight, gate_bias = weights
         views = tuple(v.flatten(2).to(slices.dtype) for v in (slices, *averages(slices)))
         across = features.transpose(1, 2)
         total = torch.baddbmm(bias.unsqueeze(-1), matrix.expand(len(features), -1, -1), across).to(slices.dtype)
-        gates = torch.baddbmm(trust_bias.unsqueeze(-1), trust.expand(len(features), -1, -1), across).to(slices.dtype)
+        gates = torch.baddbmm(gate_bias.unsqueeze(-1), gate_weight.expand(len(features), -1, -1), across).to(
+            slices.dtype
+        )
         for number, view in enumerate(views):
             total.addcmul_(gates[:, number : number + 1], view)
         ctx.size = slices.shape
-        ctx.save_for_backward(features, matrix, trust, gates, *views)
+        ctx.save_for_backward(features, matrix, gate_weight, gates, *views)
         return total
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Context, grad: Tensor) -> tuple[Tensor | None, ...]:
-        features, matrix, trust, gates, *views = ctx.saved_tensors
+        features, matrix, gate_weight, gates, *views = ctx.saved_tensors
         slopes, scratch = torch.empty_like(gates), torch.empty_like(grad)
         for number, view in enumerate(views):
             torch.sum(torch.mul(grad, view, out=scratch), 1, out=slopes[:, number])
         back = torch.bmm(grad.transpose(1, 2), matrix.expand(len(grad), -1, -1))
-        back.baddbmm_(slopes.transpose(1, 2), trust.expand(len(grad), -1, -1))
+        back.baddbmm_(slopes.transpose(1, 2), gate_weight.expand(len(grad), -1, -1))
         exact = features.to(grad.dtype)
         of_weights = (torch.bmm(grad, exact).sum(0), grad.sum((0, 2)), torch.bmm(slopes, exact).sum(0))
         to_slices = _averages_back(grad, gates, scratch, ctx.size) if ctx.needs_input_grad[1] else None
@@ -183,12 +219,12 @@ class _ReadOut(torch.autograd.Function):
 
 
 def read_out(
-    features: Tensor, slices: Tensor, fine: Tensor, fine_bias: Tensor, trust: Tensor, trust_bias: Tensor
+    features: Tensor, slices: Tensor, fine: Tensor, fine_bias: Tensor, gate_weight: Tensor, gate_bias: Tensor
 ) -> Tensor:
     """Return fine + sum_v gate_v view_v of each slice: fine and gates are linear in the features, the views are the
     slice and its averages. features (N, P, channels), slices (N, F, R, C), P = R C; weights (F, channels), (F,), (3,
     channels) and (3,) -> (N, F, P), in memory as the histogram lies."""
-    return _ReadOut.apply(features, slices, fine, fine_bias, trust, trust_bias)
+    return _ReadOut.apply(features, slices, fine, fine_bias, gate_weight, gate_bias)
 
 
 def logits_of(features: Tensor, slices: Tensor, fine: nn.Linear, gates: nn.Linear, like: Tensor) -> Tensor:

@@ -65,7 +65,7 @@ class Refined(Blockwise):
     def forward(self, x: Tensor, codes: Tensor, layer: CompressiveLayer) -> Tensor:  # type: ignore[override]
         seen = code_features(codes)
         features, slices = self.features(x, lambda f: self.early(f, seen), lambda f: self.late(f, seen))
-        first = logits_of(features, slices, self.fine, self.trust, x)
+        first = logits_of(features, slices, self.fine, self.skip_gates, x)
         posterior = first.softmax(1).view(x.shape)
         predicted = layer.encode_mean(self.mean_counts(posterior, features))
         residual = unexplained(codes, predicted, centre=not layer.options.keep_mean)

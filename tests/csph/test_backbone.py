@@ -192,3 +192,18 @@ def test_the_compact_network_begins_with_the_back_projection():
     x = torch.zeros(1, 1, 64, 8, 8)
     x[:, :, 37] = 5.0
     assert float((soft_argmax(Compact()(x)).detach() - 37.5).abs().max()) < 1
+
+
+def test_checkpoints_keep_the_names_that_modules_once_had():
+    """States of before the modules were renamed are read, and what is written can be read by who has them still."""
+    torch.manual_seed(0)
+    one, other = Compact(), Compact()
+    state = one.state_dict()
+    names = {key.partition(".")[0] for key in state}
+    assert {"near", "middle", "far", "from_far", "from_middle", "trust"} < names
+    assert not {"full_resolution", "quarter_resolution", "skip_gates"} & names
+    assert len(state) == len([*one.parameters()])
+    other.load_state_dict(state)
+    assert all(torch.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
+    with pytest.raises(RuntimeError, match="Unexpected"):
+        other.load_state_dict({**state, "nobody.weight": torch.zeros(1)})

@@ -48,7 +48,7 @@ def logits_plainly(model: DepthModel, codes: Tensor) -> Tensor:
     x = layer.decode(codes)
     seen = code_features(codes)
     features, slices = network.features(x, lambda f: network.early(f, seen), lambda f: network.late(f, seen))
-    first = _read(features, slices, network.fine, network.trust, x)
+    first = _read(features, slices, network.fine, network.skip_gates, x)
     batch, bins, rows, columns = first.shape
     p = first.softmax(1)
     log = torch.einsum("nchw,c->nhw", features, network.amplitude.weight[0]) + network.amplitude.bias
