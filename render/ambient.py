@@ -99,6 +99,8 @@ class _Sums:
             smooth = bilateral_filter((halves / np.maximum(number, 1)).reshape(2, *shape), guide_layers, self.camera)
             mean = emitted + (smooth.reshape(2, -1) * number).sum(axis=0) / spp
             noise2 = of_emitted + np.square(smooth[0] - smooth[1]).mean() / 4
+        # numbers below the least normal one are 0 in some threads and not in others, whose files would differ
+        mean = np.where(mean < np.finfo(np.float32).tiny, 0, mean)
         error = float(np.sqrt(noise2) / mean.mean()) if mean.any() else 0.0
         return AmbientLight(mean.reshape(shape).astype(np.float32), error, spp)
 
