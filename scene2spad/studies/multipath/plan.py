@@ -20,7 +20,11 @@ MODELS = (
 )
 # The same designs trained with indirect light, too
 MIXED = tuple(replace(one, trained_on="mixed") for one in MODELS)
-DELAYED = ModelSpec("learned", (1024, 2, 2), time_offset_m=12, trained_on="mixed")  # right at every depth
+# Trained with random delays: right at every depth
+DELAYED = (
+    ModelSpec("learned", (1024, 2, 2), time_offset_m=12, trained_on="mixed"),
+    ModelSpec("learned", (256, 4, 4), time_offset_m=8, trained_on="mixed", seed=42),
+)
 # What of a render is sensed: the same surfaces, truth and mean counts.
 LIGHTS: dict[str, str] = {"flood": "direct and indirect light", "direct": "direct light alone"}
 

@@ -37,7 +37,7 @@ log = logging.getLogger("scene2spad")
 
 LOOKS = {FILTER: look(0) | {"color": "black", "marker": "*"}, PEAK: look(0) | {"color": COLOURS["grey"], "marker": "X"}}
 LOOKS |= {one.name: look(n) for models in (MODELS, MIXED) for n, one in enumerate(models)}
-LOOKS[DELAYED.name] = look(len(MODELS))
+LOOKS |= {one.name: look(len(MODELS) + n) for n, one in enumerate(DELAYED)}
 # a model trained on direct light -> the same design trained with indirect light
 MIXED_NAMES = {plain.name: mixed.name for plain, mixed in zip(MODELS, MIXED, strict=True)}
 
@@ -46,7 +46,7 @@ def run(command: Study, progress: Progress) -> dict:
     """Render, measure every method on both kinds of light, compare; table, JSON and figure in `command.out`."""
     plan, folder = PLANS[command.preset], command.out / command.preset
     models = obtain(MODELS, command, progress)
-    trained = models.found | where_trained((*MIXED, DELAYED), command)
+    trained = models.found | where_trained((*MIXED, *DELAYED), command)
     subjects = [without_network(name) for name in (FILTER, PEAK)] + [one.subject for one in trained.values()]
     full = rendered_rooms(plan, folder, progress)
     names = tuple(name for name, _ in plan.scenes)
