@@ -243,7 +243,7 @@ class CompressiveLayer(nn.Module):
         return rank.pixel_gram(temporal) if spatial is None else rank.separable_gram(temporal, spatial)
 
     def _materialises_full_tensor(self, counts: int) -> bool:
-        return self.spatial is None or blocks.forms(self.codes, self.block, counts)
+        return self.spatial is None or blocks.materialises_full_tensor(self.codes, self.block, counts)
 
     def encode(self, counts: Tensor) -> Tensor:
         """Return codes (B, K, T/Mt, R/Mr, C/Mc) of counts (B, 1, T, R, C). Raises InputError for counts of another
@@ -359,6 +359,6 @@ class CompressiveLayer(nn.Module):
         per_bin = weights.sum((2, 3))
         left = shape @ per_bin.T
         # what rounding leaves of codes that cancel this background is no direction
-        seen = left.abs() > 1e-5 * (shape.abs() @ per_bin.abs().T)
-        left = torch.where(seen, left, 0.0)
+        resolved = left.abs() > 1e-5 * (shape.abs() @ per_bin.abs().T)
+        left = torch.where(resolved, left, 0.0)
         return left / left.norm(dim=1, keepdim=True).clamp(min=torch.finfo(left.dtype).tiny)

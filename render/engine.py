@@ -253,8 +253,8 @@ def _lost_to_clamp(removed: RemovedLight | None, checked: np.ndarray) -> np.ndar
     image's."""
     if removed is None:
         return 0.0
-    of_pixels = removed.squared_error()
-    whole, local = max(float(of_pixels.mean()), 0.0), np.maximum(of_pixels[checked], 0)
+    squared_error = removed.squared_error()
+    whole, local = max(float(squared_error.mean()), 0.0), np.maximum(squared_error[checked], 0)
     return local * (whole / local.mean()) if local.any() else np.full(len(checked), whole)
 
 

@@ -17,7 +17,20 @@ MAX_ANY = (
     10  # in signatures; Dr.Jit's types and JSON objects have names of their own (`drjit_types`, `scenes.json_types`)
 )
 # Private words for which the field has terms.
-NOT_OURS = {"told", "said", "whys", "share", "shares", "tails", "watched", "thrown", "spelled", "least_share"}
+NOT_OURS = {
+    *("told", "said", "whys", "share", "shares", "tails", "watched", "thrown", "spelled", "least_share", "lit_points"),
+    *(
+        "can_die",
+        "doubled",
+        "trust",
+        "of_pixels",
+        "of_parts",
+        "its_seed",
+        "traced_on",
+        "add_quanta",
+        "begun_on_highlight",
+    ),
+}
 CONSTANT = re.compile(r"(MOST|LEAST)_")
 # First words of docstrings that are nouns, pronouns or another mood.
 NO_IMPERATIVE = re.compile(

@@ -194,7 +194,7 @@ def back_project(codes: Tensor, weights: Tensor) -> Tensor:
     return applied(_Scatter, product.reshape(-1, mt * mr * mc), (mt, mr, mc), size)
 
 
-def forms(codes: int, block: tuple[int, int, int], counts: int) -> bool:
+def materialises_full_tensor(codes: int, block: tuple[int, int, int], counts: int) -> bool:
     """Return whether to form a separable coding tensor for so many counts. Else a batch of 6 x 16 x 16 pixels takes a
     fifth of the time with 512 codes of 1024 x 8 x 8 (measured), but up to twice the time where C is small."""
     return codes * math.prod(block) <= FORMED * counts
@@ -204,7 +204,7 @@ def encode_separable(counts: Tensor, temporal: Tensor, spatial: Tensor) -> Tenso
     """Return `encode_blocks` with C[k, t, r, c] = temporal[k, t] spatial[k, r, c], (K, Mt) and (K, Mr, Mc), without
     forming C.
 
-    As many multiplications; where C is far larger than all counts (`forms`) it is memory that takes time.
+    As many multiplications; where C is far larger than all counts (`materialises_full_tensor`) memory takes the time.
     """
     (codes, mt), (_, mr, mc) = temporal.shape, spatial.shape
     check_counts(counts, (mt, mr, mc))

@@ -80,5 +80,5 @@ class Blockwise(Compact):
         self.late = BlockMixer(channels, block, codes)
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:  # type: ignore[override]
-        seen = code_features(codes)
-        return self.logits(x, lambda f: self.early(f, seen), lambda f: self.late(f, seen))
+        block_codes = code_features(codes)
+        return self.logits(x, lambda f: self.early(f, block_codes), lambda f: self.late(f, block_codes))

@@ -106,7 +106,7 @@ class DepthModel(nn.Module):
         """Count the numbers that training changes."""
         return parameters_of(self)
 
-    def seen(self, counts: Tensor) -> Tensor:
+    def network_input(self, counts: Tensor) -> Tensor:
         """Return what the network sees, (B, 1, T, R, C): back-projection, counts, these matched, or 1 at the fullest
         bin."""
         if self.layer is not None:
@@ -119,7 +119,7 @@ class DepthModel(nn.Module):
 
     def windowed(self, counts: Tensor, first_bin: Tensor, window: int) -> Tensor:
         """Return logits (B, window, R, C) of the bins from `first_bin` (B,) on, whose blocks alone are encoded."""
-        whole = counts if self.layer is not None else self.seen(counts)
+        whole = counts if self.layer is not None else self.network_input(counts)
         firsts = first_bin.tolist()
         cut = torch.stack([one[:, first : first + window] for one, first in zip(whole, firsts, strict=True)])
         return self(cut) if self.layer is not None else self.network(cut)
@@ -135,7 +135,7 @@ class DepthModel(nn.Module):
         """Return logits (B, T, R, C) of counts (B, 1, T, R, C) that blocks tile."""
         if self.config.sees_codes and self.layer is not None:
             return self.logits_of_codes(self.layer.encode(counts))
-        return self.network(self.seen(counts))
+        return self.network(self.network_input(counts))
 
     def position(self, logits: Tensor, decoder: Decoder | None = None) -> Tensor:
         """Return the answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C); decoder None: the

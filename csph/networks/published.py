@@ -103,10 +103,10 @@ class DeepBoosting(nn.Module):
         channel, a seventh of up4's work.
         """
         for step in self.up[:-1]:
-            x = doubled(x, _weight(step)).relu_()
+            x = transposed_conv_x2(x, _weight(step)).relu_()
         joined = torch.einsum("ioxyz,o->ixyz", _weight(self.up[-1]), self.out.weight.flatten()).unsqueeze(1)
         assert self.out.bias is not None
-        logits = doubled(x, joined).squeeze(1) + self.out.bias
+        logits = transposed_conv_x2(x, joined).squeeze(1) + self.out.bias
         return logits.relu_() if self.final_relu else logits
 
     def forward(self, x: Tensor) -> Tensor:
@@ -120,7 +120,7 @@ def _weight(module: nn.Module) -> Tensor:
     return weight
 
 
-def doubled(x: Tensor, weight: Tensor) -> Tensor:
+def transposed_conv_x2(x: Tensor, weight: Tensor) -> Tensor:
     """Return the transposed convolution of kernel 6 x 3 x 3, stride 2 x 1 x 1, padding 2 x 1 x 1, by an ordinary one.
 
     An output at time 2 t + p takes inputs t - 1, t, t + 1 with taps p + 4, p + 2, p: a 3^3 convolution to twice the

@@ -63,8 +63,8 @@ class Refined(Blockwise):
         channels_last(self)
 
     def forward(self, x: Tensor, codes: Tensor, layer: CompressiveLayer) -> Tensor:  # type: ignore[override]
-        seen = code_features(codes)
-        features, slices = self.features(x, lambda f: self.early(f, seen), lambda f: self.late(f, seen))
+        block_codes = code_features(codes)
+        features, slices = self.features(x, lambda f: self.early(f, block_codes), lambda f: self.late(f, block_codes))
         first = logits_of(features, slices, self.fine, self.skip_gates, x)
         posterior = first.softmax(1).view(x.shape)
         predicted = layer.encode_mean(self.mean_counts(posterior, features))

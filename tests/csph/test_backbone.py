@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from csph.networks.compact import Compact, averages, enlarged, read_out, time_to_channels
-from csph.networks.published import DeepBoosting, doubled, parameters_of, soft_argmax
+from csph.networks.published import DeepBoosting, parameters_of, soft_argmax, transposed_conv_x2
 from scene2spad.bench.network import PlainDeepBoosting, gmac
 from scenes import InputError
 
@@ -71,7 +71,7 @@ def test_doubling_is_the_transposed_convolution(inputs, outputs, times, rows, co
     x = torch.randn(2, inputs, times, rows, columns, dtype=torch.float64, generator=generator)
     weight = torch.randn(inputs, outputs, 6, 3, 3, dtype=torch.float64, generator=generator)
     expected = nn.functional.conv_transpose3d(x, weight, stride=(2, 1, 1), padding=(2, 1, 1))
-    torch.testing.assert_close(doubled(x, weight), expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(transposed_conv_x2(x, weight), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_initial_weights():

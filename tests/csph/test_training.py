@@ -237,7 +237,7 @@ def test_checkpoints_come_back(model, tmp_path):
 def test_peaks_and_codes_of_8_bits():
     histogram = sense(near_planes(1).transients[0], SMALL, PhotonBudget(20, 20))
     counts = torch.from_numpy(histogram.counts).permute(2, 0, 1)[None, None]
-    peak = DepthModel(replace(MODEL, design=None, front="peak")).seen(counts)
+    peak = DepthModel(replace(MODEL, design=None, front="peak")).network_input(counts)
     assert torch.equal(peak.sum(2), torch.ones(1, 1, 16, 16))
     assert torch.equal(peak.argmax(2), counts.argmax(2))  # the first of equals
     model = DepthModel(MODEL, 1).eval()
@@ -256,7 +256,7 @@ def test_matched_counts_are_the_zero_normalised_correlation_with_the_pulse():
     arrival = torch.tensor([10.5, 40.5], dtype=torch.float64) * SMALL.bin_width_s
     pulses = binned_pulse(arrival, SMALL).float()
     counts = torch.cat([3 * pulses, 700 * pulses + 5, torch.full((1, SMALL.bins), 2.0)]).T.reshape(1, 1, -1, 1, 5)
-    seen = DepthModel(replace(MODEL, design=None, front="matched")).seen(counts)
+    seen = DepthModel(replace(MODEL, design=None, front="matched")).network_input(counts)
     assert seen.shape == counts.shape and seen.abs().max() < 1 + 1e-5
     assert seen[0, 0, :, 0].argmax(0).tolist()[:4] == [10, 40, 10, 40]
     assert torch.allclose(seen.amax(2)[..., :4], torch.ones(4), atol=1e-4)
