@@ -37,7 +37,9 @@ log = logging.getLogger("scene2spad")
 
 LOOKS = {FILTER: look(0) | {"color": "black", "marker": "*"}, PEAK: look(0) | {"color": COLOURS["grey"], "marker": "X"}}
 LOOKS |= {one.name: look(n) for models in (MODELS, MIXED) for n, one in enumerate(models)}
-LOOKS |= {one.name: look(len(MODELS) + n) for n, one in enumerate(DELAYED)}
+LOOKS |= {
+    one.name: look(number) for one, number in zip(DELAYED, (len(MODELS), 9), strict=True)
+}  # black is the filter's
 # a model trained on direct light -> the same design trained with indirect light
 MIXED_NAMES = {plain.name: mixed.name for plain, mixed in zip(MODELS, MIXED, strict=True)}
 
