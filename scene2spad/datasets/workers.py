@@ -222,16 +222,28 @@ def _on_dask(
             return
         future = next(pending)
         run = submitted.pop(future)
-        failed = future.status == "error"
+        done: list[Result] | None
         with _explain_lost_scheduler(client):
-            found = future.exception() if failed else future.result()
+            done, error = _outcome(future)
         future.release()
-        if not failed:
-            yield from found
+        if done is not None:
+            yield from done
         elif len(run) > 1:  # one of them may be to blame: each by itself
             waiting = chain([(number,) for number in run], waiting)
         else:
-            yield lost(run[0], f"its workers died: {' '.join(str(found).split())[:300]}")
+            yield lost(run[0], f"its workers died: {' '.join(str(error).split())[:300]}")
+
+
+def _outcome(future: DaskFuture[list[Result]]) -> tuple[list[Result] | None, BaseException | None]:
+    """Return what a finished task gave, or why it gave nothing."""
+    from distributed import KilledWorker
+
+    if future.status == "error":
+        return None, future.exception()
+    try:
+        return future.result(), None
+    except KilledWorker as error:  # its result died with a worker before it was fetched, and so did those who redid it
+        return None, error
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -355,6 +356,27 @@ def test_a_dask_cluster_gives_the_same_bytes_and_survives_a_dead_worker(whole, t
 
         make_set(CLI_JOB, COUNT, tmp_path / "set", scheduler=cluster.scheduler_address, progress=progress)
     assert bool(killed) == kill and contents(tmp_path / "set") == contents(whole)
+
+
+def test_a_result_that_dies_with_its_worker_before_it_is_fetched_is_made_again(monkeypatch):
+    """A finished run whose result cannot be fetched goes on number by number; a number by itself is told."""
+    distributed = pytest.importorskip("distributed")
+    result, lost = distributed.Future.result, []
+
+    def dead_result(future, *arguments, **options):
+        numbers = result(future, *arguments, **options)
+        if numbers in ([0, 1], [1], [2]):
+            raise distributed.KilledWorker(future.key, SimpleNamespace(address="tcp://dead"), 3)
+        return numbers
+
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        monkeypatch.setattr(distributed.Future, "result", dead_result)
+        with executor(1, cluster.scheduler_address) as run:
+            found = list(run(list, [(0, 1), (2,), (3, 4)], lambda number, why: lost.append(why) or -number))
+    assert sorted(found) == [-2, -1, 0, 3, 4]
+    assert len(lost) == 2 and all(why.startswith("its workers died: Attempted to run") for why in lost)
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
