@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-from render.ambient import AmbientLight, ambient_light
+from render.ambient.integrator import AmbientLight, ambient_light
 from render.clamping import RemovedLight
 from render.direct.integrator import centre_layers
 from render.error import (

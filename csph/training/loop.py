@@ -44,7 +44,7 @@ from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.resume import WholeFileCheckpoints, check_resume
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
-from csph.training.views import Views, packed_sha256
+from csph.training.views import Views, check_direct, packed_sha256
 from csph.weights.shipped import RESUME, TIMINGS
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import InputError, require
@@ -67,8 +67,7 @@ class NetworkOf(NamedTuple):
 
 
 def _mean(means: nn.ModuleDict, decoder: str) -> MeanMetric:
-    found = means[decoder]
-    assert isinstance(found, MeanMetric)
+    assert isinstance(found := means[decoder], MeanMetric)
     return found
 
 
@@ -353,9 +352,9 @@ def train(
 
     Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
     the same design to begin with, instead of random weights, or `NetworkOf` one of any design on the same sensor, whose
-    codes begin anew. No result depends on `hardware`, but for the order of sums on several devices. Returns
-    steps, seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of parameters.
-    Raises InputError for sets or an `init` that do not fit, and a folder of another run.
+    codes begin anew. No result depends on `hardware`, but for the order of sums on several devices. Returns steps,
+    seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of parameters. Raises
+    InputError for sets or an `init` that do not fit, indirect light on the published grid, and another run's folder.
     """
     config.check_memory()
     if init is not None:
@@ -363,6 +362,7 @@ def train(
     sets = [[pack_views(one.transients) for one in _listed(views)] for views in (training, validation)]
     config = _with_hashes(config, sets, init)
     if config.model.grid == "published":
+        check_direct([*_listed(training), *_listed(validation)])
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
     module_data = SetData(sets[0], sets[1], config, hardware.workers)
     record = Record(folder, progress or (lambda what, fraction: None))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,6 +66,16 @@ def split_views(views: Views, fraction: float = VALIDATION_FRACTION) -> tuple[Vi
         kept = [i for i, name in enumerate(views.scenes) if (name in held) == wanted]
         parts.append(Views(tuple(views.transients[i] for i in kept), tuple(views.scenes[i] for i in kept)))
     return parts[0], parts[1]
+
+
+def check_direct(sets: Iterable[Views]) -> None:
+    """Raise InputError for light of more than one surface: the published grid has one return a pixel, at the mean of
+    its depths."""
+    for views in sets:
+        for transient, scene in zip(views.transients, views.scenes, strict=True):
+            direct = not (transient.bounces > 1).any()
+            message = f"the published grid has one return a pixel, and {scene} has indirect light"
+            require(direct, f"{message}: render the set with --bounces 1")
 
 
 def packed_sha256(packed: PackedViews) -> str:

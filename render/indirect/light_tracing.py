@@ -21,13 +21,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.backend.drjit_types import Array, Generators, Interactions, UInts, Vectors
+from render.backend.drjit_types import Array, Generators, UInts
 from render.indirect.glossy import RATIO, glossy_of, is_glossy, laser_rays, mis_weight_light_path
-from render.scene.rays import first_opaque, in_beam, pixel_of, sample_bsdf, segment, spawn, to_camera
+from render.scene.rays import (
+    first_opaque,
+    in_beam,
+    pixel_of,
+    sample_bsdf,
+    segment,
+    shading_ratio,
+    spawn,
+    to_camera,
+)
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
 LIGHT_PATHS_PER_LAUNCH = 1 << 17  # of one launch
-MIN_SHADING_COSINE = 1e-4
 
 
 class LightPathSplats(NamedTuple):
@@ -97,7 +105,7 @@ def _trace_launch(
         out = si.to_local((world.eye - si.p) / back)
         light = si.bsdf().eval(mi.BSDFContext(), si, out, active)[0] * value
         light *= passed / dr.square(back)
-        light *= _ratio(si, si.wi) / _ratio(si, out) * (back / local.z) ** 3
+        light *= shading_ratio(si, si.wi) / shading_ratio(si, out) * (back / local.z) ** 3
         light = dr.select(active & seen & dr.isfinite(light), dr.maximum(light, 0), 0)
         dr.scatter(targets, target, slot * stride + place, active)
         dr.scatter(paths, path + back, slot * stride + place, active)
@@ -108,7 +116,7 @@ def _trace_launch(
         through = again[0]
         survive = dr.clip(through, 0.05, 0.95)
         active &= (through > 0) & (random.next_float32() < survive)
-        value *= through / survive * _ratio(si, si.wi) / _ratio(si, sample.wo)
+        value *= through / survive * shading_ratio(si, si.wi) / shading_ratio(si, sample.wo)
         active &= dr.isfinite(value)
     return targets, paths, values
 
@@ -129,12 +137,5 @@ def _sample_first_vertex(
     first = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
     sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*first), active)
     # |aim| = 1 / cos a
-    value = intensity * weight[0] * dr.rcp(dr.norm(aim)) ** 3 * _ratio(si, si.wi) / _ratio(si, sample.wo)
+    value = intensity * weight[0] * dr.rcp(dr.norm(aim)) ** 3 * shading_ratio(si, si.wi) / shading_ratio(si, sample.wo)
     return si, path, sample, value, active & (value > 0)
-
-
-def _ratio(si: Interactions, local: Vectors) -> Array:
-    """Compute the cosine to the shading normal over that to the surface's normal, of a direction in the shading
-    frame."""
-    shading, true = dr.abs(local.z), dr.abs(dr.dot(si.n, si.to_world(local)))
-    return dr.maximum(shading, MIN_SHADING_COSINE) / dr.maximum(true, MIN_SHADING_COSINE)

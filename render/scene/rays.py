@@ -6,6 +6,7 @@ from render.backend.drjit_types import Array, Floats, Generators, Interactions, 
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi
 
 MAX_LAYERS = 64  # of glass and cut-outs that one ray passes
+MIN_SHADING_COSINE = 1e-4
 
 
 def camera_rays(world: TracedScene, x: Floats, y: Floats, eye: Vectors = None) -> tuple[Array, Array]:
@@ -264,3 +265,10 @@ def passage(
         return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), limit, Float(0)
     end, transmission, optical, _, shortening = _pass_layers(world, ray, origin, active, limit, in_air)
     return dr.select(end.is_valid(), 0, transmission), optical, shortening
+
+
+def shading_ratio(si: Interactions, local: Vectors) -> Array:
+    """Compute the cosine to the shading normal over that to the surface's normal, of a direction in the shading
+    frame."""
+    shading, true = dr.abs(local.z), dr.abs(dr.dot(si.n, si.to_world(local)))
+    return dr.maximum(shading, MIN_SHADING_COSINE) / dr.maximum(true, MIN_SHADING_COSINE)

@@ -23,7 +23,7 @@ from csph.training.schedule import rate_factor
 from csph.training.views import split_views
 from scene2spad.datasets.planes import random_planes
 from scenes import InputError
-from spad.detection.training_patches import pack_views
+from spad.detection.training_patches import PackedViews, pack_views
 from spad.sensor.model import Sensor
 
 CODED = ModelConfig(design=Design("learned", (256, 2, 2), 8))
@@ -250,6 +250,27 @@ def test_the_published_grid_puts_one_return_where_print_has_it():
     np.testing.assert_allclose(grid.mean_radiance, packed.mean_radiance, rtol=1e-5)
 
 
+def test_a_pixel_at_an_edge_has_one_return_between_its_surfaces_on_the_published_grid():
+    """Three quarters of the pixel at 2 m, albedo 0.4, and a quarter at 3 m, albedo 0.8: the mean of depth by area and
+    albedo is 2.4 m; all the light arrives there. A pixel without returns is dark."""
+    sensor = Sensor()
+    near, far = 0.75 * 0.4 / 2.0**2, 0.25 * 0.8 / 3.0**2
+    packed = PackedViews(
+        offsets=np.array([0, 2, 2]),
+        path_near_m=np.array([3.9, 6.0], np.float32),
+        path_far_m=np.array([4.1, 6.0], np.float32),
+        radiance=np.array([near, far], np.float32),
+        depth_m=np.array([[[2.0, np.nan]]], np.float32),
+        ambient=np.ones((1, 1, 2), np.float32),
+        mixed=np.array([[[True, False]]]),
+    )
+    grid = on_published_grid(packed, sensor)
+    fullest = np.rint(2.4 / sensor.bin_depth_m) - 1
+    assert grid.depth_m[0, 0, 0] / sensor.bin_depth_m == pytest.approx(fullest + 0.5, rel=1e-5)
+    assert np.isnan(grid.depth_m[0, 0, 1]) and grid.offsets.tolist() == [0, 1, 1]
+    assert grid.radiance == pytest.approx(near + far, rel=1e-5)
+
+
 def test_the_published_decoding_of_the_target_is_the_label():
     sensor, fullest = Sensor(), torch.tensor([1.0, 117.0, 1000.0])
     label = (fullest + 0.5) * sensor.bin_depth_m
@@ -266,3 +287,8 @@ def test_training_on_the_published_grid(tmp_path):
     model = replace(MODEL, grid="published")
     train(preset("smoke", model, **FEW), *split_views(near_planes(3)), tmp_path / "run")
     assert load_model(tmp_path / "run")[0].config.grid == "published" and SMALL.bins == 64
+    views = near_planes(3)
+    late = [replace(one, bounces=np.full_like(one.bounces, 2)) for one in views.transients]
+    lit_twice = views._replace(transients=tuple(late))
+    with pytest.raises(InputError, match=r"one return a pixel, and .* has indirect light: .* --bounces 1"):
+        train(preset("smoke", model, **FEW), *split_views(lit_twice), tmp_path / "other")
