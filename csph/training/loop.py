@@ -67,7 +67,8 @@ class NetworkOf(NamedTuple):
 
 
 def _mean(means: nn.ModuleDict, decoder: str) -> MeanMetric:
-    assert isinstance(found := means[decoder], MeanMetric)
+    found = means[decoder]
+    assert isinstance(found, MeanMetric)
     return found
 
 
@@ -102,8 +103,7 @@ class DepthTraining(pl.LightningModule):
             depth = published_target(depth, sensor)
         if config.window and bool((batch.first_bin >= 0).all()):
             logits = self.model.windowed(batch.counts, batch.first_bin, config.window)
-            near = batch.first_bin.to(depth.device).view(-1, 1, 1) * sensor.bin_depth_m
-            depth = depth - near
+            depth = depth - batch.first_bin.to(depth.device).view(-1, 1, 1) * sensor.bin_depth_m
             valid = batch.valid & (depth >= 0) & (depth < config.window * sensor.bin_depth_m)
             # gated: what of the pulse falls outside the window is left out
             sensor = replace(sensor, bins=config.window, tdc=None)
