@@ -54,7 +54,8 @@ def ambient_light(
     light, relative = sums.light(guide_layers), None
     while light.error > noise and light.spp < spp:
         # the first paths underrate what is rare: by steps
-        more = min(max((light.error / noise) ** 2, MIN_MORE), MAX_MORE)
+        power = 1 if guide_layers is None else 2  # paths where the noise is take fewer than even ones would
+        more = min(max((light.error / noise) ** power, MIN_MORE), MAX_MORE)
         target = min(spp, math.ceil(more * light.spp))
         if guide_layers is not None:
             sums.trace_evenly(target)
