@@ -53,8 +53,8 @@ def ambient_light(
     sums.trace_evenly(spp if noise == 0 else min(spp, FIRST_SPP))
     light, relative = sums.light(guide_layers), None
     while light.error > noise and light.spp < spp:
-        # the first paths underrate what is rare: by steps
-        power = 1 if guide_layers is None else 2  # paths where the noise is take fewer than even ones would
+        # by steps, as the first paths underrate what is rare; and fewer where paths go to the noisiest pixels
+        power = 2 if guide_layers is not None else 1
         more = min(max((light.error / noise) ** power, MIN_MORE), MAX_MORE)
         target = min(spp, math.ceil(more * light.spp))
         if guide_layers is not None:
