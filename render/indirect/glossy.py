@@ -46,11 +46,8 @@ class Glossy(NamedTuple):
 
 
 def glossy_of(world: TracedScene) -> Glossy | None:
-    """Return where a flood laser lights polished surfaces, looked for once; None if nowhere.
-
-    Glass and cut-outs on the way would need to be crossed from the other side, too.
-    """
-    if not world.has_glossy or world.sees_through or world.scene.laser.mode != "flood":
+    """Return where a flood laser lights polished surfaces, looked for once; None if nowhere."""
+    if not world.has_glossy or world.scene.laser.mode != "flood":
         return None
     if world.glossy is None:
         world.glossy = _look_for(world)

@@ -9,7 +9,8 @@ density) and f the reflectance there, one of them adds to the pixel
 where d is the way from xk to the camera, cos the cosine of that way, I the laser's intensity, and a are angles to the
 optical axis, as a pixel of the image plane sees (cos a)^3 of solid angle. Shading normals s instead of true ones g make
 reflection unsymmetrical (Veach 1997, section 5.3): the product runs over x1 (in from the laser) to xk (out to the
-camera). c is the share that other paths leave to these (`render.indirect.glossy`).
+camera). c is the share that other paths leave to these (`render.indirect.glossy`). X is less by what glass on the way
+stops; solid glass spreads the laser's light otherwise (`render.scene.rays.spreading`).
 """
 
 from __future__ import annotations
@@ -92,20 +93,21 @@ def _trace_launch(
     slot = dr.zeros(UInt32, lanes)
     while active:
         towards, before = spawn(si, si.to_world(sample.wo)), mi.Point3f(si.p)
-        si, _, leg, _ = first_opaque(world, towards, active, before)
+        si, passed, leg, _ = first_opaque(world, towards, active, before)
         active &= si.is_valid()
         path += leg
+        value *= passed
         if begun:
             value *= mis_weight_light_path(world, pixel, si, -towards.d, start, active)
             begun = Bool(False)
         target, seen = pixel_of(world, si.p)
         # the camera has to see it; the laser need not shine on it
-        passed, back = segment(world, si, world.eye, active & seen)
-        local = to_camera(world, si.p - world.eye)
-        out = si.to_local((world.eye - si.p) / back)
+        passed, back = segment(world, si, world.eye, active & seen, spread=False)
+        local, distance = to_camera(world, si.p - world.eye), dr.norm(world.eye - si.p)
+        out = si.to_local((world.eye - si.p) / distance)
         light = si.bsdf().eval(mi.BSDFContext(), si, out, active)[0] * value
-        light *= passed / dr.square(back)
-        light *= shading_ratio(si, si.wi) / shading_ratio(si, out) * (back / local.z) ** 3
+        light *= passed / dr.square(distance)
+        light *= shading_ratio(si, si.wi) / shading_ratio(si, out) * (distance / local.z) ** 3
         light = dr.select(active & seen & dr.isfinite(light), dr.maximum(light, 0), 0)
         dr.scatter(targets, target, slot * stride + place, active)
         dr.scatter(paths, path + back, slot * stride + place, active)
@@ -137,5 +139,7 @@ def _sample_first_vertex(
     first = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
     sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*first), active)
     # |aim| = 1 / cos a
+    if world.sees_through:
+        intensity *= segment(world, si, world.laser, active)[0]
     value = intensity * weight[0] * dr.rcp(dr.norm(aim)) ** 3 * shading_ratio(si, si.wi) / shading_ratio(si, sample.wo)
     return si, path, sample, value, active & (value > 0)

@@ -231,11 +231,14 @@ def raster_of(world: TracedScene, eye: Vectors, point: Array) -> tuple[Array, Ar
     return x + Float(world.width) / 2, y + Float(world.height) / 2, local.z > 0
 
 
-def segment(world: TracedScene, si: Interactions, point: Array, active: Masks) -> tuple[Array, Array]:
+def segment(
+    world: TracedScene, si: Interactions, point: Array, active: Masks, *, spread: bool = True
+) -> tuple[Array, Array]:
     """Return transmission of the straight way from a surface to a point, 0 where it is blocked, and its optical path
     [m].
 
-    The transmission includes the glass's `spreading`: it is what f cos I / distance^2 is to be multiplied by.
+    The transmission includes the glass's `spreading`: it is what f cos I / distance^2 is to be multiplied by; not with
+    `spread` off, as for the radiance that a camera sees.
     """
     distance = dr.norm(point - si.p)
     if not world.sees_through:
@@ -247,7 +250,8 @@ def segment(world: TracedScene, si: Interactions, point: Array, active: Masks) -
     short = distance * (1 - 1e-4)  # not as far as a surface that the point may lie on
     ray = spawn(si, (point - si.p) / distance)
     transmission, optical, shortening = passage(world, ray, si.p, short, active, in_air=False)
-    return transmission * spreading(distance, shortening), optical + (distance - short)
+    factor = spreading(distance, shortening) if spread else 1
+    return transmission * factor, optical + (distance - short)
 
 
 def passage(

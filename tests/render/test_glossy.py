@@ -16,7 +16,7 @@ from render.scene.traced_scene import TracedScene
 from render.settings import Plan, RenderSettings
 from scenes import Camera, Laser, Material, Scene, Surface
 from scenes.library.hard_cases import hard_case
-from scenes.library.things.shapes import sphere
+from scenes.library.things.shapes import box, sphere
 
 WIDTH, HEIGHT, BATCHES = 16, 12, 16
 METAL = Material("roughconductor", roughness=0.1, eta=2.9, k=3.1)
@@ -86,6 +86,30 @@ def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, mis_we
     off = both.sum(axis=1).mean() - alone.sum(axis=1).mean()
     assert abs(off) < 5 * noise  # Student's t of 7 to 14 degrees of freedom: one in 600 at the worst
     assert noise < 0.1 * alone.sum() / len(seeds)
+
+
+@pytest.mark.parametrize("laser", ["flash", "aside"])
+@pytest.mark.parametrize("kind", ["thindielectric", "dielectric"])
+def test_both_ways_together_are_as_bright_as_one_behind_glass(kind, laser, mis_weight_sampled):
+    """A pane, or a slab, before half of the view and of what the metal shines on; a displaced laser allows a thin one."""
+    scene = room(METAL, LASERS[laser], smooth=True)
+    glass = Material(kind, ior=1.5)
+    corners = [(-0.2, -0.9, -1.2), (2, -0.9, -1.2), (2, 2, -1.2), (-0.2, 2, -1.2)]
+    if kind == "dielectric":
+        vertices, faces, _ = box((2.2, 2.9, 0.3 if laser == "flash" else 0.01))
+        pane = Surface(vertices + (0.9, 0.55, -1.3), faces, glass)
+    else:
+        pane = quad(corners, glass)
+    scene = replace(scene, surfaces=(*scene.surfaces, pane))
+    assert glossy_of(TracedScene(scene)) is not None
+    seeds = range(8)
+    both = np.array([totals(light(scene, 256, seed)) for seed in seeds])
+    mis_weight_sampled()
+    alone = np.array([totals(light(scene, 1024, 100 + seed)) for seed in seeds])
+    noise = np.hypot(*(runs.sum(axis=1).std(ddof=1) / len(seeds) ** 0.5 for runs in (both, alone)))
+    off = both.sum(axis=1).mean() - alone.sum(axis=1).mean()
+    assert abs(off) < 5 * noise and noise < 0.03 * alone.sum() / len(seeds)
+    assert both.std(axis=0, ddof=1).sum() < alone.std(axis=0, ddof=1).sum()
 
 
 def test_a_caustic_is_even_where_paths_by_chance_find_sparks(mis_weight_sampled):
