@@ -91,7 +91,7 @@ def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, mis_we
 @pytest.mark.parametrize("laser", ["flash", "aside"])
 @pytest.mark.parametrize("kind", ["thindielectric", "dielectric"])
 def test_both_ways_together_are_as_bright_as_one_behind_glass(kind, laser, mis_weight_sampled):
-    """A pane, or a slab, before half of the view and of what the metal shines on; a displaced laser allows a thin one."""
+    """A pane, or a slab, before half of the view and what the metal shines on; a displaced laser allows a thin one."""
     scene = room(METAL, LASERS[laser], smooth=True)
     glass = Material(kind, ior=1.5)
     corners = [(-0.2, -0.9, -1.2), (2, -0.9, -1.2), (2, 2, -1.2), (-0.2, 2, -1.2)]
