@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -72,20 +73,25 @@ def mis_weight_sampled(monkeypatch):
     return off
 
 
+def check_both_ways(scene: Scene, off: Callable[[], None], most_noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return totals of paths of both kinds, and of the camera's alone with four times as many, (8, pixels) each; the
+    means agree within 5 standard errors: Student's t of 7 to 14 degrees of freedom, one in 600 at the worst."""
+    assert glossy_of(TracedScene(scene)) is not None
+    both = np.array([totals(light(scene, 256, seed)) for seed in range(8)])
+    off()
+    alone = np.array([totals(light(scene, 1024, 100 + seed)) for seed in range(8)])
+    noise = np.hypot(*(runs.sum(axis=1).std(ddof=1) / 8**0.5 for runs in (both, alone)))
+    assert abs(both.sum(axis=1).mean() - alone.sum(axis=1).mean()) < 5 * noise
+    assert noise < most_noise * alone.sum() / 8
+    return both, alone
+
+
 @pytest.mark.parametrize("smooth", [False, True], ids=["facets", "smooth"])
 @pytest.mark.parametrize("laser", LASERS)
 @pytest.mark.parametrize("material", [METAL, GLOSS], ids=["metal", "gloss"])
 def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, mis_weight_sampled):
     scene = room(material, LASERS[laser], smooth=smooth)
-    assert glossy_of(TracedScene(scene)) is not None
-    seeds = range(8)
-    both = np.array([totals(light(scene, 256, seed)) for seed in seeds])
-    mis_weight_sampled()
-    alone = np.array([totals(light(scene, 1024, 100 + seed)) for seed in seeds])
-    noise = np.hypot(*(runs.sum(axis=1).std(ddof=1) / len(seeds) ** 0.5 for runs in (both, alone)))
-    off = both.sum(axis=1).mean() - alone.sum(axis=1).mean()
-    assert abs(off) < 5 * noise  # Student's t of 7 to 14 degrees of freedom: one in 600 at the worst
-    assert noise < 0.1 * alone.sum() / len(seeds)
+    check_both_ways(scene, mis_weight_sampled, 0.1)
 
 
 @pytest.mark.parametrize("laser", ["flash", "aside"])
@@ -101,14 +107,7 @@ def test_both_ways_together_are_as_bright_as_one_behind_glass(kind, laser, mis_w
     else:
         pane = quad(corners, glass)
     scene = replace(scene, surfaces=(*scene.surfaces, pane))
-    assert glossy_of(TracedScene(scene)) is not None
-    seeds = range(8)
-    both = np.array([totals(light(scene, 256, seed)) for seed in seeds])
-    mis_weight_sampled()
-    alone = np.array([totals(light(scene, 1024, 100 + seed)) for seed in seeds])
-    noise = np.hypot(*(runs.sum(axis=1).std(ddof=1) / len(seeds) ** 0.5 for runs in (both, alone)))
-    off = both.sum(axis=1).mean() - alone.sum(axis=1).mean()
-    assert abs(off) < 5 * noise and noise < 0.03 * alone.sum() / len(seeds)
+    both, alone = check_both_ways(scene, mis_weight_sampled, 0.03)
     assert both.std(axis=0, ddof=1).sum() < alone.std(axis=0, ddof=1).sum()
 
 
