@@ -1,4 +1,4 @@
-"""How many paths of ambient light each pixel takes: most where their light differs most.
+"""Allocate paths of ambient light to pixels: most where their light differs most.
 
 A pixel that sees a lamp takes hundreds of times as many paths as one that sees a lit wall. How many is seen in the
 first paths. Were it seen in a pixel's own, a rare bright path would bring more paths, which outvote it, and the

@@ -1,4 +1,4 @@
-"""Paths of ambient light that begin at the camera.
+"""Trace paths of ambient light that begin at the camera.
 
 L(p) = E[sum over the path's vertices of its weight and the light emitted there], with multiple importance sampling
 (balance heuristic) between lights and reflectance at every surface. Light that a lamp throws on a surface by way of a
@@ -8,7 +8,7 @@ that begin there (`render.ambient.light_paths`), unless the camera, too, sees wh
 
 from __future__ import annotations
 
-from render.ambient.panes import has_lit_mirrors, pane_event, straight_transmission
+from render.ambient.panes import has_lit_mirrors, mirrored_direction, pane_event, straight_transmission
 from render.backend.drjit_types import Array, Floats, Masks, Rays, UInts
 from render.scene.rays import MAX_LAYERS, camera_rays, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
@@ -80,8 +80,7 @@ def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple
 
         bounce, reflected = bsdf.sample(context, si, sampler.next_1d(surface), sampler.next_2d(surface), surface)
         onward = si.to_world(bounce.wo)
-        mirror = ray.d - 2 * dr.dot(ray.d, si.n) * si.n
-        direction = dr.select(passing, ray.d, dr.select(by_pane, mirror, onward))
+        direction = dr.select(passing, ray.d, dr.select(by_pane, mirrored_direction(ray, si), onward))
         weight = dr.select(surface, weight * reflected[0], weight)
         smooth = surface & ~mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
         mirrored = dr.select(passing, mirrored, ~smooth)

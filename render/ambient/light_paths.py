@@ -1,4 +1,4 @@
-"""Paths of ambient light that begin at lamps and go by way of mirrors, or of glass that bends light.
+"""Trace paths of ambient light that begin at lamps and go by way of mirrors, or of glass that bends light.
 
 A lamp in a bulb of thick glass, or its image in a mirror, lights a wall. A path from the wall meets the mirror by rare
 chance where that sends the lamp's light, and is as bright then as the lamp. A path from the lamp finds the wall. Paths
@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from render.ambient.camera_paths import SETS, survival
-from render.ambient.panes import pane_event, straight_transmission
+from render.ambient.panes import mirrored_direction, pane_event, straight_transmission
 from render.backend.drjit_types import Array, Floats, Generators, UInts
 from render.indirect.path_cells import scatter_add_fixed_point
 from render.scene.rays import MAX_LAYERS, pixel_of, shading_ratio, spawn, to_camera
@@ -101,8 +101,7 @@ def _trace(world: TracedScene, random: Generators, row: UInts, most: UInts, scal
             context, si, random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32()), surface
         )
         specular = mirrored | (surface & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta))
-        mirror = ray.d - 2 * dr.dot(ray.d, si.n) * si.n
-        onward = dr.select(mirrored, mirror, si.to_world(sample.wo))
+        onward = dr.select(mirrored, mirrored_direction(ray, si), si.to_world(sample.wo))
         through = reflected[0] * arriving / shading_ratio(si, sample.wo)
         weight = dr.select(surface, weight * through, weight)
         # where the first surface scatters light, the camera's paths have it

@@ -1,4 +1,4 @@
-"""What thin panes and cut-outs do to ambient light: they let it straight through, or mirror it."""
+"""Let ambient light straight through thin panes and cut-outs, or mirror it."""
 
 from __future__ import annotations
 
@@ -27,6 +27,11 @@ def pane_event(world: TracedScene, si: Interactions, ray: Rays, sample: LobeSamp
         hole = hit & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
         passing, mirrored = passing | hole, mirrored & ~hole
     return passing, mirrored
+
+
+def mirrored_direction(ray: Rays, si: Interactions) -> Array:
+    """Return the direction of a ray that a plane face mirrors."""
+    return ray.d - 2 * dr.dot(ray.d, si.n) * si.n
 
 
 def _transmission(ior: Array, ray: Rays, si: Interactions) -> Array:

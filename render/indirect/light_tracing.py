@@ -93,10 +93,10 @@ def _trace_launch(
     slot = dr.zeros(UInt32, lanes)
     while active:
         towards, before = spawn(si, si.to_world(sample.wo)), mi.Point3f(si.p)
-        si, passed, leg, _ = first_opaque(world, towards, active, before)
+        si, transmission, leg, _ = first_opaque(world, towards, active, before)
         active &= si.is_valid()
         path += leg
-        value *= passed
+        value *= transmission
         if begun:
             value *= mis_weight_light_path(world, pixel, si, -towards.d, start, active)
             begun = Bool(False)
