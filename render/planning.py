@@ -192,7 +192,7 @@ def _limits(world: TracedScene) -> list[str]:
     if world.has_cutouts:
         lines.append("cut-outs: solid where their opacity is 1/2 or more")
     if world.solid_indices:
-        way = "direct light is refracted, all other light crosses it in a straight line"
+        way = "direct light is refracted, other laser light crosses it in a straight line"
         lines.append(f"thick glass: {way if world.refracts else 'crossed in a straight line'}")
     if any(m.kind == "roughdiffuse" for m in materials):
         lines.append("rough diffuse surfaces: rendered as Lambertian")
