@@ -107,6 +107,9 @@ def trace(
     # only indirect light is counted from where direct light is
     origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
+    if settings.bounces is not None:  # the image method finds light of more surfaces, too
+        within = specular.samples.bounces <= settings.bounces
+        specular = specular._replace(samples=select(specular.samples, within))
     trim_memory(len(pixels))
     rays, indirect, schedule = direct.rays, None, None
     reasons: tuple[str, ...] = ()

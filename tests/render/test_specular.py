@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from render import RenderSettings, render
 from render.direct.integrator import centre_layers, direct_light
 from render.scene.traced_scene import TracedScene
 from render.specular.image_method import specular_light
@@ -272,6 +273,18 @@ def test_a_wall_lit_by_way_of_a_mirror():
     assert inner.any() and np.abs(got / want - 1)[inner].max() < 1e-3
     path = np.bincount(samples.pixel[seen], (samples.radiance * samples.path_m)[seen], 17 * 13).reshape(13, 17) / got
     assert np.abs(path - np.linalg.norm(point, axis=-1) - leg)[inner].max() < 1e-3
+
+
+def test_bounces_limit_mirrored_light_too():
+    """Of up to two surfaces, a render has the wall lit by way of the mirror; of one it has not."""
+    mirror = square((1, 0, -2), (-1, 0, 0), 5, GOOD_MIRROR)
+    wall = square((0, 0, -3), (0, 0, 1), 0.9, Material(albedo=0.5))
+    scene = scene_of(mirror, wall, laser=Laser("flood", cone_deg=180.0), view=camera(17, 13, 30))
+    one, two = (render(scene, RenderSettings(bounces=most, grid=4, spp=4)) for most in (1, 2))
+    assert set(one.bounces) == {1}
+    mirrored = specular_light(TracedScene(scene), 4).samples
+    lit_by_mirror = mirrored.radiance[mirrored.bounces == 2].sum()
+    assert two.radiance[two.bounces == 2].sum() == pytest.approx(lit_by_mirror, rel=1e-3)
 
 
 def test_displaced_laser_lights_a_wall_seen_in_a_mirror():
