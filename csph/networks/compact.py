@@ -81,6 +81,7 @@ class Compact(nn.Module):
     """
 
     reach = 20  # pixels around one that its answer depends on
+    read_outs: tuple[str, ...] = ("fine", "skip_gates")  # layers whose products are the answer, not features
     coarsest = 4  # pixels of a cell of its coarsest level, whose grid begins at the image's first
 
     def __init__(self) -> None:

@@ -45,6 +45,8 @@ class Refined(Blockwise):
     Mt is a multiple of 16. See the module.
     """
 
+    read_outs = (*Blockwise.read_outs, "amplitude", "correction", "correction_gates")
+
     def __init__(self, block: tuple[int, int, int], codes: int) -> None:
         super().__init__(block, codes)
         # averages see 3 pixels, the codes of a block and its mixer to the end of the block

@@ -22,6 +22,8 @@ Front = Literal["codes", "counts", "matched", "peak"]
 GROWING: tuple[Network, ...] = ("compact", "blockwise", "refined")  # each holds the weights of the one before
 NETWORKS: tuple[str, ...] = (*GROWING, "published", "published-signed")
 FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
+Optimiser = Literal["adam", "muon"]
+OPTIMISERS: tuple[str, ...] = ("adam", "muon")
 Schedule = Literal["steps", "cosine"]
 SCHEDULES: tuple[str, ...] = ("steps", "cosine")
 SenseOn = Literal["host", "device"]
@@ -124,7 +126,8 @@ class TrainConfig:
     seed          of weights, crops, photon levels and noise
     epochs, steps_per_epoch    an epoch ends in validation, and is what an interrupted run goes back to
     batch, crop   patches a step, and their side in pixels
-    rate          Adam's learning rate at the start, or after the warm-up
+    optimiser     adam; or muon: Muon for hidden layers of our networks, Adam for the rest (`csph.training.optimiser`)
+    rate          Adam's learning rate at the start, or after the warm-up; Muon's goes with it
     schedule      steps: times `decay` every `decay_steps` steps; cosine: one cosine over the run down to `rate_end` of
                   it; either after `warmup` steps of a linear rise
     decay, decay_steps, warmup, rate_end   of the schedule
@@ -176,6 +179,7 @@ class TrainConfig:
     coherence: float = 0.0
     sense_on: SenseOn = "host"
     decoded_weight: float = 0.0
+    optimiser: Optimiser = "adam"
 
     def __post_init__(self) -> None:
         for name in ("epochs", "steps_per_epoch", "batch", "crop", "decay_steps", "validation_views"):
@@ -196,6 +200,10 @@ class TrainConfig:
         self._check_recipe()
 
     def _check_recipe(self) -> None:
+        known = self.optimiser in OPTIMISERS
+        require(known, f"training: optimiser {self.optimiser!r} is unknown, expected one of {', '.join(OPTIMISERS)}")
+        ours = self.optimiser == "adam" or self.model.network in GROWING
+        require(ours, f"training: optimiser muon is for {', '.join(GROWING)}, not network {self.model.network}")
         known = self.schedule in SCHEDULES
         require(known, f"training: schedule {self.schedule!r} is unknown, expected one of {', '.join(SCHEDULES)}")
         require(self.sense_on in SENSE_ON, f"training: sense_on {self.sense_on!r}, expected {' or '.join(SENSE_ON)}")
@@ -267,8 +275,9 @@ def window_refused(model: ModelConfig, window: int) -> str:
 
 
 UNWINDOWED_STEPS = 0.55  # of a preset's steps where windows are left out: a step takes 256 ms instead of 146
-# Adam with one warm-up and one cosine, weights averaged, levels over the whole range, windows where they can be
+# Muon and Adam, one warm-up and one cosine, weights averaged, levels over the whole range, windows where they can be
 RECIPE: dict[str, Any] = {
+    "optimiser": "muon",
     "schedule": "cosine",
     "warmup": 100,
     "average": 0.995,
@@ -322,7 +331,7 @@ def preset(name: str, model: ModelConfig, **changes: object) -> TrainConfig:
     most), gpu (compact, three times workstation's pixels, sensed on the GPU), paper (the published network, levels and
     schedule), laptop-v1 (the recipe of the first models). Windows are left out where the model does not allow them, and
     with random time offsets. Without compression, and of one-hot peaks, `paper` has the published total variation and a
-    tenth of the learning rate. `levels` may be "paper".
+    tenth of the learning rate. `levels` may be "paper". The published network is trained by Adam with every preset.
     """
     require(name in PRESETS, f"preset {name!r} is unknown, expected one of {', '.join(PRESETS)}")
     known = {item.name for item in fields(TrainConfig)}
@@ -332,6 +341,8 @@ def preset(name: str, model: ModelConfig, **changes: object) -> TrainConfig:
     if given.get("levels") == "paper":
         given["levels"] = TRAIN_LEVELS
     values: dict[str, Any] = {"model": model, "preset": name, **PRESETS[name], **oracle, **given}
+    if "optimiser" not in given and model.network not in GROWING:
+        values["optimiser"] = "adam"
     if "window" not in given and (window_refused(model, values.get("window", 0)) or values.get("time_offset_m")):
         values["window"] = 0
         if values["window"] != PRESETS[name].get("window", 0) and "steps_per_epoch" not in given:

@@ -41,6 +41,7 @@ from csph.networks.published import soft_argmax
 from csph.training.config import TrainConfig, grows
 from csph.training.data import SetData, TrainBatch
 from csph.training.loss import decoded_error, kl_divergence, total_variation
+from csph.training.optimiser import make_optimiser
 from csph.training.resume import WholeFileCheckpoints, check_resume
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
@@ -56,7 +57,6 @@ from spad.detection.training_patches import PackedViews, pack_views
 
 log = logging.getLogger("csph")
 
-RANGE_RATE = 0.02  # of the logarithms of int8 clipping ranges: a bit more headroom in some 40 steps
 EXCESS_WEIGHT = 10.0  # of sums beyond 16 bits
 
 
@@ -73,8 +73,8 @@ def _mean(means: nn.ModuleDict, decoder: str) -> MeanMetric:
 
 
 class DepthTraining(pl.LightningModule):
-    """KL divergence to the pulse at the label, plus total variation and coherence where asked; Adam, and an average of
-    the weights where asked."""
+    """KL divergence to the pulse at the label, plus total variation and coherence where asked; Adam or Muon, and an
+    average of the weights where asked."""
 
     def __init__(self, config: TrainConfig, init: DepthModel | NetworkOf | None = None) -> None:
         super().__init__()
@@ -145,14 +145,10 @@ class DepthTraining(pl.LightningModule):
             _mean(self.absolute_m, decoder).update(error.abs(), weight)
 
     def configure_optimizers(self) -> dict[str, object]:
-        named = [*self.model.named_parameters()]
-        groups: list[dict[str, object]] = [{"params": [one for name, one in named if not name.endswith("_range")]}]
-        ranges = [one for name, one in named if name.endswith("_range")]
-        groups += [{"params": ranges, "lr": RANGE_RATE}] if ranges else []
-        adam = torch.optim.Adam(groups, lr=self.config.rate, fused=True)
+        optimiser = make_optimiser(self.model, self.config)
         # a function of the step alone: nothing about it has to be restored
-        steps = torch.optim.lr_scheduler.LambdaLR(adam, partial(rate_factor, config=self.config))
-        return {"optimizer": adam, "lr_scheduler": {"scheduler": steps, "interval": "step"}}
+        steps = torch.optim.lr_scheduler.LambdaLR(optimiser, partial(rate_factor, config=self.config))
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": steps, "interval": "step"}}
 
 
 class Record(pl.Callback):

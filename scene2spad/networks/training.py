@@ -79,6 +79,7 @@ def config_of(command: Train) -> TrainConfig:
         seed=command.seed,
         batch=command.batch,
         crop=command.crop,
+        optimiser=command.optimiser,
         rate=command.rate,
         tv_weight=command.tv,
         tv_start=command.tv_start,

@@ -60,6 +60,9 @@ class Train(Long):
     """Patches a step (default: the preset's)."""
     crop: Pixels = None
     """Side of a patch (default: the preset's)."""
+    optimiser: Annotated[Literal["adam", "muon"] | None, may_stay_open("{adam,muon}")] = None
+    """adam, or muon for the hidden layers and adam for the rest: the same error in a third of the steps (default: muon;
+    adam with paper, laptop-v1 and the published network)."""
     rate: Number = None
     """Learning rate at the start, or after the warm-up (default: the preset's)."""
     levels: Annotated[Literal["continuous", "paper"] | None, may_stay_open("{continuous,paper}")] = None
