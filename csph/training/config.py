@@ -275,6 +275,10 @@ def window_refused(model: ModelConfig, window: int) -> str:
 
 
 UNWINDOWED_STEPS = 0.55  # of a preset's steps where windows are left out: a step takes 256 ms instead of 146
+# Of `refined`: a step takes three times as long as one of `compact`; larger patches hold more whole blocks.
+REFINED_STEPS = 0.53
+REFINED_PATCHES = {"batch": 3, "crop": 24}
+ON_CPU = ("laptop", "workstation")
 # Muon and Adam, one warm-up and one cosine, weights averaged, levels over the whole range, windows where they can be
 RECIPE: dict[str, Any] = {
     "optimiser": "muon",
@@ -327,11 +331,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 def preset(name: str, model: ModelConfig, **changes: object) -> TrainConfig:
     """Return a preset's configuration with a model; `changes` that are None leave it as it is.
 
-    smoke (seconds), laptop (compact, one core, 25 minutes at the most), workstation (compact, two cores, 2 hours at the
-    most), gpu (compact, three times workstation's pixels, sensed on the GPU), paper (the published network, levels and
-    schedule), laptop-v1 (the recipe of the first models). Windows are left out where the model does not allow them, and
-    with random time offsets. Without compression, and of one-hot peaks, `paper` has the published total variation and a
-    tenth of the learning rate. `levels` may be "paper". The published network is trained by Adam with every preset.
+    smoke (seconds), laptop (one core, 25 minutes at the most), workstation (two cores, 2 hours at the most), gpu (three
+    times workstation's pixels, sensed on the GPU), paper (the published network, levels and schedule), laptop-v1 (the
+    recipe of the first models). Windows are left out where the model does not allow them, and with random time offsets.
+    A refined network has fewer steps of larger patches with laptop and workstation. Without compression, and of one-hot
+    peaks, `paper` has the published total variation and a tenth of the learning rate. `levels` may be "paper". The
+    published network is trained by Adam with every preset.
     """
     require(name in PRESETS, f"preset {name!r} is unknown, expected one of {', '.join(PRESETS)}")
     known = {item.name for item in fields(TrainConfig)}
@@ -343,8 +348,13 @@ def preset(name: str, model: ModelConfig, **changes: object) -> TrainConfig:
     values: dict[str, Any] = {"model": model, "preset": name, **PRESETS[name], **oracle, **given}
     if "optimiser" not in given and model.network not in GROWING:
         values["optimiser"] = "adam"
+    fraction = 1.0  # of the steps
     if "window" not in given and (window_refused(model, values.get("window", 0)) or values.get("time_offset_m")):
         values["window"] = 0
-        if values["window"] != PRESETS[name].get("window", 0) and "steps_per_epoch" not in given:
-            values["steps_per_epoch"] = math.ceil(UNWINDOWED_STEPS * values["steps_per_epoch"])
+        fraction = UNWINDOWED_STEPS if PRESETS[name].get("window", 0) else 1.0
+    if name in ON_CPU and model.network == "refined":
+        values |= {key: value for key, value in REFINED_PATCHES.items() if key not in given}
+        fraction *= REFINED_STEPS
+    if "steps_per_epoch" not in given and fraction != 1:
+        values["steps_per_epoch"] = math.ceil(fraction * values["steps_per_epoch"])
     return TrainConfig(**values)

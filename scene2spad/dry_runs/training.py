@@ -68,7 +68,18 @@ def dry_run(command: Train) -> dict:
 
 def plan_of(config: TrainConfig) -> dict:
     """Return what a run consists of, in the words of `config.json`."""
-    names = ("preset", "epochs", "steps_per_epoch", "batch", "crop", "rate", "schedule", "window", "precision")
+    names = (
+        "preset",
+        "epochs",
+        "steps_per_epoch",
+        "batch",
+        "crop",
+        "optimiser",
+        "rate",
+        "schedule",
+        "window",
+        "precision",
+    )
     return {name: getattr(config, name) for name in names} | {"steps": config.steps}
 
 
@@ -93,6 +104,7 @@ def step_seconds(config: TrainConfig) -> tuple[float, int]:
     """Return seconds of a training step on this machine, on random counts, and the number of parameters."""
     from csph.training.data import TrainBatch
     from csph.training.loop import DepthTraining  # and Lightning, which takes seconds to import
+    from csph.training.optimiser import make_optimiser
 
     if config.threads:
         torch.set_num_threads(config.threads)
@@ -103,12 +115,12 @@ def step_seconds(config: TrainConfig) -> tuple[float, int]:
     depth = torch.full(shape, 0.4 * bins * sensor.bin_depth_m)
     first = torch.full(shape[:1], 0 if config.window else -1)
     batch = TrainBatch(counts, depth, torch.ones(shape, dtype=torch.bool), first)
-    adam = torch.optim.Adam(module.model.parameters(), lr=config.rate, fused=True)
+    optimiser = make_optimiser(module.model, config)
 
     def step() -> None:
-        adam.zero_grad()
+        optimiser.zero_grad()
         module.loss(batch).backward()
-        adam.step()
+        optimiser.step()
 
     costs: list[Cost] = [timed(step)[1] for _ in range(1 + PILOT_STEPS)]
     return median(cost.wall_s for cost in costs[1:]), module.model.parameters_count

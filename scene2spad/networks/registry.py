@@ -103,6 +103,7 @@ class ModelSpec:
             block=self.block,
             compression=self.compression,
             full=self.full,
+            network=None if preset == "paper" else "compact",  # one for all designs, which studies compare
             layer=("int8",) if self.int8 else (),
             init=(str(begun) if begun.is_dir() else begun.name) if self.begun else None,
             sensor=TDC_SENSOR if self.tdc else "reference",
@@ -124,6 +125,7 @@ class ModelSpec:
         more += f" --init {self.plain.name}" if self.begun else ""
         tuned = f" --sensor {TDC_SENSOR} --rate {FINE_TUNE_RATE:g} --steps {FINE_TUNE_STEPS}"
         more += tuned if self.tdc else ""
+        more += "" if preset == "paper" else " --network compact"
         made = f"--preset {preset} --seed {self.seed} --set {training} --out {folder / self.name}"
         return f"scene2spad train --design {self.design}{coded}{more} {made}"
 

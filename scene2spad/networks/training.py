@@ -19,7 +19,7 @@ from csph.evaluation.methods import LEVEL_GROUPS, DepthEstimator, Evaluation, Ev
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.layer import SpatialStart
 from csph.networks.model import DepthModel, load_model
-from csph.training.config import Front, ModelConfig, Network, TrainConfig, preset
+from csph.training.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
 from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
@@ -48,7 +48,7 @@ def config_of(command: Train) -> TrainConfig:
     described = load_sensor(command.sensor)
     require(described.zones is None, f"train: sensor {command.sensor} has zones, networks are for pixels")
     sensor = described.sensor
-    network: Network = command.network or ("published" if command.preset == "paper" else "compact")
+    network = command.network or _default_network(command)
     # the published network finds the pulse in the counts by itself; ours, of few layers, is given them matched
     uncoded: dict[str, Front] = {"none": "matched" if network == "compact" else "counts", "peak": "peak"}
     front = uncoded.get(command.design, "codes")
@@ -102,6 +102,16 @@ def config_of(command: Train) -> TrainConfig:
     decay_steps = max(1, round(config.decay_steps * each / config.steps_per_epoch))
     warmup = min(config.warmup, command.steps // 10)
     return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps, warmup=warmup)
+
+
+def _default_network(command: Train) -> Network:
+    """Return the network of a preset: published with paper; refined for codes of several pixels, where training has the
+    time for it; else compact."""
+    if command.preset == "paper":
+        return "published"
+    bins, rows, columns = command.block
+    coded = command.design not in ("none", "peak") and rows * columns > 1 and bins % 16 == 0
+    return "refined" if coded and command.preset in ON_CPU else "compact"
 
 
 def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, object]]:

@@ -45,7 +45,8 @@ class Train(Long):
         may_stay_open("{compact,blockwise,refined,published,published-signed}"),
     ] = None
     """Our own (compact; blockwise sees the codes, too; refined looks at them twice), the published, or the published
-    without its final ReLU, which can die (default: the preset's)."""
+    without its final ReLU, which can die (default: published with paper; refined for blocks of several pixels with
+    laptop and workstation; else compact)."""
     sensor: str = "reference"
     """Sensor preset or sensor file (.toml), as in `sense`; with a time-to-digital converter patches are drawn through
     it."""

@@ -23,7 +23,8 @@ from render.transient.packs import write_pack
 from scene2spad.bench import network as bench
 from scene2spad.cli import main
 from scene2spad.datasets.planes import FAR_M, Plane, random_planes
-from scene2spad.networks.training import group_names
+from scene2spad.networks.training import config_of, group_names
+from scene2spad.options.networks import Train
 from spad.detection.detect import sense
 from spad.formats.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -120,6 +121,19 @@ def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
     assert set(layers) == {"Z", "confidence"}
     sure = layers["confidence"].pixels
     assert sure.shape == (16, 16) and sure.mean() == pytest.approx(median["posterior_within_3_bins"], abs=1e-6)
+
+
+def test_codes_of_several_pixels_get_the_refined_network():
+    """With the presets that have the time for it; other codes, no codes and other presets get what they had."""
+
+    def network(**options) -> str:
+        return config_of(Train(**{"preset": "laptop", **options})).model.network
+
+    assert network() == network(preset="workstation", block=(1024, 2, 2)) == "refined"
+    single = network(design="fourier", block=(1024, 1, 1))
+    assert {single, network(design="none"), network(block=(8, 4, 4), codes=4), network(preset="smoke")} == {"compact"}
+    assert network(preset="laptop-v1") == network(preset="gpu") == network(network="compact") == "compact"
+    assert network(preset="paper") == "published"
 
 
 def test_training_goes_on_from_a_model_by_name(capfd, packed, tmp_path):
