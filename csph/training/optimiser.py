@@ -74,6 +74,9 @@ class MuonAdam(torch.optim.Adam):
 
     def __init__(self, groups: Iterable[dict[str, Any]], rate: float) -> None:
         super().__init__([{"muon": False, **group} for group in groups], lr=rate, fused=True)
+        # A fused Adam divides by the scale of 16-bit losses itself, and skips steps that are no numbers: Muon needs
+        # gradients of which both is done before.
+        self._step_supports_amp_scaling = False
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]

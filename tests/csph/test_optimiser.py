@@ -96,6 +96,25 @@ def test_the_rest_is_adam():
     assert found[0] == found[1]
 
 
+def test_scaled_losses_take_the_same_step_and_infinite_ones_none():
+    """As with 16-mixed on a GPU: gradients come divided by the scale, and a step that is no number is skipped."""
+    found = []
+    for scale in (1.0, 2.0**10):
+        weights = [nn.Parameter(torch.ones(3, 3)), nn.Parameter(torch.ones(3))]
+        optimiser = MuonAdam([{"params": weights[:1], "muon": True}, {"params": weights[1:]}], 0.01)
+        scaler = torch.amp.GradScaler("cpu", init_scale=scale)
+        for factor in (1.0, float("inf")):
+            before = [weight.detach().clone() for weight in weights]
+            optimiser.zero_grad()
+            scaler.scale(factor * sum((weight**2).sum() for weight in weights)).backward()
+            scaler.step(optimiser)
+            changed = [not torch.equal(old, weight) for old, weight in zip(before, weights, strict=True)]
+            assert changed == [factor == 1.0] * 2
+            scaler.update()
+        found.append(torch.cat([weight.detach().flatten() for weight in weights]))
+    assert torch.allclose(*found, atol=1e-7)
+
+
 @pytest.mark.parametrize("network", ["compact", "blockwise", "refined"])
 def test_hidden_layers_are_muons_and_read_outs_and_codes_adams(network):
     config = preset("laptop", ModelConfig(design=CODED.design, network=network))
