@@ -276,7 +276,7 @@ def window_refused(model: ModelConfig, window: int) -> str:
 
 UNWINDOWED_STEPS = 0.55  # of a preset's steps where windows are left out: a step takes 256 ms instead of 146
 # Of `refined`: a step takes three times as long as one of `compact`; larger patches hold more whole blocks.
-REFINED_STEPS = 0.53
+REFINED_STEPS = 0.48
 REFINED_PATCHES = {"batch": 3, "crop": 24}
 ON_CPU = ("laptop", "workstation")
 # Muon and Adam, one warm-up and one cosine, weights averaged, levels over the whole range, windows where they can be

@@ -76,9 +76,9 @@ def test_a_refined_network_has_fewer_steps_of_larger_patches():
     refined = replace(CODED, network="refined")
     compact, fewer = preset("laptop", CODED), preset("laptop", refined)
     assert (fewer.batch, fewer.crop) == (3, 24) and compact.batch * compact.crop**2 < fewer.batch * fewer.crop**2
-    assert fewer.steps_per_epoch == math.ceil(0.53 * compact.steps_per_epoch)
+    assert fewer.steps_per_epoch == math.ceil(0.48 * compact.steps_per_epoch)
     long = preset("laptop", replace(refined, design=Design("learned", (1024, 2, 2), 8)))
-    assert long.window == 0 and long.steps_per_epoch == math.ceil(0.55 * 0.53 * compact.steps_per_epoch)
+    assert long.window == 0 and long.steps_per_epoch == math.ceil(0.55 * 0.48 * compact.steps_per_epoch)
     asked = preset("laptop", refined, batch=2, steps_per_epoch=7)
     assert (asked.batch, asked.crop, asked.steps_per_epoch) == (2, 24, 7)
     assert replace(preset("gpu", refined), model=CODED) == preset("gpu", CODED)
