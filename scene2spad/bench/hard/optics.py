@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from render.engine import render
@@ -95,7 +97,7 @@ def _caustic(seed: int) -> Outcome:
 
 def _corner_cube(seed: int) -> Outcome:
     scene = hard_case("corner-cube")
-    transient = render(scene, SMOOTH, seed=seed)
+    transient = render(scene, replace(SMOOTH, bounces=3), seed=seed)  # the light meets all three faces
     apex = np.array(scenes.CUBE_APEX_M)
     every = np.ones(transient.returns, bool)
     one_way = 2 * float(np.linalg.norm(apex))
