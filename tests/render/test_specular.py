@@ -276,15 +276,14 @@ def test_a_wall_lit_by_way_of_a_mirror():
 
 
 def test_bounces_limit_mirrored_light_too():
-    """Of up to two surfaces, a render has the wall lit by way of the mirror; of one it has not."""
     mirror = square((1, 0, -2), (-1, 0, 0), 5, GOOD_MIRROR)
     wall = square((0, 0, -3), (0, 0, 1), 0.9, Material(albedo=0.5))
     scene = scene_of(mirror, wall, laser=Laser("flood", cone_deg=180.0), view=camera(17, 13, 30))
     one, two = (render(scene, RenderSettings(bounces=most, grid=4, spp=4)) for most in (1, 2))
     assert set(one.bounces) == {1}
     mirrored = specular_light(TracedScene(scene), 4).samples
-    lit_by_mirror = mirrored.radiance[mirrored.bounces == 2].sum()
-    assert two.radiance[two.bounces == 2].sum() == pytest.approx(lit_by_mirror, rel=1e-3)
+    wanted = mirrored.radiance[mirrored.bounces == 2].sum()  # the wall lit by way of the mirror
+    assert two.radiance[two.bounces == 2].sum() == pytest.approx(wanted, rel=1e-3)
 
 
 def test_displaced_laser_lights_a_wall_seen_in_a_mirror():
