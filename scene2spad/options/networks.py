@@ -62,7 +62,7 @@ class Train(Long):
     crop: Pixels = None
     """Side of a patch (default: the preset's)."""
     optimiser: Annotated[Literal["adam", "muon"] | None, may_stay_open("{adam,muon}")] = None
-    """adam, or muon for the hidden layers and adam for the rest: the same error in a third of the steps (default: muon;
+    """adam, or muon for the hidden layers and adam for the rest: fewer steps from random weights (default: muon;
     adam with paper, laptop-v1 and the published network)."""
     rate: Number = None
     """Learning rate at the start, or after the warm-up (default: the preset's)."""
