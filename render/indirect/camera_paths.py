@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, Floats, UInts
-from render.indirect.glossy import glossy_of
+from render.indirect.glossy import camera_share, glossy_of
 from render.indirect.launch_layout import BLOCK, LaunchLayout, block_order, make_launch
 from render.indirect.light_vertices import (
     LightVertices,
@@ -202,6 +202,10 @@ def energy_by_bounces(
     traced = trace_paths(PathTask(world, blocks, launch, bounces, seed))
     suffixes, vertices = traced.suffixes, bounces - 2
     beyond = suffixes.own_onward.numpy() * suffixes.values.numpy().reshape(-1, dr.width(traced.batch))
+    if suffixes.ratios is not None:
+        lanes = dr.arange(UInt32, dr.width(suffixes.ratios)) % dr.width(traced.batch)
+        ratio = suffixes.ratios * dr.gather(Float, suffixes.own_ratio, lanes)
+        beyond *= camera_share(ratio).numpy().reshape(beyond.shape)
     energy = np.zeros(bounces + 1)
     near = [part.numpy() for part in (suffixes.own_value, *(n.value for n in traced.connections))]
     energy[2] = sum(part.sum(dtype=np.float64) for part in near)

@@ -6,14 +6,21 @@ where that sends the light of the laser on its way, once in ten thousand times, 
 laser that begins on the metal, in a direction that its lobe sends light to, finds the wall
 (`render.indirect.light_tracing`).
 
-Both ways sample paths C ... y x L whose last point x before the laser is such a surface. The one that begins on x keeps
+Both ways sample paths C, z1, ..., zk, L whose last point zk is such a surface. The one that begins on it keeps c, the
+other 1 - c, with
 
-    c = a / (a + b),   a = RATIO p_x(L -> y) cos_xL cos_yx |y - C|^2,   b = p_y(C -> x) cos_yC cos_xy |x - L|^2,
+    c = a / (a + b),   a / b = Z1 Z2 ... Zk,
 
-the other 1 - c: the balance heuristic (Veach 1997, eq. 9.8) for the densities of the pair x, y per area, as both ways
-sample it. p_x and p_y are the densities of all lobes of both surfaces together: what y reflects is taken as the camera
-sees it, which is exact where y is the pixel's own surface, and the same for both ways elsewhere. Whatever c is, the sum
-of both is right, as long as both take it from the same points.
+a and b the densities per area with which the two ways sample all of these points: the balance heuristic over the whole
+path (Veach 1997, eq. 9.8 and section 10.2). With p_m(v -> w) the density of all lobes of zm together, lengths d, and
+cos(v) the cosine at zm towards v,
+
+    Z1 = cos(z2) d(z1, C)^2 / (cos(C) p_1(C -> z2)),
+    Zm = p_m(z(m+1) -> z(m-1)) cos(z(m+1)) / (p_m(z(m-1) -> z(m+1)) cos(z(m-1)))   between the two ends,
+    Zk = RATIO cos(L) p_k(L -> z(k-1)) / (cos(z(k-1)) d(zk, L)^2).
+
+Zm is 1 where a path leaves a mirror. Whatever c is, the sum of both is right, as long as both take it from the same
+points.
 """
 
 from __future__ import annotations
@@ -23,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts, Vectors
+from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, UInts, Vectors
 from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, parts_of, raster_of, shape_index
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
@@ -31,6 +38,7 @@ RATIO = 1.0  # paths that begin in a polished pixel of the laser's image, for ev
 # Where SEEN_BY x SEEN_BY rays a pixel meet no polished surface there may be a sliver: the share that begins there.
 SEEN_BY, ELSEWHERE = 2, 1 / 8
 WIDEST_DEG = 60.0  # off the optical axis, how far such surfaces are looked for
+MAX_RATIO = 1e30  # of the densities of both ways
 
 
 class Glossy(NamedTuple):
@@ -52,6 +60,11 @@ def glossy_of(world: TracedScene) -> Glossy | None:
     if world.glossy is None:
         world.glossy = _look_for(world)
     return Glossy(*world.glossy) if world.glossy else None
+
+
+def has_light_paths(world: TracedScene) -> bool:
+    """Return whether paths begin at the laser, too."""
+    return glossy_of(world) is not None
 
 
 def _look_for(world: TracedScene) -> tuple[Array, ...]:
@@ -98,53 +111,76 @@ def is_glossy(world: TracedScene, si: Interactions, active: Masks) -> Array:
     return active & (dr.gather(Float, world.glossy_materials, shape_index(si), active) > 0)
 
 
-def mis_weight_camera_path(
-    world: TracedScene, y: Interactions, direction: Vectors, x: Interactions, active: Masks
-) -> Array:
-    """Return 1 - c: what a path from `y` in that direction to `x`, and on to the laser, keeps of its light.
+def camera_share(ratio: Floats) -> Array:
+    """Return 1 - c, which paths from the camera keep, of a path whose two densities have the ratio a / b."""
+    return dr.rcp(1 + finite_ratio(ratio))
 
-    Rays start a little off their points, which tell the direction badly where these are close.
-    """
+
+def light_share(ratio: Floats) -> Array:
+    """Return c, which paths from the laser keep, of a path whose two densities have the ratio a / b."""
+    return finite_ratio(ratio) * camera_share(ratio)
+
+
+def finite_ratio(ratio: Floats) -> Array:
+    """Return a ratio of densities, or a part of one, as a number that is neither infinite nor undefined."""
+    return dr.select(dr.isnan(ratio), 0, dr.clip(ratio, 0, MAX_RATIO))
+
+
+def ratio_at_laser(world: TracedScene, x: Interactions, towards: Vectors, active: Masks) -> Array:
+    """Compute the factor of a / b that the last surface `x` before the laser has; 0 where no path from the laser begins
+    on it. `towards` is the direction in which it sends the laser's light."""
     glossy = glossy_of(world)
-    if glossy is None:
-        return 1
+    assert glossy is not None
     column, row, seen = raster_of(world, world.laser, x.p)
     column, row = dr.floor(column) + Float(glossy.left), dr.floor(row) + Float(glossy.up)
     seen &= (column >= 0) & (column < Float(glossy.width)) & (row >= 0) & (row < Float(glossy.height))
     seen &= is_glossy(world, x, active)
     pixel = UInt32(dr.select(seen, row, 0)) * glossy.width + UInt32(dr.select(seen, column, 0))
-    return 1 - _light_path_weight(world, pixel, y, direction, x, seen)
+    return ratio_of_light_path(world, pixel, x, towards, seen)
 
 
-def mis_weight_light_path(
-    world: TracedScene, pixel: UInts, y: Interactions, direction: Vectors, x: Interactions, active: Masks
-) -> Array:
-    """Return c: what the path that begins in this pixel, on `x`, and goes to `y` has of that light; `direction` is the
-    way back."""
-    return _light_path_weight(world, pixel, y, direction, x, active)
-
-
-def _light_path_weight(
-    world: TracedScene, pixel: UInts, y: Interactions, direction: Vectors, x: Interactions, active: Masks
-) -> Array:
-    """Compute the weight c of a path from the laser, as in the module's text; 0 where no path from the laser samples
-    the pair."""
-    to_x, to_laser, to_eye = dr.normalize(direction), world.laser - x.p, world.eye - y.p
-    light, eye = dr.normalize(to_laser), dr.normalize(to_eye)
+def ratio_of_light_path(world: TracedScene, pixel: UInts, x: Interactions, towards: Vectors, active: Masks) -> Array:
+    """Compute `ratio_at_laser` of a path that began in this pixel of the laser's image."""
     glossy = glossy_of(world)
     assert glossy is not None
-    begun = dr.gather(Float, glossy.sampling_density, pixel, active) * RATIO
-    begun *= dr.abs(dr.dot(x.n, light) * dr.dot(y.n, to_x)) * dr.squared_norm(to_eye)
-    begun *= _density(x, light, -to_x, active)
-    ended = dr.abs(dr.dot(y.n, eye) * dr.dot(x.n, to_x)) * dr.squared_norm(to_laser)
-    ended *= _density(y, eye, to_x, active)
-    weight = begun / (begun + ended)
-    return dr.select(active & (begun > 0) & dr.isfinite(weight), weight, 0)
+    to_laser = world.laser - x.p
+    light = dr.normalize(to_laser)
+    begun = dr.gather(Float, glossy.sampling_density, pixel, active) * RATIO * dr.abs(dr.dot(x.n, light))
+    begun *= _density(x, x.to_local(light), x.to_local(towards), active)
+    return dr.select(active, begun / (dr.abs(dr.dot(x.n, towards)) * dr.squared_norm(to_laser)), 0)
+
+
+def ratio_at_camera(
+    world: TracedScene, y: Interactions, towards: Vectors, active: Masks, density: Floats = None
+) -> Array:
+    """Compute the factor of a / b that the camera's own surface `y` has, from which a path goes on `towards` there.
+    `density` is that of this direction as the camera's paths sample it, if it is known."""
+    to_eye = world.eye - y.p
+    eye = dr.normalize(to_eye)
+    if density is None:
+        density = _density(y, y.to_local(eye), y.to_local(towards), active)
+    return dr.abs(dr.dot(y.n, towards)) * dr.squared_norm(to_eye) / (dr.abs(dr.dot(y.n, eye)) * density)
+
+
+def reversal(si: Interactions, out: Vectors, density: Floats, active: Masks) -> Array:
+    """Compute the density of the way back over that of the way out, both per projected solid angle: the factor of a / b
+    that a surface between the two ends has on a path from the camera; on one from the laser it divides.
+
+    The way came from `si.wi` and goes `out`, which was sampled with that `density`; both in the shading frame. 1 for
+    diffuse surfaces.
+    """
+    return _density(si, out, si.wi, active) * dr.abs(out.z) / (density * dr.abs(si.wi.z))
+
+
+def reversal_of_sample(si: Interactions, sample: LobeSamples, active: Masks) -> Array:
+    """Compute `reversal` of a sampled direction; 1 of a mirror-like lobe, which no density tells."""
+    smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    return dr.select(smooth, 1, reversal(si, sample.wo, sample.pdf, active & ~smooth))
 
 
 def _density(si: Interactions, seen_from: Vectors, towards: Vectors, active: Masks) -> Array:
     """Compute the density per solid angle with which the lobes of a surface, seen from one direction, sample
-    another."""
+    another; both in its shading frame."""
     seen = interaction_from_parts(parts_of(si))
-    seen.wi = si.to_local(seen_from)
-    return si.bsdf().pdf(mi.BSDFContext(), seen, si.to_local(towards), active)
+    seen.wi = seen_from
+    return si.bsdf().pdf(mi.BSDFContext(), seen, towards, active)

@@ -23,7 +23,17 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, Generators, UInts
-from render.indirect.glossy import RATIO, glossy_of, is_glossy, laser_rays, mis_weight_light_path
+from render.indirect.glossy import (
+    RATIO,
+    finite_ratio,
+    glossy_of,
+    is_glossy,
+    laser_rays,
+    light_share,
+    ratio_at_camera,
+    ratio_of_light_path,
+    reversal_of_sample,
+)
 from render.scene.rays import (
     first_opaque,
     in_beam,
@@ -89,7 +99,7 @@ def _trace_launch(
     key = mi.sample_tea_32(lane ^ keys[0], keys[1])
     random = mi.PCG32(initstate=mi.UInt64(key[0]), initseq=mi.UInt64(key[1]))
     si, path, sample, value, active = _sample_first_vertex(world, pixel, number, batch, keys, random)
-    begun, start = Bool(True), mi.SurfaceInteraction3f(si)
+    begun, start, ratio = Bool(True), mi.SurfaceInteraction3f(si), dr.zeros(Float, lanes)
     slot = dr.zeros(UInt32, lanes)
     while active:
         towards, before = spawn(si, si.to_world(sample.wo)), mi.Point3f(si.p)
@@ -98,7 +108,7 @@ def _trace_launch(
         path += leg
         value *= transmission
         if begun:
-            value *= mis_weight_light_path(world, pixel, si, -towards.d, start, active)
+            ratio = finite_ratio(ratio_of_light_path(world, pixel, start, towards.d, active))
             begun = Bool(False)
         target, seen = pixel_of(world, si.p)
         # the camera has to see it; the laser need not shine on it
@@ -107,6 +117,7 @@ def _trace_launch(
         out = si.to_local((world.eye - si.p) / distance)
         light = si.bsdf().eval(mi.BSDFContext(), si, out, active)[0] * value
         light *= passed / dr.square(distance)
+        light *= light_share(ratio * ratio_at_camera(world, si, -towards.d, active))
         light *= shading_ratio(si, si.wi) / shading_ratio(si, out) * (distance / local.z) ** 3
         light = dr.select(active & seen & dr.isfinite(light), dr.maximum(light, 0), 0)
         dr.scatter(targets, target, slot * stride + place, active)
@@ -120,6 +131,7 @@ def _trace_launch(
         active &= (through > 0) & (random.next_float32() < survive)
         value *= through / survive * shading_ratio(si, si.wi) / shading_ratio(si, sample.wo)
         active &= dr.isfinite(value)
+        ratio = finite_ratio(ratio / reversal_of_sample(si, sample, active))
     return targets, paths, values
 
 

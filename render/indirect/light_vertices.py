@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, UInts, Vectors
-from render.indirect.glossy import mis_weight_camera_path
+from render.indirect.glossy import has_light_paths, ratio_at_laser
 from render.scene.rays import first_opaque, interaction_from_parts, laser_light, parts_of, segment, to_world
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
@@ -171,8 +171,10 @@ def connect_to_light_vertex(
     active: Masks,
     copies: Callable[[Floats], Floats] = lambda path: 1,
     connections: int = 1,
-) -> tuple[Array, Array, Array]:
-    """Connect a surface to one light vertex: light that it reflects diffusely from there, path to the laser, direction.
+) -> tuple[Array, Array, Array, Array]:
+    """Connect a surface to one light vertex: light that it reflects diffusely from there, path to the laser, direction,
+    and `ratio_at_laser` of the light vertex, with whose share the light is still to be weighted; None without light
+    paths.
 
     The light goes towards `si.wi`. It is divided by the density of all `connections` of this kind together with as many
     lobes as `copies` says of the path.
@@ -194,5 +196,6 @@ def connect_to_light_vertex(
     path = leg + dr.gather(Float, light_vertices.path, point, active)
     density = dr.gather(Float, light_vertices.density, point, active) * connections
     _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))
-    light = dr.select(active, value * passed / both * mis_weight_camera_path(world, si, direction, end, active), 0)
-    return dr.select(dr.isfinite(light), light, 0), path, direction
+    light = dr.select(active, value * passed / both, 0)
+    ratio = ratio_at_laser(world, end, -direction, active) if has_light_paths(world) else None
+    return dr.select(dr.isfinite(light), light, 0), path, direction, ratio

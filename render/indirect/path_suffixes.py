@@ -5,7 +5,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Generators, Interactions, LobeSamples, Masks, UInts, Vectors
-from render.indirect.glossy import mis_weight_camera_path
+from render.indirect.glossy import (
+    camera_share,
+    finite_ratio,
+    has_light_paths,
+    ratio_at_camera,
+    ratio_at_laser,
+    reversal,
+    reversal_of_sample,
+)
 from render.indirect.light_vertices import (
     LightVertices,
     Scattered,
@@ -19,6 +27,8 @@ from render.indirect.primary_vertices import PrimaryVertices, sampling_technique
 from render.scene.rays import first_opaque, kept, laser_light, sample_bsdf, shape_index, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
+MIN_REVERSAL = 1e-12  # of x2, by which is divided
+
 
 class PathSuffixes(NamedTuple):
     """x2 and beyond.
@@ -29,6 +39,8 @@ class PathSuffixes(NamedTuple):
     reusable, onward    whether the block may use the laser's light at x2, and what lies beyond
     own_value           what the pixel itself gets of the laser's light at x2
     own_onward          factor of what lies beyond: `values` with their `paths` from x2 to the laser, `length` of them
+    own_ratio, ratios   where light paths are traced: factors that x1 with x2, and what lies beyond, have in the ratio
+                        of densities that decides what these take of such a value (`render.indirect.glossy`)
     soonest_m           the shortest of these paths and `laser_path` that carries light
     """
 
@@ -46,19 +58,22 @@ class PathSuffixes(NamedTuple):
     own_transmission: Floats
     own_value: Floats
     own_onward: Floats
+    own_ratio: Floats
     values: Floats
     paths: Floats
+    ratios: Floats
     length: UInts
     soonest_m: Floats
 
 
 class Slots(NamedTuple):
-    """Memory for the light of the path vertices x3, x4, ...: lanes; radiances and paths, slots x lanes; and the numbers
-    of lanes and slots, as arrays."""
+    """Memory for the light of the path vertices x3, x4, ...: lanes; radiances, paths, and ratios or None, slots x
+    lanes; and the numbers of lanes and slots, as arrays."""
 
     lane: UInts
     values: Floats
     paths: Floats
+    ratios: Floats
     lanes: UInts
     count: UInts
 
@@ -67,9 +82,11 @@ def slots_for(world: TracedScene, light_vertices: LightVertices | None, lanes: i
     """Return empty slots for so many vertices: a vertex has one of its own, and one before it if the last one was
     joined."""
     count = (2 if _connects_suffix(world, light_vertices) else 1) * vertices
-    lane, values, paths = dr.arange(UInt32, lanes), *(dr.zeros(Float, lanes * max(count, 1)) for _ in range(2))
-    dr.make_opaque(lane, values, paths)  # of another length at every call
-    return Slots(lane, values, paths, dr.opaque(UInt32, lanes), dr.opaque(UInt32, count))
+    kinds = 3 if has_light_paths(world) else 2
+    lane, *kept_of_each = dr.arange(UInt32, lanes), *(dr.zeros(Float, lanes * max(count, 1)) for _ in range(kinds))
+    dr.make_opaque(lane, *kept_of_each)  # of another length at every call
+    values, paths, ratios = (*kept_of_each, None)[:3]
+    return Slots(lane, values, paths, ratios, dr.opaque(UInt32, lanes), dr.opaque(UInt32, count))
 
 
 def _connects_suffix(world: TracedScene, light_vertices: LightVertices | None) -> bool:
@@ -119,15 +136,20 @@ def trace_suffixes(
         )
     # what is reflected by a mirror in the first place cannot be read backwards
     readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    value *= mis_weight_camera_path(world, x1, direction, si, readable)
-    value = dr.select(alive & dr.isfinite(value), own * value, 0)
     onward, onward_weight = sample_bsdf(si, random, alive)
     onward_weight = onward_weight[0]
+    own_ratio = at_x2 = None
+    if has_light_paths(world):
+        own_ratio = dr.select(readable, ratio_at_camera(world, x1, direction, readable, sample.pdf), 0)
+        value *= camera_share(own_ratio * ratio_at_laser(world, si, -direction, readable))
+        at_x2 = dr.maximum(finite_ratio(reversal_of_sample(si, onward, alive)), MIN_REVERSAL)
+        own_ratio = finite_ratio(own_ratio * at_x2)
+    value = dr.select(alive & dr.isfinite(value), own * value, 0)
     connectable = Bool(alive)
     if reused and world.has_rough_coats:
         connectable &= dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
     scale = dr.select(onward_weight > 0, onward_weight, 1)
-    state = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, connectable, readable)
+    state = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, connectable, at_x2)
     soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
     light = _trace_suffix(world, task, state, alive, soonest)
     reusable = alive & (dr.gather(Float, world.allows_reuse, shape_index(si), alive) > 0)
@@ -147,6 +169,7 @@ def trace_suffixes(
         dr.select(alive, passed, 0),
         value,
         own * scale,
+        own_ratio,
         *light,
     )
 
@@ -155,8 +178,8 @@ class _SuffixState(NamedTuple):
     """Current vertices of paths and their continuation: a sample of the surface's lobes and its weight.
 
     `throughput` is the factor of light that comes from there, `throughput_at_vertex` that of light reflected on the
-    spot, reflectance counted in that light; `connectable` says whether there is such, `readable` whether other paths
-    bring a part of it (`glossy`).
+    spot, reflectance counted in that light; `connectable` says whether there is such. `reversal` is that of the sample,
+    which is no part of the ratios beyond.
     """
 
     si: Interactions
@@ -165,30 +188,35 @@ class _SuffixState(NamedTuple):
     throughput: Floats
     throughput_at_vertex: Floats
     connectable: Masks
-    readable: Masks
+    reversal: Floats
 
 
 @dr.syntax
 def _trace_suffix(
     world: TracedScene, task: SuffixTask, state: _SuffixState, active: Masks, soonest: Floats
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, ...]:
     """Light of x3, x4, ... that goes to x2 along the path, divided by the density of the path after x2.
 
-    Returns radiances and path lengths from x2 to the laser, in their slots; how many slots each lane has filled, and
-    the shortest path.
+    Returns radiances, path lengths from x2 to the laser, and ratios, in their slots; how many slots each lane has
+    filled, and the shortest path.
     """
     batch, pixel, random = task.batch, task.pixel, task.random
     light_vertices: Array = task.light_vertices  # None where nothing is connected
     lanes, connecting = dr.width(pixel), _connects_suffix(world, light_vertices)
-    lane, values, paths, stride, last = task.slots
+    with_light_paths = has_light_paths(world)
+    lane, values, paths, ratios, stride, last = task.slots
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
     si, sample = mi.SurfaceInteraction3f(state.si), mi.BSDFSample3f(state.sample)
     weight, connectable = Float(state.weight), Bool(state.connectable)
     throughput, throughput_at_vertex = Float(state.throughput), Float(state.throughput_at_vertex)
     active = Bool(active) & (slot < last)
+    # factors of the vertices between x2 and the current one, of the current one, and what a connection leaves out
+    ratio, step, given = dr.full(Float, 1, lanes), dr.full(Float, 1, lanes), dr.full(Float, 1, lanes)
+    if dr.hint(with_light_paths, mode="scalar"):
+        given *= state.reversal
     while active:
         if dr.hint(connecting, mode="scalar"):
-            light, leg, _ = connect_to_light_vertex(
+            light, leg, direction, end = connect_to_light_vertex(
                 world,
                 si,
                 light_vertices,
@@ -197,6 +225,10 @@ def _trace_suffix(
             )
             light *= throughput_at_vertex
             _put(values, paths, slot * stride + lane, light, path + leg, active)
+            if dr.hint(with_light_paths, mode="scalar"):
+                local = si.to_local(direction)
+                back = reversal(si, local, si.bsdf().pdf(mi.BSDFContext(), si, local, active), active)
+                dr.scatter(ratios, finite_ratio(ratio * back / given * end), slot * stride + lane, active)
             soonest = dr.select(light > 0, dr.minimum(soonest, path + leg), soonest)
             slot += 1
         active &= weight > 0
@@ -211,23 +243,28 @@ def _trace_suffix(
             light *= dr.select(
                 connectable, mis_weight_sampled(world, before, Scattered(sample, weight), si, density, 1, active), 1
             )
-        light *= mis_weight_camera_path(world, before, towards.d, si, active & state.readable)
         throughput_at_vertex = throughput * passed
         light = dr.select(dr.isfinite(light), throughput_at_vertex * light, 0)
         _put(values, paths, slot * stride + lane, light, path + leg, active)
+        if dr.hint(with_light_paths, mode="scalar"):
+            ratio, given = finite_ratio(ratio * step), Float(1)
+            end = ratio_at_laser(world, si, -towards.d, active)
+            dr.scatter(ratios, finite_ratio(ratio * end), slot * stride + lane, active)
         soonest = dr.select(active & (light > 0), dr.minimum(soonest, path + leg), soonest)
         slot += 1
         active &= slot < last
         sample, again = sample_bsdf(si, random, active)
         weight = again[0]
         throughput = throughput_at_vertex * weight
+        if dr.hint(with_light_paths, mode="scalar"):
+            step = finite_ratio(reversal_of_sample(si, sample, active))
         # Russian roulette: paths that carry little end early, the others carry their energy on
         survive = dr.clip(dr.select(weight > 0, throughput, throughput_at_vertex), 0.05, 0.95)
         active &= (throughput_at_vertex > 0) & (random.next_float32() < survive)
         throughput /= survive
         throughput_at_vertex /= survive
         connectable = Bool(active)
-    return values, paths, slot, soonest
+    return values, paths, ratios, slot, soonest
 
 
 def _put(values: Floats, paths: Floats, slot: UInts, light: Floats, path: Floats, active: Masks) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts, Vectors
+from render.indirect.glossy import camera_share, ratio_at_camera
 from render.indirect.launch_layout import BLOCK
 from render.indirect.light_vertices import LightVertices, connect_to_light_vertex, is_wide, light_vertex_index
 from render.indirect.path_space_filter import Point
@@ -59,7 +60,7 @@ def connect_primary_vertices(
     if light_vertices is None:
         return ()
     for number in range(connections):
-        light, path, direction = connect_to_light_vertex(
+        light, path, direction, ratio = connect_to_light_vertex(
             world,
             primary.si,
             light_vertices,
@@ -68,6 +69,8 @@ def connect_primary_vertices(
             lambda path: sampling_techniques(primary, path),
             connections,
         )
+        if ratio is not None:
+            light *= camera_share(ratio * ratio_at_camera(world, primary.si, direction, primary.valid))
         found.append(Connection(light * primary.transmission, path, direction))
     return tuple(found)
 

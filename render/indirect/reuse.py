@@ -17,18 +17,23 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from render.backend.drjit_types import Array, Floats, Masks, UInts, Vectors
 from render.indirect.accumulators import IndirectAccumulator
-from render.indirect.camera_paths import PathBatch, PathTask, trace_paths
-from render.indirect.glossy import mis_weight_camera_path
-from render.indirect.launch_layout import BLOCK, LaunchLayout
+from render.indirect.camera_paths import PathBatch
+from render.indirect.glossy import (
+    camera_share,
+    finite_ratio,
+    has_light_paths,
+    ratio_at_camera,
+    ratio_at_laser,
+    reversal,
+)
+from render.indirect.launch_layout import BLOCK
 from render.indirect.light_vertices import diffuse_fraction, mis_weight_bsdf
 from render.indirect.path_space_filter import UNIT_WEIGHT, ArrivingLight, PathSpaceFilter
 from render.indirect.primary_vertices import reuses_early_paths
-from render.scene.rays import interaction_from_parts, parts_of, segment
-from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
+from render.scene.rays import interaction_from_parts, parts_of, segment, spawn
+from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 # Of one launch, 30 and 75 MB in its course.
 CONNECTIONS_PER_LAUNCH = 3 << 18  # connections
@@ -69,94 +74,6 @@ def _weight(paths: PathBatch, sums: IndirectAccumulator) -> Array:
     return UInt32(UNIT_WEIGHT * dr.gather(Float, sums.scale, paths.primary.receiver) + 0.5)
 
 
-def noise_of_paths(
-    world: TracedScene,
-    pixels: np.ndarray,
-    launch: LaunchLayout,
-    bounces: int,
-    seed: int,
-    limit: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sum squared contributions of a block's sample to the pixels of the block, own and reused.
-
-    Histograms of paths that fall into different bins have this variance. `limit`: what a path may add to each pixel.
-    """
-    most = None if limit is None else upload(Float, limit)
-    paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, reuses_paths=True))
-    own, alone, reused = (_Squares(most) for _ in range(3))
-    lanes = own_lanes(paths)
-    add_lanes(lanes._replace(early_m=Float(0)), paths, own, own=True)
-    add_lanes(lanes, paths, alone, own=True)
-    add_lanes(pair_lanes(world, paths, _all_pairs(dr.width(paths.batch))), paths, reused, own=False)
-    return own.by_block(BLOCK), alone.by_block(BLOCK) + reused.by_block(BLOCK**2)
-
-
-def noise_of_filtered_paths(
-    world: TracedScene,
-    pixels: np.ndarray,
-    launch: LaunchLayout,
-    bounces: int,
-    seed: int,
-    from_m: float,
-    limit: np.ndarray | None = None,
-) -> np.ndarray:
-    """Return the same of filtered light: what is later than `from_m` behind direct light is read from regions, whose
-    area, and with it the number of paths in them, grows with the square of its excess path."""
-    start, most = dr.opaque(Float, from_m), None if limit is None else upload(Float, limit)
-    paths = trace_paths(PathTask(world, pixels, launch, bounces, seed, from_m=start))
-    primary: Array = paths.primary
-    own = _Squares(most, primary.path + primary.late_m, start, primary.point.reflectance > 0)
-    add_lanes(own_lanes(paths), paths, own, own=True)
-    noise = own.by_block(BLOCK)
-    pairs = select_pairs(paths, reuses_paths=False, early=reuses_early_paths(world))
-    if pairs is not None:
-        early = _Squares(most)
-        add_lanes(pair_lanes(world, paths, pairs), paths, early, own=False)
-        block = dr.gather(UInt32, pairs.suffix, dr.arange(UInt32, dr.width(pairs.suffix) // BLOCK) * BLOCK) // BLOCK
-        np.add.at(noise, block.numpy(), early.by_block(BLOCK))
-    return noise
-
-
-class _Squares:
-    """In place of `IndirectAccumulator`: the sum of squares of what every lane adds; with `from_m`, late light that a
-    filter takes counts as little as its noise.
-
-    Not a dataclass: Dr.Jit would take its fields for variables of a loop.
-    """
-
-    def __init__(self, limit: Floats = None, late_m: Floats = None, from_m: Floats = None, taken: Masks = None) -> None:
-        self._limit, self._late_m, self._from_m, self._taken = limit, late_m, from_m, taken
-        self._lanes: Floats = None
-
-    def clamped(
-        self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks, adding: Masks
-    ) -> Array:
-        """Return radiance of one path, no more than it may add."""
-        if self._limit is None:
-            return radiance
-        limit = dr.gather(Float, self._limit, pixel, active)
-        return dr.select(dr.isfinite(radiance), dr.minimum(radiance, limit), radiance)
-
-    def add(self, pixel: UInts, batch: UInts, path: Floats, radiance: Floats, active: Masks) -> Array:
-        """Compute the square of an added radiance."""
-        return dr.select(active & dr.isfinite(radiance), dr.square(radiance), 0)
-
-    def filtered(self, path: Floats, radiance: Floats, diffuse: Masks) -> Array:
-        """Return radiance of one path; what a filter takes, over the root of the number of pixels in a region."""
-        if self._from_m is None:
-            return radiance
-        behind_m = dr.maximum(path - self._late_m, 0)
-        return radiance / dr.select(diffuse & self._taken, 1 + behind_m / self._from_m, 1)
-
-    def add_total(self, pixel: UInts, batch: UInts, total: Floats) -> None:
-        """Keep every lane's sum."""
-        self._lanes = total
-
-    def by_block(self, size: int) -> np.ndarray:
-        """Sum the squares over groups of `size` lanes each."""
-        return self._lanes.numpy().astype(np.float64).reshape(-1, size).sum(axis=1)
-
-
 class _Pairs(NamedTuple):
     """Primary vertex and suffix of every pair, those of one suffix together, and which group of BLOCK that is; its
     number, and which suffixes were `chosen` (None: all)."""
@@ -175,14 +92,15 @@ def _pairs_of(number: UInts, chosen: UInts = None) -> _Pairs:
     return _Pairs(suffix // BLOCK * BLOCK + number % BLOCK, suffix, group, number, chosen)
 
 
-def _all_pairs(lanes: int) -> _Pairs:
+def all_pairs(lanes: int) -> _Pairs:
+    """Return the pairs of every primary vertex and every suffix of its block."""
     return _pairs_of(dr.arange(UInt32, lanes * BLOCK))
 
 
 def select_pairs(paths: PathBatch, *, reuses_paths: bool, early: bool) -> _Pairs | None:
     """Select the pairs of primary vertex and suffix that may have light for each other; None where there are none."""
     if reuses_paths:
-        return _all_pairs(dr.width(paths.batch))
+        return all_pairs(dr.width(paths.batch))
     if not early:
         return None
     chosen = dr.compress(_early(paths))
@@ -193,7 +111,7 @@ def select_pairs(paths: PathBatch, *, reuses_paths: bool, early: bool) -> _Pairs
 
 def _early(paths: PathBatch) -> Array:
     """Return whether a suffix may carry light that is early to any primary vertex of its block."""
-    primary, suffixes, pairs = paths.primary, paths.suffixes, _all_pairs(dr.width(paths.batch))
+    primary, suffixes, pairs = paths.primary, paths.suffixes, all_pairs(dr.width(paths.batch))
     x1, x2 = (
         dr.gather(mi.Point3f, si.p, index) for si, index in ((primary.si, pairs.vertex), (suffixes.si, pairs.suffix))
     )
@@ -222,11 +140,13 @@ class _Ends(NamedTuple):
 
 class _Connections(NamedTuple):
     """Connections of every pair: leg x1 to x2 [m], pixel radiance of x2's laser light and factor of the light from
-    beyond x2, both before division by a density; and the sums of the sampling densities over each group."""
+    beyond x2, both before division by a density; the ratio of x1 with x2 or None; and the sums of the sampling
+    densities over each group."""
 
     leg: Floats
     value: Floats
     onward: Masks
+    ratio: Floats
     density: Floats
     onward_density: Array
 
@@ -238,7 +158,8 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
     reusable = dr.gather(Bool, ends.reusable, suffix) & dr.gather(Bool, ends.allows_reuse, vertex)
     si1 = dr.gather(mi.SurfaceInteraction3f, interaction_from_parts(ends.si1), vertex, reusable)
     si2 = dr.gather(mi.SurfaceInteraction3f, interaction_from_parts(ends.si2), suffix, reusable)
-    offset = si2.p - si1.p
+    # from where a ray to x2 begins, a little off x1: beside it, that is another direction than from x1
+    offset = si2.p - spawn(si1, si2.p - si1.p).o
     distance2 = dr.squared_norm(offset)
     direction = offset * dr.rsqrt(distance2)
     passed, leg = segment(world, si1, si2.p, reusable)
@@ -267,23 +188,28 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
             dr.gather(Float, ends.density, suffix, active),
             BLOCK,
         )
-    value2 *= mis_weight_camera_path(world, si1, direction, si2, active)
+    ratio = None
+    if has_light_paths(world):
+        ratio = ratio_at_camera(world, si1, direction, active, density1)
+        value2 *= camera_share(ratio * ratio_at_laser(world, si2, -direction, active))
+        ratio = finite_ratio(ratio * reversal(si2, onward, density3, going))
     # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
     density = dr.select(active & (value1[0] > 0), density1 * area, 0)
     onward_density = dr.select(going & (value3[0] > 0), density * density3, 0)
     value = dr.select(active, reach * value2 * irradiance, 0)
     onward = dr.select(going, reach * value3[0], 0)
-    dr.eval(leg, value, onward, density, onward_density)
-    return leg, value, onward, dr.block_sum(density, BLOCK), dr.block_sum(onward_density, BLOCK)
+    dr.eval(leg, value, onward, ratio, density, onward_density)
+    return leg, value, onward, ratio, dr.block_sum(density, BLOCK), dr.block_sum(onward_density, BLOCK)
 
 
 class _Weights(NamedTuple):
     """Weighted connections of every pair: leg from x1 to x2 [m], radiance of x2's laser light, factor of the light from
-    beyond x2."""
+    beyond x2, and the ratio of x1 with x2 or None."""
 
     leg: Floats
     first: UInts
     onward: Masks
+    ratio: Floats
 
 
 def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
@@ -297,9 +223,9 @@ def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
     )
     dr.eval(pairs.number)
     made = _Connections(*world.recordings.call(world, "pairs", _connect, pairs.number, pairs.chosen, *ends))
-    density, onward_density = (dr.gather(Float, total, pairs.group) for total in made[3:])
+    density, onward_density = (dr.gather(Float, total, pairs.group) for total in made[4:])
     first = dr.select(density > 0, made.value / density, 0)
-    return _Weights(made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0))
+    return _Weights(made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0), made.ratio)
 
 
 def pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
@@ -314,6 +240,7 @@ def pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
         dr.gather(Float, primary.early_m, pairs.vertex),
         weights.first,
         weights.onward,
+        weights.ratio,
     )
 
 
@@ -330,12 +257,14 @@ def own_lanes(paths: PathBatch) -> _Lanes:
         primary.early_m,
         suffixes.own_value,
         suffixes.own_onward,
+        suffixes.own_ratio,
     )
 
 
 class _Lanes(NamedTuple):
     """Contributions of lanes: pixel and batch; suffix; paths from camera to x1 and on to x2; path from the laser up to
-    which light is reused; radiance of x2's laser light, factor of the light from beyond x2."""
+    which light is reused; radiance of x2's laser light, factor of the light from beyond x2; the ratio of x1 with x2, or
+    None without light paths."""
 
     receiver: UInts
     batch: UInts
@@ -345,6 +274,7 @@ class _Lanes(NamedTuple):
     early_m: Floats
     first: UInts
     onward: Masks
+    ratio: Floats
 
 
 @dr.syntax
@@ -358,7 +288,7 @@ def add_lanes(
     own: bool,
 ) -> None:
     """Add the light of lanes to sums; `own`: that of a pixel's own path, connected at its first vertices too."""
-    receiver, batch, suffix, path1, leg, early_m, first, onward = lanes
+    receiver, batch, suffix, path1, leg, early_m, first, onward, ratio = lanes
     connections, suffixes = paths.connections, paths.suffixes
     laser_path, last = (dr.gather(type(c), c, suffix) for c in (suffixes.laser_path, suffixes.length))
     stride = dr.opaque(UInt32, dr.width(paths.batch))
@@ -370,7 +300,10 @@ def add_lanes(
     while going:
         beyond = going & (step > connection_count)
         slot = (step - 1 - connection_count) * stride + suffix
-        radiance = dr.select(beyond, onward * dr.gather(Float, suffixes.values, slot, beyond), first)
+        later = onward * dr.gather(Float, suffixes.values, slot, beyond)
+        if dr.hint(ratio is not None, mode="scalar"):
+            later *= camera_share(ratio * dr.gather(Float, suffixes.ratios, slot, beyond))
+        radiance = dr.select(beyond, later, first)
         path = leg + dr.select(beyond, dr.gather(Float, suffixes.paths, slot, beyond), laser_path)
         if dr.hint(own, mode="scalar"):
             towards, diffuse = suffixes.direction, suffixes.diffuse

@@ -8,8 +8,9 @@ import numpy as np
 
 from render.clamping import Clamp
 from render.indirect.launch_layout import BLOCK, make_launch
+from render.indirect.path_noise import noise_of_filtered_paths, noise_of_paths
 from render.indirect.path_space_filter import GATHER_POINTS, Octaves
-from render.indirect.reuse import CONNECTIONS_PER_LAUNCH, noise_of_filtered_paths, noise_of_paths
+from render.indirect.reuse import CONNECTIONS_PER_LAUNCH
 from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, MIN_SPP
 
