@@ -26,7 +26,7 @@ from render.error import (
 from render.indirect.integrator import image_cells
 from render.indirect.path_cells import coarsened
 from render.indirect.probe import ProbePixels
-from render.indirect.schedule import Schedule
+from render.indirect.schedule import Schedule, reallocated
 from render.pipeline import (
     HOPELESS,
     PROPOSAL,
@@ -52,10 +52,10 @@ from scenes.random_streams import Stream
 log = logging.getLogger(__name__)
 
 AMBIENT_BOUNCES = 16  # most paths end long before, by chance
-# paths traced on top are at most this many times those traced before; filtered light has no pilot
-MAX_MORE, MAX_MORE_FILTERED = 3.0, 15.0
+# Paths traced on top are at most so many times those traced before, pass by pass; filtered light has no pilot.
+MAX_MORE, MAX_MORE_FILTERED, MAX_MORE_HOPELESS = (3.0, 1.0), (15.0, 15.0, 15.0), 1.0
 CLEAR = 3  # standard deviations above which a bias is believed
-MAX_FILTERED_PASSES, MIN_ALLOWED = 3, 0.25
+MIN_ALLOWED = 0.25
 
 
 def render(
@@ -124,8 +124,8 @@ def _traced_to_target(
     filtered = plan.filter and (traced.schedule is None or traced.schedule.filter_octaves is not None)
     plan = replace(plan, spp=traced.spp, filter=filtered, reasons=(*plan.reasons, *traced.reasons))
     error = estimated_error(world, plan, settings, traced, checked)
-    for number in range(MAX_FILTERED_PASSES if plan.filter else 1):
-        more = additional_schedule(world, plan, settings, traced, error)
+    for number, most in enumerate(MAX_MORE_FILTERED if plan.filter else MAX_MORE):
+        more = additional_schedule(world, plan, settings, traced, error, most)
         if more is None:
             break
         extra = MoreSamples(more, derived_seed(seed, Stream.MORE, 0, number), checked)
@@ -150,10 +150,14 @@ def planned(world: TracedScene, settings: RenderSettings, seed: int = 0) -> Plan
 
 
 def additional_schedule(
-    world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate
+    world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate, most: float
 ) -> Schedule | None:
-    """Return the schedule of extra samples if a planned render misses its target, else None. A short pilot sees few of
-    the rare bright paths and underestimates the variance."""
+    """Return the schedule of extra samples if a planned render misses its target, else None: at most so many times
+    those before.
+
+    A short pilot sees few of the rare bright paths and underestimates the variance. Where as many as may be spent would
+    still miss the target, they go where the noise is.
+    """
     if settings.spp is not None or traced.schedule is None or traced.indirect is None or plan.target <= 0:
         return None
     batches = traced.schedule.batches
@@ -168,10 +172,12 @@ def additional_schedule(
     left = most_spp(settings)[0] / traced.schedule.cost - 1
     needed = error.monte_carlo**2 / allowed - 1
     if needed > HOPELESS and not plan.filter:  # filtered light begins with few paths, whatever it needs
-        return None
-    factor = min(needed, MAX_MORE_FILTERED if plan.filter else MAX_MORE, left)
+        most = min(most, MAX_MORE_HOPELESS)
+    factor = min(needed, most, left)
     if factor <= 0:
         return None
+    if factor < needed and not plan.filter:
+        return reallocated(traced.schedule, traced.indirect.noise, 1 / (1 + needed), factor)
     rounds = np.ceil(traced.schedule.spp * factor / batches).astype(np.int64) * batches
     more = traced.schedule._replace(spp=rounds)
     if plan.filter:

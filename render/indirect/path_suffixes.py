@@ -138,7 +138,7 @@ def trace_suffixes(
     readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     onward, onward_weight = sample_bsdf(si, random, alive)
     onward_weight = onward_weight[0]
-    own_ratio = at_x2 = None
+    own_ratio, at_x2 = None, Float(1)
     if has_light_paths(world):
         own_ratio = dr.select(readable, ratio_at_camera(world, x1, direction, readable, sample.pdf), 0)
         value *= camera_share(own_ratio * ratio_at_laser(world, si, -direction, readable))
@@ -203,32 +203,21 @@ def _trace_suffix(
     batch, pixel, random = task.batch, task.pixel, task.random
     light_vertices: Array = task.light_vertices  # None where nothing is connected
     lanes, connecting = dr.width(pixel), _connects_suffix(world, light_vertices)
-    with_light_paths = has_light_paths(world)
-    lane, values, paths, ratios, stride, last = task.slots
+    lane, stride, last = task.slots.lane, task.slots.lanes, task.slots.count
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
     si, sample = mi.SurfaceInteraction3f(state.si), mi.BSDFSample3f(state.sample)
     weight, connectable = Float(state.weight), Bool(state.connectable)
     throughput, throughput_at_vertex = Float(state.throughput), Float(state.throughput_at_vertex)
     active = Bool(active) & (slot < last)
     # factors of the vertices between x2 and the current one, of the current one, and what a connection leaves out
-    ratio, step, given = dr.full(Float, 1, lanes), dr.full(Float, 1, lanes), dr.full(Float, 1, lanes)
-    if dr.hint(with_light_paths, mode="scalar"):
-        given *= state.reversal
+    ratio, step, given = dr.full(Float, 1, lanes), dr.full(Float, 1, lanes), state.reversal + dr.zeros(Float, lanes)
     while active:
         if dr.hint(connecting, mode="scalar"):
-            light, leg, direction, end = connect_to_light_vertex(
-                world,
-                si,
-                light_vertices,
-                light_vertex_index(light_vertices, batch, random.next_uint32()),
-                active & connectable,
-            )
+            chosen, joining = light_vertex_index(light_vertices, batch, random.next_uint32()), active & connectable
+            light, leg, direction, end = connect_to_light_vertex(world, si, light_vertices, chosen, joining)
             light *= throughput_at_vertex
-            _put(values, paths, slot * stride + lane, light, path + leg, active)
-            if dr.hint(with_light_paths, mode="scalar"):
-                local = si.to_local(direction)
-                back = reversal(si, local, si.bsdf().pdf(mi.BSDFContext(), si, local, active), active)
-                dr.scatter(ratios, finite_ratio(ratio * back / given * end), slot * stride + lane, active)
+            joined = _ratio_of_connection(si, direction, end, ratio / given, active)
+            _put(task.slots, slot * stride + lane, light, path + leg, joined, active)
             soonest = dr.select(light > 0, dr.minimum(soonest, path + leg), soonest)
             slot += 1
         active &= weight > 0
@@ -240,23 +229,20 @@ def _trace_suffix(
         light = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)[0] * irradiance
         if dr.hint(connecting, mode="scalar"):
             density = density_of(world, si, to_laser)
-            light *= dr.select(
-                connectable, mis_weight_sampled(world, before, Scattered(sample, weight), si, density, 1, active), 1
-            )
+            by_chance = mis_weight_sampled(world, before, Scattered(sample, weight), si, density, 1, active)
+            light *= dr.select(connectable, by_chance, 1)
         throughput_at_vertex = throughput * passed
         light = dr.select(dr.isfinite(light), throughput_at_vertex * light, 0)
-        _put(values, paths, slot * stride + lane, light, path + leg, active)
-        if dr.hint(with_light_paths, mode="scalar"):
-            ratio, given = finite_ratio(ratio * step), Float(1)
-            end = ratio_at_laser(world, si, -towards.d, active)
-            dr.scatter(ratios, finite_ratio(ratio * end), slot * stride + lane, active)
+        ratio, given = finite_ratio(ratio * step), Float(1)
+        ended = _ratio_at_end(world, si, -towards.d, ratio, active)
+        _put(task.slots, slot * stride + lane, light, path + leg, ended, active)
         soonest = dr.select(active & (light > 0), dr.minimum(soonest, path + leg), soonest)
         slot += 1
         active &= slot < last
         sample, again = sample_bsdf(si, random, active)
         weight = again[0]
         throughput = throughput_at_vertex * weight
-        if dr.hint(with_light_paths, mode="scalar"):
+        if dr.hint(has_light_paths(world), mode="scalar"):
             step = finite_ratio(reversal_of_sample(si, sample, active))
         # Russian roulette: paths that carry little end early, the others carry their energy on
         survive = dr.clip(dr.select(weight > 0, throughput, throughput_at_vertex), 0.05, 0.95)
@@ -264,10 +250,28 @@ def _trace_suffix(
         throughput /= survive
         throughput_at_vertex /= survive
         connectable = Bool(active)
-    return values, paths, ratios, slot, soonest
+    return task.slots.values, task.slots.paths, task.slots.ratios, slot, soonest
 
 
-def _put(values: Floats, paths: Floats, slot: UInts, light: Floats, path: Floats, active: Masks) -> None:
-    """Write a vertex's light and its path into their slots."""
-    dr.scatter(paths, path, slot, active)
-    dr.scatter(values, light, slot, active)
+def _ratio_of_connection(si: Interactions, direction: Vectors, end: Floats, ratio: Floats, active: Masks) -> Array:
+    """Return the ratio of a path whose last two points are a surface and the light vertex that it was connected to in
+    this direction, from that of the points before and `end`, that of the light vertex; None where that is None."""
+    if end is None:
+        return None
+    local = si.to_local(direction)
+    density = si.bsdf().pdf(mi.BSDFContext(), si, local, active)
+    return finite_ratio(ratio * reversal(si, local, density, active) * end)
+
+
+def _ratio_at_end(world: TracedScene, si: Interactions, back: Vectors, ratio: Floats, active: Masks) -> Array:
+    """Return the ratio of a path that ends on a surface, from that of the points before; `back` leads to the last of
+    these. None without light paths."""
+    return finite_ratio(ratio * ratio_at_laser(world, si, back, active)) if has_light_paths(world) else None
+
+
+def _put(slots: Slots, place: UInts, light: Floats, path: Floats, ratio: Floats, active: Masks) -> None:
+    """Write a vertex's light, its path and its ratio, if it has one, into their slots."""
+    dr.scatter(slots.paths, path, place, active)
+    dr.scatter(slots.values, light, place, active)
+    if ratio is not None:
+        dr.scatter(slots.ratios, ratio, place, active)

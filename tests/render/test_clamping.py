@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -134,13 +135,16 @@ def test_a_render_says_what_it_removed_and_counts_it():
 
 
 def test_a_target_out_of_reach_is_not_chased():
-    """Ten times the planned work does not help: the first try is all, and the plan names what would help."""
+    """Ten times the planned work does not help: as many paths again are all, and the plan names what would help."""
     settings = RenderSettings(bounces=3, error=0.02, grid=2)
-    plan, traced = make_plan(TracedScene(scene()), settings, 1), light(1, None)
-    traced = traced._replace(schedule=traced.schedule._replace(spp=np.full(12, 16)))
+    world, plan, traced = TracedScene(scene()), make_plan(TracedScene(scene()), settings, 1), light(1, None)
+    before = traced.schedule._replace(spp=np.full(12, 160))
+    traced = traced._replace(schedule=before)
     near, far = (ErrorEstimate(mc, 0.0, 0.0, mc, 0.0, 0.01, 0.05, worst_share=0.9) for mc in (0.03, 0.1))
-    assert engine.additional_schedule(TracedScene(scene()), plan, settings, traced, near) is not None
-    assert engine.additional_schedule(TracedScene(scene()), plan, settings, traced, far) is None
+    for error, least, most in ((near, 1, 3.5), (far, 0.5, 1.2)):
+        more = engine.additional_schedule(world, plan, settings, traced, error, 3.0)
+        assert least < more.cost / before.cost < most
+    assert engine.additional_schedule(world, plan, settings, traced, replace(far, total=0.01), 3.0) is None
     assert engine.clamp_reasons(plan, settings, traced, near) == ()
     (told,) = engine.clamp_reasons(plan, settings, traced, far)
     assert "stopped" in told and "25 times" in told and "--clamp" in told and "\n" not in told

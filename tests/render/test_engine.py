@@ -11,6 +11,8 @@ from render import engine
 from render import pipeline as tracing
 from render.engine import render
 from render.error import BIN_M, PULSE_POWER, SIGMA_M, estimate, response, target_verdict, worst_fraction_of
+from render.indirect.launch_layout import BLOCK
+from render.indirect.schedule import Schedule, reallocated
 from render.planning import bounces_for, make_plan, rays_for_all
 from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
@@ -127,6 +129,26 @@ def test_a_glint_is_no_error_of_the_direct_light():
     assert transient.meta["relative_error"]["total"] < 0.01
 
 
+def test_more_paths_go_where_the_noise_is():
+    """Noise that falls as one over the paths, one bright block among 64: the target is met in closed form, or what may
+    be spent is, mostly there."""
+    pixels = np.arange(64 * BLOCK)
+    noise = np.full(len(pixels), 1e-3)
+    noise[5 * BLOCK : 6 * BLOCK] = 0.3
+    for reuses in (False, True):
+        before = Schedule(pixels, np.full(64, 32), np.full(64, reuses))
+
+        def left(more: Schedule, before: Schedule = before) -> float:
+            kept = np.repeat(before.spp / (before.spp + more.spp), BLOCK)
+            return float((kept * noise**2).sum() / (noise**2).sum())
+
+        enough = reallocated(before, noise, 0.02, 10.0)
+        assert 0.005 < left(enough) <= 0.02 and enough.cost < 2.5 * before.cost
+        assert enough.spp[5] > 30 * np.delete(enough.spp, 5).max() and enough.batches == before.batches
+        little = reallocated(before, noise, 1e-4, 1.0)
+        assert 0.8 * before.cost < little.cost < 1.6 * before.cost and left(little) < 0.05
+
+
 def test_a_missed_target_is_made_good():
     """Where the first paths' own noise tells that the pilot was too hopeful, more are traced: the mean stays right."""
     scene, pixels = room(), np.arange(24 * 18)
@@ -135,7 +157,7 @@ def test_a_missed_target_is_made_good():
     plan = replace(make_plan(world, settings, 1), noise=0.05)  # a pilot that promises 2.5 times too much
     first = tracing.trace(world, plan, settings, seed=1, checked=pixels)
     error = engine.estimated_error(world, plan, settings, first, pixels)
-    more = engine.additional_schedule(world, plan, settings, first, error)
+    more = engine.additional_schedule(world, plan, settings, first, error, 3.0)
     assert error.total > 0.02 and more is not None
     both = tracing.add_samples(
         world, plan, settings, first, tracing.MoreSamples(more, 1, pixels), lambda what, fraction: None
