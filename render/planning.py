@@ -29,7 +29,7 @@ PILOT_SHOWS = 1.25
 AMBIENT_FRACTION, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE = 0.5, 0.02, 0.5
 # Energy left out by fewer bounces is bias, which no number of photons averages away. It lies in few pixels, inside a
 # lampshade say: 0.5 % of an artist's room was an error of 1.5 %, and more bounces cost next to nothing.
-LEFT_OUT, MAX_LEFT_OUT = 1 / 8, 0.02  # of the target; at most
+LEFT_OUT, MAX_LEFT_OUT = 1 / 16, 0.02  # of the target; at most
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
 CHECK_REFINEMENT, MIN_CHECK_REFINEMENT = 2, 1.5  # direct light is checked against this many times the cells a side
