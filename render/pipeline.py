@@ -35,6 +35,7 @@ MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
 # Beyond so many times the work that a plan may spend, or that it planned, there is no more than a first try.
 HOPELESS = 10
 PROPOSAL = "trade fireflies for a stated bias with --clamp 10"
+UNEVEN = 1e-3  # of the direct light's root sum square over pixels: what one pixel's mirrored light may be off by
 FIRST_FILTERED_SPP = 16  # filtered light starts with few paths, whatever it needs
 # A filter takes up to twice the time and has a bias: it has to lower the squared error at least so many times.
 FILTER_GAIN = 2.0
@@ -106,7 +107,9 @@ def trace(
     trim_memory(len(pixels))
     # only indirect light is counted from where direct light is
     origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
-    specular = specular_light(world, plan.grid, plan.direct_tolerance_m)
+    of_pixels = np.bincount(direct.samples.pixel, weights=direct.samples.radiance, minlength=len(pixels))
+    uneven = UNEVEN * float(np.linalg.norm(of_pixels))
+    specular = specular_light(world, plan.grid, plan.direct_tolerance_m, uneven)
     if settings.bounces is not None:  # the image method finds light of more surfaces, too
         within = specular.samples.bounces <= settings.bounces
         specular = specular._replace(samples=select(specular.samples, within))

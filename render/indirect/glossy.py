@@ -31,26 +31,40 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, UInts, Vectors
-from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, parts_of, raster_of, shape_index
+from render.scene.rays import (
+    camera_rays,
+    first_opaque,
+    in_beam,
+    interaction_from_parts,
+    parts_of,
+    raster_of,
+    shape_index,
+    to_camera,
+    to_world,
+)
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
 RATIO = 1.0  # paths that begin in a polished pixel of the laser's image, for every path of others (1 to 2 do best)
 # Where SEEN_BY x SEEN_BY rays a pixel meet no polished surface there may be a sliver: the share that begins there.
 SEEN_BY, ELSEWHERE = 2, 1 / 8
-WIDEST_DEG = 60.0  # off the optical axis, how far such surfaces are looked for
+WIDEST_DEG = 60.0  # off the optical axis, which the image of a wider laser does not show as a plane
 MAX_RATIO = 1e30  # of the densities of both ways
 
 
 class Glossy(NamedTuple):
-    """An image as an eye in the laser's place has it that looks as the camera does: how many paths begin in each pixel,
-    1 where it shows polished surfaces. It is `width` x `height`, and begins so much to the `left` of the camera's and
-    `up` that it holds what the laser lights. Arrays of Dr.Jit."""
+    """An image of what the laser lights, as an eye in its place has it: how many paths begin in each pixel, 1 where it
+    shows polished surfaces. It is `width` x `height`; arrays of Dr.Jit.
+
+    It looks as the camera does, and begins so much to the `left` of the camera's and `up` that it holds what the laser
+    lights. Of a wider laser it is a panorama (`left` and `up` are None): its columns are angles about the vertical axis
+    of the camera, its rows cosines to that, so that all pixels have one solid angle (Archimedes).
+    """
 
     sampling_density: Array
-    left: UInts
-    up: UInts
     width: UInts
     height: UInts
+    left: UInts = None
+    up: UInts = None
 
 
 def glossy_of(world: TracedScene) -> Glossy | None:
@@ -69,41 +83,74 @@ def has_light_paths(world: TracedScene) -> bool:
 
 def _look_for(world: TracedScene) -> tuple[Array, ...]:
     """Find the parts of `Glossy`, none if no surface is glossy: a plain tuple, which recordings take for an input."""
-    camera, laser = world.scene.camera, world.scene.laser
-    angle = min(math.acos(laser.cos_half_angle(camera)), math.radians(WIDEST_DEG))
-    reach = camera.focal_px * math.tan(angle)
-    left, up = (max(0, math.ceil(reach - side / 2)) for side in (camera.width, camera.height))
-    width, height = camera.width + 2 * left, camera.height + 2 * up
+    camera, cosine = world.scene.camera, world.scene.laser.cos_half_angle(world.scene.camera)
+    if cosine < math.cos(math.radians(WIDEST_DEG)):
+        width, height = (math.ceil(turns * camera.focal_px) for turns in (2 * math.pi, 2))
+        image = [dr.opaque(UInt32, number) for number in (width, height)]
+        own = _forward_cosines(width, height) >= cosine
+    else:
+        reach = camera.focal_px * math.tan(math.acos(cosine))
+        left, up = (max(0, math.ceil(reach - side / 2)) for side in (camera.width, camera.height))
+        width, height = camera.width + 2 * left, camera.height + 2 * up
+        image = [dr.opaque(UInt32, number) for number in (width, height, left, up)]
+        own = np.zeros((height, width), bool)
+        own[up : up + camera.height, left : left + camera.width] = True
     pixel = dr.arange(UInt32, width * height)
     dr.eval(pixel)
-    numbers = [dr.opaque(UInt32, number) for number in (left, up, width, height)]
-    polished = world.recordings.call(world, "glossy", _shows, pixel, *numbers).numpy().reshape(height, width)
-    sampling_density = polished.astype(np.float64)
+    polished = world.recordings.call(world, "glossy", _shows, pixel, *image).numpy().reshape(height, width)
     if not polished.any():
         return ()
-    own = sampling_density[up : up + camera.height, left : left + camera.width]
-    own[own == 0] = ELSEWHERE
+    sampling_density = np.where(own & ~polished, ELSEWHERE, polished)
     # of no launch's length, or Dr.Jit would record it anew (`render.indirect.camera_paths`)
-    return upload(Float, sampling_density, 16 * (sampling_density.size // 16 + 1) + 5), *numbers
+    return upload(Float, sampling_density, 16 * (sampling_density.size // 16 + 1) + 5), *image
 
 
-def _shows(world: TracedScene, pixel: UInts, left: UInts, up: UInts, width: UInts, height: UInts) -> Array:
+def _forward_cosines(width: int, height: int) -> np.ndarray:
+    """Return cosines to the optical axis of the middles of a panorama's pixels, (height, width)."""
+    turn = 2 * np.pi * (np.arange(width) + 0.5) / width
+    down = 2 * (np.arange(height) + 0.5) / height - 1
+    return np.sqrt(1 - down**2)[:, None] * np.cos(turn)
+
+
+def _shows(world: TracedScene, pixel: UInts, *image: Array) -> Array:
     shown = Bool(False)
     for place in range(SEEN_BY**2):
         x, y = ((part + 0.5) / SEEN_BY for part in (place % SEEN_BY, place // SEEN_BY))
-        ray, _ = laser_rays(world, pixel, x, y, left, up, width)
+        ray, _ = laser_rays(world, pixel, x, y, Glossy(None, *image))
         si, _, _, _ = first_opaque(world, ray, Bool(True))
         hit = si.is_valid()
-        shown |= hit & is_glossy(world, si, hit)
+        shown |= hit & is_glossy(world, si, hit) & in_beam(world, si.p, pixel)
     return shown
 
 
-def laser_rays(
-    world: TracedScene, pixel: UInts, x: Floats, y: Floats, left: UInts, up: UInts, width: UInts
-) -> tuple[Array, Array]:
-    """Return `camera_rays` from the laser through places in pixels of its image."""
-    column, row = Float(pixel % width) - Float(left), Float(pixel // width) - Float(up)
-    return camera_rays(world, column + x, row + y, world.laser)
+def laser_rays(world: TracedScene, pixel: UInts, x: Floats, y: Floats, image: Glossy) -> tuple[Array, Array]:
+    """Return rays from the laser through places in pixels of its image, and the solid angle of each pixel there, in
+    that of a camera's pixel on the optical axis."""
+    column, row = Float(pixel % image.width) + x, Float(pixel // image.width) + y
+    if image.left is not None:
+        ray, aim = camera_rays(world, column - Float(image.left), row - Float(image.up), world.laser)
+        return ray, dr.rcp(dr.norm(aim)) ** 3  # |aim| = 1 / cos a
+    down = 2 * row / Float(image.height) - 1
+    ring = dr.sqrt(dr.maximum(1 - dr.square(down), 0))
+    sine, cosine = dr.sincos(2 * math.pi * column / Float(image.width))
+    towards = to_world(world, mi.Vector3f(ring * sine, down, ring * cosine))
+    solid_angle = 4 * math.pi * dr.square(world.focal_px) / Float(image.width * image.height)
+    return mi.Ray3f(mi.Point3f(world.laser) + 0 * towards, towards), solid_angle + 0 * down
+
+
+def _pixel_of(world: TracedScene, point: Array, image: Glossy) -> tuple[Array, Array]:
+    """Return the pixel of the laser's image that shows a point, and whether there is one."""
+    if image.left is not None:
+        column, row, seen = raster_of(world, world.laser, point)
+        column, row = column + Float(image.left), row + Float(image.up)
+    else:
+        aim = dr.normalize(to_camera(world, mi.Vector3f(point) - world.laser))
+        turn = dr.atan2(aim.x, aim.z) / (2 * math.pi)
+        column = dr.minimum((turn - dr.floor(turn)) * Float(image.width), Float(image.width) - 0.5)
+        row, seen = dr.minimum((aim.y + 1) / 2 * Float(image.height), Float(image.height) - 0.5), dr.isfinite(aim.y)
+    column, row = dr.floor(column), dr.floor(row)
+    seen &= (column >= 0) & (column < Float(image.width)) & (row >= 0) & (row < Float(image.height))
+    return UInt32(dr.select(seen, row, 0)) * image.width + UInt32(dr.select(seen, column, 0)), seen
 
 
 def is_glossy(world: TracedScene, si: Interactions, active: Masks) -> Array:
@@ -131,12 +178,8 @@ def ratio_at_laser(world: TracedScene, x: Interactions, towards: Vectors, active
     on it. `towards` is the direction in which it sends the laser's light."""
     glossy = glossy_of(world)
     assert glossy is not None
-    column, row, seen = raster_of(world, world.laser, x.p)
-    column, row = dr.floor(column) + Float(glossy.left), dr.floor(row) + Float(glossy.up)
-    seen &= (column >= 0) & (column < Float(glossy.width)) & (row >= 0) & (row < Float(glossy.height))
-    seen &= is_glossy(world, x, active)
-    pixel = UInt32(dr.select(seen, row, 0)) * glossy.width + UInt32(dr.select(seen, column, 0))
-    return ratio_of_light_path(world, pixel, x, towards, seen)
+    pixel, seen = _pixel_of(world, x.p, glossy)
+    return ratio_of_light_path(world, pixel, x, towards, seen & is_glossy(world, x, active))
 
 
 def ratio_of_light_path(world: TracedScene, pixel: UInts, x: Interactions, towards: Vectors, active: Masks) -> Array:

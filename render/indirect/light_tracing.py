@@ -4,13 +4,14 @@ A path L, x1, x2, ..., xk, x1 polished, is light of the pixel that shows xk. Pat
 image that the laser would take (`render.indirect.glossy`). With W the weight of the path up to xk (reflectance over
 density) and f the reflectance there, one of them adds to the pixel
 
-    X = c W f cos I / (n d^2) (cos a_1 / cos a_k)^3 prod_m [cos_s / cos_g](in) [cos_g / cos_s](out),
+    X = c W f cos I / (n d^2) (o / (cos a)^3) prod_m [cos_s / cos_g](in) [cos_g / cos_s](out),
 
-where d is the way from xk to the camera, cos the cosine of that way, I the laser's intensity, and a are angles to the
-optical axis, as a pixel of the image plane sees (cos a)^3 of solid angle. Shading normals s instead of true ones g make
-reflection unsymmetrical (Veach 1997, section 5.3): the product runs over x1 (in from the laser) to xk (out to the
-camera). c is the share that other paths leave to these (`render.indirect.glossy`). X is less by what glass on the way
-stops; solid glass spreads the laser's light otherwise (`render.scene.rays.spreading`).
+where d is the way from xk to the camera, cos the cosine of that way, a its angle to the optical axis, I the laser's
+intensity, and o the solid angle of the laser's pixel in that of a pixel on the axis: a pixel of an image plane sees
+(cos a)^3 of it. Shading normals s instead of true ones g make reflection unsymmetrical (Veach 1997, section 5.3): the
+product runs over x1 (in from the laser) to xk (out to the camera). c is the share that other paths leave to these
+(`render.indirect.glossy`). X is less by what glass on the way stops; solid glass spreads the laser's light otherwise
+(`render.scene.rays.spreading`).
 """
 
 from __future__ import annotations
@@ -143,15 +144,14 @@ def _sample_first_vertex(
     glossy, intensity = glossy_of(world), dr.gather(Float, world.intensity, UInt32(0))
     assert glossy is not None
     jitter = mi.Point2f(random.next_float32(), random.next_float32())
-    ray, aim = laser_rays(world, pixel, jitter.x, jitter.y, glossy.left, glossy.up, glossy.width)
+    ray, solid_angle = laser_rays(world, pixel, jitter.x, jitter.y, glossy)
     si, _, path, _ = first_opaque(world, ray, dr.full(Bool, True, dr.width(pixel)))
     active = is_glossy(world, si, si.is_valid()) & in_beam(world, si.p, pixel)
     # one randomised (0, 2)-sequence a pixel and batch
     shift = mi.sample_tea_32(pixel ^ keys[1], batch ^ keys[0])
     first = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
     sample, weight = si.bsdf().sample(mi.BSDFContext(), si, random.next_float32(), mi.Point2f(*first), active)
-    # |aim| = 1 / cos a
     if world.sees_through:
         intensity *= segment(world, si, world.laser, active)[0]
-    value = intensity * weight[0] * dr.rcp(dr.norm(aim)) ** 3 * shading_ratio(si, si.wi) / shading_ratio(si, sample.wo)
+    value = intensity * weight[0] * solid_angle * shading_ratio(si, si.wi) / shading_ratio(si, sample.wo)
     return si, path, sample, value, active & (value > 0)

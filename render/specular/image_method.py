@@ -29,9 +29,10 @@ from render.specular.mirrors import (
     planes_of,
     specular_points,
 )
-from render.transient.samples import Samples, concatenate, merge, no_samples
+from render.transient.samples import Samples, concatenate, merge, no_samples, select
 
 CELLS_PER_LAUNCH = 1 << 20
+FINER, FINER_M = (32, 128), 2e-3  # cells a side of polished pixels, of those uneven still; merged within so much
 # A glint is a thin cone of rays: on an edge or in the apex of a corner cube, the share of them that comes back counts.
 LOBE_RAYS, LOBE_RAD = 32, 5e-4
 WIDEST_SPREAD = 0.25  # of the path: a footprint that spans more describes no mesh
@@ -44,15 +45,16 @@ class SpecularLight(NamedTuple):
     notes: tuple[str, ...]
 
 
-def specular_light(world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4) -> SpecularLight:
+def specular_light(world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4, allowed: float = 0.0) -> SpecularLight:
     """Return deterministic returns by way of smooth plane surfaces, as `Samples` merged within `tolerance_m`.
 
     Glints: pixel-mean radiance T R_1 ... R_k I(w) / (D^2 Omega), with D the unfolded one-way length laser -> mirrors ->
     camera, Omega the pixel's solid angle, T the transmission of glass on the way; path length D plus glass delay,
     `bounces` = k. Mirrored light is integrated over grid x grid cells of each pixel: f cos R_1 ... I(w) / D^2 with D
     the unfolded length from the laser to the surface, times the reflectances between surface and camera; `bounces`
-    counts every surface met. Paths without a mirror on the laser's side are not here: direct light and path tracing
-    find them.
+    counts every surface met. Where the cells of a pixel are so uneven that its mean could be off by more than `allowed`
+    (a radiance; 0: not asked), and on polished surfaces, whose highlights may be smaller than a cell, there are FINER
+    ones. Paths without a mirror on the laser's side are not here: direct light and path tracing find them.
 
     Raises InputError where a displaced laser's straight path through a glass slab is off by more than 10 mm.
     """
@@ -66,7 +68,7 @@ def specular_light(world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4)
     for sequence in glint_sequences(mirrors, notes):
         parts.append(_glints(world, tables, mirrors, sequence))
     for sequence in image_sequences(mirrors, notes):
-        parts += _mirrored(world, tables, mirrors, sequence, grid)
+        parts += _mirrored(world, tables, mirrors, sequence, grid, allowed)
     return SpecularLight(merge(concatenate(parts), tolerance_m), tuple(notes))
 
 
@@ -264,37 +266,63 @@ def _lobe(image: np.ndarray) -> np.ndarray:
 # ---- mirrored light ----
 
 
-def _mirrored(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray, grid: int) -> list[Samples]:
+def _mirrored(
+    world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.ndarray, grid: int, allowed: float
+) -> list[Samples]:
     """Trace what the camera sees, directly or by way of up to MAX_ORDER mirrors, lit by way of the mirror planes
     `sequence` (k,)."""
     camera, laser = world.scene.camera, world.scene.laser
     image = image_of(mirrors, sequence[None], laser.position(camera) - camera.origin)[0]
     target = mi.Point3f(*(dr.opaque(Float, float(v)) for v in image + world.eye_m))
     planes = [dr.opaque(UInt32, int(plane)) for plane in sequence]
-    pixels, cells = np.arange(camera.height * camera.width), grid * grid
-    per_chunk = max(1, CELLS_PER_LAUNCH // cells)
-    parts = []
-    for first in range(0, len(pixels), per_chunk):
-        chunk = pixels[first : first + per_chunk]
-        path, half_width, radiance, met = _cells(world, tables, int(chunk[0]), len(chunk) * cells, grid, target, planes)
-        dr.eval(path, half_width, radiance, met)
-        radiance = np.array(radiance, dtype=np.float64)
-        lit = radiance > 0
-        path, half_width = (np.array(value, dtype=np.float64)[lit] for value in (path, half_width))
-        bounces = (np.array(met)[lit] + 1 + len(sequence)).astype(np.uint8)
-        parts.append(Samples(np.repeat(chunk, cells)[lit], path, half_width, radiance[lit], bounces))
+    uneven, parts = np.full(camera.height * camera.width, True), list[Samples]()
+    for side, least in ((grid, allowed or np.inf), (FINER[0], allowed), (FINER[1], np.inf)):
+        found, polished = _of_pixels(world, tables, np.flatnonzero(uneven), side, target, planes)
+        uneven = _unevenness(found, uneven.size, side) > least
+        if side == grid and allowed > 0:  # what is polished may have a highlight between its cells
+            uneven[polished] = True
+        kept = (select(part, ~uneven[part.pixel]) for part in found)
+        parts += kept if side == grid else (merge(part, FINER_M) for part in kept)
+        if not uneven.any():
+            break
     return parts
 
 
+def _of_pixels(
+    world: TracedScene, tables: _Tables, pixels: np.ndarray, grid: int, target: UInts, planes: list[Array]
+) -> tuple[list[Samples], np.ndarray]:
+    """Return mirrored light of some pixels, a sample a lit cell, launch by launch; and which show polished surfaces."""
+    cells, parts, shown = grid * grid, [], []
+    per_chunk = max(1, CELLS_PER_LAUNCH // cells)
+    for first in range(0, len(pixels), per_chunk):
+        chunk = pixels[first : first + per_chunk]
+        path, half_width, radiance, met, polished = _cells(world, tables, chunk, grid, target, planes)
+        dr.eval(path, half_width, radiance, met, polished)
+        shown.append(chunk[np.array(polished).reshape(-1, cells).any(axis=1)])
+        radiance = np.array(radiance, dtype=np.float64)
+        lit = radiance > 0
+        path, half_width = (np.array(value, dtype=np.float64)[lit] for value in (path, half_width))
+        bounces = (np.array(met)[lit] + 1 + len(planes)).astype(np.uint8)
+        parts.append(Samples(np.repeat(chunk, cells)[lit], path, half_width, radiance[lit], bounces))
+    return parts, np.concatenate(shown)
+
+
+def _unevenness(parts: list[Samples], pixels: int, grid: int) -> np.ndarray:
+    """Compute the standard error of each pixel's mean, as if its cells lay there by chance."""
+    pixel, radiance = (np.concatenate([part[index] for part in parts]) for index in (0, 3))
+    mean = np.bincount(pixel, weights=radiance, minlength=pixels)
+    return np.sqrt(np.maximum(np.bincount(pixel, weights=radiance**2, minlength=pixels) - mean**2 / grid**2, 0))
+
+
 def _cells(
-    world: TracedScene, tables: _Tables, first: int, lanes: int, grid: int, target: UInts, planes: list[Array]
-) -> tuple[Array, Array, Array, Array]:
-    """Trace the cells of the pixels from `first` on; return path and its half width [m], radiance / cells, and mirrors
-    met."""
-    side = dr.opaque(UInt32, grid)
+    world: TracedScene, tables: _Tables, pixels: np.ndarray, grid: int, target: UInts, planes: list[Array]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Trace cells of pixels; return path, half width [m], radiance / cells, mirrors met, and if polished and lit."""
+    side, lanes = dr.opaque(UInt32, grid), len(pixels) * grid * grid
     lane = dr.arange(UInt32, lanes)
     cells = side * side
-    pixel, cell = lane // cells + dr.opaque(UInt32, first), lane % cells
+    # one more: an array of a single value would compile other kernels
+    pixel, cell = dr.gather(UInt32, upload(UInt32, np.append(pixels, 0)), lane // cells), lane % cells
     pitch = 1 / Float(side)
     x = Float(pixel % world.width) + (Float(cell % side) + 0.5) * pitch
     y = Float(pixel // world.width) + (Float(cell // side) + 0.5) * pitch
@@ -315,7 +343,8 @@ def _cells(
     path = optical + length + delay
     half_width = _half_width(local, axes, si.n, -direction, distance, pitch / world.focal_px)
     half_width = dr.minimum(half_width, WIDEST_SPREAD * path)
-    return path, half_width, dr.select(active & dr.isfinite(radiance), radiance, 0), met
+    polished = active & (passed > 0) & (dr.gather(Float, world.glossy_materials, shape_index(si), active) > 0)
+    return path, half_width, dr.select(active & dr.isfinite(radiance), radiance, 0), met, polished
 
 
 @dr.syntax

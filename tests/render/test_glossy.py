@@ -15,9 +15,11 @@ from render.indirect.camera_paths import PathBatch, PathTask, trace_paths
 from render.indirect.glossy import (
     ELSEWHERE,
     MAX_RATIO,
+    _pixel_of,
     camera_share,
     finite_ratio,
     glossy_of,
+    laser_rays,
     light_share,
     ratio_at_camera,
     ratio_at_laser,
@@ -28,7 +30,7 @@ from render.indirect.launch_layout import BLOCK, make_launch
 from render.indirect.light_tracing import trace_light_paths
 from render.indirect.reuse import pair_lanes, select_pairs
 from render.pipeline import LightSamples, trace
-from render.scene.rays import camera_rays, first_opaque, raster_of, sample_bsdf, spawn
+from render.scene.rays import camera_rays, first_opaque, sample_bsdf, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 from render.settings import Plan, RenderSettings
 from scenes import Camera, Laser, Material, Scene, Surface
@@ -186,12 +188,31 @@ def test_nothing_begins_elsewhere(scene, why):
     assert glossy_of(world) is None and not list(trace_light_paths(world, 4, 1, 3, 0)), why
 
 
-def test_polished_things_behind_the_camera_alone():
-    """Lit by a lamp, seen by no pixel: none of the wider image shows them either."""
-    scene = room(METAL, LASERS["lamp"])
-    behind = quad([(-1, -1, 2), (1, -1, 2), (1, 1, 2), (-1, 1, 2)], METAL)
-    scene = replace(scene, surfaces=(*scene.surfaces[:3], behind))
-    assert glossy_of(TracedScene(scene)) is None
+@pytest.mark.parametrize("cone_deg", [360, 200, 130])
+def test_polished_things_behind_the_camera(cone_deg, mis_weight_sampled):
+    """A wide laser lights metal that no pixel shows: what it throws on the walls is found from there. 130 degrees do
+    not reach it, and begin on the ball alone."""
+    scene = room(METAL, Laser("flood", cone_deg=cone_deg), smooth=True)
+    behind = quad([(-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2)], replace(METAL, roughness=0.03))
+    aside = quad([(1.5, -1, 1), (1.5, -1, -3), (1.5, 1, -3), (1.5, 1, 1)], replace(METAL, roughness=0.03))
+    scene = replace(scene, surfaces=(*scene.surfaces, behind, aside))
+    both, alone = check_both_ways(scene, mis_weight_sampled, 0.1)
+    assert both.std(axis=0, ddof=1).sum() < alone.std(axis=0, ddof=1).sum()
+
+
+def test_pixels_of_a_panorama_have_one_solid_angle_and_are_found_again():
+    """Their solid angles are those of all directions; what a ray meets lies in the pixel that it began in."""
+    world = TracedScene(room(METAL, LASERS["lamp"]))
+    glossy = glossy_of(world)
+    assert glossy is not None and glossy.left is None
+    pixels = int(glossy.width[0]) * int(glossy.height[0])
+    pixel, random = dr.arange(UInt32, pixels), mi.PCG32(pixels)
+    ray, solid_angle = laser_rays(world, pixel, random.next_float32(), random.next_float32(), glossy)
+    whole = solid_angle.numpy().sum() / float(world.focal_px[0]) ** 2
+    assert whole == pytest.approx(4 * np.pi, rel=1e-4)
+    assert np.allclose(ray.d.numpy().mean(axis=1), 0, atol=4 / np.sqrt(3 * pixels))
+    found, seen = _pixel_of(world, ray.o + 3 * ray.d, glossy)
+    assert seen.numpy().all() and np.mean(found.numpy() == pixel.numpy()) > 0.998  # rounding at borders
 
 
 # --- weights of paths that both ways sample -----------------------------------------------------------------------
@@ -286,19 +307,12 @@ def test_the_ratio_of_a_path_is_that_of_its_vertices_from_either_end(material):
     for i in (1, 2):
         forwards *= reversal(*seen(points[i], -towards[i - 1], towards[i]), active)
         backwards /= reversal(*seen(points[i], towards[i], -towards[i - 1]), active)
-    column, row = (dr.floor(part) for part in laser_raster(world, points[3].p))
-    pixel = UInt32(row + Float(glossy.up)) * glossy.width + UInt32(column + Float(glossy.left))
+    pixel, _ = _pixel_of(world, points[3].p, glossy)
     begun = (ratio_at_laser(world, points[3], -towards[2], active) > 0) & dr.isfinite(forwards)
     backwards *= ratio_of_light_path(world, pixel, points[3], -towards[2], active & begun)
     kept = begun.numpy() & active.numpy()
     assert kept.sum() > 500
     assert np.allclose(forwards.numpy()[kept], backwards.numpy()[kept], rtol=1e-3)
-
-
-def laser_raster(world: TracedScene, point: mi.Point3f) -> tuple[Float, Float]:
-    """Return where the laser's image shows a point."""
-    column, row, _ = raster_of(world, world.laser, point)
-    return column, row
 
 
 def test_a_diffuse_surface_reverses_as_it_goes():
