@@ -107,8 +107,8 @@ def trace(
     trim_memory(len(pixels))
     # only indirect light is counted from where direct light is
     origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
-    of_pixels = np.bincount(direct.samples.pixel, weights=direct.samples.radiance, minlength=len(pixels))
-    uneven = UNEVEN * float(np.linalg.norm(of_pixels))
+    radiance = np.bincount(direct.samples.pixel, weights=direct.samples.radiance, minlength=len(pixels))
+    uneven = UNEVEN * float(np.linalg.norm(radiance))
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m, uneven)
     if settings.bounces is not None:  # the image method finds light of more surfaces, too
         within = specular.samples.bounces <= settings.bounces

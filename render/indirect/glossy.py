@@ -138,7 +138,7 @@ def laser_rays(world: TracedScene, pixel: UInts, x: Floats, y: Floats, image: Gl
     return mi.Ray3f(mi.Point3f(world.laser) + 0 * towards, towards), solid_angle + 0 * down
 
 
-def _pixel_of(world: TracedScene, point: Array, image: Glossy) -> tuple[Array, Array]:
+def laser_pixel_of(world: TracedScene, point: Array, image: Glossy) -> tuple[Array, Array]:
     """Return the pixel of the laser's image that shows a point, and whether there is one."""
     if image.left is not None:
         column, row, seen = raster_of(world, world.laser, point)
@@ -178,7 +178,7 @@ def ratio_at_laser(world: TracedScene, x: Interactions, towards: Vectors, active
     on it. `towards` is the direction in which it sends the laser's light."""
     glossy = glossy_of(world)
     assert glossy is not None
-    pixel, seen = _pixel_of(world, x.p, glossy)
+    pixel, seen = laser_pixel_of(world, x.p, glossy)
     return ratio_of_light_path(world, pixel, x, towards, seen & is_glossy(world, x, active))
 
 

@@ -15,10 +15,10 @@ from render.indirect.camera_paths import PathBatch, PathTask, trace_paths
 from render.indirect.glossy import (
     ELSEWHERE,
     MAX_RATIO,
-    _pixel_of,
     camera_share,
     finite_ratio,
     glossy_of,
+    laser_pixel_of,
     laser_rays,
     light_share,
     ratio_at_camera,
@@ -211,7 +211,7 @@ def test_pixels_of_a_panorama_have_one_solid_angle_and_are_found_again():
     whole = solid_angle.numpy().sum() / float(world.focal_px[0]) ** 2
     assert whole == pytest.approx(4 * np.pi, rel=1e-4)
     assert np.allclose(ray.d.numpy().mean(axis=1), 0, atol=4 / np.sqrt(3 * pixels))
-    found, seen = _pixel_of(world, ray.o + 3 * ray.d, glossy)
+    found, seen = laser_pixel_of(world, ray.o + 3 * ray.d, glossy)
     assert seen.numpy().all() and np.mean(found.numpy() == pixel.numpy()) > 0.998  # rounding at borders
 
 
@@ -307,7 +307,7 @@ def test_the_ratio_of_a_path_is_that_of_its_vertices_from_either_end(material):
     for i in (1, 2):
         forwards *= reversal(*seen(points[i], -towards[i - 1], towards[i]), active)
         backwards /= reversal(*seen(points[i], towards[i], -towards[i - 1]), active)
-    pixel, _ = _pixel_of(world, points[3].p, glossy)
+    pixel, _ = laser_pixel_of(world, points[3].p, glossy)
     begun = (ratio_at_laser(world, points[3], -towards[2], active) > 0) & dr.isfinite(forwards)
     backwards *= ratio_of_light_path(world, pixel, points[3], -towards[2], active & begun)
     kept = begun.numpy() & active.numpy()
