@@ -32,7 +32,7 @@ from scenes.random_streams import Stream
 
 # Work that a plan spends by itself, in paths a pixel: nobody asked for the default target, a long wait needs asking.
 MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
-# Beyond so many times the work that a plan may spend, or that it planned, there is no more than a first try.
+# Beyond so many times the work that a plan may spend, or that it planned, a target is not chased.
 HOPELESS = 10
 PROPOSAL = "trade fireflies for a stated bias with --clamp 10"
 UNEVEN = 1e-3  # of the direct light's root sum square over pixels: what one pixel's mirrored light may be off by
@@ -161,7 +161,8 @@ def add_samples(
 ) -> LightSamples:
     """Return a render's light with further paths, weighted by their numbers.
 
-    These follow the first paths' noise; the bias of such a stop is of second order in it.
+    These follow the first paths' noise. The bias of such a stop is of second order in it, but for light of paths so
+    rare that few renders find any: a part of it is lost, as each calls for more paths and then counts less.
     """
     _, brightest = mean_path(traced.direct, len(traced.origin_m))
     light, more = SampleBuffer(), extra.schedule
