@@ -276,13 +276,13 @@ def _mirrored(
     target = mi.Point3f(*(dr.opaque(Float, float(v)) for v in image + world.eye_m))
     planes = [dr.opaque(UInt32, int(plane)) for plane in sequence]
     uneven, parts = np.full(camera.height * camera.width, True), list[Samples]()
-    for side, least in ((grid, allowed or np.inf), (FINER[0], allowed), (FINER[1], np.inf)):
+    sides = (grid, *(side for side in FINER if side > grid and allowed > 0))
+    for side in sides:
         found, polished = _of_pixels(world, tables, np.flatnonzero(uneven), side, target, planes)
-        uneven = _unevenness(found, uneven.size, side) > least
-        if side == grid and allowed > 0:  # what is polished may have a highlight between its cells
-            uneven[polished] = True
-        kept = (select(part, ~uneven[part.pixel]) for part in found)
-        parts += kept if side == grid else (merge(part, FINER_M) for part in kept)
+        uneven = _unevenness(found, uneven.size, side) > allowed
+        uneven[polished] |= side == grid  # what is polished may have a highlight between its cells
+        uneven &= side < sides[-1]
+        parts += (merge(select(part, ~uneven[part.pixel]), 0 if side == grid else FINER_M) for part in found)
         if not uneven.any():
             break
     return parts

@@ -46,6 +46,13 @@ def test_a_highlight_smaller_than_a_pixel_is_integrated_at_any_grid(grid):
     assert np.linalg.norm(coarse - fine) > 0.2 * np.linalg.norm(fine)
 
 
+def test_an_asked_grid_is_not_made_coarser():
+    scene = bathroom(METAL)
+    fine = mirrored(scene, 160, 0.0)
+    for grid in (64, 160):
+        assert np.linalg.norm(mirrored(scene, grid, 1e-9) - fine) < 0.01 * np.linalg.norm(fine)
+
+
 def test_paths_of_finer_cells_are_those_of_the_pixel():
     """Their energy, mean path and spread: merging within 2 mm keeps all three."""
     scene = bathroom(replace(METAL, roughness=0.2))
