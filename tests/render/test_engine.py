@@ -51,8 +51,28 @@ def test_bounces_follow_a_geometric_series_and_not_one_bright_path():
     energy = np.array([0.0, *0.5 ** np.arange(1, 9)])
     bounces, left_out = bounces_for(energy, 0.011)
     assert bounces == 7 and left_out == pytest.approx(0.5**7, rel=1e-9)
+    assert bounces_for(energy, 0.011, least=5) == (bounces, left_out)
+    assert bounces_for(energy, 0.011, least=12) == (12, pytest.approx(0.5**12, rel=1e-6))
+    assert bounces_for(energy, 0.6, least=12)[0] == 1
     energy[-1] *= 2
     assert bounces_for(energy, 0.011)[0] in (7, 8, 9)
+
+
+def test_light_stays_in_a_white_tube_that_few_pixels_see():
+    """Eight surfaces give 96 % of the room's light, and less than 90 % of that of a tube of albedo 0.9, five times as
+    deep as it is wide."""
+    vertices, faces, _ = box((0.4, 0.4, 2.0))
+    open_front = faces[vertices[faces].min(axis=1)[:, 2] < vertices[:, 2].max()]
+    tube = Surface(vertices + [-0.8, -0.6, -2.6], open_front[:, ::-1], Material(albedo=0.9))
+    scene = replace(room(), surfaces=(*room().surfaces, tube))
+    names = ("planned", 8, 60)
+    plans = [RenderSettings(error=0.02, spp=512, bounces=b) for b in (None, *names[1:])]
+    light = {name: render(scene, plan, seed=1).total_radiance() for name, plan in zip(names, plans, strict=True)}
+    inside = light[60] > 1.1 * light[8]
+    assert 1 <= inside.sum() < 40
+    planned, few, many = (light[name][inside].sum() for name in names)
+    assert few < 0.9 * many and planned == pytest.approx(many, rel=0.02)
+    assert light[8].sum() > 0.96 * light[60].sum()
 
 
 def test_many_views_get_the_rays_that_their_mean_squared_error_asks_for():
