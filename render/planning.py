@@ -32,7 +32,7 @@ AMBIENT_FRACTION, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE = 0.5, 0.02, 0.5
 LEFT_OUT, MAX_LEFT_OUT = 1 / 256, 0.02  # of the target; at most
 # The pilot's pixels miss such places: there, light that met more than 11 surfaces was a tenth. Paths that carry little
 # end early, so that this costs 0 to 3 % of the time where 8 to 11 would do.
-LEAST_BOUNCES = 24
+MIN_BOUNCES = 24
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
 CHECK_REFINEMENT, MIN_CHECK_REFINEMENT = 2, 1.5  # direct light is checked against this many times the cells a side
@@ -275,7 +275,7 @@ def _indirect(
     lines = []
     bounces = settings.bounces
     if bounces is None:
-        bounces, left_out = bounces_for(energy, min(LEFT_OUT * target, MAX_LEFT_OUT), LEAST_BOUNCES)
+        bounces, left_out = bounces_for(energy, min(LEFT_OUT * target, MAX_LEFT_OUT), MIN_BOUNCES)
         fraction = energy[2:].sum() / energy.sum()
         lines.append(
             f"bounces: {bounces}; indirect light is {fraction:.2%} of the energy, {left_out:.2%} is left out beyond"
