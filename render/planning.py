@@ -31,7 +31,7 @@ AMBIENT_FRACTION, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE = 0.5, 0.02, 0.5
 # lampshade or a pot: 0.2 % of an artist's room was 10 to 20 % of some pixels. More bounces cost a few per cent of time.
 LEFT_OUT, MAX_LEFT_OUT = 1 / 256, 0.02  # of the target; at most
 # The pilot's pixels miss such places: there, light that met more than 11 surfaces was a tenth. Paths that carry little
-# end early, so that this costs 0 to 3 % of the time where 8 to 11 would do.
+# end early: this costs up to 3 % of the time in rooms where 8 to 11 would do.
 MIN_BOUNCES = 24
 PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
