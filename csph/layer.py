@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from csph.codes import blocks, rank
 from csph.codes.design import Design
+from csph.codes.nested import nested
 from csph.codes.photons import encode_photons, photon_table
 from csph.codes.quantise import (
     HALF_RANGE,
@@ -236,6 +237,21 @@ class CompressiveLayer(nn.Module):
     def coding(self) -> CodingTensor:
         """Return the weights as they are now, constraint and pulse applied; separable ones stay so."""
         return CodingTensor(self.name, self._temporal_part(), self._spatial_part(), computed=self.computed)
+
+    def raw_coding(self) -> CodingTensor:
+        """Return the weights as they are now with the constraint alone, before the pulse and without steps."""
+        temporal = blocks.centred(self.temporal, 1) if self.options.zero_mean else self.temporal
+        return CodingTensor(self.name, temporal, self.spatial, computed=self.computed)
+
+    @torch.no_grad()
+    def begin_within(self, coding: CodingTensor, design: Design) -> None:
+        """Take the codes of a tensor over smaller blocks, or of a separable one: see `csph.codes.nested`."""
+        start = nested(coding, design)
+        self.temporal.copy_(start.temporal)
+        if self.spatial is not None and start.spatial is not None:
+            self.spatial.copy_(start.spatial)
+        if self.options.int8:
+            self.fit_ranges()
 
     def pixel_gram(self) -> Tensor:
         """Return inner products of the codes of each two pixels of a block, (Mr Mc, Mr Mc): see `csph.codes.rank`."""

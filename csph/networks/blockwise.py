@@ -57,6 +57,34 @@ class BlockMixer(nn.Module):
         return features + added.permute(0, 3, 1, 2)
 
 
+def mixers_for(mine: dict[str, Tensor], theirs: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the state of a network with codes for blocks of another size: `theirs`, and mixers as those of `mine` are.
+
+    Blocks of as many pixels and more bins get the mixers repeated: each part of a block, with its share of the codes,
+    is mixed as its block was. Blocks of other pixels keep the mixers of `mine`.
+    """
+    fitted = dict(theirs)
+    for name in (name.removesuffix("of_codes") for name in mine.keys() & theirs if name.endswith(".of_codes")):
+        parts = {key: theirs[name + key] for key in ("inner.weight", "of_codes", "bias", "outer.weight", "outer.bias")}
+        own = {key: mine[name + key] for key in parts}
+        alike = all(own[key].shape == parts[key].shape for key in ("inner.weight", "outer.weight"))
+        fitted |= {name + key: value for key, value in (_repeated(parts, own) if alike else own).items()}
+    return fitted
+
+
+def _repeated(mixer: dict[str, Tensor], larger: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return a mixer's weights for blocks of as many pixels, `times` as long, whose codes are `times` as many."""
+    (places, entries, hidden), (long, more, _) = mixer["of_codes"].shape, larger["of_codes"].shape
+    times = long // places
+    if long != times * places or more - 1 != times * (entries - 1):
+        return larger
+    of_codes = mixer["of_codes"].new_zeros((times, places, more, hidden))
+    for part in range(times):
+        of_codes[part, :, part * (entries - 1) : (part + 1) * (entries - 1)] = mixer["of_codes"][:, :-1]
+        of_codes[part, :, -1] = mixer["of_codes"][:, -1]  # how much of the signal the time block holds
+    return {**mixer, "of_codes": of_codes.flatten(0, 1), "bias": mixer["bias"].repeat(times, 1, 1)}
+
+
 def code_features(codes: Tensor) -> Tensor:
     """Return what `BlockMixer` sees of codes (B, K, T/Mt, R/Mr, C/Mc), free of their scale: unit codes, and the
     fraction of the block's signal in each time block, (B, T/Mt, R/Mr, C/Mc, K + 1)."""

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from csph.codes.blocks import encode_blocks
 from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8
 from csph.layer import CompressiveLayer
-from csph.networks.blockwise import Blockwise
+from csph.networks.blockwise import Blockwise, mixers_for
 from csph.networks.compact import Compact
 from csph.networks.grid import published_position
 from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
@@ -77,22 +77,32 @@ class DepthModel(nn.Module):
             self.network = _network(config)
 
     def begin_with(self, other: DepthModel) -> None:
-        """Take the weights of a model of the same design and network; clipping ranges of int8 that it has not are
-        fitted to them."""
+        """Take the weights of a model of the same design, or of one that this design `holds`, and its network; clipping
+        ranges of int8 that it has not are fitted to them."""
         mine, theirs = self.layer, other.layer
         fits = mine is not None and theirs is not None and mine.options.int8 and not theirs.options.int8
-        weights = {name: value for name, value in other.state_dict().items() if not name.startswith("network.")}
         self.begin_with_network(other)
+        if mine is not None and theirs is not None and self.config.design != other.config.design:
+            mine.begin_within(theirs.raw_coding(), self.config.codes_design)
+            return
+        weights = {name: value for name, value in other.state_dict().items() if not name.startswith("network.")}
         own = {name: value for name, value in self.state_dict().items() if name.startswith("network.")}
         self.load_state_dict({**weights, **own}, strict=not fits)
         if mine is not None and fits:
             mine.fit_ranges()
 
     def begin_with_network(self, other: DepthModel) -> None:
-        """Take the weights of another model's network alone; what a larger network has beyond a smaller one
-        (`training.config.GROWING`) keeps its start, which adds nothing."""
+        """Take the weights of another model's network alone.
+
+        What a larger network has beyond a smaller one (`training.config.GROWING`) keeps its start, which adds nothing;
+        so do the steps that mix a block's pixels where blocks differ in pixels. Where they differ in bins, these are
+        repeated along time.
+        """
         grown = self.config.network != other.config.network and grows(other.config.network, self.config.network)
-        self.network.load_state_dict(other.network.state_dict(), strict=not grown)
+        theirs = other.network.state_dict()
+        if self.config.sees_codes and other.config.sees_codes:
+            theirs = mixers_for(self.network.state_dict(), theirs)
+        self.network.load_state_dict(theirs, strict=not grown)
 
     @property
     def codes_layer(self) -> CompressiveLayer:

@@ -33,6 +33,7 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
+from csph.codes.nested import holds
 from csph.codes.rank import coherence, participation_rank
 from csph.networks.grid import on_published_grid, published_target
 from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
@@ -253,8 +254,10 @@ def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
     mine, other = config.model, (init.model if isinstance(init, NetworkOf) else init).config
     names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
     bare = [replace(one, sensor=replace(one.sensor, name="", tdc=None)) for one in (mine, other)]
-    alike = all(getattr(bare[0], name) == getattr(bare[1], name) for name in names if name != "network")
-    alike = alike and grows(other.network, mine.network)
+    differ = [name for name in names if name != "network" and getattr(bare[0], name) != getattr(bare[1], name)]
+    within = differ == ["design"] and mine.design is not None and other.design is not None
+    held = within and mine.layer == other.layer and holds(mine.codes_design, other.codes_design)
+    alike = (not differ or held) and grows(other.network, mine.network)
     message = (
         f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
     )

@@ -51,8 +51,9 @@ class Train(Long):
     """Sensor preset or sensor file (.toml), as in `sense`; with a time-to-digital converter patches are drawn through
     it."""
     init: Annotated[str | None, may_stay_open("MODEL")] = None
-    """Begin with the weights of a trained model of the same design, a shipped name or a checkpoint, instead of random
-    ones (fine-tuning)."""
+    """Begin with the weights of a trained model, a shipped name or a checkpoint, instead of random ones (fine-tuning):
+    of the same design, or of one whose blocks tile this design's at the same compression (learned 1024 4 4 can begin
+    as 256 4 4 does, and --full as a separable one)."""
     init_network: Annotated[str | None, may_stay_open("MODEL")] = None
     """Begin with the network of a trained model of any design, and codes of one's own from their start."""
     steps: Count = None
