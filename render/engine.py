@@ -16,6 +16,7 @@ from render.direct.integrator import centre_layers
 from render.error import (
     RULED,
     ErrorEstimate,
+    IndirectErrors,
     estimate,
     is_met,
     noise_of_responses,
@@ -52,8 +53,9 @@ from scenes.random_streams import Stream
 log = logging.getLogger(__name__)
 
 AMBIENT_BOUNCES = 16  # most paths end long before, by chance
-# Paths traced on top are at most so many times those traced before, pass by pass; filtered light has no pilot.
-MAX_MORE, MAX_MORE_FILTERED, MAX_MORE_HOPELESS = (3.0, 1.0), (15.0, 15.0, 15.0), 1.0
+# Paths traced on top are at most so many times those traced before, pass by pass; filtered light has no pilot. A last
+# pass is for targets that are missed, not for the margin below.
+MAX_MORE, MAX_MORE_FILTERED, MAX_MORE_HOPELESS = (3.0, 1.0, 1.0), (15.0, 15.0, 15.0), 1.0
 CLEAR = 3  # standard deviations above which a bias is believed
 MIN_ALLOWED = 0.25
 
@@ -124,7 +126,10 @@ def _traced_to_target(
     filtered = plan.filter and (traced.schedule is None or traced.schedule.filter_octaves is not None)
     plan = replace(plan, spp=traced.spp, filter=filtered, reasons=(*plan.reasons, *traced.reasons))
     error = estimated_error(world, plan, settings, traced, checked)
-    for number, most in enumerate(MAX_MORE_FILTERED if plan.filter else MAX_MORE):
+    passes = MAX_MORE_FILTERED if plan.filter else MAX_MORE
+    for number, most in enumerate(passes):
+        if number == len(passes) - 1 and is_met(error, plan.target):
+            break
         more = additional_schedule(world, plan, settings, traced, error, most)
         if more is None:
             break
@@ -231,7 +236,7 @@ def estimated_error(
         return estimate(coarse, fine)
     seen = traced.indirect.probed
     place, origin_m = np.arange(len(checked)), traced.origin_m[checked]
-    cells = image_cells(world, settings.indirect_tolerance_m, settings.indirect_growth, traced.origin_m, plan.bounces)
+    cells = image_cells(world, plan.indirect_tolerance_m, plan.indirect_growth, traced.origin_m, plan.bounces)
     # what merging changes, in two independent halves: their noise, which merging smooths, cancels in the product
     changes = []
     for half in (slice(0, None, 2), slice(1, None, 2)):
@@ -244,14 +249,34 @@ def estimated_error(
     indirect, noise = np.mean(batches, axis=0), noise_of_responses(batches)
     if traced.indirect.unfiltered is not None:
         bias = _filter_bias(batches, traced.indirect.unfiltered, place)
-    # few pixels hold the rare bright paths: the noise of all pixels' totals says how typical the checked ones are
-    variance = traced.indirect.noise**2
-    of_checked = variance[checked].mean()
-    typical = variance.mean() / of_checked if of_checked > 0 else 1.0
-    error = estimate(
-        coarse, fine, indirect, noise * typical, merging, bias, _lost_to_clamp(traced.indirect.removed, checked)
+    brightness = _brightness(traced, checked)
+    errors = IndirectErrors(
+        noise,
+        merging,
+        bias,
+        _lost_to_clamp(traced.indirect.removed, checked),
+        noise_scale=_over_checked(traced.indirect.noise**2, checked) / brightness,
+        clamped_scale=1 / brightness,
     )
+    error = estimate(coarse, fine, indirect, errors)
     return replace(error, worst_share=worst_fraction_of(traced.indirect.noise, error))
+
+
+def _over_checked(values: np.ndarray, checked: np.ndarray) -> float:
+    """Return the mean of all pixels' values (H*W,) over that of the checked ones; 1 where these have none."""
+    of_checked = float(values[checked].mean())
+    return float(values.mean()) / of_checked if of_checked > 0 else 1.0
+
+
+def _brightness(traced: LightSamples, checked: np.ndarray) -> float:
+    """Return the mean squared radiance of all pixels over that of the checked ones.
+
+    A highlight of a few pixels may hold most of it, and none or too many of them may be checked. Noise is taken out.
+    """
+    assert traced.indirect is not None
+    noise = traced.indirect.noise
+    total = np.bincount(traced.samples.pixel, weights=traced.samples.radiance, minlength=len(noise))
+    return _over_checked(np.maximum(total**2 - noise**2, 0), checked) or 1.0
 
 
 def _lost_to_clamp(removed: RemovedLight | None, checked: np.ndarray) -> np.ndarray | float:
@@ -306,8 +331,8 @@ def _meta(
         "plan": plan.to_dict(),
         "tolerance_m": {
             "direct": plan.direct_tolerance_m,
-            "indirect": settings.indirect_tolerance_m,
-            "growth": settings.indirect_growth,
+            "indirect": plan.indirect_tolerance_m,
+            "growth": plan.indirect_growth,
         },
         "rays": int(traced.rays),
         "clipped_footprints": traced.clipped,

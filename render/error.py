@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,7 @@ WIDEST_PIECE, MAX_PIECES = 1.0, 64  # sigma: side by side these are even to 0.3 
 BLOCK_ENTRIES = 1 << 16
 # Pixels that a few rare bright paths can spoil: a thousandth of the image, and at least a block that shares its paths.
 WORST_FRACTION, MIN_WORST = 1e-3, 16
+UNEVEN = 2.0  # times the error above which the median pixel's is said beside it
 RULED = 0.5  # share of the squared error in these pixels above which they rule it
 
 
@@ -98,27 +100,38 @@ def _in_pieces(samples: Samples) -> Samples:
     return Samples(pixel, path, half / each, radiance / each, bounces)
 
 
+class IndirectErrors(NamedTuple):
+    """Squared errors of indirect light after the pulse, (pixels,) or one for all: noise, merging of returns, a filter's
+    bias, what a clamp removed. The pixels are some of an image's: the scales say how many times as much noise, and
+    clamped error, the whole image has for its squared power."""
+
+    noise: np.ndarray | float = 0.0
+    merging: np.ndarray | float = 0.0
+    bias: np.ndarray | float = 0.0
+    clamped: np.ndarray | float = 0.0
+    noise_scale: float = 1.0
+    clamped_scale: float = 1.0
+
+
 def estimate(
     coarse: np.ndarray,
     fine: np.ndarray,
     indirect: np.ndarray | float = 0.0,
-    noise: np.ndarray | float = 0.0,
-    merging: np.ndarray | float = 0.0,
-    bias: np.ndarray | float = 0.0,
-    clamped: np.ndarray | float = 0.0,
+    errors: IndirectErrors = IndirectErrors(),  # noqa: B008  # cannot change
 ) -> ErrorEstimate:
     """Return error of direct light by `coarse` against `fine` cells beside the indirect light's own errors.
 
-    coarse, fine, indirect are (pixels, bins) responses; noise, merging, bias and clamped squared errors of the pixels.
-    Without these five there is direct light alone.
+    coarse, fine, indirect are (pixels, bins) responses. Without the last two there is direct light alone. Median and
+    percentile are those of the pixels, the rest is scaled to the image.
     """
-    noise, merging, bias, clamped = (np.broadcast_to(part, len(coarse)) for part in (noise, merging, bias, clamped))
+    noise, merging, bias, clamped = (np.broadcast_to(part, len(coarse)) for part in errors[:4])
     direct = ((coarse - fine) ** 2).sum(axis=1)
     power = ((fine + indirect) ** 2).sum(axis=1)
     whole = power.sum()
     if whole <= 0:
         return ErrorEstimate(*(0.0,) * 7)
-    *parts, lost = (max(part.sum() / whole, 0.0) for part in (direct, merging, noise, bias, clamped))
+    of_image = direct, merging, noise * errors.noise_scale, bias, clamped * errors.clamped_scale
+    *parts, lost = (max(part.sum() / whole, 0.0) for part in of_image)
     squared = np.maximum(direct + merging + noise + bias + clamped, 0)
     per_pixel = np.sqrt(squared[power > 0] / power[power > 0])
     return ErrorEstimate(
@@ -156,7 +169,10 @@ def is_met(error: ErrorEstimate, target: float) -> bool:
 def target_verdict(error: ErrorEstimate, target: float, pixels: int) -> str:
     """Say in one line whether the stated error meets the target; where a few pixels rule a missed one, say so."""
     if is_met(error, target):
-        return f"error: {error.total:.2g} stated, meets the target of {target:.2g}"
+        message = f"error: {error.total:.2g} stated, meets the target of {target:.2g}"
+        if error.pixel_median > UNEVEN * error.total:
+            message += f"; few pixels hold most of the light, the median pixel's error is {error.pixel_median:.2g}"
+        return message
     message = f"warning: the stated error of {error.total:.2g} MISSES the target of {target:.2g}"
     message += f"; the median pixel's is {error.pixel_median:.2g}"
     if error.worst_share > RULED:

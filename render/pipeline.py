@@ -143,7 +143,7 @@ def _task(
     brightest: float,
 ) -> IndirectTask:
     """Describe what is to be traced of indirect light."""
-    width_m, growth = settings.indirect_tolerance_m, settings.indirect_growth
+    width_m, growth = plan.indirect_tolerance_m, plan.indirect_growth
     grid = path_grid(world, origin_m, brightest, plan.bounces, width_m, growth)
     return IndirectTask(world, schedule, plan.bounces, seed, grid)
 
@@ -305,7 +305,7 @@ def filter_octaves_of(
 ) -> Octaves:
     """Return octaves of filtered light for so many paths a pixel in all."""
     distance_m = float(origin_m[origin_m > 0].mean()) / 2
-    width_m, growth = settings.indirect_tolerance_m, settings.indirect_growth
+    width_m, growth = plan.indirect_tolerance_m, plan.indirect_growth
     longest_m = float(image_cells(world, width_m, growth, origin_m, plan.bounces).edges_m[-1])
     footprint_m = distance_m / world.scene.camera.focal_px
     return octaves(spp, footprint_m, distance_m, longest_m, width_m, growth)

@@ -21,6 +21,8 @@ MIN_SPP = 16  # paths a pixel of the darkest block, since pilots are short; fewe
 FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
 MAX_AMBIENT_SPP = 1 << 12
+# Indirect returns of one pixel merge within so many metres of path, and this share of the path behind the direct light.
+WIDEST_INDIRECT_M, WIDEST_GROWTH = 0.03, 0.05
 FILTERED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours share it: as little noise as 45 alone
 
 Refraction = Literal["straight", "bent"]
@@ -50,9 +52,9 @@ class RenderSettings:
     edge_threshold  edges of surfaces and shadows are followed where they could change this share of a cell or more;
                 0 follows all of them
     direct_tolerance_m, indirect_tolerance_m   returns of one pixel closer than this in path length merge; direct ones
-                do not with 0
-    refraction  whether solid glass bends direct light; open: where there is any, and the laser is at the camera
+                do not with 0; open: as wide as the target allows
     indirect_growth  that width grows by this share of the path behind the direct light
+    refraction  whether solid glass bends direct light; open: where there is any, and the laser is at the camera
 
     Raises InputError for values out of range.
     """
@@ -73,8 +75,8 @@ class RenderSettings:
     budget: tuple[float, float] | None = None
     edge_threshold: float | None = None
     direct_tolerance_m: float | None = None
-    indirect_tolerance_m: float = 0.03
-    indirect_growth: float = 0.05
+    indirect_tolerance_m: float | None = None
+    indirect_growth: float | None = None
     refraction: Refraction | None = None
 
     def __post_init__(self) -> None:
@@ -89,6 +91,8 @@ class RenderSettings:
             ("direct_fraction", 0.05, 0.95),
             ("edge_threshold", 0, 1),
             ("ambient_spp", 1, 1 << 16),
+            ("indirect_growth", 0, 1),
+            ("indirect_tolerance_m", 1e-4, 10),
         )
         for name, low, high in limits:
             value = getattr(self, name)
@@ -104,10 +108,6 @@ class RenderSettings:
                 )
         if self.budget is not None and self.error is not None:
             raise InputError("render: give an error target or a photon budget, not both")
-        if not 0 <= self.indirect_growth <= 1:
-            raise InputError(f"render: indirect_growth {self.indirect_growth:g} is outside 0 to 1")
-        if not 1e-4 <= self.indirect_tolerance_m <= 10:
-            raise InputError(f"render: indirect_tolerance_m {self.indirect_tolerance_m:g} is outside 1e-4 to 10")
         tolerance = self.direct_tolerance_m
         if tolerance is not None and tolerance != 0 and not 1e-4 <= tolerance <= 10:
             raise InputError(f"render: direct_tolerance_m {tolerance:g} is neither 0 nor 1e-4 to 10")
@@ -118,6 +118,7 @@ class Plan:
     """Plan of a render, and its reasons: one a line, stored with the result.
 
     spp         work on indirect light in paths per pixel; None: whatever `noise` takes
+    indirect_tolerance_m, indirect_growth   cells of path in which returns of indirect light merge, as of the settings
     noise       target of the Monte-Carlo part of the error where spp is open
     target      that of the whole error
     refraction  of solid glass: direct light by Snell's law, or everything in a straight line
@@ -131,6 +132,8 @@ class Plan:
     reasons: tuple[str, ...]
     edge_threshold: float = 0.5
     direct_tolerance_m: float = 0.005
+    indirect_tolerance_m: float = WIDEST_INDIRECT_M
+    indirect_growth: float = WIDEST_GROWTH
     noise: float = 0.0
     target: float = 0.0
     adaptive: bool = True

@@ -10,7 +10,16 @@ import pytest
 from render import engine
 from render import pipeline as tracing
 from render.engine import render
-from render.error import BIN_M, PULSE_POWER, SIGMA_M, estimate, response, target_verdict, worst_fraction_of
+from render.error import (
+    BIN_M,
+    PULSE_POWER,
+    SIGMA_M,
+    IndirectErrors,
+    estimate,
+    response,
+    target_verdict,
+    worst_fraction_of,
+)
 from render.indirect.launch_layout import BLOCK
 from render.indirect.schedule import Schedule, reallocated
 from render.planning import bounces_for, make_plan, rays_for_all
@@ -362,7 +371,7 @@ def test_one_firefly_misses_the_target_and_is_named():
 
     noise = light.std(axis=1, ddof=1) / np.sqrt(batches)
     mean = response(of_batch(light.mean(axis=1)), np.arange(pixels))
-    stated = estimate(0 * mean, 0 * mean, mean, noise**2 * PULSE_POWER)
+    stated = estimate(0 * mean, 0 * mean, mean, IndirectErrors(noise**2 * PULSE_POWER))
     stated = replace(stated, worst_share=worst_fraction_of(noise, stated))
     assert stated.total > 0.9 and stated.pixel_median < 0.03 and stated.worst_share > 0.99
     message = target_verdict(stated, 0.05, pixels)

@@ -1,0 +1,81 @@
+"""The stated error where the checked pixels are not like the image: a highlight, rare bright paths."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from render.engine import render
+from render.error import PULSE_POWER, IndirectErrors, estimate, response
+from render.planning import PILOT_PIXELS, cell_narrowing
+from render.settings import WIDEST_GROWTH, WIDEST_INDIRECT_M, RenderSettings
+from render.transient import Transient
+from render.transient.samples import Samples
+from scene2spad.bench.hard import oracles
+from scenes import Material, Scene, Surface
+from scenes.library.things.shapes import box
+
+WIDTH, HEIGHT = 40, 30
+
+
+def responses(transient: Transient) -> np.ndarray:
+    near, far = transient.path_near_m.astype(float), transient.path_far_m.astype(float)
+    samples = Samples(transient.return_pixel, (near + far) / 2, (far - near) / 2, transient.radiance, transient.bounces)
+    return response(samples, np.arange(WIDTH * HEIGHT))
+
+
+def groove_with_a_bright_chip() -> Scene:
+    """A V-groove, and 0.3 m before the camera a white chip of 2 x 2 pixels, which holds most of the squared power."""
+    scene = oracles.groove_scene(WIDTH, HEIGHT, albedo=0.6)
+    vertices, faces, uv = box((0.014, 0.014, 0.001))
+    chip = Surface(vertices + [0.05, 0.04, -0.3], faces, Material(albedo=0.9), uv=uv, name="chip")
+    return replace(scene, surfaces=(*scene.surfaces, chip))
+
+
+def test_a_highlight_of_a_few_pixels_counts_whether_it_is_checked_or_not():
+    """All seeds have the same noise, and in the mean the same power: each has to state it, whatever pixels it checks.
+
+    75 blocks of pixels and 4 batches tell the noise of a render to 10 %, 6 seeds the true one to 5 %.
+    """
+    assert WIDTH * HEIGHT > 4 * PILOT_PIXELS
+    scene, settings = groove_with_a_bright_chip(), RenderSettings(bounces=2, spp=64, grid=2)
+    found = [render(scene, settings, seed=seed) for seed in range(6)]
+    images = np.array([responses(one) for one in found])
+    power = (images.mean(axis=0) ** 2).sum(axis=1)
+    assert np.sort(power)[-12:].sum() > 0.8 * power.sum()
+    true = np.sqrt(images.var(axis=0, ddof=1).sum() / power.sum())
+    stated = np.array([one.meta["relative_error"]["monte_carlo"] for one in found])
+    assert np.all(stated > true / 1.35) and np.all(stated < 1.35 * true)
+    assert np.sqrt(np.mean(stated**2)) == pytest.approx(true, rel=0.2)
+
+
+def test_scales_are_for_the_image_and_not_for_its_pixels():
+    pixels = np.arange(100)
+    light = Samples(pixels, np.full(100, 8.0), np.zeros(100), np.ones(100), np.full(100, 2))
+    mean, nothing = response(light, pixels), np.zeros((100, 1))
+    noise = np.full(100, 0.01**2 * PULSE_POWER)
+    alike, scaled = (
+        estimate(nothing, 0 * mean, mean, IndirectErrors(noise, noise_scale=scale)) for scale in (1.0, 9.0)
+    )
+    assert alike.monte_carlo == pytest.approx(0.01, rel=1e-3) and scaled.monte_carlo == pytest.approx(0.03, rel=1e-3)
+    assert scaled.pixel_median == alike.pixel_median == pytest.approx(0.01, rel=1e-3)
+    lost = estimate(nothing, 0 * mean, mean, IndirectErrors(clamped=noise, clamped_scale=4.0))
+    assert lost.clamped == lost.total == pytest.approx(0.02, rel=1e-3)
+
+
+def test_cells_are_as_wide_as_the_target_allows():
+    assert cell_narrowing(0.02, polished=False) == 1
+    assert cell_narrowing(0.02, polished=True) == pytest.approx(0.5**0.5)
+    # the error goes with the square of the width: a quarter of the target, whatever the target
+    for target in (1e-4, 1e-3, 5e-3):
+        assert cell_narrowing(target, polished=True) ** 2 * 0.01 == pytest.approx(target / 4)
+
+
+def test_plans_say_how_wide_cells_are_and_settings_rule():
+    scene = groove_with_a_bright_chip()
+    plan = render(scene, RenderSettings(bounces=2, spp=16, grid=2, error=1e-3)).meta["plan"]
+    assert plan["indirect_tolerance_m"] == pytest.approx(WIDEST_INDIRECT_M * cell_narrowing(1e-3, polished=False))
+    assert plan["indirect_growth"] == pytest.approx(WIDEST_GROWTH * cell_narrowing(1e-3, polished=False))
+    asked = RenderSettings(bounces=2, spp=16, grid=2, error=1e-3, indirect_tolerance_m=0.02, indirect_growth=0.0)
+    plan = render(scene, asked).meta["plan"]
+    assert plan["indirect_tolerance_m"] == 0.02 and plan["indirect_growth"] == 0
