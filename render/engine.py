@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
-import math
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from render.ambient.integrator import AmbientLight, ambient_light
-from render.clamping import RemovedLight
 from render.direct.integrator import centre_layers
 from render.error import (
     RULED,
     ErrorEstimate,
-    IndirectErrors,
-    estimate,
     is_met,
-    noise_of_responses,
-    response,
     target_verdict,
-    worst_fraction_of,
 )
-from render.indirect.integrator import image_cells
-from render.indirect.path_cells import coarsened
-from render.indirect.probe import ProbePixels
+from render.image_error import estimated_error
 from render.indirect.schedule import Schedule, reallocated
 from render.pipeline import (
     HOPELESS,
@@ -39,11 +30,11 @@ from render.pipeline import (
     most_spp,
     trace,
 )
-from render.planning import finer_pilot, make_plan, pilot_pixels, refracting
+from render.planning import make_plan, pilot_pixels, refracting
 from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, MAX_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
 from render.transient import Transient
-from render.transient.samples import concatenate, no_samples, select_pixels, to_returns
+from render.transient.samples import to_returns
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.model import Scene
@@ -121,11 +112,11 @@ def _traced_to_target(
     world: TracedScene, plan: Plan, settings: RenderSettings, seed: int, report: Progress
 ) -> tuple[Plan, LightSamples, ErrorEstimate]:
     """Trace what the plan says, and more where its error misses the target; the plan then says so."""
-    checked = pilot_pixels(world, derived_seed(seed, Stream.PLAN))
-    traced = trace(world, plan, settings, seed=seed, checked=checked, progress=report)
+    pilot = pilot_pixels(world, derived_seed(seed, Stream.PLAN))
+    traced = trace(world, plan, settings, seed=seed, pilot=pilot, progress=report)
     filtered = plan.filter and (traced.schedule is None or traced.schedule.filter_octaves is not None)
     plan = replace(plan, spp=traced.spp, filter=filtered, reasons=(*plan.reasons, *traced.reasons))
-    error = estimated_error(world, plan, settings, traced, checked)
+    error = estimated_error(world, plan, traced)
     passes = MAX_MORE_FILTERED if plan.filter else MAX_MORE
     for number, most in enumerate(passes):
         if number == len(passes) - 1 and is_met(error, plan.target):
@@ -133,10 +124,10 @@ def _traced_to_target(
         more = additional_schedule(world, plan, settings, traced, error, most)
         if more is None:
             break
-        extra = MoreSamples(more, derived_seed(seed, Stream.MORE, 0, number), checked)
+        extra = MoreSamples(more, derived_seed(seed, Stream.MORE, 0, number))
         traced = add_samples(world, plan, settings, traced, extra, report)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
-        error = estimated_error(world, plan, settings, traced, checked)
+        error = estimated_error(world, plan, traced)
     reasons = (*plan.reasons, *_bias_reasons(plan, traced, error), *clamp_reasons(plan, settings, traced, error))
     return replace(plan, reasons=reasons), traced, error
 
@@ -222,86 +213,6 @@ def _bias_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tup
     if error.bias > plan.target:
         message += f", more than the target of {plan.target:.2g}: render without a filter"
     return (message,)
-
-
-def estimated_error(
-    world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, checked: np.ndarray
-) -> ErrorEstimate:
-    """Estimate the error of a trace, from the checked pixels' batches and from finer direct light there."""
-    coarse = response(select_pixels(traced.direct, checked), checked)
-    glints = response(select_pixels(traced.specular, checked), checked)
-    fine = finer_pilot(world, checked, plan.grid, plan.edge_threshold) + glints
-    coarse += glints
-    if traced.indirect is None:
-        return estimate(coarse, fine)
-    seen = traced.indirect.probed
-    place, origin_m = np.arange(len(checked)), traced.origin_m[checked]
-    cells = image_cells(world, plan.indirect_tolerance_m, plan.indirect_growth, traced.origin_m, plan.bounces)
-    # what merging changes, in two independent halves: their noise, which merging smooths, cancels in the product
-    changes = []
-    for half in (slice(0, None, 2), slice(1, None, 2)):
-        kept = seen.samples(half) if seen.radiance.shape[1] > 1 else no_samples()
-        merged = coarsened(kept, cells, origin_m)
-        changes.append(response(concatenate([merged, kept._replace(radiance=-kept.radiance)]), place))
-    merging = (changes[0] * changes[1]).sum(axis=1)
-    bias: np.ndarray | float = 0.0
-    batches = [response(seen.samples(slice(b, b + 1)), place) for b in range(seen.radiance.shape[1])]
-    indirect, noise = np.mean(batches, axis=0), noise_of_responses(batches)
-    if traced.indirect.unfiltered is not None:
-        bias = _filter_bias(batches, traced.indirect.unfiltered, place)
-    brightness = _brightness(traced, checked)
-    errors = IndirectErrors(
-        noise,
-        merging,
-        bias,
-        _lost_to_clamp(traced.indirect.removed, checked),
-        noise_scale=_over_checked(traced.indirect.noise**2, checked) / brightness,
-        clamped_scale=1 / brightness,
-    )
-    error = estimate(coarse, fine, indirect, errors)
-    return replace(error, worst_share=worst_fraction_of(traced.indirect.noise, error))
-
-
-def _over_checked(values: np.ndarray, checked: np.ndarray) -> float:
-    """Return the mean of all pixels' values (H*W,) over that of the checked ones; 1 where these have none."""
-    of_checked = float(values[checked].mean())
-    return float(values.mean()) / of_checked if of_checked > 0 else 1.0
-
-
-def _brightness(traced: LightSamples, checked: np.ndarray) -> float:
-    """Return the mean squared radiance of all pixels over that of the checked ones.
-
-    A highlight of a few pixels may hold most of it, and none or too many of them may be checked. Noise is taken out.
-    """
-    assert traced.indirect is not None
-    noise = traced.indirect.noise
-    total = np.bincount(traced.samples.pixel, weights=traced.samples.radiance, minlength=len(noise))
-    return _over_checked(np.maximum(total**2 - noise**2, 0), checked) or 1.0
-
-
-def _lost_to_clamp(removed: RemovedLight | None, checked: np.ndarray) -> np.ndarray | float:
-    """Compute the squared error of the checked pixels by what a clamp removed: that of their regions, in the mean the
-    image's."""
-    if removed is None:
-        return 0.0
-    squared_error = removed.squared_error()
-    whole, local = max(float(squared_error.mean()), 0.0), np.maximum(squared_error[checked], 0)
-    return local * (whole / local.mean()) if local.any() else np.full(len(checked), whole)
-
-
-def _filter_bias(filtered: list[np.ndarray], unfiltered: ProbePixels, place: np.ndarray) -> np.ndarray | float:
-    """Compute the squared difference that the filter makes, per pixel, from two independent halves of the batches.
-
-    What noise adds to it has mean 0; 0 where the sum is not CLEAR standard deviations above that.
-    """
-    if len(filtered) < 2:
-        return 0.0
-    changes = [
-        np.mean(filtered[half], axis=0) - response(unfiltered.samples(half), place)
-        for half in (slice(0, None, 2), slice(1, None, 2))
-    ]
-    squared = (changes[0] * changes[1]).sum(axis=1)
-    return squared if squared.sum() > CLEAR * math.sqrt((squared**2).sum()) else 0.0
 
 
 def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> JsonObject:

@@ -24,6 +24,8 @@ WIDEST_PIECE, MAX_PIECES = 1.0, 64  # sigma: side by side these are even to 0.3 
 BLOCK_ENTRIES = 1 << 16
 # Pixels that a few rare bright paths can spoil: a thousandth of the image, and at least a block that shares its paths.
 WORST_FRACTION, MIN_WORST = 1e-3, 16
+# The brightest pixels are checked one by one where they hold more than this part of the image's squared radiance.
+BRIGHTEST, BRIGHT_FRACTION = 32, 0.25
 UNEVEN = 2.0  # times the error above which the median pixel's is said beside it
 RULED = 0.5  # share of the squared error in these pixels above which they rule it
 
@@ -100,6 +102,43 @@ def _in_pieces(samples: Samples) -> Samples:
     return Samples(pixel, path, half / each, radiance / each, bounces)
 
 
+class CheckedPixels(NamedTuple):
+    """Pixels by which an image's error is estimated.
+
+    pixel   sorted flat indices: the plan's random `pilot`, and those `added`
+    weight  how many of the image's pixels each stands for
+    """
+
+    pixel: np.ndarray
+    weight: np.ndarray
+    pilot: np.ndarray
+    added: np.ndarray
+
+    def mean(self, values: np.ndarray) -> float:
+        """Estimate the mean of an image's values (H*W,) from those of the checked pixels."""
+        return float(np.average(values[self.pixel], weights=self.weight))
+
+
+NOT_CHECKED = CheckedPixels(*(np.empty(0, np.int64),) * 4)
+
+
+def checked_pixels(pilot: np.ndarray, radiance: np.ndarray) -> CheckedPixels:
+    """Return the pixels to check of an image of such radiances (H*W,): a pilot's, each of which stands for many, and
+    the brightest for themselves, where these hold much of the squared radiance."""
+    count = len(radiance)
+    none = pilot[:0]
+    if count <= len(pilot) or count <= BRIGHTEST:
+        return CheckedPixels(pilot, np.full(len(pilot), count / max(len(pilot), 1)), pilot, none)
+    bright = np.argpartition(radiance, -BRIGHTEST)[-BRIGHTEST:]
+    power = np.square(radiance, dtype=np.float64)
+    if power[bright].sum() <= BRIGHT_FRACTION * power.sum():
+        return CheckedPixels(pilot, np.full(len(pilot), count / len(pilot)), pilot, none)
+    pixel = np.union1d(pilot, bright)
+    weight = np.full(len(pixel), (count - BRIGHTEST) / max(len(pixel) - BRIGHTEST, 1))
+    weight[np.searchsorted(pixel, bright)] = 1
+    return CheckedPixels(pixel, weight, pilot, np.setdiff1d(bright, pilot))
+
+
 class IndirectErrors(NamedTuple):
     """Squared errors of indirect light after the pulse, (pixels,) or one for all: noise, merging of returns, a filter's
     bias, what a clamp removed. The pixels are some of an image's: the scales say how many times as much noise, and
@@ -118,22 +157,26 @@ def estimate(
     fine: np.ndarray,
     indirect: np.ndarray | float = 0.0,
     errors: IndirectErrors = IndirectErrors(),  # noqa: B008  # cannot change
+    weight: np.ndarray | float = 1.0,
 ) -> ErrorEstimate:
     """Return error of direct light by `coarse` against `fine` cells beside the indirect light's own errors.
 
-    coarse, fine, indirect are (pixels, bins) responses. Without the last two there is direct light alone. Median and
-    percentile are those of the pixels, the rest is scaled to the image.
+    coarse, fine, indirect are (pixels, bins) responses. Without indirect light and its errors there is direct light
+    alone. `weight` (pixels,) says how many pixels of the image each stands for; median and percentile are those of
+    the pixels that stand for most.
     """
     noise, merging, bias, clamped = (np.broadcast_to(part, len(coarse)) for part in errors[:4])
     direct = ((coarse - fine) ** 2).sum(axis=1)
     power = ((fine + indirect) ** 2).sum(axis=1)
-    whole = power.sum()
+    weight = np.broadcast_to(weight, len(coarse))
+    whole = (weight * power).sum()
     if whole <= 0:
         return ErrorEstimate(*(0.0,) * 7)
     of_image = direct, merging, noise * errors.noise_scale, bias, clamped * errors.clamped_scale
-    *parts, lost = (max(part.sum() / whole, 0.0) for part in of_image)
+    *parts, lost = (max((weight * part).sum() / whole, 0.0) for part in of_image)
     squared = np.maximum(direct + merging + noise + bias + clamped, 0)
-    per_pixel = np.sqrt(squared[power > 0] / power[power > 0])
+    typical = (power > 0) & (weight == weight.max())
+    per_pixel = np.sqrt(squared[typical] / power[typical]) if typical.any() else np.zeros(1)
     return ErrorEstimate(
         math.sqrt(sum(parts) + lost),
         *(math.sqrt(part) for part in parts),  # type: ignore[misc]  # mypy cannot count them

@@ -9,7 +9,7 @@ import numpy as np
 from render.backend.malloc import trim_memory
 from render.clamping import Clamp, make_clamp
 from render.direct.integrator import direct_light
-from render.error import power_of
+from render.error import NOT_CHECKED, CheckedPixels, checked_pixels, power_of
 from render.indirect.integrator import (
     IndirectLight,
     IndirectTask,
@@ -44,7 +44,8 @@ FILTER_GAIN = 2.0
 class LightSamples(NamedTuple):
     """Light of a planned render before it is packed: its samples, what is known of indirect light or None, counts.
 
-    Samples of direct light come first, then those of specular light, up to `ends`, then those of indirect light.
+    Samples of direct light come first, then those of specular light, up to `ends`, then those of indirect light. Light
+    of the `checked` pixels is kept by batches.
     """
 
     samples: Samples
@@ -56,6 +57,7 @@ class LightSamples(NamedTuple):
     rays: int
     schedule: Schedule | None
     reasons: tuple[str, ...]
+    checked: CheckedPixels
 
     @property
     def spp(self) -> int:
@@ -92,12 +94,13 @@ def trace(
     settings: RenderSettings,
     *,
     seed: int = 0,
-    checked: np.ndarray | None = None,
+    pilot: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> LightSamples:
     """Trace what the plan says: the light alone, without layers, ambient light or an error estimate.
 
-    `checked` are sorted flat pixels whose indirect light is kept by batches, for the error estimate.
+    Indirect light of the `pilot`, sorted flat pixels, is kept by batches for the error estimate, and that of the
+    brightest pixels where the image's error hangs on them.
     """
     report = progress or (lambda what, fraction: None)
     camera = world.scene.camera
@@ -114,6 +117,8 @@ def trace(
         within = specular.samples.bounces <= settings.bounces
         specular = specular._replace(samples=select(specular.samples, within))
     trim_memory(len(pixels))
+    mirrored = np.bincount(specular.samples.pixel, weights=specular.samples.radiance, minlength=len(pixels))
+    checked = NOT_CHECKED if pilot is None else checked_pixels(pilot, radiance + mirrored)
     rays, indirect, schedule = direct.rays, None, None
     reasons: tuple[str, ...] = ()
     if plan.bounces > 1 and brightest > 0:
@@ -125,12 +130,15 @@ def trace(
     light.add(specular.samples)
     if schedule is not None:
         task = _task(world, plan, settings, schedule, derived_seed(seed, Stream.INDIRECT), origin_m, brightest)
-        probed = np.empty(0, np.int64) if checked is None else checked
-        indirect = indirect_light(task, probed, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part))
+        indirect = indirect_light(
+            task, checked.pixel, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part)
+        )
         rays += schedule.rays(plan.bounces)
     reasons = (*specular.notes, *reasons)
     samples = light.finished(lambda: trim_memory(len(pixels)))
-    return LightSamples(samples, ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons)
+    return LightSamples(
+        samples, ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons, checked
+    )
 
 
 def _task(
@@ -149,11 +157,10 @@ def _task(
 
 
 class MoreSamples(NamedTuple):
-    """Paths to trace on top of a render: their schedule, seed and probe pixels (sorted, flat)."""
+    """Paths to trace on top of a render: their schedule and seed."""
 
     schedule: Schedule
     seed: int
-    checked: np.ndarray
 
 
 def add_samples(
@@ -167,7 +174,9 @@ def add_samples(
     _, brightest = mean_path(traced.direct, len(traced.origin_m))
     light, more = SampleBuffer(), extra.schedule
     task = _task(world, plan, settings, more, extra.seed, traced.origin_m, brightest)
-    added = indirect_light(task, extra.checked, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part))
+    added = indirect_light(
+        task, traced.checked.pixel, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part)
+    )
     before = traced.schedule
     assert before is not None and traced.indirect is not None
     fraction = np.ones(len(traced.origin_m))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from render.engine import render
-from render.error import PULSE_POWER, IndirectErrors, estimate, response
+from render.error import PULSE_POWER, IndirectErrors, checked_pixels, estimate, response
 from render.planning import PILOT_PIXELS, cell_narrowing
 from render.settings import WIDEST_GROWTH, WIDEST_INDIRECT_M, RenderSettings
 from render.transient import Transient
@@ -47,6 +47,35 @@ def test_a_highlight_of_a_few_pixels_counts_whether_it_is_checked_or_not():
     stated = np.array([one.meta["relative_error"]["monte_carlo"] for one in found])
     assert np.all(stated > true / 1.35) and np.all(stated < 1.35 * true)
     assert np.sqrt(np.mean(stated**2)) == pytest.approx(true, rel=0.2)
+
+
+def test_the_brightest_pixels_stand_for_themselves_where_they_hold_much():
+    rng = np.random.default_rng(0)
+    radiance = rng.uniform(0.5, 1.5, 5000)
+    pilot = np.sort(rng.choice(5000, 256, replace=False))
+    even = checked_pixels(pilot, radiance)
+    assert np.array_equal(even.pixel, pilot) and len(even.added) == 0
+    assert even.mean(radiance**2) == pytest.approx(np.mean(radiance**2), rel=0.1)
+    bright = np.array([*pilot[:3], 7, 4999])
+    radiance[bright] = 100
+    checked = checked_pixels(pilot, radiance)
+    assert np.all(np.isin(bright, checked.pixel)) and np.all(np.diff(checked.pixel) > 0)
+    assert np.array_equal(np.union1d(pilot, checked.added), checked.pixel)
+    assert checked.weight.sum() == pytest.approx(5000)
+    assert np.all(checked.weight[np.isin(checked.pixel, bright)] == 1)
+    assert checked.mean(radiance**2) == pytest.approx(np.mean(radiance**2), rel=0.01)
+    assert np.mean(radiance[pilot] ** 2) > 5 * np.mean(radiance**2)  # the pilot met three of five
+    few = checked_pixels(np.arange(9), np.arange(9.0))
+    assert np.array_equal(few.pixel, np.arange(9)) and np.all(few.weight == 1)
+
+
+def test_pixels_count_as_often_as_they_stand_for_others():
+    pixels = np.arange(2)
+    light = Samples(pixels, np.full(2, 8.0), np.zeros(2), np.array([3.0, 1.0]), np.full(2, 1))
+    fine = response(light, pixels)
+    stated = estimate(fine * [[1.0], [1.1]], fine, weight=np.array([1.0, 9.0]))
+    assert stated.direct == pytest.approx(np.sqrt(9 * 0.1**2 / (9 + 9)))
+    assert stated.pixel_median == stated.pixel_p95 == pytest.approx(0.1)  # of those that stand for most
 
 
 def test_scales_are_for_the_image_and_not_for_its_pixels():
