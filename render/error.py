@@ -214,7 +214,7 @@ def target_verdict(error: ErrorEstimate, target: float, pixels: int) -> str:
     if is_met(error, target):
         message = f"error: {error.total:.2g} stated, meets the target of {target:.2g}"
         if error.pixel_median > UNEVEN * error.total:
-            message += f"; few pixels hold most of the light, the median pixel's error is {error.pixel_median:.2g}"
+            message += f"; the median pixel's is {error.pixel_median:.2g}, as bright ones rule the sum"
         return message
     message = f"warning: the stated error of {error.total:.2g} MISSES the target of {target:.2g}"
     message += f"; the median pixel's is {error.pixel_median:.2g}"

@@ -49,7 +49,7 @@ def light(seed: int, clamp: float | None, *, spp: int = 16, **more: object) -> L
         "clamp": clamp,
     } | more
     plan = Plan(**forced, ambient=False, reasons=())
-    return trace(TracedScene(scene()), plan, RenderSettings(**forced), seed=seed, checked=PIXELS)
+    return trace(TracedScene(scene()), plan, RenderSettings(**forced), seed=seed, pilot=PIXELS)
 
 
 def totals(traced: LightSamples) -> np.ndarray:

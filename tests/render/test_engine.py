@@ -20,6 +20,7 @@ from render.error import (
     target_verdict,
     worst_fraction_of,
 )
+from render.image_error import estimated_error
 from render.indirect.launch_layout import BLOCK
 from render.indirect.schedule import Schedule, reallocated
 from render.planning import bounces_for, make_plan, rays_for_all
@@ -184,20 +185,18 @@ def test_a_missed_target_is_made_good():
     fine = as_response(render(scene, RenderSettings(spp=8192, grid=16, bounces=4), seed=99), pixels)
     world, settings = TracedScene(scene), RenderSettings(bounces=4, error=0.02)
     plan = replace(make_plan(world, settings, 1), noise=0.05)  # a pilot that promises 2.5 times too much
-    first = tracing.trace(world, plan, settings, seed=1, checked=pixels)
-    error = engine.estimated_error(world, plan, settings, first, pixels)
+    first = tracing.trace(world, plan, settings, seed=1, pilot=pixels)
+    error = estimated_error(world, plan, first)
     more = engine.additional_schedule(world, plan, settings, first, error, 3.0)
     assert error.total > 0.02 and more is not None
-    both = tracing.add_samples(
-        world, plan, settings, first, tracing.MoreSamples(more, 1, pixels), lambda what, fraction: None
-    )
+    both = tracing.add_samples(world, plan, settings, first, tracing.MoreSamples(more, 1), lambda what, fraction: None)
     assert both.spp > first.spp
 
     def true(traced: tracing.LightSamples) -> float:
         return np.linalg.norm(response(traced.samples, pixels) - fine) / np.linalg.norm(fine)
 
     assert true(both) < true(first)
-    assert engine.estimated_error(world, plan, settings, both, pixels).total < error.total
+    assert estimated_error(world, plan, both).total < error.total
 
 
 def test_error_target_is_met_and_the_estimate_is_honest():

@@ -72,7 +72,7 @@ def light(scene: Scene, spp: int, seed: int, *, bounces: int = 3, filtered: bool
     forced = {"bounces": bounces, "spp": spp, "grid": 2, "filter": filtered, "edge_threshold": 1.0}
     settings = RenderSettings(**forced, direct_tolerance_m=1e-3)
     plan = Plan(**forced, direct_tolerance_m=1e-3, ambient=False, reasons=())
-    return trace(TracedScene(scene), plan, settings, seed=seed, checked=np.arange(0, WIDTH * HEIGHT, 3))
+    return trace(TracedScene(scene), plan, settings, seed=seed, pilot=np.arange(0, WIDTH * HEIGHT, 3))
 
 
 def totals(traced: LightSamples) -> np.ndarray:
