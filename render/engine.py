@@ -44,8 +44,8 @@ from scenes.random_streams import Stream
 log = logging.getLogger(__name__)
 
 AMBIENT_BOUNCES = 16  # most paths end long before, by chance
-# Paths traced on top are at most so many times those traced before, pass by pass; filtered light has no pilot. A last
-# pass is for targets that are missed, not for the margin below.
+# Paths traced on top are at most so many times those traced before, pass by pass; filtered light has no pilot. The last
+# pass is for targets that are missed, not for the margin below, and by no more than twice as many paths may gain.
 MAX_MORE, MAX_MORE_FILTERED, MAX_MORE_HOPELESS = (3.0, 1.0, 1.0), (15.0, 15.0, 15.0), 1.0
 CLEAR = 3  # standard deviations above which a bias is believed
 MIN_ALLOWED = 0.25
@@ -119,7 +119,7 @@ def _traced_to_target(
     error = estimated_error(world, plan, traced)
     passes = MAX_MORE_FILTERED if plan.filter else MAX_MORE
     for number, most in enumerate(passes):
-        if number == len(passes) - 1 and is_met(error, plan.target):
+        if number == len(passes) - 1 and not 1 < (error.total / plan.target) ** 2 <= 1 + most:
             break
         more = additional_schedule(world, plan, settings, traced, error, most)
         if more is None:
