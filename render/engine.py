@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -119,7 +120,7 @@ def _traced_to_target(
     error = estimated_error(world, plan, traced)
     passes = MAX_MORE_FILTERED if plan.filter else MAX_MORE
     for number, most in enumerate(passes):
-        if number == len(passes) - 1 and not 1 < (error.total / plan.target) ** 2 <= 1 + most:
+        if number == len(passes) - 1 and not is_within_reach(error, plan.target, most):
             break
         more = additional_schedule(world, plan, settings, traced, error, most)
         if more is None:
@@ -130,6 +131,11 @@ def _traced_to_target(
         error = estimated_error(world, plan, traced)
     reasons = (*plan.reasons, *_bias_reasons(plan, traced, error), *clamp_reasons(plan, settings, traced, error))
     return replace(plan, reasons=reasons), traced, error
+
+
+def is_within_reach(error: ErrorEstimate, target: float, most: float) -> bool:
+    """Tell whether a target is missed, by no more than `most` times as many paths on top may gain."""
+    return target < error.total <= target * math.sqrt(1 + most)
 
 
 def _standard_error(traced: LightSamples) -> np.ndarray:

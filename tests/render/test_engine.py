@@ -14,6 +14,7 @@ from render.error import (
     BIN_M,
     PULSE_POWER,
     SIGMA_M,
+    ErrorEstimate,
     IndirectErrors,
     estimate,
     response,
@@ -177,6 +178,13 @@ def test_more_paths_go_where_the_noise_is():
         assert enough.spp[5] > 30 * np.delete(enough.spp, 5).max() and enough.batches == before.batches
         little = reallocated(before, noise, 1e-4, 1.0)
         assert 0.8 * before.cost < little.cost < 1.6 * before.cost and left(little) < 0.05
+
+
+def test_a_last_pass_is_for_targets_that_it_may_reach():
+    def reached(total: float) -> bool:
+        return engine.is_within_reach(ErrorEstimate(total, *(0.0,) * 6), 0.02, most=1.0)
+
+    assert [reached(total) for total in (0.019, 0.0201, 0.028, 0.029)] == [False, True, True, False]
 
 
 def test_a_missed_target_is_made_good():
