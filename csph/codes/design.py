@@ -106,6 +106,11 @@ class Design:
         return self.size / self.codes
 
     @property
+    def periodic(self) -> bool:
+        """Return whether the temporal code is a Fourier series, which knows no first bin."""
+        return self.code in _QUARTER_WAVE
+
+    @property
     def spatial_parameters(self) -> int:
         """Count the parameters of the spatial factor, K Mr Mc; 0 without one."""
         return self.codes * math.prod(self.block[1:]) if self.has_spatial else 0

@@ -54,9 +54,9 @@ class FactorisedConv(nn.Module):
 class _ResidualConv3d(nn.Module):
     """x + relu(3^3 convolution of x)."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, convolution: type[nn.Conv3d]) -> None:
         super().__init__()
-        self.whole = nn.Conv3d(channels, channels, 3, padding=1)
+        self.whole = convolution(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.whole(x).relu_()
@@ -83,6 +83,7 @@ class Compact(nn.Module):
     reach = 20  # pixels around one that its answer depends on
     read_outs: tuple[str, ...] = ("fine", "skip_gates")  # layers whose products are the answer, not features
     coarsest = 4  # pixels of a cell of its coarsest level, whose grid begins at the image's first
+    convolution = nn.Conv3d  # of its coarsest level, over time and space
 
     def __init__(self) -> None:
         super().__init__()
@@ -91,8 +92,8 @@ class Compact(nn.Module):
         self.full_resolution = FactorisedConv(full)
         self.halved = nn.Conv2d(full, half, 3, stride=2, padding=1)
         self.half_resolution = nn.ModuleList([FactorisedConv(half), FactorisedConv(half)])
-        self.quartered = nn.Conv3d(half, quarter, 3, stride=2, padding=1)
-        self.quarter_resolution = nn.Sequential(*(_ResidualConv3d(quarter) for _ in range(2)))
+        self.quartered = self.convolution(half, quarter, 3, stride=2, padding=1)
+        self.quarter_resolution = nn.Sequential(*(_ResidualConv3d(quarter, self.convolution) for _ in range(2)))
         self.quarter_to_half = nn.Linear(quarter, half)
         self.half_to_full = nn.Linear(half, full)
         self.last = FactorisedConv(full)

@@ -20,6 +20,7 @@ from csph.networks.blockwise import Blockwise, mixers_for
 from csph.networks.compact import Compact
 from csph.networks.grid import published_position
 from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
+from csph.networks.periodic import Periodic
 from csph.networks.posterior import Decoder, confidence, decoded
 from csph.networks.published import DeepBoosting, parameters_of
 from csph.networks.refined import Refined
@@ -58,7 +59,9 @@ def _network(config: ModelConfig) -> Compact | DeepBoosting:
     if config.sees_codes:
         kind = Refined if config.network == "refined" else Blockwise
         return kind(config.codes_design.block, config.codes_design.codes)
-    return Compact() if config.network == "compact" else DeepBoosting(final_relu=config.network == "published")
+    if config.network in ("compact", "periodic"):
+        return Compact() if config.network == "compact" else Periodic()
+    return DeepBoosting(final_relu=config.network == "published")
 
 
 class DepthModel(nn.Module):
@@ -94,7 +97,7 @@ class DepthModel(nn.Module):
     def begin_with_network(self, other: DepthModel) -> None:
         """Take the weights of another model's network alone.
 
-        What a larger network has beyond a smaller one (`training.config.GROWING`) keeps its start, which adds nothing;
+        What a larger network has beyond a smaller one (`training.config.HELD`) keeps its start, which adds nothing;
         so do the steps that mix a block's pixels where blocks differ in pixels. Where they differ in bins, these are
         repeated along time.
         """

@@ -17,10 +17,15 @@ from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
 
-Network = Literal["compact", "blockwise", "refined", "published", "published-signed"]
+Network = Literal["compact", "blockwise", "refined", "periodic", "published", "published-signed"]
 Front = Literal["codes", "counts", "matched", "peak"]
-GROWING: tuple[Network, ...] = ("compact", "blockwise", "refined")  # each holds the weights of the one before
-NETWORKS: tuple[str, ...] = (*GROWING, "published", "published-signed")
+HELD: dict[str, tuple[str, ...]] = {  # our networks, and those whose weights each holds
+    "compact": ("compact",),
+    "blockwise": ("compact", "blockwise"),
+    "refined": ("compact", "blockwise", "refined"),
+    "periodic": ("compact", "periodic"),
+}
+NETWORKS: tuple[str, ...] = (*HELD, "published", "published-signed")
 FRONTS: tuple[str, ...] = ("codes", "counts", "matched", "peak")
 Optimiser = Literal["adam", "muon"]
 OPTIMISERS: tuple[str, ...] = ("adam", "muon")
@@ -34,11 +39,8 @@ COUNT_BYTES = 4 * 4  # of a batch: counts, logits, their gradient and the target
 
 
 def grows(smaller: str, larger: str) -> bool:
-    """Tell whether a network holds all weights of another: the same kind, or one further in `GROWING`."""
-    order: tuple[str, ...] = GROWING
-    if smaller in order and larger in order:
-        return order.index(smaller) <= order.index(larger)
-    return smaller == larger
+    """Tell whether a network holds all weights of another: the same kind, or one that it begins as (`HELD`)."""
+    return smaller in HELD.get(larger, (larger,))
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ class ModelConfig:
     design   the codes, with `front` = "codes"
     layer    switches of `csph.layer.LayerOptions` that differ from the published layer
     network  compact; blockwise, the compact one that sees codes and places in a block, too; refined, the blockwise one
-             that looks at the codes a second time; published; or published with logits of any sign, which cannot die
+             that looks at the codes a second time; periodic, the compact one on a circle of time, for Fourier codes of
+             the whole range; published; or published with logits of any sign, which cannot die
     sensor   whose histograms it takes
     grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with print
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
@@ -77,6 +80,7 @@ class ModelConfig:
         coded = self.front == "codes"
         require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
         require(coded or not self.sees_codes, f"network {self.network}: is for codes, and there are none")
+        require(self.network != "periodic" or self._on_a_circle, self._no_circle)
         if self.design is not None:
             bins, block = self.sensor.bins, self.design.block
             folded = not self.sees_codes or block[0] % 16 == 0
@@ -87,6 +91,17 @@ class ModelConfig:
             require(not (counted and self.layer.get("int8")), rounded)
             message = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
             require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{message}, or --layer keep_mean")
+
+    @property
+    def _on_a_circle(self) -> bool:
+        """Tell whether back-projections move with a delay, around the end of the range."""
+        whole = self.design is not None and self.design.periodic and self.design.block[0] == self.sensor.bins
+        return whole and bool(self.layer.get("keep_mean"))
+
+    @property
+    def _no_circle(self) -> str:
+        circle = f"Fourier codes over all {self.sensor.bins} bins with --layer keep_mean"
+        return f"network periodic: is for {circle}, not {self.name.partition(',')[0]}"
 
     @property
     def sees_codes(self) -> bool:
@@ -202,8 +217,8 @@ class TrainConfig:
     def _check_recipe(self) -> None:
         known = self.optimiser in OPTIMISERS
         require(known, f"training: optimiser {self.optimiser!r} is unknown, expected one of {', '.join(OPTIMISERS)}")
-        ours = self.optimiser == "adam" or self.model.network in GROWING
-        require(ours, f"training: optimiser muon is for {', '.join(GROWING)}, not network {self.model.network}")
+        ours = self.optimiser == "adam" or self.model.network in HELD
+        require(ours, f"training: optimiser muon is for {', '.join(HELD)}, not network {self.model.network}")
         known = self.schedule in SCHEDULES
         require(known, f"training: schedule {self.schedule!r} is unknown, expected one of {', '.join(SCHEDULES)}")
         require(self.sense_on in SENSE_ON, f"training: sense_on {self.sense_on!r}, expected {' or '.join(SENSE_ON)}")
@@ -346,7 +361,7 @@ def preset(name: str, model: ModelConfig, **changes: object) -> TrainConfig:
     if given.get("levels") == "paper":
         given["levels"] = TRAIN_LEVELS
     values: dict[str, Any] = {"model": model, "preset": name, **PRESETS[name], **oracle, **given}
-    if "optimiser" not in given and model.network not in GROWING:
+    if "optimiser" not in given and model.network not in HELD:
         values["optimiser"] = "adam"
     fraction = 1.0  # of the steps
     if "window" not in given and (window_refused(model, values.get("window", 0)) or values.get("time_offset_m")):

@@ -41,11 +41,12 @@ class Train(Long):
     network with three times workstation's pixels, sensed on the GPU; paper: the published network and schedule (GPU);
     laptop-v1: the recipe of the first models."""
     network: Annotated[
-        Literal["compact", "blockwise", "refined", "published", "published-signed"] | None,
-        may_stay_open("{compact,blockwise,refined,published,published-signed}"),
+        Literal["compact", "blockwise", "refined", "periodic", "published", "published-signed"] | None,
+        may_stay_open("{compact,blockwise,refined,periodic,published,published-signed}"),
     ] = None
-    """Our own (compact; blockwise sees the codes, too; refined looks at them twice), the published, or the published
-    without its final ReLU, which can die (default: published with paper; refined for blocks of several pixels with
+    """Our own (compact; blockwise sees the codes, too; refined looks at them twice; periodic answers alike at every
+    delay, for Fourier codes over all bins with --layer keep_mean), the published, or the published without its final
+    ReLU, which can die (default: published with paper; refined for blocks of several pixels with
     laptop and workstation; else compact)."""
     sensor: str = "reference"
     """Sensor preset or sensor file (.toml), as in `sense`; with a time-to-digital converter patches are drawn through

@@ -142,7 +142,7 @@ def test_recipes_of_before_keep_adam():
     values = preset("laptop", CODED, optimiser="adam").to_dict()
     del values["optimiser"]
     assert TrainConfig.from_dict(values) == preset("laptop", CODED, optimiser="adam")
-    with pytest.raises(InputError, match=r"muon is for compact, blockwise, refined, not network published"):
+    with pytest.raises(InputError, match=r"muon is for compact, blockwise, refined, periodic, not network published"):
         preset("laptop", published, optimiser="muon")
     with pytest.raises(InputError, match=r"optimiser 'sgd' is unknown, expected one of adam, muon"):
         preset("laptop", CODED, optimiser="sgd")
