@@ -14,7 +14,7 @@ from render.transient.packs import read_pack
 from scenes.errors import require
 from scenes.io.set_index import read_set_index
 from scenes.json_types import JsonObject
-from spad.detection.training_patches import PackedViews
+from spad.detection.training_patches import PackedViews, pack_views
 
 VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
 
@@ -84,3 +84,11 @@ def packed_sha256(packed: PackedViews) -> str:
     for name in ("offsets", "path_near_m", "path_far_m", "radiance", "depth_m", "ambient", "mixed"):
         sha.update(np.ascontiguousarray(getattr(packed, name)).tobytes())
     return sha.hexdigest()
+
+
+def training_parts(views: Views) -> dict[str, int]:
+    """Return the number of views that a run trains on, by the `packed_sha256` that it keeps of them: all of a set, or
+    those of its first scenes, where the run splits it by `split_views`."""
+    several = len(set(views.scenes)) >= 2
+    parts = [views, split_views(views)[0]] if several else [views]
+    return {packed_sha256(pack_views(part.transients)): len(part.transients) for part in parts}

@@ -20,7 +20,7 @@ from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.layer import SpatialStart
 from csph.networks.model import DepthModel, load_model
 from csph.training.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
-from csph.training.views import Views, read_views, split_views
+from csph.training.views import Views, read_views, split_views, training_parts
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.planes import random_planes
@@ -259,6 +259,9 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     if not 0 <= command.offset < sensor.range_m:
         raise InputError(f"offset {command.offset:g} m is outside 0 to the sensor's range {sensor.range_m:.4f} m")
     views = views_at(command.set)
+    parts = training_parts(views)
+    for path, (_, config, _) in zip(command.checkpoints, loaded, strict=True):
+        _warn_of_training_views(str(path), config, parts, command.set)
     if command.views is not None:
         require(command.views >= 1, f"views {command.views} is below 1")
         views = Views(views.transients[: command.views], views.scenes[: command.views])
@@ -282,6 +285,14 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     if command.levels:
         shown["by_level"] = by_level(found, groups, command.json)
     return {**shown, "overflows": sum(overflows), "csv": str(table)}
+
+
+def _warn_of_training_views(name: str, config: TrainConfig, parts: dict[str, int], path: Path) -> None:
+    """Say that a network has seen views of a test set in training; `parts`: `training_parts` of the set."""
+    hashes = config.data.get("training_sha256", [])
+    seen = [parts[one] for one in ([hashes] if isinstance(hashes, str) else hashes) if one in parts]
+    if seen:
+        log.warning("%s was trained on %d views of %s: its errors there are not those of a test", name, seen[0], path)
 
 
 def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[str]:
