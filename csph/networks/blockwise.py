@@ -57,18 +57,17 @@ class BlockMixer(nn.Module):
         return features + added.permute(0, 3, 1, 2)
 
 
-def mixers_for(mine: dict[str, Tensor], theirs: dict[str, Tensor]) -> dict[str, Tensor]:
+def mixers_for(mine: dict[str, Tensor], theirs: dict[str, Tensor], *, same_pixels: bool) -> dict[str, Tensor]:
     """Return the state of a network with codes for blocks of another size: `theirs`, and mixers as those of `mine` are.
 
-    Blocks of as many pixels and more bins get the mixers repeated: each part of a block, with its share of the codes,
+    Blocks of the same pixels and more bins get the mixers repeated: each part of a block, with its share of the codes,
     is mixed as its block was. Blocks of other pixels keep the mixers of `mine`.
     """
     fitted = dict(theirs)
     for name in (name.removesuffix("of_codes") for name in mine.keys() & theirs if name.endswith(".of_codes")):
         parts = {key: theirs[name + key] for key in ("inner.weight", "of_codes", "bias", "outer.weight", "outer.bias")}
         own = {key: mine[name + key] for key in parts}
-        alike = all(own[key].shape == parts[key].shape for key in ("inner.weight", "outer.weight"))
-        fitted |= {name + key: value for key, value in (_repeated(parts, own) if alike else own).items()}
+        fitted |= {name + key: value for key, value in (_repeated(parts, own) if same_pixels else own).items()}
     return fitted
 
 
@@ -85,28 +84,29 @@ def _repeated(mixer: dict[str, Tensor], larger: dict[str, Tensor]) -> dict[str, 
     return {**mixer, "of_codes": of_codes.flatten(0, 1), "bias": mixer["bias"].repeat(times, 1, 1)}
 
 
-def code_features(codes: Tensor) -> Tensor:
+def code_features(codes: Tensor, *, centre: bool = True) -> Tensor:
     """Return what `BlockMixer` sees of codes (B, K, T/Mt, R/Mr, C/Mc), free of their scale: unit codes, and the
-    fraction of the block's signal in each time block, (B, T/Mt, R/Mr, C/Mc, K + 1)."""
-    centred = codes - codes.mean(1, keepdim=True)
+    fraction of the block's signal in each time block, (B, T/Mt, R/Mr, C/Mc, K + 1); `centre` as `zero_normalised`."""
+    centred = codes - codes.mean(1, keepdim=True) if centre else codes
     norm = centred.norm(dim=1, keepdim=True)
     fraction = norm / norm.norm(dim=2, keepdim=True).clamp(min=1e-20)
-    return torch.cat([zero_normalised(codes, 1), fraction], 1).permute(0, 2, 3, 4, 1)
+    return torch.cat([zero_normalised(codes, 1, centre=centre), fraction], 1).permute(0, 2, 3, 4, 1)
 
 
 class Blockwise(Compact):
     """Back-projection (B, 1, T, R, C) and codes (B, K, T/Mt, R/Mr, C/Mc) -> logits (B, T, R, C), any sign.
 
-    Mt is a multiple of 16.
+    Mt is a multiple of 16. `keep_mean`: the layer leaves the mean over K in its codes, and so does the network.
     """
 
-    def __init__(self, block: tuple[int, int, int], codes: int) -> None:
+    def __init__(self, block: tuple[int, int, int], codes: int, *, keep_mean: bool = False) -> None:
         super().__init__()
+        self.centre = not keep_mean
         self.reach = Compact.reach + 2 * (max(block[1:]) - 1)  # each mixer sees to the end of its block
         channels = self.stem.out_channels
         self.early = BlockMixer(channels, block, codes)
         self.late = BlockMixer(channels, block, codes)
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:  # type: ignore[override]
-        block_codes = code_features(codes)
+        block_codes = code_features(codes, centre=self.centre)
         return self.logits(x, lambda f: self.early(f, block_codes), lambda f: self.late(f, block_codes))

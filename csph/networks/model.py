@@ -58,7 +58,8 @@ def _inside(span: Span) -> slice:
 def _network(config: ModelConfig) -> Compact | DeepBoosting:
     if config.sees_codes:
         kind = Refined if config.network == "refined" else Blockwise
-        return kind(config.codes_design.block, config.codes_design.codes)
+        design, keep_mean = config.codes_design, config.layer.get("keep_mean", False)
+        return kind(design.block, design.codes, keep_mean=keep_mean)
     if config.network in ("compact", "periodic"):
         return Compact() if config.network == "compact" else Periodic()
     return DeepBoosting(final_relu=config.network == "published")
@@ -104,7 +105,8 @@ class DepthModel(nn.Module):
         grown = self.config.network != other.config.network and grows(other.config.network, self.config.network)
         theirs = other.network.state_dict()
         if self.config.sees_codes and other.config.sees_codes:
-            theirs = mixers_for(self.network.state_dict(), theirs)
+            same = self.config.block[1:] == other.config.block[1:]
+            theirs = mixers_for(self.network.state_dict(), theirs, same_pixels=same)
         self.network.load_state_dict(theirs, strict=not grown)
 
     @property

@@ -47,8 +47,8 @@ class Refined(Blockwise):
 
     read_outs = (*Blockwise.read_outs, "amplitude", "correction", "correction_gates")
 
-    def __init__(self, block: tuple[int, int, int], codes: int) -> None:
-        super().__init__(block, codes)
+    def __init__(self, block: tuple[int, int, int], codes: int, *, keep_mean: bool = False) -> None:
+        super().__init__(block, codes, keep_mean=keep_mean)
         # averages see 3 pixels, the codes of a block and its mixer to the end of the block
         self.reach += 3 + 2 * (max(block[1:]) - 1)
         channels = self.stem.out_channels
@@ -65,12 +65,12 @@ class Refined(Blockwise):
         channels_last(self)
 
     def forward(self, x: Tensor, codes: Tensor, layer: CompressiveLayer) -> Tensor:  # type: ignore[override]
-        block_codes = code_features(codes)
+        block_codes = code_features(codes, centre=self.centre)
         features, slices = self.features(x, lambda f: self.early(f, block_codes), lambda f: self.late(f, block_codes))
         first = logits_of(features, slices, self.fine, self.skip_gates, x)
         posterior = first.softmax(1).view(x.shape)
         predicted = layer.encode_mean(self.mean_counts(posterior, features))
-        residual = unexplained(codes, predicted, centre=not layer.options.keep_mean)
+        residual = unexplained(codes, predicted, centre=self.centre)
         return first + self._correction(features, residual, posterior, layer)
 
     def mean_counts(self, posterior: Tensor, features: Tensor) -> Tensor:

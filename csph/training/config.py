@@ -72,15 +72,16 @@ class ModelConfig:
     def __post_init__(self) -> None:
         require(self.front in FRONTS, f"front {self.front!r} is unknown, expected one of {', '.join(FRONTS)}")
         require(self.network in NETWORKS, f"network {self.network!r} is unknown, expected {', '.join(NETWORKS)}")
-        switches = isinstance(self.layer, dict) and all(isinstance(value, bool) for value in self.layer.values())
-        require(switches, f"layer {self.layer!r}: expected switches by name")
+        named = isinstance(self.layer, dict) and all(isinstance(value, bool) for value in self.layer.values())
+        require(named, f"layer {self.layer!r}: expected switches by name")
         require(self.grid in GRIDS, f"grid {self.grid!r} is unknown, expected one of {', '.join(GRIDS)}")
         known = self.spatial_start in STARTS
         require(known, f"spatial start {self.spatial_start!r} is unknown, expected one of {', '.join(STARTS)}")
         coded = self.front == "codes"
         require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
-        require(coded or not self.sees_codes, f"network {self.network}: is for codes, and there are none")
-        require(self.network != "periodic" or self._on_a_circle, self._no_circle)
+        switches = ", ".join(sorted(name for name, on in self.layer.items() if on))
+        require(coded or not switches, f"layer {switches}: is for codes, and there are none")
+        self._check_network()
         if self.design is not None:
             bins, block = self.sensor.bins, self.design.block
             folded = not self.sees_codes or block[0] % 16 == 0
@@ -92,15 +93,24 @@ class ModelConfig:
             message = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
             require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{message}, or --layer keep_mean")
 
+    def _check_network(self) -> None:
+        coded = self.front == "codes"
+        require(coded or not self.sees_codes, f"network {self.network}: is for codes, and there are none")
+        require(self.network != "periodic" or self._on_a_circle, self._no_circle)
+        unit = 32 if self.network == "periodic" else 16
+        tiled = f"network {self.network}: {self.sensor.bins} bins, expected a multiple of {unit}"
+        require(self.sensor.bins % unit == 0, tiled)
+
     @property
     def _on_a_circle(self) -> bool:
         """Tell whether back-projections move with a delay, around the end of the range."""
-        whole = self.design is not None and self.design.periodic and self.design.block[0] == self.sensor.bins
-        return whole and bool(self.layer.get("keep_mean"))
+        if self.design is None or not self.design.periodic or not self.layer.get("keep_mean"):
+            return False
+        return self.design.block[0] == self.sensor.bins == self.sensor.bins_per_period
 
     @property
     def _no_circle(self) -> str:
-        circle = f"Fourier codes over all {self.sensor.bins} bins with --layer keep_mean"
+        circle = f"Fourier codes over all {self.sensor.bins_per_period} bins of a period with --layer keep_mean"
         return f"network periodic: is for {circle}, not {self.name.partition(',')[0]}"
 
     @property
@@ -368,7 +378,8 @@ def preset(name: str, model: ModelConfig, **changes: object) -> TrainConfig:
         values["window"] = 0
         fraction = UNWINDOWED_STEPS if PRESETS[name].get("window", 0) else 1.0
     if name in ON_CPU and model.network == "refined":
-        values |= {key: value for key, value in REFINED_PATCHES.items() if key not in given}
+        tiled = math.lcm(*model.block[1:], REFINED_PATCHES["crop"]) == REFINED_PATCHES["crop"]
+        values |= {key: value for key, value in REFINED_PATCHES.items() if key not in given and tiled}
         fraction *= REFINED_STEPS
     if "steps_per_epoch" not in given and fraction != 1:
         values["steps_per_epoch"] = math.ceil(fraction * values["steps_per_epoch"])

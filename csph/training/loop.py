@@ -107,7 +107,7 @@ class DepthTraining(pl.LightningModule):
             depth = depth - batch.first_bin.to(depth.device).view(-1, 1, 1) * sensor.bin_depth_m
             valid = batch.valid & (depth >= 0) & (depth < config.window * sensor.bin_depth_m)
             # gated: what of the pulse falls outside the window is left out
-            sensor = replace(sensor, bins=config.window, tdc=None)
+            sensor = replace(sensor, bins=config.window, pulse=sensor.response, jitter=None, tdc=None)
         else:
             logits, valid = self.model(batch.counts), batch.valid
         loss = kl_divergence(logits, depth, valid, sensor)
@@ -258,10 +258,10 @@ def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
     within = differ == ["design"] and mine.design is not None and other.design is not None
     held = within and mine.layer == other.layer and holds(mine.codes_design, other.codes_design)
     alike = (not differ or held) and grows(other.network, mine.network)
-    message = (
-        f"init: a model of {other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}"
-    )
-    require(alike, message)
+    switches = [", ".join(sorted(name for name, on in one.layer.items() if on)) or "none" for one in (mine, other)]
+    named = "" if switches[0] == switches[1] else f": --layer {switches[1]} and {switches[0]}"
+    message = f"{other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}{named}"
+    require(alike, f"init: a model of {message}")
     less = not network_alone and other.layer.get("int8", False) and not mine.layer.get("int8", False)
     require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
 
@@ -367,12 +367,12 @@ def train(
     record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():
         runner = _trainer(config, record, hardware)
-    claim_run(folder, config)
+    module = DepthTraining(config, init)
+    claim_run(folder, config)  # once the model is known to be possible
     if config.threads:
         torch.set_num_threads(config.threads)
     retain_freed_memory()
     start = time.perf_counter()
-    module = DepthTraining(config, init)
     resume = folder / RESUME
     if resume.is_file():
         check_resume(resume, module)

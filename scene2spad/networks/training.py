@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -256,8 +257,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     sensor = models[0].config.sensor
     others = [model.config.sensor.name for model in models if model.config.sensor != sensor]
     require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
-    if not 0 <= command.offset < sensor.range_m:
-        raise InputError(f"offset {command.offset:g} m is outside 0 to the sensor's range {sensor.range_m:.4f} m")
+    sensor.check_offset(command.offset)
     views = views_at(command.set)
     parts = training_parts(views)
     for path, (_, config, _) in zip(command.checkpoints, loaded, strict=True):
@@ -295,16 +295,18 @@ def _warn_of_training_views(name: str, config: TrainConfig, parts: dict[str, int
         log.warning("%s was trained on %d views of %s: its errors there are not those of a test", name, seen[0], path)
 
 
+def _recipe(config: TrainConfig) -> str:
+    same = replace(config, seed=0, threads=0, data={"training_sha256": config.data.get("training_sha256")})
+    return json.dumps(same.to_dict(), sort_keys=True)
+
+
 def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[str]:
     """Name the group of each checkpoint: trainings of one design and recipe by different seeds are one group.
 
-    Recipes differ in preset, training sets, steps, photon levels, random delays or the weight of coherence. Where one
-    design was trained by several, a group is named after its first checkpoint, too.
+    A recipe is the training sets and every number of the configuration but the seed and the threads. Where one design
+    was trained by several, a group is named after its first checkpoint, too.
     """
-    recipes = [
-        (c.model.name, c.preset, str(c.data.get("training_sha256")), c.steps, c.levels, c.time_offset_m, c.coherence)
-        for c in configs
-    ]
+    recipes = [(config.model.name, _recipe(config)) for config in configs]
     several = {name for name, *_ in recipes if len({one for one in recipes if one[0] == name}) > 1}
     firsts = dict(reversed([*zip(recipes, names, strict=True)]))
     return [f"{one[0]} ({firsts[one]})" if one[0] in several else one[0] for one in recipes]

@@ -156,6 +156,11 @@ class Sensor:
         """Return the unambiguous depth range [m], c period / 2."""
         return SPEED_OF_LIGHT_M_PER_S * self.period_s / 2
 
+    def check_offset(self, offset_m: float) -> None:
+        """Raise InputError unless scenes can be moved away by this many metres within the range."""
+        inside = 0 <= offset_m < self.range_m
+        require(inside, f"offset {offset_m:g} m is outside 0 to the sensor's range {self.range_m:.4f} m")
+
     @property
     def bin_depth_m(self) -> float:
         """Return the depth [m] that one bin spans, c bin_width / 2."""

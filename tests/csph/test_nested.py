@@ -95,7 +95,8 @@ def test_mixers_of_a_longer_block_mix_each_part_with_its_codes():
     for parameter in (small.outer.weight, small.bias):
         torch.nn.init.normal_(parameter)
     states = [{f"early.{name}": value for name, value in one.state_dict().items()} for one in (large, small)]
-    fitted = mixers_for(*states)
+    assert mixers_for(*states, same_pixels=False) == states[0]  # places in a block of other pixels mean other pixels
+    fitted = mixers_for(*states, same_pixels=True)
     large.load_state_dict({name.removeprefix("early."): value for name, value in fitted.items()})
     features = torch.randn((4, 3, 4, 4))
     codes = torch.randn((1, 4, 2, 2, 5))

@@ -96,14 +96,20 @@ def test_its_checkpoint_gives_the_same_answers(tmp_path):
         {"design": Design("learned", (BINS, 1, 1), 8)},
         {"design": Design("fourier", (BINS // 2, 1, 1), 8)},
         {"design": None, "front": "counts", "layer": {}},
+        {"sensor": Sensor(bins=BINS, bin_width_s=100e-9 / BINS, period_s=200e-9)},
     ],
-    ids=["without the mean", "learned codes", "half of the range", "no codes"],
+    ids=["without the mean", "learned codes", "half of the range", "no codes", "half of the period"],
 )
 def test_it_is_for_codes_that_know_no_first_bin(changes):
-    with pytest.raises(InputError, match="network periodic: is for Fourier codes over all 128 bins with --layer"):
+    with pytest.raises(InputError, match=r"network periodic: is for Fourier codes over all \d+ bins of a period with"):
         replace(PERIODIC, **changes)
 
 
 def test_bins_that_its_coarsest_slices_do_not_tile():
     with pytest.raises(InputError, match="48 bins: expected a multiple of 32"):
         Periodic()(torch.zeros(1, 1, 48, 4, 4))
+    sensor = Sensor(bins=48, bin_width_s=1e-9)
+    with pytest.raises(InputError, match="network periodic: 48 bins, expected a multiple of 32"):
+        replace(PERIODIC, sensor=sensor, design=Design("fourier", (48, 1, 1), 8))
+    with pytest.raises(InputError, match="network compact: 1000 bins, expected a multiple of 16"):
+        ModelConfig(front="counts", sensor=Sensor(bins=1000))

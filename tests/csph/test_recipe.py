@@ -14,6 +14,7 @@ from csph.codes.design import Design
 from csph.evaluation.metrics import PHOTON_LEVELS, TRAIN_LEVELS
 from csph.networks.grid import on_published_grid, published_centroid_bins, published_position, published_target
 from csph.networks.model import DepthModel, load_model, weights_sha256
+from csph.training import loop
 from csph.training.config import RECIPE, ModelConfig, TrainConfig, preset
 from csph.training.data import DeviceSensing, Requests, Samples, SetData, sensed_batch
 from csph.training.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
@@ -24,7 +25,10 @@ from csph.training.views import split_views
 from scene2spad.datasets.planes import random_planes
 from scenes import InputError
 from spad.detection.training_patches import PackedViews, pack_views
+from spad.sensor.files import load_sensor
 from spad.sensor.model import Sensor
+from spad.sensor.pulse import Pulse
+from spad.sensor.template import binned_pulse
 
 CODED = ModelConfig(design=Design("learned", (256, 2, 2), 8))
 
@@ -119,6 +123,23 @@ def test_a_window_is_a_cut_of_the_whole(model):
         bins = batch.depth_m[i][batch.valid[i]] / model.sensor.bin_depth_m
         assert ((bins >= first) & (bins < first + 512)).any()
     assert math.isfinite(float(training.loss(batch).detach()))
+
+
+def test_windows_keep_the_jitter_of_detector_and_clock(monkeypatch):
+    """The target is what one detection looks like, on a part of the bins as on all."""
+    clock = replace(load_sensor("reference-tdc").sensor.tdc, jitter_s=200e-12)
+    sensor = replace(load_sensor("reference-tdc").sensor, jitter=Pulse(100e-12), tdc=clock)
+    config = preset("smoke", replace(CODED, sensor=sensor))
+    packs = [pack_views(random_planes(2, size=16, seed=5).transients)]
+    training, targets = DepthTraining(config), []
+    monkeypatch.setattr(loop, "kl_divergence", lambda logits, *rest: targets.append(rest[-1]) or logits.mean())
+    for window in (512, 0):
+        training.loss(sensed_batch(packs, sensor, (8, 8), window, [Samples(packs, config, 0)[0]]))
+    arrival = torch.tensor([20e-9])
+    windowed, whole = (binned_pulse(arrival, one) for one in targets)
+    assert windowed.shape[-1] == 512 and whole.shape[-1] == 1024
+    torch.testing.assert_close(windowed, whole[..., :512], rtol=1e-4, atol=1e-6)
+    assert float(windowed.max()) < 0.8 * float(binned_pulse(arrival, replace(sensor, jitter=None, tdc=None)).max())
 
 
 def test_the_last_tenth_is_at_full_length():

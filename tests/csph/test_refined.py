@@ -46,7 +46,7 @@ def logits_plainly(model: DepthModel, codes: Tensor) -> Tensor:
     weights = layer.weights().double()  # (K, Mt, Mr, Mc)
     mt, mr, mc = weights.shape[1:]
     x = layer.decode(codes)
-    seen = code_features(codes)
+    seen = code_features(codes, centre=network.centre)
     features, slices = network.features(x, lambda f: network.early(f, seen), lambda f: network.late(f, seen))
     first = _read(features, slices, network.fine, network.skip_gates, x)
     batch, bins, rows, columns = first.shape
@@ -55,14 +55,14 @@ def logits_plainly(model: DepthModel, codes: Tensor) -> Tensor:
     a = log.clamp(-MAX_LOG_AMPLITUDE, MAX_LOG_AMPLITUDE).exp().view(batch, bins // FOLD, rows, columns)
     light = (a.repeat_interleave(FOLD, 1) * p).double()
     residual, back = torch.zeros(codes.shape).double(), torch.zeros(first.shape).double()
-    unit = weights - weights.mean(0)
+    unit = weights - weights.mean(0) if network.centre else weights
     unit = unit / (unit.norm(dim=0) + 1e-5)
     for b, i, j in np.ndindex(batch, rows // mr, columns // mc):
         own = b, slice(None), slice(i * mr, (i + 1) * mr), slice(j * mc, (j + 1) * mc)
         of_block = light[own].view(bins // mt, mt, mr, mc)
         q = torch.einsum("kmrc,tmrc->kt", weights, of_block)
         y = codes[b, :, :, i, j].double()
-        y, q = y - y.mean(0), q - q.mean(0)
+        y, q = (y - y.mean(0), q - q.mean(0)) if network.centre else (y, q)
         y = y / y.norm()
         r = y - max(float((y * q).sum() / (q * q).sum()), 0.0) * q
         residual[b, :, :, i, j] = r
@@ -105,6 +105,17 @@ def test_it_begins_as_the_blockwise_network():
     assert torch.equal(compact(counts()), refined(counts()))
     with pytest.raises(RuntimeError, match="amplitude"):
         DepthModel(BLOCKWISE, 1).begin_with(refined)
+
+
+def test_a_single_code_is_seen_where_its_mean_is_kept():
+    """Less its mean over K one code is zero: the network would see codes by name alone."""
+    single = replace(REFINED, design=Design("learned", (32, 2, 2), 1), layer={"keep_mean": True})
+    model = awake(single)
+    with torch.no_grad():
+        codes = model.layer.encode(counts())
+        seen = code_features(codes, centre=model.network.centre)
+        assert bool((seen[..., 0].abs() > 0.9).any()) and bool((seen[..., 1] > 0).any())
+        torch.testing.assert_close(model(counts()), logits_plainly(model, codes), rtol=1e-3, atol=1e-3)
 
 
 def test_every_part_learns():

@@ -15,6 +15,7 @@ import OpenEXR
 import pytest
 import torch
 
+from csph.codes.design import Design
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.networks.model import load_model
 from csph.training.config import ModelConfig, preset
@@ -155,11 +156,15 @@ def test_trainings_by_other_recipes_are_groups_of_their_own():
     assert group_names([config, again], ["a", "b"]) == ["no compression, compact"] * 2
     named = group_names([config, again, other], ["a", "b", "c"])
     assert named == ["no compression, compact (a)"] * 2 + ["no compression, compact (c)"]
-    delayed = replace(config, time_offset_m=12.0, window=0)
-    assert group_names([config, delayed], ["a", "t12"]) == [
-        "no compression, compact (a)",
-        "no compression, compact (t12)",
+    coded = preset("smoke", ModelConfig(design=Design("fourier", (1024, 1, 1), 8)))
+    others = [
+        replace(coded, time_offset_m=12.0, window=0),
+        replace(coded, rate=1e-3),
+        replace(coded, model=replace(coded.model, layer={"keep_mean": True})),
+        replace(coded, model=replace(coded.model, grid="published")),
     ]
+    names = group_names([coded, *others], ["a", "b", "c", "d", "e"])
+    assert names == [f"fourier 1024x1x1 K8, compact ({one})" for one in "abcde"]
 
 
 def test_models_are_listed_with_their_limits(capfd):
@@ -218,6 +223,16 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
         assert f"levels '{level}': expected" in refused(capfd, *evaluate, "--levels", level)
     paper = refused(capfd, "evaluate", str(trained), "--set", "published", "--levels", "1+1")
     assert "--levels does not go with --set published" in paper
+    for more in (("--int8",), ("--tiled",), ("--views", "2"), ("--decoder", "median"), ("--baselines", "argmax")):
+        paper = refused(capfd, "evaluate", str(trained), "--set", "published", *more)
+        assert f"{more[0]} does not go with --set published" in paper
+    far = refused(capfd, "evaluate", str(trained), "--set", "published", "--baselines", "--offset", "20")
+    assert "outside 0 to the sensor's range" in far
+    uncoded = [*train, str(packed), "--design", "none"]
+    assert "layer int8, keep_mean: is for codes" in refused(capfd, *uncoded, "--layer", "int8", "keep_mean")
+    wrong = ["--design", "fourier", "--block", "1024", "1", "1", "--codes"]
+    assert "expected" in refused(capfd, *train, str(packed), *wrong, "7")
+    assert not Path("x").exists()
     assert "outside 0 to the sensor's range" in refused(capfd, *evaluate, "--offset", "20")
     assert "file not found" in refused(capfd, "evaluate", "nowhere", "--set", str(packed))
 
@@ -230,7 +245,9 @@ def test_a_test_on_views_of_training_says_so(capfd, packed, trained, tmp_path):
     out = ("--levels", "50+1", "--views", "1", "--baselines", "argmax", "--out", str(tmp_path / "out"))
     for path, said in ((packed, True), (others, False)):
         assert main(["evaluate", str(trained), "--set", str(path), *out]) == 0
-        told = re.findall(rf"was trained on (\d+) views of {path}: its errors there are not those", capfd.readouterr().err)
+        told = re.findall(
+            rf"was trained on (\d+) views of {path}: its errors there are not those", capfd.readouterr().err
+        )
         assert bool(told) == said
         assert not said or 0 < int(told[0]) < 6
 
