@@ -221,6 +221,14 @@ class CompressiveLayer(nn.Module):
             self.spatial_range.copy_(self.spatial.abs().max().clamp(min=1e-30).log())
 
     @torch.no_grad()
+    def take_ranges(self, other: CompressiveLayer) -> None:
+        """Take the clipping ranges that another layer of the same codes, over smaller blocks, has learned with
+        `int8`."""
+        for mine, theirs in ((self.temporal_range, other.temporal_range), (self.spatial_range, other.spatial_range)):
+            if mine is not None and theirs is not None:
+                mine.copy_(theirs)
+
+    @torch.no_grad()
     def quantised(self) -> Quantised:
         """Return the weights in 8 bits: within the learned ranges of `int8`, else within their largest magnitudes."""
         if not self.options.int8:

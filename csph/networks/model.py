@@ -88,6 +88,7 @@ class DepthModel(nn.Module):
         self.begin_with_network(other)
         if mine is not None and theirs is not None and self.config.design != other.config.design:
             mine.begin_within(theirs.raw_coding(), self.config.codes_design)
+            mine.take_ranges(theirs)
             return
         weights = {name: value for name, value in other.state_dict().items() if not name.startswith("network.")}
         own = {name: value for name, value in self.state_dict().items() if name.startswith("network.")}

@@ -30,7 +30,7 @@ class Card:
     val_mae_mm    on its validation set, as the model was decoded then
     init          model whose weights, or network alone, its training began with; None: random weights
     errors        MAE [mm] by set and level, where `ship` was told
-    not_for       what it must not be used for
+    not_for       what it must not be used for: what follows from its training, and `limits` measured on it
     """
 
     name: str
@@ -71,7 +71,7 @@ def read_card(path: Path) -> Card:
         val_mae_mm=state.get("val_mae_mm"),
         init=config.data.get("init", config.data.get("init_network")),
         errors=stored.get("errors", {}),
-        not_for=limits(config),
+        not_for=(*limits(config), *stored.get("limits", ())),
     )
 
 

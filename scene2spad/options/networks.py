@@ -37,9 +37,9 @@ class Train(Long):
     validation: tuple[Path, ...] = ()
     """Sets to validate on (default: the last tenth of the scenes)."""
     preset: TrainingPreset = "laptop"
-    """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; gpu: our
-    network with three times workstation's pixels, sensed on the GPU; paper: the published network and schedule (GPU);
-    laptop-v1: the recipe of the first models."""
+    """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; gpu: the
+    compact network on three times workstation's pixels, sensed on the GPU; paper: the published network and schedule
+    (GPU); laptop-v1: the recipe of the first models."""
     network: Annotated[
         Literal["compact", "blockwise", "refined", "periodic", "published", "published-signed"] | None,
         may_stay_open("{compact,blockwise,refined,periodic,published,published-signed}"),
@@ -58,7 +58,7 @@ class Train(Long):
     init_network: Annotated[str | None, may_stay_open("MODEL")] = None
     """Begin with the network of a trained model of any design, and codes of one's own from their start."""
     steps: Count = None
-    """Steps of the whole run (default: the preset's)."""
+    """Steps of the whole run, rounded up to whole epochs (default: the preset's)."""
     batch: Count = None
     """Patches a step (default: the preset's)."""
     crop: Pixels = None
@@ -67,7 +67,7 @@ class Train(Long):
     """adam, or muon for the hidden layers and adam for the rest: fewer steps from random weights (default: muon;
     adam with paper, laptop-v1 and the published network)."""
     rate: Number = None
-    """Learning rate at the start, or after the warm-up (default: the preset's)."""
+    """Adam's learning rate at the start, or after the warm-up; Muon's is three times it (default: the preset's)."""
     levels: Annotated[Literal["continuous", "paper"] | None, may_stay_open("{continuous,paper}")] = None
     """Photon levels: signal from 1 to 100 over every background of the tests, or the paper's nine (default: the
     preset's)."""
@@ -118,7 +118,8 @@ class Evaluate(Common):
     """Cut images to what the blocks of all networks tile, instead of reflecting what is missing."""
     set: Path
     """Folder of a set that `dataset` rendered, its pack (.h5), a transient (.exr) or a folder of them; published: the
-    paper's pairs that lie beside the project, in its own simulation, read by both decoders."""
+    paper's pairs, in its own simulation, read by both decoders (middlebury/NAME/ with view1.png, disp1.png and dmin.txt
+    of half size, in $SCENE2SPAD_DATA)."""
     baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
     """Estimators of `depth`, and CODE-K decoded without a network."""
     levels: tuple[str, ...] = ()

@@ -119,6 +119,25 @@ def test_networks_begin_across_blocks(design, network_alone):
     assert bool(begun(counts()).isfinite().all())
 
 
+def test_codes_in_8_bits_keep_their_ranges_across_blocks():
+    """Ranges that training has narrowed clip the larger block's codes as they did the smaller one's."""
+    small = DepthModel(ModelConfig(design=INNER, sensor=SMALL, layer={"int8": True}), 1)
+    with torch.no_grad():
+        small.layer.temporal_range -= 0.5
+    large = DepthModel(replace(small.config, design=LARGER[0]), 2)
+    large.begin_with(small)
+    assert large.layer.temporal_range == small.layer.temporal_range
+    ours, theirs = large.layer.quantised(), small.layer.quantised()
+    assert ours.scale == theirs.scale
+
+
+def test_other_switches_are_named_where_they_are_why(tmp_path):
+    small = DepthModel(ModelConfig(design=INNER, sensor=SMALL), 1)
+    model = replace(small.config, design=LARGER[0], layer={"keep_mean": True})
+    with pytest.raises(InputError, match=r"cannot begin one of .* on reference: --layer none and keep_mean"):
+        train(preset("smoke", model, crop=8), [], [], tmp_path / "run", init=small)
+
+
 def test_what_cannot_begin_is_refused_in_one_line(tmp_path):
     small = DepthModel(ModelConfig(design=INNER, sensor=SMALL), 1)
     for model in (

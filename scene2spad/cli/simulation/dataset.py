@@ -18,7 +18,7 @@ class Dataset(Long):
     """Render a scene set to a folder of EXR files with an index; stopped at any moment, it goes on where it was."""
 
     set: Positional[str] = "rooms"
-    """rooms, rooms/val, rooms/test, tabletop, middlebury or hard-cases."""
+    """rooms, clutter (both also as in rooms/val and rooms/test), tabletop, middlebury or hard-cases."""
     count: Count = None
     """Views (default: all of a finite set, 100 of rooms)."""
     out: Annotated[Path | None, may_stay_open("FOLDER")] = None
