@@ -49,7 +49,7 @@ NOT_RUN = {
     "scene2spad train --preset gpu --devices 2 --set rooms.h5 --out run-gpu": "needs two GPUs",
     "scene2spad study depth-offset": "trains networks for hours; test_depth_offset runs it small",
     "scene2spad study real-data --capture FILE": "test_real_data runs it; needs trained networks beside the capture",
-    "jupytext --to notebook examples/01_first_photons.py": "jupytext is an extra; test_examples checks the cells",
+    "make notebooks": "jupytext is an extra; test_examples checks the cells",
     'eval "$(scene2spad --completion bash)"': "test_cli_words lets bash run the script",
     "python tools/set_error.py FOLDER": "renders with 256 paths a pixel; test_set_error runs it",
 }
