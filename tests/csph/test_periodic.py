@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from csph.codes.design import Design
 from csph.networks.compact import Compact
 from csph.networks.model import DepthModel, load_model, save_model
-from csph.networks.periodic import PERIOD, CircularInTime, Periodic
+from csph.networks.periodic import PERIOD, STEP, CircularInTime, Periodic
 from csph.training.config import ModelConfig, TrainConfig
 from scenes.errors import InputError
 from spad.sensor.model import Sensor
@@ -28,14 +28,21 @@ def counts(rows: int = 8, columns: int = 12) -> Tensor:
 
 
 @pytest.mark.parametrize("code", ["fourier", "gray", "fourier-published", "gray-published"])
-@pytest.mark.parametrize("periods", [1, 3])
-def test_a_delay_moves_the_answer(code, periods):
-    """From histograms on: photons that come 32 bins later, around the end of the range, move the logits by 32 bins."""
+@pytest.mark.parametrize("steps", [1, 3, 4, 13])
+def test_a_delay_moves_the_answer(code, steps):
+    """From histograms on: photons that come 8 bins later, around the end of the range, move the logits by 8 bins."""
     model = DepthModel(replace(PERIODIC, design=Design(code, (BINS, 1, 1), 8)), 2).eval()
-    seen, shift = counts(), periods * PERIOD
+    seen, shift = counts(), steps * STEP
     with torch.no_grad():
         moved, logits = model(seen.roll(shift, 2)), model(seen)
     torch.testing.assert_close(moved, logits.roll(shift, 1), rtol=1e-3, atol=1e-3)
+
+
+def test_in_training_it_follows_whole_periods():
+    model = DepthModel(PERIODIC, 2).train()
+    with torch.no_grad():
+        whole, part = (model(counts().roll(shift, 2)) - model(counts()).roll(shift, 1) for shift in (PERIOD, STEP))
+    assert whole.abs().max() < 1e-3 < 0.05 < part.abs().max()
 
 
 def test_the_compact_network_breaks_that_law():
@@ -47,14 +54,16 @@ def test_the_compact_network_breaks_that_law():
 
 
 def test_it_is_the_compact_network_of_three_periods():
-    """The plain twin: the middle of three copies of the range, farther from both ends than the network sees."""
+    """The plain twin: the middle of three copies of the range, farther from both ends than the network sees; trained,
+    the mean over four delays."""
     torch.manual_seed(1)
     periodic, compact = Periodic().eval(), Compact().eval()
     compact.load_state_dict(periodic.state_dict())
     x = torch.randn(2, 1, 256, 6, 9)
     with torch.no_grad():
-        whole = compact(x.repeat(1, 1, 3, 1, 1))[:, 256:512]
-        torch.testing.assert_close(periodic(x), whole, rtol=1e-4, atol=1e-4)
+        delayed = [compact(x.roll(by, 2).repeat(1, 1, 3, 1, 1))[:, 256:512].roll(-by, 1) for by in (0, 8, 16, 24)]
+        torch.testing.assert_close(periodic.train()(x), delayed[0], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(periodic.eval()(x), sum(delayed) / 4, rtol=1e-4, atol=1e-4)
 
 
 def test_its_convolutions_in_three_dimensions_are_plain_ones_of_a_range_continued():
