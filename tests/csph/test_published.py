@@ -204,7 +204,8 @@ def test_nothing_is_overwritten_and_other_files_are_named(tmp_path):
     path = checkpoint(tmp_path / "a.ckpt", renamed(direct(DESIGNS[0])))
     torch.save([1, 2], tmp_path / "list.ckpt")
     assert "holds no state_dict" in refusal(tmp_path / "list.ckpt", tmp_path / "model")
-    assert "do not divide the sensor's 1000" in refusal(path, tmp_path / "model", replace(TRAIN, bins=1000))
+    assert "do not divide the sensor's 1008" in refusal(path, tmp_path / "model", replace(TRAIN, bins=1008))
+    assert "1000 bins, expected a multiple of 16" in refusal(path, tmp_path / "model", replace(TRAIN, bins=1000))
     made = import_checkpoint(path, tmp_path / "model")
     before = made.path.read_bytes()
     with pytest.raises(InputError, match=r"model\.safetensors: exists"):
