@@ -30,5 +30,13 @@ def test_a_network_on_all_bins_has_no_bias(wall_bias, capsys):
     assert "0 of 2 walls beyond 3 mm" in told
     assert wall_bias.main(["none-mixed-s0", "--from", "5", "--to", "4"]) == 2
     assert "depths from 5 to 4 m: none" in capsys.readouterr().err
+    for wrong, said in (
+        (["--to", "inf"], "to inf m: none"),
+        (["--step", "nan"], "step nan m"),
+        (["--step", "1e-9"], "walls, expected 1000 at most"),
+        (["--draws", "0"], "draws 0 is outside 1 to 1000"),
+    ):
+        assert wall_bias.main(["none-mixed-s0", *wrong]) == 2
+        assert said in capsys.readouterr().err
     assert wall_bias.main(["nothing-s0"]) == 2
     assert "is unknown" in capsys.readouterr().err

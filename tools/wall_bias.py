@@ -30,6 +30,7 @@ from spad.sensor.model import PhotonBudget
 PIXELS, FOV_DEG = 24, 4.0
 BUDGET = PhotonBudget(50.0, 50.0)
 BOUND_MM = 3.0
+MOST = 1000  # walls, and draws of a wall
 
 
 def wall_errors_mm(models: Sequence[DepthModel], distance_m: float, draws: int, seed: int) -> np.ndarray:
@@ -68,17 +69,21 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--draws", type=int, default=4, metavar="N", help="draws of photons a wall (default: 4)")
     options = parser.parse_args(argv)
     try:
-        require(options.step > 0 and options.draws >= 1, "expected a step above 0 and at least one draw")
-        require(0 < options.first <= options.last, f"depths from {options.first:g} to {options.last:g} m: none")
+        require(options.step > 0, f"step {options.step:g} m: expected more than 0")
+        require(1 <= options.draws <= MOST, f"draws {options.draws} is outside 1 to {MOST}")
+        some = 0 < options.first <= options.last < math.inf
+        require(some, f"depths from {options.first:g} to {options.last:g} m: none")
+        walls = (options.last - options.first) / options.step
+        require(walls < MOST, f"{walls:.0f} walls, expected {MOST} at most")
         models = [load_model(checkpoint_of(Path(name)))[0] for name in options.models]
         count = round((options.last - options.first) / options.step) + 1
         depths_m = np.round(options.first + options.step * np.arange(count), 6)
-        walls = [wall_errors_mm(models, float(d), options.draws, 1000 * i) for i, d in enumerate(depths_m)]
+        errors = [wall_errors_mm(models, float(d), options.draws, MOST * i) for i, d in enumerate(depths_m)]
     except InputError as error:
         print(f"wall_bias: {error}", file=sys.stderr)
         return 2
     for row, name in enumerate(options.models):
-        print(summary(name, depths_m, np.stack([wall[row] for wall in walls])))
+        print(summary(name, depths_m, np.stack([of_wall[row] for of_wall in errors])))
     return 0
 
 
