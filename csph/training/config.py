@@ -158,6 +158,8 @@ class TrainConfig:
     decay, decay_steps, warmup, rate_end   of the schedule
     average       of the weights after every step, with this weight of the past: what is validated, kept and shipped;
                   0: the weights themselves
+    init_share    of the weights that the run begins with in those that are kept at its end: the mean of both where a
+                  converged model is trained on from a higher rate (Izmailov et al. 2018)
     window        train on so many bins around a label, in steps of 256, but for the last tenth of the run; 0: on all.
                   Not for blocks of more bins, whose codes would then not see the whole range
     weights       how often patches are drawn from each of several training sets (default: alike)
@@ -205,6 +207,7 @@ class TrainConfig:
     sense_on: SenseOn = "host"
     decoded_weight: float = 0.0
     optimiser: Optimiser = "adam"
+    init_share: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("epochs", "steps_per_epoch", "batch", "crop", "decay_steps", "validation_views"):
@@ -235,6 +238,7 @@ class TrainConfig:
         require(self.warmup >= 0, f"training: warm-up of {self.warmup} steps is negative")
         require(0 < self.rate_end <= 1, f"training: rate_end {self.rate_end:g} is outside (0, 1]")
         require(0 <= self.average < 1, f"training: average {self.average:g} is outside [0, 1)")
+        require(0 <= self.init_share < 1, f"training: init_share {self.init_share:g} is outside [0, 1)")
         good = math.isfinite(self.decoded_weight) and self.decoded_weight >= 0
         require(good, f"training: weight {self.decoded_weight:g} of the decoded error is negative")
         require(self.coherence >= 0, f"training: weight {self.coherence:g} of the coherence is negative")

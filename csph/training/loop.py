@@ -26,20 +26,19 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
-from csph.codes.nested import holds
 from csph.codes.rank import coherence, participation_rank
 from csph.networks.grid import on_published_grid, published_target
 from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
 from csph.networks.posterior import DECODERS
 from csph.networks.published import soft_argmax
-from csph.training.config import TrainConfig, grows
+from csph.training.beginning import NetworkOf, check_init
+from csph.training.config import TrainConfig
 from csph.training.data import SetData, TrainBatch
 from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.optimiser import make_optimiser
@@ -61,12 +60,6 @@ log = logging.getLogger("csph")
 EXCESS_WEIGHT = 10.0  # of sums beyond 16 bits
 
 
-class NetworkOf(NamedTuple):
-    """A trained model whose network alone a training begins with."""
-
-    model: DepthModel
-
-
 def _mean(means: nn.ModuleDict, decoder: str) -> MeanMetric:
     found = means[decoder]
     assert isinstance(found, MeanMetric)
@@ -86,6 +79,8 @@ class DepthTraining(pl.LightningModule):
         elif init is not None:
             self.model.begin_with(init)
         self.averaged: DepthModel | None = None
+        # a plain list: no part of the state, since a run that goes on begins with the same model
+        self.begun = [part.detach().clone() for part in self.model.parameters()] if config.init_share else []
         if config.average:  # a module of its own: Lightning's checkpoint then holds it
             self.averaged = deepcopy(self.model).requires_grad_(False).eval()
         self.train_loss = MeanMetric()
@@ -134,6 +129,13 @@ class DepthTraining(pl.LightningModule):
             past = min(self.config.average, (1 + self.global_step) / (10 + self.global_step))
             with torch.no_grad():
                 torch._foreach_lerp_(list(self.averaged.parameters()), list(self.model.parameters()), 1 - past)
+
+    def on_train_batch_end(self, *_: object) -> None:
+        if self.begun and self.global_step == self.config.steps:
+            kept: list[Tensor] = list(self.kept.parameters())
+            begun = [part.to(self.device) for part in self.begun]
+            with torch.no_grad():
+                torch._foreach_lerp_(kept, begun, self.config.init_share)
 
     def validation_step(self, batch: TrainBatch, _: int, dataloader_idx: int = 0) -> None:
         logits = self.kept(batch.counts)
@@ -248,24 +250,6 @@ def claim_run(folder: Path, config: TrainConfig) -> None:
         beside.write_text(text)
 
 
-def _check_init(init: DepthModel | NetworkOf, config: TrainConfig) -> None:
-    """Raise InputError unless a trained model fits the one to be trained, but for converters of its sensor."""
-    network_alone = isinstance(init, NetworkOf)
-    mine, other = config.model, (init.model if isinstance(init, NetworkOf) else init).config
-    names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
-    bare = [replace(one, sensor=replace(one.sensor, name="", tdc=None)) for one in (mine, other)]
-    differ = [name for name in names if name != "network" and getattr(bare[0], name) != getattr(bare[1], name)]
-    within = differ == ["design"] and mine.design is not None and other.design is not None
-    held = within and mine.layer == other.layer and holds(mine.codes_design, other.codes_design)
-    alike = (not differ or held) and grows(other.network, mine.network)
-    switches = [", ".join(sorted(name for name, on in one.layer.items() if on)) or "none" for one in (mine, other)]
-    named = "" if switches[0] == switches[1] else f": --layer {switches[1]} and {switches[0]}"
-    message = f"{other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}{named}"
-    require(alike, f"init: a model of {message}")
-    less = not network_alone and other.layer.get("int8", False) and not mine.layer.get("int8", False)
-    require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
-
-
 @dataclass(frozen=True)
 class Hardware:
     """What a training runs on: processes that draw samples, and Lightning's names of accelerator, devices, strategy."""
@@ -356,8 +340,7 @@ def train(
     InputError for sets or an `init` that do not fit, indirect light on the published grid, and another run's folder.
     """
     config.check_memory()
-    if init is not None:
-        _check_init(init, config)
+    check_init(init, config)
     sets = [[pack_views(one.transients) for one in _listed(views)] for views in (training, validation)]
     config = _with_hashes(config, sets, init)
     if config.model.grid == "published":

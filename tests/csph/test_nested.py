@@ -11,8 +11,9 @@ from csph.codes.nested import block_parts, holds, nested
 from csph.layer import CompressiveLayer
 from csph.networks.blockwise import BlockMixer, mixers_for
 from csph.networks.model import DepthModel
+from csph.training.beginning import NetworkOf
 from csph.training.config import ModelConfig, preset
-from csph.training.loop import DepthTraining, NetworkOf, train
+from csph.training.loop import DepthTraining, train
 from scenes.errors import InputError
 from spad.sensor.model import Sensor
 

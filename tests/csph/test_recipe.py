@@ -15,10 +15,11 @@ from csph.evaluation.metrics import PHOTON_LEVELS, TRAIN_LEVELS
 from csph.networks.grid import on_published_grid, published_centroid_bins, published_position, published_target
 from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training import loop
+from csph.training.beginning import NetworkOf
 from csph.training.config import RECIPE, ModelConfig, TrainConfig, preset
 from csph.training.data import DeviceSensing, Requests, Samples, SetData, sensed_batch
 from csph.training.levels import BACKGROUND, HARDEST, SIGNAL, draw_level
-from csph.training.loop import DepthTraining, NetworkOf, train
+from csph.training.loop import DepthTraining, train
 from csph.training.loss import decoded_error
 from csph.training.schedule import rate_factor
 from csph.training.views import split_views
@@ -228,6 +229,27 @@ def test_a_run_begins_with_a_trained_model(tmp_path):
     start = DepthModel(config.model, config.seed).layer
     torch.testing.assert_close(fourth.layer.temporal, start.temporal, rtol=0, atol=1e-9)
     assert said.data["init_sha256"] == weights_sha256(first)
+
+
+@pytest.mark.parametrize("average", [0.0, 0.9])
+def test_the_kept_weights_are_a_mean_with_those_begun_with(tmp_path, average):
+    """With a share of them: of a run and of the model that it began with, parameter by parameter; after a kill, too."""
+    training, validation = split_views(near_planes(6))
+    config = preset("smoke", MODEL, **FEW)
+    train(config, training, validation, tmp_path / "first")
+    first, _, _ = load_model(tmp_path / "first")
+    on = replace(config, seed=1, average=average)
+    for name, share in (("end", 0.0), ("mean", 0.25)):
+        train(replace(on, init_share=share), training, validation, tmp_path / name, init=first)
+    end, mean = (load_model(tmp_path / name / "last.safetensors")[0].state_dict() for name in ("end", "mean"))
+    for name, value in first.state_dict().items():
+        torch.testing.assert_close(mean[name], 0.25 * value + 0.75 * end[name], rtol=1e-5, atol=1e-7)
+    rows = [(tmp_path / name / "log.csv").read_text().splitlines() for name in ("end", "mean")]
+    assert rows[0][:-1] == rows[1][:-1] and rows[0][-1] != rows[1][-1]  # what is validated last is what is kept
+    with pytest.raises(InputError, match=r"init_share 0\.25 needs a model to begin with"):
+        train(replace(on, init_share=0.25), training, validation, tmp_path / "none")
+    with pytest.raises(InputError, match=r"init_share 1 is outside"):
+        replace(on, init_share=1.0)
 
 
 def test_the_decoded_error_is_the_soft_argmaxs_and_moves_far_mass():
