@@ -172,14 +172,17 @@ def poisson_arrivals(rate: float, frame_clocks: int, seed: int) -> np.ndarray:
 def periodic_arrivals(
     timestamps: np.ndarray, frame_clocks: int, seed: int, *, period_s: float = 100e-9, chip: ChipSpec | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return clocks of photons that a pulsed laser brings: every timestamp in a cycle of its own, at its place in the
-    period.
+    """Return clocks of photons that a pulsed laser brings: every timestamp in a laser cycle drawn at random, at its
+    place in the period. A cycle may hold several, as with the SPADs of one core.
 
-    timestamps (N,) of 0 .. 1023 over the period -> clocks (N,) rising, and the timestamps in that order.
+    timestamps (N,) of 0 .. 1023 over the period -> clocks (N,) rising, and the timestamps in that order. Raises
+    InputError for a frame that is shorter than the period.
     """
     chip = chip or ChipSpec()
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(11,)))
     period = period_s / chip.clock_s
+    fits = frame_clocks >= period
+    require(fits, f"arrivals: a frame of {frame_clocks:g} clocks is shorter than the laser period of {period:g} clocks")
     cycles = random.integers(0, int(frame_clocks // period), len(timestamps))
     clocks = (cycles + (np.asarray(timestamps) + random.random(len(timestamps))) / chip.timestamps) * period
     order = np.argsort(clocks, kind="stable")

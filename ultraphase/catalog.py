@@ -80,6 +80,12 @@ class Method:
             even = self.family == "learned" or self.codes % 2 == 0
             good = 1 <= self.codes <= 1024 and even
             require(good, f"program {self.name}: {self.codes} codes, expected an even number from 2 to 1024")
+            plain = self.shift_step is None
+            require(
+                plain, f"program {self.name}: shift {self.shift_step} is for coarse programs, the others shift none"
+            )
+        least = self.shift_step is None or self.shift_step >= 1
+        require(least, f"program {self.name}: shift of {self.shift_step} bits an instruction, expected 1 or more")
 
     @property
     def name(self) -> str:

@@ -54,7 +54,8 @@ def sense(
     and pile-up take theirs (what is counted after them is in `counts`); the share of signal detections that wrapped
     around the period, the share of the background that is dark counts, the shares of the signal in the brightest pixel
     and in the brightest thousandth of pixels, and the median pixel's signal (`spad.detection.glints`). Raises
-    InputError for an unknown law, one that the detector cannot follow, and more than 2^31 - 1 counts in a bin.
+    InputError for an unknown law, first-photon where the dead time is longer than the period, and more than 2^31 - 1
+    counts in a bin.
     """
     exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
     return Histogram(counts=counts_of(exposure, progress), sensor=sensor, budget=budget, **truth)
@@ -135,7 +136,9 @@ def _planned(
     reasons = [*rates.reasons, reason]
     if sensor.crosstalk:
         reasons.append(f"crosstalk: a detection fires each of its neighbours with probability {sensor.crosstalk:.3%}")
-    fraction = wrapped / (budget.signal * signal.size) if wrapped > 0 else 0.0
+    # dead pixels detect neither what wraps nor the rest
+    detected = float(light.signal.sum()) if (rates.alive == 0).any() else budget.signal * signal.size
+    fraction = wrapped / detected if wrapped > 0 else 0.0
     if wrapped > 0:
         reasons.append(
             f"wrap: {fraction:.3%} of the signal arrives after the period of {sensor.range_m:.3f} m and wraps"
@@ -204,7 +207,7 @@ def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
         )
     if blind <= LOW_FLUX:
         return "poisson", f"model: independent Poisson, {message}"
-    if sensor.reset == "synchronous" and not outlasts:
+    if sensor.armed_every_cycle:
         return "first-photon", f"model: first photon of each cycle (pile-up), {message}, armed at every cycle"
     if sensor.dead_time_s == 0:
         return (

@@ -19,12 +19,21 @@ from torch import Tensor
 
 from scenes.errors import require
 from scenes.random_streams import Stream
+from spad.detection.laws import NEIGHBOURS
 from spad.detection.photons import paths_in_bins
 from spad.detection.rates import background_scales
-from spad.detection.training_patches import Batch, PackedViews, Patch
+from spad.detection.training_patches import Batch, PackedViews, Patch, check_patch
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, pulse_table
 from spad.sensor.tdc import rising_edges
+
+
+class _Pixels(NamedTuple):
+    """Pixels of a batch: index among all scenes' and within their frames, and 1 where they detect light, else 0."""
+
+    flat: Tensor  # (P,) int64
+    in_frame: Tensor  # (P,) int64
+    alive: Tensor  # (P,) float32
 
 
 class _Photons(NamedTuple):
@@ -38,7 +47,7 @@ class DevicePatches:
     """Packed transients that live on a device, and patches sensed there.
 
     packed   transients of one size
-    sensor   whose bins, period, pulse, jitter and dark counts the detections have
+    sensor   whose bins, period, pulse, jitter, dark counts, dead pixels and crosstalk the detections have
     device   torch's name of the device, "cpu" among them
 
     Positions are in float32: 6e-5 of a bin at bin 1,024.
@@ -56,6 +65,7 @@ class DevicePatches:
         dark = sensor.dark_rate_map_hz(rows, columns) * sensor.exposure_s
         self.mean_radiance, self.mean_ambient, self.mean_dark = packed.mean_radiance, packed.mean_ambient, dark.mean()
         self.dark = self._moved(dark).flatten()
+        self.alive = self._moved(~sensor.dead_pixels(rows, columns)).flatten()
         edges, converter = sensor.code_edges, sensor.converter_map(rows, columns)
         self.edges = None if edges is None else torch.from_numpy(rising_edges(edges)).to(self.device)
         self.converter = None if converter is None else torch.from_numpy(converter).to(self.device).flatten()
@@ -75,37 +85,45 @@ class DevicePatches:
         """
         (height, width), bins = size, self.sensor.bins
         shape = (len(patches), height, width)
-        pixel, in_frame = self._pixels(patches, height, width)
-        signal, ambient, dark = self._scales(patches, height * width)
+        pixels = self._pixels(patches, size, 0)
+        # crosstalk comes from the pixels around a patch, too
+        lit = self._pixels(patches, size, 1) if self.sensor.crosstalk else pixels
+        lit_per_patch = len(lit.flat) // len(patches)
+        signal, ambient, dark = self._scales(patches, lit_per_patch)
         number = np.random.SeedSequence(seed, spawn_key=(Stream.DEVICE_PATCH,)).generate_state(1, np.uint64)[0]
         draw = torch.Generator(self.device).manual_seed(int(number >> np.uint64(1)))
-        moved = torch.tensor([p.time_offset_m for p in patches], device=self.device).repeat_interleave(height * width)
-        light = self._signal_photons(pixel, signal, moved / self.sensor.bin_depth_m, draw)
-        steady = self._background_photons(self.ambient[pixel] * ambient + self.dark[in_frame] * dark, draw)
+        offset = torch.tensor([p.time_offset_m for p in patches], device=self.device)
+        moved = offset.repeat_interleave(lit_per_patch)
+        light = self._signal_photons(lit.flat, signal * lit.alive, moved / self.sensor.bin_depth_m, draw)
+        expected = self.ambient[lit.flat] * ambient + self.dark[lit.in_frame] * dark
+        steady = self._background_photons(expected * lit.alive, draw)
         counts = torch.zeros(len(patches) * bins * height * width, device=self.device)
         for photons in (light, steady):
-            self._count(photons, in_frame, height * width, counts)
-        depth = (self.depth_m[pixel] + moved).view(shape)
+            if self.sensor.crosstalk:
+                photons = self._with_crosstalk(photons, pixels.alive, size, draw)
+            self._count(photons, pixels.in_frame, height * width, counts)
+        depth = (self.depth_m[pixels.flat] + offset.repeat_interleave(height * width)).view(shape)
         return Batch(
             counts.view(len(patches), 1, bins, height, width),
             depth,
-            self.mixed[pixel].view(shape),
+            self.mixed[pixels.flat].view(shape),
             depth < self.sensor.range_m,
         )
 
-    def _pixels(self, patches: Sequence[Patch], height: int, width: int) -> tuple[Tensor, Tensor]:
-        """Return flat indices of the patches' pixels among all scenes', (B h w,), and within their frames."""
-        scenes, rows, columns = self.shape
+    def _pixels(self, patches: Sequence[Patch], size: tuple[int, int], margin: int) -> _Pixels:
+        """Return the patches' pixels and so many on all sides; those outside of the frame detect nothing."""
+        (height, width), (_, rows, columns) = size, self.shape
         for one in patches:
-            inside = 0 <= one.scene < scenes and 0 <= one.row <= rows - height and 0 <= one.column <= columns - width
-            place = f"patch of {height} x {width} at scene {one.scene}, row {one.row}, column {one.column}"
-            require(inside, f"{place} is outside {scenes} scenes of {rows} x {columns}")
+            check_patch(one, size, self.shape)
         scene, row, column = (
             np.array([getattr(one, name) for one in patches])[:, None, None] for name in ("scene", "row", "column")
         )
-        in_frame = (row + np.arange(height)[:, None]) * columns + column + np.arange(width)
+        row, column = row + np.arange(-margin, height + margin)[:, None], column + np.arange(-margin, width + margin)
+        outside = (row < 0) | (row >= rows) | (column < 0) | (column >= columns)
+        in_frame = row.clip(0, rows - 1) * columns + column.clip(0, columns - 1)
         flat = scene * rows * columns + in_frame
-        return tuple(torch.from_numpy(values.ravel()).to(self.device) for values in (flat, in_frame))  # type: ignore
+        there, place, out = (torch.from_numpy(values.ravel()).to(self.device) for values in (flat, in_frame, outside))
+        return _Pixels(there, place, self.alive[place] * ~out)
 
     def _scales(self, patches: Sequence[Patch], pixels: int) -> Sequence[Tensor]:
         """Return factors of radiance, ambient light and dark counts that bring each scene to its photon level, one for
@@ -143,6 +161,28 @@ class DevicePatches:
             owner,
             torch.rand(len(owner), generator=draw, device=self.device) * self.sensor.bins_per_period,
         )
+
+    def _with_crosstalk(
+        self, photons: _Photons, alive: Tensor, size: tuple[int, int], draw: torch.Generator
+    ) -> _Photons:
+        """Add what detections fire in their neighbours, as `laws.crosstalk_events`.
+
+        The detections are of patches with a margin of one pixel, the result is of patches without it.
+        """
+        (height, width), (tall, wide) = size, (size[0] + 2, size[1] + 2)
+        pixel, positions = photons.pixel, [photons.position]
+        rows, columns, patches = [pixel // wide % tall - 1], [pixel % wide - 1], [pixel // (tall * wide)]
+        for down, right in NEIGHBOURS:
+            fired = torch.rand(len(pixel), generator=draw, device=self.device) < self.sensor.crosstalk
+            rows.append(rows[0][fired] + down)
+            columns.append(columns[0][fired] + right)
+            patches.append(patches[0][fired])
+            positions.append(photons.position[fired])
+        row, column, patch, position = (torch.cat(parts) for parts in (rows, columns, patches, positions))
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        place = ((patch * height + row) * width + column)[inside]
+        seen = alive[place] > 0
+        return _Photons(place[seen], position[inside][seen])
 
     def _count(self, photons: _Photons, in_frame: Tensor, pixels: int, counts: Tensor) -> None:
         """Add detections to flat counts (B T P); whole numbers, so that no order of additions shows."""

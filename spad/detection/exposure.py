@@ -109,6 +109,7 @@ def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
     counts = counts.reshape(height, width, bins)
     if exposure.adds_crosstalk:
         add_crosstalk(counts, exposure.sensor.crosstalk, exposure.rng(Stream.CROSSTALK, slice(0, 0)))
+        counts[exposure.rates.alive == 0] = 0  # dead pixels detect no crosstalk either
     return counts
 
 
@@ -204,6 +205,8 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
     events = Detections(*(np.concatenate(columns) for columns in zip(*everything, strict=True)))
     rng = exposure.rng(Stream.CROSSTALK, slice(0, 0))
     cause, pixel = crosstalk_events(events.pixel, sensor.crosstalk, transient.height, transient.width, rng)
+    seen = exposure.rates.alive.ravel()[pixel] > 0  # dead pixels detect no crosstalk either
+    cause, pixel = cause[seen], pixel[seen]
     fired = Detections(pixel, events.cycle[cause], events.position[cause])
     both = Detections(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
     detected = exposure.coded(exposure.law.keep(both, sensor, ready), 0)

@@ -50,7 +50,7 @@ def rates_for(
     scale = budget.signal * transient.height * transient.width / total if total > 0 else 0.0
     dark_hz, dead = detector_maps(sensor, shape, dark_map_hz, seed)
     filled = fill_background(transient.ambient, dark_hz * sensor.exposure_s, budget.background)
-    reasons = (filled.reason, *_odd_pixels(sensor, dead))
+    reasons = (filled.reason, *_odd_pixels(sensor, dead, measured=dark_map_hz is not None))
     background, alive = np.where(dead, 0.0, filled.background), np.where(dead, 0.0, 1.0)
     return Rates(scale, background, filled.dark_fraction, reasons, alive, sensor.converter_map(*shape, seed))
 
@@ -100,7 +100,8 @@ def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Fill
         return Filled(dark * dark_scale, 1.0 if asked > 0 else 0.0, reason)
     fraction = counted / asked if asked > 0 else 0.0
     if counted > 0:
-        reason = f"background: {fraction:.1%} dark counts ({counted:g} a pixel), the rest ambient light"
+        rest = "ambient light" if ambient.sum() > 0 else "uniform over the image, the scene has no ambient light"
+        reason = f"background: {fraction:.1%} dark counts ({counted:g} a pixel), the rest {rest}"
     elif ambient.sum() > 0:
         reason = "background: the scene's ambient light"
     else:
@@ -119,6 +120,8 @@ def background_scales(ambient_mean: float, dark_mean: float, asked: float) -> tu
     return (asked - dark_mean) / ambient_mean, 1.0
 
 
-def _odd_pixels(sensor: Sensor, dead: np.ndarray) -> tuple[str, ...]:
-    hot = (f"hot pixels: {sensor.hot_share:.2%} at {sensor.hot_rate_hz:g} Hz",) if sensor.hot_share else ()
+def _odd_pixels(sensor: Sensor, dead: np.ndarray, measured: bool) -> tuple[str, ...]:
+    """Return the plan's lines on hot and dead pixels; a measured map of dark counts holds its own hot pixels."""
+    drawn = sensor.hot_share and not measured
+    hot = (f"hot pixels: {sensor.hot_share:.2%} at {sensor.hot_rate_hz:g} Hz",) if drawn else ()
     return (*hot, f"dead pixels: {int(dead.sum())} of {dead.size}") if dead.any() else hot

@@ -5,7 +5,9 @@
     batch.counts                                                    # (B, 1, T, h, w) float32, for the network
 
 Detections follow the independent Poisson law (training levels lie far below 1 % detections a cycle), drawn photon by
-photon on the CPU, so that a seed gives the same counts on every device; the histogram is summed on `device`.
+photon on the CPU, so that a seed gives the same counts on every device; the histogram is summed on `device`. Dead
+pixels are those of the view, as `sense` places them with seed 0. Crosstalk comes from all neighbours in the view, those
+outside the patch included.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ import torch
 from torch import Tensor
 
 from render.transient import Transient
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.random_streams import Stream
+from spad.detection.laws import crosstalk_events
 from spad.detection.photons import PhotonEvents, PixelFlux, draw_primaries, paths_in_bins
 from spad.detection.rates import background_scales
 from spad.sensor.model import PhotonBudget, Sensor
@@ -145,10 +148,9 @@ def sense_patches(
 
     def draw(number: int) -> None:
         patch = patches[number]
-        light = _light_of_patch(packed, sensor, patch, height, width)
         rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(patch.seed, spawn_key=(Stream.PATCH, 0, 0))))
         rows, columns = slice(patch.row, patch.row + height), slice(patch.column, patch.column + width)
-        events = draw_primaries(light, sensor, rng, fractional=edges is not None)
+        events = _detections(packed, sensor, patch, size, rng)
         if edges is not None and converter is not None:
             mine = converter[rows, columns].reshape(-1)[events.pixel]
             events = events._replace(position=time_codes(events.position, mine, edges))
@@ -189,14 +191,39 @@ def _count(events: PhotonEvents, counts: Tensor) -> None:
     np.copyto(counts.numpy(), narrow)
 
 
-def _light_of_patch(packed: PackedViews, sensor: Sensor, patch: Patch, height: int, width: int) -> PixelFlux:
-    scenes, rows, columns = packed.depth_m.shape
+def check_patch(patch: Patch, size: tuple[int, int], shape: tuple[int, ...]) -> None:
+    """Raise InputError for a patch of a size (h, w) that is outside views of a shape (S, H, W)."""
+    (height, width), (scenes, rows, columns) = size, shape
     inside = 0 <= patch.scene < scenes and 0 <= patch.row <= rows - height and 0 <= patch.column <= columns - width
-    if not inside:
-        raise InputError(
-            f"patch of {height} x {width} at scene {patch.scene}, row {patch.row}, column {patch.column} is outside "
-            f"{scenes} scenes of {rows} x {columns}"
-        )
+    place = f"patch of {height} x {width} at scene {patch.scene}, row {patch.row}, column {patch.column}"
+    require(inside, f"{place} is outside {scenes} scenes of {rows} x {columns}")
+
+
+def _detections(
+    packed: PackedViews, sensor: Sensor, patch: Patch, size: tuple[int, int], rng: np.random.Generator
+) -> PhotonEvents:
+    """Draw the detections of a patch, and what its pixels and those around it fire in it by crosstalk."""
+    (height, width), (_, rows, columns) = size, packed.depth_m.shape
+    check_patch(patch, size, packed.depth_m.shape)
+    timed = sensor.tdc is not None
+    if not sensor.crosstalk:
+        return draw_primaries(_light_of_patch(packed, sensor, patch, height, width), sensor, rng, fractional=timed)
+    top, left = max(0, patch.row - 1), max(0, patch.column - 1)
+    tall, wide = min(rows, patch.row + height + 1) - top, min(columns, patch.column + width + 1) - left
+    light = _light_of_patch(packed, sensor, patch._replace(row=top, column=left), tall, wide)
+    events = draw_primaries(light, sensor, rng, fractional=timed)
+    cause, fired = crosstalk_events(events.pixel, sensor.crosstalk, tall, wide, rng)
+    pixel = np.concatenate((events.pixel, fired))
+    position = np.concatenate((events.position, events.position[cause]))
+    row, column = pixel // wide + top, pixel % wide + left
+    seen = (row >= patch.row) & (row < patch.row + height) & (column >= patch.column) & (column < patch.column + width)
+    seen &= ~_dead_pixels(sensor, rows, columns)[row, column]
+    place = (row - patch.row) * width + column - patch.column
+    return PhotonEvents(place[seen].astype(np.int32), position[seen])
+
+
+def _light_of_patch(packed: PackedViews, sensor: Sensor, patch: Patch, height: int, width: int) -> PixelFlux:
+    _, rows, columns = packed.depth_m.shape
     budget = PhotonBudget(patch.signal, patch.background)
     mean = float(packed.mean_radiance[patch.scene])
     if mean <= 0 and budget.signal > 0:
@@ -213,12 +240,14 @@ def _light_of_patch(packed: PackedViews, sensor: Sensor, patch: Patch, height: i
     # each pixel's returns are a run: start of its run minus where the run goes, plus a running index
     index = np.repeat(first - np.cumsum(number) + number, number) + np.arange(int(number.sum()))
     start, length = paths_in_bins(packed.path_near_m[index], packed.path_far_m[index], sensor)
+    owner = np.repeat(np.arange(height * width, dtype=np.int32), number)
+    alive = ~_dead_pixels(sensor, rows, columns)[crop].ravel()
     return PixelFlux(
-        owner=np.repeat(np.arange(height * width, dtype=np.int32), number),
+        owner=owner,
         start=start + patch.time_offset_m / sensor.bin_depth_m,
         length=length,
-        signal=packed.radiance[index] * (budget.signal / mean if mean > 0 else 0.0),
-        background=(dark[crop] * dark_scale + ambient * ambient_scale).ravel(),
+        signal=packed.radiance[index] * (budget.signal / mean if mean > 0 else 0.0) * alive[owner],
+        background=(dark[crop] * dark_scale + ambient * ambient_scale).ravel() * alive,
     )
 
 
@@ -228,3 +257,11 @@ def _dark_counts(sensor: Sensor, rows: int, columns: int) -> np.ndarray:
     dark = sensor.dark_rate_map_hz(rows, columns) * sensor.exposure_s
     dark.flags.writeable = False
     return dark
+
+
+@lru_cache(maxsize=16)
+def _dead_pixels(sensor: Sensor, rows: int, columns: int) -> np.ndarray:
+    """Return the pixels of a view that detect nothing, (H, W) bool, read only."""
+    dead = sensor.dead_pixels(rows, columns)
+    dead.flags.writeable = False
+    return dead

@@ -9,8 +9,8 @@ noise-free pulse, `noise_free_bias_m`.
     log-matched  Poisson maximum likelihood: argmax over tau of sum_i n_i log(S h_i(tau) + B) - S sum_i h_i(tau)
     correlation  the same as matched over whole bins, with a parabola: zero-normalised cross-correlation
     lmf-published   argmax over whole bins of the correlation with log(1 + h), the filter of the ICCV 2023 code
-    coates       log-matched, after the pile-up of the sensor's detector is undone: Coates' correction of first
-                 photons, or the dead-time correction of a free-running detector
+    coates       log-matched, after pile-up is undone: Coates' correction of first photons, or the dead-time correction
+                 of a detector that is not armed at every cycle, by the law that made the counts where it is known
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from torch import Tensor
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, did_you_mean
 from scenes.model import Camera
+from spad.detection.detectors import LAWS
+from spad.detection.laws import LOW_FLUX
 from spad.estimators.matching import (
     argmax_bins,
     correlate,
@@ -52,6 +54,7 @@ __all__ = [
     "cramer_rao_m",
     "depth_errors",
     "depth_in_range",
+    "detection_law",
     "estimate_depth",
     "grid_peak",
     "histogram_depth_m",
@@ -143,20 +146,21 @@ def _require_method(method: str) -> None:
         raise InputError(f"depth method {method!r} is unknown{meant}, expected one of {', '.join(METHODS)}")
 
 
-def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched") -> Tensor:
+def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched", *, law: str | None = None) -> Tensor:
     """Estimate half the optical path [m] from counts, (..., T) -> (...,) float32 in [0, range); NaN without counts.
 
     It is the depth where the laser is co-located with the camera. Counts know no laser: `histogram_depth_m` takes a
-    `Histogram`, which does, and gives the depth beside a displaced one too. Raises InputError for an unknown method, a
-    wrong number of bins, negative or non-finite counts, and with `coates` for counts that the sensor's detector cannot
-    have made.
+    `Histogram`, which does, and gives the depth beside a displaced one too. `law` is the detection law whose losses
+    `coates` undoes; None stands for that of the sensor's detector (`spad.estimators.pile_up.linearised`). Raises
+    InputError for an unknown method, a wrong number of bins, negative or non-finite counts, and with `coates` for
+    counts that the law cannot have made.
     """
     _require_method(method)
     rows = checked_histogram(counts, sensor.bins)
     if not len(rows):
         return torch.empty(counts.shape[:-1], dtype=torch.float32, device=counts.device)
     if method == "coates":
-        rows = by_pixels(lambda part: linearised(part, sensor), rows)
+        rows = by_pixels(lambda part: linearised(part, sensor, law), rows)
     depth = _raw_depth(rows, sensor, method) - noise_free_bias_m(method, sensor)
     return depth_in_range(depth, sensor).reshape(counts.shape[:-1])
 
@@ -219,9 +223,12 @@ def radial_depth_m(half_path_m: np.ndarray, directions: np.ndarray, baseline_m: 
 
     With p the path, b the laser's place relative to the camera and r the unit ray: the ellipsoid
     d = (p^2 - |b|^2) / (2 (p - r.b)). half_path_m (...,), directions (..., 3) and b in one frame -> (...,) float32.
+    NaN for a path that is not longer than the baseline: no surface gives one.
     """
     path, baseline = 2.0 * np.asarray(half_path_m, dtype=np.float64), np.asarray(tuple(baseline_m), dtype=np.float64)
-    distance = (path**2 - baseline @ baseline) / (2 * (path - directions @ baseline))
+    squared = baseline @ baseline
+    path = np.where(path > math.sqrt(squared), path, np.nan)
+    distance = (path**2 - squared) / (2 * (path - directions @ baseline))
     return distance.astype(np.float32)
 
 
@@ -242,18 +249,32 @@ def radial_depth_of(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray
     return radial_depth_m(half_path_m, camera.rays() @ camera.rotation, baseline)
 
 
+def detection_law(histogram: Histogram) -> str | None:
+    """Return the detection law that made a histogram, None where the sensor's detector is all that is known.
+
+    `sense` states the law and the pile-up in `meta`. Measured counts state `poisson` and a pile-up of 0, since nobody
+    knows either: there the answer is None, as it is where pile-up is too small to matter.
+    """
+    meta, sensor = histogram.meta, histogram.sensor
+    law = meta.get("model")
+    if law == "poisson":
+        blind = meta.get("pile_up", 0.0) * max(1.0, sensor.dead_time_s / sensor.period_s)
+        return law if blind > LOW_FLUX else None
+    return law if law in LAWS else None
+
+
 def histogram_depth_m(
     histogram: Histogram, estimator: str | Callable[[Tensor, Sensor], Tensor] = "log-matched"
 ) -> np.ndarray:
     """Estimate the radial depth [m] of every pixel, (H, W) float32; NaN where a pixel has no count.
 
     `estimator` is one of METHODS, or any function (counts (H, W, T), sensor) -> half the optical path (H, W) [m].
-    With a displaced laser that half path becomes a distance by the scene's geometry (`radial_depth_of`). Raises
-    InputError as `estimate_depth` does.
+    With a displaced laser that half path becomes a distance by the scene's geometry (`radial_depth_of`). `coates`
+    undoes the law that made the histogram (`detection_law`). Raises InputError as `estimate_depth` does.
     """
     counts = torch.from_numpy(histogram.counts)
     if isinstance(estimator, str):
-        half_path = estimate_depth(counts, histogram.sensor, estimator)
+        half_path = estimate_depth(counts, histogram.sensor, estimator, law=detection_law(histogram))
     else:
         half_path = estimator(counts, histogram.sensor)
     return radial_depth_of(histogram, half_path.numpy())

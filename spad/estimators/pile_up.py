@@ -64,15 +64,23 @@ def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
     return -torch.log1p(-ratio.clamp(max=1 - 0.5 / cycles))
 
 
-def linearised(counts: Tensor, sensor: Sensor) -> Tensor:
+def linearised(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor:
     """Return counts as they would be without pile-up, (..., T) float64: `coates`, or `free_running_flux`, times the
     cycles.
+
+    `law` is the detection law that made the counts, a name in `spad.detection.detectors.LAWS`; `poisson` loses none.
+    None stands for the law of the sensor's detector: first-photon where it is armed at every cycle, else free-running.
+    A synchronous detector whose dead time is longer than the period is not armed at every cycle.
 
     Pixels with at most 1 % detections per cycle (or dead time, if longer) keep their counts: what would change is a
     hundredth of one, which does nothing but decide between equal maxima.
     """
     counts = counts.double()
-    if sensor.reset == "synchronous":
+    if law is None:
+        law = "first-photon" if sensor.armed_every_cycle else "free-running"
+    if law == "poisson":
+        return counts
+    if law == "first-photon":
         corrected = coates(counts, sensor.cycles) * sensor.cycles
     else:
         corrected = free_running_flux(counts, sensor.cycles, sensor) * sensor.cycles

@@ -41,7 +41,8 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     rates (H, W, T) is the signal's share of the expected counts: S times the binned pulse at the true depth, min-max
     normalised in every pixel, 0 where there is no depth or no signal; rates_norm_params undoes that. Estimates are
     ours, in whole bins from 1 without the published offset of one. `bin` is the fullest bin of the noise-free pulse,
-    as published, and `bin_hr` the arrival moved by as much as that bin stands off the pulse's centroid on average.
+    as published. `bin_hr` and the estimates are of the arrival, which is the pulse's centroid, moved by as much as
+    that bin stands off it on average.
     Where nothing is, and where nothing was detected, bins are 1: published loaders subtract 1 from unsigned numbers.
     Raises InputError in one line where the file cannot be written, for sensors whose bins do not cover the period, and
     where the folder holds the pulse of another sensor.
@@ -75,11 +76,12 @@ def _frame(histogram: Histogram) -> dict[str, Matrix | float | dict[str, np.ndar
     pulses, known = _pulses(histogram), np.isfinite(depth)
     rates, offset, scaling = _normalised_rates(histogram, pulses)
     arrival = np.remainder(depth, sensor.range_m) / sensor.bin_depth_m
-    fine = np.where(known, arrival + 0.5 + _peak_offset_bins(sensor), NO_BIN)
+    peak = _peak_offset_bins(sensor)
+    fine = np.where(known, arrival + 0.5 + peak, NO_BIN)
     index = np.where(known, pulses.argmax(axis=-1) + 1, NO_BIN).astype(np.uint16)
     counts = torch.from_numpy(histogram.counts)
     estimates = {
-        f"est_range_bins_{name}": _whole_bins(estimate_depth(counts, sensor, method).numpy(), sensor)
+        f"est_range_bins_{name}": _whole_bins(estimate_depth(counts, sensor, method).numpy(), peak, sensor)
         for name, method in ESTIMATES.items()
     }
     budget, albedo = histogram.budget, histogram.albedo.astype(np.float64)
@@ -127,9 +129,11 @@ def _normalised_rates(histogram: Histogram, pulses: np.ndarray) -> tuple[np.ndar
     return (rates - low[..., None]) * scaling[..., None], low, scaling
 
 
-def _whole_bins(depth_m: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Return the bin from 1 that a depth lies in, NO_BIN for none, (H, W) uint16."""
-    inside = np.floor(np.nan_to_num(depth_m.astype(np.float64)) / sensor.bin_depth_m) % sensor.bins
+def _whole_bins(depth_m: np.ndarray, peak_offset: float, sensor: Sensor) -> np.ndarray:
+    """Return the bin from 1 that the peak of a pulse from this depth lies in, `peak_offset` bins behind its centroid;
+    NO_BIN for none, (H, W) uint16."""
+    arrival = np.nan_to_num(depth_m.astype(np.float64)) / sensor.bin_depth_m
+    inside = np.floor(arrival + peak_offset) % sensor.bins
     return np.where(np.isnan(depth_m), NO_BIN, inside + 1).astype(np.uint16)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -31,13 +32,14 @@ KINDS_OF_PULSE = "sigma, fwhm, or samples with step"
 
 class Key(NamedTuple):
     """One key of a table: the field that it sets, its dimension ("" a number, "count" a whole one, "word" a text),
-    whether it must be there, may be negative, and is a list (or may be one)."""
+    whether it must be there, may be negative, is a list (or may be one), and may be infinite."""
 
     field: str
     dimension: str = ""
     required: bool = False
     signed: bool = False
     many: Literal["no", "may", "must"] = "no"
+    infinite: bool = False
 
 
 HISTOGRAM = {
@@ -96,7 +98,7 @@ ZONES = {
     "leak": Key("leak", many="must"),
     "echo": Key("echo_m2", "area", many="must"),
     "crosstalk": Key("crosstalk"),
-    "trials": Key("trials", many="must"),
+    "trials": Key("trials", many="must", infinite=True),
     "recovery": Key("recovery", many="may"),
     "compression": Key("compression", many="may"),
     "illumination_x": Key("illumination_x", signed=True),
@@ -242,10 +244,10 @@ def _field(value: object, key: Key, where: str) -> object:
         require(whole, f"{where}: {value!r} is no whole number")
         return value
     require(isinstance(value, list) or key.many != "must", f"{where}: expected a list of numbers")
+    read = partial(parse_quantity, signed=key.signed, infinite=key.infinite)
     if isinstance(value, list) and key.many != "no":
-        named = ((item, f"{where}[{at}]") for at, item in enumerate(value))
-        return tuple(parse_quantity(item, key.dimension, name, signed=key.signed) for item, name in named)
-    return parse_quantity(value, key.dimension, where, signed=key.signed)
+        return tuple(read(item, key.dimension, f"{where}[{at}]") for at, item in enumerate(value))
+    return read(value, key.dimension, where)
 
 
 def _pulse(values: JsonObject, where: str) -> AnyPulse:

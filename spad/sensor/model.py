@@ -152,6 +152,12 @@ class Sensor:
         return self.exposure_s / self.period_s
 
     @property
+    def armed_every_cycle(self) -> bool:
+        """Tell whether the detector is armed at the start of every laser cycle: synchronous, and its dead time is not
+        longer than the period."""
+        return self.reset == "synchronous" and self.dead_time_s <= self.period_s
+
+    @property
     def range_m(self) -> float:
         """Return the unambiguous depth range [m], c period / 2."""
         return SPEED_OF_LIGHT_M_PER_S * self.period_s / 2

@@ -17,7 +17,7 @@ from scenes.constants import REFERENCE_PULSE_SIGMA_S
 from scenes.errors import InputError, require
 from scenes.files import read_array
 from scenes.json_types import JsonObject
-from spad.sensor.normal import erfc, ndtr
+from spad.sensor.normal import erfc, erfcx_far, ndtr
 
 MAX_SAMPLES = 1 << 16
 # Steps of a table that stands for two kernels in one, per standard deviation of the narrower: the table widens the
@@ -84,12 +84,16 @@ class Pulse:
 
 
 def _decayed(x: np.ndarray, sigma: float, tail: float) -> np.ndarray:
-    """Compute exp(s^2 / 2 tau^2 - x / tau) Phi(x / s - s / tau) where the exponent cannot overflow: below, Phi itself
-    is 0."""
+    """Compute exp(s^2 / 2 tau^2 - x / tau) Phi(x / s - s / tau), tau times the density of a pulse with a tail.
+
+    Where the exponential may overflow, Phi is as small as that is large: their product is written with
+    erfcx(a) = exp(a^2) erfc(a), whose factor exp(-x^2 / 2 s^2) cannot. There a is above sqrt(500).
+    """
     exponent = sigma**2 / (2 * tail**2) - x / tail
-    return np.where(exponent < 500, np.exp(np.minimum(exponent, 500)), 0) * (
-        0.5 * erfc((sigma / tail - x / sigma) / math.sqrt(2))
-    )
+    below = (sigma / tail - x / sigma) / math.sqrt(2)
+    near = np.exp(np.minimum(exponent, 500)) * (0.5 * erfc(below))
+    far = 0.5 * erfcx_far(np.maximum(below, math.sqrt(500))) * np.exp(-0.5 * (x / sigma) ** 2)
+    return np.where(exponent < 500, near, far)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal, InvalidOperation, Overflow
 
 from scenes.errors import InputError, require
 
@@ -20,18 +20,22 @@ UNITS: dict[str, dict[str, int]] = {
 _QUANTITY = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf)\s*(\S*)\s*")
 
 
-def parse_quantity(value: object, dimension: str, where: str, *, signed: bool = False) -> float:
+def parse_quantity(value: object, dimension: str, where: str, *, signed: bool = False, infinite: bool = False) -> float:
     """Return a quantity in its dimension's base unit.
 
     `value` is a number where `dimension` is empty, else a text of number and unit.
 
     Raises InputError, which begins with `where`, for a value that is no finite number of 0 or more (`signed`: of any
-    sign), and for a unit that is missing or of another dimension.
+    sign; `infinite`: infinity too), and for a unit that is missing or of another dimension.
     """
     if not dimension:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise InputError(f"{where}: {value!r} is no number")
-        return _checked(float(value), value, where, signed)
+        try:
+            number = float(value)
+        except OverflowError:
+            raise InputError(f"{where}: a whole number of more than 308 digits is too large") from None
+        return _checked(number, value, where, signed, infinite)
     units = UNITS[dimension]
     example = f'a {dimension} in {", ".join(units)}, as "1 {next(iter(units))}"'
     if not isinstance(value, str):
@@ -39,19 +43,19 @@ def parse_quantity(value: object, dimension: str, where: str, *, signed: bool = 
     found = _QUANTITY.fullmatch(value)
     if found is None:
         raise InputError(f"{where}: {value!r} is no number with a unit, expected {example}")
-    number, unit = found.groups()
+    digits, unit = found.groups()
     meant = "".join(f"; did you mean '{known}'?" for known in units if known.lower() == unit.lower())
     named = f"the unit {unit}" if unit else "no unit"
     require(unit in units, f"{where}: {value!r} has {named}, expected {example}{meant}")
     try:
-        exact = Decimal(number).scaleb(units[unit])
-    except InvalidOperation:
+        exact = Decimal(digits).scaleb(units[unit])
+    except (InvalidOperation, Overflow):
         raise InputError(f"{where}: {value!r} is no number with a unit, expected {example}") from None
-    return _checked(float(exact), value, where, signed)
+    return _checked(float(exact), value, where, signed, infinite)
 
 
-def _checked(number: float, value: object, where: str, signed: bool) -> float:
-    require(math.isfinite(number), f"{where}: {value!r} is not finite")
+def _checked(number: float, value: object, where: str, signed: bool, infinite: bool) -> float:
+    require(math.isfinite(number) or (infinite and math.isinf(number)), f"{where}: {value!r} is not finite")
     require(signed or number >= 0, f"{where}: {value!r} is negative, expected 0 or more")
     return number
 

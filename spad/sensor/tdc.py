@@ -36,7 +36,8 @@ class Tdc:
     table            measured codes: a table that ships (`shipped_tables`), or a .npz file with `end_ps`
                      (converters, codes), when each code ends after the clock's edge; empty: DRAWN converters are drawn
     codes            fine codes a clock period of drawn converters; 0 with a table, which has its own
-    dnl              differential nonlinearity of drawn ones: standard deviation of the widths of all codes, in codes
+    dnl              differential nonlinearity of drawn ones: standard deviation of the widths of all codes, in codes;
+                     at most sqrt(codes - 1), where one code is as wide as all
     missing          fraction of the codes of drawn ones that never come
     jitter_s         standard deviation of the clock's jitter, which adds to the pulse's
     correction       of the codes before they are counted: none; a straight line a pixel; a look-up table a pixel
@@ -138,6 +139,9 @@ def _drawn(codes: int, dnl: float, missing: float) -> np.ndarray:
     mean is 1 and the standard deviation `dnl`."""
     absent = round(missing * codes)
     there = codes - absent
+    require(there > 0, f"tdc: missing {missing:g} of {codes} codes leaves none")
+    most = math.sqrt(codes - 1)  # where one code is as wide as the clock period, and the others have no width
+    require(dnl <= most, f"tdc: dnl {dnl:g} is above {most:.3g} codes, the most that {codes} codes can have")
     mean = codes / there
     spread = (1 + dnl**2) / mean - 1
     least = math.sqrt(mean - 1)
@@ -190,7 +194,9 @@ def reported_times(tdc: Tdc) -> np.ndarray:
     # least squares over what comes, each code weighted by how often it does
     centre, mean = widths @ nominal, (widths * middle).sum(axis=1)
     apart = nominal - centre[:, None]
-    rise = (widths * apart * (middle - mean[:, None])).sum(axis=1) / (widths * apart**2).sum(axis=1)
+    spread = (widths * apart**2).sum(axis=1)
+    rise = np.ones(len(spread))  # kept by converters of which one code comes: every slope fits it
+    np.divide((widths * apart * (middle - mean[:, None])).sum(axis=1), spread, out=rise, where=spread > _ROUNDING**2)
     rise, begin = (np.round(value * steps) / steps for value in (rise, mean - rise * centre))
     # within the clock period: codes before the first that comes must not fall into the period before
     return (begin[:, None] + rise[:, None] * nominal).clip(0, 1 - 1 / (2 * steps))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.io.inputs import read_text
 
 MAX_BYTES = 1 << 24
@@ -16,12 +16,33 @@ _LINE = 110
 
 
 def read_toml(path: Path, what: str = "sensor file") -> dict[str, object]:
-    """Return the tables of a TOML file. Raises InputError naming the file, and the line where it is no TOML."""
+    """Return the tables of a TOML file.
+
+    Raises InputError naming the file, and the line where it is no TOML; and for whole numbers beyond the 64 bits that
+    TOML has.
+    """
     text = read_text(path, what, most_bytes=MAX_BYTES)
     try:
-        return tomllib.loads(text)
+        tables = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"{path}: is no TOML ({error})") from None
+    except ValueError:  # a number of more digits than Python reads
+        raise InputError(f"{path}: holds a whole number beyond the 64 bits that TOML has") from None
+    for key, value in _whole_numbers(tables, ""):
+        require(-(1 << 63) <= value < 1 << 63, f"{path}: {key}: a whole number beyond the 64 bits that TOML has")
+    return tables
+
+
+def _whole_numbers(value: object, where: str) -> Iterator[tuple[str, int]]:
+    """Yield every whole number in tables and lists, with its key."""
+    if isinstance(value, int):
+        yield where, value
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _whole_numbers(inner, f"{where}.{key}" if where else key)
+    elif isinstance(value, list):
+        for at, inner in enumerate(value):
+            yield from _whole_numbers(inner, f"{where}[{at}]")
 
 
 def format_toml(tables: Mapping[str, object], comment: str = "") -> str:

@@ -175,7 +175,8 @@ def zone_returns(transient: Transient, zones: ZoneArray) -> list[ZoneReturns]:
     """
     _check_laser(transient, zones)
     x, y, depth = _pixel_tangents(transient)
-    pitch = x[0, 1] - x[0, 0] if x.shape[1] > 1 else 2 * x[0, 0]
+    # a single column of pixels is as wide as the field of view
+    pitch = x[0, 1] - x[0, 0] if x.shape[1] > 1 else 2 * _half_view(transient)
     flat = np.where(np.isfinite(depth), depth, 1e9)
     light = _intensity(zones, x, y, flat) / (1 + x * x + y * y) ** 2
     blur = zones.aperture_m / flat
@@ -203,9 +204,14 @@ def _check_laser(transient: Transient, zones: ZoneArray) -> None:
 def _pixel_tangents(transient: Transient) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tangents x, y (H, W) of the pixels' centres, and their depth along the axis [m], NaN where nothing is."""
     height, width = transient.height, transient.width
-    focal = 0.5 * width / math.tan(math.radians(transient.meta["camera"]["fov_deg"]) / 2)
+    focal = 0.5 * width / _half_view(transient)
     x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal)
     return x, y, transient.depth_m.astype(np.float64) / np.sqrt(1 + x * x + y * y)
+
+
+def _half_view(transient: Transient) -> float:
+    """Return the tangent of half the camera's horizontal field of view."""
+    return math.tan(math.radians(transient.meta["camera"]["fov_deg"]) / 2)
 
 
 def _intensity(zones: ZoneArray, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -266,10 +272,15 @@ def with_skew(returns: ZoneReturns, skew_m: float) -> ZoneReturns:
 
 
 def stray_returns(returns: ZoneReturns, leak: float, echo_m2: float) -> ZoneReturns:
-    """Return the module's own reflection, at a path of 0, and the echo at twice the paths, as one interval each."""
+    """Return the module's own reflection, at a path of 0, and the echo at twice the paths, as one interval each.
+
+    The reflection is there also where a zone sees nothing, and so has no echo.
+    """
     near_m, far_m, light = returns
-    if not len(light) or not (leak or echo_m2):
+    if not (leak or echo_m2):
         return ZoneReturns(*np.zeros((3, 0)))
+    if not len(light):
+        return ZoneReturns(np.zeros(1), np.zeros(1), np.array([float(leak)]))
     echo = echo_m2 * float((light / ((near_m + far_m) / 4) ** 2).sum())
     near, far = 2 * near_m.min(), 2 * far_m.max()
     return ZoneReturns(np.array([0.0, near]), np.array([0.0, far]), np.array([leak, echo]))
@@ -290,8 +301,6 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
     own = np.zeros((zones.count, sensor.bins))
     edges = torch.arange(sensor.bins + 1, dtype=torch.float64) * sensor.bin_width_s
     for zone, seen in enumerate(returns):
-        if not len(seen.light):
-            continue
         scale = 1 / (SPEED_OF_LIGHT_M_PER_S * zones.clock[zone])
         every = zip(seen, stray_returns(seen, zones.leak[zone], zones.echo_m2[zone]), strict=True)
         all_light = ZoneReturns(*(np.concatenate(pair) for pair in every))

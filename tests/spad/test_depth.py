@@ -21,6 +21,7 @@ from spad.estimators.depth import (
     estimate_depth,
     histogram_depth_m,
     noise_free_bias_m,
+    radial_depth_m,
 )
 from spad.estimators.matching import correlation, normalised_correlation
 from spad.formats.histogram import Histogram
@@ -355,3 +356,15 @@ def test_depth_of_a_histogram_knows_where_the_laser_is(baseline_m):
     assert (np.abs(half_path - histogram.depth_m).max() > 0.03) == any(baseline_m)
     blind = replace(histogram, meta={})
     assert np.array_equal(histogram_depth_m(blind), half_path), "counts without a geometry stay half paths"
+
+
+def test_paths_that_no_surface_gives_have_no_depth():
+    """Light from a laser 0.3 m aside takes more than 0.3 m to the camera."""
+    half_path = np.array([0.0, 0.05, 0.15, 0.1500001, 0.2, 1.0])
+    ahead = np.tile([0.0, 0.0, 1.0], (6, 1))
+    depth = radial_depth_m(half_path, ahead, (0.3, 0.0, 0.0))
+    assert np.isnan(depth[:3]).all() and (depth[3:] >= 0).all()
+    legs = depth[3:] + np.hypot(depth[3:], 0.3)
+    assert legs == pytest.approx(2 * half_path[3:], rel=1e-5)
+    aside = np.tile([0.6, 0.0, 0.8], (6, 1))  # 2 (p - r.b) is 0 at a path of 0.18 m
+    assert np.isnan(radial_depth_m(np.array([0.05, 0.09, 0.1]), aside[:3], (0.3, 0.0, 0.0))).all()

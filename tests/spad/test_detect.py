@@ -82,6 +82,21 @@ def test_plan_reports_pile_up_wrap_and_dark_counts():
         sense(transient_of([(1, 1, 1.0)]), REFERENCE, PhotonBudget(), model="magic")
 
 
+def test_plan_names_what_there_is():
+    """No ambient light where the scene has none, no drawn hot pixels beside a measured map, and dead ones do not count
+    as light that arrives in time."""
+    wall = transient_of(*[[(31.0, 31.0, 1.0)]] * 8)
+    lit = replace(wall, ambient=np.ones((1, 8), np.float32))
+    dark = replace(REFERENCE, dark_count_rate_hz=300.0, hot_share=0.25, hot_rate_hz=600.0)
+    plan = sense(wall, dark, PhotonBudget(10, 20)).meta["plan"]
+    assert "the rest uniform over the image, the scene has no ambient light" in plan[0] and "hot pixels" in plan[1]
+    assert "the rest ambient light" in sense(lit, dark, PhotonBudget(10, 20)).meta["plan"][0]
+    measured = sense(wall, dark, PhotonBudget(10, 20), dark_map_hz=np.full((1, 8), 300.0)).meta["plan"]
+    assert not any("hot pixels" in reason for reason in measured)
+    half_dead = sense(wall, replace(REFERENCE, dead_share=0.5), PhotonBudget(10, 20)).meta
+    assert half_dead["wrapped"] == pytest.approx(1)
+
+
 @pytest.mark.parametrize(
     ("signal", "background"), [(0.0, 0.0), (0.0, 5.0), (1e-6, 0.0), (1.0, 0.0), (1e7, 10.0), (10.0, 1e6)]
 )

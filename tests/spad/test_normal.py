@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.special
 
-from spad.sensor.normal import erfc, ndtr
+from spad.sensor.normal import erfc, erfcx_far, ndtr
 
 
 def test_as_scipy():
@@ -12,3 +12,8 @@ def test_as_scipy():
     np.testing.assert_allclose(ndtr(x), scipy.special.ndtr(x), rtol=1e-12, atol=0)
     assert erfc(x).dtype == np.float64 and ndtr(0.0) == 0.5 and np.isnan(ndtr(np.nan))
     assert ndtr(x.reshape(1, -1)).shape == (1, len(x)) and erfc(np.empty(0)).shape == (0,)
+
+
+def test_scaled_erfc_as_scipy():
+    x = np.concatenate((np.geomspace(20, 1e150, 2001), [np.inf]))
+    np.testing.assert_allclose(erfcx_far(x), scipy.special.erfcx(x), rtol=1e-14, atol=0)

@@ -97,6 +97,16 @@ def test_tail_against_quadrature() -> None:
         assert float(pulse_density(pulse, torch.tensor(t))) == pytest.approx(expected, rel=1e-7)
 
 
+@pytest.mark.parametrize("tail_s", [1e-15, 2e-12, 4.2e-12, 4.3e-12, 4.4e-12, 10e-12])
+def test_tails_far_shorter_than_the_gaussian(tail_s: float) -> None:
+    """Both ways to the bins agree: numpy's and torch's. At 4.2 ps numpy's was off by half of the peak."""
+    pulse, edges = Pulse(135e-12, tail_s), np.linspace(-1.4e-9, 1.4e-9, 401)
+    masses = pulse.bin_masses(edges)
+    assert np.abs(masses - np.diff(pulse_cdf(pulse, torch.from_numpy(edges)).numpy())).max() < 1e-11 * masses.max()
+    assert masses.sum() == pytest.approx(1, abs=1e-11)
+    assert abs(masses @ (edges[1:] + edges[:-1]) / 2) < 1e-16
+
+
 def test_a_sensor_survives_json() -> None:
     import json
 

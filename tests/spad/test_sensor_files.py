@@ -1,7 +1,7 @@
 """Sensor files: round trips to the last bit, every preset by its data sheet, one line for every mistake in a file."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 from hypothesis import given, settings
@@ -18,6 +18,7 @@ from spad.sensor.files import (
     load_sensor,
     preset_files,
     read_sensor,
+    sensor_from_tables,
     sensor_names,
     write_sensor,
 )
@@ -84,6 +85,17 @@ def test_a_sensor_comes_back_from_its_file_to_the_last_bit(sensor, optics, tmp_p
     assert read_sensor(write_sensor(whole, tmp_path / "s.toml")) == whole
 
 
+def test_zones_of_which_some_never_saturate_come_back_from_their_file(tmp_path):
+    whole = SensorFile(WIDE, None, replace(ZONES, trials=(math.inf, 1e5)))
+    assert read_sensor(write_sensor(whole, tmp_path / "s.toml")) == whole
+
+
+def test_numbers_that_no_float_holds_are_refused_in_tables_too():
+    tables = {"name": "x", "histogram": {"bins": 8, "bin_width": "1 ns"}, "pulse": {"sigma": "1 ns"}}
+    with pytest.raises(InputError, match=r"detector\.pde: a whole number of more than 308 digits"):
+        sensor_from_tables(tables | {"detector": {"pde": 10**400}})
+
+
 def test_every_field_of_a_sensor_has_a_key():
     keyed = {key.field for table in (HISTOGRAM, DETECTOR) for key in table.values()} | {
         "name",
@@ -135,6 +147,26 @@ def test_the_presets_that_were_there_keep_their_names_and_values():
         ('"91 ps"', '"-91 ps"', "histogram.bin_width: '-91 ps' is negative"),
         ('"91 ps"', '"inf ps"', "is not finite"),
         ('"91 ps"', '"1.2.3 ps"', "is no number with a unit"),
+        ('"91 ps"', '"1e9999999999 ps"', "is no number with a unit"),
+        ("bins = 128", "bins = 1" + 5000 * "0", "a whole number beyond the 64 bits that TOML has"),
+        ("bins = 128", "bins = 0x1" + 5000 * "0", "histogram.bins: a whole number beyond the 64 bits"),
+        ('"200 ps"', '"200 ps"\n[detector]\npde = 1' + 400 * "0", "detector.pde: a whole number beyond the 64 bits"),
+        (
+            'fwhm = "200 ps"',
+            "samples = [1, 1" + 400 * "0" + ']\nstep = "9 ps"',
+            "pulse.samples[1]: a whole number beyond",
+        ),
+        (
+            '"200 ps"',
+            '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, 1]\ntrials = [inf, nan]"),
+            "trials[1]: nan is not finite",
+        ),
+        (
+            '"200 ps"',
+            '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, 1]\ntrials = [inf, -inf]"),
+            "trials[1]: -inf is negative",
+        ),
+        ('"200 ps"', '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, 1]\ngain = [inf, 1]"), "gain[0]: inf is not finite"),
         ('"91 ps"', '"0 ps"', "bin width 0 s is outside"),
         ('bin_width = "91 ps"', "", "histogram.bin_width is missing"),
         ("bins = 128", "", "histogram.bins is missing"),

@@ -250,6 +250,11 @@ def test_presets_with_a_converter() -> None:
         ('clock_period = "2.5 ns"\ncodes = 14.5', "tdc.codes: 14.5 is no whole number"),
         ('clock_period = "2.5 ns"\ncodes = 140\nmissing = 0.2\ndnl = 0.1', "dnl 0.1 is below 0.5 codes"),
         ('clock_period = "2.5 ns"\ncodes = 140\ndnl = -1', "dnl"),
+        (
+            'clock_period = "2.5 ns"\ncodes = 16\ndnl = 100',
+            "dnl 100 is above 3.87 codes, the most that 16 codes can have",
+        ),
+        ('clock_period = "2.5 ns"\ncodes = 4\nmissing = 0.9', "missing 0.9 of 4 codes leaves none"),
         ('clock_period = "2.5 ns"\ntable = "linospad2"\ndnl = 1', "has its own nonlinearity"),
         ('clock_period = "2.5 ns"\ncodes = 140\ncorrection = "lut"', "correction 'lut' is unknown"),
         ('clock_period = "2.5 ns"\ncodes = 140\ncorrection_bits = 17', "17 correction bits, expected 1 to 16"),
@@ -279,3 +284,18 @@ def test_tables_that_are_none_are_told_in_one_line(tmp_path) -> None:
             Tdc(2.5e-9, table=str(path))
     with pytest.raises(InputError, match="bins that cover the period"):
         Sensor(bins=100, bin_width_s=WIDTH_S, period_s=PERIOD_S, tdc=REAL)
+
+
+@pytest.mark.parametrize(
+    "tdc", [Tdc(2.5e-9, codes=1, correction="line"), Tdc(2.5e-9, codes=3, missing=0.6, dnl=2**0.5)]
+)
+def test_a_converter_with_one_code_gives_the_clock_period(tdc: Tdc) -> None:
+    """Of one code that comes a line has no slope: its edges are the clock's."""
+    edges = Sensor(bins=8, bin_width_s=2.5e-9, tdc=replace(tdc, correction="line")).code_edges
+    assert np.allclose(edges, np.arange(9))
+
+
+@pytest.mark.parametrize(("codes", "dnl"), [(16, 15**0.5), (2, 1.0), (4096, 4095**0.5)])
+def test_the_largest_nonlinearity_leaves_every_converter_a_code(codes: int, dnl: float) -> None:
+    ends = Tdc(2.5e-9, codes=codes, dnl=dnl).ends()
+    assert np.isfinite(ends).all() and (ends[:, -1] == 1).all() and (np.diff(ends, axis=1) >= 0).all()

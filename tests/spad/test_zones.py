@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from render.transient import Transient
 from scenes.errors import InputError
 from spad.detection.saturation import draw_saturated, saturated, saturated_jacobian
+from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.files import SensorFile
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse
@@ -234,3 +235,30 @@ def test_zones_are_laid_out_as_they_look_and_take_a_budget():
     assert (again.counts == histogram.counts).all()
     with pytest.raises(InputError, match="look beside the image"):
         sense_zones(view(fov_deg=20.0), SENSOR, nine)
+
+
+def seen_by_a_camera(depth_m: np.ndarray) -> Transient:
+    """White pixels at given depths, NaN for none, in a field of view of 60 degrees."""
+    ones = np.ones(depth_m.shape)
+    return transient_from_rgbd(depth_m, ones, np.zeros_like(ones), meta={"camera": {"fov_deg": 60.0}})
+
+
+@pytest.mark.parametrize("rows", [1, 9])
+def test_one_column_of_pixels_lights_a_zone(rows):
+    """A column is as wide as the field of view, 1.15: the zone lies within its middle pixel, which looks straight
+    ahead at a white wall 1 m away. That returns 1 / pi."""
+    zone = ZoneArray((0.0,), (0.0,), (0.3,), (0.3,))
+    returns = zone_returns(seen_by_a_camera(np.full((rows, 1), 1.0)), zone)[0]
+    assert returns.light.sum() == pytest.approx(0.3 * 0.3 / math.pi, rel=1e-6)
+
+
+def test_the_modules_own_reflection_is_there_where_a_zone_sees_nothing():
+    zone = ZoneArray((0.0,), (0.0,), (0.3,), (0.3,), gain=(1e3,), leak=(2.0,), echo_m2=(0.1,))
+    depth = np.full((9, 9), np.nan)
+    nothing = zone_signal(zone_returns(seen_by_a_camera(depth), zone), SENSOR, zone)
+    depth[4, 4] = 1.8
+    faint = replace(seen_by_a_camera(depth), radiance=np.array([1e-9], np.float32))
+    some = zone_signal(zone_returns(faint, zone), SENSOR, zone)
+    assert nothing == pytest.approx(some, abs=1e-3) and nothing.sum() > 900
+    dark = replace(zone, leak=(0.0,))
+    assert not zone_signal(zone_returns(seen_by_a_camera(np.full((9, 9), np.nan)), dark), SENSOR, dark).any()

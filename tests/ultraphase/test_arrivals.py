@@ -1,5 +1,7 @@
 """Cores with arrival times against the queue's closed form, an independent queue, and the untimed core."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -86,6 +88,20 @@ def test_photons_of_a_pulsed_laser_keep_their_place_in_the_period():
     period = 100e-9 / 2.38e-9
     assert (np.diff(clocks) >= 0).all() and sorted(ordered) == sorted(stamps)
     assert (((clocks % period) / period * 1024).astype(int) == ordered).mean() > 0.99
+
+
+def test_cycles_of_a_pulsed_laser_are_drawn_independently():
+    """500 photons over 2000 cycles: as many cycles are hit as of independent draws, and short frames are refused."""
+    period = 100e-9 / 2.38e-9
+    frame = math.ceil(2000 * period)
+    clocks, _ = periodic_arrivals(np.zeros(500, int), frame, seed=0)
+    empty = (1 - 1 / 2000) ** 500
+    # variance of the number of cycles without a photon, for 500 draws of 2000
+    variance = 2000 * (2000 - 1) * (1 - 2 / 2000) ** 500 + 2000 * empty - (2000 * empty) ** 2
+    hit = len(np.unique(np.floor(clocks / period)))
+    assert abs(hit - 2000 * (1 - empty)) < 4 * math.sqrt(variance)
+    with pytest.raises(InputError, match=r"frame of 42 clocks is shorter than the laser period of 42\.0"):
+        periodic_arrivals(np.arange(3), 42, 0)
 
 
 def test_arrivals_that_are_none_are_refused():

@@ -268,3 +268,16 @@ def test_int8_codes_stay_within_127():
     assert int8_codes(np.array([1.0, -1.0, 1.004, 0.5 / 127, 0.0])).tolist() == [127, -127, 127, 0, 0]
     with pytest.raises(InputError, match="not finite"):
         int8_codes(np.array([np.nan]))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("fourier-8-shift-2", "program fourier-8-shift-2: shift 2 is for coarse programs"),
+        ("coarse-16-shift-0", "program coarse-16-shift-0: shift of 0 bits an instruction, expected 1 or more"),
+    ],
+)
+def test_shifts_that_change_nothing_or_divide_by_zero_are_refused(name, message):
+    with pytest.raises(InputError, match=message):
+        method(name)
+    assert method("coarse-16-shift-2").program().instructions != method("coarse-16").program().instructions

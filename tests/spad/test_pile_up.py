@@ -1,0 +1,84 @@
+"""Pile-up is undone by the law that made the counts, whichever detector the sensor has."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_laws import same
+
+from spad.detection.detect import choose_model, sense
+from spad.estimators.depth import detection_law, estimate_depth, histogram_depth_m
+from spad.estimators.pile_up import coates, free_running_flux, linearised
+from spad.formats.histogram import Histogram
+from spad.sensor.model import PhotonBudget, Sensor
+
+CYCLES, PIXELS, PER_CYCLE = 2000, 200, 3.5
+SENSOR = Sensor(exposure_s=CYCLES * Sensor().period_s)
+WALL_M = 6.0
+WALL = same(PIXELS, (2 * WALL_M, 2 * WALL_M, 1.0))
+BUDGET = PhotonBudget(1.5 * CYCLES, 2.0 * CYCLES)
+
+
+def recovered(histogram: Histogram, law: str | None = None) -> float:
+    """Primary detections a pixel and cycle, after pile-up is undone."""
+    counts = torch.from_numpy(histogram.counts)
+    return float(linearised(counts, histogram.sensor, law).sum()) / (CYCLES * PIXELS)
+
+
+@pytest.mark.parametrize("dead_s", [150e-9, 250e-9])
+def test_a_synchronous_detector_that_misses_cycles_is_not_corrected_as_one_that_does_not(dead_s: float) -> None:
+    """Its dead time outlasts the period: `sense` takes it for free-running, and so does the inverse."""
+    sensor = replace(SENSOR, dead_time_s=dead_s)
+    histogram = sense(WALL, sensor, BUDGET, seed=1)
+    assert histogram.meta["model"] == "free-running" and not sensor.armed_every_cycle
+    # n detections tell a rate within 1 / sqrt(n); 2 % for photons that are not uniform within their bin
+    tolerance = 4.5 / np.sqrt(histogram.counts.sum()) + 0.02
+    assert recovered(histogram) == pytest.approx(PER_CYCLE, rel=tolerance)
+    counts = torch.from_numpy(histogram.counts)
+    assert float(coates(counts, CYCLES).sum()) / PIXELS < PER_CYCLE / 3, "the other law's inverse is far off"
+    free = replace(sensor, reset="free-running")
+    assert torch.equal(linearised(counts, sensor), linearised(counts, free))
+    # one pixel is off by 1.3 mm (standard deviation), the mean of 200 by 0.1 mm
+    error_m = estimate_depth(counts, sensor, "coates").numpy() - WALL_M
+    assert abs(error_m.mean()) < 1e-3 < 5e-3 < abs(estimate_depth(counts, sensor).numpy() - WALL_M).mean()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "law"),
+    [
+        (replace(SENSOR, reset="free-running", dead_time_s=10e-9), "first-photon"),
+        (replace(SENSOR, reset="free-running"), "first-photon"),
+        (replace(SENSOR, dead_time_s=30e-9), "free-running"),
+        (replace(SENSOR, dead_time_s=30e-9), "poisson"),
+    ],
+    ids=["first of free-running", "first without dead time", "free of synchronous", "poisson of synchronous"],
+)
+def test_a_law_that_was_asked_for_is_undone_by_its_own_inverse(sensor: Sensor, law: str) -> None:
+    histogram = sense(WALL, sensor, BUDGET, seed=2, model=law)
+    assert detection_law(histogram) == law
+    tolerance = 4.5 / np.sqrt(histogram.counts.sum()) + 0.02
+    assert recovered(histogram, law) == pytest.approx(PER_CYCLE, rel=tolerance)
+    assert abs((histogram_depth_m(histogram, "coates") - WALL_M).mean()) < 1e-3
+
+
+def test_without_a_stated_law_it_is_the_detectors() -> None:
+    """Measured counts, files of others, and pile-up too small to matter."""
+    counts = np.random.default_rng(3).integers(0, 3, (2, 3, 64)).astype(np.int32)
+    sensor = Sensor(bins=64, exposure_s=100 * Sensor(bins=64).period_s)
+    assert detection_law(Histogram.from_counts(counts, sensor)) is None
+    assert detection_law(Histogram.from_counts(counts, sensor, {"model": "zones"})) is None
+    assert detection_law(sense(WALL, SENSOR, PhotonBudget(5, 5))) is None
+    rows = torch.from_numpy(counts)
+    assert torch.equal(linearised(rows, sensor), coates(rows, 100) * 100)
+    free = replace(sensor, reset="free-running", dead_time_s=2e-9)
+    assert torch.equal(linearised(rows, free), free_running_flux(rows, 100, free) * 100)
+
+
+@pytest.mark.parametrize("reset", ["synchronous", "free-running"])
+@pytest.mark.parametrize("dead_s", [0.0, 50e-9, 100e-9, 101e-9])
+def test_the_law_that_is_chosen_and_the_inverse_agree(reset: str, dead_s: float) -> None:
+    sensor = replace(SENSOR, reset=reset, dead_time_s=dead_s)
+    chosen, _ = choose_model("auto", PER_CYCLE, sensor)
+    counts = torch.from_numpy(sense(WALL, sensor, PhotonBudget(1000, 1000), seed=4).counts[:, :4])
+    assert torch.equal(linearised(counts, sensor), linearised(counts, sensor, chosen))
