@@ -12,12 +12,7 @@ import numpy as np
 
 from render.ambient.integrator import AmbientLight, ambient_light
 from render.direct.integrator import centre_layers
-from render.error import (
-    RULED,
-    ErrorEstimate,
-    is_met,
-    target_verdict,
-)
+from render.error import ErrorEstimate, is_met, is_ruled_by_few, target_verdict
 from render.image_error import estimated_error
 from render.indirect.schedule import Schedule, reallocated
 from render.pipeline import (
@@ -203,7 +198,7 @@ def clamp_reasons(plan: Plan, settings: RenderSettings, traced: LightSamples, er
     times = error.monte_carlo**2 / plan.target**2 if missed else 0.0
     if times < 1 + HOPELESS:
         return ()
-    remedy = PROPOSAL if error.worst_share > RULED else "force more with spp"
+    remedy = PROPOSAL if is_ruled_by_few(error, len(traced.origin_m)) else "force more with spp"
     return (f"indirect light: stopped, as the target takes {times:.0f} times these paths; {remedy}",)
 
 
@@ -211,8 +206,6 @@ def _bias_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tup
     """State the bias of a filter, measured against the same paths without it."""
     if not plan.filter or traced.schedule is None:
         return ()
-    if traced.schedule.batches < FILTERED_BATCHES:
-        return ("filter: biased, and one path a pixel does not tell by how much",)
     if error.bias == 0:
         return ("filter: biased, by less than the noise of as many paths shows",)
     message = f"filter: biased by {error.bias:.2g}, measured against the same paths without it"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.transient.samples import Samples
+from render.transient.samples import Samples, select
 from scenes.constants import (
     REFERENCE_BINS,
     REFERENCE_PERIOD_S,
@@ -28,6 +28,7 @@ WORST_FRACTION, MIN_WORST = 1e-3, 16
 BRIGHTEST, BRIGHT_FRACTION = 32, 0.25
 UNEVEN = 2.0  # times the error above which the median pixel's is said beside it
 RULED = 0.5  # share of the squared error in these pixels above which they rule it
+FEW = 1 / 16  # of an image's pixels: the worst ones are no more where they are spoken of
 
 
 @dataclass(frozen=True)
@@ -54,15 +55,41 @@ class ErrorEstimate:
         return asdict(self)
 
 
+# Of a render whose checked pixels hold no light, though others do: nothing is known of its error.
+UNKNOWN = ErrorEstimate(1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0)
+
+
 def response(samples: Samples, pixels: np.ndarray) -> np.ndarray:
     """Return energy per reference bin after the pulse, (len(pixels), bins) float64, wrapped at the period.
 
     A sample's pulse and footprint are taken as one Gaussian of variance sigma^2 + h^2 / 3 at bin centres: exact to
     second order, which is all an error estimate needs of a footprint no wider than the pulse. Wider ones are cut into
-    such pieces: next to each other Gaussians would not add up to what is even. `pixels` must be sorted and hold every
-    sample's pixel.
+    such pieces: next to each other Gaussians would not add up to what is even. Those of too many pieces are integrals
+    of the pulses at their two ends. `pixels` must be sorted and hold every sample's pixel.
     """
-    samples = _in_pieces(samples)
+    wide = samples.half_width_m > WIDEST_PIECE * MAX_PIECES * SIGMA_M
+    if not wide.any():
+        return _gaussians(_in_pieces(samples), pixels)
+    return _gaussians(_in_pieces(select(samples, ~wide)), pixels) + _even(select(samples, wide), pixels)
+
+
+def _even(samples: Samples, pixels: np.ndarray) -> np.ndarray:
+    """Return `response` of samples that are even over their whole width, which may be many periods."""
+    radiance, half_m = (column.astype(np.float64) for column in (samples.radiance, samples.half_width_m))
+    per_bin, zero = radiance * BIN_M / (2 * half_m), np.zeros_like(half_m)
+    # the sum over bins up to one takes in the half of it that lies beyond its centre
+    rise, fall = (
+        samples._replace(path_m=samples.path_m + side * half_m + BIN_M / 2, half_width_m=zero, radiance=-side * per_bin)
+        for side in (-1, 1)
+    )
+    counts = np.cumsum(_gaussians(rise, pixels) + _gaussians(fall, pixels), axis=1)
+    # what wraps is a constant, which the energy tells
+    energy = np.bincount(np.searchsorted(pixels, samples.pixel), radiance, len(pixels))
+    return counts + (energy / REFERENCE_BINS - counts.mean(axis=1))[:, None]
+
+
+def _gaussians(samples: Samples, pixels: np.ndarray) -> np.ndarray:
+    """Return `response` of samples each of which is one Gaussian."""
     counts = np.zeros(len(pixels) * REFERENCE_BINS)
     row = np.searchsorted(pixels, samples.pixel).astype(np.int32) * REFERENCE_BINS
     # float32: an estimate of errors needs no more, from bins counted from a whole one
@@ -191,6 +218,11 @@ def worst_pixels(pixels: int) -> int:
     return min(max(round(WORST_FRACTION * pixels), MIN_WORST), pixels)
 
 
+def is_ruled_by_few(error: ErrorEstimate, pixels: int) -> bool:
+    """Return whether a few of an image's pixels rule its error; False where the worst are no small part of it."""
+    return error.worst_share > RULED and worst_pixels(pixels) <= FEW * pixels
+
+
 def worst_fraction_of(standard_error: np.ndarray, error: ErrorEstimate) -> float:
     """Estimate the share of the squared error in the worst pixels, from every pixel's Monte-Carlo error (H*W,).
 
@@ -218,7 +250,7 @@ def target_verdict(error: ErrorEstimate, target: float, pixels: int) -> str:
         return message
     message = f"warning: the stated error of {error.total:.2g} MISSES the target of {target:.2g}"
     message += f"; the median pixel's is {error.pixel_median:.2g}"
-    if error.worst_share > RULED:
+    if is_ruled_by_few(error, pixels):
         rest = error.total * math.sqrt(1 - error.worst_share)
         message += (
             f"; {error.worst_share:.0%} of its square lies in the worst {worst_pixels(pixels)} of {pixels} pixels"

@@ -9,6 +9,7 @@ import numpy as np
 
 from render.clamping import RemovedLight
 from render.error import (
+    UNKNOWN,
     CheckedPixels,
     ErrorEstimate,
     IndirectErrors,
@@ -21,7 +22,7 @@ from render.indirect.integrator import image_cells
 from render.indirect.path_cells import coarsened
 from render.indirect.probe import ProbePixels
 from render.pipeline import LightSamples
-from render.planning import finer_pilot
+from render.planning import CHECK_REFINEMENT, cone_width_px, finer_pilot
 from render.scene.traced_scene import TracedScene
 from render.settings import Plan
 from render.transient.samples import concatenate, no_samples, select_pixels
@@ -30,14 +31,19 @@ CLEAR = 3  # standard deviations above which a bias is believed
 
 
 def estimated_error(world: TracedScene, plan: Plan, traced: LightSamples) -> ErrorEstimate:
-    """Estimate the error of a trace, from the checked pixels' batches and from finer direct light there."""
+    """Estimate the error of a trace, from the checked pixels' batches and from finer direct light there.
+
+    It is UNKNOWN where these hold no light and others do, and where finer cells, too, may miss the laser's cone.
+    """
     checked = traced.checked
+    if CHECK_REFINEMENT * plan.grid * cone_width_px(world) < 1:
+        return UNKNOWN
     coarse = response(select_pixels(traced.direct, checked.pixel), checked.pixel)
     glints = response(select_pixels(traced.specular, checked.pixel), checked.pixel)
     fine = _finer(world, plan, checked) + glints
     coarse += glints
     if traced.indirect is None:
-        return estimate(coarse, fine, weight=checked.weight)
+        return estimate(coarse, fine, weight=checked.weight) if fine.any() or not _is_lit(traced) else UNKNOWN
     seen = traced.indirect.probed
     place, origin_m = np.arange(len(checked.pixel)), traced.origin_m[checked.pixel]
     cells = image_cells(world, plan.indirect_tolerance_m, plan.indirect_growth, traced.origin_m, plan.bounces)
@@ -51,6 +57,8 @@ def estimated_error(world: TracedScene, plan: Plan, traced: LightSamples) -> Err
     bias: np.ndarray | float = 0.0
     batches = [response(seen.samples(slice(b, b + 1)), place) for b in range(seen.radiance.shape[1])]
     indirect, noise = np.mean(batches, axis=0), noise_of_responses(batches)
+    if not (fine.any() or indirect.any()) and _is_lit(traced):
+        return UNKNOWN
     if traced.indirect.unfiltered is not None:
         bias = _filter_bias(batches, traced.indirect.unfiltered, place)
     # few pixels hold the rare bright paths, and few may hold most of the light: all pixels' totals say how typical the
@@ -64,6 +72,10 @@ def estimated_error(world: TracedScene, plan: Plan, traced: LightSamples) -> Err
     )
     error = estimate(coarse, fine, indirect, errors, checked.weight)
     return replace(error, worst_share=worst_fraction_of(traced.indirect.noise, error))
+
+
+def _is_lit(traced: LightSamples) -> bool:
+    return bool(traced.samples.radiance.any())
 
 
 def _finer(world: TracedScene, plan: Plan, checked: CheckedPixels) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -20,13 +21,15 @@ from render.indirect.integrator import (
     path_grid,
 )
 from render.indirect.launch_layout import BLOCK, block_order
-from render.indirect.light_vertices import is_wide
+from render.indirect.light_vertices import connects_suffixes
 from render.indirect.path_space_filter import Octaves, octaves
 from render.indirect.schedule import Schedule, allocate, pilot_noise, uniform
+from render.light_scale import LightScale, light_scale
 from render.scene.traced_scene import TracedScene
-from render.settings import BATCHES, FILTERED_BATCHES, MIN_SPP, Plan, RenderSettings
+from render.settings import BATCHES, FILTERED_BATCHES, MAX_BOUNCES, MIN_SPP, Plan, RenderSettings
 from render.specular.image_method import specular_light
 from render.transient.samples import SampleBuffer, Samples, concatenate, no_samples, select
+from scenes.errors import require
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 
@@ -36,6 +39,7 @@ MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
 HOPELESS = 10
 PROPOSAL = "trade fireflies for a stated bias with --clamp 10"
 UNEVEN = 1e-3  # of the direct light's root sum square over pixels: what one pixel's mirrored light may be off by
+MIN_BATCHES = 2  # whose difference tells the noise
 FIRST_FILTERED_SPP = 16  # filtered light starts with few paths, whatever it needs
 # A filter takes up to twice the time and has a bias: it has to lower the squared error at least so many times.
 FILTER_GAIN = 2.0
@@ -58,6 +62,7 @@ class LightSamples(NamedTuple):
     schedule: Schedule | None
     reasons: tuple[str, ...]
     checked: CheckedPixels
+    brightest: float = 0.0  # radiance that sets the fixed-point scale of indirect light
 
     @property
     def spp(self) -> int:
@@ -78,7 +83,11 @@ class LightSamples(NamedTuple):
 
 
 def derived_seed(seed: int, stage: int, scene: int = 0, number: int = 0) -> int:
-    """Return a 32-bit seed for one pass of one stage of one scene: independent streams from one number."""
+    """Return a 32-bit seed for one pass of one stage of one scene: independent streams from one number.
+
+    Raises InputError for a seed that is no whole number of 0 or more.
+    """
+    require(isinstance(seed, Integral) and seed >= 0, f"seed {seed!r}: expected a whole number, 0 or more")
     return int(np.random.SeedSequence(seed, spawn_key=(stage, scene, number)).generate_state(1)[0])
 
 
@@ -108,47 +117,40 @@ def trace(
     report("direct light", 0.05)
     direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, edge_threshold=plan.edge_threshold)
     trim_memory(len(pixels))
-    # only indirect light is counted from where direct light is
-    origin_m, brightest = mean_path(direct.samples, len(pixels)) if plan.bounces > 1 else (np.zeros(len(pixels)), 0.0)
     radiance = np.bincount(direct.samples.pixel, weights=direct.samples.radiance, minlength=len(pixels))
     uneven = UNEVEN * float(np.linalg.norm(radiance))
-    specular = specular_light(world, plan.grid, plan.direct_tolerance_m, uneven)
-    if settings.bounces is not None:  # the image method finds light of more surfaces, too
-        within = specular.samples.bounces <= settings.bounces
-        specular = specular._replace(samples=select(specular.samples, within))
+    # the image method finds light of more surfaces than asked for, too
+    most = MAX_BOUNCES if settings.bounces is None else settings.bounces
+    specular = specular_light(world, plan.grid, plan.direct_tolerance_m, uneven, most)
     trim_memory(len(pixels))
     mirrored = np.bincount(specular.samples.pixel, weights=specular.samples.radiance, minlength=len(pixels))
     checked = NOT_CHECKED if pilot is None else checked_pixels(pilot, radiance + mirrored)
     rays, indirect, schedule = direct.rays, None, None
-    reasons: tuple[str, ...] = ()
-    if plan.bounces > 1 and brightest > 0:
-        schedule, reasons = planned_schedule(world, plan, settings, direct.samples, origin_m, seed)
+    scale, reasons = LightScale(np.zeros(len(pixels)), 0.0, no_samples()), tuple[str, ...]()
+    if plan.bounces > 1:
+        scale = light_scale(world, plan, direct.samples, derived_seed(seed, Stream.PILOT, 0, 1))
+    if scale.brightest > 0:
+        schedule, reasons = planned_schedule(world, plan, settings, scale.light, scale.origin_m, seed)
     light = SampleBuffer()
     light.add(direct.samples)
     direct = direct._replace(samples=no_samples())  # they are in the list now
     ends = len(light), len(light) + len(specular.samples.pixel)
     light.add(specular.samples)
     if schedule is not None:
-        task = _task(world, plan, settings, schedule, derived_seed(seed, Stream.INDIRECT), origin_m, brightest)
+        task = _task(world, plan, schedule, derived_seed(seed, Stream.INDIRECT), scale.origin_m, scale.brightest)
         indirect = indirect_light(
             task, checked.pixel, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part)
         )
         rays += schedule.rays(plan.bounces)
-    reasons = (*specular.notes, *reasons)
-    samples = light.finished(lambda: trim_memory(len(pixels)))
+    reasons = (*specular.notes, *scale.reasons, *reasons)
+    samples, counts = light.finished(lambda: trim_memory(len(pixels))), (direct.clipped, rays)
     return LightSamples(
-        samples, ends, indirect, origin_m, direct.mixed, direct.clipped, rays, schedule, reasons, checked
+        samples, ends, indirect, scale.origin_m, direct.mixed, *counts, schedule, reasons, checked, scale.brightest
     )
 
 
 def _task(
-    world: TracedScene,
-    plan: Plan,
-    settings: RenderSettings,
-    schedule: Schedule,
-    seed: int,
-    origin_m: np.ndarray,
-    brightest: float,
+    world: TracedScene, plan: Plan, schedule: Schedule, seed: int, origin_m: np.ndarray, brightest: float
 ) -> IndirectTask:
     """Describe what is to be traced of indirect light."""
     width_m, growth = plan.indirect_tolerance_m, plan.indirect_growth
@@ -171,9 +173,8 @@ def add_samples(
     These follow the first paths' noise. The bias of such a stop is of second order in it, but for light of paths so
     rare that few renders find any: a part of it is lost, as each calls for more paths and then counts less.
     """
-    _, brightest = mean_path(traced.direct, len(traced.origin_m))
     light, more = SampleBuffer(), extra.schedule
-    task = _task(world, plan, settings, more, extra.seed, traced.origin_m, brightest)
+    task = _task(world, plan, more, extra.seed, traced.origin_m, traced.brightest)
     added = indirect_light(
         task, traced.checked.pixel, light.add, lambda part: report("indirect light", 0.1 + 0.8 * part)
     )
@@ -197,7 +198,7 @@ def planned_schedule(
     world: TracedScene, plan: Plan, settings: RenderSettings, direct: Samples, origin_m: np.ndarray, seed: int
 ) -> tuple[Schedule, tuple[str, ...]]:
     """Allocate paths to pixels by the noise of a pilot of a few paths, which is not used again; return the schedule and
-    the reasons for it."""
+    the reasons for it. Targets and clamps are counted in the `direct` light, or what is there in place of it."""
     clamp = None
     if plan.clamp is not None:
         camera = world.scene.camera
@@ -221,7 +222,7 @@ def _allocated(
     blocks = block_order(np.arange(camera.height * camera.width), camera.width)
     pilot_seed, few = derived_seed(seed, Stream.PILOT), plan.spp is not None and plan.spp < MIN_SPP
     # under a lamp much light is late, and the noise that the filter leaves is even: a pilot costs more than it saves
-    if plan.filter and (not plan.adaptive or few or is_wide(world)):
+    if plan.filter and (not plan.adaptive or few or connects_suffixes(world)):
         return _filtered(world, plan, settings, blocks, origin_m)
     if plan.spp is not None and (not plan.adaptive or few):
         return uniform(blocks, _in_batches(plan.spp, BATCHES), reuses_paths=False), ()
@@ -240,8 +241,9 @@ def _allocated(
 
 
 def _in_batches(spp: int, batches: int) -> int:
-    """Round paths of a pixel up to batches of one size; fewer than there are batches stay as they are."""
-    return spp if spp < batches else -(-spp // batches) * batches
+    """Round paths of a pixel up to batches of one size; fewer than there are batches are one each, two at least: the
+    noise of one batch is unknown."""
+    return max(spp, MIN_BATCHES) if spp < batches else -(-spp // batches) * batches
 
 
 def gain_of_filter(blocks: np.ndarray, plain: tuple[np.ndarray, np.ndarray], filtered: np.ndarray, spp: float) -> float:
@@ -318,11 +320,3 @@ def filter_octaves_of(
     longest_m = float(image_cells(world, width_m, growth, origin_m, plan.bounces).edges_m[-1])
     footprint_m = distance_m / world.scene.camera.focal_px
     return octaves(spp, footprint_m, distance_m, longest_m, width_m, growth)
-
-
-def mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:
-    """Return radiance-weighted mean path of each pixel [m], 0 where there is none; and the brightest pixel's
-    radiance."""
-    total = np.bincount(samples.pixel, weights=samples.radiance, minlength=pixels)
-    moment = np.bincount(samples.pixel, weights=samples.radiance * samples.path_m, minlength=pixels)
-    return np.divide(moment, total, out=np.zeros(pixels), where=total > 0), float(total.max(initial=0))

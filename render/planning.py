@@ -11,7 +11,16 @@ from render.direct.integrator import default_edge_threshold, direct_light
 from render.error import PULSE_POWER, error_for_budget, error_of_background, estimate, response
 from render.indirect.camera_paths import energy_by_bounces
 from render.scene.traced_scene import TracedScene
-from render.settings import GRIDS, MAX_BOUNCES, MIN_SPP, WIDEST_GROWTH, WIDEST_INDIRECT_M, Plan, RenderSettings
+from render.settings import (
+    GRIDS,
+    MAX_BOUNCES,
+    MAX_GRID,
+    MIN_SPP,
+    WIDEST_GROWTH,
+    WIDEST_INDIRECT_M,
+    Plan,
+    RenderSettings,
+)
 from render.transient.samples import select_pixels
 from scenes.errors import InputError
 from scenes.model import Material
@@ -19,6 +28,7 @@ from scenes.model import Material
 DEFAULT_ERROR = 0.02
 # Of the square that is aimed at: the rest is for merged returns and what twice as many rays a side still miss.
 PLANNED = 0.96
+MIN_NOISE_FRACTION = 0.1  # of that square, which noise of indirect light may have, however much direct light takes
 # Time of a cell in that of a path: where many paths are to come, finer cells leave them more of the error.
 CELL_COST = 0.25
 # The pilot's pixels are not compared with those beside them, so that it shows 1.3 to 1.4 times the error of cells at
@@ -37,6 +47,8 @@ PILOT_PIXELS = 256
 PILOT_BOUNCES = 8
 CHECK_REFINEMENT, MIN_CHECK_REFINEMENT = 2, 1.5  # direct light is checked against this many times the cells a side
 PILOT_GRID = 4
+# A cone narrower than a pixel may lie between the rays of a few cells a side.
+CELLS_ACROSS_CONE, MAX_HALF_ANGLE = 8, math.radians(80)
 # Errors of direct light fall at least with this power of the grid (1.2 to 1.9 in rooms); trusted so far beyond a grid.
 GRID_POWER, EXTRAPOLATED = 1.3, 2
 THRESHOLD_POWER = 0.7  # with which they fall as fewer edges are left alone (0.7 at grid 4, 0.5 at 5)
@@ -56,6 +68,20 @@ def pilot_pixels(world: TracedScene, seed: int) -> np.ndarray:
     if pixels <= PILOT_PIXELS:
         return np.arange(pixels)
     return np.sort(np.random.default_rng(seed).choice(pixels, PILOT_PIXELS, replace=False))
+
+
+def cone_width_px(world: TracedScene) -> float:
+    """Return the width of a flood laser's own cone in pixels, as if it were at the camera; inf where it is the image's,
+    or another laser."""
+    laser, camera = world.scene.laser, world.scene.camera
+    if laser.cone_deg is None:
+        return math.inf
+    return 2 * camera.focal_px * math.tan(min(laser.half_angle(camera), MAX_HALF_ANGLE))
+
+
+def _grid_for_cone(world: TracedScene) -> int:
+    """Return the grid whose cells are narrow enough for the laser's cone, or the finest there is."""
+    return min(math.ceil(CELLS_ACROSS_CONE / cone_width_px(world)), MAX_GRID)
 
 
 def pilot_response(
@@ -139,14 +165,16 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
     direct_alone = settings.bounces == 1 or (settings.bounces is None and world.scene.laser.mode == "scan")
     fine = None
     if settings.grid is None or settings.budget is not None or not direct_alone:
-        fine = pilot_response(world, pixels, PILOT_GRID)
+        fine = pilot_response(world, pixels, max(PILOT_GRID, _grid_for_cone(world)))
     target, why = _target(settings, fine)
     reasons.append(why)
     bounces, spp, paths, more_reasons = _indirect(world, settings, pixels, fine, target, seed)
     fraction = _direct_fraction(settings, direct_alone)
-    grid, off, why = _grid(
-        world, settings, pixels, fraction * target, paths, PLANNED * settings.target_fraction * target**2
-    )
+    planned = PLANNED * settings.target_fraction * target**2
+    grid, off, why = _grid(world, settings, pixels, fraction * target, paths, planned)
+    if settings.grid is None and grid < _grid_for_cone(world):
+        grid, width_px = _grid_for_cone(world), cone_width_px(world)
+        why = f"direct light: {grid} x {grid} rays a pixel, as the laser's cone is {width_px:.2g} pixels wide"
     reasons += [why, *more_reasons]
     tolerance_m = settings.direct_tolerance_m
     if tolerance_m is None:
@@ -167,7 +195,7 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
         direct_tolerance_m=tolerance_m,
         indirect_tolerance_m=narrowing * WIDEST_INDIRECT_M if width_m is None else width_m,
         indirect_growth=narrowing * WIDEST_GROWTH if growth is None else growth,
-        noise=math.sqrt(max(PLANNED * settings.target_fraction * target**2 - off**2, 0.0)),
+        noise=math.sqrt(max(planned - off**2, MIN_NOISE_FRACTION * planned)),
         target=target,
         adaptive=settings.adaptive and mode_is_flood,
         filter=settings.filter,
@@ -262,7 +290,7 @@ def _grid(
     power = math.log2(error / finer) if 0 < finer < error else GRID_POWER
     grid = max(min(math.ceil(coarse * (error / allowed) ** (1 / power)), GRIDS[-1]), coarse)
     offs = {g: error * (coarse / g) ** (power if g <= 2 * coarse else GRID_POWER) for g in range(grid, GRIDS[-1] + 1)}
-    grid = min(offs, key=lambda g: CELL_COST * g**2 + paths / max(1 - offs[g] ** 2 / squared, 0.1))
+    grid = min(offs, key=lambda g: CELL_COST * g**2 + paths / max(1 - offs[g] ** 2 / squared, MIN_NOISE_FRACTION))
     why = f"direct light: {grid} x {grid} rays a pixel, error {offs[grid]:.2g} by twice as many a side"
     if offs[grid] > allowed:
         return grid, allowed, f"{why}: its share of the target needs more; force grid"
@@ -284,10 +312,10 @@ def _indirect(
     energy, noise = energy_by_bounces(world, pixels, MIN_SPP, most, seed)
     assert fine is not None
     energy[1] = fine.sum()
-    if energy.sum() <= 0:
-        return settings.bounces or 1, settings.spp or MIN_SPP, 0.0, ["indirect light: nothing is lit"]
-    lines = []
-    bounces = settings.bounces
+    lines, bounces = list[str](), settings.bounces
+    if energy.sum() <= 0:  # what the laser lights may lie between the pilot's rays
+        most = bounces or MIN_BOUNCES
+        return most, settings.spp, 0.0, [f"bounces: {most}; indirect light: the pilot's paths found no light"]
     if bounces is None:
         bounces, left_out = bounces_for(energy, min(LEFT_OUT * target, MAX_LEFT_OUT), MIN_BOUNCES)
         fraction = energy[2:].sum() / energy.sum()

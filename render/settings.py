@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from numbers import Integral
 from typing import Literal, get_args
 
 from scenes.errors import InputError
@@ -20,10 +21,13 @@ BATCHES = 4
 MIN_SPP = 16  # paths a pixel of the darkest block, since pilots are short; fewer are traced only where asked for
 FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
+MAX_GRID = 64  # that can be forced
 MAX_AMBIENT_SPP = 1 << 12
 # Indirect returns of one pixel merge within so many metres of path, and this share of the path behind the direct light.
 WIDEST_INDIRECT_M, WIDEST_GROWTH = 0.03, 0.05
 FILTERED_AMBIENT_SPP = 2  # paths a pixel of ambient light where neighbours share it: as little noise as 45 alone
+
+WHOLE = ("bounces", "spp", "grid", "min_spp", "ambient_spp")  # settings that are whole numbers
 
 Refraction = Literal["straight", "bent"]
 
@@ -33,7 +37,8 @@ class RenderSettings:
     """Settings of a render, as the user asks for them; None leaves a choice to the plan.
 
     bounces     surfaces that light may meet, 1 = direct light only
-    spp         work on indirect light, in paths per pixel; spent where the noise is, and partly on sharing paths
+    spp         work on indirect light, in paths per pixel; spent where the noise is, and partly on sharing paths. 1
+                traces 2, whose difference tells the noise
     adaptive    whether it is spent so, or evenly and without sharing
     filter      whether late indirect light is averaged over regions of surfaces instead: far less noise, and a bias;
                 left out where a pilot sees little gain, but without `adaptive`
@@ -41,7 +46,7 @@ class RenderSettings:
                 fireflies go, and some energy, which is measured and counted as an error
     grid        direct rays per pixel side: a pixel is cut into grid x grid cells, one ray and footprint each
     ambient     whether steady ambient light is rendered; open: if the scene has any and the budget has background
-    ambient_spp paths per pixel of ambient light; open: as many as its noise asks for
+    ambient_spp paths per pixel of ambient light, 1 traces 2; open: as many as its noise asks for
     ambient_filtered  whether neighbouring pixels share the ambient light they reflect: far less noise, edges of shadows
                 and reflections in it are blurred by some pixels
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
@@ -84,7 +89,7 @@ class RenderSettings:
             ("bounces", 1, MAX_BOUNCES),
             ("spp", 1, MAX_SAMPLES),
             ("clamp", 1e-3, 1e6),
-            ("grid", 1, 64),
+            ("grid", 1, MAX_GRID),
             ("error", 1e-4, 1.0),
             ("min_spp", 1, MAX_SAMPLES),
             ("target_fraction", 0.1, 2.0),
@@ -98,6 +103,8 @@ class RenderSettings:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise InputError(f"render: {name} {value} is outside {low} to {high}")
+            if value is not None and name in WHOLE and not isinstance(value, Integral):
+                raise InputError(f"render: {name} {value!r} is no whole number, as it has to be from {low} to {high}")
         if self.refraction is not None and self.refraction not in get_args(Refraction):
             raise InputError(f"render: refraction {self.refraction!r}, expected {' or '.join(get_args(Refraction))}")
         if self.budget is not None:

@@ -31,6 +31,7 @@ _ADDED_AT = {"distribution": "ggx"}
 # Metres from the origin: float32, in which rays are traced, resolves 1 m there.
 MAX_COORDINATE_M = 1e7
 MAX_IMAGE_SIDE = 16384  # pixels
+MIN_CONE_DEG = 1e-6  # float32 holds its intensity, and places on its rim
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +237,7 @@ class Camera:
         return local @ self.rotation.T
 
     def pixel_solid_angle(self) -> np.ndarray:
-        """Return solid angle of each pixel [sr], (H, W), exact: the sum over corners of +-atan(x y / sqrt(1 + x^2 +
-        y^2))."""
+        """Return solid angle of each pixel [sr], (H, W): the sum over corners of +-atan(x y / sqrt(1 + x^2 + y^2))."""
         x = (np.arange(self.width + 1) - self.width / 2) / self.focal_px
         y = (np.arange(self.height + 1)[:, None] - self.height / 2) / self.focal_px
         corner = np.arctan(x * y / np.sqrt(1 + x * x + y * y))
@@ -266,8 +266,8 @@ class Laser:
         baseline = tuple(float(v) for v in self.baseline_m)
         require(len(baseline) == 3 and all(map(math.isfinite, baseline)), f"laser baseline {baseline} is not 3 numbers")
         object.__setattr__(self, "baseline_m", baseline)
-        good = self.cone_deg is None or 0 < self.cone_deg <= 360
-        require(good, f"laser cone {self.cone_deg} degrees is outside (0, 360]")
+        good = self.cone_deg is None or MIN_CONE_DEG <= self.cone_deg <= 360
+        require(good, f"laser cone {self.cone_deg} degrees is outside (0, 360], {MIN_CONE_DEG:g} at least")
         require(self.cone_deg is None or self.mode == "flood", f"laser mode {self.mode}: a cone is for flood only")
 
     @property
@@ -279,17 +279,20 @@ class Laser:
         """Return the laser's position in the world [m], (3,)."""
         return camera.origin + camera.rotation @ np.asarray(self.baseline_m)
 
+    def half_angle(self, camera: Camera) -> float:
+        """Return half angle of the flood cone [rad]."""
+        if self.cone_deg is not None:
+            return math.radians(self.cone_deg) / 2
+        return math.acos(camera.focal_px / math.hypot(camera.focal_px, camera.width / 2, camera.height / 2))
+
     def cos_half_angle(self, camera: Camera) -> float:
         """Return cosine of the flood cone's half angle."""
-        if self.cone_deg is not None:
-            return math.cos(math.radians(self.cone_deg) / 2)
-        return camera.focal_px / math.hypot(camera.focal_px, camera.width / 2, camera.height / 2)
+        return math.cos(self.half_angle(camera))
 
     def intensity(self, camera: Camera) -> np.ndarray:
-        """Return radiant intensity of the lit cone, row or pixel while each pixel is measured [1/sr per joule], (H,
-        W)."""
-        if self.mode == "flood":
-            return np.full((camera.height, camera.width), 1 / (2 * math.pi * (1 - self.cos_half_angle(camera))))
+        """Return radiant intensity (H, W) of the lit cone, row or pixel while each is measured [1/sr per joule]."""
+        if self.mode == "flood":  # 1 - cos without cancellation
+            return np.full((camera.height, camera.width), 0.25 / math.pi / math.sin(self.half_angle(camera) / 2) ** 2)
         solid_angle = camera.pixel_solid_angle()
         if self.mode == "line":
             solid_angle = np.broadcast_to(solid_angle.sum(axis=1, keepdims=True), solid_angle.shape)
@@ -342,10 +345,8 @@ class Scene:
 
     def __repr__(self) -> str:
         camera, laser = self.camera, self.laser
-        return (
-            f"Scene({self.name!r}, {len(self.surfaces)} surfaces, {self.triangles} triangles, "
-            f"{camera.width} x {camera.height} pixels, fov {camera.fov_deg:g} deg, {laser.mode} laser)"
-        )
+        seen = f"{camera.width} x {camera.height} pixels, fov {camera.fov_deg:g} deg, {laser.mode} laser"
+        return f"Scene({self.name!r}, {len(self.surfaces)} surfaces, {self.triangles} triangles, {seen})"
 
     @property
     def triangles(self) -> int:

@@ -21,6 +21,7 @@ from render.scene.traced_scene import TracedScene, UInt32, dr, upload
 
 MAX_LANES = 1 << 18  # paths of one launch
 FIRST_SPP, MIN_MORE, MAX_MORE = 64, 1.25, 8  # paths a pixel whose noise tells how many times as many are needed
+MIN_SPP = 2  # paths a pixel, whose difference tells the noise
 UNEVEN = 1 << 24  # keys of launches that give pixels different numbers of paths
 CAUSTIC_COST = 0.15  # time of the paths from lamps that are traced for one of the camera's
 
@@ -45,11 +46,11 @@ def ambient_light(
 
     Paths of the camera (`render.ambient.camera_paths`), and of lamps where mirrors or solid glass throw their light
     (`render.ambient.light_paths`); unbiased. Same seed, same bytes. With `guide_layers` of the pixels' centres,
-    neighbours share what is reflected (`bilateral_filter`): far less noise, biased. `spp` paths a pixel; where a
-    `noise` is enough, as many as take the `AmbientLight.error` there, `spp` at most, and most in the pixels that are
-    noisiest (`render.ambient.allocation`).
+    neighbours share what is reflected (`bilateral_filter`): far less noise, biased. `spp` paths a pixel, MIN_SPP at
+    least; where a `noise` is enough, as many as take the `AmbientLight.error` there, `spp` at most, and most in the
+    pixels that are noisiest (`render.ambient.allocation`).
     """
-    sums = _Sums(world, bounces, seed)
+    sums, spp = _Sums(world, bounces, seed), max(spp, MIN_SPP)
     sums.trace_evenly(spp if noise == 0 else min(spp, FIRST_SPP))
     light, relative = sums.light(guide_layers), None
     while light.error > noise and light.spp < spp:

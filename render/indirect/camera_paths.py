@@ -19,7 +19,7 @@ from render.indirect.light_vertices import (
     LightVertices,
     Scattered,
     connections_per_vertex,
-    is_wide,
+    connects_suffixes,
     sample_light_vertices,
 )
 from render.indirect.path_space_filter import Point, late_from, point_of
@@ -82,7 +82,7 @@ def trace_paths(task: PathTask) -> PathBatch:
         from_m,
     )
     work = partial(_paths, reuses_paths=reuses_paths, connections=connections)
-    key = "paths", reuses_paths, connections, is_wide(world)
+    key = "paths", reuses_paths, connections, connects_suffixes(world)
     primary, near, suffixes, batch = world.recordings.call(world, key, work, *given)
     late_m = dr.full(Float, dr.inf if reuses_paths else 0, lanes) if from_m is None else primary[-2]
     point = None if from_m is None else Point(*primary[-1])

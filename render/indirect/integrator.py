@@ -14,7 +14,7 @@ from render.indirect.accumulators import IndirectAccumulator
 from render.indirect.camera_paths import PathTask, trace_paths
 from render.indirect.launch_layout import BLOCK, LaunchLayout, make_launch
 from render.indirect.light_tracing import trace_light_paths
-from render.indirect.path_cells import Cells, MomentHistogram, coarsened, make_cells, quantum_for
+from render.indirect.path_cells import Cells, MomentHistogram, coarsened, make_cells, quantum_for, require_rows
 from render.indirect.path_space_filter import PathSpaceFilter
 from render.indirect.probe import Probe, ProbePixels, make_probe, probe_splats, read_probe
 from render.indirect.reuse import (
@@ -125,6 +125,9 @@ def indirect_light(
     """
     (origin_m, _, fine, brightest), schedule = task.grid, task.schedule
     batches, filtered = schedule.batches, schedule.filter_octaves is not None
+    # asked at once: each alone may fit
+    regions = 0 if schedule.clamp is None else schedule.clamp.regions
+    require_rows(len(probed) * batches * (2 if filtered else 1) + 2 * regions, fine)
     probe = make_probe(probed, origin_m, fine, batches, brightest, filtered=filtered)
     clamp = None
     if schedule.clamp is not None:

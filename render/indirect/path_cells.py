@@ -13,13 +13,19 @@ import numpy as np
 from render.backend.drjit_types import Array, Floats, Masks, UInts
 from render.scene.traced_scene import Float, UInt32, dr, mi
 from render.transient.samples import Samples, merge_by, no_samples, packed, with_energy
+from scenes.errors import require
+from scenes.limits import require_memory
 
 UInt64 = mi.UInt64
 # One quantum is 2^-43 of the brightest pixel's direct radiance: 2^26 samples of a tenth of it keep 13 bits each, and a
-# cell overflows only beyond 2^21 times that radiance. A single sample above 2^17 times is clipped, and counted.
+# cell overflows only beyond 2^21 times that radiance. A single sample above 2^17 times is clipped.
 QUANTA_PER_BRIGHTEST = 2.0**43
 MAX_QUANTA = 2.0**60
 READ = 1 << 16  # cells read at a time
+MOMENTS = 3  # of a cell: entries of its accumulator
+ENTRY_BYTES = 8 + 8  # in fixed point, and read as float64
+MAX_ENTRIES = (1 << 32) - 1  # of one array of Dr.Jit
+MAKING_BYTES = 5 * 8  # a cell, of the arrays in which edges are worked out
 
 
 class Cells(NamedTuple):
@@ -46,9 +52,23 @@ class Cells(NamedTuple):
 def make_cells(width_m: float, growth: float, nearest_m: float, farthest_m: float) -> Cells:
     """Return cells that cover x from `nearest_m` (negative) to `farthest_m`."""
     behind, ahead = (math.ceil(float(_cell_number(abs(x), width_m, growth))) + 1 for x in (nearest_m, farthest_m))
+    require_memory(MAKING_BYTES * (behind + ahead), _what(1, behind + ahead))
     number = np.arange(-behind, ahead + 1, dtype=np.float64)
     far = np.expm1(growth * np.abs(number)) / growth if growth > 0 else np.abs(number)
     return Cells(width_m, growth, behind, np.sign(number) * far * width_m)
+
+
+def require_rows(rows: int, cells: Cells) -> None:
+    """Raise InputError where accumulators of so many rows of cells take more memory than there may be, or have more
+    entries than Dr.Jit numbers."""
+    what, entries = _what(rows, cells.size), MOMENTS * rows * cells.size
+    require_memory(ENTRY_BYTES * entries, what)
+    require(entries <= MAX_ENTRIES, f"{what}: {entries} entries, the limit is {MAX_ENTRIES}")
+
+
+def _what(rows: int, cells: int) -> str:
+    """Name cells for a message, with what makes them fewer."""
+    return f"{rows} x {cells} cells of indirect light (widen indirect_tolerance_m or indirect_growth)"
 
 
 def _cell_number(x: Floats, width_m: float, growth: float) -> Array:
@@ -72,7 +92,8 @@ class MomentHistogram:
 
     def __init__(self, rows: int, cells: Cells, quantum: float) -> None:
         self.rows, self.cells, self.quantum = rows, cells, quantum
-        self.moments = dr.zeros(UInt64, int(rows * cells.size) * 3)
+        require_rows(rows, cells)
+        self.moments = dr.zeros(UInt64, int(rows * cells.size) * MOMENTS)
         self._edges = Float(cells.edges_m)
         self._growth, self._width = dr.opaque(Float, cells.growth), dr.opaque(Float, cells.width_m)
         self._behind, self._count = dr.opaque(UInt32, cells.behind), dr.opaque(UInt32, cells.size)

@@ -18,8 +18,8 @@ from render.indirect.light_vertices import (
     LightVertices,
     Scattered,
     connect_to_light_vertex,
+    connects_suffixes,
     density_of,
-    is_wide,
     light_vertex_index,
     mis_weight_sampled,
 )
@@ -91,7 +91,7 @@ def slots_for(world: TracedScene, light_vertices: LightVertices | None, lanes: i
 
 def _connects_suffix(world: TracedScene, light_vertices: LightVertices | None) -> bool:
     """Return whether path vertices after x1 are connected to light vertices."""
-    return light_vertices is not None and is_wide(world)
+    return light_vertices is not None and connects_suffixes(world)
 
 
 class SuffixTask(NamedTuple):

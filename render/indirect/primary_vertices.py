@@ -7,7 +7,7 @@ from typing import NamedTuple
 from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts, Vectors
 from render.indirect.glossy import camera_share, ratio_at_camera
 from render.indirect.launch_layout import BLOCK
-from render.indirect.light_vertices import LightVertices, connect_to_light_vertex, is_wide, light_vertex_index
+from render.indirect.light_vertices import LightVertices, connect_to_light_vertex, connects_suffixes, light_vertex_index
 from render.indirect.path_space_filter import Point
 from render.scene.traced_scene import Float, TracedScene, dr
 
@@ -44,7 +44,7 @@ class Connection(NamedTuple):
 
 def reuses_early_paths(world: TracedScene) -> bool:
     """Return whether blocks share what comes too early to be filtered: under a lamp that is little of the light."""
-    return not is_wide(world)
+    return not connects_suffixes(world)
 
 
 def connect_primary_vertices(

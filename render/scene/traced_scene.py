@@ -126,7 +126,7 @@ class TracedScene:
         self.focal_px = dr.opaque(Float, camera.focal_px)  # a literal would compile every kernel again for each view
         self.width, self.height = dr.opaque(UInt32, camera.width), dr.opaque(UInt32, camera.height)
         # the corner pixels' rays lie on the rim of the smallest cone
-        self.half_angle = dr.opaque(Float, math.acos(scene.laser.cos_half_angle(camera)) * (1 + 1e-5))
+        self.half_angle = dr.opaque(Float, scene.laser.half_angle(camera) * (1 + 1e-5))
 
     def _reflectance(self, material: Material, masks: str, known: Mapping[tuple, Array]) -> Array:
         """Make Mitsuba's BSDF of a material, taken from those known if it is a plain, whole plastic that is among

@@ -9,7 +9,6 @@ Mirrored light: what the camera sees, directly or by way of mirrors, lit by way 
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +16,11 @@ import numpy as np
 from render.backend.drjit_types import Array, Floats, Masks, Rays, UInts, Vectors
 from render.scene.rays import camera_rays, first_opaque, in_beam, passage, shape_index, spawn, spreading
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, upload
+from render.settings import MAX_BOUNCES
 from render.specular.mirrors import (
     COATED,
+    LOBE_RAD,
+    LOBE_RAYS,
     MAX_ORDER,
     Mirrors,
     check_slabs,
@@ -26,6 +28,7 @@ from render.specular.mirrors import (
     glint_sequences,
     image_of,
     image_sequences,
+    lobe_points,
     planes_of,
     specular_points,
 )
@@ -33,8 +36,6 @@ from render.transient.samples import Samples, concatenate, merge, no_samples, se
 
 CELLS_PER_LAUNCH = 1 << 20
 FINER, FINER_M = (32, 128), 2e-3  # cells a side of polished pixels, of those uneven still; merged within so much
-# A glint is a thin cone of rays: on an edge or in the apex of a corner cube, the share of them that comes back counts.
-LOBE_RAYS, LOBE_RAD = 32, 5e-4
 WIDEST_SPREAD = 0.25  # of the path: a footprint that spans more describes no mesh
 
 
@@ -45,16 +46,19 @@ class SpecularLight(NamedTuple):
     notes: tuple[str, ...]
 
 
-def specular_light(world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4, allowed: float = 0.0) -> SpecularLight:
+def specular_light(
+    world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4, allowed: float = 0.0, bounces: int = MAX_BOUNCES
+) -> SpecularLight:
     """Return deterministic returns by way of smooth plane surfaces, as `Samples` merged within `tolerance_m`.
 
     Glints: pixel-mean radiance T R_1 ... R_k I(w) / (D^2 Omega), with D the unfolded one-way length laser -> mirrors ->
     camera, Omega the pixel's solid angle, T the transmission of glass on the way; path length D plus glass delay,
     `bounces` = k. Mirrored light is integrated over grid x grid cells of each pixel: f cos R_1 ... I(w) / D^2 with D
     the unfolded length from the laser to the surface, times the reflectances between surface and camera; `bounces`
-    counts every surface met. Where the cells of a pixel are so uneven that its mean could be off by more than `allowed`
-    (a radiance; 0: not asked), and on polished surfaces, whose highlights may be smaller than a cell, there are FINER
-    ones. Paths without a mirror on the laser's side are not here: direct light and path tracing find them.
+    counts every surface met. Light of more surfaces than the `bounces` asked for is left out. Where the cells of a
+    pixel are so uneven that its mean could be off by more than `allowed` (a radiance; 0: not asked), and on polished
+    surfaces, whose highlights may be smaller than a cell, there are FINER ones. Paths without a mirror on the laser's
+    side are not here: direct light and path tracing find them.
 
     Raises InputError where a displaced laser's straight path through a glass slab is off by more than 10 mm.
     """
@@ -63,12 +67,12 @@ def specular_light(world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4,
         return SpecularLight(no_samples(), tuple(notes))
     mirrors, more = find_mirrors(world)
     notes += more
-    tables = _Tables(world, mirrors)
+    tables = _Tables(world, mirrors, bounces)
     parts = [no_samples()]
-    for sequence in glint_sequences(mirrors, notes):
-        parts.append(_glints(world, tables, mirrors, sequence))
+    parts += [_glints(world, tables, mirrors, s) for s in glint_sequences(mirrors, notes) if s.shape[1] <= bounces]
     for sequence in image_sequences(mirrors, notes):
-        parts += _mirrored(world, tables, mirrors, sequence, grid, allowed)
+        if len(sequence) < bounces:  # and the surface that is lit
+            parts += _mirrored(world, tables, mirrors, sequence, grid, allowed)
     return SpecularLight(merge(concatenate(parts), tolerance_m), tuple(notes))
 
 
@@ -76,9 +80,10 @@ def specular_light(world: TracedScene, grid: int = 4, tolerance_m: float = 1e-4,
 
 
 class _Tables:
-    """Planes and, per registered shape, what decides a smooth reflectance, as Dr.Jit arrays."""
+    """Planes and, per registered shape, what decides a smooth reflectance, as Dr.Jit arrays; the most `bounces`."""
 
-    def __init__(self, world: TracedScene, mirrors: Mirrors) -> None:
+    def __init__(self, world: TracedScene, mirrors: Mirrors, bounces: int) -> None:
+        self.bounces = bounces
         # one row more: an array of a single value would compile other kernels
         columns = np.vstack((np.column_stack((mirrors.normal, mirrors.offset)), np.zeros(4)))
         self.normal = mi.Vector3f(*(upload(Float, column) for column in columns[:, :3].T))
@@ -185,7 +190,7 @@ def _glints(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.
     sequence, image = sequence[kept], image[kept]
     row, column = row[kept].astype(np.int64), column[kept].astype(np.int64)
     distance = np.linalg.norm(image, axis=1)
-    lanes = _lobe(image).reshape(-1, 3)
+    lanes = lobe_points(image).reshape(-1, 3)
     planes = [upload(UInt32, np.repeat(plane, LOBE_RAYS)) for plane in sequence.T]
     target = mi.Point3f(*(upload(Float, axis) for axis in (lanes + world.eye_m).T))
     start = mi.Point3f(world.eye) + dr.zeros(mi.Vector3f, len(lanes))
@@ -244,23 +249,9 @@ def _shines_on(
     camera, laser = world.scene.camera, world.scene.laser
     if laser.mode == "flood":
         x, y, z = ((point - laser_point) @ camera.rotation).T
-        return np.arctan2(np.hypot(x, y), z) <= math.acos(laser.cos_half_angle(camera)) * (1 + 1e-5)
+        return np.arctan2(np.hypot(x, y), z) <= laser.half_angle(camera) * (1 + 1e-5)
     lit_column, lit_row = _raster(world, point)
     return (lit_row == row) & ((lit_column == column) | (laser.mode == "line"))
-
-
-def _lobe(image: np.ndarray) -> np.ndarray:
-    """Spread points over a small disk around each image as seen from the camera, (m, LOBE_RAYS, 3): a sunflower's
-    spiral."""
-    number = np.arange(LOBE_RAYS)
-    radius = LOBE_RAD * np.sqrt((number + 0.5) / LOBE_RAYS)
-    angle = number * math.pi * (3 - math.sqrt(5)) + 0.5
-    axis = np.eye(3)[np.abs(image).argmin(axis=1)]
-    first = np.cross(image, axis)
-    first *= (np.linalg.norm(image, axis=1) / np.linalg.norm(first, axis=1))[:, None]
-    second = np.cross(image, first) / np.linalg.norm(image, axis=1, keepdims=True)
-    around = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
-    return image[:, None] + radius[:, None] * around
 
 
 # ---- mirrored light ----
@@ -299,11 +290,11 @@ def _of_pixels(
         path, half_width, radiance, met, polished = _cells(world, tables, chunk, grid, target, planes)
         dr.eval(path, half_width, radiance, met, polished)
         shown.append(chunk[np.array(polished).reshape(-1, cells).any(axis=1)])
-        radiance = np.array(radiance, dtype=np.float64)
-        lit = radiance > 0
+        radiance, bounces = np.array(radiance, dtype=np.float64), np.array(met) + 1 + len(planes)
+        lit = (radiance > 0) & (bounces <= tables.bounces)
         path, half_width = (np.array(value, dtype=np.float64)[lit] for value in (path, half_width))
-        bounces = (np.array(met)[lit] + 1 + len(planes)).astype(np.uint8)
-        parts.append(Samples(np.repeat(chunk, cells)[lit], path, half_width, radiance[lit], bounces))
+        met_in_all = bounces[lit].astype(np.uint8)
+        parts.append(Samples(np.repeat(chunk, cells)[lit], path, half_width, radiance[lit], met_in_all))
     return parts, np.concatenate(shown)
 
 

@@ -19,6 +19,8 @@ MAX_PLANES = 64  # a smooth mesh of more planes is a curved surface
 MAX_SEQUENCES = 1 << 18
 MAX_IMAGES = 64
 MAX_SLAB_ERROR_M = 0.010
+# A glint is a thin cone of rays: on an edge or in the apex of a corner cube, the share of them that comes back counts.
+LOBE_RAYS, LOBE_RAD = 32, 5e-4
 COATED = ("conductor", "plastic", "dielectric", "thindielectric")
 
 
@@ -263,3 +265,17 @@ def slab_error_m(world: TracedScene) -> list[SlabError]:
             path += max(surface.material.ior * (straight - thickness / inside), 0.0)
         errors.append(SlabError(surface.name, thickness, shift, path, True))
     return errors
+
+
+def lobe_points(image: np.ndarray) -> np.ndarray:
+    """Spread points over a small disk around each image as seen from the camera, (m, LOBE_RAYS, 3): a sunflower's
+    spiral."""
+    number = np.arange(LOBE_RAYS)
+    radius = LOBE_RAD * np.sqrt((number + 0.5) / LOBE_RAYS)
+    angle = number * math.pi * (3 - math.sqrt(5)) + 0.5
+    axis = np.eye(3)[np.abs(image).argmin(axis=1)]
+    first = np.cross(image, axis)
+    first *= (np.linalg.norm(image, axis=1) / np.linalg.norm(first, axis=1))[:, None]
+    second = np.cross(image, first) / np.linalg.norm(image, axis=1, keepdims=True)
+    around = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
+    return image[:, None] + radius[:, None] * around

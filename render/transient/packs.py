@@ -130,10 +130,10 @@ def _short(values: np.ndarray, bits: int) -> np.ndarray:
 
 
 def _encoded(values: np.ndarray, steps: int) -> np.ndarray:
-    """Encode values as uint16 on a scale of `steps` per octave, from 2^-32 to 2^32; 0 stays 0."""
+    """Encode values as uint16 on a scale of `steps` per octave, from 2^-32 to 2^32; 0, and what is below, are 0."""
     with np.errstate(divide="ignore"):
         code = np.rint((np.log2(values, dtype=np.float64) + OCTAVES) * steps)
-    return np.where(values > 0, np.clip(code, 1, 65535), 0).astype(np.uint16)
+    return np.clip(code, 0, 65535).astype(np.uint16)
 
 
 def _decoded(codes: np.ndarray, steps: int) -> np.ndarray:

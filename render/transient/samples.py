@@ -23,6 +23,9 @@ class Samples(NamedTuple):
 
 COLUMN_TYPES = (np.int32, np.float32, np.float32, np.float32, np.uint8)
 SORTED = 1 << 19  # samples sorted at a time
+# Of a key of 63 bits: the number of a cell; the others hold a flat pixel of int32 and one bit for indirect light.
+CELL_BITS = 31
+MAX_CELL = 1 << (CELL_BITS - 1)  # cells on either side of 0
 
 
 class SampleBuffer:
@@ -82,14 +85,18 @@ def concatenate(parts: list[Samples]) -> Samples:
 def merge(samples: Samples, tolerance_m: float) -> Samples:
     """Merge samples of one pixel whose path centres share a cell; direct and indirect samples stay apart.
 
-    Cells are `tolerance_m` wide. Samples without energy go; with a tolerance of 0 that is all.
+    Cells are `tolerance_m` wide, wider where a path is longer than MAX_CELL of them. Samples without energy go; with a
+    tolerance of 0 that is all.
     """
     samples = with_energy(samples)
     if len(samples.pixel) == 0 or tolerance_m == 0:
         return samples
-    cell = np.floor(samples.path_m.astype(np.float64) / tolerance_m)
-    number = np.clip(cell + (1 << 27), 0, (1 << 28) - 1).astype(np.int64)
-    key = (samples.pixel.astype(np.int64) << 1 | (samples.bounces > 1)) << 28 | number
+    path_m = samples.path_m.astype(np.float64)
+    # beyond, float32 does not tell such cells apart
+    tolerance_m = max(tolerance_m, float(np.abs(path_m).max()) / (MAX_CELL - 1))
+    cell = np.floor(path_m / tolerance_m)
+    number = cell.astype(np.int64) + MAX_CELL
+    key = (samples.pixel.astype(np.int64) << 1 | (samples.bounces > 1)) << CELL_BITS | number
     return merge_by(samples, key, cell * tolerance_m)
 
 

@@ -236,3 +236,13 @@ def test_noisy_pixels_take_most_paths_and_none_decides_for_itself():
     present = np.full((2, 48), 32)
     numbers = numbers_for(100.0, relative, present, 4)
     assert (numbers >= present).all() and (numbers % 4 == 0).all() and 100 <= numbers.mean() < 108
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_one_path_a_pixel_states_its_noise(shared):
+    """2 are traced, whose difference tells it; halves of a filter hold one each. In 48 pixels, 8 tell it to 20 %."""
+    world = TracedScene(windowed_room())
+    layers = centre_layers(world) if shared else None
+    one, eight = (ambient_light(world, spp, 4, 1, layers) for spp in (1, 8))
+    assert one.spp == 2 and 0.5 * eight.error < one.error
+    assert one.radiance.mean() == pytest.approx(eight.radiance.mean(), rel=4 * np.hypot(one.error, eight.error))

@@ -245,7 +245,7 @@ def test_different_seeds_agree_within_the_estimated_error():
     assert (np.abs(difference) / np.sqrt(squared)).max() < 12
 
 
-@pytest.mark.parametrize(("asked", "traced"), [(1, 1), (3, 3), (5, 8), (18, 20)])
+@pytest.mark.parametrize(("asked", "traced"), [(1, 2), (3, 3), (5, 8), (18, 20)])
 def test_batches_are_of_one_size(asked, traced):
     """Batches of different sizes would add their difference to the stated error."""
     settings = RenderSettings(bounces=2, spp=asked, grid=2, adaptive=False)
@@ -319,7 +319,8 @@ def test_progress_is_told():
     [
         {"bounces": 0}, {"spp": 0}, {"grid": 0}, {"grid": 65}, {"error": 0.0}, {"error": float("nan")},
         {"budget": (0, 10)}, {"budget": (10, -1)}, {"error": 0.1, "budget": (1, 1)}, {"direct_tolerance_m": 1e-6},
-        {"indirect_growth": 2.0},
+        {"indirect_growth": 2.0}, {"bounces": 2.0}, {"grid": 2.5}, {"spp": 16.0}, {"min_spp": 1.5},
+        {"ambient_spp": 2.0},
     ],
 )  # fmt: skip
 def test_bad_settings_are_refused_in_one_line(bad):

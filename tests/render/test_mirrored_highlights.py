@@ -10,7 +10,7 @@ import pytest
 from render.scene.traced_scene import TracedScene
 from render.specular.image_method import specular_light
 from scenes import Camera, Laser, Material, Scene, Surface
-from scenes.library.things.shapes import sphere
+from scenes.library.things.shapes import box, sphere
 
 METAL = Material("roughconductor", roughness=0.02, eta=2.9, k=3.1)
 
@@ -72,3 +72,23 @@ def test_paths_of_finer_cells_are_those_of_the_pixel():
         (e, m, s), (energy, mean, spread) = moments(fine, pixel), moments(found, pixel)
         assert energy == pytest.approx(e, rel=0.02) and mean == pytest.approx(m, abs=2e-3)
         assert spread == pytest.approx(s, abs=2e-3)
+
+
+def test_light_of_more_bounces_is_left_out_before_returns_merge():
+    """Three mirrors in a room, returns merged within 5 mm: a merged return has the bounces of its first part."""
+    vertices, faces, uv = box((4, 4, 5))
+    walls = Surface(vertices + [0, 0, -0.5], faces[:, ::-1], Material(albedo=0.7), uv=uv)
+    halves, x = np.array([[0, 1, 2], [0, 2, 3]]), 1.9
+    corners = (
+        [(x, -x, 0), (x, x, 0), (x, x, -2.9), (x, -x, -2.9)],
+        [(-x, -x, 0), (-x, x, 0), (-x, x, -2.9), (-x, -x, -2.9)],
+        [(-x, -x, 0), (x, -x, 0), (x, -x, -2.9), (-x, -x, -2.9)],
+    )
+    mirrors = [Surface(np.array(four, float), halves, Material("conductor")) for four in corners]
+    view = Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=80, width=16, height=16)
+    world = TracedScene(Scene("mirrors", (walls, *mirrors), view))
+    merged, every = (specular_light(world, 4, m, 0.0, most).samples for m, most in ((5e-3, 2), (0.0, 63)))
+    few = every.radiance[every.bounces <= 2].sum(dtype=float)
+    assert merged.bounces.max() == 2 and merged.radiance.sum(dtype=float) == pytest.approx(few, rel=1e-5)
+    late = specular_light(world, 4, 5e-3).samples
+    assert late.radiance[late.bounces <= 2].sum(dtype=float) > 1.002 * few

@@ -125,3 +125,12 @@ def test_what_does_not_fit_is_refused(tmp_path):
         with pytest.raises(InputError, match=why):
             write_pack(((view, {}) for view in views), tmp_path / "x.h5")
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_too_dark_for_a_pack_is_dark(tmp_path):
+    """Below 2^-32 there is no code but that of 0."""
+    radiance = np.zeros(VIEWS[0].returns, np.float32)
+    radiance[:4] = 1e-15, 1e-10, 2.0**-32, 2.0**-31
+    write_pack([(replace(VIEWS[0], radiance=radiance), {})], tmp_path / "dark.h5")
+    got = np.sort(read_pack(tmp_path / "dark.h5")[0].radiance)[-4:]
+    assert got.tolist() == [0, 0, 0, 2.0**-31]

@@ -74,3 +74,12 @@ def test_far_apart_in_float32_stays_apart():
     one = packed(np.zeros(5, int), path, np.zeros(5), np.ones(5), np.ones(5, int))
     assert merge(one, 0.01).path_m == pytest.approx(path, rel=1e-6)
     assert len(merge(one, 0.5).path_m) == 2
+
+
+def test_far_paths_in_narrow_cells_stay_apart():
+    """Cells of 0.1 mm are numbered up to 107 km; beyond, where float32 tells 8 mm apart, they are wider."""
+    for near, far in ((15000.0, 15800.0), (2e6, 2e6 + 1)):
+        both = packed(np.zeros(2, int), np.array([near, far]), np.zeros(2), np.ones(2), np.ones(2, int))
+        assert merge(both, 1e-4).path_m.tolist() == [near, far]
+    pixels = packed(np.array([2**31 - 1, 2**31 - 2]), np.full(2, 1e5), np.zeros(2), np.ones(2), np.full(2, 2))
+    assert sorted(merge(pixels, 1e-4).pixel.tolist()) == [2**31 - 2, 2**31 - 1]

@@ -151,6 +151,7 @@ def test_look_at_refuses_a_view_without_direction(origin, target, up):
         ({"baseline_m": (0.1, 0.2)}, "not 3 numbers"),
         ({"baseline_m": (0.1, NAN, 0)}, "not 3 numbers"),
         ({"cone_deg": 0.0}, "outside (0, 360]"),
+        ({"cone_deg": 1e-7}, "laser cone 1e-07 degrees is outside (0, 360], 1e-06 at least"),
         ({"cone_deg": 361.0}, "outside (0, 360]"),
         ({"cone_deg": NAN}, "outside (0, 360]"),
         ({"mode": "scan", "cone_deg": 10.0}, "a cone is for flood only"),
@@ -259,11 +260,12 @@ def test_pixel_solid_angle_falls_with_the_cube_of_the_cosine():
 # --- Laser -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("cone_deg", [None, 20.0, 90.0, 360.0])
+@pytest.mark.parametrize("cone_deg", [None, 1e-6, 20.0, 90.0, 360.0])
 def test_flood_intensity_integrates_to_one_over_its_cone(cone_deg):
     view, laser = camera(), Laser("flood", cone_deg=cone_deg)
     # rings of equal steps in angle: sum of intensity x 2 pi sin(angle) d(angle), exact to the midpoint rule
-    half = math.acos(laser.cos_half_angle(view))
+    half = laser.half_angle(view)
+    assert math.cos(half) == laser.cos_half_angle(view)
     angle = (np.arange(2000) + 0.5) / 2000 * half
     solid_angle = (2 * math.pi * np.sin(angle)).sum() * half / 2000
     intensity = laser.intensity(view)
