@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
     from render.transient import Transient
     from spad.formats.histogram import Histogram
+    from spad.sensor.model import Sensor
 
 BY_SUFFIX = {
     ".exr": ("transient", "depth"),
@@ -90,6 +91,15 @@ def open_transient(path: Path, kind: str, view: int) -> Transient:
     pack = read_pack(path)
     require(0 <= view < len(pack), f"{path}: no view {view}, there are 0 to {len(pack) - 1}")
     return pack[view]
+
+
+def pixel_sensor(name: str | None, path: Path) -> Sensor:
+    """Return the sensor that a transient is put into, by name or file (default: reference); InputError for zones."""
+    from spad.sensor.files import load_sensor
+
+    found = load_sensor(name or "reference")
+    require(found.zones is None, f"{path}: a sensor of zones has no pixels; run `scene2spad sense` first")
+    return found.sensor
 
 
 def open_histogram(path: Path, frame: int = 0) -> Histogram:

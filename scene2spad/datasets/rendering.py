@@ -280,12 +280,17 @@ def check_asked(job: Job, count: int, workers: int) -> None:
     require(1 <= count <= most, f"set {job.set}: count {count} is outside 1 to {most}")
     check_workers(workers)
     sides = [side for side in (job.width, job.height) if side is not None]
-    for side in sides:
-        require(1 <= side <= MAX_IMAGE_SIDE, f"image side {side} is outside 1 to {MAX_IMAGE_SIDE} pixels")
+    check_sides(sides)
     if sides:
         width, height = sides[0], sides[-1]
         message = f"views of {width} x {height} pixels on {workers} process{'es' * (workers > 1)}"
         require_memory(workers * MIN_PIXEL_BYTES * width * height, message)
+
+
+def check_sides(sides: Iterable[int]) -> None:
+    """Raise InputError for a width or a height that no image has."""
+    for side in sides:
+        require(1 <= side <= MAX_IMAGE_SIDE, f"image side {side} is outside 1 to {MAX_IMAGE_SIDE} pixels")
 
 
 def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
@@ -364,12 +369,15 @@ def make_set(
 # --- Packing ---------------------------------------------------------------------------------------------------------
 
 
-def pack_set(folder: Path, path: Path, progress: Progress | None = None) -> int:
-    """Return all finished views of a set's folder as one file (`render.transient.packs`); returns its size in bytes."""
+def pack_set(folder: Path, path: Path, progress: Progress | None = None, *, count: int | None = None) -> int:
+    """Write the finished views of a set's folder as one file (`render.transient.packs`); return how many there are.
+
+    `count`: of the first so many views alone (default: of all).
+    """
     from render.transient import read_transient
     from render.transient.packs import write_pack
 
-    records = read_set_index(folder)
+    records = [one for one in read_set_index(folder) if count is None or one["view"] < count]
     report = progress or (lambda what, fraction: None)
 
     def views() -> Iterator[tuple]:
@@ -379,5 +387,4 @@ def pack_set(folder: Path, path: Path, progress: Progress | None = None) -> int:
             kept = {key: transient.meta[key] for key in ("camera", "laser", "scene_sha256")}
             yield transient, record | kept | {"time_offset_m": transient.meta.get("time_offset_m", 0.0)}
 
-    write_pack(views(), path)
-    return path.stat().st_size
+    return write_pack(views(), path)

@@ -42,6 +42,7 @@ log = logging.getLogger("scene2spad")
 PLANES = "planes"  # the set that needs no renderer
 PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "gpu": 4000, "paper": 13851}
 SMOKE_PIXELS = 32
+DEFAULT_COMPRESSION = 128.0
 
 
 def config_of(command: Train) -> TrainConfig:
@@ -55,10 +56,10 @@ def config_of(command: Train) -> TrainConfig:
     front = uncoded.get(command.design, "codes")
     design = None
     if front == "codes":
-        compression = command.compression if command.codes is None else None
         design = Design.named(
-            command.design, command.block, codes=command.codes, compression=compression, full=command.full
+            command.design, command.block, codes=command.codes, compression=_compression(command), full=command.full
         )
+    _check_numbers(command)
     switches: tuple[str, ...] = command.layer
     layer = dict.fromkeys(switches, True)
     # the first models' and the published start, which their recipes reproduce
@@ -91,6 +92,7 @@ def config_of(command: Train) -> TrainConfig:
         window=command.window,
         weights=command.set_weights or None,
         coherence=command.coherence,
+        init_share=command.init_share,
         sense_on=command.sense_on,
         decoded_weight=command.decoded,
     )
@@ -103,6 +105,24 @@ def config_of(command: Train) -> TrainConfig:
     decay_steps = max(1, round(config.decay_steps * each / config.steps_per_epoch))
     warmup = min(config.warmup, command.steps // 10)
     return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps, warmup=warmup)
+
+
+def _compression(command: Train) -> float | None:
+    """Return the compression asked for, DEFAULT_COMPRESSION of none; None where the number of codes is given."""
+    if command.codes is None:
+        return DEFAULT_COMPRESSION if command.compression is None else command.compression
+    require(command.compression is None, f"train: give --codes {command.codes} or --compression, not both")
+    return None
+
+
+def _check_numbers(command: Train) -> None:
+    """Raise InputError for numbers of devices, threads and set weights that no training can have, and a share of no
+    model."""
+    for name, value in (("devices", command.devices), ("threads", command.threads)):
+        require(value is None or value >= 1, f"train: --{name} {value} is below 1")
+    require(not command.init_share or command.init is not None, "train: --init-share needs --init")
+    weights, sets = len(command.set_weights), len(command.set)
+    require(weights in (0, sets), f"train: {weights} --set-weights for {sets} sets, expected one for each")
 
 
 def _default_network(command: Train) -> Network:
@@ -152,7 +172,8 @@ def run_train(command: Train, progress: Progress) -> dict:
     config.check_memory()
     require(bool(command.set), "train: --set without a set")
     check_workers(command.workers, least=0)
-    from csph.training.loop import Hardware, NetworkOf, train  # and Lightning, which takes seconds to import
+    from csph.training.beginning import NetworkOf
+    from csph.training.loop import Hardware, train  # and Lightning, which takes seconds to import
 
     training, validation, data = views_of(command)
     require(command.init is None or command.init_network is None, "train: give --init or --init-network, not both")

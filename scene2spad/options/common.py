@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional as Positional
+
+from scenes.errors import InputError
 
 
 def may_stay_open(metavar: str) -> object:
@@ -38,3 +41,20 @@ class Long(Common):
 
     dry_run: bool = False
     """Say what would be done, in which memory and about how long, and write nothing."""
+
+
+def only_for(command: Common, where: str, options: Mapping[str, tuple[bool, str]]) -> None:
+    """Refuse options that were given where they mean nothing.
+
+    `where`: file or command that the message names. `options`: by the field's name, whether the option means
+    something here, and what it is for, as in `{"view": (kind == "pack", "a pack")}`. An option was given where its
+    value is not the default. Raises InputError.
+    """
+    defaults = {field.name: field.default for field in fields(command)}
+    for name, (means_something, purpose) in options.items():
+        value = getattr(command, name)
+        if not means_something and value != defaults[name]:
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            words = (f"{one:g}" if isinstance(one, float) else str(one) for one in values)
+            option = " ".join([f"--{name.replace('_', '-')}", *words])
+            raise InputError(f"{where}: {option} is for {purpose}")

@@ -64,6 +64,18 @@ StudyName = Literal[
     "all",
 ]
 STUDIES: tuple[str, ...] = tuple(name for name in get_args(StudyName) if name != "all")
+# Options that some studies read, and which ones; the others are of all studies, or of those of trained models.
+OPTIONS_OF: dict[str, tuple[str, ...]] = {
+    "checkpoints": ("tensors", "render-error", "real-data"),
+    **dict.fromkeys(("design", "block", "codes"), ("tensors",)),
+    "full": ("tensors", "depth-offset", *ABLATIONS),
+    "ship": ("depth-offset", *ABLATIONS),
+    "scene": ("codes", "power"),
+    **dict.fromkeys(("width", "height"), ("codes", "power", "render-error")),
+    **dict.fromkeys(("signal", "background"), ("power",)),
+    **dict.fromkeys(("scene_set", "views", "cache"), ("render-error",)),
+    **dict.fromkeys(("capture", "frame"), ("real-data",)),
+}
 
 
 @dataclass(frozen=True, kw_only=True)

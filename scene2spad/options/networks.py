@@ -21,8 +21,8 @@ class Train(Long):
     themselves, peak for their fullest bins."""
     block: tuple[int, int, int] = (256, 4, 4)
     """Block of the codes: time bins, rows, columns."""
-    compression: float = 128.0
-    """Counts of a block for one code that is kept."""
+    compression: Number = None
+    """Counts of a block for one code that is kept (default: 128)."""
     codes: Count = None
     """Number K of codes, instead of --compression."""
     full: bool = False
@@ -57,6 +57,9 @@ class Train(Long):
     as 256 4 4 does, and --full as a separable one)."""
     init_network: Annotated[str | None, may_stay_open("MODEL")] = None
     """Begin with the network of a trained model of any design, and codes of one's own from their start."""
+    init_share: Number = None
+    """Share of the weights of --init in those that are kept at the end: 0.5 is the mean of both, for a converged model
+    that is trained on from a higher rate (default: 0)."""
     steps: Count = None
     """Steps of the whole run, rounded up to whole epochs (default: the preset's)."""
     batch: Count = None

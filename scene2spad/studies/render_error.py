@@ -28,6 +28,7 @@ import numpy as np
 from csph.evaluation.methods import EvaluationPlan, Method, evaluate
 from csph.networks.model import DepthModel, load_model
 from csph.training.views import Views
+from csph.weights.cards import checkpoint_of
 from render.transient import Transient, read_transient
 from scene2spad.bench.rendering.references import default_folder, key_of
 from scene2spad.datasets.rendering import Job, render_view
@@ -78,7 +79,7 @@ def run(command: Study, progress: Progress) -> dict:
     of = scene_set(command.scene_set)
     most = of.size or 100
     require(1 <= command.views <= most, f"views {command.views} is outside 1 to {most} of set {of.name}")
-    models = {str(path): load_model(path)[0] for path in command.checkpoints}
+    models = {str(path): load_model(checkpoint_of(path))[0] for path in command.checkpoints}
     sensor = _sensor_of(models)
     methods = {BASELINE: baseline(BASELINE), **{path: network_method(model) for path, model in models.items()}}
     tile = common_tile([*models.values()])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
@@ -17,7 +18,31 @@ from scenes.io.mesh_declarations import check_ply
 MAPS = {"expected_signal": "photons", "expected_background": "photons", "albedo": ""}
 COLUMNS = [(name, "<f4") for name in ("x", "y", "z", "intensity", "confidence")]
 COLUMNS += [(name, "u1") for name in ("red", "green", "blue")]
+DENSE = ("data", "tofs", "depth_m")  # arrays that every dense export holds
 HEADER = "property float x property float y property float z property float intensity property float confidence"
+
+
+def is_dense(path: Path) -> bool:
+    """Tell whether a file (.npz, .h5) holds the arrays of a dense export, by their names alone."""
+    try:
+        if path.suffix.lower() == ".npz":
+            with ZipFile(path) as file:
+                return {f"{name}.npy" for name in DENSE} <= {*file.namelist()}
+        with open_checked(path) as file:
+            return {*DENSE} <= {*file}
+    except (InputError, OSError, BadZipFile):
+        return False
+
+
+def is_cloud(path: Path) -> bool:
+    """Tell whether a file (.ply) has the columns of a point cloud that `export` writes."""
+    with path.open("rb") as file:
+        return HEADER in _columns(file.read(1024))
+
+
+def _columns(content: bytes) -> str:
+    """Return the header of a point cloud in one line."""
+    return " ".join(content.partition(b"end_header\n")[0].decode("latin-1").split())
 
 
 def dense_content(path: Path) -> Content:
@@ -52,15 +77,14 @@ def dense_content(path: Path) -> Content:
 
 
 def _dense_arrays(path: Path) -> dict[str, np.ndarray]:
-    wanted = ("data", "tofs", "depth_m")
     if path.suffix.lower() == ".npz":
         arrays = read_arrays(path, "dense array")
-        missing = [name for name in wanted if name not in arrays]
+        missing = [name for name in DENSE if name not in arrays]
         require(not missing, f"{path}: holds no {', '.join(missing)}; expected a dense array that `export` wrote")
         return arrays
     try:
         with open_checked(path) as file:
-            return {name: read_dataset(file, name) for name in (*wanted, *MAPS) if name in wanted or name in file}
+            return {name: read_dataset(file, name) for name in (*DENSE, *MAPS) if name in DENSE or name in file}
     except InputError as error:
         raise InputError(f"{path}: no dense array that `export` wrote: {error}") from None
 
@@ -73,16 +97,13 @@ def _map(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...]) -> L
 def cloud_content(path: Path) -> Content:
     """Show a point cloud (.ply) that `export` wrote. Raises InputError for a file of other columns."""
     content = read_bytes(path, "point cloud")
-    header, _, body = content.partition(b"end_header\n")
-    columns = " ".join(header.decode("latin-1").split())
-    require(
-        HEADER in columns, f"{path}: no point cloud that `export` wrote (x y z intensity confidence); render a mesh"
-    )
+    known = HEADER in _columns(content)
+    require(known, f"{path}: no point cloud that `export` wrote (x y z intensity confidence); render a mesh")
     try:
         check_ply(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    rows = np.frombuffer(body, np.dtype(COLUMNS))
+    rows = np.frombuffer(content.partition(b"end_header\n")[2], np.dtype(COLUMNS))
     points = np.stack([rows[axis] for axis in "xyz"], axis=1)
     distance = np.linalg.norm(points, axis=1)
     facts = {"kind": "point cloud", "points": f"{len(rows):,}"}

@@ -7,9 +7,11 @@ import pytest
 
 from render.transient import write_transient
 from scene2spad.cli import main
+from scene2spad.cli.simulation.calibrating import is_calibrated
 from scene2spad.datasets.zone_captures import read_plane_captures, render_plane, shipped_captures, zone_captures
 from spad.formats.histogram import read_histogram
-from spad.sensor.files import load_sensor, read_sensor, write_sensor
+from spad.sensor.files import load_sensor, read_sensor, sensor_tables, write_sensor
+from spad.sensor.toml import format_toml
 from spad.zones.sensor import draw_zone_counts, zone_returns
 
 
@@ -56,6 +58,28 @@ def test_sense_takes_the_calibrated_sensor(calibrated, capfd, tmp_path, monkeypa
     assert json.loads(capfd.readouterr().out.splitlines()[-1])["mean_signal"] == pytest.approx(500, rel=1e-4)
     assert main([*options, "--radiometric"]) == 2
     assert "--radiometric does not go with a sensor of zones" in capfd.readouterr().err
+
+
+def test_files_that_calibrate_did_not_write_are_kept(calibrated, tmp_path, monkeypatch, capfd):
+    """A folder, another program's file, a sensor of one's own with its comments: refused before any work."""
+
+    def work(*_):
+        raise AssertionError("work was begun")
+
+    monkeypatch.setattr("scene2spad.cli.simulation.calibrating.zone_captures", work)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dd.toml").mkdir()
+    (tmp_path / "pyproject.toml").write_text("[project]\nname = 'mine'\n")
+    mine = "# measured on Tuesday\n" + format_toml(sensor_tables(load_sensor("tmf8820")))
+    (tmp_path / "mine.toml").write_text(mine)
+    for name, words in (("dd", "is a folder"), ("pyproject", "exists and is no"), ("mine", "exists and is no")):
+        assert main(["calibrate", "--out", f"{name}.toml"]) == 2
+        err = capfd.readouterr().err
+        assert f"{name}.toml: {words}" in err and len(err.splitlines()) == 1
+    assert (tmp_path / "mine.toml").read_text() == mine
+    assert is_calibrated(calibrated)  # and so it may be written again
+    with pytest.raises(AssertionError, match="work was begun"):
+        main(["calibrate", "--out", str(calibrated)])
 
 
 @pytest.mark.parametrize(

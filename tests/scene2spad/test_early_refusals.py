@@ -29,6 +29,7 @@ DATASET = ["dataset", "rooms"]
         ([*TRAIN, "--crop", "1000000000"], "patches of 1000000000 x 1000000000 pixels"),
         ([*TRAIN, "--steps", "1000000000000"], "1000000000000 steps are above 100000000"),
         ([*TRAIN, "--threads", "1000000"], "threads 1000000 is outside 0 to 1024"),
+        ([*TRAIN, "--init-share", "0.5"], "--init-share needs --init"),
         ([*TRAIN, "--workers", "1000000"], "workers 1000000 is outside 0 to 256"),
     ],
 )

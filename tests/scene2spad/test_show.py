@@ -269,7 +269,7 @@ def test_code_tables_hold_the_tensor(int8, capfd):
         (["show", "set/views"], "of no set and of no run"),
         (["compare", "gallery.h5", "--methods", "nosuch"], "'nosuch' is none of"),
         (["compare", "gallery.h5", "--methods", "argmax", "argmax"], "named twice"),
-        (["depth", "gallery.h5", "--codes-file", "mine.npy"], "goes with --method compressive"),
+        (["depth", "gallery.h5", "--codes-file", "mine.npy"], "--codes-file mine.npy is for --method compressive"),
         (["export", "gallery.h5", "--out", "a.txt"], "goes to .npz"),
         (["export", "mine.npy", "--out", "a.ply"], "goes to .txt"),
         (["export", "gallery.h5", "--out", "gallery.h5"], "is the file itself"),

@@ -141,11 +141,22 @@ def test_codes_of_several_pixels_get_the_refined_network():
 def test_training_goes_on_from_a_model_by_name(capfd, packed, tmp_path):
     """One step at a learning rate of nearly 0 keeps the shipped weights, of 11 bits each."""
     design = ["--design", "learned", "--block", "256", "4", "4", "--init", "learned-256x4x4-128x-s0"]
-    more = ["--rate", "1e-12", "--steps", "1", "--set", str(packed), "--out", str(tmp_path / "run")]
+    more = [
+        "--init-share",
+        "0.5",
+        "--rate",
+        "1e-12",
+        "--steps",
+        "1",
+        "--set",
+        str(packed),
+        "--out",
+        str(tmp_path / "run"),
+    ]
     run(capfd, "train", *QUICK, *design, *more)
     tuned, config, _ = load_model(tmp_path / "run")
     shipped, _, _ = load_model(checkpoint_of("learned-256x4x4-128x-s0"))
-    assert config.data["init"] == "learned-256x4x4-128x-s0"
+    assert config.data["init"] == "learned-256x4x4-128x-s0" and config.init_share == 0.5
     for name, value in tuned.state_dict().items():
         torch.testing.assert_close(value, shipped.state_dict()[name], rtol=0, atol=1e-9)
 
@@ -204,7 +215,7 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
     write_pack([(t, {"scene": "a"}) for t in lasers], Path("one.h5"))
     assert "a set of one scene (a)" in refused(capfd, *train, "one.h5")
     assert "crops of 8 pixels are not tiled by blocks of 3 x 3" in refused(
-        capfd, *train, str(packed), "--block", "256", "3", "3", "--compression", "1", "--codes", "8"
+        capfd, *train, str(packed), "--block", "256", "3", "3", "--codes", "8"
     )
     assert "does not divide" in refused(capfd, *train, str(packed), "--compression", "100")
     assert "holds a run with other options" in refused(

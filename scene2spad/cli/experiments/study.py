@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from scene2spad.options.experiments import STUDIES, Study
-from scenes.errors import InputError
+from scene2spad.cli.paths import output_folder
+from scene2spad.options.common import only_for
+from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study
 from scenes.progress import Progress
 
 
 def run(command: Study, progress: Progress) -> dict:
     """Run the command: one study or all of them, or say what that would take."""
-    if command.out.is_file():
-        raise InputError(f"{command.out}: is a file, expected a folder for the figures")
+    output_folder(command.out, "the figures")
+    if command.name != "all":
+        purposes = {
+            option: (command.name in names, f"study {', '.join(names)}") for option, names in OPTIONS_OF.items()
+        }
+        only_for(command, f"study {command.name}", purposes)
     if not command.dry_run:
         from scene2spad.plots.style import with_pdf
         from scene2spad.studies import every

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
+from scene2spad.options.common import only_for
 from scene2spad.studies.power.program_tables import all_costs, fixed_spatial, int8_temporal, verified
 from scenes.errors import InputError, require
 from scenes.files import whole_file
@@ -24,16 +26,33 @@ if TYPE_CHECKING:
 
 _MAX_PHOTONS = 20_000
 _MAX_WATCHED = 100
+# What each action writes, as older versions wrote it too.
+_POWER_TABLE = Mark("power table", lambda path: begins(path, rb"name,[^\n]*processing_uw"))
+_LISTING = Mark("listing", lambda path: begins(path, rb"; [^\n]*: \d+ of \d+ words, "))
+_WORDS = Mark("list of words", lambda path: begins(path, rb"([0-9a-f]{8}\n|\n)+\Z"))
+_WRITES = {"table": _POWER_TABLE, "sweep": _POWER_TABLE, "asm": _WORDS, "list": _LISTING, "compile": _LISTING}
 
 
 def run(command: Ultraphase, progress: Progress) -> dict:
     """Run the command: one action; see `Ultraphase`."""
     actions = {"table": _table, "run": _run, "asm": _asm, "list": _list, "verify": _verify, "sweep": _sweep}
     actions["compile"] = _compile
-    require(command.headroom is None or command.action == "compile", "--headroom is for compile")
+    where = f"ultraphase {command.action}"
+    only_for(command, where, _purposes(command.action))
     needs = command.action in ("compile", "run", "asm", "list", "verify")
-    require(bool(command.program) == needs, f"ultraphase {command.action}: {_arity(command.action, needs)}")
+    require(bool(command.program) == needs, f"{where}: {_arity(command.action, needs)}")
+    if command.out is not None:
+        check_target(command.out, Path(command.program) if needs else None)
+        keep_foreign(command.out, _WRITES[command.action])
     return actions[command.action](command, progress)
+
+
+def _purposes(action: str) -> dict[str, tuple[bool, str]]:
+    """Return, by option, whether the action takes it and which ones do, for `only_for`."""
+    takers = {"headroom": ("compile",), "define": ("asm", "list", "run", "verify"), "out": (*_WRITES,)}
+    takers |= {"photons": ("run", "sweep"), "signal": ("run",), "trace": ("run",), "watch": ("run",)}
+    takers |= dict.fromkeys(("fps", "codes", "pixels"), ("sweep",))
+    return {option: (action in actions, ", ".join(actions)) for option, actions in takers.items()}
 
 
 def _arity(action: str, needs: bool) -> str:
@@ -116,7 +135,6 @@ def _compile(command: Ultraphase, progress: Progress) -> dict:
     from scene2spad.studies.chip.chain import measured, trial
     from scene2spad.studies.chip.code import compile_model, headroom_of, listing_with_tables, with_headroom
 
-    require(not command.define, "constants by --define are for source files")
     path = checkpoint_of(command.program)
     model = load_model(path)[0]
     headroom = headroom_of(model) if command.headroom is None else command.headroom

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scene2spad.cli.opening import open_histogram
-from scene2spad.cli.paths import input_file, output_file
+from scene2spad.cli.paths import Mark, begins, check_target, input_file, keep_foreign, picture
 from scene2spad.options.common import Common, File, Positional
 from scenes.errors import require
 from scenes.progress import Progress
 
 FIGURES = ("mae_mm", "rmse_mm", "median_mm", "within_10mm", "pixels", "missing")
+TABLE = Mark("table of `compare`", lambda path: begins(path, rb"method,mae_mm,rmse_mm,"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +31,8 @@ class Compare(Common):
     unmixed: bool = False
     """Leave out pixels that see surfaces more than 50 mm apart."""
     out: File = None
-    """The table to write (.csv); the figure lies beside it (default: the histogram's name with -compare.csv)."""
+    """The table to write (.csv); the figure (.compare.png) lies beside it (default: the histogram's name with
+    -compare.csv)."""
 
 
 def run(command: Compare, progress: Progress) -> dict:
@@ -45,8 +47,10 @@ def run(command: Compare, progress: Progress) -> dict:
     source = input_file(command.file)
     out = command.out or source.with_name(f"{source.stem}-compare.csv")
     require(out.suffix.lower() == ".csv", f"{out}: the table must end in .csv")
-    figure = out.with_suffix(".png")
-    output_file(figure.with_suffix(".exr"), ".exr", "depth")  # the folder is there and may be written to
+    figure = picture(out, "compare")
+    for target in (out, figure):
+        check_target(target, source)
+    keep_foreign(out, TABLE)
     histogram = open_histogram(source, command.frame)
     methods = {name: depth_method(name, histogram.sensor, seed=command.seed) for name in command.methods}
     rows, depths = [], {}

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Literal
 
 import numpy as np
 
-from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient
-from scene2spad.options.common import Common, File, Positional, may_stay_open
+from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient, pixel_sensor
+from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
+from scene2spad.options.common import Common, File, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 
 DENSE = (".npz", ".h5", ".hdf5")
 CODES = (".txt", ".npy")
+# An array of codes (.npy) has no mark of ours: it is as any program writes it.
+MARKS = {
+    **dict.fromkeys(DENSE, Mark("dense array", lambda path: _exports().is_dense(path))),
+    ".ply": Mark("point cloud", lambda path: _exports().is_cloud(path)),
+    ".txt": Mark("table of codes", lambda path: begins(path, rb"# [^\n]*: \d+ codes of blocks of ")),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,11 +50,13 @@ def run(command: Export, progress: Progress) -> dict:
     """Open the file, and write it in the form that the output's ending asks for."""
     path, out, suffix = command.file, command.out, command.out.suffix.lower()
     kind = kind_of(path)
-    require(out.parent.is_dir(), f"{out}: folder {out.parent} does not exist")
-    require(not (out.exists() and path.exists() and out.samefile(path)), f"{out}: is the file itself")
-    codes = kind in ("codes", "network")
-    require(not command.int8 or codes, f"{path}: --int8 is for codes")
-    require(command.sensor is None or kind in ("transient", "pack"), f"{path}: --sensor is for a transient")
+    codes, dense = kind in ("codes", "network"), suffix in DENSE
+    light = dense and kind in ("transient", "pack")
+    purposes = {"int8": (codes, "codes"), "sensor": (light, "a dense array (.npz, .h5) of a transient")}
+    purposes |= {"layout": (dense, "a dense array (.npz, .h5)"), "view": (kind == "pack", "a pack")}
+    only_for(command, str(path), purposes | {"intensity": (kind == "depth", "a depth map")})
+    check_target(out, path)
+    keep_foreign(out, MARKS.get(suffix))
     if codes and suffix in CODES:
         from csph.codes.files import write_codes
 
@@ -61,20 +71,26 @@ def run(command: Export, progress: Progress) -> dict:
         return {"shape": list(arrays["data"].shape), "layout": command.layout, "out": str(out)}
     if suffix == ".ply" and kind in ("transient", "pack", "histogram", "depth"):
         return {"points": _points(command, kind), "out": str(out)}
-    dense = (".npz", ".h5", ".ply")
-    wanted = {"codes": CODES, "network": CODES, "depth": (".ply",), "transient": dense, "pack": dense}
-    wanted["histogram"] = dense
+    all_forms = (".npz", ".h5", ".ply")
+    wanted = {"codes": CODES, "network": CODES, "depth": (".ply",), "transient": all_forms, "pack": all_forms}
+    wanted["histogram"] = all_forms
     require(kind in wanted, f"{path}: a {kind} is not exported")
     raise InputError(f"{out}: a {kind} goes to {', '.join(wanted[kind])}")
 
 
+def _exports() -> ModuleType:
+    """Import what knows our exports; it imports torch, and --help must be quick."""
+    from scene2spad.viewer import exports
+
+    return exports
+
+
 def _dense(command: Export, kind: str) -> dict[str, np.ndarray]:
     from spad.formats.dense import dense_counts, dense_radiance
-    from spad.sensor.files import load_sensor
 
     if kind == "histogram":
         return dense_counts(open_histogram(command.file))
-    sensor = load_sensor(command.sensor or "reference").sensor
+    sensor = pixel_sensor(command.sensor, command.file)
     return dense_radiance(open_transient(command.file, kind, command.view), sensor)
 
 
@@ -104,7 +120,6 @@ def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.nd
             bright = open_histogram(command.intensity).counts.sum(axis=2, dtype=np.int64).astype(np.float32)
             require(bright.shape == found.depth_m.shape, f"{command.intensity}: is of another size than {command.file}")
         return found.depth_m, bright, sure, found.meta.get("camera")
-    require(command.intensity is None, f"{command.file}: --intensity is for a depth map")
     if kind == "histogram":
         histogram = open_histogram(command.file)
         bright = histogram.counts.sum(axis=2, dtype=np.int64).astype(np.float32)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from scene2spad.cli.paths import holds_kind, input_file
-from scene2spad.options.common import Common, Positional, may_stay_open
+from scene2spad.options.common import Common, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
@@ -48,6 +48,7 @@ def run(command: Inspect, progress: Progress) -> dict:
     kind = next((kind for kind in known if holds_kind(path, kind)), None)
     if kind is None:
         raise InputError(f"{path}: expected a transient (.exr), a histogram (.h5) or a pack (.h5) of scene2spad")
+    only_for(command, str(path), {"view": (kind == "pack", "a pack")})
     if kind == "histogram":
         from spad.formats.histogram import read_histogram
 

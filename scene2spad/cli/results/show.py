@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient, transient_of
-from scene2spad.options.common import Common, File, Positional
+from scene2spad.cli.paths import PDF_FIGURE, PNG_FIGURE, Mark, check_target, holds_at_start, keep_foreign
+from scene2spad.options.common import Common, File, Positional, only_for
 from scenes.errors import InputError, require
 from scenes.io.inputs import read_text, read_whole_lines
 from scenes.json_types import JsonObject
@@ -26,6 +27,12 @@ SUFFIXES = (".html", ".png", ".pdf", ".gif", ".mp4")
 MAX_TAPS = 65536  # bins of a pulse
 MAX_SHEET = 24  # views of a set on its sheet
 PAGE_MARK = b'content="scene2spad show"'
+# Animations have no mark of ours: they are the encoders' alone.
+MARKS = {
+    ".html": Mark("page of `show`", lambda path: holds_at_start(path, PAGE_MARK)),
+    ".png": PNG_FIGURE,
+    ".pdf": PDF_FIGURE,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +62,10 @@ def run(command: Show, progress: Progress) -> dict:
     if command.out is None and path.parent != Path() and not path.is_dir():
         out = path.parent / out
     require(out.suffix.lower() in SUFFIXES, f"{out}: the output must end in {', '.join(SUFFIXES)}")
-    _check_target(out, path)
-    require(command.transient is None or kind == "histogram", f"{path}: --transient goes with a histogram")
+    purposes = {"transient": (kind == "histogram", "a histogram"), "view": (kind == "pack", "a pack")}
+    only_for(command, str(path), purposes | {"frame": (kind == "histogram", "captures (.mat)")})
+    check_target(out, path)
+    keep_foreign(out, MARKS.get(out.suffix.lower()))
     if out.suffix.lower() in (".png", ".pdf"):
         drawn = _picture(command, kind, out)
     elif out.suffix.lower() in (".gif", ".mp4"):
@@ -69,16 +78,6 @@ def run(command: Show, progress: Progress) -> dict:
 
         drawn = write_page(_content(command, kind), out)
     return {"kind": kind, "bytes": drawn.stat().st_size, "out": str(drawn)}
-
-
-def _check_target(out: Path, source: Path) -> None:
-    """Refuse a target that cannot be written, and a file of another program."""
-    require(out.parent.is_dir(), f"{out}: folder {out.parent} does not exist")
-    require(not out.is_dir(), f"{out}: is a folder, expected a file name")
-    require(not (out.exists() and source.exists() and out.samefile(source)), f"{out}: is the file itself")
-    if out.is_file() and out.suffix.lower() == ".html":
-        with out.open("rb") as file:
-            require(PAGE_MARK in file.read(4096), f"{out}: exists and is no page of `show`; choose another --out")
 
 
 def _content(command: Show, kind: str) -> Content:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scene2spad.cli.paths import Mark, check_target, keep_foreign
 from scene2spad.datasets.zone_captures import read_plane_captures, shipped_captures, within, zone_captures
 from scenes.errors import InputError, require
 from scenes.progress import Progress
-from spad.sensor.files import load_sensor, write_sensor
+from spad.sensor.files import load_sensor, read_sensor, write_sensor
 from spad.zones.calibration import Calibration, calibrate, calibrated_file, check_effects, poisson_deviance
 from spad.zones.expected_counts import ZoneCapture
 from spad.zones.sensor import expected_zone_counts
@@ -20,12 +22,14 @@ if TYPE_CHECKING:
     from scene2spad.cli.simulation.calibrate import Calibrate
 
 MIN_CAPTURES = 16
+HOW = "calibrated from"  # first words of the sources that a written file names
 
 
 def run(command: Calibrate, progress: Progress) -> dict:
     """Render the plane at each distance, fit every N-th capture, score the others, write the file."""
     require(command.out.suffix == ".toml", f"{command.out}: the output must end in .toml")
-    require(command.out.parent.is_dir(), f"{command.out}: folder {command.out.parent} does not exist")
+    check_target(command.out)
+    keep_foreign(command.out, Mark("calibrated sensor", is_calibrated))
     require(command.every >= 2, f"--every {command.every} leaves no capture to be held out, expected 2 or more")
     require(0 <= command.model_error < 1, f"--model-error {command.model_error:g} is outside 0 to 1")
     check_effects(command.effects)
@@ -45,7 +49,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
     held = [one for at, one in enumerate(captures) if at % command.every]
     fitted = calibrate(used, start.sensor, start.zones, free=command.effects, model_error=command.model_error)
     span = f"{chosen.distance_m[0]:g} to {chosen.distance_m[-1]:g} m"
-    how = f"calibrated from {len(used)} captures of {path.name}, {span}"
+    how = f"{HOW} {len(used)} captures of {path.name}, {span}"
     write_sensor(calibrated_file(start, fitted, command.out.stem, how), command.out)
     trials, recovery, compression = (values.tolist() for values in fitted.zones.saturation)
     return {
@@ -62,6 +66,14 @@ def run(command: Calibrate, progress: Progress) -> dict:
         "standard_errors": {name: float(np.max(error)) for name, error in fitted.errors.items()},
         "out": str(command.out),
     }
+
+
+def is_calibrated(path: Path) -> bool:
+    """Tell whether a file is a sensor file that `calibrate` wrote."""
+    try:
+        return any(source.startswith(HOW) for source in read_sensor(path).sources.values())
+    except InputError:
+        return False
 
 
 def mean_deviance(captures: Sequence[ZoneCapture], fitted: Calibration) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from render.settings import FILTERED_AMBIENT_SPP
-from scene2spad.cli.paths import output_file
+from scene2spad.cli.paths import file_stem, output_file, output_folder
 from scene2spad.options.common import Count, File, Long, Number, Offset, Pixels, Positional, may_stay_open
 from scenes.library.sets import scene_set
 from scenes.progress import Progress
@@ -58,14 +58,15 @@ def run(command: Dataset, progress: Progress) -> dict:
     from scene2spad.datasets.rendering import Job, make_set, pack_set
 
     of = scene_set(command.set)
-    error = command.error or (0.01 if command.bounces == 1 else 0.03)
+    error = (0.01 if command.bounces == 1 else 0.03) if command.error is None else command.error
     job = Job(
         of.name, command.seed, command.width, command.height, command.bounces, command.spp, command.grid, error,
         command.offset, command.offset_mode, command.ambient, command.ambient_spp, filter=command.filter,
     )  # fmt: skip
     if command.pack is not None:
         output_file(command.pack, ".h5", "pack")
-    out = command.out or Path("out") / of.name.replace("/", "-")
+    out = command.out or Path("out") / file_stem(of.name)
+    output_folder(out, "the set")
     count = command.count if command.count is not None else of.size or 100
     if command.dry_run:
         from scene2spad.dry_runs.sets import dry_run
@@ -73,5 +74,6 @@ def run(command: Dataset, progress: Progress) -> dict:
         return dry_run(job, count, out, command.workers)
     result = make_set(job, count, out, workers=command.workers, scheduler=command.scheduler, progress=progress)
     if command.pack is not None:
-        result |= {"pack_bytes": pack_set(out, command.pack, progress), "pack": str(command.pack)}
+        views = pack_set(out, command.pack, progress, count=count)
+        result |= {"pack_views": views, "pack_bytes": command.pack.stat().st_size, "pack": str(command.pack)}
     return result

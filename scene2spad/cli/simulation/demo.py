@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from scene2spad.cli.paths import output_file
+from scene2spad.cli.paths import file_stem, output_file, output_folder
 from scene2spad.cli.simulation.render import in_view
 from scene2spad.options.common import Common
 from scenes.errors import InputError
@@ -54,13 +54,11 @@ def run(command: Demo, progress: Progress) -> dict:
     from spad.sensor.model import PhotonBudget, sensor_by_name
 
     budget = PhotonBudget(command.signal, command.background)
-    folder = command.out
-    if not (folder.is_dir() or not folder.exists()):
-        raise InputError(f"{folder}: is a file, expected a folder for the demo's results")
+    folder = output_folder(command.out, "the demo's results")
     scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
     folder.mkdir(parents=True, exist_ok=True)
-    output_file(folder / f"{scene.name}.exr", ".exr", "transient")
-    output_file(folder / f"{scene.name}.h5", ".h5", "histogram")
+    light = output_file(folder / f"{file_stem(scene.name)}.exr", ".exr", "transient")
+    counts = output_file(light.with_suffix(".h5"), ".h5", "histogram")
     start = time.perf_counter()
     transient = in_view(render(scene, seed=command.seed, progress=progress))
     rendered = time.perf_counter()
@@ -73,8 +71,8 @@ def run(command: Demo, progress: Progress) -> dict:
         depths[label] = depth_method(method, sensor, seed=command.seed)(histogram)
     errors = {n: depth_errors(d, histogram.depth_m, range_m=sensor.range_m) for n, d in depths.items()}
     estimated = time.perf_counter()
-    write_transient(transient, folder / f"{scene.name}.exr")
-    write_histogram(histogram, folder / f"{scene.name}.h5")
+    write_transient(transient, light)
+    write_histogram(histogram, counts)
     costs = {model: chip_cost(model) for model in ON_THE_CHIP}
     figure = figures.draw_demo(transient, histogram, depths, errors, folder / "demo.png", costs)
     return {

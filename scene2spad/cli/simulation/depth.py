@@ -6,14 +6,14 @@ import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import numpy as np
 
-from scene2spad.cli.opening import open_histogram, open_transient
+from scene2spad.cli.opening import open_histogram, open_transient, pixel_sensor
 from scene2spad.cli.paths import holds_kind, input_file, output_file, picture
 from scene2spad.methods import depth_method
-from scene2spad.options.common import Common, File, Number, Positional, may_stay_open
+from scene2spad.options.common import Common, Count, File, Number, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.formats.depth_map import write_depth
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("scene2spad")
 SENSING = ("sensor", "signal", "background")  # options of a transient alone
+Code = Literal["fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published"]
 MEANS = ("mae_mm", "rmse_mm", "within_10mm")  # over the views of a folder
 
 
@@ -55,11 +56,11 @@ class Depth(Common):
     int8_rule: Annotated[Literal["calibrated", "published"] | None, may_stay_open("{calibrated,published}")] = None
     """Rounding of weights with --int8: 255 steps over each factor's own range (default), or over -1 to 1 as
     published."""
-    code: Literal["fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published"] = "fourier"
+    code: Annotated[Code | None, may_stay_open(f"{{{','.join(get_args(Code))}}}")] = None
     """Temporal code of `--method compressive`: truncated Fourier, Gray Fourier, coarse histogram, Walsh-Hadamard; or
-    the first two in their published rows."""
-    codes: int = 16
-    """Number K of codes kept per pixel by `--method compressive`."""
+    the first two in their published rows (default: fourier)."""
+    codes: Count = None
+    """Number K of codes kept per pixel by `--method compressive` (default: 16)."""
     codes_file: File = None
     """Codes of your own for `--method compressive`, (K, T) in a .npy file, instead of --code and --codes."""
     frame: int = 0
@@ -76,6 +77,7 @@ class Depth(Common):
 
 def run(command: Depth, progress: Progress) -> dict:
     """Run the command: one file or a folder of transients -> depth maps, error figures and pictures."""
+    _check_codes(command)
     label = depth_label(command)
     if command.file.is_dir():
         return _run_folder(command, label, progress)
@@ -101,19 +103,16 @@ def _sensed(command: Depth, source: Path, seed: int) -> tuple[Histogram, str]:
     """Return the histogram of a transient, and the words that say what it was sensed with."""
     from scene2spad.cli.simulation.sensing import DEFAULT_PHOTONS
     from spad.detection.detect import sense
-    from spad.sensor.files import load_sensor
     from spad.sensor.model import PhotonBudget
 
-    require(not command.frame, f"{source}: --frame is for captures (.mat)")
-    found = load_sensor(command.sensor or "reference")
-    require(found.zones is None, f"{source}: a sensor of zones has no pixels; run `scene2spad sense` first")
+    only_for(command, str(source), {"frame": (False, "captures (.mat)")})
+    sensor = pixel_sensor(command.sensor, source)
     signal, background = (DEFAULT_PHOTONS if value is None else value for value in (command.signal, command.background))
     transient = open_transient(source, "transient", 0)
-    histogram = sense(transient, found.sensor, PhotonBudget(signal, background), seed=seed)
+    histogram = sense(transient, sensor, PhotonBudget(signal, background), seed=seed)
     default = ", the defaults" if command.signal is None and command.background is None else ""
     return histogram, (
-        f"by {found.sensor.name} with {signal:g} signal and {background:g} background photons a pixel{default}, "
-        f"seed {seed}"
+        f"by {sensor.name} with {signal:g} signal and {background:g} background photons a pixel{default}, seed {seed}"
     )
 
 
@@ -194,7 +193,7 @@ def depth_label(command: Depth) -> str:
     if command.method == "compressive" and command.codes_file is not None:
         return command.codes_file.stem
     if command.method == "compressive":
-        return f"{command.code}-{command.codes}"
+        return _code_name(command)
     if command.method == "network" and command.model is not None:
         return f"network-{command.model}"
     if command.method != "network" or command.checkpoint is None:
@@ -208,6 +207,19 @@ def depth_label(command: Depth) -> str:
     return f"network-{run}{checkpoint.stem}"
 
 
+def _code_name(command: Depth) -> str:
+    """Return the code of `--method compressive` by its name, as in fourier-16."""
+    return f"{command.code or 'fourier'}-{16 if command.codes is None else command.codes}"
+
+
+def _check_codes(command: Depth) -> None:
+    """Raise InputError for options of codes that the method, or a file of codes, leaves without a meaning."""
+    compressive, own = command.method == "compressive", command.codes_file is not None
+    purpose = "--method compressive"
+    only_for(command, "depth", dict.fromkeys(("code", "codes", "codes_file"), (compressive, purpose)))
+    only_for(command, "depth", dict.fromkeys(("code", "codes"), (not own, f"{purpose} without --codes-file")))
+
+
 def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:
     """Estimate depth [m] by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code."""
     return depth_method(f"{code}-{codes}" if method == "compressive" else method, histogram.sensor, seed=seed)(
@@ -217,11 +229,9 @@ def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "f
 
 def _chosen_method(command: Depth, sensor: Sensor) -> Callable[[Histogram], np.ndarray]:
     """Return the method without a network that the options name."""
-    compressive = command.method == "compressive"
     if command.codes_file is not None:
-        require(compressive, "depth: --codes-file goes with --method compressive")
         return depth_method(str(input_file(command.codes_file)), sensor)
-    name = f"{command.code}-{command.codes}" if compressive else command.method
+    name = _code_name(command) if command.method == "compressive" else command.method
     return depth_method(name, sensor, seed=command.seed)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from render.settings import RenderSettings
-from scene2spad.cli.paths import output_file, picture
+from scene2spad.cli.paths import file_stem, output_file, picture
 from scene2spad.options.common import (
     Count,
     File,
@@ -124,7 +124,7 @@ def run(command: Render, progress: Progress) -> dict:
     if command.out is not None:
         output_file(command.out, ".exr", "transient")
     scene = _load(command)
-    out = command.out or output_file(Path(f"{scene.name.replace('/', '-')}.exr"), ".exr", "transient")
+    out = command.out or output_file(Path(f"{file_stem(scene.name)}.exr"), ".exr", "transient")
     scene = _lit(scene, command)
     start = time.perf_counter()
     if command.offset and command.offset_mode != "time":
@@ -175,7 +175,8 @@ def _settings(command: Render) -> RenderSettings:
 
 
 def _load(command: Render) -> Scene:
-    if command.depth or command.focal or command.depth_scale:
+    given = (command.depth, command.focal, command.depth_scale)
+    if command.cosine or any(value is not None for value in given):
         return _rgbd(command)
     return load_scene(
         command.scene, seed=command.seed, width=command.width, height=command.height, placing=_placing(command)
@@ -215,11 +216,11 @@ def _rgbd(command: Render) -> Scene:
     from scenes.io.relief import RgbdFiles, rgbd
 
     require(_placing(command) == Placing(), f"{command.scene}: an RGB-D pair has its own size and camera")
-
     if command.depth is None or command.focal is None:
         raise InputError(f"{command.scene}: an RGB-D pair needs --depth FILE and --focal PIXELS (and --depth-scale)")
     files = RgbdFiles(Path(command.scene), command.depth, command.focal, command.depth_scale, command.cosine)
-    return rgbd(files, width=command.width or (None if command.height else WIDTH), height=command.height)
+    width = WIDTH if command.width is None and command.height is None else command.width
+    return rgbd(files, width=width, height=command.height)
 
 
 def in_view(transient: Transient) -> Transient:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from scene2spad.cli.paths import PNG_FIGURE, check_target, keep_foreign
 from scene2spad.options.common import Common, File, Pixels, Positional
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.library.catalog import SCENES, load_scene
 from scenes.library.sets import SETS, scene_set
 from scenes.progress import Progress
@@ -55,16 +56,19 @@ def run(command: Scenes, progress: Progress) -> dict:
 def _sheet(command: Scenes, path: Path, progress: Progress) -> dict:
     """Draw a contact sheet of a set."""
     from scene2spad.datasets.contact_sheets import draw_sheet
+    from scene2spad.datasets.rendering import check_sides
 
-    if path.suffix.lower() != ".png" or not path.parent.is_dir():
-        raise InputError(f"{path}: expected a .png in a folder that exists")
+    require(path.suffix.lower() == ".png", f"{path}: expected a .png in a folder that exists")
+    check_target(path)
+    keep_foreign(path, PNG_FIGURE)
     of = scene_set(command.scene or "rooms")
     if command.count < 1:
         raise InputError(f"count {command.count} is less than 1")
+    check_sides(() if command.width is None else (command.width,))
     count = command.count if of.size is None else min(of.size, command.count)
     width, height = command.width, None
     if of.size is None:
-        width = command.width or 128
+        width = 128 if command.width is None else command.width
         height = round(0.75 * width)
     scenes = [of.view(i, seed=command.seed, width=width, height=height) for i in range(count)]
     draw_sheet(scenes, path, progress=progress)

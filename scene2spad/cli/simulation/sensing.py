@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from dataclasses import replace
 from functools import partial
@@ -12,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from render.transient import Transient, read_transient
-from scene2spad.cli.paths import input_file, output_file, picture
+from scene2spad.cli.paths import Mark, begins, check_target, input_file, keep_foreign, output_file, picture
+from scene2spad.options.common import only_for
 from scenes.errors import InputError, require
 from scenes.files import read_array
 from scenes.progress import Progress
@@ -33,6 +35,15 @@ log = logging.getLogger("scene2spad")
 
 DEFAULT_PHOTONS = 50.0
 HOT_RATE_HZ = 1e4
+OPTICS = {  # options, and the fields that they set
+    "pulse_energy": "pulse_energy_j",
+    "focal_length": "focal_length_m",
+    "f_number": "f_number",
+    "pixel_pitch": "pixel_pitch_m",
+    "transmission": "transmission",
+    "filter_width": "filter_nm",
+    "wavelength": "wavelength_m",
+}
 DEFAULT_OPTICS = Optics(10e-9, 10e-3, 2.0, 20e-6, 0.8, 10.0, 850e-9)
 
 
@@ -62,6 +73,8 @@ def changed_sensor(sensor: Sensor, command: Sense) -> Sensor:
         changes["period_s"] = None
     if command.hot_pixels and command.hot_rate is None and not sensor.hot_rate_hz:
         changes["hot_rate_hz"] = HOT_RATE_HZ
+    hot = sensor.hot_share if command.hot_pixels is None else command.hot_pixels
+    only_for(command, "sense", {"hot_rate": (hot != 0, "hot pixels (--hot-pixels)")})
     if command.jitter is not None:
         changes["jitter"] = Pulse(command.jitter, command.jitter_tail)
     require(command.jitter is not None or not command.jitter_tail, "--jitter-tail needs --jitter")
@@ -83,19 +96,12 @@ def _asked_pulse(command: Sense) -> AnyPulse | None:
 
 def optics_of(command: Sense) -> Optics | None:
     """Return the optics of a radiometric budget, None without one: the sensor file's with what the options change."""
+    only_for(command, "sense", dict.fromkeys(OPTICS, (command.radiometric, "a --radiometric budget")))
     if not command.radiometric:
         return None
     given = command.signal is not None or command.background is not None
     require(not given, "--radiometric computes the photon budget: leave out --signal and --background")
-    asked = {
-        "pulse_energy_j": command.pulse_energy,
-        "focal_length_m": command.focal_length,
-        "f_number": command.f_number,
-        "pixel_pitch_m": command.pixel_pitch,
-        "transmission": command.transmission,
-        "filter_nm": command.filter_width,
-        "wavelength_m": command.wavelength,
-    }
+    asked = {field: getattr(command, option) for option, field in OPTICS.items()}
     optics = load_sensor(command.sensor).optics or DEFAULT_OPTICS
     return replace(optics, **{name: value for name, value in asked.items() if value is not None})
 
@@ -115,6 +121,9 @@ def run(command: Sense, progress: Progress) -> dict:
     budget = budget_of(command)
     source, out = _files(command)
     transient = read_transient(source)
+    mat = out.with_suffix(".mat")
+    if command.export == "mat":
+        _check_mat(mat, transient)
     dark_map = None if command.dark_map is None else read_dark_map(command.dark_map, transient)
     if optics is not None:
         budget = optics.budget(transient, sensor, seed=command.seed, dark_map_hz=dark_map)
@@ -130,7 +139,6 @@ def run(command: Sense, progress: Progress) -> dict:
     if command.export == "mat":
         from spad.formats.mat import write_mat
 
-        mat = out.with_suffix(".mat")
         result.update({"pulse_file": str(write_mat(histogram, mat)), "export": str(mat)})
     if command.figure:
         from scene2spad.plots import figures
@@ -149,6 +157,34 @@ def _files(command: Sense) -> tuple[Path, Path]:
     return source, output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
 
 
+def _check_mat(path: Path, transient: Transient) -> None:
+    """Raise InputError where the .mat file, or its pulse's, is another program's or cannot be written."""
+    from spad.formats.mat import PULSE_NAME
+
+    check_target(path)
+    keep_foreign(path, Mark(".mat file", is_our_mat))
+    for pulse in path.parent.glob(f"{PULSE_NAME}{transient.height}_*-{transient.width}.mat"):
+        keep_foreign(pulse, Mark("pulse", is_our_mat))
+
+
+def is_our_mat(path: Path) -> bool:
+    """Tell whether `sense` wrote a .mat file, or its pulse: by the header, or as older versions left it to scipy.
+
+    The published files come from MATLAB, whose header names another platform.
+    """
+    from spad.formats.matfile import HEADER_TEXT, load_mat
+
+    if begins(path, re.escape(HEADER_TEXT)):
+        return True
+    if not begins(path, rb"MATLAB 5.0 MAT-file Platform: posix"):
+        return False
+    try:
+        held = load_mat(path, ["dist", "bin_hr", "psf", "pulse_len"]).keys()
+    except InputError:
+        return False
+    return {"dist", "bin_hr"} <= held or {"psf", "pulse_len"} <= held
+
+
 def _run_zones(command: Sense, zones: ZoneArray) -> dict:
     """Transient -> histogram of a multi-zone sensor, whose gains are its own unless a budget is asked for."""
     from spad.zones.histogram import sense_zones, with_budget
@@ -158,6 +194,7 @@ def _run_zones(command: Sense, zones: ZoneArray) -> dict:
         given = getattr(command, option) not in (None, False)
         require(not given, f"--{option.replace('_', '-')} does not go with a sensor of zones")
     require(command.model == "auto", f"--model {command.model} does not go with a sensor of zones")
+    optics_of(command)
     sensor = sensor_of(command)
     source, out = _files(command)
     transient = read_transient(source)

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from csph.networks.model import DepthModel, load_model
+from csph.weights.cards import checkpoint_of
 from render.engine import render
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
@@ -95,7 +96,7 @@ Method = Callable[[torch.Tensor, Sensor], torch.Tensor]
 def run(command: Study, progress: Progress) -> dict:
     """Run the study: depth images and point clouds of every capture by every method; figures and a table in
     `command.out`."""
-    networks = [(path, load_model(path)[0]) for path in command.checkpoints]
+    networks = [(path, load_model(checkpoint_of(path))[0]) for path in command.checkpoints]
     for path, model in networks:
         bins = model.config.sensor.bins
         require(bins == BINS, f"{path}: a network for {bins} bins, captures are resampled to {BINS}")
