@@ -314,7 +314,7 @@ _BEYOND = Section(
             ),
             (
                 Table("sim-to-real.csv", "Errors of the prediction by distance"),
-                Table("sim-to-real-ablation.csv", "What each effect buys: it is off, the rest calibrated again"),
+                Table("sim-to-real-ablation.csv", "What each effect gains: it is off, the rest calibrated again"),
             ),
             ("sim-to-real-pose.csv", "sim-to-real-pile-up.csv"),
         ),
