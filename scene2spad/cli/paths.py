@@ -56,7 +56,7 @@ def check_target(path: Path, source: Path | None = None) -> None:
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected a file name")
     if source is not None and path.exists() and source.exists() and path.samefile(source):
-        raise InputError(f"{path}: is the file itself")
+        raise InputError(f"{path}: is the input itself; choose another --out")
 
 
 def keep_foreign(path: Path, mark: Mark | None) -> None:

@@ -100,7 +100,7 @@ def test_pictures_and_arrays_of_other_programs_are_kept(folder, capfd):
 
 
 def test_no_program_is_written_over_its_source(folder, capfd):
-    assert "is the file itself" in kept(
+    assert "is the input itself" in kept(
         capfd, ["ultraphase", "list", "own.s", "--out", "own.s"], "own.s", Path("own.s").read_bytes()
     )
 

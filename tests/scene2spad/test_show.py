@@ -272,7 +272,7 @@ def test_code_tables_hold_the_tensor(int8, capfd):
         (["depth", "gallery.h5", "--codes-file", "mine.npy"], "--codes-file mine.npy is for --method compressive"),
         (["export", "gallery.h5", "--out", "a.txt"], "goes to .npz"),
         (["export", "mine.npy", "--out", "a.ply"], "goes to .txt"),
-        (["export", "gallery.h5", "--out", "gallery.h5"], "is the file itself"),
+        (["export", "gallery.h5", "--out", "gallery.h5"], "is the input itself"),
     ],
 )
 def test_mistakes_are_one_line(argv, message, capfd):
