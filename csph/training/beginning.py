@@ -1,4 +1,4 @@
-"""What a training begins with: a trained model, or the network of one."""
+"""Check what a training begins with: a trained model, or the network of one."""
 
 from __future__ import annotations
 

@@ -177,7 +177,7 @@ def test_a_pack_holds_the_views_asked_for(tmp_path, capfd):
 
 
 def test_the_demo_takes_scenes_of_a_set(tmp_path, capfd):
-    """Its name has a slash, its files have none."""
+    """Write the files of a scene with a slash in its name without one."""
     argv = ["demo", "--scene", "tabletop/kitchen", "--width", "16", "--height", "12", "--out", str(tmp_path)]
     assert main(argv) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"tabletop-kitchen.exr", "tabletop-kitchen.h5", "demo.png"}

@@ -28,7 +28,7 @@ def recovered(histogram: Histogram, law: str | None = None) -> float:
 
 @pytest.mark.parametrize("dead_s", [150e-9, 250e-9])
 def test_a_synchronous_detector_that_misses_cycles_is_not_corrected_as_one_that_does_not(dead_s: float) -> None:
-    """Its dead time outlasts the period: `sense` takes it for free-running, and so does the inverse."""
+    """Undo the free-running law, which `sense` takes where the dead time outlasts the period."""
     sensor = replace(SENSOR, dead_time_s=dead_s)
     histogram = sense(WALL, sensor, BUDGET, seed=1)
     assert histogram.meta["model"] == "free-running" and not sensor.armed_every_cycle

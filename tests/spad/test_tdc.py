@@ -290,7 +290,7 @@ def test_tables_that_are_none_are_told_in_one_line(tmp_path) -> None:
     "tdc", [Tdc(2.5e-9, codes=1, correction="line"), Tdc(2.5e-9, codes=3, missing=0.6, dnl=2**0.5)]
 )
 def test_a_converter_with_one_code_gives_the_clock_period(tdc: Tdc) -> None:
-    """Of one code that comes a line has no slope: its edges are the clock's."""
+    """Keep the clock's edges where one code alone comes: a line through it has no slope."""
     edges = Sensor(bins=8, bin_width_s=2.5e-9, tdc=replace(tdc, correction="line")).code_edges
     assert np.allclose(edges, np.arange(9))
 
