@@ -242,8 +242,10 @@ def _outcome(future: DaskFuture[list[Result]]) -> tuple[list[Result] | None, Bas
         return None, future.exception()
     try:
         return future.result(), None
-    except KilledWorker as error:  # its result died with a worker before it was fetched, and so did those who redid it
-        return None, error
+    except Exception as error:
+        if isinstance(error, KilledWorker) or future.status == "error":
+            return None, error  # the result died with a worker before it was fetched, and so did those who redid it
+        raise
 
 
 @contextmanager
@@ -252,8 +254,9 @@ def _explain_lost_scheduler(client: Client) -> Iterator[None]:
     try:
         yield
     except (Exception, asyncio.CancelledError) as error:
-        cancelled = isinstance(error, (CancelledError, asyncio.CancelledError))
-        if client.status == "running" and not cancelled:
+        # a fetch may meet the closed connection before the client's own has noticed: then `status` is still "running"
+        told = isinstance(error, (CancelledError, asyncio.CancelledError, OSError))
+        if client.status == "running" and not told:
             raise
         message = f"scheduler {client.scheduler.address}: has gone away; what is finished stays"
         raise InputError(f"{message}, and the same command goes on from it") from None

@@ -380,6 +380,25 @@ def test_a_result_that_dies_with_its_worker_before_it_is_fetched_is_made_again(m
     assert len(lost) == 2 and all(why.startswith("its workers died: Attempted to run") for why in lost)
 
 
+def test_a_connection_that_closes_under_a_fetch_is_the_scheduler_gone_away(monkeypatch):
+    """A fetch may notice first, while the client's status is still `running`: one line that names the scheduler."""
+    distributed = pytest.importorskip("distributed")
+    from distributed.comm import CommClosedError
+
+    def closed(future, *arguments, **options):
+        raise CommClosedError("in <TCP (closed) ConnectionPool.gather>: Stream is closed")
+
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        monkeypatch.setattr(distributed.Future, "result", closed)
+        with (
+            pytest.raises(InputError, match=r"^scheduler tcp://\S+: has gone away; what is finished stays"),
+            executor(1, cluster.scheduler_address) as run,
+        ):
+            list(run(list, [(0,)], lambda number, why: -number))
+
+
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path):
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="cannot be reached"):
