@@ -164,7 +164,10 @@ def md1_lost_fraction(rho: float) -> float:
 
 
 def poisson_arrivals(rate: float, frame_clocks: int, seed: int) -> np.ndarray:
-    """Return rising clocks of a Poisson process of `rate` photons a clock."""
+    """Return rising clocks of a Poisson process of `rate` photons a clock. Raises InputError for a rate below 0, NaN or
+    without end, and a frame below 0."""
+    require(0 <= rate < np.inf, f"arrivals: a rate of {rate:g} photons a clock, expected a finite number of 0 or more")
+    require(frame_clocks >= 0, f"arrivals: a frame of {frame_clocks} clocks, expected 0 or more")
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(10,)))
     return np.sort(random.random(random.poisson(rate * frame_clocks))) * frame_clocks
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import logging
+from dataclasses import asdict, replace
 from typing import NamedTuple
 
 from csph.codes.nested import holds
+from csph.layer import LayerOptions
 from csph.networks.model import DepthModel
-from csph.training.config import TrainConfig, grows
+from csph.training.config import ModelConfig, TrainConfig, grows
 from scenes.errors import require
+
+log = logging.getLogger("csph")
 
 
 class NetworkOf(NamedTuple):
@@ -19,7 +23,7 @@ class NetworkOf(NamedTuple):
 
 def check_init(init: DepthModel | NetworkOf | None, config: TrainConfig) -> None:
     """Raise InputError unless a trained model fits the one to be trained, but for converters of its sensor; and for a
-    share of the weights of none."""
+    share of the weights of none. Warn where only switches of the layer differ: the network then meets other inputs."""
     network_alone = isinstance(init, NetworkOf)
     shared = config.init_share > 0 and (init is None or network_alone)
     require(not shared, f"training: init_share {config.init_share:g} needs a model to begin with")
@@ -32,9 +36,29 @@ def check_init(init: DepthModel | NetworkOf | None, config: TrainConfig) -> None
     within = differ == ["design"] and mine.design is not None and other.design is not None
     held = within and mine.layer == other.layer and holds(mine.codes_design, other.codes_design)
     alike = (not differ or held) and grows(other.network, mine.network)
-    switches = [", ".join(sorted(name for name, on in one.layer.items() if on)) or "none" for one in (mine, other)]
+    switches = [_switches(one) for one in (mine, other)]
     named = "" if switches[0] == switches[1] else f": --layer {switches[1]} and {switches[0]}"
     message = f"{other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}{named}"
     require(alike, f"init: a model of {message}")
     less = not network_alone and other.layer.get("int8", False) and not mine.layer.get("int8", False)
     require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
+    theirs = _options(other)
+    changed = {name for name, on in _options(mine).items() if on != theirs.get(name, False)}
+    # int8 alone is what --init is for: the same codes, rounded
+    if not network_alone and mine.design is not None and changed - {"int8"}:
+        message = "init: a model of %s with --layer %s begins one with --layer %s; its network meets other inputs"
+        log.warning(message, other.name, switches[1], switches[0])
+
+
+def _options(model: ModelConfig) -> dict[str, bool]:
+    """Return all switches of the layer, those at their defaults among them."""
+    return {**asdict(LayerOptions()), **model.layer}
+
+
+def _switches(model: ModelConfig) -> str:
+    """Name the switches that differ from the published layer, as `--layer` takes them; zero_mean has no option."""
+    published = asdict(LayerOptions())
+    changed = [
+        name if on else f"no {name}" for name, on in sorted(_options(model).items()) if on != published.get(name)
+    ]
+    return ", ".join(changed) or "none"

@@ -10,6 +10,8 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from csph.codes.tensor import CodingTensor
+from csph.networks.model import load_model
 from csph.training.config import TrainConfig
 from csph.training.levels import BACKGROUND, CONTINUOUS, SIGNAL
 from csph.weights.shipped import CARD, WEIGHTS, shipped_file, shipped_names
@@ -127,3 +129,12 @@ def checkpoint_of(name_or_path: Path | str, folder: Path = WEIGHTS) -> Path:
         return shipped_model(str(name_or_path), folder)
     except InputError as error:
         raise InputError(f"{path}: file not found, and {error}") from None
+
+
+def model_coding(name_or_path: Path | str, folder: Path = WEIGHTS) -> CodingTensor:
+    """Return the coding tensor of a trained model: a shipped name, a checkpoint or a run's folder. InputError where it
+    has none."""
+    model = load_model(checkpoint_of(name_or_path, folder))[0]
+    if model.layer is None:
+        raise InputError(f"{name_or_path}: a network without codes, it takes the counts themselves")
+    return model.layer.coding()

@@ -127,13 +127,9 @@ def open_coding(path: Path, kind: str) -> CodingTensor:
         from csph.codes.files import read_codes
 
         return read_codes(path)
-    from csph.networks.model import load_model
-    from csph.weights.cards import checkpoint_of
+    from csph.weights.cards import model_coding
 
-    model = load_model(checkpoint_of(path))[0]
-    if model.layer is None:
-        raise InputError(f"{path}: a network without codes, it takes the counts themselves")
-    return model.layer.coding()
+    return model_coding(path)
 
 
 def transient_of(histogram: Histogram, path: Path, given: Path | None) -> Transient | None:

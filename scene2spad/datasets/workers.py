@@ -255,8 +255,8 @@ def _explain_lost_scheduler(client: Client) -> Iterator[None]:
         yield
     except (Exception, asyncio.CancelledError) as error:
         # a fetch may meet the closed connection before the client's own has noticed: then `status` is still "running"
-        told = isinstance(error, (CancelledError, asyncio.CancelledError, OSError))
-        if client.status == "running" and not told:
+        lost = isinstance(error, (CancelledError, asyncio.CancelledError, OSError))
+        if client.status == "running" and not lost:
             raise
         message = f"scheduler {client.scheduler.address}: has gone away; what is finished stays"
         raise InputError(f"{message}, and the same command goes on from it") from None

@@ -92,8 +92,8 @@ class Study(Long):
     name: Positional[StudyName]
     """Study to run, or all of them."""
     checkpoints: tuple[Path, ...] = ()
-    """Trained layers that `study tensors` draws: checkpoints, or .npy arrays (K, Mt) or (K, Mt, Mr, Mc); trained
-    networks of `study render-error` and `study real-data`."""
+    """Trained layers that `study tensors` draws: names of models (see `models`), checkpoints, or .npy arrays (K, Mt) or
+    (K, Mt, Mr, Mc); trained networks of `study render-error` and `study real-data`, by name or checkpoint."""
     design: str = ""
     """A design that `study tensors` draws instead of the paper's: learned, fourier, gray, coarse, hadamard or random,
     with +learned for a fixed temporal code and a learned spatial part."""

@@ -230,7 +230,7 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
 
 
 def draw_depth_map(depth_m: np.ndarray, confidence: np.ndarray | None, title: str, path: Path) -> Path:
-    """Draw a depth map on its own, and the confidence where a network stated one."""
+    """Draw a depth map on its own, and the confidence where its file states one."""
     columns = 1 if confidence is None else 2
     figure, axes = plt.subplots(1, columns, figsize=(6 * columns, 4.8), layout="constrained", squeeze=False)
     draw_image(axes[0, 0], depth_m, title, "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from csph import CodingTensor, Design, make_coding
 from csph.codes.files import read_codes
+from csph.weights.cards import checkpoint_of, model_coding
+from csph.weights.shipped import checkpoint_name
 from csph.weights.torch_files import load_torch_file
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import save
@@ -61,9 +64,15 @@ def _start(design: Design, seed: int) -> CodingTensor:
 
 
 def coding_of(path: Path) -> CodingTensor:
-    """Return the coding tensor in a file: a checkpoint whose state holds `temporal` and maybe `spatial` (of one layer,
-    under any prefix), or a .npy array (K, Mt) or (K, Mt, Mr, Mc). Raises InputError in one line.
+    """Return the coding tensor of a model or a file. Raises InputError in one line.
+
+    A model is a name (`models`), a run's folder or its checkpoint (.safetensors), and lends its name; a file of another
+    program is a checkpoint whose state holds `temporal` and maybe `spatial` (of one layer, under any prefix), or a .npy
+    array (K, Mt) or (K, Mt, Mr, Mc).
     """
+    path = checkpoint_of(path)
+    if path.is_dir() or path.suffix == ".safetensors":
+        return replace(model_coding(path), name=checkpoint_name(path))
     regular_file(path)
     if path.suffix == ".npy":
         return read_codes(path)

@@ -76,7 +76,7 @@ def histogram_content(histogram: Histogram, title: str, transient: Transient | N
 
 
 def depth_content(depth_m: np.ndarray, confidence: np.ndarray | None, meta: JsonObject, title: str) -> Content:
-    """Show a depth map: depth, confidence where a network stated it, and the points."""
+    """Show a depth map: depth, confidence where the file states it, and the points."""
     layers = [depth_layer("depth", depth_m)]
     if confidence is not None:
         layers.append(Layer("confidence", "", confidence, "gray", 0.0, 1.0))

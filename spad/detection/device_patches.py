@@ -85,6 +85,10 @@ class DevicePatches:
         """
         (height, width), bins = size, self.sensor.bins
         shape = (len(patches), height, width)
+        if not patches:  # a batch of none, as the plain twin gives
+            empty = torch.empty(shape, device=self.device)
+            counts = torch.empty((0, 1, bins, height, width), device=self.device)
+            return Batch(counts, empty, empty.bool(), empty.bool())
         pixels = self._pixels(patches, size, 0)
         # crosstalk comes from the pixels around a patch, too
         lit = self._pixels(patches, size, 1) if self.sensor.crosstalk else pixels

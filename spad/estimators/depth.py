@@ -50,6 +50,7 @@ __all__ = [
     "by_pixels",
     "checked_histogram",
     "confidence",
+    "confidence_map",
     "correlate",
     "cramer_rao_m",
     "depth_errors",
@@ -59,7 +60,6 @@ __all__ = [
     "grid_peak",
     "histogram_depth_m",
     "laser_baseline_m",
-    "mean_confidence",
     "noise_free_bias_m",
     "radial_depth_m",
     "radial_depth_of",
@@ -91,12 +91,14 @@ def checked_histogram(counts: Tensor, bins: int) -> Tensor:
     return counts.reshape(-1, bins)
 
 
-def by_pixels(function: Callable[[Tensor], Tensor], rows: Tensor, per_pixel: int = 0) -> Tensor:
+def by_pixels(function: Callable[..., Tensor], rows: Tensor, per_pixel: int = 0, *beside: Tensor) -> Tensor:
     """Return `function` (P, T) -> (P, ...) over chunks of pixels, so that memory does not grow with the image.
 
-    `per_pixel` is the size of its largest intermediate tensor for one pixel, where that exceeds T."""
+    `per_pixel` is the size of its largest intermediate tensor for one pixel, where that exceeds T; `beside` (P, ...)
+    are its further arguments."""
     size = max(1, _CHUNK.get(rows.device.type, _CHUNK["cuda"]) // max(1, rows.shape[-1], per_pixel))
-    return torch.cat([function(part) for part in torch.split(rows, size)])
+    parts = zip(*(torch.split(one, size) for one in (rows, *beside)), strict=True)
+    return torch.cat([function(*part) for part in parts])
 
 
 def depth_in_range(depth_m: Tensor, sensor: Sensor) -> Tensor:
@@ -165,43 +167,48 @@ def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched", 
     return depth_in_range(depth, sensor).reshape(counts.shape[:-1])
 
 
-def confidence(counts: Tensor, depth_m: Tensor, sensor: Sensor) -> Tensor:
+def confidence(
+    counts: Tensor, depth_m: Tensor, sensor: Sensor, method: str = "log-matched", *, law: str | None = None
+) -> Tensor:
     """Return probability that an estimated depth is the pulse's and not a chance peak, (..., T), (...,) -> (...,)
     float32.
 
     The posterior share of arrivals within two pulse widths (the window that holds 95 % of a Gaussian) of the estimate,
     with every bin as likely before as any other: softmax of the log-likelihood over bins, S and B as `log-matched`
-    estimates them. NaN where the depth is. Of any method's depth; raises InputError as `estimate_depth` does.
+    estimates them. NaN where the depth is. Of any method's depth; that of `coates` is judged by counts without the
+    pile-up of `law`, as it was estimated. Raises InputError as `estimate_depth` does.
     """
     rows = checked_histogram(counts, sensor.bins)
     if depth_m.shape != counts.shape[:-1]:
         raise InputError(f"depth of shape {tuple(depth_m.shape)} for counts of shape {tuple(counts.shape)}")
+    if not len(rows):
+        return torch.empty_like(depth_m, dtype=torch.float32)
     taps = pulse_taps(sensor, str(rows.device))
     reach = taps.shifts[taps.window]
     estimate = (depth_m.reshape(-1, 1).double() / sensor.bin_depth_m).floor().nan_to_num(0).clamp(0, sensor.bins - 1)
 
-    def near(part: Tensor) -> Tensor:
-        posterior, index = likelihood(part[:, :-1], sensor).softmax(-1), part[:, -1:].long() + reach
+    def near(part: Tensor, place: Tensor) -> Tensor:
+        if method == "coates":
+            part = linearised(part, sensor, law)
+        part = part if part.dtype == torch.float64 else part.float()  # which counts bins to 16 million
+        posterior, index = likelihood(part, sensor).softmax(-1), place + reach
         inside = (
             torch.ones_like(index, dtype=torch.bool) if is_circular(sensor) else (index >= 0) & (index < sensor.bins)
         )
         # no bin twice, where the window is as wide as the period
         return (posterior.gather(-1, index.remainder(sensor.bins)) * inside).sum(-1).clamp(max=1)
 
-    kind = rows.dtype if rows.dtype == torch.float64 else torch.float32  # which counts bins to 16 million
-    fraction = by_pixels(near, torch.cat([rows.to(kind), estimate.to(kind)], dim=-1)).float()
+    fraction = by_pixels(near, rows, 0, estimate.long()).float()
     return torch.where(depth_m.isnan(), math.nan, fraction.reshape(depth_m.shape))
 
 
-def mean_confidence(histogram: Histogram, depth_m: np.ndarray) -> float:
-    """Return mean probability that an estimate is no chance peak, over the pixels that have one; NaN with a baseline.
-
-    There the distance is not the arrival time that the probability is of.
-    """
-    if any(laser_baseline_m(histogram)) or np.isnan(depth_m).all():
-        return math.nan
-    fraction = confidence(torch.from_numpy(histogram.counts), torch.from_numpy(depth_m), histogram.sensor)
-    return float(fraction.nanmean())
+def confidence_map(histogram: Histogram, depth_m: np.ndarray, method: str = "log-matched") -> np.ndarray | None:
+    """Return the probability of each pixel's estimate that it is no chance peak, (H, W) float32; None beside a
+    displaced laser, where the distance is not the arrival time that the probability is of."""
+    if any(laser_baseline_m(histogram)):
+        return None
+    counts, law = torch.from_numpy(histogram.counts), detection_law(histogram)
+    return confidence(counts, torch.from_numpy(depth_m), histogram.sensor, method, law=law).numpy()
 
 
 def cramer_rao_m(arrival_s: Tensor, signal: Tensor, background_per_bin: Tensor, sensor: Sensor) -> Tensor:

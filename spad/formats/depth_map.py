@@ -14,7 +14,7 @@ from scenes.json_types import JsonObject
 
 
 def write_depth(depth_m: np.ndarray, path: Path, meta: JsonObject, confidence: np.ndarray | None = None) -> None:
-    """Write a depth map (H, W) [m], and beside it how sure a network is of it (`confidence`, in [0, 1])."""
+    """Write a depth map (H, W) [m], and beside it how sure its method is of it (`confidence`, in [0, 1])."""
     import OpenEXR
 
     layers = {"Z": depth_m} if confidence is None else {"Z": depth_m, "confidence": confidence}

@@ -47,6 +47,7 @@ _OFF = {
     "echo": 0.0,
 }
 TAIL_BINS = 48
+RETURN_SIGMAS = 6.0  # of a bin's background: Poisson noise alone reaches it in 1 of 1,000 histograms at the most
 _FIRST_SKEW = 0.3  # bins: where the fit begins, as the derivative at 0 is 0
 
 
@@ -158,11 +159,39 @@ def poisson_deviance(counts: np.ndarray, expected: np.ndarray) -> float:
 # Where to start
 
 
+def sees_return(counts: np.ndarray) -> np.ndarray:
+    """Tell which histograms hold a return: the fullest bin is RETURN_SIGMAS above the median one, (..., T) -> (...)."""
+    background = np.median(counts, axis=-1)
+    return counts.max(axis=-1) > background + RETURN_SIGMAS * np.sqrt(np.maximum(background, 1.0))
+
+
+def check_returns(counts: np.ndarray) -> None:
+    """Raise InputError for a zone that sees no return in most of the captures, counts (N, Z, T), or if some zone misses
+    it in every capture.
+
+    A gain of 0 is no way out: whatever covered the zone, the file would go on to say that it is blind.
+    """
+    seen = sees_return(counts)
+    for zone, number in enumerate(seen.sum(axis=0)):
+        kind = "all its counts are 0" if not counts[:, zone].any() else "the others hold background alone or nothing"
+        message = f"zone {zone} (of 0 to {seen.shape[1] - 1}) sees a return in {number} of {len(seen)} captures, {kind}"
+        advice = "its gain and delay cannot be fitted; uncover it, or leave it out of counts and [zones]"
+        require(2 * number > len(seen), f"{message}: {advice}")
+    message = f"in none of {len(seen)} captures do all {seen.shape[1]} zones see a return, which a fit begins with"
+    require(bool(seen.all(axis=1).any()), message)
+
+
+def middle_capture(captures: Sequence[ZoneCapture]) -> ZoneCapture:
+    """Return the capture next to the middle one in which every zone sees a return."""
+    good = np.flatnonzero([sees_return(capture.counts).all() for capture in captures])
+    return captures[good[np.abs(good - len(captures) // 2).argmin()]]
+
+
 def starting_values(
     captures: Sequence[ZoneCapture], sensor: Sensor, zones: int, first_bin: int, basis: PulseBasis, reference: int
 ) -> Values:
     """Find rough values from the captures: pulse from the middle capture, gains and delays from its zones."""
-    middle = captures[len(captures) // 2]
+    middle = middle_capture(captures)
     counts = middle.counts.astype(np.float64)
     background = np.maximum(np.median(counts, axis=1), 1.0)
     signal = np.maximum(counts - background[:, None], 0.0)
@@ -224,10 +253,12 @@ def calibrate(
     """Calibrate from captures in order of distance; what is not `free` stays off, the delays of the zones at 0.
 
     First the pulse, gains, delays and background from every fourth capture, then all from every second, then from all;
-    from `start`, all at once. Raises InputError for fewer than eight captures without a start.
+    from `start`, all at once. Raises InputError for fewer than eight captures without a start, and a zone that sees no
+    return in most of them.
     """
     check_effects(free)
     require(start is not None or len(captures) >= 8, f"calibrate: {len(captures)} captures, expected 8 or more")
+    check_returns(np.array([capture.counts for capture in captures]))
     reference = zones.count // 2
     if start is not None:
         basis, values = start.basis, dict(start.values)
@@ -254,7 +285,7 @@ def calibrate(
 
 def _basis_for(captures: Sequence[ZoneCapture], sensor: Sensor, reference: int) -> PulseBasis:
     """Choose the pulse's steps: fine from 3 bins before the return's peak to 4 after it, coarse for TAIL_BINS more."""
-    middle = captures[len(captures) // 2]
+    middle = middle_capture(captures)
     near_m, far_m, light = middle.returns[reference]
     path = float((near_m + far_m) @ light / (2 * light.sum()))
     peak = int(middle.counts[reference].argmax()) - path / (SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s)

@@ -11,7 +11,7 @@ from csph.codes.nested import block_parts, holds, nested
 from csph.layer import CompressiveLayer
 from csph.networks.blockwise import BlockMixer, mixers_for
 from csph.networks.model import DepthModel
-from csph.training.beginning import NetworkOf
+from csph.training.beginning import NetworkOf, check_init
 from csph.training.config import ModelConfig, preset
 from csph.training.loop import DepthTraining, train
 from scenes.errors import InputError
@@ -137,6 +137,28 @@ def test_other_switches_are_named_where_they_are_why(tmp_path):
     model = replace(small.config, design=LARGER[0], layer={"keep_mean": True})
     with pytest.raises(InputError, match=r"cannot begin one of .* on reference: --layer none and keep_mean"):
         train(preset("smoke", model, crop=8), [], [], tmp_path / "run", init=small)
+
+
+def test_other_switches_of_the_same_design_are_warned_of(caplog):
+    """In one line; not of the network alone, nor of 8 bits, which are trained for from a model without them."""
+    small = DepthModel(ModelConfig(design=INNER, sensor=SMALL, layer={"per_pixel_norm": True}), 1)
+
+    def warnings(init: DepthModel | NetworkOf, **switches: bool) -> list[str]:
+        caplog.clear()
+        with caplog.at_level("WARNING", logger="csph"):
+            check_init(init, preset("smoke", replace(small.config, layer=switches), crop=8))
+        return [record.getMessage() for record in caplog.records]
+
+    (line,) = warnings(small, keep_mean=True, int8=True)
+    named = "with --layer per_pixel_norm begins one with --layer int8, keep_mean"
+    assert f"learned 16x2x2 K4, compact {named}" in line and "\n" not in line
+    assert "begins one with --layer none" in warnings(small)[0]
+    assert (
+        "begins one with --layer per_pixel_norm, no zero_mean;"
+        in warnings(small, per_pixel_norm=True, zero_mean=False)[0]
+    )
+    assert not warnings(small, per_pixel_norm=True) and not warnings(small, per_pixel_norm=True, keep_mean=False)
+    assert not warnings(small, per_pixel_norm=True, int8=True) and not warnings(NetworkOf(small))
 
 
 def test_what_cannot_begin_is_refused_in_one_line(tmp_path):

@@ -82,6 +82,36 @@ def test_files_that_calibrate_did_not_write_are_kept(calibrated, tmp_path, monke
         main(["calibrate", "--out", str(calibrated)])
 
 
+def shipped_without(path, change):
+    """Write the shipped captures beyond 0.25 m, changed, to a file of one's own."""
+    with np.load(shipped_captures()) as held:
+        far = held["distance_m"] > 0.25
+        arrays = {name: held[name][far] for name in ("distance_m", "counts", "reference_counts")}
+    change(arrays["counts"])
+    np.savez(path, **arrays)
+
+
+@pytest.mark.parametrize("background", [0, 100])
+def test_a_zone_that_sees_nothing_is_named_with_its_file(background, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    random = np.random.default_rng(1)
+    shipped_without("dead.npz", lambda counts: np.copyto(counts[:, 3], random.poisson(background, counts[:, 3].shape)))
+    assert main(["calibrate", "dead.npz", "--every", "6", "--nearest", "0.25"]) == 2
+    err = capfd.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
+    assert len(lines) == 1 and "dead.npz: zone 3 (of 0 to 8) sees a return in 0 of 8 captures" in lines[0]
+    assert "Traceback" not in err and "RuntimeWarning" not in err and not [*tmp_path.glob("*.toml")]
+
+
+def test_captures_that_a_zone_misses_are_told_and_used(capfd, tmp_path, monkeypatch):
+    """Among them the one that the fit would begin with."""
+    monkeypatch.chdir(tmp_path)
+    shipped_without("some.npz", lambda counts: counts[18:25, 2].fill(0))
+    assert main(["calibrate", "some.npz", "--every", "6", "--nearest", "0.25", "--effects", "delay"]) == 0
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("some.npz: in 7 of 45 captures a zone sees no return, the first at 0.3") and "zone 2" in line
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

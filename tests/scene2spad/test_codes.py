@@ -3,12 +3,15 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from csph import CompressiveLayer, Design
+from csph.networks.model import load_model
+from csph.weights.shipped import shipped_file
 from render.engine import render
 from render.settings import RenderSettings
 from scene2spad.bench import encode as bench_encode
@@ -166,6 +169,25 @@ def test_study_tensors_draws_checkpoints(capfd, tmp_path):
     assert (trained["codes"], trained["block"], trained["parameters"]) == (6, [32, 2, 2], 6 * 36)
     assert trained["later_half_energy"] < 0.05 and given["block"] == [16, 2, 2]
     assert torch.equal(tensors.coding_of(tmp_path / "trained.ckpt").spatial, layer.spatial.detach())
+
+
+def test_study_tensors_takes_names_of_models(capfd, tmp_path):
+    """As `evaluate` and `depth` do: a shipped name, a run's folder and its checkpoint; mistakes in one line."""
+    name = "learned-64x4x4-128x-s0"
+    file = shipped_file(name)
+    argv = ("study", "tensors", "--out", str(tmp_path), "--checkpoints")
+    status, result, err = run(capfd, *argv, name, str(file), str(file.parent))
+    assert status == 0, err
+    drawn = result["tensors"]["tensors-checkpoints"]
+    assert drawn[0]["name"] == name and drawn[0]["block"] == [64, 4, 4] and drawn[0]["compression"] == 128
+    assert drawn[1:] == drawn[:1] * 2
+    assert torch.equal(tensors.coding_of(Path(name)).temporal, load_model(file)[0].codes_layer.coding().temporal)
+    for given, words in (
+        ("learned-64x4x4", "learned-64x4x4: file not found, and model 'learned-64x4x4' is unknown, like learned-"),
+        ("none-s0", "a network without codes, it takes the counts themselves"),
+    ):
+        status, _, err = run(capfd, *argv, given)
+        assert status == 2 and words in err and len(err.splitlines()) == 1
 
 
 def test_rows_are_scaled_between_their_extremes():

@@ -16,7 +16,8 @@ from scene2spad.cli import main
 from scene2spad.plots import figures
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel, sense
-from spad.formats.histogram import read_histogram
+from spad.formats.depth_map import read_depth
+from spad.formats.histogram import read_histogram, write_histogram
 from spad.formats.mat import read_mat
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.budget import Optics
@@ -39,7 +40,7 @@ def run(capfd, *argv: str) -> tuple[int, dict, str]:
     return status, json.loads(out.splitlines()[-1]) if out.strip() else {}, err
 
 
-def test_laws_and_inverses_by_command(scene, capfd):
+def test_laws_and_inverses_by_command(scene, capfd, tmp_path):
     status, message, err = run(capfd, "sense", "s.exr", "--signal", "4e5", "--background", "4e5")
     assert status == 0 and message["model"] == "first-photon" and message["pile_up"] > 0.5 and "pile-up" in err
     assert message["mean_counts"] < 0.95 * 8e5
@@ -47,11 +48,28 @@ def test_laws_and_inverses_by_command(scene, capfd):
     for method in ("log-matched", "coates", "lmf-published", "correlation"):
         status, depth, _ = run(capfd, "depth", "s.h5", "--method", method)
         assert status == 0 and 0 <= depth["confidence"] <= 1
+        _, sure, _ = read_depth(tmp_path / f"s-{method}.exr")
+        assert sure.shape == (8, 10) and np.nanmean(sure) == pytest.approx(depth["confidence"], rel=1e-5)
         errors[method] = depth["mae_mm"]
     assert errors["coates"] < 0.5 < errors["log-matched"]
     options = ("--model", "free-running", "--dead-time", "3e-7", "--exposure", "1e-3")
     status, message, _ = run(capfd, "sense", "s.exr", "--signal", "1e3", "--background", "1e3", *options)
     assert status == 0 and message["model"] == "free-running" and message["mean_counts"] < 1e-3 / 3e-7 + 1
+
+
+def test_depth_beside_a_displaced_laser_has_no_confidence(scene, capfd, tmp_path):
+    """Its distance is not the arrival time that the probability is of; pixels without a depth have none either."""
+    assert run(capfd, "sense", "s.exr", "--signal", "2", "--background", "1")[0] == 0
+    histogram = read_histogram(tmp_path / "s.h5")
+    assert run(capfd, "depth", "s.h5", "--method", "argmax")[0] == 0
+    depth, sure, _ = read_depth(tmp_path / "s-argmax.exr")
+    assert np.isnan(depth).any() and np.array_equal(np.isnan(sure), np.isnan(depth))
+    camera = {"fov_deg": 50.0, "width": 10, "height": 8, "pose": np.eye(4).tolist()}
+    meta = {**histogram.meta, "transient": {"camera": camera, "laser": {"baseline_m": [0.1, 0.0, 0.0]}}}
+    write_histogram(replace(histogram, meta=meta), tmp_path / "beside.h5")
+    status, message, err = run(capfd, "depth", "beside.h5")
+    assert status == 0 and message["confidence"] is None, err
+    assert read_depth(tmp_path / "beside-log-matched.exr")[1] is None
 
 
 def test_detector_options_reach_the_sensor(scene, capfd, tmp_path):

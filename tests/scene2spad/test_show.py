@@ -18,6 +18,7 @@ from render.transient import read_transient
 from scene2spad.cli import main
 from scene2spad.cli.results.show import PAGE_MARK
 from scene2spad.viewer.content import LEVELS, Cube, cube_payload
+from scene2spad.viewer.exports import COLUMNS
 from scene2spad.viewer.sources import expected_cube, light_over_path, merged_returns
 from spad.detection.detect import expected_in_pixel, rates_for
 from spad.formats.depth_map import read_depth
@@ -236,12 +237,17 @@ def test_dense_exports_are_read_back(capfd):
 
 def test_points_lie_at_their_depth(capfd):
     found = told(capfd, "export", "depth.exr", "--out", "cloud.ply", "--intensity", "gallery.h5")
-    depth_m = read_depth(Path("depth.exr"))[0]
+    depth_m, sure, _ = read_depth(Path("depth.exr"))
     points = trimesh.load("cloud.ply").vertices
     known = depth_m[np.isfinite(depth_m)]
     assert found["points"] == len(points) == known.size
     assert np.linalg.norm(points, axis=1) == pytest.approx(known, rel=1e-5)
     assert b"property float confidence" in Path("cloud.ply").read_bytes()[:400]
+    held = np.frombuffer(Path("cloud.ply").read_bytes().partition(b"end_header\n")[2], COLUMNS)["confidence"]
+    assert np.array_equal(held, sure[np.isfinite(depth_m)]) and 0 <= held.min() < held.max() <= 1
+    told(capfd, "show", "depth.exr", "--out", "page.html")
+    layers = {layer["name"]: unpacked(layer["data"], "<f4") for layer in payload(Path("page.html"))["layers"]}
+    assert np.array_equal(layers["confidence"], sure.ravel(), equal_nan=True)
 
 
 @pytest.mark.parametrize("int8", [False, True])

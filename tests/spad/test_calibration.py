@@ -10,7 +10,16 @@ from scenes.errors import InputError
 from spad.detection.saturation import draw_saturated
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
-from spad.zones.calibration import as_sensor, calibrate, natural, poisson_deviance, standard_errors
+from spad.zones.calibration import (
+    as_sensor,
+    calibrate,
+    check_returns,
+    middle_capture,
+    natural,
+    poisson_deviance,
+    sees_return,
+    standard_errors,
+)
 from spad.zones.expected_counts import PulseBasis, ZoneCapture, ZoneModel
 from spad.zones.fit import fit
 from spad.zones.sensor import (
@@ -157,6 +166,36 @@ def test_what_cannot_be_fitted_is_refused():
         calibrate([], SENSOR, ZONES, free=("gravity",))
     with pytest.raises(InputError, match="0 captures, expected 8 or more"):
         calibrate([], SENSOR, ZONES)
+
+
+@pytest.mark.parametrize("zone", [0, 1])  # one of them carries the gauge
+@pytest.mark.parametrize(("background", "words"), [(0, "all its counts are 0"), (600, "background alone")])
+def test_a_zone_that_sees_nothing_is_named(zone, background, words):
+    shown = captures(*truth(), 8, 3)
+    for number, capture in enumerate(shown):
+        capture.counts[zone] = np.random.default_rng(number).poisson(background, SENSOR.bins)
+    with pytest.raises(InputError, match=rf"zone {zone} \(of 0 to 2\) sees a return in 0 of 8 captures, .*{words}"):
+        calibrate(shown, SENSOR, ZONES)
+
+
+def test_a_fit_begins_with_a_capture_in_which_all_zones_see_a_return():
+    shown = captures(*truth(), 8, 3)
+    shown[4].counts[0] = shown[5].counts[2] = 0
+    assert middle_capture(shown) is shown[3]
+    assert np.isfinite(calibrate(shown, SENSOR, ZONES, free=("delay", "background")).deviance)
+    shown = captures(*truth(), 8, 3)
+    for number, capture in enumerate(shown):
+        capture.counts[number % 3] = 0
+    with pytest.raises(InputError, match="in none of 8 captures do all 3 zones see a return"):
+        check_returns(np.array([capture.counts for capture in shown]))
+
+
+@pytest.mark.parametrize("background", [0.02, 0.65, 3.0, 40.0])
+def test_background_alone_is_no_return(background):
+    counts = np.random.default_rng(1).poisson(background, (4000, 128))
+    assert sees_return(counts).mean() < 2e-3
+    counts[:, 60] += 12 + round(12 * math.sqrt(background))
+    assert sees_return(counts).all()
 
 
 def test_a_fit_with_numbers_at_their_bounds_reaches_the_optimum():

@@ -66,6 +66,14 @@ def test_labels_masks_and_offsets_are_the_plain_twins() -> None:
     assert torch.equal(mine.mixed, plain.mixed) and torch.equal(mine.valid, plain.valid)
 
 
+def test_no_patches_are_an_empty_batch_like_the_plain_twins() -> None:
+    packed = pack_views(scenes())
+    mine = DevicePatches(packed, SENSOR, "cpu").sense([], size=(6, 7), seed=0)
+    plain = sense_patches(packed, SENSOR, [], size=(6, 7))
+    for ours, theirs in zip(mine, plain, strict=True):
+        assert ours.shape == theirs.shape and ours.dtype == theirs.dtype and not len(ours)
+
+
 def test_one_seed_gives_one_batch() -> None:
     resident = DevicePatches(pack_views(scenes()), SENSOR, "cpu")
     patches = [Patch(1, 0, 0, 20, 10, 0)] * 2

@@ -8,7 +8,7 @@ import torch
 from test_laws import same
 
 from spad.detection.detect import choose_model, sense
-from spad.estimators.depth import detection_law, estimate_depth, histogram_depth_m
+from spad.estimators.depth import confidence_map, detection_law, estimate_depth, histogram_depth_m
 from spad.estimators.pile_up import coates, free_running_flux, linearised
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -82,3 +82,13 @@ def test_the_law_that_is_chosen_and_the_inverse_agree(reset: str, dead_s: float)
     chosen, _ = choose_model("auto", PER_CYCLE, sensor)
     counts = torch.from_numpy(sense(WALL, sensor, PhotonBudget(1000, 1000), seed=4).counts[:, :4])
     assert torch.equal(linearised(counts, sensor), linearised(counts, sensor, chosen))
+
+
+def test_confidence_of_corrected_depth_is_that_of_corrected_counts() -> None:
+    """Where 4 background photons a cycle hide a pulse of 0.1, the counts as they are speak for the first bins."""
+    histogram = sense(WALL, SENSOR, PhotonBudget(0.1 * CYCLES, 4 * CYCLES), seed=1)
+    depth = histogram_depth_m(histogram, "coates")
+    right = (np.abs(depth - WALL_M) < 0.05).mean()
+    raw, corrected = (confidence_map(histogram, depth, method).mean() for method in ("log-matched", "coates"))
+    # corrected counts scatter more than Poisson's, which flatters the confidence
+    assert right > 0.8 and abs(corrected - right) < 0.15 < 0.5 < right - raw

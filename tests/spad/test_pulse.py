@@ -220,5 +220,16 @@ def test_confidence_is_the_share_of_right_answers(signal: float, background: flo
     assert np.isnan(confidence(torch.zeros(1, 1024), torch.tensor([math.nan]), Sensor()).numpy()).all()
 
 
+def test_confidence_is_that_of_each_pixel_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the chunks of pixels, the shape and the type of the counts."""
+    counts = torch.from_numpy(np.random.default_rng(3).poisson(0.05, (3, 7, 1024))).to(torch.uint8)
+    depth = estimate_depth(counts, Sensor())
+    sure = confidence(counts, depth, Sensor())
+    monkeypatch.setattr("spad.estimators.depth._CHUNK", {"cpu": 4 * 1024, "cuda": 4 * 1024})
+    assert torch.equal(confidence(counts.int(), depth, Sensor()), sure)
+    assert torch.equal(confidence(counts[1, 3], depth[1, 3], Sensor()), sure[1, 3])
+    assert confidence(counts[:0], depth[:0], Sensor()).shape == (0, 7)
+
+
 def test_budget_sbr() -> None:
     assert PhotonBudget(5, 0).sbr == math.inf and PhotonBudget(5, 10).sbr == 0.5

@@ -104,6 +104,15 @@ def test_cycles_of_a_pulsed_laser_are_drawn_independently():
         periodic_arrivals(np.arange(3), 42, 0)
 
 
+@pytest.mark.parametrize(("rate", "named"), [(-1, "-1"), (math.nan, "nan"), (math.inf, "inf")])
+def test_rates_that_no_process_has_are_refused(rate, named):
+    with pytest.raises(InputError, match=f"a rate of {named} photons a clock, expected a finite number of 0 or more"):
+        poisson_arrivals(rate, 1000, seed=0)
+    with pytest.raises(InputError, match="a frame of -5 clocks, expected 0 or more"):
+        poisson_arrivals(0.1, -5, seed=0)
+    assert len(poisson_arrivals(0, 1000, seed=0)) == 0
+
+
 def test_arrivals_that_are_none_are_refused():
     core = timed("coarse-64")
     for clocks in ([2.0, 1.0], [-1.0, 2.0], [1.0, 5000.0], [1.0]):

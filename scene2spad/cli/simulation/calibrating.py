@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,16 +11,32 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scene2spad.cli.paths import Mark, check_target, keep_foreign
-from scene2spad.datasets.zone_captures import read_plane_captures, shipped_captures, within, zone_captures
+from scene2spad.datasets.zone_captures import (
+    PlaneCaptures,
+    read_plane_captures,
+    shipped_captures,
+    within,
+    zone_captures,
+)
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.sensor.files import load_sensor, read_sensor, write_sensor
-from spad.zones.calibration import Calibration, calibrate, calibrated_file, check_effects, poisson_deviance
+from spad.zones.calibration import (
+    Calibration,
+    calibrate,
+    calibrated_file,
+    check_effects,
+    check_returns,
+    poisson_deviance,
+    sees_return,
+)
 from spad.zones.expected_counts import ZoneCapture
 from spad.zones.sensor import expected_zone_counts
 
 if TYPE_CHECKING:
     from scene2spad.cli.simulation.calibrate import Calibrate
+
+log = logging.getLogger("scene2spad")
 
 MIN_CAPTURES = 16
 HOW = "calibrated from"  # first words of the sources that a written file names
@@ -44,6 +61,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
     began = time.perf_counter()
     progress("render the plane", 0.0)
     captures = zone_captures(chosen, start.sensor, start.zones)
+    _check_zones(chosen, command.every, path)
     progress("fit", 0.3)
     used = captures[:: command.every]
     held = [one for at, one in enumerate(captures) if at % command.every]
@@ -74,6 +92,21 @@ def is_calibrated(path: Path) -> bool:
         return any(source.startswith(HOW) for source in read_sensor(path).sources.values())
     except InputError:
         return False
+
+
+def _check_zones(chosen: PlaneCaptures, every: int, path: Path) -> None:
+    """Raise InputError that names the file for a zone that the captures used say nothing of; warn of captures that some
+    zone sees nothing in."""
+    try:
+        check_returns(chosen.counts[::every])
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    blind = np.argwhere(~sees_return(chosen.counts))
+    if len(blind):
+        number, (first, zone) = len(np.unique(blind[:, 0])), blind[0]
+        where = f"the first at {chosen.distance_m[first]:g} m, zone {zone}"
+        message = "%s: in %d of %d captures a zone sees no return, %s; they are used as they are, see --nearest"
+        log.warning(message, path, number, len(chosen.counts), where)
 
 
 def mean_deviance(captures: Sequence[ZoneCapture], fitted: Calibration) -> float:

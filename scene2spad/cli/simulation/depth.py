@@ -19,7 +19,7 @@ from scenes.progress import Progress
 from spad.formats.depth_map import write_depth
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from csph.networks.model import DepthModel
     from spad.formats.histogram import Histogram
@@ -141,15 +141,15 @@ def _run_folder(command: Depth, label: str, progress: Progress) -> dict:
     return {"sensed": sensed, "views": len(views), "method": label, **means, "by_view": views, "out": str(out)}
 
 
-def _mean(values: list[float]) -> float:
-    """Mean over the views that have a value, NaN of none."""
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.mean(known)) if known else float("nan")
+def _mean(values: Sequence[float] | np.ndarray) -> float:
+    """Mean over the views or pixels that have a value, NaN of none."""
+    known = np.asarray(values)[np.isfinite(values)]
+    return float(known.mean()) if known.size else float("nan")
 
 
 def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram, source: Path, out: Path) -> dict:
     """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
-    from spad.estimators.depth import depth_errors, mean_confidence
+    from spad.estimators.depth import confidence_map, depth_errors
 
     label, fraction = depth_label(command), None
     start = time.perf_counter()
@@ -163,19 +163,19 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
         if overflows:
             log.warning("%d sums of 16 bits wrapped around", overflows)
     seconds = time.perf_counter() - start
-    sure = mean_confidence(histogram, depth)
+    sure = confidence_map(histogram, depth, command.method)
     range_m = histogram.sensor.range_m
     errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
     if np.isnan(histogram.depth_m).all():
         log.info("%s: holds no true depth, so that no error can be stated", source)
     meta = {"method": label, "histogram_sha256": histogram.sha256()}
     camera = histogram.meta.get("transient", {}).get("camera")
-    write_depth(depth, out, meta | ({"camera": camera} if camera else {}), fraction)
+    write_depth(depth, out, meta | ({"camera": camera} if camera else {}), sure if network is None else fraction)
     result = {
         "seconds": seconds,
         "method": label,
         **errors,
-        "confidence": sure,
+        "confidence": _mean([] if sure is None else sure),
         "unmixed": depth_errors(depth, histogram.depth_m, range_m=range_m, exclude=histogram.mixed),
         "out": str(out),
     }
