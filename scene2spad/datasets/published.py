@@ -37,8 +37,9 @@ from scenes.io.relief import (
     filled,
     middlebury_folder,
     middlebury_names,
-    read_levels,
+    read_disparity,
 )
+from scenes.io.textures import opened_image
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.formats.histogram import Histogram
@@ -139,14 +140,16 @@ def pairs(count: int | None = None) -> list[Pair]:
 
 
 def _pair(folder: Path) -> Pair:
-    disparity = read_levels(folder / "disp1.png")
-    least = float((folder / "dmin.txt").read_text().split()[0])
+    disparity, least = read_disparity(folder)
     known = disparity > 0
     depth = MIDDLEBURY_FOCAL_PX * MIDDLEBURY_BASELINE_M / (filled(disparity, known, near_is_high=True) + least)
     if folder.name == "Bowling1":
         hole = binary_dilation(binary_erosion(~known, _disk(3)), _disk(20)) & ~known
         depth = np.where(hole, PADLESS_M, depth)
-    with Image.open(folder / "view1.png") as image:
+    with opened_image(folder / "view1.png") as image:
+        same = (image.height, image.width) == disparity.shape
+        rows, columns = disparity.shape
+        require(same, f"{image.width} x {image.height} pixels, disp1.png has {columns} x {rows}")
         luma = np.asarray(image.convert("RGB"), np.float64) @ LUMA / 255
     return Pair(folder.name, _shrunk(depth), np.clip(_shrunk(luma), 0, None))
 

@@ -317,6 +317,15 @@ def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
         raise InputError(f"{path}: is damaged; delete it, and it is made again") from None
 
 
+def _check_places(job: Job, folder: SetFolder) -> None:
+    """Raise InputError where views are of other scenes than the set, of those found beside the project, has now."""
+    chosen = scene_set(job.set)
+    for view, record in sorted(folder.records.items()):
+        now = chosen.place(view) if chosen.size is None or view < chosen.size else "nothing"
+        message = f"{folder.path}: view {view} is of {record.get('place')}, the set has {now} there now"
+        require(record.get("place", now) == now, f"{message}; choose another --out")
+
+
 def make_set(
     job: Job, count: int, out: Path, *, workers: int = 1, scheduler: str | None = None, progress: Progress | None = None
 ) -> dict:
@@ -327,6 +336,7 @@ def make_set(
     """
     check_asked(job, count, workers)
     folder = SetFolder(out, job.made())
+    _check_places(job, folder)
     missing = count - sum(view < count for view in folder.records)
     todo = (view for view in range(count) if view not in folder.records)
     report = progress or (lambda what, fraction: None)

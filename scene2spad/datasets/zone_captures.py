@@ -86,14 +86,15 @@ def read_plane_captures(path: Path) -> PlaneCaptures:
 
 def _drift_bins(reference: np.ndarray) -> np.ndarray:
     """Compute how late the reference channel's pulse is in each capture, bins after its mean; 0 without such a
-    channel."""
+    channel, and in captures where it counted nothing."""
     if not reference.any():
         return np.zeros(len(reference))
     peak = int(reference.sum(axis=0).argmax())
     first, last = max(0, peak + REFERENCE_REACH[0]), min(reference.shape[1], peak + REFERENCE_REACH[1])
     window = reference[:, first:last]
+    lit = window.sum(axis=1) > 0
     centroid = window @ np.arange(first, last) / np.maximum(window.sum(axis=1), 1)
-    return centroid - centroid.mean()
+    return np.where(lit, centroid - centroid[lit].mean(), 0.0)
 
 
 def plane_scene(

@@ -1,11 +1,13 @@
 """Check what mesh files declare of themselves against what is in them, before a loader allocates or believes anything.
 
 trimesh reads a text file that was cut, drops a texture that it cannot find, and takes negative indices as Python does.
+It passes over what it has no model for: what would then be seen as something else is refused, or put as it reads it.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import re
 import struct
 import warnings
@@ -45,6 +47,8 @@ _GLB_INDICES = (
     *("buffer", "bufferView", "camera", "indices", "material", "mesh", "node", "sampler", "scene", "skin", "source"),
     *("index", "count", "byteLength", "byteOffset", "byteStride", "children", "nodes"),
 )
+
+_GLB_USHORT, _GLB_FLOAT = 5123, 5126  # component types
 
 ReadImage = Callable[[str], bytes]
 
@@ -181,6 +185,45 @@ def _end_of_binary(content: bytes, start: int, element: _Element, order: str) ->
     return end
 
 
+# --- OBJ -------------------------------------------------------------------------------------------------------------
+
+
+def plain_obj(content: bytes) -> bytes:
+    """Return an OBJ as trimesh reads it rightly: no indents and tabs, indices from the first vertex on.
+
+    trimesh passes over indented lines, takes the first `mtllib` of comments too, counts negative indices from the end
+    of the file instead of from their line, and takes vertex 0 for vertex 1. Raises InputError for an index of 0, or
+    before the first.
+    """
+    content = content.replace(b"\r\n", b"\n").replace(b"\\\n", b" ").replace(b"\t", b" ")
+    if content[:1] in b" #" or b"\n " in content or re.search(rb"\n#.*mtllib", content):
+        content = re.sub(rb"^ +|^#.*mtllib.*", b"", content, flags=re.MULTILINE)
+    if re.search(rb"\nf[^-\n]*[ /]-|\nf.*? 0+(?=[ /\n]|$)", content) is None:
+        return content
+    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+    lines = content.split(b"\n")
+    for number, line in enumerate(lines):
+        key, *corners = line.partition(b"#")[0].split() or [b""]
+        if key in counts:
+            counts[key] += 1
+        elif key == b"f":
+            found = [_corner(corner, [*counts.values()], number + 1) for corner in corners]
+            lines[number] = b" ".join((key, *found))
+    return b"\n".join(lines)
+
+
+def _corner(corner: bytes, counts: list[int], line: int) -> bytes:
+    """Return a corner, vertex/uv/normal, with indices that count from 1; `counts` of each are above its line."""
+    parts = corner.split(b"/")
+    for place, count in zip(range(len(parts)), counts, strict=False):
+        index = int(parts[place] or 1)
+        wrong = index < -count or (index == 0 and place == 0)
+        require(not wrong, f"line {line}: a face's index {index}, {count} are there to count back, and 1 is the first")
+        if index < 0:
+            parts[place] = b"%d" % (count + 1 + index)
+    return b"/".join(parts)
+
+
 # --- STL -------------------------------------------------------------------------------------------------------------
 
 
@@ -218,6 +261,9 @@ def check_glb(content: bytes, read: ReadImage) -> None:
     _check_indices(header)
     try:
         _check_accessors(header, len(content))
+        for mesh in header.get("meshes", []):
+            for primitive in mesh["primitives"]:
+                _check_primitive(header, primitive)
         for number in sorted(_used_images(header)):
             _check_image(header, number, binary, read)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
@@ -277,6 +323,42 @@ def _check_accessors(header: JsonObject, size: int) -> None:
         require(held or number not in read, message)
         fits = held or accessor["count"] <= size
         require(fits, f"accessor {number} declares {accessor['count']} elements in a file of {size} bytes")
+
+
+def _check_primitive(header: JsonObject, primitive: JsonObject) -> None:
+    """Raise InputError for shapes and coordinates that trimesh drops, or takes for others."""
+    require(primitive.get("mode", 4) != 6, "a mesh is a triangle fan, which is not read; export it as triangles")
+    attributes, accessors = primitive["attributes"], header.get("accessors", [])
+    whole = "POSITION" in attributes and accessors[attributes["POSITION"]].get("normalized", False)
+    require(not whole, "positions are normalized whole numbers, which are not read; export them as floats")
+    material = header["materials"][primitive["material"]] if "material" in primitive else {}
+    base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+    if base is None:
+        return
+    moved = base.get("extensions", {}).get("KHR_texture_transform", {})
+    still = [*moved.get("offset", (0, 0)), *moved.get("scale", (1, 1)), moved.get("rotation", 0)] == [0, 0, 1, 1, 0]
+    require(still, "a base colour has a KHR_texture_transform, which is not read; bake it into the coordinates")
+    chosen = moved.get("texCoord", base.get("texCoord", 0))
+    require(chosen == 0, f"a base colour uses TEXCOORD_{chosen}, TEXCOORD_0 alone is read; export it with one set")
+    floats = "TEXCOORD_0" not in attributes or accessors[attributes["TEXCOORD_0"]]["componentType"] == _GLB_FLOAT
+    require(floats, "texture coordinates are whole numbers, which are not read; export them as floats")
+
+
+def with_bare_materials(content: bytes) -> bytes:
+    """Return a GLB in which 16-bit vertex colours have a material: trimesh keeps such of these alone as they are."""
+    header, _ = _glb_chunks(content)
+    primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" not in one]
+    colours = [(one, one["attributes"].get("COLOR_0")) for one in primitives]
+    wide = [one for one, at in colours if at is not None and header["accessors"][at]["componentType"] == _GLB_USHORT]
+    if not wide:
+        return content
+    header["materials"] = [*header.get("materials", []), {}]
+    for one in wide:
+        one["material"] = len(header["materials"]) - 1
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + struct.unpack_from("<I", content, 12)[0] :]
+    return content[:8] + struct.pack("<II4s", 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
 
 
 def _used_images(header: JsonObject) -> set[int]:

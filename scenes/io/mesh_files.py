@@ -4,6 +4,7 @@ their folder."""
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, read_bytes
-from scenes.io.mesh_declarations import check_glb, check_ply, check_stl
+from scenes.io.mesh_declarations import check_glb, check_ply, check_stl, plain_obj, with_bare_materials
 from scenes.io.textures import luminance, srgb_to_linear
 
 if TYPE_CHECKING:
@@ -52,6 +53,9 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
     beside = _Beside(path)
     try:
         content, triangles = _checked(content, kind, beside)
+        if kind == ".obj" and options.get("skip_materials") and b"\nvn " not in content:
+            # trimesh parts a mesh where materials change, and normals that are made would have a crease there
+            content = re.sub(rb"^usemtl.*", b"", content, flags=re.MULTILINE)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             loaded = trimesh.load_scene(
@@ -89,9 +93,10 @@ def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | N
                 return content, check_stl(content)
             case ".glb":
                 check_glb(content, beside.get)
+                content = with_bare_materials(content)
             case ".obj":
                 # Comments and names in an old encoding must not stop the geometry from being read.
-                content = content.decode("utf-8", errors="replace").encode()
+                content = plain_obj(content.decode("utf-8", errors="replace").encode())
     except InputError as error:
         raise InputError(f"broken {kind} file ({error})") from None
     return content, None
@@ -115,10 +120,11 @@ def check_vertices(vertices: np.ndarray, name: str) -> None:
 
 @dataclass(frozen=True)
 class MaterialEntry:
-    """Entry of an .mtl file for one material: linear luminance of Kd, file of map_Kd."""
+    """Entry of an .mtl file for one material: linear luminance of Kd, file of map_Kd, whether it names a map_d."""
 
     colour: float | None = None
     image: Path | None = None
+    cut_out: bool = False
 
 
 def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEntry]:
@@ -127,7 +133,7 @@ def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEnt
     trimesh reads the library too, but silently drops such textures and rounds Kd to 8 bits.
     """
     text = lenient_text(path)
-    lines = [line.split(maxsplit=1) for line in text.splitlines() if line.startswith("mtllib")]
+    lines = [line.split(maxsplit=1) for line in map(str.strip, text.splitlines()) if line.startswith("mtllib")]
     named = [words[1].strip() for words in lines if len(words) == 2 and words[0] == "mtllib"]
     if not named:
         return {}
@@ -141,6 +147,16 @@ def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEnt
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return _read_library(library)
+
+
+def ply_texture(path: Path) -> Path | None:
+    """Return the image that a PLY's header names; InputError where it is not there, None where it names none."""
+    header = read_bytes(path).partition(b"end_header")[0].decode("utf-8", errors="replace")
+    named = re.search(r"^comment +TextureFile +(.+?)\s*$", header, re.IGNORECASE | re.MULTILINE)
+    try:
+        return None if named is None else file_inside(path.parent, named[1], "texture")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def lenient_text(path: Path) -> str:
@@ -160,6 +176,8 @@ def _read_library(library: Path) -> dict[str, MaterialEntry]:
             entries[name] = replace(entries[name], colour=_kd(library, rest))
         elif key.lower() == "map_kd" and name:
             entries[name] = replace(entries[name], image=_map_kd(library, name, rest))
+        elif key.lower() == "map_d" and name:
+            entries[name] = replace(entries[name], cut_out=True)
     return entries
 
 

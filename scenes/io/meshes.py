@@ -15,15 +15,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenes.arrays import check_faces
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.io.mesh_files import (
     MAX_COORDINATE,
     MaterialEntry,
     check_vertices,
     load_trimesh,
+    ply_texture,
     read_material_library,
 )
-from scenes.io.textures import load_texture, luminance, srgb_to_linear
+from scenes.io.textures import MAX_PIXELS, load_texture, luminance, opened_image, srgb_to_linear
 from scenes.library.things import shapes
 from scenes.model import Camera, Material, Scene, Surface, Texture
 from scenes.placing import AS_IT_IS, Placing
@@ -63,6 +64,7 @@ class _Part:
     uv: np.ndarray | None
     normals: np.ndarray | None
     visual: Visuals
+    colours: np.ndarray | None = None  # per vertex, beside a material
 
 
 def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placing = AS_IT_IS) -> Scene:
@@ -148,7 +150,8 @@ def _read(path: Path) -> list[_Part]:
     kind = path.suffix.lower()
     if kind not in EXTENSIONS:
         raise InputError(f"{path}: extension {kind or '(none)'}, expected one of {' '.join(EXTENSIONS)}")
-    loaded = load_trimesh(path, kind)
+    # the texture of a PLY is read here: trimesh goes on without one that it cannot read
+    loaded = load_trimesh(path, kind, **({"skip_materials": True} if kind == ".ply" else {}))
     try:
         meshes = [(*loaded.graph[node], node) for node in loaded.graph.nodes_geometry]
         found = [_part(loaded.geometry[name], np.asarray(pose), node) for pose, name, node in meshes]
@@ -184,7 +187,9 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> _Part | None:
         normals = shapes.transform_normals(normals, pose) if usable else None
     if np.linalg.det(pose[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored mesh would have its faces inside out
-    return _Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual)
+    beside = mesh.visual if "color" in getattr(mesh.visual, "vertex_attributes", {}) else mesh
+    colours = beside.vertex_attributes.get("color")
+    return _Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual, colours)
 
 
 def _check_pose(pose: np.ndarray, name: str) -> None:
@@ -233,7 +238,12 @@ def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
     low, high = SENSIBLE_EXTENT_M
     with path.open("rb") as file:
         header = file.read(HEADER_BYTES).decode("latin-1")
-    names = "|".join(sorted(UNITS_M, key=len, reverse=True))
+    # short ones are whole words: neither "microns" nor "units in use" is a unit of these; "metric" is none either
+    ends = {"met": "(?=er|re)", "in": r"(?! *[a-z0-9])"}
+    names = "|".join(
+        f"{name}{ends.get(name, '(?![a-z0-9])' if len(name) < 3 else '')}"
+        for name in sorted(UNITS_M, key=len, reverse=True)
+    )
     stated = re.search(rf"\bunits?\b[^a-z0-9\n]{{0,9}}(?:are |in )?({names})", header, re.IGNORECASE)
     if stated is not None and path.suffix.lower() != ".glb":
         unit = stated[1].lower()
@@ -305,25 +315,50 @@ class _Paint:
     def _albedo(self, part: _Part) -> tuple[object, Callable[[], float | Texture]]:
         """Return a key that tells the part's albedo from others, and a function that makes the albedo."""
         source = getattr(part.visual, "material", None)
+        kind = self.path.suffix.lower()
         if source is None:
             value = self._vertex_colour(part)
-        elif self.path.suffix.lower() == ".obj":
+        elif kind == ".obj":
             entry = self.library.get(str(source.name), MaterialEntry())
+            if entry.cut_out:
+                self.notes.append(f"{part.name}: alpha (map_d) is left out, its surface is opaque")
             if entry.image is not None and part.uv is not None:
                 return entry.image, lambda: load_texture(entry.image)
             value = entry.colour
+        elif kind == ".ply":
+            file, mean = ply_texture(self.path), self._mean_colour(part)
+            if file is not None and part.uv is not None:
+                return file, lambda: _file_albedo(file)
+            value = None if mean is None else float(luminance(mean))
         else:
             image = getattr(source, "baseColorTexture", None) or getattr(source, "image", None)
-            factor = getattr(source, "baseColorFactor", None)
+            factor, mean = getattr(source, "baseColorFactor", None), self._mean_colour(part)
             tint = np.ones(4) if factor is None else np.asarray(factor) / 255
+            tint[:3] *= 1 if mean is None else mean
+            if getattr(source, "alphaMode", None) in ("MASK", "BLEND"):
+                self.notes.append(f"{part.name}: alpha is left out, its surface is opaque")
             if image is not None and part.uv is not None:
+                pixels = image.width * image.height
+                message = f"{self.path}: the texture of {part.name} has {pixels} pixels, the limit is {MAX_PIXELS}"
+                require(pixels <= MAX_PIXELS, message)
                 return (id(image), tint.tobytes()), lambda: _image_albedo(image, tint)
-            value = None if factor is None else float(luminance(tint))  # glTF's factor is linear already
+            # glTF's factor is linear already
+            value = None if factor is None and mean is None else float(luminance(tint))
         if value is None:
             value = DEFAULT_ALBEDO
             self.notes.append(f"{part.name}: no colour in the file, albedo {value:g}")
         value = round(min(max(float(value), 0.0), 1.0), 9)
         return value, lambda: value
+
+    def _mean_colour(self, part: _Part) -> np.ndarray | None:
+        """Average the colours (3,), linear, that a part has per vertex beside its material; None where it has none."""
+        if part.colours is None:
+            return None
+        colours = part.colours[:, :3]
+        most = np.iinfo(colours.dtype).max if colours.dtype.kind in "iu" else 1
+        colours = np.clip(colours / most, 0, 1)
+        self.notes.append(f"{part.name}: one mean albedo in place of its colours per vertex")
+        return np.mean(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours), axis=0)
 
     def _vertex_colour(self, part: _Part) -> float | None:
         """Average the colours stored per vertex or face (linear in glTF, sRGB elsewhere); None where there are none."""
@@ -335,7 +370,17 @@ class _Paint:
         return float(luminance(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours)).mean())
 
 
+def _file_albedo(path: Path) -> Texture:
+    """Return the texture of an sRGB image in a file."""
+    with opened_image(path, "texture") as image:
+        return _image_albedo(image, np.ones(3))
+
+
 def _image_albedo(image: Image.Image, tint: np.ndarray) -> Texture:
     """Return the texture of an sRGB image held in memory, times a linear colour."""
-    pixels = srgb_to_linear(np.asarray(image.convert("RGB")) / 255)
-    return Texture(np.minimum(luminance(pixels * tint[:3]), 1.0), "base colour")
+    values = np.asarray(image.convert("RGB"))
+    made = np.empty(values.shape[:2], np.float32)
+    for row in range(0, len(values), 64):  # a few at a time: in double precision an image takes 100 bytes a pixel
+        pixels = srgb_to_linear(values[row : row + 64] / 255)
+        made[row : row + 64] = np.minimum(luminance(pixels * tint[:3]), 1.0)
+    return Texture(made, "base colour")

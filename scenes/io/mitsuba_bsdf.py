@@ -252,7 +252,9 @@ def _rough(values: Values, smooth: str, rough: Values) -> Values:
 
 
 def _diffuse(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
-    return {"albedo": materials.fraction(plugin, "reflectance", 0.5, uv)}
+    given = plugin.has("reflectance") or plugin.nested_as("reflectance") is not None
+    name = "diffuse_reflectance" if plugin.document.legacy and not given else "reflectance"  # version 0.6 knows both
+    return {"albedo": materials.fraction(plugin, name, 0.5, uv)}
 
 
 def _rough_diffuse(materials: Materials, plugin: Plugin, uv: Uv) -> Values:

@@ -47,6 +47,7 @@ class Plugin:
         self._owner = ""
         self._values: dict[str, Element] = {}
         self._nested: list[tuple[str, Element]] = []
+        self._given: set[str] = set()  # names of values and textures
         self._used: set[str] = set()
         for child in element:
             self._add(child)
@@ -58,13 +59,15 @@ class Plugin:
         if child.tag == "ref":
             target = self.document.target(child, self.document.need(child, "id"))
         name = snake_case(child.get("name", ""))
+        if name and target.tag in ("texture", *VALUE_TAGS):
+            if name in self._given:
+                raise self.fail(f"{name} is given twice")
+            self._given.add(name)
         if target.tag in PLUGIN_TAGS:
             self._nested.append((name, target))
         elif target.tag in VALUE_TAGS:
             if not name:
                 raise self.document.error(child, f'lacks name="..." inside {self.label}')
-            if name in self._values:
-                raise self.fail(f"{name} is given twice")
             self._values[name] = target
         else:
             raise self.fail(f"unknown element <{target.tag}>")
@@ -90,6 +93,7 @@ class Plugin:
 
     def nested_as(self, name: str) -> Plugin | None:
         """Return the nested plugin given as the parameter `name`."""
+        self._used.add(name)
         found = [element for key, element in self._nested if key == name]
         return self._inner(found[0]) if found else None
 
@@ -116,9 +120,9 @@ class Plugin:
 
     def note_unused(self) -> None:
         """Say which values nobody asked for: a mistyped name must not go unnoticed."""
-        for name in self._values:
+        for name in (*self._values, *(name for name, element in self._nested if element.tag == "texture")):
             if name not in self._used:
-                self.note(f"parameter {name} is not used")
+                self.note(f"parameter {name} is not used" if name else "a texture without a name is not used")
 
     def _text(self, name: str, tags: tuple[str, ...], default: object) -> str | None:
         element = self.value(name)

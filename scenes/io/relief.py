@@ -225,13 +225,7 @@ def middlebury(folder: Path, *, cosine: bool = False, width: int | None = None, 
     Depth along the axis = 3740 px 0.16 m / (disp1 + dmin), focal length 1870 px.
     """
     folder = Path(folder)
-    for file in ("view1.png", "disp1.png", "dmin.txt"):
-        require((folder / file).is_file(), f"{folder / file}: file not found, expected in a Middlebury scene")
-    disparity = read_levels(folder / "disp1.png")
-    try:
-        least = float(read_text(folder / "dmin.txt").split()[0])
-    except (ValueError, IndexError):
-        raise InputError(f"{folder / 'dmin.txt'}: holds no number") from None
+    disparity, least = read_disparity(folder)
     known = disparity > 0
     levels = filled(disparity, known, near_is_high=True)
     full = dequantised(levels) + least
@@ -247,6 +241,20 @@ def middlebury(folder: Path, *, cosine: bool = False, width: int | None = None, 
         notes=(f"holes: {1 - known.mean():.2%} of the disparities filled from behind",),
     )
     return replace(scene, camera=scene.camera.resized(width, height))
+
+
+def read_disparity(folder: Path) -> tuple[np.ndarray, float]:
+    """Return disp1.png (0 = unknown) and the number of dmin.txt, to be added to it, of a Middlebury scene.
+
+    Raises InputError naming the file that is missing, view1.png too, or broken.
+    """
+    for file in ("view1.png", "disp1.png", "dmin.txt"):
+        require((folder / file).is_file(), f"{folder / file}: file not found, expected in a Middlebury scene")
+    try:
+        least = float(read_text(folder / "dmin.txt").split()[0])
+    except (ValueError, IndexError):
+        raise InputError(f"{folder / 'dmin.txt'}: holds no number") from None
+    return read_levels(folder / "disp1.png"), least
 
 
 def rgbd(files: RgbdFiles, *, width: int | None = None, height: int | None = None) -> Scene:
@@ -294,7 +302,9 @@ def _albedo(path: Path, shape: tuple[int, int]) -> Texture:
 def read_levels(path: Path) -> np.ndarray:
     """Return a single-channel 8- or 16-bit image as whole numbers (h, w) float64, whatever its mode."""
     with opened_image(path, "depth image") as image:
-        values = np.asarray(image)
+        deep = len(image.getbands()) > 1 and any("16" in str(tile.args) for tile in getattr(image, "tile", ()))
+        require(not deep, f"16 bits in {len(image.getbands())} channels, of which 8 would be read; save one channel")
+        values = np.asarray(image.convert("RGB") if image.mode == "P" else image)
     if values.ndim == 3 and (values[..., :1] == values[..., :3]).all():
         values = values[..., 0]
     integer = values.ndim == 2 and np.issubdtype(values.dtype, np.integer)

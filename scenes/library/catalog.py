@@ -73,7 +73,7 @@ def _loaded(spec: str, seed: int, width: int | None, height: int | None) -> Scen
     if (Path(spec) / "disp1.png").is_file():
         from scenes.io.relief import middlebury
 
-        return middlebury(Path(spec), width=width or (None if height else WIDTH), height=height)
+        return middlebury(Path(spec), width=WIDTH if width is None and height is None else width, height=height)
     if spec not in SCENES and kind not in EXTENSIONS:
         families = ", ".join(f"{family}NAME" for family in FAMILIES)
         raise InputError(
@@ -113,7 +113,9 @@ def _of_a_set(spec: str, seed: int, width: int | None, height: int | None) -> Sc
 
     family, _, name = spec.partition("/")
     if family == "middlebury":
-        return middlebury(middlebury_folder(name), width=width or (None if height else WIDTH), height=height)
+        return middlebury(
+            middlebury_folder(name), width=WIDTH if width is None and height is None else width, height=height
+        )
     if family == "tabletop":
         if name not in TABLETOP:
             raise InputError(f"scene {spec!r}: expected tabletop/ and one of {', '.join(TABLETOP)}")

@@ -39,6 +39,7 @@ class SceneSet:
     def view(self, index: int, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
         most = LARGEST if self.size is None else self.size
         require(0 <= index < most, f"set {self.name}: view {index} is outside 0 to {most - 1}")
+        require(seed >= 0, f"set {self.name}: seed {seed} is not a whole number of 0 or more")
         return self.make(index, seed, width, height)
 
 
@@ -64,11 +65,17 @@ def scene_set(name: str) -> SceneSet:
     return SceneSet(name, len(names), make, lambda index: f"{name}/{names[index]}")
 
 
+def _sides(width: int | None, height: int | None) -> dict[str, int]:
+    """Return both sides of a view without an end: one alone makes a square."""
+    side = next((side for side in (width, height) if side is not None), 64)
+    return {"width": side if width is None else width, "height": side if height is None else height}
+
+
 def _rooms(name: str, split: str) -> SceneSet:
     from scenes.library.rooms import VIEWS_PER_ROOM, room_name, room_view
 
     def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
-        return room_view(index, split, seed=seed, width=width or height or 64, height=height or width or 64)
+        return room_view(index, split, seed=seed, **_sides(width, height))
 
     return SceneSet(name, None, make, lambda index: room_name(index, split), VIEWS_PER_ROOM)
 
@@ -77,7 +84,7 @@ def _clutter(name: str, split: str) -> SceneSet:
     from scenes.library.clutter_set import clutter_view
 
     def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
-        return clutter_view(index, split, seed=seed, width=width or height or 64, height=height or width or 64)
+        return clutter_view(index, split, seed=seed, **_sides(width, height))
 
     return SceneSet(name, None, make, lambda index: f"{name}/{index}")
 

@@ -154,3 +154,13 @@ def test_a_material_library_with_tabs_is_read_and_a_second_one_is_noted(tmp_path
     assert scene.surfaces[0].material.albedo == 1 and any("only one.mtl is read" in note for note in scene.notes)
     (tmp_path / "m.obj").write_text(f"mtllib \n{corners}f 1 2 3\n")
     assert load_scene(str(tmp_path / "m.obj")).surfaces[0].material.albedo == 0.6
+
+
+@pytest.mark.parametrize("family", ["rooms", "clutter"])
+def test_views_of_endless_sets_take_no_zero_and_no_negative_seed(family):
+    assert size(load_scene(f"{family}/val/0", height=24)) == (24, 24)
+    for width, height in ((0, None), (16, 0)):
+        with pytest.raises(InputError, match=r"^camera (width|height) 0 [^\n]*$"):
+            load_scene(f"{family}/val/0", width=width, height=height)
+    with pytest.raises(InputError, match=r"seed -1 is not a whole number of 0 or more"):
+        load_scene(f"{family}/val/0", seed=-1)

@@ -246,3 +246,29 @@ def test_two_uv_transforms_and_missing_uv_are_refused(tmp_path: Path) -> None:
     assert "different to_uv" in refusal(tmp_path, masked)
     bare = f'<shape type="obj"><string name="filename" value="bare.obj"/>{inner}</shape>'
     assert "bare.obj: mesh bare: its material has a texture" in refusal(tmp_path, bare)
+
+
+def test_textures_that_nobody_asks_for_are_noted_and_doubled_ones_refused(tmp_path: Path) -> None:
+    """A mistyped name leaves the default colour, or the default light."""
+    image(tmp_path, "a.png", np.full((2, 2, 3), 200))
+    bitmap = '<texture type="bitmap"{}><string name="filename" value="a.png"/></texture>'
+    named = [bitmap.format(f' name="{name}"') for name in ("reflectance", "difuse_reflectance", "radience")]
+    shape = '<shape type="rectangle">{}</shape>'
+    for inside, words in (
+        (f'<bsdf type="diffuse">{named[1]}</bsdf>', "parameter difuse_reflectance is not used"),
+        (f'<bsdf type="mask">{bitmap.format("")}<bsdf type="diffuse"/></bsdf>', "a texture without a name is not used"),
+        (f'<emitter type="area">{named[2]}</emitter>', "parameter radience is not used"),
+    ):
+        assert any(words in note for note in load(tmp_path, shape.format(inside)).notes)
+    assert load(tmp_path, shape.format(f'<bsdf type="diffuse">{named[0]}</bsdf>')).notes == ()
+    for other in (named[0], GREY):
+        assert "reflectance is given twice" in refusal(
+            tmp_path, shape.format(f'<bsdf type="diffuse">{named[0]}{other}</bsdf>')
+        )
+
+
+@pytest.mark.parametrize("kind", ["diffuse", "roughdiffuse"])
+def test_version_06_knows_two_names_of_a_matte_colour(tmp_path: Path, kind: str) -> None:
+    bsdf = f'<bsdf type="{kind}"><rgb name="diffuseReflectance" value="0.1"/></bsdf>'
+    assert material(tmp_path, bsdf, version="0.6.0").albedo == pytest.approx(0.1)
+    assert material(tmp_path, bsdf).albedo == 0.5

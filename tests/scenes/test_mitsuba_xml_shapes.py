@@ -79,6 +79,15 @@ def test_bare_obj_gets_smooth_normals_unless_asked(tmp_path: Path, mitsuba: obje
     assert flat.surfaces[0].normals is None
 
 
+def test_smooth_normals_know_no_materials_of_the_file(tmp_path: Path, mitsuba: object) -> None:
+    vertices = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 0 1\nv 0 1 1\n"
+    (tmp_path / "two.obj").write_text(f"{vertices}usemtl a\nf 1 2 3\nusemtl b\nf 2 4 5 3\n")
+    path = write(tmp_path, '<shape type="obj"><string name="filename" value="two.obj"/></shape>')
+    ray = [0.48, 0.48, 5.0], [0.0, 0.0, -1.0]
+    ours = first_hit(load_mitsuba_xml(path).surfaces[0], *ray)[1]
+    assert ours == pytest.approx(np.array(mitsuba(path, rays=[ray])["hits"][0][1]), abs=1e-4)
+
+
 def test_a_mesh_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import trimesh
 

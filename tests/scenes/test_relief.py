@@ -1,11 +1,13 @@
 """RGB-D reliefs: dequantising, holes, cuts, and depth in every pixel."""
 
+import struct
+import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from scenes import Texture
+from scenes import InputError, Texture
 from scenes.io.relief import RgbdFiles, dequantised, filled, middlebury, middlebury_names, read_levels, relief, rgbd
 
 GREY = Texture(np.full((40, 60), 0.4, np.float32), "grey")
@@ -111,3 +113,27 @@ def test_middlebury_reliefs_keep_their_disparities(shared_data, monkeypatch):
     known = levels > 0
     off = np.abs(3740 * 0.160 / axial - float((folder / "dmin.txt").read_text()) - levels)[known]
     assert (off <= 0.5).mean() >= 0.95 and np.isfinite(axial).all()
+
+
+def test_depth_images_of_a_palette_are_its_colours(tmp_path):
+    """A palette in any order, as image optimisers make it."""
+    from PIL import Image
+
+    levels = np.arange(1, 13, dtype=np.uint8).reshape(3, 4)
+    image = Image.fromarray(12 - levels)
+    image.putpalette([value for index in range(256) for value in (max(12 - index, 0),) * 3])
+    image.save(tmp_path / "depth.png")
+    with Image.open(tmp_path / "depth.png") as saved:
+        assert saved.mode == "P"
+    assert (read_levels(tmp_path / "depth.png") == levels).all()
+
+
+def test_depth_images_of_16_bits_in_several_channels_are_refused(tmp_path):
+    """Pillow would read their upper 8 bits."""
+    levels = np.repeat(np.array([[1000, 2000], [3000, 4000]], ">u2")[..., None], 3, axis=-1)
+    rows = b"".join(b"\0" + row.tobytes() for row in levels)
+    parts = ((b"IHDR", struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 0)), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+    chunks = [struct.pack(">I", len(d)) + name + d + struct.pack(">I", zlib.crc32(name + d)) for name, d in parts]
+    (tmp_path / "depth.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    with pytest.raises(InputError, match=r"^[^\n]*depth\.png: 16 bits in 3 channels[^\n]*$"):
+        read_levels(tmp_path / "depth.png")

@@ -1,0 +1,227 @@
+"""Mesh files as their formats mean them, where trimesh reads something else: indices, units, colours, coordinates."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scenes import InputError, Scene, Surface
+from scenes.io import meshes
+from scenes.io.meshes import load_mesh
+from scenes.io.textures import luminance, srgb_to_linear
+from scenes.placing import Placing
+
+AS_FILE = Placing(scale=1, bare=True)
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], np.float32)
+UV = np.array([(0, 1), (1, 1), (1, 0), (0, 0)], np.float32)
+TEXTURED = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+
+
+def written(path: Path, content: str | bytes) -> Path:
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def only(scene: Scene) -> Surface:
+    assert len(scene.surfaces) == 1
+    return scene.surfaces[0]
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        load_mesh(path, placing=AS_FILE)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    return message
+
+
+def glb(path: Path, attributes: dict[str, np.ndarray], material: dict | None = None, **primitive: object) -> Path:
+    """Write a square: whole numbers of attributes are normalized; its one image is a grey ramp."""
+    picture = io.BytesIO()
+    Image.fromarray(np.arange(0, 256, 4, dtype=np.uint8).reshape(8, 8)).convert("RGB").save(picture, "PNG")
+    names = {"float32": 5126, "uint16": 5123, "uint8": 5121, "int16": 5122}
+    arrays = [*attributes.values(), np.array([0, 1, 2, 0, 2, 3], np.uint16)]
+    blocks = [*(array.tobytes() for array in arrays), picture.getvalue()]
+    starts = np.cumsum([0, *(len(block) + -len(block) % 4 for block in blocks)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(block)}
+        for start, block in zip(starts, blocks, strict=False)
+    ]
+    accessors = [
+        {
+            "bufferView": i,
+            "componentType": names[array.dtype.name],
+            "count": len(array),
+            "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
+            "normalized": array.dtype.kind in "iu" and array.ndim > 1,
+        }
+        for i, array in enumerate(arrays)
+    ]
+    used = {"material": 0} if material is not None else {}
+    one = {
+        "attributes": {name: i for i, name in enumerate(attributes)},
+        "indices": len(arrays) - 1,
+        **used,
+        **primitive,
+    }
+    header = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [one]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": starts[-1]}],
+        "images": [{"bufferView": len(blocks) - 1, "mimeType": "image/png"}],
+        "textures": [{"source": 0}],
+        "materials": [] if material is None else [material],
+    }
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    binary = b"".join(block + b"\0" * (-len(block) % 4) for block in blocks)
+    size = 28 + len(text) + len(binary)
+    head = b"glTF" + struct.pack("<IIII", 2, size, len(text), 0x4E4F534A)
+    return written(path, head + text + struct.pack("<II", len(binary), 0x4E4942) + binary)
+
+
+# --- OBJ -------------------------------------------------------------------------------------------------------------
+
+
+def test_relative_indices_count_from_their_line(tmp_path: Path) -> None:
+    second = SQUARE.replace(" 0\n", " 2\n")
+    text = f"{SQUARE}vt 0 0\nf -4/-1 -3/-1 -2/-1 -1/-1\n{second}vt 1 1\nf -4/-1 -3/-1 -2/-1 -1/-1 # the last\n"
+    surface = only(load_mesh(written(tmp_path / "a.obj", text), placing=AS_FILE))
+    assert len(surface.faces) == 4 and np.ptp(surface.vertices, axis=0) == pytest.approx((1, 1, 2))
+    near = surface.vertices[:, 2] < 0
+    assert (surface.uv[near] == 0).all() and (surface.uv[~near] == 1).all()
+
+
+@pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 0", "f -5 -4 -3", "f 1/1 0/1 2/1"])
+def test_an_index_of_no_vertex_is_refused_with_its_line(tmp_path: Path, face: str) -> None:
+    assert "line 5: a face's index" in refusal(written(tmp_path / "a.obj", f"{SQUARE}{face}\n"))
+
+
+def test_indents_tabs_and_comments_change_nothing(tmp_path: Path) -> None:
+    written(tmp_path / "a.mtl", "newmtl a\nKd 0.5 0.5 0.5\n")
+    text = f"# mtllib b.mtl\n  mtllib a.mtl\n{SQUARE}".replace("v ", "v\t") + "usemtl a\n\tf 1 2 3\n  f 1 3 \\\n 4\n"
+    surface = only(load_mesh(written(tmp_path / "a.obj", text), placing=AS_FILE))
+    assert len(surface.faces) == 2
+    assert surface.material.albedo == pytest.approx(float(srgb_to_linear(0.5)))
+
+
+@pytest.mark.parametrize(
+    ("words", "metres"),
+    [
+        ("units: microns", 0.9),
+        ("unit mesh", 0.9),
+        ("units in use", 0.9),
+        ("units: metric", 0.9),
+        ("units: m", 900),
+        ("Unit = metres", 900),
+        ("units=in", 900 * 0.0254),
+        ("units in cm", 9),
+    ],
+)
+def test_a_unit_is_a_whole_word(tmp_path: Path, words: str, metres: float) -> None:
+    """What names no unit leaves 900 of them to be millimetres."""
+    path = written(tmp_path / "a.obj", f"# {words}\nv 0 0 0\nv 900 0 0\nv 0 900 0\nf 1 2 3\n")
+    assert np.ptp(load_mesh(path, placing=Placing(bare=True)).surfaces[0].vertices, axis=0).max() == pytest.approx(
+        metres
+    )
+
+
+def test_cut_outs_of_an_obj_are_noted(tmp_path: Path) -> None:
+    written(tmp_path / "a.mtl", "newmtl a\nKd 0.5 0.5 0.5\nmap_d leaf.png\n")
+    scene = load_mesh(written(tmp_path / "a.obj", f"mtllib a.mtl\n{SQUARE}usemtl a\nf 1 2 3 4\n"), placing=AS_FILE)
+    assert "a: alpha (map_d) is left out, its surface is opaque" in scene.notes
+
+
+# --- PLY -------------------------------------------------------------------------------------------------------------
+
+
+def ply(comment: str = "", colour: str = "") -> str:
+    kinds = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) if colour else ""
+    rows = "".join(f"{x} {y} 0 {x} {y} {colour}\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+    coordinates = "".join(f"property float {name}\n" for name in "xyzuv")
+    head = f"ply\nformat ascii 1.0\n{comment}element vertex 3\n{coordinates}{kinds}element face 1\n"
+    return f"{head}property list uchar int vertex_index\nend_header\n{rows}3 0 1 2\n"
+
+
+def test_coordinates_without_a_texture_are_no_colour(tmp_path: Path) -> None:
+    scene = load_mesh(written(tmp_path / "a.ply", ply()), placing=AS_FILE)
+    assert only(scene).material.albedo == 0.6 and any("no colour" in note for note in scene.notes)
+    scene = load_mesh(written(tmp_path / "b.ply", ply(colour="128 128 128")), placing=AS_FILE)
+    assert only(scene).material.albedo == pytest.approx(float(srgb_to_linear(128 / 255)))
+
+
+def test_a_ply_without_its_texture_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path / "a.ply", ply("comment TextureFile skin.png\n"))
+    assert "skin.png" in refusal(path)
+    written(tmp_path / "skin.png", b"no image")
+    with pytest.raises(InputError, match=r"skin\.png: not an image"):
+        load_mesh(path)
+    assert capfd.readouterr().err == ""
+    Image.new("RGB", (4, 4), (128, 128, 128)).save(tmp_path / "skin.png")
+    pixels = only(load_mesh(path, placing=AS_FILE)).material.albedo.image
+    assert pixels == pytest.approx(np.full((4, 4), srgb_to_linear(128 / 255)))
+
+
+# --- GLB -------------------------------------------------------------------------------------------------------------
+
+_TRANSFORM = {"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}}
+
+
+@pytest.mark.parametrize(
+    ("attributes", "material", "primitive", "words"),
+    [
+        ({"TEXCOORD_0": (UV * 65535).astype(np.uint16)}, TEXTURED, {}, "whole numbers"),
+        ({"POSITION": (CORNERS * 32767).astype(np.int16)}, None, {}, "normalized"),
+        ({"TEXCOORD_0": UV}, {"pbrMetallicRoughness": {"baseColorTexture": _TRANSFORM}}, {}, "KHR_texture_transform"),
+        (
+            {"TEXCOORD_0": UV, "TEXCOORD_1": UV},
+            {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}},
+            {},
+            "TEXCOORD_1",
+        ),
+        ({}, None, {"mode": 6}, "triangle fan"),
+    ],
+)
+def test_what_would_be_read_as_something_else_is_refused(
+    tmp_path: Path, attributes: dict, material: dict | None, primitive: dict, words: str
+) -> None:
+    assert words in refusal(glb(tmp_path / "a.glb", {"POSITION": CORNERS} | attributes, material, **primitive))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.uint8, np.uint16])
+@pytest.mark.parametrize("factor", [None, 0.8])
+def test_colours_per_vertex_count_whatever_their_type_and_material(
+    tmp_path: Path, kind: type, factor: float | None
+) -> None:
+    most = 1 if kind is np.float32 else np.iinfo(kind).max
+    colours = np.broadcast_to(np.array((0.21, 0.43, 0.64, 1)) * most, (4, 4)).astype(kind)
+    material = None if factor is None else {"pbrMetallicRoughness": {"baseColorFactor": [factor] * 3 + [1]}}
+    path = glb(tmp_path / "a.glb", {"POSITION": CORNERS, "COLOR_0": colours}, material)
+    expected = float(luminance(np.array((0.21, 0.43, 0.64)))) * (factor or 1)
+    assert only(load_mesh(path, placing=AS_FILE)).material.albedo == pytest.approx(expected, abs=3e-3)
+
+
+def test_a_textures_tint_is_that_of_its_vertices_and_alpha_is_noted(tmp_path: Path) -> None:
+    values = {"POSITION": CORNERS, "TEXCOORD_0": UV}
+    plain = only(load_mesh(glb(tmp_path / "a.glb", values, TEXTURED), placing=AS_FILE)).material.albedo.image
+    tinted = glb(tmp_path / "b.glb", values | {"COLOR_0": np.full((4, 4), 0.5, np.float32)}, TEXTURED)
+    assert only(load_mesh(tinted, placing=AS_FILE)).material.albedo.image == pytest.approx(plain / 2)
+    cut = load_mesh(glb(tmp_path / "c.glb", values, TEXTURED | {"alphaMode": "MASK"}), placing=AS_FILE)
+    assert any("alpha is left out" in note for note in cut.notes)
+
+
+def test_a_texture_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(meshes, "MAX_PIXELS", 63)
+    path = glb(tmp_path / "a.glb", {"POSITION": CORNERS, "TEXCOORD_0": UV}, TEXTURED)
+    assert "has 64 pixels, the limit is 63" in refusal(path)
