@@ -244,7 +244,11 @@ class CompressiveLayer(nn.Module):
 
     def coding(self) -> CodingTensor:
         """Return the weights as they are now, constraint and pulse applied; separable ones stay so."""
-        return CodingTensor(self.name, self._temporal_part(), self._spatial_part(), computed=self.computed)
+        steps = None
+        if self.options.int8:
+            of_spatial = 1.0 if self.spatial is None else float(self._spatial_steps()[1].detach())
+            steps = float(self._temporal_steps()[1].detach()), of_spatial
+        return CodingTensor(self.name, self._temporal_part(), self._spatial_part(), self.computed, steps)
 
     def raw_coding(self) -> CodingTensor:
         """Return the weights as they are now with the constraint alone, before the pulse and without steps."""

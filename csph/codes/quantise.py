@@ -76,10 +76,12 @@ def _to_int8(values: Tensor, scale: float | None = None) -> tuple[np.ndarray, fl
 def quantised(coding: CodingTensor) -> Quantised:
     """Round every factor to the nearest of 255 steps between plus and minus its largest magnitude.
 
-    This is what an in-pixel core computes with: one 8-bit tensor, of separable factors their product in integers.
+    This is what an in-pixel core computes with: one 8-bit tensor, of separable factors their product in integers. A
+    tensor that is in steps already keeps them.
     """
-    spatial = (None, 1.0) if coding.spatial is None else _to_int8(coding.spatial)
-    return from_factors(coding.name, _to_int8(coding.temporal), spatial)
+    steps = coding.steps or (None, None)
+    spatial = (None, 1.0) if coding.spatial is None else _to_int8(coding.spatial, steps[1])
+    return from_factors(coding.name, _to_int8(coding.temporal, steps[0]), spatial)
 
 
 def from_factors(
@@ -108,7 +110,8 @@ def published_int8(coding: CodingTensor) -> CodingTensor:
         return torch.from_numpy(steps.astype(np.float32) * np.float32(scale))
 
     spatial = None if coding.spatial is None else rounded(coding.spatial)
-    return replace(coding, name=f"{coding.name} int8 as published", temporal=rounded(coding.temporal), spatial=spatial)
+    name, temporal = f"{coding.name} int8 as published", rounded(coding.temporal)
+    return replace(coding, name=name, temporal=temporal, spatial=spatial, steps=None)
 
 
 class IntegerCodes(NamedTuple):

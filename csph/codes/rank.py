@@ -8,8 +8,9 @@ from torch import Tensor
 
 
 def pixel_gram(weights: Tensor) -> Tensor:
-    """Return inner products of what the codes of a tensor (K, Mt, Mr, Mc) are for each two pixels, (Mr Mc, Mr Mc)."""
-    rows = weights.flatten(2).flatten(0, 1)
+    """Return inner products of what the codes of a tensor (K, Mt, Mr, Mc), or (K, Mt) of one pixel, are for each two
+    pixels, (Mr Mc, Mr Mc)."""
+    rows = weights.reshape(weights.shape[0] * weights.shape[1], -1)
     return rows.T @ rows
 
 

@@ -32,6 +32,7 @@ from spad.sensor.template import binned_pulse
 
 FIXED_CODES = ("fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 GROUPS = 64  # of neighbouring time bins that `grouped_energy` tells apart
+MAX_SEED = (1 << 63) - 1  # torch's generators take a bit more, and spatial codes begin 2^32 further on
 BAND_LIMIT = 0.2  # of the pulse's spectrum at harmonic 1: what Gray Fourier keeps
 
 
@@ -133,10 +134,15 @@ def walsh_hadamard(codes: int, bins: int) -> Tensor:
     return (1 - 2 * parity).float()
 
 
+def _generator(seed: int) -> torch.Generator:
+    require(0 <= seed <= MAX_SEED + (1 << 32), f"seed {seed} is outside 0 to {MAX_SEED}")
+    return torch.Generator().manual_seed(seed)
+
+
 def uniform_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
     """Return uniform in +-1/sqrt(taps), float32: where learned factors begin; taps is the number of entries of one
-    code."""
-    generator = torch.Generator().manual_seed(seed)
+    code. Raises InputError for a seed that is no generator's."""
+    generator = _generator(seed)
     return (2 * torch.rand(shape, generator=generator) - 1) / math.sqrt(taps)
 
 
@@ -145,8 +151,9 @@ def orthogonal_start(shape: tuple[int, ...], taps: int, seed: int) -> Tensor:
 
     All rows have the root mean square length of `uniform_start`'s, 1/sqrt(3). Any `taps` rows that follow one another
     from a multiple of `taps` are orthogonal; of K a multiple of `taps` so are the columns, and the rank is full.
+    Raises InputError for a seed that is no generator's.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = _generator(seed)
     stacked = []
     for _ in range(math.ceil(shape[0] / taps)):
         factor, triangle = torch.linalg.qr(torch.randn(taps, taps, generator=generator, dtype=torch.float64))

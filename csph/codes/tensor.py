@@ -27,6 +27,8 @@ class CodingTensor:
     spatial   (K, Mr, Mc) float32 of a separable tensor, C[k, t, r, c] = temporal[k, t] spatial[k, r, c]; else None
     computed  how many numbers generate the temporal part on the fly, whatever K (Fourier: Mt/4, a quarter wave);
               None where it is stored entry by entry
+    steps     weight of one step of the temporal and of the spatial part where both are whole steps within +-127
+              already, as those of a layer trained with `int8`; None for others
 
     Raises InputError for other shapes, values that are not finite, and more codes than counts.
     """
@@ -35,6 +37,7 @@ class CodingTensor:
     temporal: Tensor
     spatial: Tensor | None = None
     computed: int | None = None
+    steps: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for label, ranks, layout in (

@@ -120,7 +120,7 @@ class Evaluation:
         estimate, truth = (
             np.concatenate(parts) for parts in zip(*(pair for m in methods for pair in self.depths[m]), strict=True)
         )
-        far = math.ceil(float(np.nanmax(truth, initial=1.0)))
+        far = math.floor(float(np.nanmax(truth, initial=0.0))) + 1  # a depth of whole metres begins an interval
         return {**table, "bias_by_depth": [b._asdict() for b in bias_by_depth(estimate, truth, range(far + 1))]}
 
 
@@ -157,6 +157,9 @@ def evaluate(
     method, an image smaller than a tile, and what the methods raise.
     """
     require(bool(views.transients) and bool(methods), "evaluation: no view or no method")
+    for transient, scene in zip(views.transients, views.scenes, strict=True):  # told now, not after an hour
+        lit = bool(transient.radiance.any())
+        require(lit, f"evaluation: no light returns from a view of {scene}, its photons cannot be had")
     retain_freed_memory()
     report, result = progress or (lambda what, fraction: None), Evaluation(depths={name: [] for name in methods})
     total = len(views.transients) * len(plan.levels)

@@ -139,7 +139,8 @@ def bootstrap_mean(values: Mapping[str, ArrayLike], *, draws: int = 2000, seed: 
 def paired_difference(first: Mapping[str, ArrayLike], second: Mapping[str, ArrayLike], **bootstrap: int) -> Interval:
     """Return mean of first - second, value by value, with its interval; both as in `bootstrap_mean`.
 
-    What makes a scene or a level hard is in both and cancels. Other numbers of seeds: of the means over seeds.
+    What makes a scene or a level hard is in both and cancels. Other numbers of seeds: of the means over seeds. NaN
+    where no value of both is finite.
     """
     scenes = [scene for scene in first if scene in second]
     require(bool(scenes), "paired difference: the two have no scene in common")
@@ -148,4 +149,6 @@ def paired_difference(first: Mapping[str, ArrayLike], second: Mapping[str, Array
         a, b = (np.atleast_2d(np.asarray(v[scene], float)) for v in (first, second))
         require(a.shape[1] == b.shape[1], f"paired difference: scene {scene} has other levels in the two")
         differences[scene] = a - b if len(a) == len(b) else a.mean(0) - b.mean(0)
+    if not any(np.isfinite(values).any() for values in differences.values()):
+        return Interval(math.nan, math.nan, math.nan)
     return bootstrap_mean(differences, **bootstrap)

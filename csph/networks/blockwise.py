@@ -87,10 +87,11 @@ def _repeated(mixer: dict[str, Tensor], larger: dict[str, Tensor]) -> dict[str, 
 def code_features(codes: Tensor, *, centre: bool = True) -> Tensor:
     """Return what `BlockMixer` sees of codes (B, K, T/Mt, R/Mr, C/Mc), free of their scale: unit codes, and the
     fraction of the block's signal in each time block, (B, T/Mt, R/Mr, C/Mc, K + 1); `centre` as `zero_normalised`."""
-    centred = codes - codes.mean(1, keepdim=True) if centre else codes
-    norm = centred.norm(dim=1, keepdim=True)
-    fraction = norm / norm.norm(dim=2, keepdim=True).clamp(min=1e-20)
-    return torch.cat([zero_normalised(codes, 1, centre=centre), fraction], 1).permute(0, 2, 3, 4, 1)
+    with torch.autocast(codes.device.type, enabled=False):  # 16 bits would overflow in a bright block's mean
+        centred = codes - codes.mean(1, keepdim=True) if centre else codes
+        norm = centred.norm(dim=1, keepdim=True)
+        fraction = norm / norm.norm(dim=2, keepdim=True).clamp(min=1e-20)
+        return torch.cat([zero_normalised(codes, 1, centre=centre), fraction], 1).permute(0, 2, 3, 4, 1)
 
 
 class Blockwise(Compact):

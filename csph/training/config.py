@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 from csph.codes.design import Design
+from csph.codes.temporal import MAX_SEED
 from csph.evaluation.metrics import TRAIN_LEVELS
 from csph.layer import STARTS, SpatialStart
 from csph.networks.grid import GRIDS, Grid
@@ -216,7 +217,9 @@ class TrainConfig:
         require(0 <= self.threads <= MAX_THREADS, f"training: threads {self.threads} is outside 0 to {MAX_THREADS}")
         require(0 < self.rate < 1, f"training: learning rate {self.rate:g} is outside 0 to 1")
         require(0 < self.decay <= 1, f"training: decay {self.decay:g} is outside (0, 1]")
-        require(self.tv_weight >= 0, f"training: weight {self.tv_weight:g} of the total variation is negative")
+        require(0 <= self.seed <= MAX_SEED, f"training: seed {self.seed} is outside 0 to {MAX_SEED}")
+        good = 0 <= self.tv_weight < math.inf
+        require(good, f"training: weight {self.tv_weight:g} of the total variation is negative or infinite")
         require(0 <= self.time_offset_m < math.inf, f"training: time offset {self.time_offset_m:g} m is negative")
         require(self.precision in PRECISIONS, f"precision {self.precision!r}: expected {', '.join(PRECISIONS)}")
         rows, columns = self.model.block[1:]
@@ -241,7 +244,11 @@ class TrainConfig:
         require(0 <= self.init_share < 1, f"training: init_share {self.init_share:g} is outside [0, 1)")
         good = math.isfinite(self.decoded_weight) and self.decoded_weight >= 0
         require(good, f"training: weight {self.decoded_weight:g} of the decoded error is negative")
-        require(self.coherence >= 0, f"training: weight {self.coherence:g} of the coherence is negative")
+        good = 0 <= self.coherence < math.inf
+        require(good, f"training: weight {self.coherence:g} of the coherence is negative or infinite")
+        several = math.prod(self.model.block[1:]) > 1
+        refusal = f"training: weight {self.coherence:g} of the coherence is for codes over several pixels"
+        require(several or not self.coherence, f"{refusal}, not {self.model.name}")
         weighted = all(math.isfinite(weight) and weight > 0 for weight in self.weights)
         require(weighted, f"training: set weights {', '.join(map(str, self.weights))} are not all positive")
         if self.window:

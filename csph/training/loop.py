@@ -45,7 +45,7 @@ from csph.training.optimiser import make_optimiser
 from csph.training.resume import WholeFileCheckpoints, check_resume
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
-from csph.training.views import Views, check_direct, packed_sha256
+from csph.training.views import Views, check_direct, check_light, packed_sha256
 from csph.weights.shipped import RESUME, TIMINGS
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import InputError, require
@@ -58,6 +58,11 @@ from spad.detection.training_patches import PackedViews, pack_views
 log = logging.getLogger("csph")
 
 EXCESS_WEIGHT = 10.0  # of sums beyond 16 bits
+
+
+def _strict_mean() -> MeanMetric:
+    """Make a mean that is NaN where a value is: by default those are left out, and a warning is all that is said."""
+    return MeanMetric(nan_strategy=math.nan)
 
 
 def _mean(means: nn.ModuleDict, decoder: str) -> MeanMetric:
@@ -83,9 +88,9 @@ class DepthTraining(pl.LightningModule):
         self.begun = [part.detach().clone() for part in self.model.parameters()] if config.init_share else []
         if config.average:  # a module of its own: Lightning's checkpoint then holds it
             self.averaged = deepcopy(self.model).requires_grad_(False).eval()
-        self.train_loss = MeanMetric()
-        self.squared_m2 = nn.ModuleDict({name: MeanMetric() for name in DECODERS})
-        self.absolute_m = nn.ModuleDict({name: MeanMetric() for name in DECODERS})
+        self.train_loss = _strict_mean()
+        self.squared_m2 = nn.ModuleDict({name: _strict_mean() for name in DECODERS})
+        self.absolute_m = nn.ModuleDict({name: _strict_mean() for name in DECODERS})
 
     @property
     def kept(self) -> DepthModel:
@@ -171,7 +176,8 @@ class Record(pl.Callback):
 
     @property
     def best_mm(self) -> float:
-        return min((row["val_rmse_mm"] for row in self.rows), default=float("inf"))
+        errors = (row["val_rmse_mm"] for row in self.rows)
+        return min((error for error in errors if not math.isnan(error)), default=math.inf)
 
     def state_dict(self) -> dict[str, list[dict[str, float]]]:
         return {"rows": self.rows}
@@ -346,6 +352,7 @@ def train(
     if config.model.grid == "published":
         check_direct([*_listed(training), *_listed(validation)])
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
+    check_light([_listed(views) for views in (training, validation)], sets, config.model.sensor)
     module_data = SetData(sets[0], sets[1], config, hardware.workers)
     record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():

@@ -35,10 +35,12 @@ class CodeEnergy(pl.Callback):
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: object) -> None:
         step, last = trainer.global_step, module.config.steps
-        if step == last or step % max(1, last // SNAPSHOTS) == 0:
+        if step != last and step % max(1, last // SNAPSHOTS) == 0:
             self._keep(module, step)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if trainer.global_step == module.config.steps:  # of the code that is kept: by now it holds `init_share`
+            self._keep(module, trainer.global_step)
         if self.rows and trainer.is_global_zero:
             write_csv(self.rows, self.folder / "energy.csv")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from scenes.errors import require
 from scenes.io.set_index import read_set_index
 from scenes.json_types import JsonObject
 from spad.detection.training_patches import PackedViews, pack_views
+from spad.sensor.model import Sensor
 
 VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
 
@@ -76,6 +77,26 @@ def check_direct(sets: Iterable[Views]) -> None:
             direct = not (transient.bounces > 1).any()
             message = f"the published grid has one return a pixel, and {scene} has indirect light"
             require(direct, f"{message}: render the set with --bounces 1")
+
+
+def check_light(sets: Sequence[Sequence[Views]], packs: Sequence[Sequence[PackedViews]], sensor: Sensor) -> None:
+    """Raise InputError for a view from which no light returns, whose photons cannot be had, and for a set without a
+    depth within the sensor's range; training sets, then validation sets, as they are and packed."""
+    for name, some, packed_sets in zip(("training", "validation"), sets, packs, strict=True):
+        for views, packed in zip(some, packed_sets, strict=True):
+            for scene, mean in zip(views.scenes, packed.mean_radiance, strict=True):
+                require(mean > 0, f"{name} set: no light returns from a view of {scene}, its photons cannot be had")
+            known = bool((packed.depth_m < sensor.range_m).any())
+            shows = f"{views.scenes[0]} and {len(views.scenes) - 1} views more"
+            require(known, f"{name} set ({shows}): no pixel has a depth within the sensor's {sensor.range_m:.4g} m")
+
+
+def check_truth(path: Path, views: Views, sensor: Sensor, offset_m: float = 0.0) -> None:
+    """Raise InputError for views without a depth to compare with: within the sensor's range, moved away by an offset
+    [m]."""
+    known = any(bool((one.depth_m + offset_m < sensor.range_m).any()) for one in views.transients)
+    moved = f" at an offset of {offset_m:g} m" if offset_m else ""
+    require(known, f"{path}: no pixel has a depth within the sensor's {sensor.range_m:.4g} m{moved}")
 
 
 def packed_sha256(packed: PackedViews) -> str:

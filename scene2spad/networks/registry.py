@@ -100,8 +100,8 @@ class ModelSpec:
         begun = folder / self.plain.name
         return Train(
             design=self.design,
-            block=self.block,
-            compression=self.compression,
+            block=self.block if self.coded else Train.block,
+            compression=self.compression if self.coded else None,
             full=self.full,
             network=None if preset == "paper" else "compact",  # one for all designs, which studies compare
             layer=("int8",) if self.int8 else (),

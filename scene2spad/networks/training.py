@@ -21,13 +21,13 @@ from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.layer import SpatialStart
 from csph.networks.model import DepthModel, load_model
 from csph.training.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
-from csph.training.views import Views, read_views, split_views, training_parts
+from csph.training.views import Views, check_truth, read_views, split_views, training_parts
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.renders import views_at
 from scene2spad.datasets.workers import check_workers
-from scene2spad.options.networks import Evaluate, Train
+from scene2spad.options.networks import Evaluate, Train, check_used
 from scenes.errors import InputError, require
 from scenes.files import write_csv
 from scenes.json_types import JsonObject
@@ -117,7 +117,8 @@ def _compression(command: Train) -> float | None:
 
 def _check_numbers(command: Train) -> None:
     """Raise InputError for numbers of devices, threads and set weights that no training can have, and a share of no
-    model."""
+    model, and what would be ignored."""
+    check_used(command)
     for name, value in (("devices", command.devices), ("threads", command.threads)):
         require(value is None or value >= 1, f"train: --{name} {value} is below 1")
     require(not command.init_share or command.init is not None, "train: --init-share needs --init")
@@ -223,7 +224,8 @@ def classical(name: str) -> Callable[[Tensor, Sensor], Tensor]:
     if name in METHODS:
         return lambda counts, sensor: estimate_depth(counts, sensor, name)
     code, _, number = name.rpartition("-")
-    require(code != "" and number.isdigit(), f"baseline {name!r}: expected {', '.join(METHODS)}, or CODE-K")
+    numbered = code != "" and number.isascii() and number.isdigit()
+    require(numbered, f"baseline {name!r}: expected {', '.join(METHODS)}, or CODE-K")
 
     def compressive(counts: Tensor, sensor: Sensor) -> Tensor:
         coding = _coding(code, int(number), sensor)
@@ -286,6 +288,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     if command.views is not None:
         require(command.views >= 1, f"views {command.views} is below 1")
         views = Views(views.transients[: command.views], views.scenes[: command.views])
+    check_truth(command.set, views, sensor, command.offset)
     overflows: list[int] = []
     methods: dict[str, Method] = {}
     groups: dict[str, list[str]] = {}
@@ -334,14 +337,13 @@ def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[st
 
 
 def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[dict[str, object]]:
-    """Return mean MAE [mm] and share within 10 mm of every level and group; as lines unless `full`."""
-    rows = [row for row in found.rows if row.group == "all"]
+    """Return MAE [mm] and share within 10 mm of every level and group, means over scenes; as lines unless `full`."""
     lines: list[JsonObject] = []
-    for signal, background in dict.fromkeys((row.signal, row.background) for row in rows):
-        here = [row for row in rows if (row.signal, row.background) == (signal, background)]
+    for signal, background in dict.fromkeys((row.signal, row.background) for row in found.rows):
+        here = Evaluation([row for row in found.rows if (row.signal, row.background) == (signal, background)])
         for name, members in groups.items():
-            mine = [row for row in here if row.method in members]
-            means = {key: float(np.nanmean([getattr(row, key) for row in mine])) for key in ("mae_mm", "within_10mm")}
+            found_here = {key: here.interval(members, figure=key) for key in ("mae_mm", "within_10mm")}
+            means = {key: math.nan if one is None else one.mean for key, one in found_here.items()}
             lines.append({"signal": signal, "background": background, "method": name, **means})
     if full:
         return lines

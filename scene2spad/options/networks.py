@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from scene2spad.options.common import Common, Count, Long, Number, Pixels, Positional, may_stay_open
+from scene2spad.options.common import Common, Count, Long, Number, Pixels, Positional, may_stay_open, only_for
 
 TrainingPreset = Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"]
 
@@ -106,6 +107,17 @@ class Train(Long):
     """GPUs (default: all there are)."""
     out: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder of the run (default: out/train and a name from the options)."""
+
+
+def check_used(command: Train) -> None:
+    """Raise InputError for options that a training of this design would ignore."""
+    coded = command.design not in ("none", "peak")
+    learned = command.design == "learned" or command.design.endswith("+learned")
+    spatial = learned and not command.full and math.prod(command.block[1:]) > 1
+    varied = bool(command.tv) or (command.preset == "paper" and not coded)
+    options = dict.fromkeys(("block", "compression", "codes", "full"), (coded, "designs with codes"))
+    options |= {"spatial_start": (spatial, "spatial codes that are learned"), "tv_start": (varied, "--tv above 0")}
+    only_for(command, f"train --design {command.design}", options)
 
 
 @dataclass(frozen=True, kw_only=True)

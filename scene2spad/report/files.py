@@ -98,23 +98,29 @@ def gather(root: Path) -> Found:
 
 
 def smoke_results(files: Mapping[str, Sequence[Path]]) -> set[Path]:
-    """Return the files of every study that ran at toy size: its JSON says so, its files bear its name beside it."""
+    """Return the files of every study that ran at toy size: its JSON says so, its files bear its name beside it, or are
+    among the figures that it names."""
     every = [path for paths in files.values() for path in paths]
     found = set()
     for numbers in (path for path in every if path.suffix == ".json"):
-        if _is_smoke(numbers):
+        figures = _smoke_figures(numbers)
+        if figures is not None:
             beside = (path for path in every if path.parent == numbers.parent)
-            found |= {path for path in beside if f"{path.stem}-".startswith(f"{numbers.stem}-")}
+            mine = f"{numbers.stem}-"
+            found |= {path for path in beside if f"{path.stem}-".startswith(mine) or path.name in figures}
     return found
 
 
-def _is_smoke(path: Path) -> bool:
-    """Return whether a study's numbers are of the preset `smoke`, or rest on models of it."""
+def _smoke_figures(path: Path) -> list[object] | None:
+    """Return the figures that a study's numbers name where they are of the preset `smoke`, or rest on models of it;
+    None where not."""
     try:
         numbers = read_json_object(path)
     except UNREADABLE:
-        return False  # told where it is shown
-    return "smoke" in (numbers.get("preset"), *(model.get("preset") for model in rows_in(numbers.get("models"))))
+        return None  # told where it is shown
+    models, figures = rows_in(numbers.get("models")), numbers.get("figures")
+    smoke = "smoke" in (numbers.get("preset"), *(model.get("preset") for model in models))
+    return (figures if isinstance(figures, list) else []) if smoke else None
 
 
 def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:

@@ -122,3 +122,14 @@ def test_checkpoints_keep_it(tmp_path):
 def test_what_it_does_not_fit_is_refused(config, message):
     with pytest.raises(InputError, match=message):
         replace(BLOCKWISE, **config)
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+def test_features_of_codes_do_not_depend_on_mixed_precision(kind):
+    """Means of bright blocks, in 16 bits, rounded away the codes or overflowed into NaN."""
+    codes = torch.randn(1, 8, 2, 2, 3, generator=torch.Generator().manual_seed(0)) + 50
+    for scale in (1.0, 1e4):
+        exact = code_features(scale * codes)
+        with torch.autocast("cpu", dtype=kind):
+            found = code_features(scale * codes)
+        assert exact.isfinite().all() and torch.equal(found, exact)

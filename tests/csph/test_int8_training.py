@@ -8,7 +8,8 @@ import torch
 from test_training import FEW, SMALL, near_planes
 
 from csph.codes.design import Design
-from csph.codes.quantise import clipped_steps, encode_int16, quantised
+from csph.codes.files import write_codes
+from csph.codes.quantise import clipped_steps, encode_int16, published_int8, quantised
 from csph.layer import CompressiveLayer
 from csph.networks.model import DepthModel, load_model, save_model
 from csph.training.config import ModelConfig, preset
@@ -106,6 +107,28 @@ def test_a_trained_model_begins_one_for_the_chip_and_keeps_its_codes(tmp_path):
     training = split_views(near_planes(3))
     with pytest.raises(InputError, match="in 8 bits cannot begin one without --layer int8"):
         train(preset("smoke", plain.config, **FEW), *training, tmp_path / "run", init=model)
+
+
+@pytest.mark.parametrize("design", [LEARNED, FOURIER, Design("learned", (64, 1, 1), 8)], ids=lambda d: d.name)
+def test_tables_in_files_hold_the_steps_that_were_trained(design, tmp_path):
+    """Ranges that learned headroom leave steps below 127; exported codes were stretched to 127 again."""
+    layer = CompressiveLayer.of(design, int8=True)
+    with torch.no_grad():
+        layer.temporal_range += 0.7
+        if layer.spatial_range is not None:
+            layer.spatial_range += 0.3
+    trained = layer.quantised()
+    assert np.abs(trained.temporal).max() == 63
+    assert np.array_equal(
+        np.load(write_codes(layer.coding(), tmp_path / "c.npy", int8=True)).ravel(), trained.tensor.ravel()
+    )
+    text = write_codes(layer.coding(), tmp_path / "c.txt", int8=True).read_text().splitlines()
+    assert f"one step is {trained.temporal_scale:.9g}" in text[1]
+    assert [int(v) for v in text[2].split()] == trained.temporal[0].ravel().tolist()
+    again = quantised(layer.coding())
+    assert (again.scale, again.spatial_scale) == (trained.scale, trained.spatial_scale)
+    stretched = published_int8(layer.coding())  # another rounding, whose steps are its own
+    assert stretched.steps is None and np.array_equal(quantised(stretched).tensor, quantised(replace(stretched)).tensor)
 
 
 def test_what_the_chip_has_no_table_for_is_refused():

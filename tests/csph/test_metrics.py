@@ -127,6 +127,8 @@ def test_paired_differences_cancel_what_scenes_share():
     assert paired_difference(first, second) == pytest.approx((1, 1, 1))
     trained = {scene: np.stack([values, values + 2]) for scene, values in second.items()}
     assert paired_difference(trained, second) == pytest.approx((1, 1, 1))
+    nothing = paired_difference({"a": [np.nan, 1.0], "b": [np.nan]}, {"a": [1.0, np.nan], "b": [2.0]})
+    assert all(math.isnan(value) for value in nothing)  # no value of both: not known, and no mistake of the user's
     with pytest.raises(InputError, match="no scene in common"):
         paired_difference({"a": [1.0]}, {"b": [1.0]})
     with pytest.raises(InputError, match="scene a has other levels"):

@@ -150,3 +150,16 @@ def test_images_that_blocks_do_not_tile(size):
     found = network.estimate(replace(histogram, **cut))
     assert found.depth_m.shape == found.confidence.shape == size and np.isfinite(found.depth_m).all()
     assert (found.confidence >= 0).all() and (found.confidence <= 1).all()
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+def test_answers_do_not_depend_on_mixed_precision(kind):
+    """A sum in bf16 holds 8 bits, in float16 11: the mean of a peak was off by bins."""
+    logits = torch.full((1, 1024, 1, 2), -20.0)
+    logits[:, 777:780, :, 0] = 5.0
+    logits[:, 901:903, :, 1] = 5.0
+    for decoder in ("soft-argmax", "median"):
+        exact = decoded(logits, decoder)
+        with torch.autocast("cpu", dtype=kind):
+            found = decoded(logits, decoder)
+        assert found.dtype == torch.float32 and torch.equal(found, exact)

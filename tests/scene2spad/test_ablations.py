@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from csph.evaluation.methods import Row
@@ -13,6 +14,7 @@ from scene2spad.cli import main
 from scene2spad.datasets.published import printed
 from scene2spad.networks.registry import ModelSpec
 from scene2spad.networks.training import config_of
+from scene2spad.studies.ablations import figures
 from scene2spad.studies.ablations import plan as plans
 from scene2spad.studies.ablations.study import decided, verdict
 
@@ -81,6 +83,21 @@ def test_a_conclusion_is_decided_scene_by_scene_and_says_what_is_absent():
         more = [*rows, *(row(again, i, 100.0 * i + mae) for i in range(8))]
         found = decided(claim, more, dict.fromkeys((claim.first, claim.second, again)))
         assert found["verdict"] == expected and len(found["second_seeds_mm"]) == 2
+
+
+def test_the_title_of_a_figure_is_the_sheets(monkeypatch, tmp_path):
+    """It was the photon level of the last line of depth images."""
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure) or path)
+    rows = [Row("m", "s", 0, 10.0, 10.0, "all", e, e, 0, 0, 0.5, 1.0, 0.0, 4, 0, 0) for e in (3.0, 5.0)]
+    depth = np.linspace(1, 2, 16).reshape(4, 4)
+    lines = [(level, depth, [depth + 0.01]) for level in ("[10, 10]", "[10, 1000]")]
+    figures.draw("spatial block, 128x", ["learned"], ["m"], rows, lines, tmp_path / "a.png")
+    assert drawn[0].get_suptitle().startswith("spatial block, 128x\n")
+    assert [axes.get_ylabel() for axes in drawn[0].get_axes() if axes.get_ylabel().startswith("[")] == [
+        "[10, 10]",
+        "[10, 1000]",
+    ]
 
 
 @pytest.mark.slow

@@ -101,6 +101,25 @@ def refused(capfd, argv: list[str]) -> str:
         ("train --threads 0", "train: --threads 0 is below 1"),
         ("train --dry-run --preset smoke --set-weights 1 2", "train: 2 --set-weights for 1 sets"),
         ("train --codes 8 --compression 64", "train: give --codes 8 or --compression, not both"),
+        ("train --design none --codes 8 --dry-run", "train --design none: --codes 8 is for designs with codes"),
+        (
+            "train --design none --compression 64 --dry-run",
+            "train --design none: --compression 64 is for designs with codes",
+        ),
+        ("train --design peak --full --dry-run", "train --design peak: --full is for designs with codes"),
+        (
+            "train --design peak --block 512 2 2 --dry-run",
+            "train --design peak: --block 512 2 2 is for designs with codes",
+        ),
+        ("train --design none --coherence 1 --dry-run", "coherence is for codes over several pixels"),
+        (
+            "train --design none --spatial-start orthogonal --dry-run",
+            "orthogonal is for spatial codes that are learned",
+        ),
+        ("train --full --spatial-start orthogonal --dry-run", "orthogonal is for spatial codes that are learned"),
+        ("train --tv-start 9 --dry-run", "train --design learned: --tv-start 9 is for --tv above 0"),
+        ("train --seed 99999999999999999999 --dry-run", "training: seed 99999999999999999999 is outside 0 to 92233"),
+        ("study tensors --seed 99999999999999999999 --out o", "seed 99999999999999999999 is outside 0 to 92233"),
         ("evaluate a --set g.exr --out g.h5", "g.h5: is a file, expected a folder for the table"),
         ("evaluate a --set g.exr --out g.h5/x", "g.h5 is a file, expected a folder"),
         (f"evaluate {MODEL} {MODEL} --set g.exr", f"{MODEL} is the same checkpoint as {MODEL}"),
@@ -130,6 +149,13 @@ def test_a_checkpoint_by_its_folder_and_by_its_file_is_one(tmp_path, capfd):
     shutil.copytree(checkpoint_of(MODEL).parent, tmp_path / "run")
     argv = ["evaluate", str(tmp_path / "run"), str(tmp_path / "run/model.safetensors"), "--set", "g.exr"]
     assert "is the same checkpoint as" in refused(capfd, argv)
+
+
+def test_options_of_a_training_that_mean_something_pass():
+    assert config_of(Train(design="fourier+learned", spatial_start="uniform")).model.spatial_start == "uniform"
+    assert config_of(Train(tv=0.1, tv_start=9)).tv_start == 9
+    assert config_of(Train(design="none", preset="paper", tv_start=9)).tv_start == 9  # whose total variation is on
+    assert config_of(Train(design="none", block=(256, 4, 4))).model.design is None  # at its default
 
 
 def test_compression_is_128_unless_codes_are_given():

@@ -59,6 +59,9 @@ def test_smoke_study_draws_every_figure_and_goes_on_from_what_is_there(capfd, fo
         "real-data-128x.png",
         "real-data-256x.png",
     ]
+    kept = json.loads((folder / "study/real-data.json").read_text())
+    assert kept["preset"] == "smoke" and len(kept["rows"]) == len(result["rows"])  # `report` sets it apart
+    assert [f"study/{name}" for name in kept["figures"]] == result["figures"]
     for figure in result["figures"]:
         assert (folder / figure).read_bytes()[:4] == b"\x89PNG"
     methods = {row["method"] for row in result["rows"]}

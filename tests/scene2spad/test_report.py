@@ -240,6 +240,20 @@ def test_smoke_results_stand_apart_and_never_beside_print(tree, capfd):
         assert "study/fourier-published.csv" in smoke and not page.wrong and not page.open
 
 
+def test_smoke_figures_of_other_names_stand_apart_too(tree, capfd):
+    """The point clouds of `study real-data`."""
+    for number, name in enumerate(("real-data-128x.png", "clouds.png", "codes.png")):
+        put(tree / "study/own" / name, png(20 + number))
+    put(tree / "study/own/real-data.csv", "capture,method,mae_mm\nroom,argmax,98.76\n")
+    for preset, apart in (("laptop", False), ("smoke", True)):
+        put(tree / "study/own/real-data.json", {"preset": preset, "figures": ["real-data-128x.png", "clouds.png"]})
+        _, text = made(tree, capfd)
+        smoke = text[text.find('<section id="smoke"') :]
+        for name in ("real-data-128x.png", "clouds.png", "real-data.csv"):
+            assert (f"study/own/{name}" in smoke and text.count(f"smoke: study/own/{name}") < 3) == apart
+        assert ("98.76" in text) != apart and "smoke: study/own/codes.png" not in text
+
+
 def test_an_empty_folder_makes_a_page_of_what_is_missing(tmp_path, capfd):
     (tmp_path / "results").mkdir()
     message, text = made(tmp_path / "results", capfd)

@@ -24,7 +24,7 @@ from render.transient import write_transient
 from render.transient.packs import write_pack
 from scene2spad.bench import network as bench
 from scene2spad.cli import main
-from scene2spad.datasets.planes import FAR_M, Plane, random_planes
+from scene2spad.datasets.planes import FAR_M, Plane, random_planes, wall
 from scene2spad.networks.training import config_of, group_names
 from scene2spad.options.networks import Train
 from spad.detection.detect import sense
@@ -230,6 +230,7 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
     assert "trained for another sensor" in refused(capfd, *depth, "--checkpoint", str(trained))
     evaluate = ["evaluate", str(trained), "--set", str(packed)]
     assert "expected argmax" in refused(capfd, *evaluate, "--baselines", "guess")
+    assert "expected argmax" in refused(capfd, *evaluate, "--baselines", "fourier-²")
     for level in ("10", "1+x", "0+5", "2+-1", "nan+1"):
         assert f"levels '{level}': expected" in refused(capfd, *evaluate, "--levels", level)
     paper = refused(capfd, "evaluate", str(trained), "--set", "published", "--levels", "1+1")
@@ -261,6 +262,42 @@ def test_a_test_on_views_of_training_says_so(capfd, packed, trained, tmp_path):
         )
         assert bool(told) == said
         assert not said or 0 < int(told[0]) < 6
+
+
+def planes_pack(path: Path, transients, scenes) -> str:
+    write_pack([(t, {"scene": s}) for t, s in zip(transients, scenes, strict=True)], path)
+    return str(path)
+
+
+def test_an_evaluation_without_answers_or_truth(capfd, tmp_path, monkeypatch):
+    """One line that names the set before any work; a method without an answer has none, and the others keep theirs."""
+    monkeypatch.chdir(tmp_path)
+    far = planes_pack(Path("far.h5"), [wall(9.0, 4), wall(10.0, 4)], "ab")
+    command = ("evaluate", "none-s0", "--baselines", "log-matched", "--out", "out", "--levels")
+    told = refused(capfd, *command, "50+1", "--set", far, "--offset", "7")
+    assert told == "scene2spad: far.h5: no pixel has a depth within the sensor's 14.99 m at an offset of 7 m"
+    lit, none = wall(2.0, 4), {"path_near_m": 0, "path_far_m": 0, "radiance": 0, "bounces": 0}
+    dark = replace(lit, offsets=0 * lit.offsets, **{name: getattr(lit, name)[:n] for name, n in none.items()})
+    told = refused(capfd, *command, "50+1", "--set", planes_pack(Path("dark.h5"), [lit, dark], ("lit", "dark")))
+    assert "evaluation: no light returns from a view of dark" in told and not Path("out").exists()
+    found = run(capfd, *command, "0.001+0", "--set", far)
+    nothing = found["methods"]["log-matched"]["all"]["all"]["mae_mm"]
+    assert nothing is None and found["mae_mm"] > 0 and found["by_level"][1]["mae_mm"] is None
+    assert found["mae_difference_mm"]["all"]["log-matched"] == {"mean": None, "low": None, "high": None}
+
+
+def test_figures_of_levels_and_depths_count_scenes_and_every_pixel(capfd, tmp_path, monkeypatch):
+    """Of one level the line's MAE is the headline's, whatever the views of a scene; the farthest pixel has its bias
+    told where it is whole metres away."""
+    monkeypatch.chdir(tmp_path)
+    near = [wall(1.0 + i / 8, 4) for i in range(3)]
+    uneven = planes_pack(Path("uneven.h5"), [*near, wall(3.0, 4)], "aaab")
+    command = ("evaluate", "none-s0", "--baselines", "argmax", "--levels", "3+9", "--set", uneven, "--out", "out")
+    found = run(capfd, *command)
+    by_level = {one["method"]: one["mae_mm"] for one in found["by_level"]}
+    assert by_level == {name: pytest.approx(of["all"]["all"]["mae_mm"]) for name, of in found["methods"].items()}
+    counted = {b["near_m"]: b["pixels"] for b in found["methods"]["argmax"]["bias_by_depth"]}
+    assert counted == {1: 48, 3: 16}
 
 
 def test_bench_network(capfd, tmp_path, monkeypatch):

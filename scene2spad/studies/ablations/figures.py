@@ -47,7 +47,7 @@ def draw(
     points = panel.collections[-1]
     above.colorbar(points, ax=panel, pad=0.01).set_label("signal / background", fontsize=8)
     axes = below.subplots(len(lines), count + 1, squeeze=False)
-    for row, (title, truth, maps) in zip(axes, lines, strict=True):
+    for row, (level, truth, maps) in zip(axes, lines, strict=True):
         known = truth[np.isfinite(truth)]
         margin = 0.5 * known.std()
         colours = {"cmap": DEPTH_COLOURS, "vmin": known.min() - margin, "vmax": known.max() + margin}
@@ -56,7 +56,7 @@ def draw(
             one.set(xticks=[], yticks=[])
             error = 1e3 * np.nanmean(np.abs(depth - truth))
             one.set_title("truth" if depth is truth else f"MAE {error:,.1f} mm", fontsize=7.5)
-        row[0].set_ylabel(title, fontsize=8)
+        row[0].set_ylabel(level, fontsize=8)
         bar = below.colorbar(shown, ax=row[-1], fraction=0.06, pad=0.03)
         bar.set_label("depth [m]", fontsize=7)
         bar.ax.tick_params(labelsize=7)

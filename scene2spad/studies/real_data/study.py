@@ -29,7 +29,7 @@ from scene2spad.studies.real_data import figures
 from scene2spad.studies.real_data.figures import View
 from scenes import Laser, Scene
 from scenes.errors import require
-from scenes.files import write_csv
+from scenes.files import finite, whole_file, write_csv
 from scenes.library.catalog import load_scene
 from scenes.model import Ambient, Texture
 from scenes.progress import Progress
@@ -123,6 +123,10 @@ def run(command: Study, progress: Progress) -> dict:
         for found, title, name in _pages(by_compression)
     ]
     drawn.append(figures.draw_clouds(views, [*methods], depths, f"Point clouds. {note}", command.out / "clouds.png"))
+    # given captures know no preset; `report` sets those of `smoke` apart
+    kept = {"preset": None if command.capture else command.preset, "note": note, "figures": [p.name for p in drawn]}
+    with whole_file(command.out / "real-data.json") as beside:
+        beside.write_text(json.dumps(finite({**kept, "rows": rows}), indent=1, allow_nan=False) + "\n")
     return {
         "note": note,
         "other_sensor": [_describe(path, model) for path, model in networks],
