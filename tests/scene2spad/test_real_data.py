@@ -103,16 +103,14 @@ def test_rendered_captures_show_the_prototypes_rows_sun_and_counts(folder):
 
 
 def test_networks_see_bins_and_tiles(folder):
-    """One tile is the model itself, in bins of this sensor; several tiles cover the image."""
+    """One tile is the model itself, in bins of this sensor, and so are several tiles of a wide image."""
     model = checkpoint(folder / "m.safetensors").eval()
     sensor = resampled_sensor(real_data.prototype())
-    counts = torch.from_numpy(np.random.default_rng(0).poisson(0.2, (24, 20, 1024)).astype(np.float32))
+    counts = torch.from_numpy(np.random.default_rng(0).poisson(0.2, (12, 72, 1024)).astype(np.float32))
     with torch.no_grad():
         whole = model.depth_m(counts.permute(2, 0, 1)[None, None])[0] * (sensor.bin_depth_m / Sensor().bin_depth_m)
     assert torch.allclose(real_data.network(model)(counts, sensor), whole, atol=1e-5)
-    wide = real_data.network(model, tile=8, margin=24)  # so wide that every tile sees the whole image
-    assert torch.allclose(wide(counts, sensor), whole, atol=1e-5)
-    assert real_data.network(model, tile=8, margin=2)(counts, sensor).isfinite().all()
+    assert torch.allclose(real_data.network(model, tile=8)(counts, sensor), whole, atol=1e-4)
 
 
 def test_clouds_lie_where_the_camera_looks():

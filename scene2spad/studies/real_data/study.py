@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,7 +44,7 @@ log = logging.getLogger("scene2spad")
 NOT_REAL = "No real capture was used: rendered scenes in the LinoSPAD layout"
 BINS, POOL = 1024, 2
 FOV_DEG = 40.0  # of point clouds of captures: their files do not say it
-TILE, MARGIN = 64, 16  # pixels that a network sees at a time, and how many of them only to see their neighbours
+TILE = 64  # rows and columns that a network answers for at a time
 MIXED_M = 0.05  # depths further apart than this in one pooled pixel are no single truth
 # What is seen without a network: uncompressed, and decoded by correlation from K of 1024 codes.
 BASELINES = ("argmax", "log-matched")
@@ -235,11 +236,13 @@ def methods_of(models: list[DepthModel]) -> dict[int, dict[str, Method]]:
     return found
 
 
-def network(model: DepthModel, tile: int = TILE, margin: int = MARGIN) -> Method:
+def network(model: DepthModel, tile: int = TILE) -> Method:
     """Return depth by a trained network, whose bins stand for the capture's: what it learned of a pulse was in bins.
 
-    Tile by tile, each with `margin` pixels around it, so that an image needs no more memory than a tile.
+    Tile by tile, each with what the network sees around it, so that an image needs no more memory than a tile.
     """
+    unit = math.lcm(*model.config.block[1:], model.network.coarsest)
+    tile, margin = (-(-pixels // unit) * unit for pixels in (tile, model.network.reach))
 
     @torch.no_grad()
     def depth_of(counts: torch.Tensor, sensor: Sensor) -> torch.Tensor:
