@@ -32,8 +32,8 @@ from spad.sensor.template import binned_pulse
 
 FIXED_CODES = ("fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 GROUPS = 64  # of neighbouring time bins that `grouped_energy` tells apart
-MAX_SEED = (1 << 63) - 1  # torch's generators take a bit more, and spatial codes begin 2^32 further on
 BAND_LIMIT = 0.2  # of the pulse's spectrum at harmonic 1: what Gray Fourier keeps
+MAX_SEED = (1 << 63) - 1  # torch's generators take a bit more, and spatial codes begin 2^32 further on
 
 
 def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 0) -> Tensor:
