@@ -76,7 +76,7 @@ def test_the_largest_seed_begins_both_factors():
 
 
 def test_coherence_is_for_several_pixels():
-    """Of codes over one pixel it was a traceback at the first step; of a network without codes it was ignored."""
+    """One pixel a block ended in a traceback at the first step; without codes the option was ignored."""
     layer = CompressiveLayer.of(FOURIER.design)
     gram = layer.pixel_gram()
     torch.testing.assert_close(gram, layer.temporal.double().square().sum().float().view(1, 1))

@@ -32,21 +32,9 @@ from scenes.io.set_index import read_set_index
 # hard cases 0 to 7: walls at 0.05 to 500 m, quick to build and to render
 JOB = Job("hard-cases", width=12, height=9, bounces=1, grid=2)
 COUNT = 8
-ARGUMENTS = [
-    "dataset",
-    "hard-cases",
-    "--width",
-    "12",
-    "--height",
-    "9",
-    "--bounces",
-    "1",
-    "--grid",
-    "2",
-    "--error",
-    "0.01",
-]
+ARGUMENTS = ["dataset", "hard-cases", "--width=12", "--height=9", "--bounces=1", "--grid=2", "--error=0.01"]
 CLI_JOB = Job("hard-cases", 0, 12, 9, 1, None, 2, 0.01)
+ONE_WORKER = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "protocol": "tcp", "host": "127.0.0.1"}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -370,9 +358,7 @@ def test_a_result_that_dies_with_its_worker_before_it_is_fetched_is_made_again(m
             raise distributed.KilledWorker(future.key, SimpleNamespace(address="tcp://dead"), 3)
         return numbers
 
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None, host="127.0.0.1"
-    ) as cluster:
+    with distributed.LocalCluster(**ONE_WORKER, dashboard_address=None) as cluster:
         monkeypatch.setattr(distributed.Future, "result", dead_result)
         with executor(1, cluster.scheduler_address) as run:
             found = list(run(list, [(0, 1), (2,), (3, 4)], lambda number, why: lost.append(why) or -number))
@@ -388,9 +374,7 @@ def test_a_connection_that_closes_under_a_fetch_is_the_scheduler_gone_away(monke
     def closed(future, *arguments, **options):
         raise CommClosedError("in <TCP (closed) ConnectionPool.gather>: Stream is closed")
 
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None, host="127.0.0.1"
-    ) as cluster:
+    with distributed.LocalCluster(**ONE_WORKER, dashboard_address=None) as cluster:
         monkeypatch.setattr(distributed.Future, "result", closed)
         with (
             pytest.raises(InputError, match=r"^scheduler tcp://\S+: has gone away; what is finished stays"),

@@ -1,4 +1,4 @@
-"""What data sets are made of, where it is not whole: scenes that come later, photographs and captures with gaps."""
+"""Data sets of inputs that are not whole: scenes that come later, photographs and captures with gaps."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_pairs_that_are_not_whole_are_one_line(
 
 
 def test_a_capture_without_reference_light_has_no_drift(tmp_path: Path) -> None:
-    """Its centroid counted as bin 0: it was 15 bins early, all others 5 bins late."""
+    """An empty channel has no drift. It counted as bin 0: 15 bins early, and all others 5 bins late."""
     reference = np.zeros((4, 128), np.int32)
     reference[:, 20] = 1000
     reference[2] = 0

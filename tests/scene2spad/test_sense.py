@@ -58,7 +58,7 @@ def test_laws_and_inverses_by_command(scene, capfd, tmp_path):
 
 
 def test_depth_beside_a_displaced_laser_has_no_confidence(scene, capfd, tmp_path):
-    """Its distance is not the arrival time that the probability is of; pixels without a depth have none either."""
+    """The distance there is no arrival time, which the probability is of; pixels without a depth have none either."""
     assert run(capfd, "sense", "s.exr", "--signal", "2", "--background", "1")[0] == 0
     histogram = read_histogram(tmp_path / "s.h5")
     assert run(capfd, "depth", "s.h5", "--method", "argmax")[0] == 0

@@ -287,8 +287,8 @@ def test_an_evaluation_without_answers_or_truth(capfd, tmp_path, monkeypatch):
 
 
 def test_figures_of_levels_and_depths_count_scenes_and_every_pixel(capfd, tmp_path, monkeypatch):
-    """Of one level the line's MAE is the headline's, whatever the views of a scene; the farthest pixel has its bias
-    told where it is whole metres away."""
+    """The MAE in the line of the only level is the headline's, whatever the views of a scene; the bias of the farthest
+    pixel is told where it is whole metres away."""
     monkeypatch.chdir(tmp_path)
     near = [wall(1.0 + i / 8, 4) for i in range(3)]
     uneven = planes_pack(Path("uneven.h5"), [*near, wall(3.0, 4)], "aaab")

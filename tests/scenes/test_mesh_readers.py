@@ -130,7 +130,7 @@ def test_indents_tabs_and_comments_change_nothing(tmp_path: Path) -> None:
     ],
 )
 def test_a_unit_is_a_whole_word(tmp_path: Path, words: str, metres: float) -> None:
-    """What names no unit leaves 900 of them to be millimetres."""
+    """A comment that names no unit leaves 900 of them to be millimetres."""
     path = written(tmp_path / "a.obj", f"# {words}\nv 0 0 0\nv 900 0 0\nv 0 900 0\nf 1 2 3\n")
     assert np.ptp(load_mesh(path, placing=Placing(bare=True)).surfaces[0].vertices, axis=0).max() == pytest.approx(
         metres

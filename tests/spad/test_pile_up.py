@@ -85,7 +85,7 @@ def test_the_law_that_is_chosen_and_the_inverse_agree(reset: str, dead_s: float)
 
 
 def test_confidence_of_corrected_depth_is_that_of_corrected_counts() -> None:
-    """Where 4 background photons a cycle hide a pulse of 0.1, the counts as they are speak for the first bins."""
+    """Counts as they are speak for the first bins where 4 background photons a cycle hide a pulse of 0.1."""
     histogram = sense(WALL, SENSOR, PhotonBudget(0.1 * CYCLES, 4 * CYCLES), seed=1)
     depth = histogram_depth_m(histogram, "coates")
     right = (np.abs(depth - WALL_M) < 0.05).mean()
