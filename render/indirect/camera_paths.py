@@ -25,12 +25,17 @@ from render.indirect.light_vertices import (
 from render.indirect.path_space_filter import Point, late_from, point_of
 from render.indirect.path_suffixes import PathSuffixes, Slots, SuffixTask, slots_for, trace_suffixes
 from render.indirect.primary_vertices import Connection, PrimaryVertices, connect_primary_vertices, reuses_early_paths
+from render.indirect.sample_sequences import (
+    aligned_number,
+    own_directions,
+    positions_in_pixel,
+    sample_order,
+    shared_directions,
+)
 from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, kept, parts_of, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
 
-# Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32; and of the plain
-GOLDEN = (3242174889, 2447445414)
-PLAIN_GOLDEN = 2654435769
+PLAIN_GOLDEN = 2654435769  # bits of the golden ratio, in units of 2^-32
 
 
 class PathBatch(NamedTuple):
@@ -125,32 +130,25 @@ def _paths(
         else LightVertices(interaction_from_parts(given.light_vertices[0]), *given.light_vertices[1:])
     )
     row, member = slots.lane // BLOCK, slots.lane % BLOCK
-    block, stream, sample_index, stride = (dr.gather(UInt32, given.launch, 4 * row + part) for part in range(4))
-    batch = sample_index % given.batches
+    block, stream, sample_index, per_batch = (dr.gather(UInt32, given.launch, 4 * row + part) for part in range(4))
+    batch, order = sample_order(sample_index, given.batches, per_batch)
     # a hash of block, member and sample index numbers the streams, whichever launch they run in
     lane_key = mi.sample_tea_32(stream * BLOCK + member, sample_index ^ keys[1])
     random = mi.PCG32(initstate=mi.UInt64(lane_key[0]), initseq=mi.UInt64(lane_key[1]))
     if reuses_paths:
-        # one random shift a block and batch of an additive recurrence that goes on from sample to sample: first
-        # directions of all members and samples are one low-discrepancy set. The members share their light vertices:
-        # rays to these are neighbours
-        shift = mi.sample_tea_32(stream, batch ^ keys[0])
-        number = member + BLOCK * (sample_index // given.batches)
-        spread: Array = [Float((s + number * g) >> 8) * 2.0**-24 for s, g in zip(shift, GOLDEN, strict=True)]
+        spread = shared_directions(stream, member, order, keys[0])
+        # the members share their light vertices: rays to these are neighbours
         first = mi.sample_tea_32(stream, sample_index ^ keys[1])[0]
     else:
-        # one randomised (0, 2)-sequence a block and batch (Sobol 1967): the samples of each member are an aligned run
-        # of it, and as even as those of all
-        shift = mi.sample_tea_32(stream, batch ^ keys[0])
-        number = member * stride + sample_index // given.batches
-        spread = mi.radical_inverse_2(number, shift[0]), mi.sobol_2(number, shift[1])
+        number = aligned_number(member, sample_index, given.batches, per_batch)
+        spread = own_directions(stream, batch, number, keys[0])
         first = (number + stream * PLAIN_GOLDEN) * connections
     receiver = block * BLOCK + member
     pixel = dr.gather(UInt32, given.pixels, receiver)
     valid = pixel != 0xFFFFFFFF
     pixel = dr.select(valid, pixel, 0)
-    jitter = mi.Point2f(random.next_float32(), random.next_float32())
-    ray, _ = camera_rays(world, Float(pixel % world.width) + jitter.x, Float(pixel // world.width) + jitter.y)
+    column, line = positions_in_pixel(stream, member, order, keys[0])
+    ray, _ = camera_rays(world, Float(pixel % world.width) + column, Float(pixel // world.width) + line)
     si, transmission, path, _ = first_opaque(world, ray, valid)
     hit = valid & si.is_valid()
     allows_reuse = hit & (dr.gather(Float, world.allows_reuse, shape_index(si), hit) > 0)

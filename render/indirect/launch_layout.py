@@ -13,13 +13,13 @@ class LaunchLayout(NamedTuple):
     """One launch: entry n traces a path in each pixel of block `block[n]`, number `stream[n]` of the image.
 
     `sample_index` numbers the samples of a block. With the seed, stream and sample index decide the random numbers.
-    `stride` is a power of two, at least the samples that a block has in a batch.
+    `per_batch` is the number of samples that a block has in a batch, rounded up.
     """
 
     block: np.ndarray
     stream: np.ndarray
     sample_index: np.ndarray
-    stride: np.ndarray
+    per_batch: np.ndarray
 
 
 def make_launch(
@@ -29,8 +29,8 @@ def make_launch(
     ends = np.cumsum(spp)
     indices = np.arange(int(ends[-1])) if indices is None else indices
     place = np.searchsorted(ends, indices, side="right")
-    stride = 1 << np.ceil(np.log2(np.maximum(spp / batches, 1))).astype(np.int64)
-    return LaunchLayout(blocks[place], streams[place], indices - (ends - spp)[place], stride[place])
+    per_batch = np.maximum(-(-spp // batches), 1)
+    return LaunchLayout(blocks[place], streams[place], indices - (ends - spp)[place], per_batch[place])
 
 
 def block_order(pixels: np.ndarray, width: int) -> np.ndarray:

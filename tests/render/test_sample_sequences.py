@@ -1,0 +1,77 @@
+"""Sequences of positions and directions: runs of samples without gaps, even for each pixel, for its batches, and for a
+block."""
+
+import numpy as np
+import pytest
+
+from render.backend.llvm import start_mitsuba
+
+start_mitsuba()
+
+from render.indirect.launch_layout import BLOCK, make_launch  # noqa: E402
+from render.indirect.sample_sequences import (  # noqa: E402
+    aligned_number,
+    block_sequence,
+    positions_in_pixel,
+    recurrence,
+    sample_order,
+    shared_directions,
+)
+from render.scene.traced_scene import UInt32, dr  # noqa: E402
+
+
+def _samples(spp: int, batches: int) -> tuple:
+    """Return member, sample index and samples a batch of all samples of one block, as arrays."""
+    launch = make_launch(np.arange(1), np.arange(1), np.array([spp]), batches)
+    index = np.repeat(launch.sample_index, BLOCK)
+    member = np.tile(np.arange(BLOCK), spp)
+    return UInt32(member), UInt32(index), UInt32(np.repeat(launch.per_batch, BLOCK))
+
+
+@pytest.mark.parametrize(("spp", "batches"), [(16, 4), (20, 4), (7, 1), (64, 4)])
+def test_samples_of_a_block_are_a_run_without_gaps(spp, batches):
+    member, index, per_batch = _samples(spp, batches)
+    batch, order = sample_order(index, UInt32(batches), per_batch)
+    number = block_sequence(member, order).numpy()
+    assert sorted(number) == list(range(spp * BLOCK))
+    for one in range(batches):  # and so are those of a batch
+        part = np.sort(number[batch.numpy() == one])
+        assert np.array_equal(part, np.arange(part[0], part[0] + len(part)))
+
+
+def test_aligned_numbers_of_members_do_not_overlap():
+    member, index, per_batch = _samples(20, 4)  # 5 in a batch: runs of 8
+    number = aligned_number(member, index, UInt32(4), per_batch).numpy()
+    assert np.array_equal(number // 8, member.numpy())
+    assert number.max() == 8 * (BLOCK - 1) + 4
+
+
+def _discrepancy(points: np.ndarray) -> float:
+    """Return the rms over a grid of boxes at the origin of the share of points inside less the area."""
+    corner = np.linspace(0.1, 1, 10)
+    inside = (points[None, None] < np.stack(np.meshgrid(corner, corner), -1)[:, :, None]).all(-1).mean(-1)
+    return float(np.sqrt(np.square(inside - np.outer(corner, corner)).mean()))
+
+
+@pytest.mark.parametrize("kind", ["positions", "block", "member"])
+def test_sequences_are_more_even_than_random_points(kind):
+    """Random points have an rms of sqrt(a (1 - a) / n) in a box of area a; a recurrence less than half as much."""
+    found = []
+    for stream in range(20):
+        member, index, per_batch = _samples(64, 4)
+        order = sample_order(index, UInt32(4), per_batch)[1]
+        sequence = positions_in_pixel if kind == "positions" else shared_directions
+        points = np.stack([part.numpy() for part in sequence(UInt32(stream), member, order, UInt32(7))], -1)
+        found.append(_discrepancy(points if kind == "block" else points[member.numpy() == 5]))
+    area = np.outer(*(np.linspace(0.1, 1, 10),) * 2)
+    count = 64 * (BLOCK if kind == "block" else 1)
+    assert np.mean(found) < 0.5 * np.sqrt((area * (1 - area)).mean() / count)
+
+
+def test_a_recurrence_is_uniform_over_its_shifts():
+    """Every number's point is uniform over random shifts: estimates by it are unbiased."""
+    shift = np.random.default_rng(0).integers(1 << 32, size=(2, 20000), dtype=np.uint64).astype(np.uint32)
+    points = recurrence(dr.full(UInt32, 1234, 20000), (UInt32(shift[0]), UInt32(shift[1])))
+    for values in points:
+        counts = np.histogram(values.numpy(), 10, (0, 1))[0]
+        assert np.square(counts - 2000).sum() / 2000 < 27.9  # chi-square, 9 degrees of freedom, 1 in 1,000
