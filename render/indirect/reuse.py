@@ -98,12 +98,14 @@ def all_pairs(lanes: int) -> _Pairs:
 
 
 def select_pairs(paths: PathBatch, *, reuses_paths: bool, early: bool) -> _Pairs | None:
-    """Select the pairs of primary vertex and suffix that may have light for each other; None where there are none."""
-    if reuses_paths:
-        return all_pairs(dr.width(paths.batch))
-    if not early:
+    """Select the pairs of primary vertex and suffix that may have light for each other; None where there are none.
+
+    A suffix that carries no light adds nothing to any pixel: under a flash these are half of all or more.
+    """
+    if not reuses_paths and not early:
         return None
-    chosen = dr.compress(_early(paths))
+    suffixes = paths.suffixes
+    chosen = dr.compress(suffixes.reusable & dr.isfinite(suffixes.soonest_m) if reuses_paths else _early(paths))
     if dr.width(chosen) == 0:
         return None
     return _pairs_of(dr.arange(UInt32, dr.width(chosen) * BLOCK), chosen)
@@ -162,14 +164,14 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
     offset = si2.p - spawn(si1, si2.p - si1.p).o
     distance2 = dr.squared_norm(offset)
     direction = offset * dr.rsqrt(distance2)
-    passed, leg = segment(world, si1, si2.p, reusable)
+    context = mi.BSDFContext()
+    value1, density1 = si1.bsdf().eval_pdf(context, si1, si1.to_local(direction), reusable)
+    passed, leg = segment(world, si1, si2.p, reusable & (value1[0] > 0))
     # a suffix is seen from where it came, whatever rounding says
     own = vertex == suffix
     passed = dr.select(own, dr.gather(Float, ends.own_transmission, suffix, reusable), passed)
     leg = dr.select(own, dr.gather(Float, ends.leg, suffix, reusable), leg)
-    active = reusable & (passed > 0) & (distance2 > 0)
-    context = mi.BSDFContext()
-    value1, density1 = si1.bsdf().eval_pdf(context, si1, si1.to_local(direction), active)
+    active = reusable & (value1[0] > 0) & (passed > 0) & (distance2 > 0)
     si2.wi = si2.to_local(-direction)
     to_laser = si2.to_local(_gather_vector(ends.to_laser, suffix, active))
     value2 = si2.bsdf().eval(context, si2, to_laser, active)[0]
@@ -194,7 +196,7 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
         value2 *= camera_share(ratio * ratio_at_laser(world, si2, -direction, active))
         ratio = finite_ratio(ratio * reversal(si2, onward, density3, going))
     # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
-    density = dr.select(active & (value1[0] > 0), density1 * area, 0)
+    density = dr.select(active, density1 * area, 0)
     onward_density = dr.select(going & (value3[0] > 0), density * density3, 0)
     value = dr.select(active, reach * value2 * irradiance, 0)
     onward = dr.select(going, reach * value3[0], 0)

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from render.backend.drjit_types import Array, UInts
 from render.indirect.launch_layout import BLOCK
-from render.scene.traced_scene import Float, UInt32, dr, mi
+from render.scene.traced_scene import Float, dr, mi
 
 # Bits of the generalised golden ratio in two dimensions (real root of x^3 = x + 1), in units of 2^-32
 GOLDEN = (3242174889, 2447445414)
 POSITIONS = 0x9E3779B9  # tells the stream of positions from that of directions
-# Members of a block change places in its sequence by so many from sample to sample. Each then has a recurrence of its
-# own, of step (BLOCK + ROTATION) g = (0.34, 0.83); without, its directions would be (0.08, 0.12) apart
-ROTATION = 3
+# Members of a block change places in its sequence by ROTATION from sample to sample: each then has a recurrence of its
+# own, of step (BLOCK + ROTATION) g = (0.59, 0.26). Without, its directions would be (0.08, 0.12) apart. Positions in
+# pixels go in steps of POSITION_STEP g, so that positions and directions of a member are even together, too: of pairs
+# of these two numbers few have a lower discrepancy in two and in four dimensions at 16 to 128 samples.
+ROTATION, POSITION_STEP = 2, 9
 
 
 def sample_order(sample_index: UInts, batches: UInts, per_batch: UInts) -> tuple[Array, Array]:
@@ -41,7 +43,7 @@ def recurrence(number: UInts, shift: tuple[UInts, UInts]) -> tuple[Array, Array]
 
 def positions_in_pixel(stream: UInts, member: UInts, order: UInts, key: UInts) -> tuple[Array, Array]:
     """Return where in its pixel a path begins: a recurrence of the pixel's own."""
-    return recurrence(order, mi.sample_tea_32(stream * BLOCK + member, key ^ POSITIONS))
+    return recurrence(POSITION_STEP * order, mi.sample_tea_32(stream * BLOCK + member, key ^ POSITIONS))
 
 
 def shared_directions(stream: UInts, member: UInts, order: UInts, key: UInts) -> tuple[Array, Array]:

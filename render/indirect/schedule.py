@@ -16,8 +16,9 @@ from render.indirect.reuse import CONNECTIONS_PER_LAUNCH, add_lanes, all_pairs, 
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, upload
 from render.settings import BATCHES, FILTERED_BATCHES, MIN_SPP
 
-# Seconds of one path with its suffix in units of one connection, on 2 cores. Which blocks reuse paths depends on it.
-PATH_COST = 9.0
+# Seconds of one path with its suffix in units of one connection, those included that carry no light and take no time: 3
+# between two walls, 30 in rooms. Which blocks reuse paths depends on it.
+PATH_COST = 24.0
 
 
 class Schedule(NamedTuple):

@@ -73,6 +73,26 @@ def totals(scene: Scene, seed: int, *, reuses_paths: bool, rounds: int = 64, fro
     return found.reshape(count, rounds).T
 
 
+def test_suffixes_without_light_are_left_out_of_pairs():
+    """Under a narrow flash most of a room is dark: pairs with the rest alone give every pixel the same light."""
+    scene = room(laser=Laser("flood", cone_deg=20))
+    world, count = TracedScene(scene), 12 * 12 // BLOCK
+    blocks = block_order(np.arange(12 * 12), 12)
+    turns = make_launch(np.arange(count), np.arange(count), np.full(count, 16))
+    traced = trace_paths(PathTask(world, blocks, turns, 3, 0, reuses_paths=True))
+    every = sharing.all_pairs(dr.width(traced.batch))
+    some = sharing.select_pairs(traced, reuses_paths=True, early=False)
+    assert some is not None
+    assert dr.width(some.vertex) < 0.8 * dr.width(every.vertex)
+    sums = []
+    for pairs in (every, some):
+        light = Sum()
+        sharing.add_lanes(sharing.pair_lanes(world, traced, pairs), traced, light, own=False)
+        sums.append(np.bincount(pairs.vertex.numpy(), light.lanes, dr.width(traced.batch)))
+    assert sums[0].sum() > 0
+    np.testing.assert_allclose(sums[1], sums[0], rtol=1e-5)
+
+
 @pytest.mark.parametrize("cone_deg", [360, 40])
 def test_lit_points_cover_what_the_laser_lights(cone_deg):
     """The mean of 1 / density is the area lit: all of a closed room, or the patch that a cone cuts from a wall."""
