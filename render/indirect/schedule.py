@@ -47,7 +47,7 @@ class Schedule(NamedTuple):
 
     @property
     def connections(self) -> int:
-        """Count the rays between pixels and their neighbours' paths."""
+        """Count the rays between pixels and their neighbours' paths, if all of these carry light."""
         return int(self.spp[self.reuses_paths].sum()) * BLOCK**2
 
     def rays(self, bounces: int) -> int:
