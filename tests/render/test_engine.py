@@ -240,8 +240,9 @@ def test_different_seeds_agree_within_the_estimated_error():
     difference = first.total_radiance() - second.total_radiance()
     squared = first.error**2 + second.error**2
     # 432 pixels in 27 blocks, which share their paths, of 6 degrees of freedom each: their mean square is known to
-    # between 1.41 / sqrt(432) and 1.41 / sqrt(27), 7 and 27 %; Student's t of 6 passes 12 once in 50,000
-    assert 0.6 < (difference**2).mean() / squared.mean() < 1.6
+    # between 1.41 / sqrt(432) and 1.41 / sqrt(27), 7 and 27 %. Batches together are more even than each alone: the
+    # stated error is the larger one, here by 1.3, and may be by 1.5. Student's t of 6 passes 12 once in 50,000
+    assert 0.44 < (difference**2).mean() / squared.mean() < 1.6
     assert (np.abs(difference) / np.sqrt(squared)).max() < 12
 
 
