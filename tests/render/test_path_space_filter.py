@@ -179,13 +179,14 @@ def test_one_pixel_nothing_in_view_and_glass():
 @pytest.mark.parametrize("name", ["hall", "room"])
 def test_left_out_where_it_hurts(name):
     """A stairwell under a flash owes its noise to gloss, which no filter takes: with 64 paths it had 0.15 instead of
-    0.07 of error. In a diffuse room the squared error falls to less than half."""
+    0.07 of error. In a diffuse room with 16 the squared error falls to less than half."""
     if name == "hall":
         scene = load_scene("hall", width=32, height=24)
         scene = replace(scene, camera=replace(scene.camera, fov_deg=settings.FLASH_FOV_DEG), laser=Laser("flood"))
     else:
         scene = replace(room(32), laser=Laser("flood"))
-    world, given = TracedScene(scene), RenderSettings(bounces=4, spp=64, grid=2, filter=True)
+    spp = 64 if name == "hall" else 16
+    world, given = TracedScene(scene), RenderSettings(bounces=4, spp=spp, grid=2, filter=True)
     traced = trace(world, make_plan(world, given, 1), given, seed=1)
     assert (traced.schedule.filter_octaves is not None) == (name == "room")
     assert ("filter: left out" in traced.reasons[0]) == (name == "hall")
