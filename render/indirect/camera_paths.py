@@ -14,7 +14,17 @@ import numpy as np
 
 from render.backend.drjit_types import Array, Floats, UInts
 from render.indirect.glossy import camera_share, glossy_of
-from render.indirect.launch_layout import BLOCK, LaunchLayout, block_order, make_launch
+from render.indirect.launch_layout import (
+    BLOCK,
+    LaunchLayout,
+    aligned_number,
+    block_order,
+    make_launch,
+    own_directions,
+    positions_in_pixel,
+    sample_order,
+    shared_directions,
+)
 from render.indirect.light_vertices import (
     LightVertices,
     Scattered,
@@ -25,13 +35,6 @@ from render.indirect.light_vertices import (
 from render.indirect.path_space_filter import Point, late_from, point_of
 from render.indirect.path_suffixes import PathSuffixes, Slots, SuffixTask, slots_for, trace_suffixes
 from render.indirect.primary_vertices import Connection, PrimaryVertices, connect_primary_vertices, reuses_early_paths
-from render.indirect.sample_sequences import (
-    aligned_number,
-    own_directions,
-    positions_in_pixel,
-    sample_order,
-    shared_directions,
-)
 from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, kept, parts_of, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
 

@@ -224,7 +224,7 @@ def test_bias_and_depth_under_a_flash():
 
     def half_means(spp: int, runs: int, first_seed: int, filtered: bool) -> list[np.ndarray]:
         """Means of two independent halves of the runs, after the pulse."""
-        given = RenderSettings(bounces=5, spp=spp, grid=8, filter=filtered)
+        given = RenderSettings(bounces=5, spp=spp, grid=8, filter=filtered, adaptive=not filtered)  # forced
         plan = make_plan(world, given, 0)
         means = [np.zeros((size * size, BINS), np.float32) for _ in range(2)]
         for number in range(runs):

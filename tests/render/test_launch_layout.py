@@ -4,20 +4,17 @@ block."""
 import numpy as np
 import pytest
 
-from render.backend.llvm import start_mitsuba
-
-start_mitsuba()
-
-from render.indirect.launch_layout import BLOCK, make_launch  # noqa: E402
-from render.indirect.sample_sequences import (  # noqa: E402
+from render.indirect.launch_layout import (
+    BLOCK,
     aligned_number,
     block_sequence,
+    make_launch,
     positions_in_pixel,
     recurrence,
     sample_order,
     shared_directions,
 )
-from render.scene.traced_scene import UInt32, dr  # noqa: E402
+from render.scene.traced_scene import UInt32, dr
 
 
 def _samples(spp: int, batches: int) -> tuple:
