@@ -13,14 +13,11 @@ import importlib.metadata
 import logging
 import os
 import re
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from threading import current_thread, main_thread
-from types import FrameType, ModuleType
+from types import ModuleType
 
+from render.backend.interrupts import interrupts_wait
 from scenes.errors import InputError
 from scenes.files import silenced
 
@@ -124,7 +121,8 @@ def start_mitsuba() -> ModuleType:
         reload_llvm(library)
     for backend in wanted:
         try:
-            with _interrupt_waits(), silenced():  # Dr.Jit prints lines of its own before it raises
+            # Dr.Jit, imported by half, aborts the process at its end; and it prints lines of its own before it raises.
+            with interrupts_wait(), silenced():
                 import drjit as dr
                 import mitsuba as mi
 
@@ -143,22 +141,6 @@ def start_mitsuba() -> ModuleType:
         check_llvm_version(tuple(dr.detail.llvm_version()))
     mi.set_log_level(mi.LogLevel.Error)
     return mi
-
-
-@contextmanager
-def _interrupt_waits() -> Iterator[None]:
-    """Hold Ctrl-C back until the end of the block: Dr.Jit, imported by half, aborts the process at its end."""
-    if current_thread() is not main_thread():  # only the main thread is interrupted, and may set handlers
-        yield
-        return
-    held: list[tuple[int, FrameType | None]] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if held and callable(before):
-            before(*held[0])
 
 
 def reload_llvm(library: Path) -> bool:

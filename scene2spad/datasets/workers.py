@@ -21,6 +21,7 @@ from multiprocessing.process import BaseProcess
 from threading import Thread
 from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar
 
+from render.backend.interrupts import interrupts_wait
 from scenes.errors import InputError, require
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ log = logging.getLogger("scene2spad")
 MAX_WORKERS = 256
 TRIES = 3  # of a number whose worker process died, among others; then once by itself
 CONNECT_S, CLOSE_S = 10, 2  # until a scheduler that does not answer is given up, and one is left
+LOOK_S = 0.1  # Ctrl-C waits so long at most
 Numbers = tuple[int, ...]
 Result = TypeVar("Result")
 Work: TypeAlias = Callable[[Numbers], list[Result]]  # one result a number; pickled to other processes
@@ -90,14 +92,13 @@ def _on_processes(
                 while True:
                     for run in islice(waiting, 2 * workers - len(running)):
                         try:
-                            with _interrupts_blocked():
-                                running[pool.submit(work, run)] = run
+                            running[_submitted(pool, work, run)] = run
                         except BrokenProcessPool:  # noticed here first: nobody has this run
                             waiting = chain([run], waiting)
                             raise
                     if not running:
                         return
-                    for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    for future in _finished(running):
                         done = future.result()
                         del running[future]
                         yield from done
@@ -109,9 +110,8 @@ def _on_processes(
             if tries[number] >= TRIES:
                 try:
                     with _pool(1, threads, others) as pool:
-                        with _interrupts_blocked():
-                            alone = pool.submit(work, (number,))
-                        done = alone.result()
+                        alone = _submitted(pool, work, (number,))
+                        done = next(iter(_finished([alone]))).result()
                     yield from done
                 except BrokenProcessPool:
                     yield lost(number, f"its process died {TRIES + 1} times, at last by itself")
@@ -133,15 +133,26 @@ def _pool(workers: int, threads: int, others: set[BaseProcess]) -> Iterator[Proc
             raise
 
 
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Keep Ctrl-C from the processes that are started meanwhile, for good: who started them is interrupted, and ends
-    them."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _submitted(pool: ProcessPoolExecutor, work: Work[Result], run: Numbers) -> Future[list[Result]]:
+    """Give a run to a pool. Ctrl-C is kept from processes that start meanwhile, for good: their parent ends them."""
+    with interrupts_wait():
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return pool.submit(work, run)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _finished(running: Iterable[Future[list[Result]]]) -> set[Future[list[Result]]]:
+    """Wait for the first runs that are done.
+
+    Ctrl-C comes between two looks: `wait` takes the locks of all runs, and those that it held when an exception ends it
+    stay locked, so that the pool would never end.
+    """
+    while True:
+        with interrupts_wait():
+            if done := wait(running, LOOK_S, FIRST_COMPLETED).done:
+                return done
 
 
 def _start_worker(threads: int, parent: int) -> None:
