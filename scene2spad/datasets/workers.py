@@ -122,7 +122,9 @@ def _on_processes(
 def _pool(workers: int, threads: int, others: set[BaseProcess]) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool whose processes are ended at once where something else than their own death ends the work: all
     children but `others`."""
-    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads, os.getpid())) as pool:
+    with interrupts_wait():  # a semaphore half made would never be removed
+        made = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads, os.getpid()))
+    with made as pool:
         try:
             yield pool
         except BrokenProcessPool:

@@ -1,13 +1,16 @@
-"""Ctrl-C where the pool of processes holds its locks."""
+"""Ctrl-C where a pool of processes is half made, or holds its locks."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
+import pytest
+
 INTERRUPTING = """
 import signal
 from concurrent.futures import _base
+from multiprocessing import resource_tracker
 from scene2spad.datasets import workers
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
@@ -19,8 +22,12 @@ class Interrupting(_base._AcquireFutures):
         for future in self.futures[1:]:
             future._condition.acquire()
 
+def interrupting(*semaphore, register=resource_tracker.register):
+    register(*semaphore)
+    signal.raise_signal(signal.SIGINT)
+
 if __name__ == "__main__":
-    _base._AcquireFutures = Interrupting
+    {patch}
     workers._start_worker = max  # a worker of no renderer
     try:
         with workers.executor(2, None) as run:
@@ -28,11 +35,17 @@ if __name__ == "__main__":
     except KeyboardInterrupt:
         print("interrupted")
 """
+PATCHES = {
+    # an exception there would leave locks that the pool's own thread waits for, for ever
+    "the locks of all runs are taken": "_base._AcquireFutures = Interrupting",
+    # a semaphore that the tracker of resources knows and nobody removes
+    "a semaphore is made": "resource_tracker.register = interrupting",
+}
 
 
-def test_ctrl_c_while_the_locks_of_all_runs_are_taken_ends_the_pool(tmp_path):
-    """An exception there would leave some locked, and the pool's own thread would wait for them for ever."""
+@pytest.mark.parametrize("moment", PATCHES)
+def test_ctrl_c_in_the_middle_of_the_pool_ends_it_without_a_word(tmp_path, moment):
     script = tmp_path / "interrupting.py"
-    script.write_text(INTERRUPTING)
+    script.write_text(INTERRUPTING.format(patch=PATCHES[moment]))
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=100)
     assert done.returncode == 0 and done.stdout == "interrupted\n" and not done.stderr, done.stderr
