@@ -11,7 +11,7 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
@@ -145,7 +145,7 @@ def _submitted(pool: ProcessPoolExecutor, work: Work[Result], run: Numbers) -> F
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _finished(running: Iterable[Future[list[Result]]]) -> set[Future[list[Result]]]:
+def _finished(running: Collection[Future[list[Result]]]) -> set[Future[list[Result]]]:
     """Wait for the first runs that are done.
 
     Ctrl-C comes between two looks: `wait` takes the locks of all runs, and those that it held when an exception ends it
