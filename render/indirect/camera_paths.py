@@ -24,6 +24,7 @@ from render.indirect.launch_layout import (
     positions_in_pixel,
     sample_order,
     shared_directions,
+    traced_members,
 )
 from render.indirect.light_vertices import (
     LightVertices,
@@ -76,7 +77,8 @@ def trace_paths(task: PathTask) -> PathBatch:
     """Trace the camera paths of one launch, and connect their vertices to light vertices."""
     world, pixels, launch, bounces, seed, batches, reuses_paths, from_m = task
     glossy_of(world)  # looked for before anything is recorded
-    lanes = len(launch.block) * BLOCK
+    members = traced_members(pixels, shared=reuses_paths or from_m is not None)
+    lanes = len(launch.block) * members
     seeds = np.random.SeedSequence(seed).generate_state(4)
     connections = connections_per_vertex(world, reuses_paths=reuses_paths)
     light_vertices = _sample_light_vertices(world, launch, lanes, batches, connections, seeds[2:])
@@ -89,8 +91,8 @@ def trace_paths(task: PathTask) -> PathBatch:
         None if light_vertices is None else (parts_of(light_vertices.si), *light_vertices[1:]),
         from_m,
     )
-    work = partial(_paths, reuses_paths=reuses_paths, connections=connections)
-    key = "paths", reuses_paths, connections, connects_suffixes(world)
+    work = partial(_paths, reuses_paths=reuses_paths, connections=connections, members=members)
+    key = "paths", reuses_paths, connections, members, connects_suffixes(world)
     primary, near, suffixes, batch = world.recordings.call(world, key, work, *given)
     late_m = dr.full(Float, dr.inf if reuses_paths else 0, lanes) if from_m is None else primary[-2]
     point = None if from_m is None else Point(*primary[-1])
@@ -108,8 +110,8 @@ class _Given(NamedTuple):
     flat pixels; keys of the random numbers; the number of batches; the parts of `LightVertices`; and from where on
     light is filtered [m], or None.
 
-    Dr.Jit records anew where two inputs have one size that had not before: there are 16 n lanes, 4 n + 2 numbers of
-    the layout, 16 n + 1 pixels and 2^n + 3 light vertices.
+    Dr.Jit records anew where two inputs have one size that had not before: there are 16 n lanes (of a single block as
+    many as it has pixels), 4 n + 2 numbers of the layout, 16 n + 1 pixels and 2^n + 3 light vertices.
     """
 
     slots: tuple
@@ -122,7 +124,7 @@ class _Given(NamedTuple):
 
 
 def _paths(
-    world: TracedScene, *given: Array, reuses_paths: bool, connections: int
+    world: TracedScene, *given: Array, reuses_paths: bool, connections: int, members: int
 ) -> tuple[tuple, tuple, tuple, Array]:
     """Trace the parts of `PathBatch`, in plain tuples, which recordings look into."""
     given = _Given(*given)
@@ -132,7 +134,7 @@ def _paths(
         if given.light_vertices is None
         else LightVertices(interaction_from_parts(given.light_vertices[0]), *given.light_vertices[1:])
     )
-    row, member = slots.lane // BLOCK, slots.lane % BLOCK
+    row, member = slots.lane // members, slots.lane % members
     block, stream, sample_index, per_batch = (dr.gather(UInt32, given.launch, 4 * row + part) for part in range(4))
     batch, order = sample_order(sample_index, given.batches, per_batch)
     # a hash of block, member and sample index numbers the streams, whichever launch they run in

@@ -12,7 +12,7 @@ from render.backend.malloc import trim_memory
 from render.clamping import ClampedPixels, ClampSums, RemovedLight, clamped_splats, mean_removed
 from render.indirect.accumulators import IndirectAccumulator
 from render.indirect.camera_paths import PathTask, trace_paths
-from render.indirect.launch_layout import BLOCK, LaunchLayout, make_launch
+from render.indirect.launch_layout import BLOCK, LaunchLayout, make_launch, traced_members
 from render.indirect.light_tracing import trace_light_paths
 from render.indirect.path_cells import Cells, MomentHistogram, coarsened, make_cells, quantum_for, require_rows
 from render.indirect.path_space_filter import PathSpaceFilter
@@ -195,7 +195,7 @@ def _trace_camera(
     sums, path_filter = _accumulators(task, blocks, pixels, probe, clamp)
     from_m = None if path_filter is None else path_filter.from_m
     launches = 0
-    for launch in _launches(blocks, schedule, reuses_paths=reuses_paths):
+    for launch in _launches(blocks, pixels, schedule, reuses_paths=reuses_paths):
         dr.sync_thread()  # launches that wait hold memory of their own
         launches += 1
         paths = trace_paths(
@@ -233,14 +233,18 @@ def _accumulators(
     return sums, PathSpaceFilter(task.world, pixels, schedule.filter_octaves, schedule.batches, rows.quantum, task.seed)
 
 
-def _launches(blocks: np.ndarray, schedule: Schedule, *, reuses_paths: bool) -> Iterator[LaunchLayout]:
-    """Yield all samples of some blocks in launches of one size: memory of another is not reused.
+def _launches(
+    blocks: np.ndarray, pixels: np.ndarray, schedule: Schedule, *, reuses_paths: bool
+) -> Iterator[LaunchLayout]:
+    """Yield all samples of some blocks, and of their pixels, in launches of one size: memory of another is not reused.
 
     A launch is OVER larger where that saves one.
     """
     spp = schedule.spp[blocks]
-    paths = PATHS_PER_LAUNCH if schedule.filter_octaves is None else FILTERED_PATHS_PER_LAUNCH
-    most = CONNECTIONS_PER_LAUNCH // BLOCK**2 if reuses_paths else paths // BLOCK
+    filtered = schedule.filter_octaves is not None
+    paths = FILTERED_PATHS_PER_LAUNCH if filtered else PATHS_PER_LAUNCH
+    members = traced_members(pixels, shared=reuses_paths or filtered)
+    most = CONNECTIONS_PER_LAUNCH // BLOCK**2 if reuses_paths else paths // members
     count = int(spp.sum())
     for indices in np.array_split(np.arange(count), max(1, math.ceil(count / most - OVER))):
         yield make_launch(np.arange(len(spp)), blocks, spp, schedule.batches, indices)

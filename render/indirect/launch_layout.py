@@ -61,6 +61,16 @@ def block_order(pixels: np.ndarray, width: int) -> np.ndarray:
     return np.concatenate((ordered, np.full(-len(ordered) % BLOCK, -1, ordered.dtype)))
 
 
+def traced_members(pixels: np.ndarray, *, shared: bool) -> int:
+    """Return how many members of a block each of its samples traces: all, but of a single block only real pixels.
+
+    `pixels` of some blocks, -1 pads at the end. Where paths are `shared`, groups of BLOCK lanes belong together.
+    """
+    if shared or len(pixels) > BLOCK:
+        return BLOCK
+    return max(1, int(np.count_nonzero(pixels >= 0)))
+
+
 def sample_order(sample_index: UInts, batches: UInts, per_batch: UInts) -> tuple[Array, Array]:
     """Return the batch of a sample, and its number among those of its pixel, counted batch by batch."""
     batch = sample_index % batches

@@ -1,9 +1,12 @@
 """Sequences of positions and directions: runs of samples without gaps, even for each pixel, for its batches, and for a
 block."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from render.indirect import camera_paths, integrator
 from render.indirect.launch_layout import (
     BLOCK,
     aligned_number,
@@ -13,8 +16,13 @@ from render.indirect.launch_layout import (
     recurrence,
     sample_order,
     shared_directions,
+    traced_members,
 )
-from render.scene.traced_scene import UInt32, dr
+from render.pipeline import trace
+from render.scene.traced_scene import TracedScene, UInt32, dr
+from render.settings import Plan, RenderSettings
+from scenes.library.catalog import load_scene
+from scenes.model import Laser
 
 
 def _samples(spp: int, batches: int) -> tuple:
@@ -72,3 +80,29 @@ def test_a_recurrence_is_uniform_over_its_shifts():
     for values in points:
         counts = np.histogram(values.numpy(), 10, (0, 1))[0]
         assert np.square(counts - 2000).sum() / 2000 < 27.9  # chi-square, 9 degrees of freedom, 1 in 1,000
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (3, 2)])
+def test_what_pads_a_small_image_is_not_traced(monkeypatch, width, height):
+    """Lanes of its pixels give what all lanes of its block do: each has its own numbers, and sums have no order."""
+    room = load_scene("living-room")
+    scene = replace(room, camera=replace(room.camera, width=width, height=height), laser=Laser("scan"))
+    plan, settings = Plan(4, 64, 2, False, (), 1.0, 0.0), RenderSettings(bounces=4, spp=64, grid=2)
+    traced = []
+
+    def indirect() -> np.ndarray:
+        samples = trace(TracedScene(scene), plan, settings, seed=3).samples
+        return np.bincount(samples.pixel, samples.radiance * (samples.bounces > 1), width * height)
+
+    def counted(pixels: np.ndarray, *, shared: bool) -> int:
+        traced.append(traced_members(pixels, shared=shared))
+        return traced[-1]
+
+    for module in (camera_paths, integrator):
+        monkeypatch.setattr(module, "traced_members", counted)
+    alone = indirect()
+    assert width * height in traced
+    for module in (camera_paths, integrator):
+        monkeypatch.setattr(module, "traced_members", lambda pixels, *, shared: BLOCK)
+    assert (alone > 0).all()
+    np.testing.assert_array_equal(alone, indirect())
