@@ -253,7 +253,8 @@ def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
     for name, metres in (("millimetres", 1e-3), ("inches (or centimetres)", 0.0254)):
         if low <= metres * extent <= high and path.suffix.lower() != ".glb":
             return metres, [f"warning: no unit in the file, {extent:.4g} looks like {name}"]
-    return 1.0 / extent, ["warning: no unit makes a sensible size of it, so its size is made up"]
+    kept = f"; --scale 1 keeps {extent:.4g} m"
+    return 1.0 / extent, [f"warning: no unit makes a sensible size of it, so its size is made up{kept}"]
 
 
 def _moved(part: _Part, pose: np.ndarray) -> _Part:
