@@ -23,7 +23,7 @@ from render.indirect.integrator import (
 from render.indirect.launch_layout import BLOCK, block_order
 from render.indirect.light_vertices import connects_suffixes
 from render.indirect.path_space_filter import Octaves, octaves
-from render.indirect.schedule import Schedule, allocate, pilot_noise, uniform
+from render.indirect.schedule import Schedule, allocate, least_spp, pilot_noise, uniform
 from render.light_scale import LightScale, light_scale
 from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, MAX_BOUNCES, MIN_SPP, Plan, RenderSettings
@@ -40,6 +40,7 @@ HOPELESS = 10
 PROPOSAL = "trade fireflies for a stated bias with --clamp 10"
 UNEVEN = 1e-3  # of the direct light's root sum square over pixels: what one pixel's mirrored light may be off by
 MIN_BATCHES = 2  # whose difference tells the noise
+FEWEST_ALLOCATED = 2 * BATCHES  # forced paths a pixel from which on a pilot pays, and blocks can share
 FIRST_FILTERED_SPP = 16  # filtered light starts with few paths, whatever it needs
 # A filter takes up to twice the time and has a bias: it has to lower the squared error at least so many times.
 FILTER_GAIN = 2.0
@@ -220,20 +221,21 @@ def _allocated(
     """Allocate paths, and say why: the schedule but for its clamp, with which the pilot's paths are clamped, too."""
     camera = world.scene.camera
     blocks = block_order(np.arange(camera.height * camera.width), camera.width)
-    pilot_seed, few = derived_seed(seed, Stream.PILOT), plan.spp is not None and plan.spp < MIN_SPP
+    pilot_seed, least = derived_seed(seed, Stream.PILOT), settings.min_spp if plan.spp is None else least_spp(plan.spp)
+    few, fewer = (plan.spp is not None and plan.spp < spp for spp in (MIN_SPP, FEWEST_ALLOCATED))
     # under a lamp much light is late, and the noise that the filter leaves is even: a pilot costs more than it saves
     if plan.filter and (not plan.adaptive or few or connects_suffixes(world)):
         return _filtered(world, plan, settings, blocks, origin_m)
-    if plan.spp is not None and (not plan.adaptive or few):
+    if plan.spp is not None and (not plan.adaptive or fewer):
         return uniform(blocks, _in_batches(plan.spp, BATCHES), reuses_paths=False), ()
     own, reused = pilot_noise(world, blocks, plan.bounces, pilot_seed, clamp=clamp)
-    schedule, reasons = _unfiltered(plan, settings, blocks, (own, reused), direct)
+    schedule, reasons = _unfiltered(plan, settings, blocks, (own, reused), direct, least)
     if not plan.filter:
         return schedule, reasons
     spp = max(schedule.cost, FIRST_FILTERED_SPP)
     from_m = float(filter_octaves_of(world, plan, settings, origin_m, spp).from_m[0])
     (noise,) = pilot_noise(world, blocks, plan.bounces, pilot_seed, from_m, clamp)
-    gain = gain_of_filter(blocks, (own, reused), noise, spp)
+    gain = gain_of_filter(blocks, (own, reused), noise, spp, least)
     if gain < FILTER_GAIN:
         message = f"filter: left out, as it would lower the squared error {gain:.2g} times, not {FILTER_GAIN:g} or more"
         return schedule, (f"{message}; adaptive=False forces it", *reasons)
@@ -246,11 +248,13 @@ def _in_batches(spp: int, batches: int) -> int:
     return max(spp, MIN_BATCHES) if spp < batches else -(-spp // batches) * batches
 
 
-def gain_of_filter(blocks: np.ndarray, plain: tuple[np.ndarray, np.ndarray], filtered: np.ndarray, spp: float) -> float:
+def gain_of_filter(
+    blocks: np.ndarray, plain: tuple[np.ndarray, np.ndarray], filtered: np.ndarray, spp: float, least: int
+) -> float:
     """Estimate how many times a filter lowers the squared error of `spp` paths a pixel, from the pilot's noise of every
-    block without it (each path for its own pixel, and for all of the block) and with it."""
+    block without it (each path for its own pixel, and for all of the block), `least` each, and with it."""
     own, reused = plain
-    shared = allocate(blocks, own, reused, cost=spp)
+    shared = allocate(blocks, own, reused, cost=spp, min_spp=least)
     without = float((np.where(shared.reuses_paths, reused, own) / shared.spp).sum())
     alone = allocate(blocks, filtered, cost=spp, batches=FILTERED_BATCHES, min_spp=FILTERED_BATCHES)
     with_filter = float((filtered / alone.spp).sum())
@@ -284,14 +288,15 @@ def _unfiltered(
     blocks: np.ndarray,
     noise: tuple[np.ndarray, np.ndarray],
     direct: Samples,
+    least: int,
 ) -> tuple[Schedule, tuple[str, ...]]:
-    """Allocate paths by the pilot's noise of every block: each path for its own pixel, and for all of the block."""
+    """Allocate paths, at least so many a pixel, by the pilot's noise of every block: each path for its own pixel, and
+    for all of the block."""
     own, reused = noise
     if not plan.adaptive:
         own, reused = np.full_like(own, own.mean()), np.full_like(own, 1e3 * own.mean())
     if plan.spp is not None:
-        return allocate(blocks, own, reused, cost=plan.spp), ()
-    least = settings.min_spp
+        return allocate(blocks, own, reused, cost=plan.spp, min_spp=least), ()
     power, per_sample = power_of(direct)
     allowed = plan.noise**2 * power / per_sample
     schedule = allocate(blocks, own, reused, squared_error=allowed, min_spp=least)

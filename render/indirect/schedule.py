@@ -233,6 +233,14 @@ def allocate(
     return Schedule(blocks, spp.astype(np.int64), best == 1)
 
 
+def least_spp(spp: int) -> int:
+    """Return the paths a pixel of the darkest block where `spp` in all are forced.
+
+    A quarter of them: a floor of all would leave nothing for sharing, which takes more work a path and less noise.
+    """
+    return min(MIN_SPP, max(BATCHES, spp // 4))
+
+
 def reallocated(before: Schedule, noise: np.ndarray, fraction: float, most: float) -> Schedule:
     """Allocate paths on top of traced ones where these left the noise.
 

@@ -18,6 +18,7 @@ from render.indirect.launch_layout import (
     shared_directions,
     traced_members,
 )
+from render.indirect.schedule import Schedule, least_spp
 from render.pipeline import trace
 from render.scene.traced_scene import TracedScene, UInt32, dr
 from render.settings import Plan, RenderSettings
@@ -106,3 +107,26 @@ def test_what_pads_a_small_image_is_not_traced(monkeypatch, width, height):
         monkeypatch.setattr(module, "traced_members", lambda pixels, *, shared: BLOCK)
     assert (alone > 0).all()
     np.testing.assert_array_equal(alone, indirect())
+
+
+@pytest.mark.parametrize("spp", [8, 16])
+def test_few_forced_paths_are_shared_where_that_lowers_the_noise(spp):
+    """Shared or not, the forced work is spent; a groove under a flash has a fraction of the noise by shared paths."""
+    scene = load_scene("corner", width=32, height=24)
+    world, pixels = TracedScene(replace(scene, laser=Laser("flood"))), 32 * 24
+
+    def noise_and_schedule(adaptive: bool) -> tuple[float, Schedule]:
+        plan, given = (
+            Plan(3, spp, 2, False, (), 1.0, 0.0, adaptive=adaptive),
+            RenderSettings(bounces=3, spp=spp, grid=2),
+        )
+        found = [trace(world, plan, given, seed=seed) for seed in range(4)]
+        sums = [np.bincount(s.samples.pixel, s.samples.radiance, pixels) for s in found]
+        return float(np.square(np.std(sums, axis=0)).sum()), found[0].schedule
+
+    shared, schedule = noise_and_schedule(True)
+    alone, even = noise_and_schedule(False)
+    assert schedule.reuses_paths.mean() > 0.5 and not even.reuses_paths.any()
+    assert schedule.spp.min() >= least_spp(spp) and schedule.cost <= spp
+    assert even.cost == spp
+    assert shared < alone / 2
