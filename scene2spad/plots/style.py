@@ -62,8 +62,10 @@ def letter_panels(figure: Figure) -> None:
     if not 1 < len(panels) <= len(LETTERS):
         return
     for number, panel in enumerate(panels):
+        # a second axis, on top, may have a number over the corner
+        left = -16 if any(hasattr(child, "set_functions") for child in panel.child_axes) else -4
         panel.annotate(
-            LETTERS[number], (0, 1), (-4, 3), xycoords="axes fraction", textcoords="offset points", ha="right",
+            LETTERS[number], (0, 1), (left, 3), xycoords="axes fraction", textcoords="offset points", ha="right",
             va="bottom", fontsize=10, fontweight="bold", annotation_clip=False,
         )  # fmt: skip
 
