@@ -116,10 +116,8 @@ def test_few_forced_paths_are_shared_where_that_lowers_the_noise(spp):
     world, pixels = TracedScene(replace(scene, laser=Laser("flood"))), 32 * 24
 
     def noise_and_schedule(adaptive: bool) -> tuple[float, Schedule]:
-        plan, given = (
-            Plan(3, spp, 2, False, (), 1.0, 0.0, adaptive=adaptive),
-            RenderSettings(bounces=3, spp=spp, grid=2),
-        )
+        plan = Plan(3, spp, 2, False, (), 1.0, 0.0, adaptive=adaptive)
+        given = RenderSettings(bounces=3, spp=spp, grid=2)
         found = [trace(world, plan, given, seed=seed) for seed in range(4)]
         sums = [np.bincount(s.samples.pixel, s.samples.radiance, pixels) for s in found]
         return float(np.square(np.std(sums, axis=0)).sum()), found[0].schedule
