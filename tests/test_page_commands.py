@@ -26,6 +26,7 @@ from deepinv_stand_in import provide_deepinv
 from test_readability import PAGES, ROOT
 
 from scene2spad.cli.main import main
+from spad.sensor.files import read_sensor
 
 # Options of a command that are small here: as they stand in place of the page's, or added.
 SMALL = {
@@ -148,7 +149,8 @@ def had(tmp_path_factory) -> Path:
     (text,) = (block for kind, block in steps(ROOT / "docs/sensors.md") if kind == "toml")
     for name in ("my.toml", "my-sensor.toml"):
         (folder / name).write_text(text)
-    np.save(folder / "mine.npy", np.random.default_rng(0).normal(size=(8, 1024)))
+    bins = read_sensor(folder / "my.toml").sensor.bins
+    np.save(folder / "mine.npy", np.random.default_rng(0).normal(size=(8, bins)))
     with contextlib.chdir(folder):
         run("scene2spad render living-room")
         run("scene2spad sense living-room.exr --no-figure")
