@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from numbers import Integral
 from typing import NamedTuple
 
@@ -222,11 +223,11 @@ def _allocated(
     camera = world.scene.camera
     blocks = block_order(np.arange(camera.height * camera.width), camera.width)
     pilot_seed, least = derived_seed(seed, Stream.PILOT), settings.min_spp if plan.spp is None else least_spp(plan.spp)
-    few, fewer = (plan.spp is not None and plan.spp < spp for spp in (MIN_SPP, FEWEST_ALLOCATED))
+    forced = math.inf if plan.spp is None else plan.spp
     # under a lamp much light is late, and the noise that the filter leaves is even: a pilot costs more than it saves
-    if plan.filter and (not plan.adaptive or few or connects_suffixes(world)):
+    if plan.filter and (not plan.adaptive or forced < MIN_SPP or connects_suffixes(world)):
         return _filtered(world, plan, settings, blocks, origin_m)
-    if plan.spp is not None and (not plan.adaptive or fewer):
+    if plan.spp is not None and (not plan.adaptive or forced < FEWEST_ALLOCATED):
         return uniform(blocks, _in_batches(plan.spp, BATCHES), reuses_paths=False), ()
     own, reused = pilot_noise(world, blocks, plan.bounces, pilot_seed, clamp=clamp)
     schedule, reasons = _unfiltered(plan, settings, blocks, (own, reused), direct, least)
