@@ -4,6 +4,10 @@ from pathlib import Path
 
 import pytest
 
+# Beside other test processes torch takes one thread: two with two threads each on two cores are many times slower.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # the tests' own helpers are imported by name; the packages are installed
 sys.path[:0] = [str(Path(__file__).parent / package) for package in ("spad", "scenes", "csph", "support")]
 

@@ -123,7 +123,7 @@ def test_mirrored_and_spans():
         ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL, network="blockwise"),
         ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL, network="refined"),
         ModelConfig(front="matched", sensor=SMALL),
-        ModelConfig(front="counts", network="published-signed", sensor=SMALL),
+        pytest.param(ModelConfig(front="counts", network="published-signed", sensor=SMALL), marks=pytest.mark.slow),
     ],
     ids=lambda m: m.name,
 )

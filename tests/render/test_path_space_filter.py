@@ -26,6 +26,8 @@ from scenes.library.catalog import load_scene
 from scenes.library.hard_cases import hard_case
 from scenes.library.things.shapes import box, sphere
 
+SLOW = pytest.mark.slow
+
 
 def room(width: int = 24, kind: str = "diffuse", **laser) -> Scene:
     vertices, faces, uv = box((4, 3, 5))
@@ -81,7 +83,9 @@ def test_integrating_sphere_is_exact_but_for_noise(albedo):
         assert abs(np.mean(values)) < allowed + 4 * np.std(values, ddof=1) / math.sqrt(len(values)), values
 
 
-@pytest.mark.parametrize("kind", ["diffuse", "plastic", "roughconductor"])
+@pytest.mark.parametrize(
+    "kind", ["diffuse", pytest.param("plastic", marks=SLOW), pytest.param("roughconductor", marks=SLOW)]
+)
 def test_energy_is_kept(kind):
     """Every path goes into one region of one octave, and regions are read by all that is in them.
 
@@ -96,6 +100,7 @@ def test_energy_is_kept(kind):
     assert abs(np.mean(totals) / wanted.sum() - 1) < 0.005 + 4 * standard
 
 
+@pytest.mark.slow
 def test_noise_falls_and_the_bias_goes_with_more_paths():
     """At 16 paths the filter's error is half of the same paths' own; at 256 its mean is nearer to the truth.
 
@@ -133,6 +138,7 @@ def test_same_seed_same_bytes_with_one_and_two_threads():
     assert render(room(), given, seed=6).sha256() not in hashes
 
 
+@pytest.mark.slow
 def test_the_stated_error_is_the_true_one():
     """Of the mean over seeds, within the issue's factor of 1.3; a filtered result says that it is biased."""
     scene = room(32)

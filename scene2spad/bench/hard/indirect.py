@@ -209,7 +209,7 @@ CASES = (
     Case("groove-90", GROOVE, partial(_groove, 90)),
     Case("furnace-0.5", f"L (1 - a^{AMBIENT_BOUNCES}) / (1 - a)", partial(_furnace, 0.5)),
     Case("furnace-0.99", f"L (1 - a^{AMBIENT_BOUNCES}) / (1 - a)", partial(_furnace, 0.99)),
-    Case("integrating-sphere-0.5", CHORDS, partial(_integrating_sphere, 0.5)),
+    Case("integrating-sphere-0.5", CHORDS, partial(_integrating_sphere, 0.5), slow=True),
     Case("integrating-sphere-0.99", CHORDS, partial(_integrating_sphere, 0.99), slow=True),
     Case("albedo-0.001", CHORDS, _dark_sphere),
     Case("duplicated-faces", CLEAN, partial(_odd_mesh, "duplicated")),
