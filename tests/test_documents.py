@@ -1,6 +1,7 @@
 """README and guides: short, every link leads somewhere, every command exists. test_page_commands runs them."""
 
 import json
+import math
 import re
 import textwrap
 from pathlib import Path
@@ -83,11 +84,18 @@ def test_the_worked_example_of_the_photon_budget_runs(tmp_path, monkeypatch, cap
 
 
 def test_the_sensor_file_of_the_guide_is_one(tmp_path):
-    """With the page's tables of optics and of a time-to-digital converter."""
+    """With the page's tables of optics, jitter and a time-to-digital converter; and with those of zones."""
     page = (ROOT / "docs/sensors.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```toml\n(.*?)```", page, re.S)
-    tables = re.findall(r"^    \[[a-z]+\]\n(?:    .*\n)+", page, re.M)
-    assert len(tables) == 2
-    (tmp_path / "mine.toml").write_text(text + textwrap.dedent("".join(tables)))
-    found = read_sensor(tmp_path / "mine.toml")
-    assert (found.sensor.bins, found.sensor.dead_time_s, found.sensor.pde) == (1000, 30e-9, 0.25)
+    found = re.findall(r"^    \[[a-z]+\]\n(?:    .*\n)+", page, re.M)
+    tables = {table.split("]")[0].strip(" ["): textwrap.dedent(table) for table in found}
+    assert set(tables) == {"optics", "jitter", "tdc", "zones"}
+    zones = tables.pop("zones")
+    (tmp_path / "mine.toml").write_text(text + "".join(tables.values()))
+    sensor = read_sensor(tmp_path / "mine.toml").sensor
+    assert (sensor.bins, sensor.dead_time_s, sensor.pde) == (1000, 30e-9, 0.25)
+    assert (sensor.jitter.fwhm_s, sensor.jitter.tail_s) == pytest.approx((60e-12, 120e-12))
+    (tmp_path / "zones.toml").write_text(text + zones)
+    array = read_sensor(tmp_path / "zones.toml").zones
+    assert array.centre_x == (-0.105, 0.105) and array.delay_s == pytest.approx((0, 35e-12))
+    assert array.trials == (math.inf, 1e5)
