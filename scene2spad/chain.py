@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from scenes.errors import InputError, did_you_mean
+from scenes.errors import InputError, did_you_mean, require
 from scenes.progress import Progress
 
 if TYPE_CHECKING:
@@ -134,19 +135,20 @@ def sense(
     from spad.detection.detect import sense as sense_exposure
     from spad.sensor.model import PhotonBudget, sensor_by_name
 
+    require(isinstance(seed, Integral) and seed >= 0, f"seed {seed!r}: expected a whole number, 0 or more")
     chosen = sensor_by_name(sensor) if isinstance(sensor, str) else sensor
     budget = optics.budget(transient, chosen) if optics is not None else PhotonBudget(signal, background)
     return sense_exposure(transient, chosen, budget, seed=seed, model=law)
 
 
-def estimate_depth(histogram: Histogram, method: str | CodingTensor | DepthModel = "log-matched") -> np.ndarray:
+def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | DepthModel = "log-matched") -> np.ndarray:
     """Estimate the radial depth of every pixel.
 
     Parameters
     ----------
     histogram : Histogram
         What `sense`, `read_histogram` or `read_mat` gives.
-    method : str, CodingTensor or DepthModel
+    method : str, Path, CodingTensor or DepthModel
         A classical estimator (argmax, matched, log-matched, correlation, coates), the name or file of a trained
         network (`models` lists those that come with the package), a network that `load_model` gave, or a temporal
         coding tensor, whose codes are decoded by correlation.
@@ -183,13 +185,14 @@ def estimate_depth(histogram: Histogram, method: str | CodingTensor | DepthModel
 
     if isinstance(method, CodingTensor):
         return decoded_by(method)(histogram)
-    if isinstance(method, str):
+    if isinstance(method, str | Path):
         try:
             method = load_model(method)
         except InputError as error:
             raise InputError(
                 f"depth method {method!r} is none of {', '.join(METHODS)}, and no network: {error}"
             ) from None
+    require(hasattr(method, "estimate"), f"depth method {method!r}: expected a name, a file, codes or a network")
     return method.estimate(histogram).depth_m
 
 

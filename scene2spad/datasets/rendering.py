@@ -27,7 +27,6 @@ from scene2spad.datasets.workers import Run, check_workers, executor
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.io.inputs import read_json_object
-from scenes.io.set_index import read_set_index
 from scenes.library.sets import LARGEST, scene_set
 from scenes.limits import require_memory
 from scenes.model import MAX_IMAGE_SIDE, Scene
@@ -149,7 +148,7 @@ def _direct_errors(job: Job, views: Sequence[int]) -> list[float]:
     for view in views:
         with _ONE_AT_A_TIME:
             try:
-                scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
+                scene = _scene(job, view)
                 world = _world(job, view, scene) or TracedScene(scene)
                 found.append(direct_error(world, job.settings(), _seed(job, view)))
             except Exception:  # as in `render_view`
@@ -182,14 +181,8 @@ def record_and_exr(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     from render.transient.data import exr_bytes
     from render.transient.packs import rounded
     from render.transient.thinning import thinned
-    from scene2spad.datasets.moving import moved
 
-    scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
-    if not job.ambient:
-        scene = scene.without_lights()
-    if job.offset_m and job.offset_mode != "time":
-        scene = moved(scene, job.offset_m, job.offset_mode)
-    seed = _seed(job, view, again)
+    scene, seed = _scene(job, view), _seed(job, view, again)
     world = _world(job, view, scene)
     transient = render(scene, job.settings(), seed=seed, world=world, plan=_plan(job, view, world))
     if job.offset_m and job.offset_mode == "time":
@@ -218,6 +211,15 @@ def record_and_exr(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         "triangles": scene.triangles,
     }
     return record, exr
+
+
+def _scene(job: Job, view: int) -> Scene:
+    """Return the scene of a view as it is rendered: moved, and without lamps, if the set is to be so."""
+    from scene2spad.datasets.moving import moved
+
+    scene = scene_set(job.set).view(view, seed=job.seed, width=job.width, height=job.height)
+    scene = scene if job.ambient else scene.without_lights()
+    return moved(scene, job.offset_m, job.offset_mode) if job.offset_m and job.offset_mode != "time" else scene
 
 
 def _seed(job: Job, view: int, again: int = 0) -> int:
@@ -353,8 +355,9 @@ def make_set(
     seconds = time.perf_counter() - start
     records = [folder.records[view] for view in range(count)]
     good = [record for record in records if "failed" not in record]
+    require(bool(good), f"{out}: none of {count} views could be rendered; view 0: {records[0].get('failed')}")
     missed = [record for record in good if not record["target_met"]]
-    together = math.sqrt(np.mean([record["error"] ** 2 for record in good])) if good else math.nan
+    together = math.sqrt(np.mean([record["error"] ** 2 for record in good]))
     if missed:
         worst = max(missed, key=lambda record: record["error"] / record["target"])
         log.warning(
@@ -368,33 +371,9 @@ def make_set(
         "rendered_now": missing,
         "seconds": seconds,
         "scenes_per_second": missing / seconds if missing else 0.0,
-        "bytes_per_scene": sum(record["bytes"] for record in good) / max(len(good), 1),
+        "bytes_per_scene": sum(record["bytes"] for record in good) / len(good),
         "target_missed": len(missed),
         "error_together": together,
-        "error_median": float(np.median([record["error"] for record in good])) if good else float("nan"),
+        "error_median": float(np.median([record["error"] for record in good])),
         "out": str(out),
     }
-
-
-# --- Packing ---------------------------------------------------------------------------------------------------------
-
-
-def pack_set(folder: Path, path: Path, progress: Progress | None = None, *, count: int | None = None) -> int:
-    """Write the finished views of a set's folder as one file (`render.transient.packs`); return how many there are.
-
-    `count`: of the first so many views alone (default: of all).
-    """
-    from render.transient import read_transient
-    from render.transient.packs import write_pack
-
-    records = [one for one in read_set_index(folder) if count is None or one["view"] < count]
-    report = progress or (lambda what, fraction: None)
-
-    def views() -> Iterator[tuple]:
-        for i, record in enumerate(records):
-            report("pack", i / len(records))
-            transient = read_transient(folder / record["file"])
-            kept = {key: transient.meta[key] for key in ("camera", "laser", "scene_sha256")}
-            yield transient, record | kept | {"time_offset_m": transient.meta.get("time_offset_m", 0.0)}
-
-    return write_pack(views(), path)

@@ -11,6 +11,7 @@ timings.jsonl seconds and places, kept out of the index so that two runs are the
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,7 +66,8 @@ def _stands(folder: Path, record: dict) -> bool:
     if "failed" in record or record.get("file") != file_name(record["view"]):
         return False
     path = folder / record["file"]
-    if not isinstance(record.get("error"), (int, float)):
+    numbers = [record.get(key) for key in ("error", "target", "bytes")]
+    if "target_met" not in record or not all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
         return False
     return path.is_file() and path.stat().st_size == record.get("bytes")
 

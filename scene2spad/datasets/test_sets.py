@@ -13,7 +13,8 @@ import numpy as np
 from csph.evaluation.methods import EvaluationPlan, Method, Row, as_dicts, evaluate
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.training.views import Views, read_views
-from scene2spad.datasets.rendering import Job, make_set, pack_set
+from scene2spad.datasets.packing import pack_set
+from scene2spad.datasets.rendering import Job, make_set
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.networks.training import network_method
 from scene2spad.studies.results import Store

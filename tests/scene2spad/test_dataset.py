@@ -23,7 +23,8 @@ from render.transient.packs import PATH_STEP_M, read_pack
 from scene2spad.cli import main
 from scene2spad.datasets import rendering as dataset
 from scene2spad.datasets import workers
-from scene2spad.datasets.rendering import Job, make_set, pack_set, render_view
+from scene2spad.datasets.packing import pack_set
+from scene2spad.datasets.rendering import Job, make_set, render_view
 from scene2spad.datasets.set_folder import SetFolder
 from scene2spad.datasets.workers import executor
 from scenes import InputError

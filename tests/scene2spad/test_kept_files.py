@@ -110,6 +110,7 @@ def test_a_comparison_keeps_the_users_picture(folder, capfd):
     Path("my.csv").write_text(f"method,{','.join(FIGURES)},seconds\n")  # as every version wrote it
     assert main(["compare", "g.h5", "--methods", "argmax", "--out", "my.csv"]) == 0
     assert Path("my.png").read_bytes() == b"a picture" and Path("my.compare.png").is_file()
+    kept(capfd, ["compare", "g.h5", "--methods", "argmax", "--out", "x.csv"], "x.compare.png", foreign_png())
 
 
 @pytest.mark.parametrize(

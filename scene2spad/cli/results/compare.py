@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scene2spad.cli.opening import open_histogram
-from scene2spad.cli.paths import Mark, begins, check_target, input_file, keep_foreign, picture
+from scene2spad.cli.paths import PNG_FIGURE, Mark, begins, check_target, input_file, keep_foreign, picture
 from scene2spad.options.common import Common, File, Positional
 from scenes.errors import require
 from scenes.progress import Progress
@@ -51,6 +51,7 @@ def run(command: Compare, progress: Progress) -> dict:
     for target in (out, figure):
         check_target(target, source)
     keep_foreign(out, TABLE)
+    keep_foreign(figure, PNG_FIGURE)
     histogram = open_histogram(source, command.frame)
     methods = {name: depth_method(name, histogram.sensor, seed=command.seed) for name in command.methods}
     rows, depths = [], {}

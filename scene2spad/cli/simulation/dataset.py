@@ -20,7 +20,7 @@ class Dataset(Long):
     set: Positional[str] = "rooms"
     """rooms, clutter (both also as in rooms/val and rooms/test), tabletop, middlebury or hard-cases."""
     count: Count = None
-    """Views (default: all of a finite set, 100 of rooms)."""
+    """Views (default: all of a finite set, 100 of rooms and clutter)."""
     out: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder of the set (default: out/ and the set's name)."""
     workers: int = 1
@@ -30,7 +30,8 @@ class Dataset(Long):
     pack: File = None
     """Make one .h5 file of the finished set, which training reads without a renderer."""
     width: Pixels = None
-    """Image width, pixels (default: 64 of rooms, the scenes' own of others)."""
+    """Image width, pixels (default: 64 of rooms and clutter, the scenes' own of others). One side alone makes images of
+    rooms and clutter square, and keeps the proportions of others."""
     height: Pixels = None
     """Image height, pixels."""
     bounces: Count = None
@@ -55,7 +56,8 @@ class Dataset(Long):
 
 def run(command: Dataset, progress: Progress) -> dict:
     """Run the command: A scene set -> a folder of .exr files, and one .h5 of them all."""
-    from scene2spad.datasets.rendering import Job, make_set, pack_set
+    from scene2spad.datasets.packing import check_one_size, pack_set
+    from scene2spad.datasets.rendering import Job, check_asked, make_set
 
     of = scene_set(command.set)
     error = (0.01 if command.bounces == 1 else 0.03) if command.error is None else command.error
@@ -68,6 +70,9 @@ def run(command: Dataset, progress: Progress) -> dict:
     out = command.out or Path("out") / file_stem(of.name)
     output_folder(out, "the set")
     count = command.count if command.count is not None else of.size or 100
+    check_asked(job, count, command.workers)
+    if command.pack is not None:
+        check_one_size(job, count, command.pack)
     if command.dry_run:
         from scene2spad.dry_runs.sets import dry_run
 

@@ -1,0 +1,87 @@
+"""Folders of sets: rays planned for the scenes that are rendered, damaged views and records, packs of one size."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from render.transient import read_transient
+from scene2spad.cli import main
+from scene2spad.datasets.packing import pack_set
+from scene2spad.datasets.rendering import PLANNED_PLACES, Job, make_set
+from scene2spad.datasets.set_folder import finished_views
+from scenes import InputError
+from scenes.library.sets import scene_set
+
+JOB = Job("hard-cases", width=12, height=9, bounces=1, grid=2)
+
+
+@pytest.fixture
+def small(tmp_path) -> Path:
+    """A set of three views."""
+    make_set(JOB, 3, tmp_path / "set")
+    return tmp_path / "set"
+
+
+def test_a_place_that_was_planned_without_ambient_light_is_rendered_without(tmp_path):
+    """Planning had left the last place's world behind with its lamps, and the first view after it was lit by them."""
+    job, out = Job("rooms", width=8, bounces=1, error=0.3, ambient=False), tmp_path / "set"
+    last = (PLANNED_PLACES - 1) * scene_set("rooms").views_per_place
+    make_set(job, last + 1, out)
+    view = out / f"views/{last:06d}.exr"
+    before = view.read_bytes()
+    view.unlink()
+    (out / "grid.json").unlink()
+    make_set(job, last + 1, out)
+    assert view.read_bytes() == before and not read_transient(view).ambient.any()
+
+
+def test_rays_are_planned_for_the_moved_scenes(tmp_path):
+    """A rigid move shows the camera another image, which takes another number of rays."""
+    errors = {}
+    for offset_m in (0.0, 3.0):
+        make_set(
+            Job("clutter", width=8, bounces=1, error=0.3, offset_m=offset_m, offset_mode="rigid"),
+            1,
+            tmp_path / f"{offset_m}",
+        )
+        errors[offset_m] = json.loads((tmp_path / f"{offset_m}/grid.json").read_text())["errors"]
+    assert errors[0.0] != errors[3.0]
+
+
+def test_views_of_several_sizes_are_not_packed(tmp_path, capsys):
+    """It is said before any is rendered."""
+    argv = ["dataset", "hard-cases", "--width", "12", "--bounces", "1", "--out", str(tmp_path / "set")]
+    assert main([*argv, "--pack", str(tmp_path / "set.h5")]) == 2
+    message = capsys.readouterr().err
+    assert "set.h5: views of hard-cases are of several sizes (12 x " in message and message.count("\n") == 1
+    assert not (tmp_path / "set").exists()
+
+
+def test_a_damaged_view_is_named_with_what_mends_it(small, tmp_path):
+    view = small / "views/000001.exr"
+    view.write_bytes(view.read_bytes()[:-40] + bytes(40))
+    with pytest.raises(InputError, match=r"000001\.exr: .*; delete it, and `dataset` renders it again$"):
+        pack_set(small, tmp_path / "set.h5")
+    assert not (tmp_path / "set.h5").exists()
+
+
+@pytest.mark.parametrize("change", [lambda r: r.pop("target_met"), lambda r: r.update(error=float("nan"))])
+def test_a_record_without_its_numbers_is_rendered_again(small, change):
+    index = small / "index.jsonl"
+    records = [json.loads(line) for line in index.read_text().splitlines()]
+    change(records[0])
+    index.write_text("".join(json.dumps(record) + "\n" for record in records))
+    assert set(finished_views(small, JOB.made())) == {1, 2}
+    assert make_set(JOB, 3, small)["rendered_now"] == 1
+
+
+def test_a_set_of_which_no_view_can_be_rendered_is_an_error(tmp_path, monkeypatch, shared_data, capsys):
+    folder = tmp_path / "data/middlebury/Art"
+    shutil.copytree(shared_data / "middlebury/Art", folder)
+    (folder / "view1.png").write_bytes((folder / "view1.png").read_bytes()[:100])
+    monkeypatch.setenv("SCENE2SPAD_DATA", str(tmp_path / "data"))
+    argv = ["dataset", "middlebury", "--width", "8", "--bounces", "1", "--error", "0.3", "--out", str(tmp_path / "set")]
+    assert main(argv) == 2
+    assert "set: none of 1 views could be rendered; view 0: " in capsys.readouterr().err
