@@ -15,7 +15,7 @@ DEEP = b"[" * 100_000 + b"\n"
 
 
 def record(view: int) -> dict:
-    return {"view": view, "file": file_name(view), "bytes": 3, "error": 0.01}
+    return {"view": view, "file": file_name(view), "bytes": 3, "error": 0.01, "target": 0.02, "target_met": True}
 
 
 @pytest.mark.parametrize("junk", [b"\xff\xfe", b"{", DEEP, b'{"view": 1e400}\n', b'{"view": [], "file": {}}\n'])

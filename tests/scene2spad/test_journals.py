@@ -57,7 +57,8 @@ def test_a_journal_cut_at_any_byte_of_its_last_line_loses_that_entry_alone(tmp_p
 
 
 def test_a_set_goes_on_from_a_journal_cut_at_any_byte(tmp_path):
-    done = [Done({"view": i, "file": file_name(i), "bytes": 4, "error": 0.1}, b"view", 0.5, "here/1") for i in range(3)]
+    numbers = {"bytes": 4, "error": 0.1, "target": 0.2, "target_met": True}
+    done = [Done({"view": i, "file": file_name(i), **numbers}, b"view", 0.5, "here/1") for i in range(3)]
     whole = SetFolder(tmp_path / "whole", MADE)
     for one in done:
         whole.add(one)
