@@ -94,7 +94,9 @@ def draw_transient(transient: Transient, path: Path) -> Path:
         cmap=DEPTH_COLOURS,
         **depth_limits(transient.depth_m),
     )
-    draw_image(axes[0, 2], 100 * fraction, "indirect share of the laser light", "%", cmap=ERROR_COLOURS, vmin=0)
+    # a scale from 0, also where there is no indirect light at all
+    limits = {"vmin": 0, "vmax": max(float(np.nanmax(100 * fraction, initial=0)), 1.0)}
+    draw_image(axes[0, 2], 100 * fraction, "indirect share of the laser light", "%", cmap=ERROR_COLOURS, **limits)
     axes[1, 0].imshow(np.abs(transient.normal.astype(float)))
     axes[1, 0].set(title="|normal|, world x y z as red green blue", xticks=[], yticks=[])
     axes[1, 0].title.set_fontsize(10)

@@ -68,7 +68,9 @@ def run(command: Export, progress: Progress) -> dict:
         from spad.formats.dense import write_dense
 
         write_dense(arrays, out, layout=command.layout)
-        return {"shape": list(arrays["data"].shape), "layout": command.layout, "out": str(out)}
+        rows, columns, times = arrays["data"].shape
+        shape = [times, rows, columns] if command.layout == "thw" else [rows, columns, times]
+        return {"shape": shape, "layout": command.layout, "out": str(out)}
     if suffix == ".ply" and kind in ("transient", "pack", "histogram", "depth"):
         return {"points": _points(command, kind), "out": str(out)}
     all_forms = (".npz", ".h5", ".ply")
