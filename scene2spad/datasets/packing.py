@@ -16,13 +16,14 @@ def check_one_size(job: Job, count: int, path: Path) -> None:
     """Raise InputError where the first `count` views of a set are of several sizes, which no pack holds, before any of
     them is rendered."""
     chosen = scene_set(job.set)
-    if chosen.size is None:  # views of endless sets are of one size
+    if chosen.size is None or None not in (job.width, job.height):  # views of endless sets are of one size
         return
-    cameras = [chosen.view(view, seed=job.seed, width=job.width, height=job.height).camera for view in range(count)]
+    some = range(min(count, chosen.size))
+    cameras = [chosen.view(view, seed=job.seed, width=job.width, height=job.height).camera for view in some]
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     several = ", ".join(f"{width} x {height}" for width, height in sizes)
     message = f"{path}: views of {job.set} are of several sizes ({several}), a pack holds one"
-    require(len(sizes) == 1, f"{message}; give --width and --height, or leave out --pack")
+    require(len(sizes) <= 1, f"{message}; give --width and --height, or leave out --pack")
 
 
 def pack_set(folder: Path, path: Path, progress: Progress | None = None, *, count: int | None = None) -> int:

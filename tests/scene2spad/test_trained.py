@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+import scene2spad as s2s
 from csph.networks.model import load_model, save_model
-from csph.weights.shipped import shipped_names
+from csph.weights.shipped import shipped_file, shipped_names
 from scene2spad.cli.main import parse_command
 from scene2spad.datasets.planes import random_planes
 from scene2spad.networks.registry import ModelRegistry, ModelSpec, check, ship_all
@@ -50,6 +51,17 @@ def test_studies_take_every_model_that_ships(tmp_path):
         assert wanted.name == name
         found = ModelRegistry(tmp_path).find(wanted)
         assert found is not None and found.shipped, name
+
+
+def test_depth_by_the_path_of_a_model(tmp_path):
+    transient = s2s.render("plane", width=8, height=8, bounces=1)
+    histogram = s2s.sense(transient, signal=50, background=5)
+    found = s2s.estimate_depth(histogram, shipped_file("none-s0"))
+    assert (found == s2s.estimate_depth(histogram, "none-s0")).all()
+    with pytest.raises(InputError, match="depth method None: expected a name"):
+        s2s.estimate_depth(histogram, None)
+    with pytest.raises(InputError, match=r"^seed -1: expected a whole number, 0 or more$"):
+        s2s.sense(transient, seed=-1)
 
 
 @pytest.fixture(scope="module")

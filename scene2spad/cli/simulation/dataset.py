@@ -57,7 +57,7 @@ class Dataset(Long):
 def run(command: Dataset, progress: Progress) -> dict:
     """Run the command: A scene set -> a folder of .exr files, and one .h5 of them all."""
     from scene2spad.datasets.packing import check_one_size, pack_set
-    from scene2spad.datasets.rendering import Job, check_asked, make_set
+    from scene2spad.datasets.rendering import Job, make_set
 
     of = scene_set(command.set)
     error = (0.01 if command.bounces == 1 else 0.03) if command.error is None else command.error
@@ -70,7 +70,6 @@ def run(command: Dataset, progress: Progress) -> dict:
     out = command.out or Path("out") / file_stem(of.name)
     output_folder(out, "the set")
     count = command.count if command.count is not None else of.size or 100
-    check_asked(job, count, command.workers)
     if command.pack is not None:
         check_one_size(job, count, command.pack)
     if command.dry_run:
