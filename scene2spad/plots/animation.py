@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw
 
-from scene2spad.viewer.content import NS_PER_M, Cube
+from scene2spad.viewer.content import Cube
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 
@@ -81,7 +81,7 @@ def _pictures(cube: Cube, frames: int, side: int) -> list[Image.Image]:
     lit = np.clip(shown - steady, 0, None)
     white = float(np.quantile(lit.max(axis=0), WHITE)) or 1.0
     return [
-        _picture(np.clip(frame / white, 0, 1), cube.start_ns + (t + width / 2) * cube.step_ns, side)
+        _picture(np.clip(frame / white, 0, 1), _caption(cube, t + width / 2), side)
         for frame, t in zip(lit, chosen, strict=True)
     ]
 
@@ -94,13 +94,17 @@ def _lit(values: np.ndarray) -> tuple[int, int]:
     return (int(max(lit[0] - 2, 0)), int(lit[-1])) if lit.size else (0, values.shape[2] - 1)
 
 
-def _picture(fraction: np.ndarray, at_ns: float, side: int) -> Image.Image:
-    """One frame (H, W) in [0, 1], enlarged by a whole factor, with its time and the depth seen then."""
+def _caption(cube: Cube, bins: float) -> str:
+    """Say a frame's time, and the depth that is seen then where time tells it."""
+    at_ns = cube.start_ns + bins * cube.step_ns
+    return f"{at_ns:5.1f} ns" + ("" if cube.metres_per_ns is None else f", {at_ns * cube.metres_per_ns:.2f} m")
+
+
+def _picture(fraction: np.ndarray, caption: str, side: int) -> Image.Image:
+    """One frame (H, W) in [0, 1], enlarged by a whole factor, with words below."""
     factor = max(1, side // max(fraction.shape))
     rgb = np.rint(255 * matplotlib.colormaps["inferno"](fraction ** (1 / 2.2))[..., :3]).astype(np.uint8)
     image = Image.fromarray(rgb.repeat(factor, axis=0).repeat(factor, axis=1))
     if image.width >= 160:  # else there is no room for words
-        ImageDraw.Draw(image).text(
-            (6, image.height - 16), f"{at_ns:5.1f} ns, {at_ns / NS_PER_M / 2:.2f} m", fill="white"
-        )
+        ImageDraw.Draw(image).text((6, image.height - 16), caption, fill="white")
     return image

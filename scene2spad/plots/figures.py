@@ -1,8 +1,7 @@
-"""Pictures of what the chain makes: transients, histograms, depth maps, and the demo's figure. Units on every axis."""
+"""Pictures of what the chain makes: transients, depth maps, pulses. Units on every axis."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -12,9 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from render.transient import Transient
-from scene2spad.plots.style import COLOURS, plt, save
-from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from spad.detection.detect import expected_in_pixel
+from scene2spad.plots.style import plt, save
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 
@@ -111,7 +108,8 @@ def draw_transient(transient: Transient, path: Path) -> Path:
 
 def _mean_transient(axes: Axes, transient: Transient) -> None:
     centre = 0.5 * (transient.path_near_m + transient.path_far_m)
-    edges = np.linspace(0.98 * centre.min(initial=0), 1.02 * np.quantile(centre, 0.999) if centre.size else 1, 200)
+    low, high = (0.98 * centre.min(), 1.02 * np.quantile(centre, 0.999)) if centre.size else (0.0, 1.0)
+    edges = np.linspace(low, high, 200)
     pixels = transient.height * transient.width
     for label, kept in (("direct", transient.bounces == 1), ("indirect", transient.bounces > 1)):
         if kept.any():
@@ -123,43 +121,7 @@ def _mean_transient(axes: Axes, transient: Transient) -> None:
     axes.legend(fontsize=8)
 
 
-SHOWN_RANKS = {"dark": 0.1, "median": 0.5, "bright": 0.9}  # of expected signal, among pixels of one known surface
-WINDOW_NS = (4.0, 12.0)  # before and after the true arrival
-
-
-def draw_histogram(
-    histogram: Histogram, path: Path, *, expected: Callable[[int, int], np.ndarray] | None = None
-) -> Path:
-    """Draw detections per pixel, expected signal to background, and three pixels around their true depths.
-
-    `expected(row, column)` gives the rates (T,) that a pixel's counts were drawn from: a line over the counts, without
-    which a pixel of few photons tells nothing.
-    """
-    figure, images, right = _image_row(histogram.depth_m.shape, 2, right=4.4)
-    panels = dict(zip("AB", images, strict=True)) | dict(zip(SHOWN_RANKS, right, strict=True))
-    counts = histogram.counts.sum(axis=2, dtype=np.int64)
-    ratio = histogram.expected_signal / np.maximum(histogram.expected_background, 1e-12)
-    bright = max(np.quantile(counts, 0.995), 1)
-    draw_image(panels["A"], counts, "detections per pixel", "photons", cmap="gray", vmin=0, vmax=bright)
-    decibels = 10 * np.log10(np.maximum(ratio, 1e-12))
-    low, high = np.quantile(decibels[ratio > 0], (0.01, 0.99)) if (ratio > 0).any() else (0, 1)
-    draw_image(panels["B"], decibels, "expected signal to background", "dB", cmap=ERROR_COLOURS, vmin=low, vmax=high)
-    for number, (name, (row, column)) in enumerate(shown_pixels(histogram).items()):
-        for key in "AB":
-            panels[key].plot(column, row, "o", mfc="none", mec=f"C{number + 1}", ms=8, mew=1.5)
-        rate = None if expected is None else expected(row, column)
-        _pixel_counts(panels[name], histogram, row, column, rate, f"C{number + 1}", name)
-    panels[[*SHOWN_RANKS][-1]].set_xlabel("time since the laser's emission [ns]", fontsize=9)
-    budget = histogram.budget
-    figure.suptitle(
-        f"{histogram.sensor.name} sensor, {budget.signal:g} + {budget.background:g} photons per pixel on average; "
-        "right: pixels whose expected signal is above that of 10, 50 and 90 % of pixels",
-        fontsize=11,
-    )
-    return save(figure, path)
-
-
-def _image_row(shape: tuple[int, ...], images: int, right: float = 0.0) -> tuple[Figure, list[Axes], list[Axes]]:
+def image_row(shape: tuple[int, ...], images: int, right: float = 0.0) -> tuple[Figure, list[Axes], list[Axes]]:
     """Make a figure of a row of images, and with `right` three panels of that width [inches] one below another.
 
     Places are computed here: matplotlib's layouts draw everything once more, half of what a picture costs.
@@ -179,49 +141,13 @@ def _image_row(shape: tuple[int, ...], images: int, right: float = 0.0) -> tuple
     return figure, row, column
 
 
-def shown_pixels(histogram: Histogram) -> dict[str, tuple[int, int]]:
-    """Return row and column of the pixels at SHOWN_RANKS of expected signal, among those of one surface of known depth
-    (all where there is none)."""
-    candidates = np.flatnonzero(np.isfinite(histogram.depth_m) & ~histogram.mixed & (histogram.expected_signal > 0))
-    if not candidates.size:
-        candidates = np.arange(histogram.depth_m.size)
-    ranked = candidates[np.argsort(histogram.expected_signal.ravel()[candidates], kind="stable")]
-    places = {name: int(ranked[int(rank * (ranked.size - 1))]) for name, rank in SHOWN_RANKS.items()}
-    return {name: divmod(place, histogram.depth_m.shape[1]) for name, place in places.items()}
-
-
-def _pixel_counts(
-    axes: Axes, histogram: Histogram, row: int, column: int, rate: np.ndarray | None, colour: str, name: str
-) -> None:
-    """Draw counts of one pixel as bars, the expected rate as a line over them, its true depth dotted."""
-    edges_ns = np.arange(histogram.sensor.bins + 1) * histogram.sensor.bin_width_s * 1e9
-    depth_m, shown = float(histogram.depth_m[row, column]), slice(0, histogram.sensor.bins)
-    true_ns = 2e9 * depth_m / SPEED_OF_LIGHT_M_PER_S % edges_ns[-1]
-    if np.isfinite(depth_m):
-        window_ns = (max(true_ns - WINDOW_NS[0], 0), min(true_ns + WINDOW_NS[1], edges_ns[-1]))
-        first, last = np.searchsorted(edges_ns, window_ns)
-        shown = slice(max(int(first) - 1, 0), int(last))  # bins outside would take most of the figure's time
-        axes.set_xlim(*window_ns)
-    bins_ns = edges_ns[shown.start : shown.stop + 1]
-    axes.stairs(histogram.counts[row, column, shown], bins_ns, fill=True, color="0.7", label="detections")
-    if rate is not None:
-        axes.stairs(rate[shown], bins_ns, color=colour, lw=1.4, label="expected")
-    if np.isfinite(depth_m):
-        axes.axvline(true_ns, color="k", lw=0.8, ls=":", label="true depth")
-    signal, background = (float(v[row, column]) for v in (histogram.expected_signal, histogram.expected_background))
-    axes.set_title(f"{name} pixel ({row}, {column}): {signal:.3g} + {background:.3g} photons expected", fontsize=9)
-    axes.set_ylabel("per bin", fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.legend(fontsize=7, loc="upper right")
-
-
 def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: dict, path: Path) -> Path:
     """Draw truth, estimate and absolute error; the estimate alone where no truth is known."""
     if np.isnan(histogram.depth_m).all():
-        figure, (only,), _ = _image_row(depth_m.shape, 1)
+        figure, (only,), _ = image_row(depth_m.shape, 1)
         draw_image(only, depth_m, f"{method}, no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
         return save(figure, path)
-    figure, axes, _ = _image_row(depth_m.shape, 3)
+    figure, axes, _ = image_row(depth_m.shape, 3)
     limits = depth_limits(histogram.depth_m)
     draw_image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     title = f"{method}: MAE {errors['mae_mm']:.1f} mm, {errors['within_10mm']:.0%} within 10 mm"
@@ -290,100 +216,3 @@ def draw_taps(taps: np.ndarray, path: Path) -> Path:
     axes.stairs(taps, np.arange(len(taps) + 1))
     axes.set(xlabel="bin of the frame's pulse", ylabel="share of a detection", title=f"pulse of {len(taps)} taps")
     return save(figure, path)
-
-
-def draw_demo(
-    transient: Transient,
-    histogram: Histogram,
-    depths: dict[str, np.ndarray],
-    errors: dict[str, dict],
-    path: Path,
-    chip: dict[str, str],
-) -> Path:
-    """Draw intensity, true depth, every estimate with its error, one pixel from returns to detections, and what codes
-    cost in the pixel (`chip`, by model)."""
-    figure = plt.figure(figsize=(14, 11.5), layout="constrained")
-    panels = figure.subplot_mosaic("ABC;DEF;GGG;HHH", height_ratios=(1, 1, 0.45, 0.6))
-    limits = depth_limits(histogram.depth_m)
-    draw_image(panels["A"], histogram.expected_signal, "expected signal", "photons per pixel", cmap="gray", vmin=0,
-           vmax=np.quantile(histogram.expected_signal, 0.98))  # fmt: skip
-    draw_image(panels["B"], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
-    for key, (name, depth) in zip("CDEF", depths.items(), strict=True):
-        message = f"{name}\nMAE {errors[name]['mae_mm']:.0f} mm, {errors[name]['within_10mm']:.0%} within 10 mm"
-        draw_image(panels[key], depth, message, "m", cmap=DEPTH_COLOURS, **limits)
-    row, column = _telling_pixel(transient)
-    for key in "ABCDEF":
-        panels[key].plot(column, row, "o", mfc="none", mec=COLOURS["vermilion"], ms=9)
-    _one_pixel(panels["G"], panels["H"], transient, histogram, row, column)
-    costs = "\n".join(f"{model}: {cost}" for model, cost in chip.items())
-    figure.supxlabel(f"The codes on emulated in-pixel cores\n{costs}", fontsize=8.5)
-    budget = histogram.budget
-    figure.suptitle(
-        f"{transient.meta['scene']}: {budget.signal:g} signal + {budget.background:g} background photons per pixel, "
-        f"{histogram.sensor.bins} bins of {histogram.sensor.bin_width_s * 1e12:.1f} ps, render error "
-        f"{transient.meta['relative_error']['total']:.1%}"
-    )
-    return save(figure, path)
-
-
-def _telling_pixel(transient: Transient) -> tuple[int, int]:
-    """Pick an unmixed pixel of median brightness or more whose indirect share is the 90th percentile of such pixels."""
-    total = transient.total_radiance()
-    later = transient.bounces > 1
-    indirect = np.bincount(transient.return_pixel[later], weights=transient.radiance[later], minlength=total.size)
-    fraction = indirect / np.maximum(total.ravel(), 1e-30)
-    known = np.isfinite(transient.depth_m) if np.isfinite(transient.depth_m).any() else total > 0
-    bright = known & (total >= np.median(total[known])) & ~transient.mixed
-    candidates = np.flatnonzero(bright if bright.any() else known)
-    ranked = candidates[np.argsort(fraction[candidates], kind="stable")]
-    row, column = np.unravel_index(int(ranked[int(0.9 * (len(ranked) - 1))]), total.shape)
-    return int(row), int(column)
-
-
-def _one_pixel(above: Axes, below: Axes, transient: Transient, histogram: Histogram, row: int, column: int) -> None:
-    """One pixel from returns (above) to expected and detected photons (below), on one time axis."""
-    sensor, ns = histogram.sensor, 1e9
-    pixel = row * transient.width + column
-    mine = slice(int(transient.offsets[pixel]), int(transient.offsets[pixel + 1]))
-    centre = 0.5 * (transient.path_near_m + transient.path_far_m)[mine] / SPEED_OF_LIGHT_M_PER_S * ns
-    fraction = transient.radiance[mine] / transient.radiance[mine].sum()
-    for name, colour, kept in (
-        ("direct", COLOURS["green"], transient.bounces[mine] == 1),
-        ("indirect", COLOURS["vermilion"], transient.bounces[mine] > 1),
-    ):
-        if kept.any():
-            above.vlines(centre[kept], 0, fraction[kept], color=colour, lw=1)
-            above.plot(
-                centre[kept],
-                fraction[kept],
-                "o",
-                color=colour,
-                ms=3,
-                label=f"{name} returns ({fraction[kept].sum():.0%})",
-            )
-    above.set_yscale("log")
-    above.set_ylabel("share of the\npixel's radiance")
-    above.set_title(
-        f"the circled pixel (row {row}, column {column}): its transient, and what the sensor makes of it", fontsize=10
-    )
-    above.legend(fontsize=8, loc="upper right")
-    above.tick_params(labelbottom=False)
-
-    edges_ns = np.arange(sensor.bins + 1) * sensor.bin_width_s * ns
-    below.stairs(histogram.counts[row, column], edges_ns, fill=True, color="0.75", label="detections")
-    expected = expected_in_pixel(transient, sensor, histogram.budget, row, column)
-    below.stairs(expected, edges_ns, color=COLOURS["blue"], label="expected counts")
-    first_ns = min(float(centre.min()), edges_ns[-1] - 1)
-    for axes in (above, below):
-        axes.set_xlim(max(first_ns - 3, 0), min(first_ns + 18, edges_ns[-1]))
-    if np.isfinite(transient.depth_m[row, column]):
-        true_ns = 2 * float(transient.depth_m[row, column]) / SPEED_OF_LIGHT_M_PER_S * ns
-        below.axvline(true_ns, color="k", lw=0.8, ls=":")
-        below.annotate("true depth", (true_ns, 0.92), xycoords=("data", "axes fraction"), xytext=(-4, 0),
-                       textcoords="offset points", fontsize=8, ha="right", va="top")  # fmt: skip
-    below.set(xlabel="time since the laser's emission [ns]", ylabel="photons per bin")
-    below.legend(fontsize=8, loc="upper right")
-    metres_per_ns = SPEED_OF_LIGHT_M_PER_S / ns / 2
-    depth_axis = below.secondary_xaxis("top", functions=(lambda t: t * metres_per_ns, lambda d: d / metres_per_ns))
-    depth_axis.set_xlabel("depth [m]", fontsize=8)
-    depth_axis.tick_params(labelsize=8)

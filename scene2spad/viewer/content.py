@@ -34,7 +34,10 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Cube:
-    """Numbers of every pixel over time, (H, W, T): whole counts, or rates of which a step of the scale is told."""
+    """Numbers of every pixel over time, (H, W, T): whole counts, or rates of which a step of the scale is told.
+
+    metres_per_ns   depth that a nanosecond is; None beside a displaced laser, where depth is no function of time alone
+    """
 
     name: str
     unit: str
@@ -42,6 +45,7 @@ class Cube:
     start_ns: float
     step_ns: float
     drawn: Literal["bars", "line"]
+    metres_per_ns: float | None = 0.5 / NS_PER_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,7 @@ class Content:
     layers: tuple[Layer, ...] = ()
     cubes: tuple[Cube, ...] = ()
     returns: Returns | None = None
+    arrival_ns: np.ndarray | None = None  # (H, W) when light from the true depth arrives, NaN where it is unknown
     points: np.ndarray | None = None  # (N, 3) float32 [m], x right, y down, z forward
     point_value: np.ndarray | None = None  # (N,) in [0, 1], what colours them
     figures: tuple[tuple[str, bytes], ...] = ()  # caption and PNG
@@ -103,6 +108,7 @@ def cube_payload(cube: Cube) -> dict[str, object]:
         "drawn": cube.drawn,
         "bins": values.shape[2],
         "start_ns": cube.start_ns,
+        "metres_per_ns": cube.metres_per_ns,
         "step_ns": cube.step_ns * summed,
         "summed": summed,
         "top": top,

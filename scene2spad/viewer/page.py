@@ -13,7 +13,7 @@ import matplotlib
 import numpy as np
 
 from scene2spad.report.html import table
-from scene2spad.viewer.content import NS_PER_M, Content, Returns, cube_payload, packed
+from scene2spad.viewer.content import Content, Returns, cube_payload, packed
 from scenes.files import whole_file
 from scenes.json_types import JsonObject
 
@@ -97,8 +97,8 @@ def _precision(content: Content, cubes: list[JsonObject]) -> str:
         lines.append(f"{part['name']}: {part['unit']}{summed}{rounded}")
     if content.returns is not None:
         lines.append(f"returns on a logarithmic scale of four decades, {content.returns.note}")
-    if any(layer.palette == "depth" for layer in content.layers):
-        lines.append("dotted: depth")
+    if content.arrival_ns is not None:
+        lines.append("dotted: when light from the true depth arrives")
     return "; ".join(lines) + "."
 
 
@@ -120,11 +120,11 @@ def _payload(content: Content) -> JsonObject:
     return {
         "height": height,
         "width": width,
-        "metres_per_ns": 0.5 / NS_PER_M,
         "palettes": colours,
         "layers": layers,
         "cubes": [cube_payload(cube) for cube in content.cubes],
         "returns": None if content.returns is None else _returns(content.returns),
+        "arrival_ns": None if content.arrival_ns is None else packed(content.arrival_ns.astype(np.float32)),
         "points": _cloud(content),
     }
 

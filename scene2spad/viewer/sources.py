@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from render.transient import Transient
+from scene2spad.plots.pixels import expected_name, has_expected
 from scene2spad.viewer.content import NS_PER_M, Content, Cube, Layer, Returns, grey_layer
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.json_types import JsonObject
 from scenes.model import Camera
 from spad.detection.rates import Rates, rates_for
+from spad.formats.bistatic import baseline_of, true_arrival_s, true_path_m
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 
@@ -41,17 +46,16 @@ def transient_content(transient: Transient, title: str) -> Content:
         layers,
         (light_over_path(transient),),
         merged_returns(transient, 1.0, "1/(m² sr)"),
+        true_path_m(transient) * NS_PER_M,
         **surface(transient.depth_m, transient.meta.get("camera"), total),
     )
 
 
 def histogram_content(histogram: Histogram, title: str, transient: Transient | None = None) -> Content:
     """Show a histogram: its images, detections, and with its transient the expected counts and the returns."""
-    sensor, step_ns = histogram.sensor, histogram.sensor.bin_width_s * 1e9
-    counts = histogram.counts
-    detections = counts.sum(axis=2, dtype=np.int64)
-    layers = [grey_layer("detections", "", detections)]
-    if np.isfinite(histogram.expected_signal).any():
+    sensor, counted = histogram.sensor, histogram.counts.sum(axis=2, dtype=np.int64)
+    layers = [grey_layer("detections", "", counted)]
+    if has_expected(histogram):
         layers += [
             grey_layer("expected signal", "photons", histogram.expected_signal),
             grey_layer("expected background", "photons", histogram.expected_background),
@@ -61,18 +65,37 @@ def histogram_content(histogram: Histogram, title: str, transient: Transient | N
             depth_layer("true depth", histogram.depth_m),
             Layer("two surfaces", "", histogram.mixed, "gray", MIXED_LOW, MIXED_HIGH),
         ]
-    cubes = [Cube("detections", "per bin", counts, 0.0, step_ns, "bars")]
+    cubes = [detections(histogram)]
     returns, notes = None, []
     if transient is None:
         notes.append("Expected counts and returns are in the transient: lay it beside the histogram, or give it.")
     else:
         rates = rates_for(transient, sensor, histogram.budget, seed=int(histogram.meta.get("seed", 0)))
         expected = expected_cube(transient, sensor, rates)
-        cubes.append(Cube("expected", "per bin", expected, 0.0, step_ns, "line"))
-        returns = merged_returns(transient, rates.signal_scale, "photons")
+        cubes.append(replace(cubes[0], name=expected_name(histogram), values=expected, drawn="line"))
+        returns = merged_returns(transient, rates.signal_scale, "photons", period_ns=1e9 * sensor.period_s)
     camera = histogram.meta.get("transient", {}).get("camera")
-    cloud = surface(histogram.depth_m, camera, detections)
-    return Content(title, histogram_facts(histogram), tuple(layers), tuple(cubes), returns, notes=notes, **cloud)
+    cloud = surface(histogram.depth_m, camera, counted)
+    arrival_ns, record_ns = 1e9 * true_arrival_s(histogram), 1e9 * sensor.bins * sensor.bin_width_s
+    missed = int((arrival_ns >= record_ns).sum())
+    if missed:
+        notes.append(f"Light from the true depth of {missed:,} pixels arrives after the record's {record_ns:.4g} ns.")
+    return Content(
+        title, histogram_facts(histogram), tuple(layers), tuple(cubes), returns, arrival_ns, notes=notes, **cloud
+    )
+
+
+def detections(histogram: Histogram) -> Cube:
+    """Return the counts of a histogram over time."""
+    step_ns = 1e9 * histogram.sensor.bin_width_s
+    depth = depth_per_ns(histogram.meta.get("transient", {}))
+    return Cube("detections", "per bin", histogram.counts, 0.0, step_ns, "bars", depth)
+
+
+def depth_per_ns(rendered: JsonObject) -> float | None:
+    """Return metres of depth that a nanosecond is, None beside a displaced laser, by what a transient states of
+    itself."""
+    return None if any(baseline_of(rendered)) else 0.5 / NS_PER_M
 
 
 def depth_content(depth_m: np.ndarray, confidence: np.ndarray | None, meta: JsonObject, title: str) -> Content:
@@ -124,7 +147,8 @@ def light_over_path(transient: Transient) -> Cube:
     spread(cube, transient.return_pixel[seen], (near[seen] - low) / step, (far[seen] - low) / step,
            transient.radiance[seen])  # fmt: skip
     shape = (transient.height, transient.width, FRAMES)
-    return Cube("light", "1/(m² sr) per step", cube.reshape(shape), low * NS_PER_M, step * NS_PER_M, "line")
+    start_ns, step_ns, depth = low * NS_PER_M, step * NS_PER_M, depth_per_ns(transient.meta)
+    return Cube("light", "1/(m² sr) per step", cube.reshape(shape), start_ns, step_ns, "line", depth)
 
 
 def spread(cube: np.ndarray, row: np.ndarray, near: np.ndarray, far: np.ndarray, energy: np.ndarray) -> None:
@@ -157,10 +181,10 @@ def _span(near: np.ndarray, far: np.ndarray, radiance: np.ndarray) -> tuple[floa
     return max(low - margin, 0.0), float(end) + margin
 
 
-def merged_returns(transient: Transient, scale: float, unit: str) -> Returns:
+def merged_returns(transient: Transient, scale: float, unit: str, *, period_ns: float = math.inf) -> Returns:
     """Make one line of the returns of a pixel that lie in one cell of time and are of one kind: energies are summed,
-    times weighted by energy."""
-    time = 0.5 * (transient.path_near_m.astype(float) + transient.path_far_m) * NS_PER_M
+    times weighted by energy. Time wraps at the laser's period."""
+    time = np.fmod(0.5 * (transient.path_near_m.astype(float) + transient.path_far_m) * NS_PER_M, period_ns)
     direct = transient.bounces == 1
     cell = np.floor(time / np.where(direct, DIRECT_NS, INDIRECT_NS)).astype(np.int64)
     cells = int(cell.max(initial=0)) + 1
@@ -224,7 +248,7 @@ def transient_facts(transient: Transient) -> dict[str, str]:
 def histogram_facts(histogram: Histogram) -> dict[str, str]:
     sensor, budget = histogram.sensor, histogram.budget
     photons = f"{budget.signal:g} signal + {budget.background:g} background detections a pixel"
-    if not np.isfinite(histogram.expected_signal).any():  # counts without a truth, of a capture say
+    if not has_expected(histogram):  # counts without a truth, of a capture say
         photons = f"{budget.signal + budget.background:g} detections a pixel; how many are signal is unknown"
     return {
         "kind": "histogram",

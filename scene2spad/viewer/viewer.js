@@ -65,11 +65,10 @@ function tell() {
 function range(pixel) {
   const cube = page.cubes[0], end = cube.start_ns + cube.bins * cube.step_ns;
   if (state.whole) return [cube.start_ns, end];
-  let first = Infinity, peak = 0, at = cube.start_ns;
-  if (page.returns && page.returns.offsets[pixel + 1] > page.returns.offsets[pixel]) first = page.returns.time[page.returns.offsets[pixel]];
-  const last = page.cubes[page.cubes.length - 1];
+  const last = page.cubes[page.cubes.length - 1], arrival = page.arrival ? page.arrival[pixel] : NaN;
+  let peak = 0, at = cube.start_ns;
   for (let t = 0; t < last.bins; t++) { const v = value(last, pixel, t); if (v > peak) { peak = v; at = last.start_ns + t * last.step_ns; } }
-  const centre = Number.isFinite(first) ? first : at, span = Math.max(22, 60 * cube.step_ns);
+  const centre = arrival < end ? arrival : at, span = Math.max(22, 60 * cube.step_ns);
   const low = clamp(centre - .2 * span, cube.start_ns, Math.max(cube.start_ns, end - span));
   return [low, Math.min(low + span, end)];
 }
@@ -92,13 +91,13 @@ function drawPlot() {
     c.beginPath(); c.moveTo(x(t), 8); c.lineTo(x(t), bottom); c.stroke();
     c.fillText(number(t, 6), x(t), bottom + 14);
   }
-  const deep = right - left > 380 ? `; 1 ns is ${number(page.metres_per_ns, 4)} m of depth` : "";
+  const metres = page.cubes[0].metres_per_ns, deep = metres && right - left > 380 ? `; 1 ns is ${number(metres, 4)} m of depth` : "";
   c.fillText(`time since emission [ns]${deep}`, (left + right) / 2, height - 5);
   c.textAlign = "right"; for (const v of [0, top]) c.fillText(short(v), left - 4, y(v) + 4);
   c.save(); c.beginPath(); c.rect(left, 0, right - left, bottom + 1); c.clip();
   for (const cube of page.cubes) cube.drawn === "bars" ? bars(c, cube, pixel, x, y, low, high) : curve(c, cube, pixel, x, y, low, high);
   const shown = page.cubes[0];
-  if (page.depth) { const d = page.depth.values[pixel]; if (Number.isFinite(d)) { c.strokeStyle = INK; c.setLineDash([2, 3]); const at = x(d / page.metres_per_ns); c.beginPath(); c.moveTo(at, 8); c.lineTo(at, bottom); c.stroke(); c.setLineDash([]); } }
+  if (page.arrival) { if (Number.isFinite(page.arrival[pixel])) { c.strokeStyle = INK; c.setLineDash([2, 3]); const at = x(page.arrival[pixel]); c.beginPath(); c.moveTo(at, 8); c.lineTo(at, bottom); c.stroke(); c.setLineDash([]); } }
   if ($("movie")) { const at = x(shown.start_ns + (state.frame + .5) * shown.step_ns); c.strokeStyle = MARK; c.beginPath(); c.moveTo(at, 8); c.lineTo(at, bottom); c.stroke(); }
   if (page.returns) stems(c, pixel, x, middle);
   c.restore();
@@ -137,7 +136,7 @@ function drawMovie() {
   }
   paint($("movie"), frame, "light", 0, cube.white * (reach ? 3 : 1), 1 / 2.2); cross($("movie"));
   const at = cube.start_ns + (state.frame + .5) * cube.step_ns;
-  $("when").textContent = `${number(at, 5)} ns, ${number(at * page.metres_per_ns, 4)} m deep`;
+  $("when").textContent = `${number(at, 5)} ns` + (cube.metres_per_ns ? `, ${number(at * cube.metres_per_ns, 4)} m deep` : "");
   $("time").value = state.frame;
 }
 function prepareMovie() {
@@ -233,7 +232,7 @@ async function start() {
     cube.values = await unpacked(cube.data, cube.type);
     if (cube.rooted) cube.table = Float64Array.from({ length: 256 }, (_, k) => cube.top * (k / 255) ** 2);
   }
-  page.depth = page.layers.find((l) => l.palette === "depth");
+  if (page.arrival_ns) page.arrival = await unpacked(page.arrival_ns, "float32");
   if (page.returns) {
     const r = page.returns, sizes = await unpacked(r.sizes, "uint16"), kind = await unpacked(r.direct_data, "uint8");
     r.offsets = new Uint32Array(sizes.length + 1); sizes.forEach((s, i) => { r.offsets[i + 1] = r.offsets[i] + s; });

@@ -16,7 +16,7 @@ noise-free pulse, `noise_free_bias_m`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -25,7 +25,6 @@ from torch import Tensor
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, did_you_mean
-from scenes.model import Camera
 from spad.detection.detectors import LAWS
 from spad.detection.laws import LOW_FLUX
 from spad.estimators.matching import (
@@ -40,6 +39,7 @@ from spad.estimators.matching import (
     published_log_matched_bins,
 )
 from spad.estimators.pile_up import linearised
+from spad.formats.bistatic import laser_baseline_m, radial_depth_of
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse, binned_pulse_slope, pulse_taps
@@ -59,10 +59,7 @@ __all__ = [
     "estimate_depth",
     "grid_peak",
     "histogram_depth_m",
-    "laser_baseline_m",
     "noise_free_bias_m",
-    "radial_depth_m",
-    "radial_depth_of",
 ]
 
 _BIAS_PHASES = 16
@@ -222,38 +219,6 @@ def cramer_rao_m(arrival_s: Tensor, signal: Tensor, background_per_bin: Tensor, 
     slope = signal * binned_pulse_slope(arrival_s, sensor)
     information = torch.where(rate > 0, slope**2 / rate, 0.0).sum(-1)
     return SPEED_OF_LIGHT_M_PER_S / 2 * information**-0.5
-
-
-def radial_depth_m(half_path_m: np.ndarray, directions: np.ndarray, baseline_m: Iterable[float]) -> np.ndarray:
-    """Return distance from the camera, given half the optical path from a displaced laser to the surface to the camera
-    [m].
-
-    With p the path, b the laser's place relative to the camera and r the unit ray: the ellipsoid
-    d = (p^2 - |b|^2) / (2 (p - r.b)). half_path_m (...,), directions (..., 3) and b in one frame -> (...,) float32.
-    NaN for a path that is not longer than the baseline: no surface gives one.
-    """
-    path, baseline = 2.0 * np.asarray(half_path_m, dtype=np.float64), np.asarray(tuple(baseline_m), dtype=np.float64)
-    squared = baseline @ baseline
-    path = np.where(path > math.sqrt(squared), path, np.nan)
-    distance = (path**2 - squared) / (2 * (path - directions @ baseline))
-    return distance.astype(np.float32)
-
-
-def laser_baseline_m(histogram: Histogram) -> tuple[float, ...]:
-    """Return the laser's place relative to the camera, in the camera's frame [m]; 0 0 0 if not told."""
-    return tuple(histogram.meta.get("transient", {}).get("laser", {}).get("baseline_m", (0.0, 0.0, 0.0)))
-
-
-def radial_depth_of(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
-    """Convert half the optical path (H, W) [m] into distance from the camera by the histogram's own camera and laser.
-
-    With a co-located laser, or where the histogram does not know of any, it is the same array.
-    """
-    baseline = laser_baseline_m(histogram)
-    if not any(baseline):
-        return half_path_m
-    camera = Camera(**histogram.meta["transient"]["camera"])
-    return radial_depth_m(half_path_m, camera.rays() @ camera.rotation, baseline)
 
 
 def detection_law(histogram: Histogram) -> str | None:

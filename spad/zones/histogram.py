@@ -47,7 +47,7 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
     signal = zone_signal(returns, sensor, zones).sum(axis=1)
     background = np.asarray(zones.background) * sensor.bins
     lost = 1 - counts.sum() / max(1.0, float((signal + background).sum()))
-    pixel = _centre_pixels(transient, zones)
+    pixel, centres = _centre_pixels(transient, zones), (zones.centre_x, zones.centre_y)
 
     def laid(values: np.ndarray, kind: type) -> np.ndarray:
         return values[order].reshape(rows, columns, *values.shape[1:]).astype(kind)
@@ -73,6 +73,10 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
             "brightest_thousandth": brightest,
             "median_signal": float(np.median(signal)),
             "transient": {**transient.meta, "sha256": transient.sha256()},
+            # tangents as the zones are laid out: beside a displaced emitter the depth depends on them
+            "zone_centres": {
+                axis: laid(np.asarray(at), float).tolist() for axis, at in zip("xy", centres, strict=True)
+            },
         },
     )
 

@@ -4,20 +4,23 @@ import csv
 import json
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
+from matplotlib.axes import Axes
 
 from render.transient import write_transient
 from scene2spad.bench import estimators
 from scene2spad.bench.sense import alternating, one_law, relief
 from scene2spad.cli import main
-from scene2spad.plots import figures
+from scene2spad.plots import pixels
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel, sense
+from spad.formats.bistatic import true_arrival_s
 from spad.formats.depth_map import read_depth
-from spad.formats.histogram import read_histogram, write_histogram
+from spad.formats.histogram import Histogram, read_histogram, write_histogram
 from spad.formats.mat import read_mat
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.budget import Optics
@@ -194,17 +197,17 @@ def test_the_figure_shows_pixels_by_a_stated_rule_with_their_rates_over_the_coun
     """At 10 + 200 photons the rate still peaks at the true depth, where counts alone would not."""
     budget = PhotonBudget(10, 200)
     histogram = sense(scene, sensor_by_name("reference"), budget, seed=1)
-    shown = figures.shown_pixels(histogram)
+    shown = pixels.shown_pixels(histogram)
     signal = histogram.expected_signal
     for name, rank in (("dark", 0.1), ("median", 0.5), ("bright", 0.9)):
         below = (signal < signal[shown[name]]).mean()
         assert abs(below - rank) < 0.02  # 80 pixels
     mixed = replace(histogram, mixed=signal > np.median(signal))
-    assert all(not mixed.mixed[place] for place in figures.shown_pixels(mixed).values())
+    assert all(not mixed.mixed[place] for place in pixels.shown_pixels(mixed).values())
     kept = []
-    monkeypatch.setattr(figures, "save", lambda figure, path: kept.append(figure) or path)
+    monkeypatch.setattr(pixels, "save", lambda figure, path: kept.append(figure) or path)
     rate = partial(expected_in_pixel, scene, histogram.sensor, budget)
-    figures.draw_histogram(histogram, tmp_path / "h.png", expected=rate)
+    pixels.draw_histogram(histogram, tmp_path / "h.png", expected=rate)
     panels = {axes.get_title().split(" pixel")[0]: axes for axes in kept[0].axes if " pixel (" in axes.get_title()}
     assert [*panels] == ["dark", "median", "bright"]
     for name, axes in panels.items():
@@ -219,3 +222,42 @@ def test_the_figure_shows_pixels_by_a_stated_rule_with_their_rates_over_the_coun
         assert np.array_equal(bars, histogram.counts[shown[name]][first : first + bars.size])
         low, high = axes.get_xlim()
         assert edges[0] <= low < edges[1] and edges[-2] < high <= edges[-1] and low < depth_ns < high
+
+
+def drawn(histogram: Histogram, monkeypatch: pytest.MonkeyPatch) -> list[Axes]:
+    """Return the panels of pixels in the histogram's figure."""
+    kept = []
+    monkeypatch.setattr(pixels, "save", lambda figure, path: kept.append(figure) or path)
+    pixels.draw_histogram(histogram, Path("h.png"))
+    return [axes for axes in kept[0].axes if " pixel (" in axes.get_title()]
+
+
+def test_the_figure_of_measured_counts_makes_nothing_up(scene, monkeypatch):
+    """Without a truth there is no signal, no ratio and no true depth: pixels are ranked by what was counted."""
+    counts = sense(scene, sensor_by_name("reference"), PhotonBudget(10, 200), seed=1).counts
+    panels = drawn(Histogram.from_counts(counts, sensor_by_name("reference")), monkeypatch)
+    figure, total = panels[0].figure, counts.sum(axis=2)
+    assert "expected" not in " ".join([figure.get_suptitle(), *(axes.get_title() for axes in figure.axes)])
+    for axes, rank in zip(panels, (0.1, 0.5, 0.9), strict=True):
+        row, column = map(int, axes.get_title().split("(")[1].split(")")[0].split(","))
+        assert axes.get_title().endswith(f" {total[row, column]:,} detections")
+        assert abs((total < total[row, column]).mean() - rank) < 0.1
+        assert not axes.lines
+
+
+def test_the_figure_draws_true_depth_where_its_light_arrives(scene, monkeypatch):
+    """A record shorter than the period, and a laser beside the camera."""
+    sensor = Sensor(name="gated", bins=128, bin_width_s=9.1e-11, period_s=2.73e-8)
+    histogram = sense(scene, sensor, PhotonBudget(10, 200), seed=1)
+    record_ns = 1e9 * sensor.bins * sensor.bin_width_s
+    camera = {"pose": np.eye(4).tolist(), "fov_deg": 40.0, "width": 10, "height": 8}
+    for laser in ({}, {"mode": "flood", "baseline_m": [0.3, 0.0, 0.0]}):
+        transient = {**histogram.meta["transient"], "laser": laser, "camera": camera}
+        seen = replace(histogram, meta={**histogram.meta, "transient": transient})
+        arrival_ns = 1e9 * true_arrival_s(seen)
+        for axes, place in zip(drawn(seen, monkeypatch), pixels.shown_pixels(seen).values(), strict=True):
+            lines = [line.get_xdata()[0] for line in axes.lines if len(line.get_xdata())]
+            assert lines == ([pytest.approx(arrival_ns[place])] if arrival_ns[place] < record_ns else [])
+    unrecorded = replace(histogram, depth_m=np.full_like(histogram.depth_m, 0.95 * sensor.range_m))
+    words = [text.get_text() for axes in drawn(unrecorded, monkeypatch) for text in axes.get_legend().get_texts()]
+    assert sum("after the record" in word for word in words) == 3

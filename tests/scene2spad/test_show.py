@@ -20,6 +20,7 @@ from scene2spad.cli.results.show import PAGE_MARK
 from scene2spad.viewer.content import LEVELS, Cube, cube_payload
 from scene2spad.viewer.exports import COLUMNS
 from scene2spad.viewer.sources import expected_cube, light_over_path, merged_returns
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel, rates_for
 from spad.formats.depth_map import read_depth
 from spad.formats.histogram import read_histogram
@@ -105,6 +106,8 @@ def test_the_page_holds_the_counts_and_the_images(capfd):
     truth = expected_in_pixel(read_transient(Path("gallery.exr")), histogram.sensor, histogram.budget, 6, 8)
     assert rates[6, 8] == pytest.approx(truth, abs=0.02 * truth.max())
     assert found["points"] is not None and found["returns"] is not None
+    arrival = unpacked(found["arrival_ns"], "<f4")
+    assert arrival == pytest.approx(2e9 * histogram.depth_m.ravel() / SPEED_OF_LIGHT_M_PER_S, rel=1e-6, nan_ok=True)
 
 
 def test_rates_for_looking_are_those_that_sense_draws_from():
@@ -126,6 +129,22 @@ def test_light_over_path_and_lines_keep_the_energy():
     assert lines.energy.sum() == pytest.approx(2 * total)
     firsts = lines.offsets[:-1][np.diff(lines.offsets) > 1]
     assert all(lines.time_ns[first] <= lines.time_ns[first + 1] for first in firsts)
+
+
+def test_a_sensor_that_records_less_than_its_period(capfd):
+    """Lines of returns wrap as the light does, and the page tells of arrivals that the record does not reach."""
+    told(capfd, "sense", "gallery.exr", "--sensor", "tmf8828", "--out", "short.h5")
+    told(capfd, "show", "short.h5", "--transient", "gallery.exr", "--out", "short.html")
+    found, sensor = payload(Path("short.html")), read_histogram(Path("short.h5")).sensor
+    period_ns, record_ns = 1e9 * sensor.period_s, 1e9 * sensor.bins * sensor.bin_width_s
+    arrival = unpacked(found["arrival_ns"], "<f4")
+    late = int((arrival >= record_ns).sum())
+    assert 0 < late < arrival.size and np.nanmax(arrival) < period_ns
+    assert f"true depth of {late} pixels arrives after the record" in Path("short.html").read_text(encoding="utf-8")
+    transient = read_transient(Path("gallery.exr"))
+    far, wrapped = merged_returns(transient, 1.0, ""), merged_returns(transient, 1.0, "", period_ns=period_ns)
+    assert far.time_ns.max() > period_ns > wrapped.time_ns.max()
+    assert wrapped.energy.sum() == pytest.approx(far.energy.sum())
 
 
 def test_large_cubes_are_summed_in_time_and_keep_their_counts(monkeypatch):

@@ -21,9 +21,9 @@ from spad.estimators.depth import (
     estimate_depth,
     histogram_depth_m,
     noise_free_bias_m,
-    radial_depth_m,
 )
 from spad.estimators.matching import correlation, normalised_correlation
+from spad.formats.bistatic import radial_depth_m
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 from spad.sensor.template import binned_pulse, pulse_taps

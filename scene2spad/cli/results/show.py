@@ -203,7 +203,7 @@ def _picture(command: Show, kind: str, out: Path) -> Path:
 def _histogram_figure(command: Show, out: Path) -> Path:
     from functools import partial
 
-    from scene2spad.plots import figures
+    from scene2spad.plots.pixels import draw_histogram
     from spad.detection.detect import expected_in_pixel
 
     histogram = open_histogram(command.file, command.frame)
@@ -211,18 +211,16 @@ def _histogram_figure(command: Show, out: Path) -> Path:
     if transient is not None:
         seed = int(histogram.meta.get("seed", 0))
         rate = partial(expected_in_pixel, transient, histogram.sensor, histogram.budget, seed=seed)
-    return figures.draw_histogram(histogram, out, expected=rate)
+    return draw_histogram(histogram, out, expected=rate)
 
 
 def _cube(command: Show, kind: str) -> Cube:
     """Return what an animation plays."""
     from scene2spad.viewer import sources
-    from scene2spad.viewer.content import Cube
 
     path = command.file
     if kind in ("transient", "pack"):
         return sources.light_over_path(open_transient(path, kind, command.view))
     if kind == "histogram":
-        histogram = open_histogram(path, command.frame)
-        return Cube("detections", "per bin", histogram.counts, 0.0, histogram.sensor.bin_width_s * 1e9, "bars")
+        return sources.detections(open_histogram(path, command.frame))
     raise InputError(f"{path}: a {kind} has nothing to play; expected a transient, a pack or a histogram")

@@ -47,7 +47,7 @@ def run(command: Demo, progress: Progress) -> dict:
     from render.engine import render
     from render.transient import write_transient
     from scene2spad.methods import depth_method
-    from scene2spad.plots import figures
+    from scene2spad.plots.pixels import draw_demo
     from spad.detection.detect import sense
     from spad.estimators.depth import depth_errors
     from spad.formats.histogram import write_histogram
@@ -74,7 +74,7 @@ def run(command: Demo, progress: Progress) -> dict:
     write_transient(transient, light)
     write_histogram(histogram, counts)
     costs = {model: chip_cost(model) for model in ON_THE_CHIP}
-    figure = figures.draw_demo(transient, histogram, depths, errors, folder / "demo.png", costs)
+    figure = draw_demo(transient, histogram, depths, errors, folder / "demo.png", costs)
     return {
         "seconds": time.perf_counter() - start,
         "seconds_render": rendered - start,

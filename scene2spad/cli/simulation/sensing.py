@@ -141,11 +141,11 @@ def run(command: Sense, progress: Progress) -> dict:
 
         result.update({"pulse_file": str(write_mat(histogram, mat)), "export": str(mat)})
     if command.figure:
-        from scene2spad.plots import figures
+        from scene2spad.plots.pixels import draw_histogram
 
         # a map of dark counts is not part of the rates that the figure could draw
         rate = partial(quadrature_in_pixel, transient, sensor, budget, seed=command.seed) if dark_map is None else None
-        result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram"), expected=rate))
+        result["figure"] = str(draw_histogram(histogram, picture(out, "histogram"), expected=rate))
     return result
 
 
@@ -209,9 +209,9 @@ def _run_zones(command: Sense, zones: ZoneArray) -> dict:
     write_histogram(histogram, out)
     result = {"seconds": seconds, **summary(histogram), "out": str(out)}
     if command.figure:
-        from scene2spad.plots import figures
+        from scene2spad.plots.pixels import draw_histogram
 
-        result["figure"] = str(figures.draw_histogram(histogram, picture(out, "histogram"), expected=None))
+        result["figure"] = str(draw_histogram(histogram, picture(out, "histogram"), expected=None))
     return result
 
 

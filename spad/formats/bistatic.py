@@ -1,0 +1,111 @@
+"""Bistatic geometry: depth, optical path and arrival time where the laser stands beside the camera.
+
+With d the distance from the camera, r the unit ray and b the laser's place relative to the camera, light travels
+p = |d r - b| + d. Points of one path lie on an ellipsoid whose foci are the laser and the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from render.transient import Transient
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.errors import InputError
+from scenes.json_types import JsonObject
+from scenes.model import Camera
+from spad.formats.histogram import Histogram
+
+CO_LOCATED = (0.0, 0.0, 0.0)
+
+
+def radial_depth_m(half_path_m: np.ndarray, directions: np.ndarray, baseline_m: Iterable[float]) -> np.ndarray:
+    """Return distance from the camera, given half the optical path from a displaced laser to the surface to the camera
+    [m].
+
+    With p the path, b the laser's place relative to the camera and r the unit ray: the ellipsoid
+    d = (p^2 - |b|^2) / (2 (p - r.b)). half_path_m (...,), directions (..., 3) and b in one frame -> (...,) float32.
+    NaN for a path that is not longer than the baseline: no surface gives one.
+    """
+    path, baseline = 2.0 * np.asarray(half_path_m, dtype=np.float64), np.asarray(tuple(baseline_m), dtype=np.float64)
+    squared = baseline @ baseline
+    path = np.where(path > math.sqrt(squared), path, np.nan)
+    distance = (path**2 - squared) / (2 * (path - directions @ baseline))
+    return distance.astype(np.float32)
+
+
+def optical_path_m(depth_m: np.ndarray, directions: np.ndarray, baseline_m: Iterable[float]) -> np.ndarray:
+    """Return the path from a displaced laser to the surface to the camera [m]: `radial_depth_m` the other way round.
+
+    depth_m (...,) is the distance from the camera, directions (..., 3) and the baseline in one frame -> (...,) float64.
+    """
+    depth = np.asarray(depth_m, dtype=np.float64)
+    return depth + np.linalg.norm(depth[..., None] * directions - np.asarray(tuple(baseline_m)), axis=-1)
+
+
+def baseline_of(rendered: JsonObject) -> tuple[float, ...]:
+    """Return the laser's place relative to the camera, in the camera's frame [m], by what a transient states of itself
+    (`Transient.meta`); 0 0 0 if not told."""
+    return tuple(rendered.get("laser", {}).get("baseline_m", CO_LOCATED))
+
+
+def laser_baseline_m(histogram: Histogram) -> tuple[float, ...]:
+    """Return the laser's place relative to the camera, in the camera's frame [m]; 0 0 0 if not told."""
+    return baseline_of(histogram.meta.get("transient", {}))
+
+
+def radial_depth_of(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
+    """Convert half the optical path (H, W) [m] into distance from the camera by the histogram's own camera and laser.
+
+    With a co-located laser, or where the histogram does not know of any, it is the same array. Raises InputError beside
+    a displaced laser where the histogram does not tell where its pixels look.
+    """
+    baseline = laser_baseline_m(histogram)
+    if not any(baseline):
+        return half_path_m
+    directions = _directions(histogram.meta, histogram.depth_m.shape)
+    if directions is None:
+        rows, columns = histogram.depth_m.shape
+        raise InputError(
+            f"histogram of {rows} x {columns} pixels beside a laser at {baseline} m: its camera has another image, so "
+            "nothing tells where its pixels look"
+        )
+    return radial_depth_m(half_path_m, directions, baseline)
+
+
+def true_path_m(seen: Transient | Histogram) -> np.ndarray:
+    """Return the optical path (H, W) float64 [m] of light from the true depths; NaN where the depth is, and beside a
+    displaced laser where nothing tells where the pixels look."""
+    meta = seen.meta if isinstance(seen, Histogram) else {"transient": seen.meta}
+    baseline = baseline_of(meta.get("transient", {}))
+    if not any(baseline):
+        return 2.0 * seen.depth_m.astype(np.float64)
+    directions = _directions(meta, seen.depth_m.shape)
+    if directions is None:
+        return np.full(seen.depth_m.shape, np.nan)
+    return optical_path_m(seen.depth_m, directions, baseline)
+
+
+def true_arrival_s(histogram: Histogram) -> np.ndarray:
+    """Return when light from the true depth arrives, (H, W) float64 [s] after the laser's emission, within the laser's
+    period; NaN where no depth is known.
+
+    A time at the record's end or later, in a period longer than the record, is one that the sensor does not record.
+    """
+    return true_path_m(histogram) / SPEED_OF_LIGHT_M_PER_S % histogram.sensor.period_s
+
+
+def _directions(meta: JsonObject, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Return unit rays (H, W, 3) of a histogram's pixels, or of its zones' centres, in the camera's frame; None where
+    the camera's image is of another size."""
+    if "zone_centres" in meta:
+        x, y = (np.asarray(meta["zone_centres"][axis], dtype=np.float64) for axis in "xy")
+        ray = np.stack((x, y, np.ones_like(x)), axis=-1)
+        return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    camera = meta["transient"].get("camera")
+    if camera is None or (camera.get("height"), camera.get("width")) != shape:
+        return None
+    known = Camera(**camera)
+    return known.rays() @ known.rotation

@@ -1,0 +1,91 @@
+"""Bistatic geometry: the ellipsoid both ways, arrival times within the period, and zones beside their emitter."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from render.transient import Transient
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
+from scenes.errors import InputError
+from scenes.model import Camera
+from spad.estimators.depth import histogram_depth_m
+from spad.formats.bistatic import optical_path_m, radial_depth_m, true_arrival_s, true_path_m
+from spad.formats.histogram import Histogram
+from spad.formats.rgbd import transient_from_rgbd
+from spad.sensor.model import Sensor
+from spad.sensor.pulse import Pulse
+from spad.zones.histogram import sense_zones
+from spad.zones.sensor import ZoneArray
+
+GATED = Sensor(name="gated", bins=64, bin_width_s=1e-10, period_s=2e-8)
+BASELINE = (0.4, -0.2, 0.1)
+
+
+def histogram_of(depth_m: np.ndarray, sensor: Sensor, baseline_m=(0.0, 0.0, 0.0), height: int | None = None):
+    rows, columns = depth_m.shape
+    camera = {"pose": np.eye(4).tolist(), "fov_deg": 50.0, "width": columns, "height": height or rows}
+    counts = Histogram.from_counts(np.zeros((rows, columns, sensor.bins), int), sensor)
+    meta = {"transient": {"camera": camera, "laser": {"mode": "flood", "baseline_m": list(baseline_m)}}}
+    return replace(counts, depth_m=depth_m.astype(np.float32), meta=meta)
+
+
+def test_path_and_depth_are_inverse():
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    depth = rng.uniform(0.01, 20, 500)
+    path = optical_path_m(depth, directions, BASELINE)
+    assert (path >= np.linalg.norm(BASELINE)).all(), "the triangle inequality"
+    assert radial_depth_m(path / 2, directions, BASELINE) == pytest.approx(depth, rel=1e-5, abs=1e-6)
+    assert optical_path_m(depth, directions, (0, 0, 0)) == pytest.approx(2 * depth)
+
+
+def test_arrival_is_by_both_legs_and_wraps_at_the_period():
+    """The record covers 6.4 of 20 ns: 1 m arrives after it, 3.1 m wraps to its beginning."""
+    depth = np.array([[0.5, 1.0], [3.1, np.nan]])
+    arrival = true_arrival_s(histogram_of(depth, GATED))
+    assert arrival[0] == pytest.approx([1.0 / C, 2.0 / C])
+    assert arrival[1, 0] == pytest.approx(6.2 / C - GATED.period_s) and math.isnan(arrival[1, 1])
+    record_s = GATED.bins * GATED.bin_width_s
+    assert arrival[0, 0] < record_s <= arrival[0, 1]
+
+    beside = histogram_of(depth, GATED, BASELINE)
+    rays = Camera(np.eye(4), 50.0, 2, 2).rays() @ Camera(np.eye(4), 50.0, 2, 2).rotation
+    legs = depth[0] + np.linalg.norm(depth[0][:, None] * rays[0] - BASELINE, axis=-1)
+    assert true_arrival_s(beside)[0] == pytest.approx(legs / C)
+
+
+def test_unknown_rays_beside_a_displaced_laser():
+    """A histogram that is not of its camera's image has no arrival to draw, and its depth is refused, not made up."""
+    cropped = histogram_of(np.ones((2, 2)), GATED, BASELINE, height=4)
+    assert np.isnan(true_path_m(cropped)).all()
+    with pytest.raises(InputError, match="where its pixels look"):
+        histogram_depth_m(cropped)
+    assert np.isfinite(true_path_m(replace(cropped, meta={}))).all(), "a laser that nobody told of is at the camera"
+
+
+def test_depth_of_zones_beside_their_emitter():
+    """Narrow zones of a plane: the zones' centres, not the image's pixels, tell depth from half the path."""
+    pixels, baseline = 120, (0.1, 0.05, 0.0)
+    camera = Camera(np.eye(4), 60.0, pixels, pixels)
+    rays = camera.rays() @ camera.rotation
+    depth = 1.5 / rays[..., 2]
+    flat = transient_from_rgbd(
+        depth.astype(np.float32), np.ones((pixels, pixels)), np.zeros((pixels, pixels)), fov_deg=60.0
+    )
+    path = optical_path_m(depth, rays, baseline).ravel().astype(np.float32)
+    laser = {"mode": "flood", "baseline_m": list(baseline), "cone_deg": None}
+    lit = replace(flat, path_near_m=path, path_far_m=path, meta={"camera": {"fov_deg": 60.0}, "laser": laser})
+    assert isinstance(lit, Transient) and lit.returns == pixels**2
+    zones = ZoneArray((-0.3, 0.3), (0.2, 0.2), (0.02, 0.02), (0.02, 0.02), gain=(1e9, 1e9), baseline_m=baseline)
+    sensor = Sensor(name="s", bins=256, bin_width_s=1e-10, pulse=Pulse(3e-10))
+    histogram = sense_zones(lit, sensor, zones, seed=1)
+    assert histogram.counts.sum() > 1000
+    error = histogram_depth_m(histogram) - histogram.depth_m
+    assert np.abs(error).max() < 0.01
+    ray = np.stack((np.array(zones.centre_x), np.array(zones.centre_y), np.ones(2)), axis=-1)[None]
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    legs = histogram.depth_m + np.linalg.norm(histogram.depth_m[..., None] * ray - baseline, axis=-1)
+    assert true_arrival_s(histogram) == pytest.approx(legs / C)
