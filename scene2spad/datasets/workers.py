@@ -218,15 +218,13 @@ def _on_dask(
     from distributed import as_completed
 
     waiting = iter(runs)
-    with _explain_lost_scheduler(client):
-        workers = client.scheduler_info(n_workers=-1)["workers"]
-    if not workers:
+    if not _workers_of(client):
         log.warning("scheduler %s has no workers yet: waiting for some", client.scheduler.address)
-    lanes = max(1, len(workers))
     submitted: dict[DaskFuture, Numbers] = {}
     pending = as_completed()
     while True:
-        for run in islice(waiting, 3 * lanes - len(submitted)):
+        lanes = max(1, _workers_of(client))  # they come and go
+        for run in islice(waiting, max(0, 3 * lanes - len(submitted))):
             with _explain_lost_scheduler(client):
                 future = client.submit(work, run, pure=False, retries=TRIES)
             submitted[future] = run
@@ -245,6 +243,11 @@ def _on_dask(
             waiting = chain([(number,) for number in run], waiting)
         else:
             yield lost(run[0], f"its workers died: {' '.join(str(error).split())[:300]}")
+
+
+def _workers_of(client: Client) -> int:
+    with _explain_lost_scheduler(client):
+        return client.scheduler_info(n_workers=0)["n_workers"]  # their number alone, however many there are
 
 
 def _outcome(future: DaskFuture[list[Result]]) -> tuple[list[Result] | None, BaseException | None]:

@@ -1,4 +1,4 @@
-"""Ctrl-C where a pool of processes is half made, or holds its locks."""
+"""Ctrl-C where a pool of processes is half made, or holds its locks; clusters that grow while they work."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import subprocess
 import sys
 
 import pytest
+
+from scene2spad.datasets.workers import executor
 
 INTERRUPTING = """
 import signal
@@ -49,3 +51,27 @@ def test_ctrl_c_in_the_middle_of_the_pool_ends_it_without_a_word(tmp_path, momen
     script.write_text(INTERRUPTING.format(patch=PATCHES[moment]))
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=100)
     assert done.returncode == 0 and done.stdout == "interrupted\n" and not done.stderr, done.stderr
+
+
+def test_a_cluster_whose_workers_join_later_has_work_for_all_of_them():
+    """A run that began before its workers had joined kept three views under way, however many came."""
+    distributed = pytest.importorskip("distributed")
+    taken = []
+
+    def numbers():
+        for number in range(40):
+            taken.append(number)
+            yield (number,)
+
+    options = {"threads_per_worker": 1, "processes": False, "protocol": "tcp", "host": "127.0.0.1"}
+    with (
+        distributed.LocalCluster(n_workers=1, dashboard_address=None, **options) as cluster,
+        executor(1, cluster.scheduler_address) as run,
+    ):
+        results = run(list, numbers(), lambda number, why: why)
+        next(results)
+        assert len(taken) == 3
+        cluster.scale(4)
+        cluster.wait_for_workers(4)
+        next(results)
+        assert len(taken) == 1 + 3 * 4
