@@ -40,8 +40,12 @@ class Plane(NamedTuple):
 
 
 def random_planes(count: int, *, size: int = 64, seed: int = 0) -> Views:
-    """Return `count` scenes of two random planes, size x size pixels. Raises InputError for a count or size below 1."""
-    require(count >= 1 and size >= 1, f"planes: {count} scenes of {size} pixels, expected 1 or more")
+    """Return `count` scenes of two random planes, size x size pixels.
+
+    Raises InputError for a count below 1, or a size below 2: a pixel as wide as the view often sees no plane in full.
+    """
+    require(count >= 1, f"planes: {count} scenes, expected 1 or more")
+    require(size >= 2, f"planes: images of {size} x {size} pixels, expected 2 x 2 or more")
     scenes = [
         _scene(size, np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.PLANES, number))))
         for number in range(count)
@@ -83,6 +87,7 @@ def _scene(size: int, rng: np.random.Generator) -> Transient:
 def _transient(depth: np.ndarray, spread: np.ndarray, radiance: np.ndarray, albedo: np.ndarray) -> Transient:
     """One return a pixel, laid symmetrically about the pixel centre's depth; none where depth is infinite."""
     met = np.isfinite(depth)
+    spread = np.minimum(spread, 2 * depth)  # a wide pixel of a steep plane: nothing returns from behind the camera
     size = depth.shape[0]
     columns = {
         "path_near_m": 2 * depth[met] - spread[met],

@@ -27,6 +27,7 @@ from scene2spad.cli import main
 from scene2spad.datasets.planes import FAR_M, Plane, random_planes, wall
 from scene2spad.networks.training import config_of, group_names
 from scene2spad.options.networks import Train
+from scenes import InputError
 from spad.detection.detect import sense
 from spad.formats.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -64,6 +65,14 @@ def trained(packed, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "learned"
     assert main(["train", *QUICK, "--set", str(packed), "--out", str(folder)]) == 0
     return folder
+
+
+def test_planes_of_few_pixels_return_no_light_from_behind_the_camera():
+    """A wide pixel of a steep plane spans more than twice its depth: one scene of twenty at 2 x 2, few at 8 x 8."""
+    with pytest.raises(InputError, match="planes: images of 1 x 1 pixels, expected 2 x 2 or more"):
+        random_planes(1, size=1)
+    for view in random_planes(100, size=2).transients:
+        assert view.returns > 0 and (view.path_near_m >= 0).all()
 
 
 def test_planes_are_planes():
