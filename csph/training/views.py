@@ -109,7 +109,8 @@ def packed_sha256(packed: PackedViews) -> str:
 
 def training_parts(views: Views) -> dict[str, int]:
     """Return the number of views that a run trains on, by the `packed_sha256` that it keeps of them: all of a set, or
-    those of its first scenes, where the run splits it by `split_views`."""
+    those of its first scenes, where the run splits it by `split_views`. None trains on views of several sizes."""
     several = len(set(views.scenes)) >= 2
     parts = [views, split_views(views)[0]] if several else [views]
+    parts = [part for part in parts if len({one.depth_m.shape for one in part.transients}) == 1]
     return {packed_sha256(pack_views(part.transients)): len(part.transients) for part in parts}

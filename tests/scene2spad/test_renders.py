@@ -89,6 +89,14 @@ def test_evaluate_takes_transients(capfd, folder):
         views_at(folder / "both")
 
 
+def test_evaluate_takes_views_of_several_sizes(capfd, folder):
+    """As Middlebury's are. Nobody trains on them, and the error was that they cannot be packed."""
+    image = np.full((9, 12), 0.5)
+    write_transient(transient_from_rgbd(np.full((9, 12), 3.0), image, image), folder / "renders/c.exr")
+    found = answer(capfd, "evaluate", MODEL, "--levels", "10+10", "--baselines", "argmax", "--set", "renders")
+    assert found["mae_mm"] > 0
+
+
 def test_a_set_is_read_in_the_order_of_its_index(capfd, folder):
     answer(capfd, "dataset", "clutter", "--count", "2", "--width", "8", "--bounces", "1", "--out", "set")
     assert [path.name for path in transient_files(folder / "set")] == ["000000.exr", "000001.exr"]
