@@ -263,7 +263,13 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     named = {str(path): load_model(checkpoint_of(path))[0] for path in command.checkpoints}
     require(bool(named), "evaluate: give at least one checkpoint")
     require(not command.levels, "evaluate: --levels does not go with --set published, whose 16 levels are the paper's")
-    given = {"--decoder": command.decoder, "--tiled": command.tiled, "--views": command.views, "--int8": command.int8}
+    given = {
+        "--decoder": command.decoder,
+        "--tiled": command.tiled,
+        "--views": command.views,
+        "--int8": command.int8,
+        "--int8-rule": command.int8_rule,
+    }
     for option, value in given.items():
         require(value in (None, False), f"evaluate: {option} does not go with --set published")
     kept = not command.baselines or command.baselines == Evaluate.baselines

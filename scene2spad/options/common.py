@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -58,3 +58,8 @@ def only_for(command: Common, where: str, options: Mapping[str, tuple[bool, str]
             words = (f"{one:g}" if isinstance(one, float) else str(one) for one in values)
             option = " ".join([f"--{name.replace('_', '-')}", *words])
             raise InputError(f"{where}: {option} is for {purpose}")
+
+
+def check_indirect(command: Common, where: str, bounces: int | None, options: Sequence[str]) -> None:
+    """Raise InputError for options of indirect light, by their fields' names, where only direct light is rendered."""
+    only_for(command, where, dict.fromkeys(options, (bounces != 1, "indirect light (--bounces above 1)")))

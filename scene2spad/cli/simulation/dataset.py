@@ -8,7 +8,17 @@ from typing import Annotated
 
 from render.settings import FILTERED_AMBIENT_SPP
 from scene2spad.cli.paths import file_stem, output_file, output_folder
-from scene2spad.options.common import Count, File, Long, Number, Offset, Pixels, Positional, may_stay_open
+from scene2spad.options.common import (
+    Count,
+    File,
+    Long,
+    Number,
+    Offset,
+    Pixels,
+    Positional,
+    check_indirect,
+    may_stay_open,
+)
 from scenes.library.sets import scene_set
 from scenes.progress import Progress
 
@@ -59,6 +69,7 @@ def run(command: Dataset, progress: Progress) -> dict:
     from scene2spad.datasets.packing import check_one_size, pack_set
     from scene2spad.datasets.rendering import Job, make_set
 
+    check_indirect(command, "dataset", command.bounces, ("spp", "filter"))
     of = scene_set(command.set)
     error = (0.01 if command.bounces == 1 else 0.03) if command.error is None else command.error
     job = Job(

@@ -23,6 +23,7 @@ from scene2spad.options.common import (
     Offset,
     Pixels,
     Positional,
+    check_indirect,
     may_stay_open,
 )
 from scenes import Ambient, InputError, Laser, Scene
@@ -119,6 +120,7 @@ def run(command: Render, progress: Progress) -> dict:
     from render.transient import write_transient
     from scene2spad.plots import figures
 
+    check_indirect(command, "render", command.bounces, ("spp", "filter", "clamp"))
     settings = _settings(command)
     check_offset(command.offset)
     if command.out is not None:
