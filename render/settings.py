@@ -101,6 +101,8 @@ class RenderSettings:
         )
         for name, low, high in limits:
             value = getattr(self, name)
+            if isinstance(value, bool):  # which Python compares as 0 and 1
+                raise InputError(f"render: {name} {value} is no number, as it has to be from {low} to {high}")
             if value is not None and not low <= value <= high:
                 raise InputError(f"render: {name} {value} is outside {low} to {high}")
             if value is not None and name in WHOLE and not isinstance(value, Integral):
