@@ -48,7 +48,7 @@ def whole_file(path: Path) -> Iterator[Path]:
             raise InputError(f"{path}: folder {path.parent} does not exist")
         if path.is_dir():
             raise InputError(f"{path}: is a folder, expected a file name")
-        _sweep(path.parent.resolve())
+        _sweep_once(path.parent.resolve())
         try:
             yield beside
             _flush_to_disk(beside)
@@ -65,13 +65,15 @@ def _machine() -> str:
     return os.uname().nodename[:40]
 
 
-@lru_cache(maxsize=1024)  # once a process: a set's folder may hold a million files
-def _sweep(folder: Path) -> None:
+def sweep(folder: Path) -> None:
     """Remove the temporary files in a folder whose processes, of this machine, are gone."""
     for path in abandoned_files(folder):
         owner = re.search(rf"\.{re.escape(_machine())}\.(\d{{1,9}})\.part", path.name)
         if owner is not None and not _is_running(int(owner[1])):
             path.unlink(missing_ok=True)
+
+
+_sweep_once = lru_cache(maxsize=1024)(sweep)  # a process: a set's folder may hold a million files
 
 
 def _is_running(process: int) -> bool:

@@ -113,7 +113,8 @@ class Job:
             DIRECT_FRACTION,
             SET_MIN_SPP,
         ]
-        return asdict(self) | {"schema": 8, "tolerances": tolerances}
+        mode = self.offset_mode if self.offset_m else "time"  # of a scene that stays where it is they are all one
+        return asdict(self) | {"offset_mode": mode, "schema": 8, "tolerances": tolerances}
 
 
 def render_view(job: Job, view: int, again: int = 0) -> Done:
@@ -182,6 +183,7 @@ def record_and_exr(job: Job, view: int, again: int) -> tuple[dict, bytes]:
     from render.transient.packs import rounded
     from render.transient.thinning import thinned
 
+    inputs = scene_set(job.set).inputs_sha256(view)
     scene, seed = _scene(job, view), _seed(job, view, again)
     world = _world(job, view, scene)
     transient = render(scene, job.settings(), seed=seed, world=world, plan=_plan(job, view, world))
@@ -210,7 +212,7 @@ def record_and_exr(job: Job, view: int, again: int) -> tuple[dict, bytes]:
         "indirect_fraction": round(transient.indirect_fraction, 6),
         "triangles": scene.triangles,
     }
-    return record, exr
+    return record | ({"inputs_sha256": inputs} if inputs else {}), exr
 
 
 def _scene(job: Job, view: int) -> Scene:
@@ -319,13 +321,19 @@ def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
         raise InputError(f"{path}: is damaged; delete it, and it is made again") from None
 
 
-def _check_places(job: Job, folder: SetFolder) -> None:
-    """Raise InputError where views are of other scenes than the set, of those found beside the project, has now."""
+def _check_scenes(job: Job, folder: SetFolder) -> None:
+    """Raise InputError where views are of other scenes than the set, of those found beside the project, has now, or of
+    other files of the same names."""
     chosen = scene_set(job.set)
     for view, record in sorted(folder.records.items()):
         now = chosen.place(view) if chosen.size is None or view < chosen.size else "nothing"
         message = f"{folder.path}: view {view} is of {record.get('place')}, the set has {now} there now"
         require(record.get("place", now) == now, f"{message}; choose another --out")
+        inputs = chosen.inputs_sha256(view)
+        kept = record.get("inputs_sha256", inputs)
+        changed = [name for name in inputs if not isinstance(kept, dict) or kept.get(name) != inputs[name]]
+        message = f"{folder.path}: view {view} is of another {', '.join(changed)} than {now} has now"
+        require(not changed, f"{message}; choose another --out")
 
 
 def make_set(
@@ -338,12 +346,13 @@ def make_set(
     """
     check_asked(job, count, workers)
     folder = SetFolder(out, job.made())
-    _check_places(job, folder)
+    _check_scenes(job, folder)
     missing = count - sum(view < count for view in folder.records)
     todo = (view for view in range(count) if view not in folder.records)
     report = progress or (lambda what, fraction: None)
     start = time.perf_counter()
     with executor(workers if missing else 1, scheduler if missing else None) as run:
+        folder.begin()  # not before a scheduler has answered: a mistyped address leaves no folder
         endless = scene_set(job.set).size is None
         job = _with_grid(job, folder, run, report) if missing and endless and job.grid is None else job
         for number, done in enumerate(run(partial(render_views, job), views_by_place(job, todo), _lost), 1):

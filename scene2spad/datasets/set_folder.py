@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from scenes.errors import InputError, require
-from scenes.files import abandoned_files, append_line, is_unclaimed, whole_file
+from scenes.files import append_line, finite, is_unclaimed, sweep, whole_file
 from scenes.io.inputs import read_text, read_whole_lines
 
 
@@ -37,22 +37,20 @@ def _as_text(made: dict) -> str:
     return json.dumps(made, sort_keys=True, indent=1) + "\n"
 
 
-def _is_continued(path: Path, made: dict) -> bool:
-    """Tell whether a folder holds views of this set already; InputError where it holds anything else."""
+def _as_line(record: dict) -> str:
+    """Return a record in one line; the depths of a view that shows no surface are null."""
+    return json.dumps(finite(record), sort_keys=True)
+
+
+def _check_ours(path: Path, made: dict) -> None:
+    """Raise InputError where a folder holds anything else than views of this set."""
     config = path / "set.json"
     if not config.is_file():
         require(is_unclaimed(path), f"{path}: is not empty and holds no set; choose another --out")
-        return False
-    if read_text(config) != _as_text(made):
+    elif read_text(config) != _as_text(made):
         raise InputError(
             f"{path}: holds a set that was made with other options or another version; choose another --out"
         )
-    return True
-
-
-def finished_views(path: Path, made: dict) -> dict[int, dict]:
-    """Return the records of the views that need not be rendered again. InputError for the folder of something else."""
-    return _records(path) if _is_continued(path, made) else {}
 
 
 def _records(path: Path) -> dict[int, dict]:
@@ -73,18 +71,27 @@ def _stands(folder: Path, record: dict) -> bool:
 
 
 class SetFolder:
-    """A set's folder: what is there already, and where finished views go. `made` is all that decides their bytes."""
+    """A set's folder: `records` of what is there already, and where finished views go.
+
+    `made` is all that decides their bytes. Nothing is written before `begin`. Raises InputError for the folder of
+    something else.
+    """
 
     def __init__(self, path: Path, made: dict) -> None:
+        _check_ours(path, made)
         self.path = path
-        if not _is_continued(path, made):
-            path.mkdir(parents=True, exist_ok=True)
-            with whole_file(path / "set.json") as beside:
-                beside.write_text(_as_text(made))
-        (path / "views").mkdir(exist_ok=True)
-        for left in (*abandoned_files(path), *abandoned_files(path / "views")):
-            left.unlink(missing_ok=True)
         self.records = _records(path)
+        self._made = made
+
+    def begin(self) -> None:
+        """Make the folder where it is not there, and remove what killed processes left half written."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        if not (self.path / "set.json").is_file():
+            with whole_file(self.path / "set.json") as beside:
+                beside.write_text(_as_text(self._made))
+        (self.path / "views").mkdir(exist_ok=True)
+        for folder in (self.path, self.path / "views"):
+            sweep(folder)
 
     def add(self, done: Done) -> None:
         """Write the file first, then the line that vouches for it."""
@@ -94,12 +101,11 @@ class SetFolder:
                 beside.write_bytes(done.exr)
         self.records[view] = done.record
         timing = {"view": view, "seconds": round(done.seconds, 4), "where": done.where}
-        append_line(self.path / "journal.jsonl", json.dumps(done.record, sort_keys=True))
+        append_line(self.path / "journal.jsonl", _as_line(done.record))
         append_line(self.path / "timings.jsonl", json.dumps(timing, sort_keys=True))
 
     def close(self) -> None:
         """Write the index in the order of the views, then no journal."""
         with whole_file(self.path / "index.jsonl") as beside:
-            lines = (json.dumps(self.records[view], sort_keys=True) + "\n" for view in sorted(self.records))
-            beside.write_text("".join(lines))
+            beside.write_text("".join(_as_line(self.records[view]) + "\n" for view in sorted(self.records)))
         (self.path / "journal.jsonl").unlink(missing_ok=True)

@@ -30,6 +30,7 @@ OFF_CENTRE_PX = 0.01
 SPANS_PX = (16, 8, 4, 2, 1)  # dequantising: distances over which straight lines are sought, and how often
 PASSES = 12
 MAX_LEVEL = 0.485
+MIDDLEBURY_FILES = ("view1.png", "disp1.png", "dmin.txt")
 DATA_VARIABLE = "SCENE2SPAD_DATA"
 DEPTH_EXTENSIONS = (".png", ".exr")
 IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -248,7 +249,7 @@ def read_disparity(folder: Path) -> tuple[np.ndarray, float]:
 
     Raises InputError naming the file that is missing, view1.png too, or broken.
     """
-    for file in ("view1.png", "disp1.png", "dmin.txt"):
+    for file in MIDDLEBURY_FILES:
         require((folder / file).is_file(), f"{folder / file}: file not found, expected in a Middlebury scene")
     try:
         least = float(read_text(folder / "dmin.txt").split()[0])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from scenes.errors import InputError, did_you_mean, require
+from scenes.io.inputs import read_bytes
 from scenes.model import Scene
 
 SETS: dict[str, str] = {
@@ -27,7 +30,7 @@ class SceneSet:
     """`size` views (None: as many as one likes); `make(index, seed, width, height)` builds one, None sizes its own.
 
     `place(index)` names what a view shows: views of one place, `views_per_place` in a row, are not independent, and are
-    quickly made one after the other.
+    quickly made one after the other. `inputs(index)`: the files that a view is read from.
     """
 
     name: str
@@ -35,12 +38,17 @@ class SceneSet:
     make: Callable[[int, int, int | None, int | None], Scene]
     place: Callable[[int], str]
     views_per_place: int = 1
+    inputs: Callable[[int], Sequence[Path]] = lambda index: ()
 
     def view(self, index: int, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
         most = LARGEST if self.size is None else self.size
         require(0 <= index < most, f"set {self.name}: view {index} is outside 0 to {most - 1}")
         require(seed >= 0, f"set {self.name}: seed {seed} is not a whole number of 0 or more")
         return self.make(index, seed, width, height)
+
+    def inputs_sha256(self, index: int) -> dict[str, str]:
+        """Return SHA-256 of each file that a view is read from, by the file's name. InputError where one is missing."""
+        return {path.name: hashlib.sha256(read_bytes(path)).hexdigest() for path in self.inputs(index)}
 
 
 def scene_set(name: str) -> SceneSet:
@@ -54,7 +62,7 @@ def scene_set(name: str) -> SceneSet:
     family, _, split = name.partition("/")
     if family in ENDLESS:
         return ENDLESS[family](name, split)
-    names, load = _named(name)
+    names, load, inputs = _named(name)
 
     def make(index: int, seed: int, width: int | None, height: int | None) -> Scene:
         scene = load(names[index])
@@ -62,7 +70,9 @@ def scene_set(name: str) -> SceneSet:
             return scene
         return replace(scene, camera=scene.camera.resized(width, height))
 
-    return SceneSet(name, len(names), make, lambda index: f"{name}/{names[index]}")
+    return SceneSet(
+        name, len(names), make, lambda index: f"{name}/{names[index]}", inputs=lambda index: inputs(names[index])
+    )
 
 
 def _sides(width: int | None, height: int | None) -> dict[str, int]:
@@ -92,17 +102,20 @@ def _clutter(name: str, split: str) -> SceneSet:
 ENDLESS: dict[str, Callable[[str, str], SceneSet]] = {"rooms": _rooms, "clutter": _clutter}
 
 
-def _named(name: str) -> tuple[list[str], Callable[[str], Scene]]:
-    """Return the scenes of a set of named ones, and what loads one of them."""
+def _named(name: str) -> tuple[list[str], Callable[[str], Scene], Callable[[str], Sequence[Path]]]:
+    """Return the scenes of a set of named ones, what loads one of them, and which files it is read from."""
     if name == "tabletop":
         from scenes.library.tabletop import SCENES, tabletop
 
-        return list(SCENES), tabletop
+        return list(SCENES), tabletop, lambda scene: ()
     if name == "hard-cases":
         from scenes.library.hard_cases import SCENES as CASES
         from scenes.library.hard_cases import hard_case
 
-        return list(CASES), hard_case
-    from scenes.io.relief import middlebury, middlebury_folder, middlebury_names
+        return list(CASES), hard_case, lambda scene: ()
+    from scenes.io.relief import MIDDLEBURY_FILES, middlebury, middlebury_folder, middlebury_names
 
-    return middlebury_names(), lambda scene: middlebury(middlebury_folder(scene), width=88)
+    def inputs(scene: str) -> list[Path]:
+        return [middlebury_folder(scene) / file for file in MIDDLEBURY_FILES]
+
+    return middlebury_names(), lambda scene: middlebury(middlebury_folder(scene), width=88), inputs

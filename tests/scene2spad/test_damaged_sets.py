@@ -4,9 +4,9 @@ import json
 import os
 
 import pytest
+from set_folders import begun, finished
 
 from scene2spad.cli import main
-from scene2spad.datasets.set_folder import Done, SetFolder, file_name
 from scene2spad.studies.results import Store
 from scenes.errors import InputError
 
@@ -14,37 +14,33 @@ MADE = {"set": "planes", "seed": 0}
 DEEP = b"[" * 100_000 + b"\n"
 
 
-def record(view: int) -> dict:
-    return {"view": view, "file": file_name(view), "bytes": 3, "error": 0.01, "target": 0.02, "target_met": True}
-
-
 @pytest.mark.parametrize("junk", [b"\xff\xfe", b"{", DEEP, b'{"view": 1e400}\n', b'{"view": [], "file": {}}\n'])
 @pytest.mark.parametrize("name", ["journal.jsonl", "index.jsonl"])
 def test_damaged_lines_of_a_journal_cost_their_view_alone(tmp_path, name, junk):
-    folder = SetFolder(tmp_path, MADE)
+    folder = begun(tmp_path, MADE)
     for view in range(3):
-        folder.add(Done(record(view), b"exr", 0.1, "here"))
+        folder.add(finished(view))
     lines = (tmp_path / "journal.jsonl").read_bytes().splitlines(keepends=True)
     (tmp_path / "journal.jsonl").unlink()
     (tmp_path / name).write_bytes(lines[0] + junk.rstrip(b"\n") + b"\n" + lines[2])
-    assert sorted(SetFolder(tmp_path, MADE).records) == [0, 2]
+    assert sorted(begun(tmp_path, MADE).records) == [0, 2]
 
 
 def test_a_journal_vouches_for_no_file_elsewhere(tmp_path):
     (tmp_path / "out.exr").write_bytes(b"exr")
-    SetFolder(tmp_path / "set", MADE)
-    stolen = [record(0) | {"file": "../out.exr"}, record(1) | {"file": None}, record(2) | {"error": None}]
+    begun(tmp_path / "set", MADE)
+    stolen = [finished(0, file="../out.exr").record, finished(1, file=None).record, finished(2, error=None).record]
     (tmp_path / "set" / "views" / "000002.exr").write_bytes(b"exr")
     (tmp_path / "set" / "journal.jsonl").write_text("".join(json.dumps(one) + "\n" for one in stolen))
-    assert SetFolder(tmp_path / "set", MADE).records == {}
+    assert begun(tmp_path / "set", MADE).records == {}
 
 
 @pytest.mark.parametrize("junk", [b"\xff\xfe", b"", DEEP])
 def test_a_damaged_set_json_is_refused(tmp_path, junk):
-    SetFolder(tmp_path, MADE)
+    begun(tmp_path, MADE)
     (tmp_path / "set.json").write_bytes(junk)
     with pytest.raises(InputError):
-        SetFolder(tmp_path, MADE)
+        begun(tmp_path, MADE)
 
 
 def test_damaged_lines_of_a_store_are_passed_over(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,23 @@ def test_a_set_whose_scenes_changed_is_not_continued(tmp_path: Path, monkeypatch
     photographed(tmp_path / "middlebury/Art")
     with pytest.raises(InputError, match=r"view 0 is of middlebury/Books, the set has middlebury/Art there now"):
         make_set(job, 2, out)
+
+
+def test_a_set_whose_photographs_changed_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It went on, half of its views of one photograph and half of another. Records of before do not tell."""
+    monkeypatch.setenv("SCENE2SPAD_DATA", str(tmp_path))
+    folder, out = tmp_path / "middlebury/Books", tmp_path / "set"
+    photographed(folder)
+    job = Job("middlebury", width=8, height=6, bounces=1, grid=1)
+    make_set(job, 1, out)
+    index = (out / "index.jsonl").read_text()
+    photographed(folder, least="5\n")
+    with pytest.raises(InputError, match=r"view 0 is of another dmin\.txt than middlebury/Books has now; choose"):
+        make_set(job, 1, out)
+    record = json.loads(index)
+    del record["inputs_sha256"]
+    (out / "index.jsonl").write_text(json.dumps(record) + "\n")
+    assert make_set(job, 1, out)["rendered_now"] == 0
 
 
 @pytest.mark.parametrize(

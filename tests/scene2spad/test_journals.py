@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import os
 import resource
-import subprocess
-import sys
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from processes import ended_process
+from set_folders import begun, finished
 
 from csph.codes.design import Design
 from csph.training.config import ModelConfig, TrainConfig
@@ -18,7 +18,6 @@ from csph.training.loop import claim_run
 from csph.weights.shipped import cpu_minutes
 from render.transient.packs import read_pack, write_pack
 from scene2spad.datasets.planes import random_planes
-from scene2spad.datasets.set_folder import Done, SetFolder, file_name
 from scene2spad.studies.results import Store
 from scenes import InputError
 from scenes.files import append_line, is_unclaimed, whole_file
@@ -38,13 +37,6 @@ def largest_file(size: int):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def ended_process() -> int:
-    """The number of a process that is gone."""
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    return process.pid
-
-
 def test_a_journal_cut_at_any_byte_of_its_last_line_loses_that_entry_alone(tmp_path):
     path = tmp_path / "journal.jsonl"
     entries = [{"view": 0}, {"view": 1, "text": "ä"}, {"view": 2, "error": 0.5}]
@@ -57,9 +49,8 @@ def test_a_journal_cut_at_any_byte_of_its_last_line_loses_that_entry_alone(tmp_p
 
 
 def test_a_set_goes_on_from_a_journal_cut_at_any_byte(tmp_path):
-    numbers = {"bytes": 4, "error": 0.1, "target": 0.2, "target_met": True}
-    done = [Done({"view": i, "file": file_name(i), **numbers}, b"view", 0.5, "here/1") for i in range(3)]
-    whole = SetFolder(tmp_path / "whole", MADE)
+    done = [finished(view) for view in range(3)]
+    whole = begun(tmp_path / "whole", MADE)
     for one in done:
         whole.add(one)
     journal = (tmp_path / "whole/journal.jsonl").read_bytes()
@@ -68,11 +59,11 @@ def test_a_set_goes_on_from_a_journal_cut_at_any_byte(tmp_path):
     for kept in range(len(journal) - start):
         path = tmp_path / f"cut {kept}"
         for one in done:
-            SetFolder(path, MADE).add(one)
+            begun(path, MADE).add(one)
         for name in ("journal.jsonl", "timings.jsonl"):
             data = (path / name).read_bytes()
             (path / name).write_bytes(data[: start + kept] if name == "journal.jsonl" else data[: -(kept % 20) or None])
-        folder = SetFolder(path, MADE)
+        folder = begun(path, MADE)
         assert {0, 1} <= set(folder.records)
         if 2 not in folder.records:
             folder.add(done[2])
@@ -120,7 +111,7 @@ def test_temporary_files_of_ended_processes_are_removed_and_those_of_others_stay
 def test_a_folder_that_was_killed_while_it_was_begun_is_begun_again(tmp_path):
     config = TrainConfig(model=ModelConfig(design=Design()))
     for claim, name in (
-        (lambda path: SetFolder(path, MADE), "set.json"),
+        (lambda path: begun(path, MADE), "set.json"),
         (lambda path: claim_run(path, config), "config.json"),
     ):
         path = tmp_path / name

@@ -5,12 +5,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+from set_folders import begun
 
 from render.transient import read_transient
 from scene2spad.cli import main
 from scene2spad.datasets.packing import pack_set
 from scene2spad.datasets.rendering import PLANNED_PLACES, Job, make_set
-from scene2spad.datasets.set_folder import finished_views
+from scene2spad.datasets.set_folder import SetFolder
 from scenes import InputError
 from scenes.library.sets import scene_set
 
@@ -50,6 +51,21 @@ def test_rays_are_planned_for_the_moved_scenes(tmp_path):
     assert errors[0.0] != errors[3.0]
 
 
+def test_a_mode_of_moving_by_nothing_makes_no_other_set():
+    """A folder begun with `--offset-mode ray` and no offset was another's without it."""
+    assert Job("rooms", offset_mode="ray").made() == Job("rooms").made()
+    assert Job("rooms", offset_m=1.0, offset_mode="ray").made() != Job("rooms", offset_m=1.0).made()
+
+
+@pytest.mark.parametrize("damage", [{"grid": True}, {"edge_threshold": True}, {"grid": "2"}, {"grid": 2.5}])
+def test_a_plan_of_rays_that_holds_no_numbers_is_damaged(tmp_path, damage):
+    job, out = Job("clutter", width=8, bounces=1, error=0.3), tmp_path / "set"
+    begun(out, job.made())
+    (out / "grid.json").write_text(json.dumps({"grid": 2, "edge_threshold": 0.5, "errors": []} | damage))
+    with pytest.raises(InputError, match=r"grid\.json: is damaged; delete it"):
+        make_set(job, 1, out)
+
+
 def test_views_of_several_sizes_are_not_packed(tmp_path, capsys):
     """It is said before any is rendered."""
     argv = ["dataset", "hard-cases", "--width", "12", "--bounces", "1", "--out", str(tmp_path / "set")]
@@ -73,7 +89,7 @@ def test_a_record_without_its_numbers_is_rendered_again(small, change):
     records = [json.loads(line) for line in index.read_text().splitlines()]
     change(records[0])
     index.write_text("".join(json.dumps(record) + "\n" for record in records))
-    assert set(finished_views(small, JOB.made())) == {1, 2}
+    assert set(SetFolder(small, JOB.made()).records) == {1, 2}
     assert make_set(JOB, 3, small)["rendered_now"] == 1
 
 

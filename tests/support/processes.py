@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,6 +21,13 @@ def end_at_three(numbers: tuple[int, ...]) -> list[int]:
         os._exit(1)
     time.sleep(0.1)
     return [*numbers]
+
+
+def ended_process() -> int:
+    """Return the number of a process that is gone."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
 
 
 def members(group: int) -> Iterator[list[str]]:
