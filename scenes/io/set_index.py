@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from scenes.errors import InputError, require
-from scenes.io.inputs import file_inside, parse_json, read_text
+from scenes.io.inputs import file_inside, parse_json, read_text, read_whole_lines
 from scenes.json_types import JsonObject
 
 
@@ -13,7 +13,7 @@ def read_set_index(folder: Path) -> list[JsonObject]:
     """Return the records of a set's finished views in order; those of failed views are left out.
 
     Every `file` of a record is a regular file inside the folder. Raises InputError in one line where there is no
-    index, and where a line of it is damaged.
+    index, where a line of it is damaged, and where views were added since it was written: the set is not finished.
     """
     folder = Path(folder)
     index = folder / "index.jsonl"
@@ -28,7 +28,16 @@ def read_set_index(folder: Path) -> list[JsonObject]:
             raise InputError(f"{index}: is damaged, line {number} {error}; run scene2spad dataset again") from None
         if "failed" not in record:
             records.append(record)
+    more = _added(folder) - {record["view"] for record in records}
+    message = f"{folder}: was left unfinished, {len(more)} views more are in journal.jsonl than in its index"
+    require(not more, f"{message}; run scene2spad dataset again")
     return records
+
+
+def _added(folder: Path) -> set[int]:
+    """Return the views that a run has finished whose end, the index, is not written yet."""
+    lines = (line for line in read_whole_lines(folder / "journal.jsonl") if isinstance(line, dict))
+    return {line["view"] for line in lines if "failed" not in line and isinstance(line.get("view"), int)}
 
 
 def _checked(folder: Path, line: str, last: int) -> tuple[int, JsonObject]:
