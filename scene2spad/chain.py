@@ -264,10 +264,10 @@ def depth_errors(depth_m: np.ndarray, histogram: Histogram, *, unmixed: bool = F
     >>> s2s.depth_errors(histogram.depth_m, histogram)["mae_mm"]
     0.0
     """
-    from spad.estimators.depth import depth_errors as compared
+    from spad.estimators.depth import histogram_errors
 
     exclude = histogram.mixed if unmixed else None
-    return compared(depth_m, histogram.depth_m, range_m=histogram.sensor.range_m, exclude=exclude)
+    return histogram_errors(depth_m, histogram, exclude=exclude)
 
 
 def models() -> list[Card]:

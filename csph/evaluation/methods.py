@@ -31,6 +31,7 @@ from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.detect import sense
+from spad.estimators.depth import recorded_range_m
 from spad.formats.histogram import TRUTH, Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
@@ -173,7 +174,7 @@ def evaluate(
             for name, method in methods.items():
                 estimate = method(histogram)
                 result.rows += _rows(name, scene, view, (signal, background), estimate, histogram)
-                known = np.isfinite(histogram.depth_m) & (histogram.depth_m < sensor.range_m)
+                known = np.isfinite(histogram.depth_m) & (histogram.depth_m < recorded_range_m(histogram))
                 result.depths[name].append((estimate[known], histogram.depth_m[known]))
     return result
 
@@ -191,7 +192,7 @@ def _tiled(histogram: Histogram, tile: tuple[int, int]) -> Histogram:
 def _rows(
     method: str, scene: str, view: int, level: tuple[float, float], estimate: np.ndarray, histogram: Histogram
 ) -> Iterable[Row]:
-    groups = grouped_errors(estimate, histogram.depth_m, histogram.mixed, histogram.sensor.range_m)
+    groups = grouped_errors(estimate, histogram.depth_m, histogram.mixed, recorded_range_m(histogram))
     for group, errors in groups.items():
         kept = {key: errors[key] for key in (*FIGURES, "pixels", "missing", "beyond_range")}
         yield Row(method, scene, view, *level, group, ssim=errors.get("ssim", math.nan), **kept)

@@ -30,7 +30,9 @@ def is_low_sbr(signal: float, background: float) -> bool:
     return signal <= LOW_SBR * background
 
 
-def image_errors(estimate: np.ndarray, truth: np.ndarray, range_m: float, exclude: np.ndarray | None = None) -> dict:
+def image_errors(
+    estimate: np.ndarray, truth: np.ndarray, range_m: float | np.ndarray, exclude: np.ndarray | None = None
+) -> dict:
     """Return `spad.estimators.depth.depth_errors` with the shares strictly within 1, 5, 10 and 20 mm; depths (H, W)
     [m]."""
     errors = depth_errors(estimate, truth, range_m=range_m, exclude=exclude)
@@ -39,13 +41,17 @@ def image_errors(estimate: np.ndarray, truth: np.ndarray, range_m: float, exclud
     return {**errors, **fractions}
 
 
-def _error_mm(estimate: np.ndarray, truth: np.ndarray, range_m: float, exclude: np.ndarray | None) -> np.ndarray:
+def _error_mm(
+    estimate: np.ndarray, truth: np.ndarray, range_m: float | np.ndarray, exclude: np.ndarray | None
+) -> np.ndarray:
     keep = np.isfinite(truth) & (truth < range_m) & np.isfinite(estimate)
     keep = keep if exclude is None else keep & ~exclude
     return (estimate.astype(np.float64) - truth)[keep] * 1e3
 
 
-def grouped_errors(estimate: np.ndarray, truth: np.ndarray, mixed: np.ndarray, range_m: float) -> dict[str, dict]:
+def grouped_errors(
+    estimate: np.ndarray, truth: np.ndarray, mixed: np.ndarray, range_m: float | np.ndarray
+) -> dict[str, dict]:
     """Return `image_errors` of all pixels, of those with one surface, and of those where surfaces mix; SSIM of all."""
     left_out = {"all": None, "unmixed": mixed, "mixed": ~mixed}
     groups = {name: image_errors(estimate, truth, range_m, exclude) for name, exclude in left_out.items()}
@@ -53,7 +59,7 @@ def grouped_errors(estimate: np.ndarray, truth: np.ndarray, mixed: np.ndarray, r
     return groups
 
 
-def ssim(estimate: np.ndarray, truth: np.ndarray, range_m: float) -> float:
+def ssim(estimate: np.ndarray, truth: np.ndarray, range_m: float | np.ndarray) -> float:
     """Return mean structural similarity (Wang et al. 2004, 7 x 7 windows) over the pixels that have a truth.
 
     The data range is that of the truth, so that a wild estimate cannot raise its own score. Where there is no truth,

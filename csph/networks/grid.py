@@ -42,7 +42,7 @@ def on_published_grid(packed: PackedViews, sensor: Sensor) -> PackedViews:
         np.bincount(owner, weights, pixels).reshape(shape) for weights in (packed.radiance, area, area * path / 2)
     )
     depth = np.divide(moment, filled, out=np.full(shape, np.nan), where=filled > 0)
-    known = depth < sensor.range_m
+    known = depth < sensor.recorded_range_m
     fullest = np.maximum(np.rint(np.where(known, depth, 0.0) / sensor.bin_depth_m), 1) - 1
     # a pulse that begins before the first bin has gone round
     arrival = (fullest + 0.5 + published_centroid_bins(sensor)) % sensor.bins_per_period

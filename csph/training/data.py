@@ -173,7 +173,7 @@ class DeviceSensing:
     def _labels(self, patch: Patch, side: int) -> np.ndarray:
         rows, columns = slice(patch.row, patch.row + side), slice(patch.column, patch.column + side)
         depth = self.packed.depth_m[patch.scene, rows, columns]
-        return depth[depth < self.config.model.sensor.range_m]
+        return depth[depth < self.config.model.sensor.recorded_range_m]
 
 
 class SetData(pl.LightningDataModule):

@@ -86,17 +86,18 @@ def check_light(sets: Sequence[Sequence[Views]], packs: Sequence[Sequence[Packed
         for views, packed in zip(some, packed_sets, strict=True):
             for scene, mean in zip(views.scenes, packed.mean_radiance, strict=True):
                 require(mean > 0, f"{name} set: no light returns from a view of {scene}, its photons cannot be had")
-            known = bool((packed.depth_m < sensor.range_m).any())
+            known = bool((packed.depth_m < sensor.recorded_range_m).any())
+            within = f"no pixel has a depth within the sensor's {sensor.recorded_range_m:.4g} m"
             shows = f"{views.scenes[0]} and {len(views.scenes) - 1} views more"
-            require(known, f"{name} set ({shows}): no pixel has a depth within the sensor's {sensor.range_m:.4g} m")
+            require(known, f"{name} set ({shows}): {within}")
 
 
 def check_truth(path: Path, views: Views, sensor: Sensor, offset_m: float = 0.0) -> None:
     """Raise InputError for views without a depth to compare with: within the sensor's range, moved away by an offset
     [m]."""
-    known = any(bool((one.depth_m + offset_m < sensor.range_m).any()) for one in views.transients)
+    known = any(bool((one.depth_m + offset_m < sensor.recorded_range_m).any()) for one in views.transients)
     moved = f" at an offset of {offset_m:g} m" if offset_m else ""
-    require(known, f"{path}: no pixel has a depth within the sensor's {sensor.range_m:.4g} m{moved}")
+    require(known, f"{path}: no pixel has a depth within the sensor's {sensor.recorded_range_m:.4g} m{moved}")
 
 
 def packed_sha256(packed: PackedViews) -> str:

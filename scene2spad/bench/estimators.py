@@ -17,7 +17,7 @@ from render.transient import Transient
 from scene2spad.options.experiments import Bench
 from scene2spad.plots.figures import save
 from spad.detection.detect import sense
-from spad.estimators.depth import METHODS, depth_errors, estimate_depth
+from spad.estimators.depth import METHODS, estimate_depth, histogram_errors
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor
 
@@ -68,7 +68,7 @@ def table(
                 depth = estimate_depth(counts, sensor, method)
                 where = {"scene": name, "signal": signal, "background": background, "method": method}
                 for group in GROUPS:
-                    errors = depth_errors(depth, transient.depth_m, range_m=sensor.range_m, exclude=leave_out[group])
+                    errors = histogram_errors(depth, histogram, exclude=leave_out[group])
                     rows.append({**where, "group": group, **errors})
     return rows
 

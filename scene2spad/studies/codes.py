@@ -36,7 +36,7 @@ from scenes.files import whole_file
 from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 from spad.detection.detect import sense
-from spad.estimators.depth import cramer_rao_m, depth_errors, estimate_depth
+from spad.estimators.depth import cramer_rao_m, depth_errors, estimate_depth, recorded_range_m
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
@@ -101,13 +101,13 @@ def decoded_table(
         counts = torch.from_numpy(histogram.counts)
         truth = _truth(histogram)
         kept.append((truth, [encode(counts, coding) for _, coding in codings]))
-        rows.append(_row(UNCOMPRESSED, 0, truth, estimate_depth(counts, sensor, UNCOMPRESSED), sensor))
+        rows.append(_row(UNCOMPRESSED, 0, truth, estimate_depth(counts, sensor, UNCOMPRESSED)))
     if sensor is None:
         return rows
     for number, (name, coding) in enumerate(codings):  # one code after the other: its templates are made once
         for truth, encoded in kept:
             depth = decode_depth(encoded[number], coding, sensor)
-            rows.append(_row(name, coding.codes, truth, depth, sensor))
+            rows.append(_row(name, coding.codes, truth, depth))
     return rows
 
 
@@ -126,7 +126,7 @@ def _codings(codes: tuple[str, ...], numbers: tuple[int, ...], sensor: Sensor) -
 
 def _truth(histogram: Histogram) -> _Truth:
     sensor = histogram.sensor
-    left_out = histogram.mixed | ~np.isfinite(histogram.depth_m) | (histogram.depth_m >= sensor.range_m)
+    left_out = histogram.mixed | ~np.isfinite(histogram.depth_m) | (histogram.depth_m >= recorded_range_m(histogram))
     arrival, signal, background = (
         torch.from_numpy(values[~left_out].astype(np.float64))
         for values in (
@@ -139,9 +139,9 @@ def _truth(histogram: Histogram) -> _Truth:
     return _Truth(histogram.depth_m, left_out, histogram.budget, float(bound.mean()))
 
 
-def _row(method: str, codes: int, truth: _Truth, depth_m: Tensor, sensor: Sensor) -> Row:
+def _row(method: str, codes: int, truth: _Truth, depth_m: Tensor) -> Row:
     # a pixel without a detection is missing for every method alike: it does not count
-    errors = depth_errors(depth_m, truth.depth_m, range_m=sensor.range_m, exclude=truth.left_out)
+    errors = depth_errors(depth_m, truth.depth_m, range_m=math.inf, exclude=truth.left_out)
     absolute = 1e3 * np.abs(depth_m.numpy() - truth.depth_m)[~truth.left_out]
     median = float(np.nanmedian(absolute)) if np.isfinite(absolute).any() else math.nan
     return Row(

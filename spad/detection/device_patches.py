@@ -111,7 +111,7 @@ class DevicePatches:
             counts.view(len(patches), 1, bins, height, width),
             depth,
             self.mixed[pixels.flat].view(shape),
-            depth < self.sensor.range_m,
+            depth < self.sensor.recorded_range_m,
         )
 
     def _pixels(self, patches: Sequence[Patch], size: tuple[int, int], margin: int) -> _Pixels:

@@ -165,7 +165,7 @@ def sense_patches(
         counts.reshape(len(patches), 1, bins, height, width),
         depth,
         torch.from_numpy(mixed).to(device),
-        depth < sensor.range_m,  # false for NaN
+        depth < sensor.recorded_range_m,  # false for NaN
     )
 
 

@@ -39,7 +39,7 @@ from spad.estimators.matching import (
     published_log_matched_bins,
 )
 from spad.estimators.pile_up import linearised
-from spad.formats.bistatic import laser_baseline_m, radial_depth_of
+from spad.formats.bistatic import laser_baseline_m, radial_depth_of, recorded_range_m
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse, binned_pulse_slope, pulse_taps
@@ -59,6 +59,7 @@ __all__ = [
     "estimate_depth",
     "grid_peak",
     "histogram_depth_m",
+    "histogram_errors",
     "noise_free_bias_m",
 ]
 
@@ -103,7 +104,7 @@ def depth_in_range(depth_m: Tensor, sensor: Sensor) -> Tensor:
     if is_circular(sensor):
         depth_m = torch.remainder(depth_m, sensor.range_m)
     else:
-        depth_m = depth_m.clamp(0, sensor.bins * sensor.bin_depth_m)
+        depth_m = depth_m.clamp(0, sensor.recorded_range_m)
     single = depth_m.float()  # may round up to the range itself, which is depth 0
     return torch.where(single.double() >= sensor.range_m, 0.0, single)
 
@@ -256,13 +257,14 @@ def depth_errors(
     estimate: Tensor | np.ndarray,
     truth: Tensor | np.ndarray,
     *,
-    range_m: float,
+    range_m: float | np.ndarray,
     exclude: Tensor | np.ndarray | None = None,
 ) -> dict[str, float | int]:
     """Return error figures of a depth map against the truth [m], both of one shape, over the pixels not in `exclude`.
 
     mae_mm, rmse_mm, median_mm (signed) and within_10mm (share strictly under 10 mm) over `pixels` pixels; left out and
-    counted: empty (truth NaN), beyond_range (truth at the range or beyond), missing (estimate NaN).
+    counted: empty (truth NaN), beyond_range (truth at the range, one for all or (H, W), or beyond), missing (estimate
+    NaN).
     """
     estimate, truth = (
         np.asarray(value.cpu() if isinstance(value, Tensor) else value, dtype=np.float64) for value in (estimate, truth)
@@ -288,3 +290,10 @@ def depth_errors(
         }
     counted = {"empty": int(empty.sum()), "beyond_range": int(beyond.sum()), "missing": int(missing.sum())}
     return {**figures, "pixels": int(error.size), **counted}
+
+
+def histogram_errors(
+    depth_m: Tensor | np.ndarray, histogram: Histogram, *, exclude: np.ndarray | None = None
+) -> dict[str, float | int]:
+    """Return `depth_errors` against the truth of a histogram, of the pixels whose return its record can hold."""
+    return depth_errors(depth_m, histogram.depth_m, range_m=recorded_range_m(histogram), exclude=exclude)

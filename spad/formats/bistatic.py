@@ -97,6 +97,15 @@ def true_arrival_s(histogram: Histogram) -> np.ndarray:
     return true_path_m(histogram) / SPEED_OF_LIGHT_M_PER_S % histogram.sensor.period_s
 
 
+def recorded_range_m(histogram: Histogram) -> np.ndarray:
+    """Return the depth (H, W) [m] of each pixel whose return arrives when the last bin ends; errors are of nearer ones.
+
+    Beside a displaced laser it differs between pixels, and is 0 where the record is shorter than the baseline.
+    """
+    end_m = np.full(histogram.depth_m.shape, histogram.sensor.recorded_range_m)
+    return np.nan_to_num(radial_depth_of(histogram, end_m))
+
+
 def _directions(meta: JsonObject, shape: tuple[int, ...]) -> np.ndarray | None:
     """Return unit rays (H, W, 3) of a histogram's pixels, or of its zones' centres, in the camera's frame; None where
     the camera's image is of another size."""

@@ -162,6 +162,11 @@ class Sensor:
         """Return the unambiguous depth range [m], c period / 2."""
         return SPEED_OF_LIGHT_M_PER_S * self.period_s / 2
 
+    @property
+    def recorded_range_m(self) -> float:
+        """Return the depth [m] that the bins cover: `range_m`, or less where the period has a part without bins."""
+        return self.range_m if self.bins == self.bins_per_period else self.bins * self.bin_depth_m
+
     def check_offset(self, offset_m: float) -> None:
         """Raise InputError unless scenes can be moved away by this many metres within the range."""
         inside = 0 <= offset_m < self.range_m

@@ -20,6 +20,7 @@ from spad.estimators.depth import (
     depth_errors,
     estimate_depth,
     histogram_depth_m,
+    histogram_errors,
     noise_free_bias_m,
 )
 from spad.estimators.matching import correlation, normalised_correlation
@@ -328,13 +329,12 @@ def test_depth_errors_counts_what_it_leaves_out() -> None:
         depth_errors(np.zeros(3), np.zeros(4), range_m=1.0)
 
 
-def beside_a_displaced_laser(baseline_m: tuple[float, float, float]) -> Histogram:
+def beside_a_displaced_laser(baseline_m: tuple[float, float, float], sensor: Sensor = REFERENCE) -> Histogram:
     """Bright pixels of an oblique wall, lit from `baseline_m`: arrival times by the two legs, without any formula."""
     camera = Camera(np.eye(4), 60.0, 8, 6)
     rays = camera.rays() @ camera.rotation
     depth = 2.0 / (rays @ (0.3, 0.1, 0.95))
     path = depth + np.linalg.norm(depth[..., None] * rays - baseline_m, axis=-1)
-    sensor = Sensor()
     rate = 2e4 * binned_pulse(torch.from_numpy(path) / C, sensor)
     geometry = {
         "camera": {"pose": np.eye(4).tolist(), "fov_deg": 60.0, "width": 8, "height": 6},
@@ -356,6 +356,28 @@ def test_depth_of_a_histogram_knows_where_the_laser_is(baseline_m):
     assert (np.abs(half_path - histogram.depth_m).max() > 0.03) == any(baseline_m)
     blind = replace(histogram, meta={})
     assert np.array_equal(histogram_depth_m(blind), half_path), "counts without a geometry stay half paths"
+
+
+@pytest.mark.parametrize("baseline_m", [(0.0, 0.0, 0.0), (0.8, -0.3, 0.2)])
+def test_errors_are_of_the_pixels_whose_return_the_record_holds(baseline_m):
+    """The period goes on after the last bin; beside a displaced laser the path decides, not the depth."""
+    whole = beside_a_displaced_laser(baseline_m)
+    rays = Camera(np.eye(4), 60.0, 8, 6).rays()
+    path = whole.depth_m + np.linalg.norm(whole.depth_m[..., None] * rays - baseline_m, axis=-1)
+    bins = int(np.median(path) / (2 * REFERENCE.bin_depth_m))
+    gated = beside_a_displaced_laser(baseline_m, Sensor(bins=bins, period_s=REFERENCE.period_s))
+    held = path < 2 * bins * REFERENCE.bin_depth_m
+    errors = histogram_errors(whole.depth_m, gated)
+    assert (errors["pixels"], errors["beyond_range"]) == (held.sum(), (~held).sum())
+    assert 0 < errors["pixels"] < held.size and histogram_errors(whole.depth_m, whole)["pixels"] == held.size
+    near = whole.depth_m < np.sort(whole.depth_m.ravel())[held.sum()]
+    assert np.array_equal(near, held) != any(baseline_m)
+
+
+def test_a_record_shorter_than_the_baseline_holds_no_return():
+    histogram = beside_a_displaced_laser((0.8, -0.3, 0.2), Sensor(bins=16, period_s=REFERENCE.period_s))
+    errors = histogram_errors(histogram.depth_m, histogram)
+    assert errors["pixels"] == 0 and errors["beyond_range"] == histogram.depth_m.size
 
 
 def test_paths_that_no_surface_gives_have_no_depth():

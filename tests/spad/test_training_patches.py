@@ -55,6 +55,16 @@ def test_labels_and_masks_are_the_crops() -> None:
     assert np.array_equal(batch.valid[0].numpy(), depth < SENSOR.range_m)
 
 
+def test_labels_that_the_bins_do_not_reach_are_not_valid() -> None:
+    """The period goes on after the last bin, and the pulse of such a label has no bin at all."""
+    packed = pack_views(scenes()[:1])
+    ends = float(np.nanmedian(packed.depth_m))
+    gated = replace(SENSOR, bins=int(ends / SENSOR.bin_depth_m), period_s=SENSOR.period_s)
+    batch = sense_patches(packed, gated, [Patch(0, 0, 0, 5, 5, 0)], size=packed.depth_m.shape[1:])
+    held = packed.depth_m < gated.bins * gated.bin_depth_m
+    assert np.array_equal(batch.valid.numpy(), held) and 0 < held.sum() < held.size
+
+
 def test_the_seed_decides_and_nothing_else() -> None:
     packed = pack_views(scenes())
     patches = [Patch(i % 3, i % 5, i % 4, 20, 10, seed=(1, i)) for i in range(8)]

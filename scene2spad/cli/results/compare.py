@@ -40,7 +40,7 @@ def run(command: Compare, progress: Progress) -> dict:
     from scene2spad.methods import depth_method
     from scene2spad.plots.figures import draw_comparison
     from scenes.files import write_csv
-    from spad.estimators.depth import depth_errors
+    from spad.estimators.depth import histogram_errors
 
     require(bool(command.methods), "compare: no method")
     require(len(set(command.methods)) == len(command.methods), "compare: a method is named twice")
@@ -61,7 +61,7 @@ def run(command: Compare, progress: Progress) -> dict:
         depths[name] = method(histogram)
         seconds = time.perf_counter() - start
         exclude = histogram.mixed if command.unmixed else None
-        errors = depth_errors(depths[name], histogram.depth_m, range_m=histogram.sensor.range_m, exclude=exclude)
+        errors = histogram_errors(depths[name], histogram, exclude=exclude)
         rows.append({"method": name, **{key: errors[key] for key in FIGURES}, "seconds": round(seconds, 3)})
     write_csv(rows, out)
     drawn = draw_comparison(histogram, depths, dict(zip(methods, rows, strict=True)), figure)

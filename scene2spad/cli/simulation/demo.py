@@ -49,7 +49,7 @@ def run(command: Demo, progress: Progress) -> dict:
     from scene2spad.methods import depth_method
     from scene2spad.plots.pixels import draw_demo
     from spad.detection.detect import sense
-    from spad.estimators.depth import depth_errors
+    from spad.estimators.depth import histogram_errors
     from spad.formats.histogram import write_histogram
     from spad.sensor.model import PhotonBudget, sensor_by_name
 
@@ -69,7 +69,7 @@ def run(command: Demo, progress: Progress) -> dict:
     for number, (label, method) in enumerate(METHODS.items()):
         progress(label, number / len(METHODS))
         depths[label] = depth_method(method, sensor, seed=command.seed)(histogram)
-    errors = {n: depth_errors(d, histogram.depth_m, range_m=sensor.range_m) for n, d in depths.items()}
+    errors = {n: histogram_errors(d, histogram) for n, d in depths.items()}
     estimated = time.perf_counter()
     write_transient(transient, light)
     write_histogram(histogram, counts)

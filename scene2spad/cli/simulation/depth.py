@@ -149,7 +149,7 @@ def _mean(values: Sequence[float] | np.ndarray) -> float:
 
 def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram, source: Path, out: Path) -> dict:
     """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
-    from spad.estimators.depth import confidence_map, depth_errors
+    from spad.estimators.depth import confidence_map, histogram_errors
 
     label, fraction = depth_label(command), None
     start = time.perf_counter()
@@ -164,8 +164,7 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
             log.warning("%d sums of 16 bits wrapped around", overflows)
     seconds = time.perf_counter() - start
     sure = confidence_map(histogram, depth, command.method)
-    range_m = histogram.sensor.range_m
-    errors = depth_errors(depth, histogram.depth_m, range_m=range_m)
+    errors = histogram_errors(depth, histogram)
     if np.isnan(histogram.depth_m).all():
         log.info("%s: holds no true depth, so that no error can be stated", source)
     meta = {"method": label, "histogram_sha256": histogram.sha256()}
@@ -176,7 +175,7 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
         "method": label,
         **errors,
         "confidence": _mean([] if sure is None else sure),
-        "unmixed": depth_errors(depth, histogram.depth_m, range_m=range_m, exclude=histogram.mixed),
+        "unmixed": histogram_errors(depth, histogram, exclude=histogram.mixed),
         "out": str(out),
     }
     if fraction is not None:

@@ -24,7 +24,7 @@ from scene2spad.studies.power.emulated_chain import by_torch, decode
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense
-from spad.estimators.depth import depth_errors
+from spad.estimators.depth import histogram_errors
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 from ultraphase import ChipSpec, Method, Program, method
@@ -102,7 +102,7 @@ def front_rows(found: list[Design], transient: Transient, seed: int, progress: P
         for one in found:
             progress(f"{one.name}, {photons:g} photons", number / len(PHOTONS))
             depth = one.depth_m(histogram)
-            errors = depth_errors(depth, histogram.depth_m, range_m=histogram.sensor.range_m)
+            errors = histogram_errors(depth, histogram)
             median = float(1e3 * np.nanmedian(np.abs(depth - histogram.depth_m)))
             common = {"name": one.name, "photons": photons, "mae_mm": errors["mae_mm"], "median_mm": median}
             rows += [{**common, **_costs(one, photons, rate)} for rate in FRAME_RATES]

@@ -24,7 +24,7 @@ from scenes.files import read_arrays, whole_file, write_csv
 from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 from spad.detection.detect import sense
-from spad.estimators.depth import depth_errors
+from spad.estimators.depth import histogram_errors
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, sensor_by_name
 from ultraphase import Method, method
@@ -87,7 +87,7 @@ def run(command: Study, progress: Progress) -> dict:
 
 
 def _errors(depth: np.ndarray, histogram: Histogram) -> dict:
-    found = depth_errors(depth, histogram.depth_m, range_m=histogram.sensor.range_m)
+    found = histogram_errors(depth, histogram)
     return {name: found[name] for name in ("mae_mm", "within_10mm")} | {
         "median_mm": float(1e3 * np.nanmedian(np.abs(depth - histogram.depth_m)))
     }

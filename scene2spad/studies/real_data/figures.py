@@ -147,7 +147,7 @@ def _frame(view: View, depths: Depths) -> tuple[np.ndarray, np.ndarray]:
 def _error(view: View, depth: np.ndarray | None, label: str) -> str:
     if view.depth_m is None or depth is None or label == "truth":
         return ""
-    found = depth_errors(depth, view.depth_m, range_m=view.sensor.range_m, exclude=view.mixed)
+    found = depth_errors(depth, view.depth_m, range_m=view.sensor.recorded_range_m, exclude=view.mixed)
     return f"MAE {found['mae_mm']:.0f} mm,\n{found['within_10mm']:.0%} < 10 mm" if found["pixels"] else ""
 
 

@@ -276,7 +276,7 @@ def _row(view: View, label: str, depth: np.ndarray) -> dict:
     """Photons, and errors where there is a truth; NaN without."""
     row = {"capture": view.name, "method": label, "photons": float(view.counts.sum(axis=-1).mean())}
     truth = np.full(depth.shape, np.nan) if view.depth_m is None else view.depth_m
-    found = depth_errors(depth, truth, range_m=view.sensor.range_m, exclude=view.mixed)
+    found = depth_errors(depth, truth, range_m=view.sensor.recorded_range_m, exclude=view.mixed)
     wanted = ("mae_mm", "rmse_mm", "median_mm", "within_10mm", "pixels", "beyond_range")
     return {**row, **{name: found[name] for name in wanted}}
 
