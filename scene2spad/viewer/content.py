@@ -92,15 +92,17 @@ def packed(values: np.ndarray) -> str:
 
 
 def cube_payload(cube: Cube) -> dict[str, object]:
-    """Pack a cube: counts as they are in 8 or 16 bits, rates as square roots in LEVELS steps.
+    """Pack a cube: counts as they are in 8, 16 or 32 bits, rates and larger counts as square roots in LEVELS steps.
 
     A cube of more than MAX_CELLS is summed over neighbouring bins first; `summed` says over how many.
     """
     values, summed = cube.values, 1
+    counted = values.dtype.kind in "iu"
+    wide = np.int64 if counted else np.float64  # a file's own numbers may be of 8 bits, which sums exceed
     while values.size > MAX_CELLS and values.shape[2] > 1:
         if values.shape[2] % 2:
             values = np.concatenate([values, np.zeros((*values.shape[:2], 1), values.dtype)], axis=2)
-        values, summed = values[..., ::2] + values[..., 1::2], 2 * summed
+        values, summed = np.add(values[..., ::2], values[..., 1::2], dtype=wide), 2 * summed
     top = float(values.max(initial=0))
     common = {
         "name": cube.name,
@@ -113,7 +115,7 @@ def cube_payload(cube: Cube) -> dict[str, object]:
         "summed": summed,
         "top": top,
     }
-    if values.dtype.kind in "iu":
+    if counted and top <= np.iinfo(np.uint32).max:
         kind = np.uint8 if top <= 255 else np.uint16 if top <= 65535 else np.uint32
         return {**common, "type": np.dtype(kind).name, "data": packed(values.astype(kind))}
     # steps of the square root: each is the same share of a rate's shot noise

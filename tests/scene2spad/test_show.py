@@ -155,6 +155,16 @@ def test_large_cubes_are_summed_in_time_and_keep_their_counts(monkeypatch):
     assert unpacked(found["data"], found["type"]).sum() == counts.sum()
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int32, np.uint32, np.float16])
+def test_sums_of_narrow_numbers_do_not_overflow(kind, monkeypatch):
+    monkeypatch.setattr("scene2spad.viewer.content.MAX_CELLS", 4)
+    top = np.finfo(kind).max if kind is np.float16 else np.iinfo(kind).max
+    found = cube_payload(Cube("counts", "", np.full((2, 2, 8), top, kind), 0.0, 1.0, "bars"))
+    assert found["summed"] == 8 and found["top"] == 8 * float(top)
+    data = unpacked(found["data"], found["type"])
+    assert (data == (255 if "rooted" in found else found["top"])).all()
+
+
 @pytest.mark.parametrize("suffix", ["png", "pdf", "gif"])
 def test_pictures_and_animations(suffix, capfd):
     for file in ("gallery.exr", "gallery.h5") if suffix == "gif" else ("gallery.h5", "depth.exr", MODEL):
