@@ -30,14 +30,18 @@ def read_codes(path: Path) -> CodingTensor:
 def write_codes(coding: CodingTensor, path: Path, *, int8: bool = False) -> Path:
     """Write a coding tensor as .npy, (K, Mt) or (K, Mt, Mr, Mc) float32 or int8, or as text with a row a code.
 
-    Text names each factor of a separable tensor, and with `int8` the value of one step. Raises InputError for another
-    ending.
+    Text names each factor of a separable tensor, and with `int8` the value of one step; an int8 array's step is in
+    `step_file` beside it. Raises InputError for another ending.
     """
     if path.suffix.lower() == ".npy":
-        whole = quantised(coding).tensor if int8 else coding.tensor.numpy()
+        exact = quantised(coding) if int8 else None
+        whole = coding.tensor.numpy() if exact is None else exact.tensor
         flat = whole[..., 0, 0] if coding.block[1:] == (1, 1) else whole
         with whole_file(path) as beside:
             np.save(beside, np.ascontiguousarray(flat))
+        if exact is not None:
+            with whole_file(step_file(path)) as beside:
+                beside.write_text(f"{_heading(coding)}\n# int8, one step is\n{exact.scale:.9g}\n")
         return path
     if path.suffix.lower() != ".txt":
         raise InputError(f"{path}: codes go to .npy or .txt")
@@ -46,10 +50,19 @@ def write_codes(coding: CodingTensor, path: Path, *, int8: bool = False) -> Path
     return path
 
 
+def step_file(path: Path) -> Path:
+    """Return the name of the text beside an array of int8 codes: the value of one step, which times them is codes."""
+    return path.with_name(f"{path.stem}.step.txt")
+
+
+def _heading(coding: CodingTensor) -> str:
+    bins, rows, columns = coding.block
+    return f"# {coding.name}: {coding.codes} codes of blocks of {bins} bins x {rows} rows x {columns} columns"
+
+
 def codes_text(coding: CodingTensor, *, int8: bool = False) -> str:
     """Return the text form: comments with #, then for each factor a row a code, numbers apart by spaces."""
-    (bins, rows, columns), codes = coding.block, coding.codes
-    lines = [f"# {coding.name}: {codes} codes of blocks of {bins} bins x {rows} rows x {columns} columns"]
+    lines = [_heading(coding)]
     if int8:
         exact = quantised(coding)
         factors = [("temporal", exact.temporal, exact.temporal_scale), ("spatial", exact.spatial, exact.spatial_scale)]
@@ -61,6 +74,6 @@ def codes_text(coding: CodingTensor, *, int8: bool = False) -> str:
             continue
         step = f", int8, one step is {scale:.9g}" if int8 else ""
         lines.append(f"# {name}, shape {' x '.join(map(str, values.shape))}{step}")
-        for row in values.reshape(codes, -1):
+        for row in values.reshape(coding.codes, -1):
             lines.append(" ".join(str(int(v)) if int8 else f"{v:.9g}" for v in row))
     return "\n".join(lines) + "\n"

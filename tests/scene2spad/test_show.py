@@ -294,6 +294,18 @@ def test_code_tables_hold_the_tensor(int8, capfd):
         assert temporal == pytest.approx(truth, abs=1e-6)
 
 
+def test_integers_of_an_array_have_their_step_beside_them(tmp_path, capfd):
+    out = tmp_path / "codes.npy"
+    line = told(capfd, "export", MODEL, "--out", str(out), "--int8")
+    step, whole = np.loadtxt(tmp_path / "codes.step.txt"), np.load(out)
+    assert whole.dtype == np.int8 and line["step"] == pytest.approx(step, rel=1e-8)
+    told(capfd, "export", MODEL, "--out", str(tmp_path / "exact.npy"))
+    assert whole * step == pytest.approx(np.load(tmp_path / "exact.npy"), abs=1.1 * step)
+    (tmp_path / "codes.step.txt").write_text("notes of mine")
+    assert main(["export", MODEL, "--out", str(out), "--int8"]) == 2
+    assert "codes.step.txt: exists and is no table of codes" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [

@@ -58,11 +58,7 @@ def run(command: Export, progress: Progress) -> dict:
     check_target(out, path)
     keep_foreign(out, MARKS.get(suffix))
     if codes and suffix in CODES:
-        from csph.codes.files import write_codes
-
-        coding = open_coding(path, kind)
-        write_codes(coding, out, int8=command.int8)
-        return {"codes": coding.codes, "block": list(coding.block), "out": str(out)}
+        return _codes(command, kind)
     if suffix in DENSE and kind in ("transient", "pack", "histogram"):
         arrays = _dense(command, kind)
         from spad.formats.dense import write_dense
@@ -85,6 +81,22 @@ def _exports() -> ModuleType:
     from scene2spad.viewer import exports
 
     return exports
+
+
+def _codes(command: Export, kind: str) -> dict:
+    """Write the codes; the step of 8-bit integers is in a text, or stands beside an array, which holds numbers alone."""
+    from csph.codes.files import step_file, write_codes
+    from csph.codes.quantise import quantised
+
+    out, step = command.out, {}
+    coding = open_coding(command.file, kind)
+    if command.int8 and out.suffix.lower() == ".npy":
+        beside = step_file(out)
+        check_target(beside)
+        keep_foreign(beside, MARKS[".txt"])
+        step = {"step": quantised(coding).scale, "step_file": str(beside)}
+    write_codes(coding, out, int8=command.int8)
+    return {"codes": coding.codes, "block": list(coding.block), **step, "out": str(out)}
 
 
 def _dense(command: Export, kind: str) -> dict[str, np.ndarray]:
