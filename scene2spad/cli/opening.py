@@ -10,6 +10,7 @@ import numpy as np
 
 from scene2spad.cli.paths import holds_kind, input_file
 from scenes.errors import InputError, require
+from scenes.io.hdf5 import HDF5_SUFFIXES
 
 if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 BY_SUFFIX = {
     ".exr": ("transient", "depth"),
-    ".h5": ("histogram", "pack", "dense"),
+    **dict.fromkeys(HDF5_SUFFIXES, ("histogram", "pack", "dense")),
     ".npz": ("dense",),
     ".ply": ("cloud",),
     ".mat": ("histogram",),

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from scenes.errors import InputError
+from scenes.io.hdf5 import HDF5_SUFFIXES
 
 HEAD_BYTES = 4096  # of a file, by which its format is told
 
@@ -39,7 +40,7 @@ def output_file(path: Path, suffix: str, kind: str) -> Path:
 
     Results of the same kind may be written again; any other file is not overwritten.
     """
-    if path.suffix.lower() != suffix:
+    if path.suffix.lower() not in (HDF5_SUFFIXES if suffix in HDF5_SUFFIXES else (suffix,)):
         raise InputError(f"{path}: the output must end in {suffix}")
     for target in (path, picture(path, kind)):
         check_target(target)

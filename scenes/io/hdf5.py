@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import h5py
     from typing_extensions import Buffer
 
+HDF5_SUFFIXES = (".h5", ".hdf5")  # one form of file, by either name
 USER_BLOCK = 512
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 MARK = b"scene2spad SHA-256 of what follows byte 512: "

@@ -16,6 +16,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.errors import InputError
 from scenes.files import whole_file
+from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.limits import require_memory
 from spad.detection.flux import signal_per_bin
 from spad.formats.histogram import NOTES, Histogram
@@ -72,7 +73,7 @@ def write_dense(arrays: dict[str, np.ndarray], path: Path, *, layout: Layout = "
         with whole_file(path) as beside, beside.open("wb") as file:
             np.savez_compressed(file, allow_pickle=True, **arrays)
         return path
-    if suffix not in (".h5", ".hdf5"):
+    if suffix not in HDF5_SUFFIXES:
         raise InputError(f"{path}: a dense export ends in .npz or .h5")
     with whole_file(path) as beside:
         beside.write_bytes(_hdf5(arrays, layout))

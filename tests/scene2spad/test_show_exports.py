@@ -16,6 +16,7 @@ from scene2spad.viewer.exports import cloud_content, dense_content
 from scenes.errors import InputError
 from spad.formats.histogram import read_histogram
 from spad.formats.linospad import capture_of, write_linospad
+from spad.formats.mat import read_mat
 from spad.formats.timestamps import Timestamps
 
 MODEL = "fourier-1024x1x1-128x-s0"
@@ -78,6 +79,36 @@ def test_a_frame_of_a_capture_is_shown_by_its_number(capfd, tmp_path):
     capfd.readouterr()
     assert main(["show", str(tmp_path / "capture.mat"), "--frame", "2", "--out", "none.html"]) == 2
     assert "frame 2 is not one of its 2" in capfd.readouterr().err
+    for frame in (0, 1):
+        asked = ["--frame", str(frame)] if frame else []
+        assert main(["export", str(tmp_path / "capture.mat"), "--out", str(tmp_path / "dense.npz"), *asked]) == 0
+        with np.load(tmp_path / "dense.npz") as dense:
+            assert np.array_equal(dense["data"], read_mat(tmp_path / "capture.mat", frame).counts)
+    assert main(["export", str(tmp_path / "capture.mat"), "--out", str(tmp_path / "x.npz"), "--frame", "2"]) == 2
+
+
+def test_hdf5_files_may_end_in_hdf5(tmp_path, capfd):
+    """Counts, sets in one file and dense arrays, in every command that reads or writes them."""
+    histogram, dense, pack = (str(tmp_path / name) for name in ("a.hdf5", "dense.hdf5", "set.HDF5"))
+    for line in (
+        ["sense", "gallery.exr", "--out", histogram, "--no-figure"],
+        ["inspect", histogram],
+        ["depth", histogram, "--no-figure"],
+        ["compare", histogram, "--methods", "argmax"],
+        ["export", histogram, "--out", dense],
+        ["show", histogram],
+        ["show", dense],
+        [
+            *["dataset", "rooms", "--count", "1", "--width", "8", "--height", "8", "--bounces", "1", "--out"],
+            str(tmp_path / "s"),
+            "--pack",
+            pack,
+        ],
+        ["inspect", pack],
+        ["show", pack],
+    ):
+        assert main(line) == 0, (line, capfd.readouterr().err)
+    assert main(["sense", histogram]) == 2 and "is an HDF5 file" in capfd.readouterr().err
 
 
 def test_a_checkpoint_is_shown_and_exported_by_its_file(tmp_path):

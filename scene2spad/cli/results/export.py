@@ -13,9 +13,10 @@ from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histog
 from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
 from scene2spad.options.common import Common, File, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
+from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.progress import Progress
 
-DENSE = (".npz", ".h5", ".hdf5")
+DENSE = (".npz", *HDF5_SUFFIXES)
 CODES = (".txt", ".npy")
 # An array of codes (.npy) has no mark of ours: it is as any program writes it.
 MARKS = {
@@ -44,6 +45,8 @@ class Export(Common):
     """Codes as the 8-bit integers that a core in the pixel adds, with the value of one step."""
     view: int = 0
     """View of a pack, from 0."""
+    frame: int = 0
+    """Frame of a capture (.mat), from 0."""
 
 
 def run(command: Export, progress: Progress) -> dict:
@@ -54,7 +57,8 @@ def run(command: Export, progress: Progress) -> dict:
     light = dense and kind in ("transient", "pack")
     purposes = {"int8": (codes, "codes"), "sensor": (light, "a dense array (.npz, .h5) of a transient")}
     purposes |= {"layout": (dense, "a dense array (.npz, .h5)"), "view": (kind == "pack", "a pack")}
-    only_for(command, str(path), purposes | {"intensity": (kind == "depth", "a depth map")})
+    purposes |= {"frame": (kind == "histogram", "captures (.mat)"), "intensity": (kind == "depth", "a depth map")}
+    only_for(command, str(path), purposes)
     check_target(out, path)
     keep_foreign(out, MARKS.get(suffix))
     if codes and suffix in CODES:
@@ -84,7 +88,7 @@ def _exports() -> ModuleType:
 
 
 def _codes(command: Export, kind: str) -> dict:
-    """Write the codes; the step of 8-bit integers is in a text, or stands beside an array, which holds numbers alone."""
+    """Write the codes; the step of 8-bit integers stands in the text, or in one beside an array."""
     from csph.codes.files import step_file, write_codes
     from csph.codes.quantise import quantised
 
@@ -103,7 +107,7 @@ def _dense(command: Export, kind: str) -> dict[str, np.ndarray]:
     from spad.formats.dense import dense_counts, dense_radiance
 
     if kind == "histogram":
-        return dense_counts(open_histogram(command.file))
+        return dense_counts(open_histogram(command.file, command.frame))
     sensor = pixel_sensor(command.sensor, command.file)
     return dense_radiance(open_transient(command.file, kind, command.view), sensor)
 
@@ -135,7 +139,7 @@ def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.nd
             require(bright.shape == found.depth_m.shape, f"{command.intensity}: is of another size than {command.file}")
         return found.depth_m, bright, sure, found.meta.get("camera")
     if kind == "histogram":
-        histogram = open_histogram(command.file)
+        histogram = open_histogram(command.file, command.frame)
         bright = histogram.counts.sum(axis=2, dtype=np.int64).astype(np.float32)
         camera = histogram.meta.get("transient", {}).get("camera")
         return histogram.depth_m, bright, np.ones_like(histogram.depth_m), camera

@@ -13,6 +13,7 @@ import numpy as np
 from scene2spad.cli.paths import holds_kind, input_file
 from scene2spad.options.common import Common, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
+from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from spad.formats.histogram import Histogram
 
 log = logging.getLogger("scene2spad")
-KINDS = {".exr": ("transient",), ".h5": ("histogram", "pack")}
+KINDS = {".exr": ("transient",), **dict.fromkeys(HDF5_SUFFIXES, ("histogram", "pack"))}
 RANGES = {"path_m", "depth_m", "ambient_W_per_m2_sr_nm"}
 MAX_LINES = 40  # of a pixel's table
 BARS = " ▁▂▃▄▅▆▇█"

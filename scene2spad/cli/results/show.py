@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from scene2spad.viewer.content import Content, Cube
 
 log = logging.getLogger("scene2spad")
-SUFFIXES = (".html", ".png", ".pdf", ".gif", ".mp4")
+ANIMATIONS = (".gif", ".mp4")
+SUFFIXES = (".html", ".png", ".pdf", *ANIMATIONS)
 MAX_TAPS = 65536  # bins of a pulse
 MAX_SHEET = 24  # views of a set on its sheet
 PAGE_MARK = b'content="scene2spad show"'
@@ -62,13 +63,14 @@ def run(command: Show, progress: Progress) -> dict:
     if command.out is None and path.parent != Path() and not path.is_dir():
         out = path.parent / out
     require(out.suffix.lower() in SUFFIXES, f"{out}: the output must end in {', '.join(SUFFIXES)}")
-    purposes = {"transient": (kind == "histogram", "a histogram"), "view": (kind == "pack", "a pack")}
+    drawn_with = kind == "histogram" and out.suffix.lower() not in ANIMATIONS
+    purposes = {"transient": (drawn_with, "a histogram's page or picture"), "view": (kind == "pack", "a pack")}
     only_for(command, str(path), purposes | {"frame": (kind == "histogram", "captures (.mat)")})
     check_target(out, path)
     keep_foreign(out, MARKS.get(out.suffix.lower()))
     if out.suffix.lower() in (".png", ".pdf"):
         drawn = _picture(command, kind, out)
-    elif out.suffix.lower() in (".gif", ".mp4"):
+    elif out.suffix.lower() in ANIMATIONS:
         from scene2spad.plots.animation import write_gif, write_mp4
 
         write = write_gif if out.suffix.lower() == ".gif" else write_mp4

@@ -17,6 +17,7 @@ from scene2spad.cli.paths import Mark, begins, check_target, input_file, keep_fo
 from scene2spad.options.common import only_for
 from scenes.errors import InputError, require
 from scenes.files import read_array
+from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.detection.one_pixel import quadrature_in_pixel
@@ -152,7 +153,7 @@ def run(command: Sense, progress: Progress) -> dict:
 def _files(command: Sense) -> tuple[Path, Path]:
     """Return the transient's file and the histogram's, checked."""
     source = input_file(command.file)
-    histogram_given = source.suffix.lower() in (".h5", ".hdf5")
+    histogram_given = source.suffix.lower() in HDF5_SUFFIXES
     require(not histogram_given, f"{source}: is an HDF5 file, expected a transient (.exr) that `render` wrote")
     return source, output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
 
