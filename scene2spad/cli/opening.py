@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 BY_SUFFIX = {
     ".exr": ("transient", "depth"),
-    **dict.fromkeys(HDF5_SUFFIXES, ("histogram", "pack", "dense")),
     ".npz": ("dense",),
+    **dict.fromkeys(HDF5_SUFFIXES, ("histogram", "pack", "dense")),
     ".ply": ("cloud",),
     ".mat": ("histogram",),
     ".safetensors": ("network",),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from scene2spad.cli import main
+from scene2spad.cli.results.show import page_of
 from scene2spad.viewer.exports import cloud_content, dense_content
 from scenes.errors import InputError
 from spad.formats.histogram import read_histogram
@@ -85,6 +86,24 @@ def test_a_frame_of_a_capture_is_shown_by_its_number(capfd, tmp_path):
         with np.load(tmp_path / "dense.npz") as dense:
             assert np.array_equal(dense["data"], read_mat(tmp_path / "capture.mat", frame).counts)
     assert main(["export", str(tmp_path / "capture.mat"), "--out", str(tmp_path / "x.npz"), "--frame", "2"]) == 2
+
+
+def test_files_of_one_name_have_pages_of_their_own(tmp_path, capfd):
+    """A dense array in two forms, counts in two layouts, a checkpoint and its run's folder, sets of two folders."""
+    for name in ("a", "b"):
+        (tmp_path / name / "set").mkdir(parents=True)
+    sources = {Path(name): "dense" for name in ("c.npz", "c.h5", "c.hdf5")}
+    sources |= {Path(f"x{end}"): "histogram" for end in (".h5", ".hdf5", ".mat")}
+    sources |= {Path("x"): "network", Path("x.safetensors"): "network"}
+    sources |= {tmp_path / "a" / "set": "set", tmp_path / "b" / "set": "set"}
+    pages = [page_of(path, kind) for path, kind in sources.items()]
+    assert len({*pages}) == len(sources)
+    assert pages[:2] == [Path("c.dense.html"), Path("c.h5.dense.html")] and pages[3] == Path("x.histogram.html")
+    shutil.copy("counts.h5", tmp_path / "c.h5")
+    shutil.copy("counts.npz", tmp_path / "c.npz")
+    for end in ("h5", "npz"):
+        assert main(["show", str(tmp_path / f"c.{end}")]) == 0
+    assert {page.name for page in tmp_path.glob("*.html")} == {"c.dense.html", "c.h5.dense.html"}
 
 
 def test_hdf5_files_may_end_in_hdf5(tmp_path, capfd):

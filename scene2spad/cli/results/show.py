@@ -11,7 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient, transient_of
+from scene2spad.cli.opening import (
+    BY_SUFFIX,
+    kind_of,
+    open_coding,
+    open_depth,
+    open_histogram,
+    open_transient,
+    transient_of,
+)
 from scene2spad.cli.paths import PDF_FIGURE, PNG_FIGURE, Mark, check_target, holds_at_start, keep_foreign
 from scene2spad.options.common import Common, File, Positional, only_for
 from scenes.errors import InputError, require
@@ -45,7 +53,7 @@ class Show(Common):
     file: Positional[Path]
     """The file, the folder of a set or of a run, or a model's name."""
     out: File = None
-    """File to write: .html, .png, .pdf, .gif or .mp4 (default: name and kind, such as room.histogram.html)."""
+    """File to write: .html, .png, .pdf, .gif or .mp4 (default: room.histogram.html, with the kind, by room.h5)."""
     transient: File = None
     """The transient that a histogram was sensed from (default: the .exr beside it, if it is that one)."""
     view: int = 0
@@ -58,10 +66,7 @@ def run(command: Show, progress: Progress) -> dict:
     """Open the file, and write its page or picture."""
     path = command.file
     kind = kind_of(path)
-    # with the kind, as pictures have it: a transient and its histogram have one name
-    out = command.out or Path(f"{path.resolve().name if path.is_dir() else path.stem}.{kind}.html")
-    if command.out is None and path.parent != Path() and not path.is_dir():
-        out = path.parent / out
+    out = command.out or page_of(path, kind)
     require(out.suffix.lower() in SUFFIXES, f"{out}: the output must end in {', '.join(SUFFIXES)}")
     drawn_with = kind == "histogram" and out.suffix.lower() not in ANIMATIONS
     purposes = {"transient": (drawn_with, "a histogram's page or picture"), "view": (kind == "pack", "a pack")}
@@ -80,6 +85,19 @@ def run(command: Show, progress: Progress) -> dict:
 
         drawn = write_page(_content(command, kind), out)
     return {"kind": kind, "bytes": drawn.stat().st_size, "out": str(drawn)}
+
+
+def page_of(path: Path, kind: str) -> Path:
+    """Name the page beside a file or a folder, so that no two sources have one page.
+
+    With the kind, as pictures have it: a transient and its histogram have one name. Of endings that stand for one kind
+    the first is left out, and all but it are in the name.
+    """
+    source = path.resolve() if path.is_dir() else path
+    # a run's folder and a model's name have no ending
+    usual = "" if kind == "network" else next((end for end, kinds in BY_SUFFIX.items() if kind in kinds), "")
+    name = source.stem if usual and source.suffix == usual and not path.is_dir() else source.name
+    return source.with_name(f"{name}.{kind}.html")
 
 
 def _content(command: Show, kind: str) -> Content:
