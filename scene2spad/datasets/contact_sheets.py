@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from scenes.progress import Progress
 
 DRAFT = RenderSettings(bounces=1, grid=2)
 DEPTH_SHOWN_M = (0.5, 7.0)
+VIEW_INCHES = 1.5  # width of a view
+LABEL = "depth [m]; above it laser light, its falloff with distance mostly removed"
+LETTERS_PER_INCH, LINE_INCHES = 15, 0.14  # of the label's letters
 
 
 def draw_sheet(scenes: Sequence[Scene], path: Path, *, columns: int = 8, progress: Progress | None = None) -> Path:
@@ -36,10 +40,11 @@ def draw_views(views: Sequence[Transient], path: Path, *, columns: int = 8) -> P
     columns = min(columns, len(views))
     rows = math.ceil(len(views) / columns)
     shape = views[0].height / views[0].width
-    figure, axes = plt.subplots(
-        2 * rows, columns, figsize=(1.5 * columns, rows * (3 * shape + 0.25) + 0.3), squeeze=False, layout="constrained"
-    )
-    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.01, hspace=0.01)
+    wide = VIEW_INCHES * columns
+    label = textwrap.wrap(LABEL, int(LETTERS_PER_INCH * wide))  # one view is narrower than the label
+    high = rows * (2 * VIEW_INCHES * shape + 0.25) + 0.3 + LINE_INCHES * (len(label) - 1)
+    figure, axes = plt.subplots(2 * rows, columns, figsize=(wide, high), squeeze=False, layout="compressed")
+    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.03, wspace=0.01, hspace=0.01)
     for axis in axes.ravel():
         axis.set_axis_off()
     shown = None
@@ -48,8 +53,9 @@ def draw_views(views: Sequence[Transient], path: Path, *, columns: int = 8) -> P
         above.imshow(photograph(view), cmap="gray", vmin=0, vmax=1)
         above.set_title(str(view.meta.get("scene", "")), fontsize=6, pad=2)
         shown = below.imshow(view.depth_m, cmap=DEPTH_COLOURS, vmin=DEPTH_SHOWN_M[0], vmax=DEPTH_SHOWN_M[1])
-    bar = figure.colorbar(shown, ax=axes, location="bottom", fraction=0.02, aspect=60, pad=0.005)
-    bar.set_label("depth [m]; above it laser light, its falloff with distance mostly removed", fontsize=8)
+    bar = figure.colorbar(shown, ax=axes, location="bottom", fraction=0.02, aspect=min(60, 15 * columns), pad=0.005)
+    bar.set_label("\n".join(label), fontsize=8)
+    bar.ax.tick_params(labelsize=8)
     return save(figure, path)
 
 

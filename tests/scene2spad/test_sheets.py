@@ -1,12 +1,17 @@
 """Contact sheets, and RGB-D pairs and offsets from the command line."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
+import pytest
+from matplotlib import pyplot as plt
 from PIL import Image
 
 from render.transient import read_transient
 from scene2spad.cli import main
+from scene2spad.datasets import contact_sheets
+from spad.formats.rgbd import transient_from_rgbd
 
 
 def test_a_sheet_of_rooms_is_drawn(tmp_path, capsys):
@@ -15,6 +20,25 @@ def test_a_sheet_of_rooms_is_drawn(tmp_path, capsys):
     message = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert message["scenes"] == ["rooms/val/0", "rooms/val/1"]
     assert Image.open(sheet).width > 100
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_all_words_of_a_small_sheet_are_within_it(count, tmp_path, monkeypatch):
+    """Of one or two small views: the label of the colour bar is longer than they are wide."""
+    depth = np.full((12, 16), 2.0)
+    drawn = []
+    monkeypatch.setattr(contact_sheets, "save", lambda figure, path: drawn.append(figure) or path)
+    views = [transient_from_rgbd(depth, depth / 4, depth / 4, block=1)] * count
+    views = [replace(view, meta={**view.meta, "scene": "rooms/train/0"}) for view in views]
+    contact_sheets.draw_views(views, tmp_path / "sheet.png")
+    (figure,) = drawn
+    figure.canvas.draw()
+    words = [text for axes in figure.axes for text in (axes.title, axes.xaxis.label) if text.get_text()]
+    assert len(words) == count + 1
+    for text in words:
+        box = text.get_window_extent()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1, text
+    plt.close(figure)
 
 
 def test_sets_are_listed_and_bad_sheets_refused(tmp_path, capsys):
