@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 
 if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
@@ -33,7 +33,11 @@ def depth_method(name: str, sensor: Sensor, *, seed: int = 0) -> Method:
     if name.endswith(".npy"):
         from csph.codes.files import read_codes
 
-        return decoded_by(read_codes(Path(name)))
+        coding = read_codes(Path(name))
+        bins, rows, columns = coding.block
+        alone = f"{name}: codes of blocks of {bins} bins x {rows} rows x {columns} columns, expected those of one pixel"
+        require((bins, rows, columns) == (sensor.bins, 1, 1), f"{alone} over the {sensor.bins} bins of {sensor.name}")
+        return decoded_by(coding)
     found = re.fullmatch(r"([a-z-]+?)-(\d{1,4})", name)
     if found is not None and found[1] in CODES:
         from csph import CodingTensor, temporal_code

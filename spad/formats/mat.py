@@ -44,26 +44,32 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     as published. `bin_hr` and the estimates are of the arrival, which is the pulse's centroid, moved by as much as
     that bin stands off it on average.
     Where nothing is, and where nothing was detected, bins are 1: published loaders subtract 1 from unsigned numbers.
-    Raises InputError in one line where the file cannot be written, for sensors whose bins do not cover the period, and
-    where the folder holds the pulse of another sensor.
+    Raises InputError as `check_mat` does, and where the file cannot be written.
     """
     path, sensor = Path(path), histogram.sensor
-    require(path.suffix == ".mat", f"{path}: the output must end in .mat")
-    require(sensor.bins == sensor.bins_per_period, f"{path}: the layout needs bins that cover the period")
-    height, width, bins = histogram.counts.shape
-    size = 8 * height * width * bins
-    require(size < 2**31, f"{path}: {height} x {width} x {bins} rates take {size} bytes, a version 5 file holds 2^31")
-    contents = _frame(histogram)
-    pulse = _pulse_file(path, height, width)
-    taps = _centred_taps(sensor)
-    if pulse.is_file():
-        known = load_mat(pulse, ["psf"]).get("psf", np.zeros(0)).ravel()
-        same = known.shape == taps.shape and np.allclose(known, taps, rtol=1e-6, atol=0)
-        require(same, f"{pulse}: holds the pulse of another sensor; export to another folder")
-    save_mat(contents, path)
+    height, width = histogram.depth_m.shape
+    check_mat(path, sensor, height, width)
+    pulse, taps = _pulse_file(path, height, width), _centred_taps(sensor)
+    save_mat(_frame(histogram), path)
     psf = {"PSF_img": np.broadcast_to(taps, (height, width, len(taps))), "psf": taps, "pulse_len": float(len(taps))}
     save_mat(psf, pulse)
     return pulse
+
+
+def check_mat(path: Path, sensor: Sensor, height: int, width: int) -> None:
+    """Raise InputError in one line for what the layout cannot hold: bins that do not cover the period, too large a
+    frame, and the pulse of another sensor in the folder."""
+    bins, period = sensor.bins, sensor.bins_per_period
+    require(path.suffix == ".mat", f"{path}: the output must end in .mat")
+    uncovered = f"the layout needs bins that cover the period, {sensor.name} has {bins} of {period}"
+    require(bins == period, f"{path}: {uncovered}")
+    size = 8 * height * width * bins
+    require(size < 2**31, f"{path}: {height} x {width} x {bins} rates take {size} bytes, a version 5 file holds 2^31")
+    pulse = _pulse_file(path, height, width)
+    if pulse.is_file():
+        known, taps = load_mat(pulse, ["psf"]).get("psf", np.zeros(0)).ravel(), _centred_taps(sensor)
+        same = known.shape == taps.shape and np.allclose(known, taps, rtol=1e-6, atol=0)
+        require(same, f"{pulse}: holds the pulse of another sensor; export to another folder")
 
 
 def _pulse_file(path: Path, height: int, width: int) -> Path:

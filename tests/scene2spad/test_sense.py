@@ -115,6 +115,13 @@ def test_radiometric_budget_by_command(scene, capfd):
     assert twice["mean_signal"] == pytest.approx(2 * message["mean_signal"], rel=1e-5)
 
 
+def test_export_beside_another_sensors_pulse_is_refused_before_the_work(scene, capfd, tmp_path):
+    assert run(capfd, "sense", "s.exr", "--export", "mat")[0] == 0
+    status, _, err = run(capfd, "sense", "s.exr", "--export", "mat", "--out", "t.h5", "--pulse-fwhm", "2e-9")
+    assert status == 2 and "holds the pulse of another sensor" in err and "model:" not in err
+    assert not (tmp_path / "t.h5").exists()
+
+
 def test_export_by_command(scene, capfd, tmp_path):
     status, message, _ = run(capfd, "sense", "s.exr", "--export", "mat")
     assert status == 0 and (tmp_path / "s.mat").is_file() and message["export"] == "s.mat"
@@ -140,6 +147,7 @@ def test_export_by_command(scene, capfd, tmp_path):
         (["--pulse-tail", "1e-10"], "needs --pulse-fwhm"),
         (["--pulse", "p.npy", "--pulse-step", "1e-11", "--pulse-fwhm", "1e-10"], "not both"),
         (["--bins", "100", "--period", "1e-12"], "is not a whole number of bin widths"),
+        (["--sensor", "tmf8828", "--export", "mat"], "s.mat: the layout needs bins that cover the period, tmf8828 has"),
     ],
 )
 def test_bad_options_are_refused_in_one_line(scene, capfd, tmp_path, options, words):

@@ -39,6 +39,8 @@ def files(tmp_path_factory) -> Path:
         size = ("--width", "16", "--height", "12", "--bounces", "1", "--count", "2")
         assert main(["dataset", "rooms", *size, "--out", "set", "--pack", "set.h5"]) == 0
         np.save("mine.npy", np.random.default_rng(0).normal(size=(8, 1024)))
+        np.save("blocks.npy", np.random.default_rng(0).normal(size=(8, 1024, 4, 4)))
+        np.save("short.npy", np.random.default_rng(0).normal(size=(8, 64)))
     return folder
 
 
@@ -316,6 +318,8 @@ def test_integers_of_an_array_have_their_step_beside_them(tmp_path, capfd):
         (["show", "set/views"], "of no set and of no run"),
         (["compare", "gallery.h5", "--methods", "nosuch"], "'nosuch' is none of"),
         (["compare", "gallery.h5", "--methods", "argmax", "argmax"], "named twice"),
+        (["compare", "gallery.h5", "--methods", "blocks.npy"], "blocks.npy: codes of blocks of 1024 bins x 4 rows"),
+        (["compare", "gallery.h5", "--methods", "short.npy"], "short.npy: codes of blocks of 64 bins x 1 rows"),
         (["depth", "gallery.h5", "--codes-file", "mine.npy"], "--codes-file mine.npy is for --method compressive"),
         (["export", "gallery.h5", "--out", "a.txt"], "goes to .npz"),
         (["export", "mine.npy", "--out", "a.ply"], "goes to .txt"),

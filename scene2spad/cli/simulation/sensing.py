@@ -124,7 +124,7 @@ def run(command: Sense, progress: Progress) -> dict:
     transient = read_transient(source)
     mat = out.with_suffix(".mat")
     if command.export == "mat":
-        _check_mat(mat, transient)
+        _check_mat(mat, transient, sensor)
     dark_map = None if command.dark_map is None else read_dark_map(command.dark_map, transient)
     if optics is not None:
         budget = optics.budget(transient, sensor, seed=command.seed, dark_map_hz=dark_map)
@@ -158,14 +158,16 @@ def _files(command: Sense) -> tuple[Path, Path]:
     return source, output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
 
 
-def _check_mat(path: Path, transient: Transient) -> None:
-    """Raise InputError where the .mat file, or its pulse's, is another program's or cannot be written."""
-    from spad.formats.mat import PULSE_NAME
+def _check_mat(path: Path, transient: Transient, sensor: Sensor) -> None:
+    """Raise InputError where the .mat file, or its pulse's, is another program's or cannot be written, and for what
+    the layout cannot hold."""
+    from spad.formats.mat import PULSE_NAME, check_mat
 
     check_target(path)
     keep_foreign(path, Mark(".mat file", is_our_mat))
     for pulse in path.parent.glob(f"{PULSE_NAME}{transient.height}_*-{transient.width}.mat"):
         keep_foreign(pulse, Mark("pulse", is_our_mat))
+    check_mat(path, sensor, transient.height, transient.width)
 
 
 def is_our_mat(path: Path) -> bool:
