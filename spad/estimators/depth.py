@@ -16,7 +16,7 @@ noise-free pulse, `noise_free_bias_m`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -60,6 +60,7 @@ __all__ = [
     "grid_peak",
     "histogram_depth_m",
     "histogram_errors",
+    "no_error_reason",
     "noise_free_bias_m",
 ]
 
@@ -290,6 +291,15 @@ def depth_errors(
         }
     counted = {"empty": int(empty.sum()), "beyond_range": int(beyond.sum()), "missing": int(missing.sum())}
     return {**figures, "pixels": int(error.size), **counted}
+
+
+def no_error_reason(errors: Mapping[str, float | int]) -> str | None:
+    """Say why figures of `depth_errors` are over no pixel; None where they are over some."""
+    if errors["pixels"]:
+        return None
+    if errors["missing"]:
+        return "no estimate in range"
+    return "no pixel in range" if errors["beyond_range"] else "no true depth"
 
 
 def histogram_errors(

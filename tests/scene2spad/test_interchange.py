@@ -130,7 +130,12 @@ def test_depth_reads_a_frame_of_a_capture(capfd, folder):
     found = run(capfd, "depth", "capture.mat", "--frame", "1", "--method", "argmax")
     assert found["mae_mm"] is None and found["empty"] == 64 and Path(found["figure"]).is_file()
     status = main(["depth", "capture.mat", "--no-figure"])
-    assert status == 0 and "holds no true depth" in capfd.readouterr().err
+    out, err = capfd.readouterr()
+    assert status == 0 and "holds no true depth" in err
+    assert "errors: no true depth" in out and "nan" not in out and "mm" not in out
+    assert main(["compare", "capture.mat", "--methods", "argmax"]) == 0
+    table = capfd.readouterr().out
+    assert "no true depth" in table and "nan" not in table
 
 
 def test_mat_files_that_are_none_end_in_one_line(capfd, folder):

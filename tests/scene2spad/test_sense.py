@@ -75,6 +75,17 @@ def test_depth_beside_a_displaced_laser_has_no_confidence(scene, capfd, tmp_path
     assert read_depth(tmp_path / "beside-log-matched.exr")[1] is None
 
 
+def test_depth_beyond_the_record_says_that_no_pixel_is_in_range(scene, capfd):
+    """The scene begins at 2 m, and 100 bins of the reference sensor end at 1.46 m."""
+    assert run(capfd, "sense", "s.exr", "--bins", "100", "--period", "1e-7")[0] == 0
+    status, message, _ = run(capfd, "depth", "s.h5")
+    assert status == 0 and message["mae_mm"] is None and message["beyond_range"] == 80
+    for line in (["s.h5"], [".", "--out", "maps", "--sensor", "tmf8828"]):
+        assert main(["depth", *line, "--no-figure"]) == 0
+        told = capfd.readouterr().out
+        assert "errors: no pixel in range" in told and "nan" not in told and "beyond_range: 80" in told
+
+
 def test_detector_options_reach_the_sensor(scene, capfd, tmp_path):
     np.save(tmp_path / "p.npy", np.exp(-np.arange(40) / 8))
     np.save(tmp_path / "d.npy", np.full((8, 10), 90.0))

@@ -12,7 +12,7 @@ from scene2spad.options.common import Common, File, Positional
 from scenes.errors import require
 from scenes.progress import Progress
 
-FIGURES = ("mae_mm", "rmse_mm", "median_mm", "within_10mm", "pixels", "missing")
+FIGURES = ("mae_mm", "rmse_mm", "median_mm", "within_10mm", "pixels", "beyond_range", "missing")
 TABLE = Mark("table of `compare`", lambda path: begins(path, rb"method,mae_mm,rmse_mm,"))
 
 
@@ -71,11 +71,12 @@ def run(command: Compare, progress: Progress) -> dict:
 
 def _table(rows: list[dict]) -> list[str]:
     """Return the rows as aligned lines."""
+    from spad.estimators.depth import no_error_reason
+
     width = max(len(row["method"]) for row in rows)
     lines = [f"{'method':<{width}}  {'MAE mm':>8} {'RMSE mm':>8} {'< 10 mm':>8} {'missing':>8} {'seconds':>8}"]
     for row in rows:
-        lines.append(
-            f"{row['method']:<{width}}  {row['mae_mm']:>8.1f} {row['rmse_mm']:>8.1f} {row['within_10mm']:>8.1%} "
-            f"{row['missing']:>8d} {row['seconds']:>8.2f}"
-        )
+        errors = f"{row['mae_mm']:>8.1f} {row['rmse_mm']:>8.1f} {row['within_10mm']:>8.1%}"
+        errors = errors if row["pixels"] else f"{no_error_reason(row):>26}"
+        lines.append(f"{row['method']:<{width}}  {errors} {row['missing']:>8d} {row['seconds']:>8.2f}")
     return lines

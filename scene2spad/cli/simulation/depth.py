@@ -29,6 +29,7 @@ log = logging.getLogger("scene2spad")
 SENSING = ("sensor", "signal", "background")  # options of a transient alone
 Code = Literal["fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published"]
 MEANS = ("mae_mm", "rmse_mm", "within_10mm")  # over the views of a folder
+COUNTS = ("pixels", "empty", "beyond_range", "missing")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +81,8 @@ def run(command: Depth, progress: Progress) -> dict:
     _check_codes(command)
     label = depth_label(command)
     if command.file.is_dir():
-        return _run_folder(command, label, progress)
+        result = _run_folder(command, label, progress)
+        return result if command.json else readable(result)
     source = input_file(command.file)
     if source.suffix.lower() == ".safetensors":
         raise InputError(f"{source}: is a checkpoint, expected a histogram; give it as --method network --checkpoint")
@@ -96,7 +98,25 @@ def run(command: Depth, progress: Progress) -> dict:
         histogram, sensed = open_histogram(source, command.frame), ""
     progress(command.method, 0.1)
     result = _estimated(command, network, histogram, source, out)
-    return ({"sensed": sensed} if sensed else {}) | result
+    result = ({"sensed": sensed} if sensed else {}) | result
+    return result if command.json else readable(result)
+
+
+def readable(result: dict) -> dict:
+    """Return a result for the terminal: where there is no error, why stands in the place of its figures."""
+    from spad.estimators.depth import no_error_reason
+
+    why = no_error_reason(result)
+    kept = dict(result)
+    if why is not None:
+        unknown = (*MEANS, "median_mm", "unmixed")
+        items = (("errors", why) if key == "mae_mm" else (key, value) for key, value in result.items())
+        kept = {key: value for key, value in items if key not in unknown}
+    if isinstance(kept.get("unmixed"), dict):
+        kept["unmixed"] = readable(kept["unmixed"])
+    if "by_view" in kept:
+        kept["by_view"] = [readable(view) for view in kept["by_view"]]
+    return kept
 
 
 def _sensed(command: Depth, source: Path, seed: int) -> tuple[Histogram, str]:
@@ -135,10 +155,12 @@ def _run_folder(command: Depth, label: str, progress: Progress) -> dict:
         sensed = sensed or f"{words} and more, one for each"
         out.mkdir(exist_ok=True)
         found = _estimated(command, network, histogram, file, output_file(target, ".exr", "depth"))
-        views.append({"file": str(file), **{key: found[key] for key in (*MEANS, "out")}})
+        views.append({"file": str(file), **{key: found[key] for key in (*MEANS, *COUNTS, "out")}})
     log.info("%s: %d transients sensed %s", folder, len(files), sensed)
     means = {key: _mean([view[key] for view in views]) for key in MEANS}
-    return {"sensed": sensed, "views": len(views), "method": label, **means, "by_view": views, "out": str(out)}
+    counts = {key: sum(view[key] for view in views) for key in COUNTS}
+    common = {"sensed": sensed, "views": len(views), "method": label}
+    return {**common, **means, **counts, "by_view": views, "out": str(out)}
 
 
 def _mean(values: Sequence[float] | np.ndarray) -> float:
