@@ -31,7 +31,7 @@ from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.detect import sense
-from spad.estimators.depth import recorded_range_m
+from spad.formats.bistatic import recorded_range_m
 from spad.formats.histogram import TRUTH, Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 

@@ -29,7 +29,7 @@ def draw_histogram(
     which a pixel of few photons tells nothing. Of measured counts nobody knows signal from background: the ratio is
     left out, and the pixels are chosen by their detections.
     """
-    known = has_expected(histogram)
+    known = histogram.signal_known
     figure, images, right = image_row(histogram.depth_m.shape, 2 if known else 1, right=4.4)
     pixels = dict(zip(SHOWN_RANKS, right, strict=True))
     counts = histogram.counts.sum(axis=2, dtype=np.int64)
@@ -59,11 +59,6 @@ def draw_histogram(
     return save(figure, path)
 
 
-def has_expected(histogram: Histogram) -> bool:
-    """Tell whether expected detections are known: of measured counts nobody knows signal from background."""
-    return bool(np.isfinite(histogram.expected_signal).any())
-
-
 def expected_name(histogram: Histogram) -> str:
     """Name the rates that detections are drawn from: where a detector misses photons, more are expected than seen."""
     lossless = histogram.meta.get("model", "poisson") == "poisson"
@@ -86,7 +81,7 @@ def shown_pixels(histogram: Histogram) -> dict[str, tuple[int, int]]:
 
     Ranked are pixels of one surface whose true depth is known and recorded, all pixels where there is none.
     """
-    ranked_by = histogram.expected_signal if has_expected(histogram) else histogram.counts.sum(axis=2, dtype=np.int64)
+    ranked_by = histogram.expected_signal if histogram.signal_known else histogram.counts.sum(axis=2, dtype=np.int64)
     recorded = true_arrival_s(histogram) < histogram.sensor.bins * histogram.sensor.bin_width_s
     candidates = np.flatnonzero(recorded & ~histogram.mixed & (ranked_by > 0))
     if not candidates.size:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from render.transient import Transient
-from scene2spad.plots.pixels import expected_name, has_expected
+from scene2spad.plots.pixels import expected_name
 from scene2spad.viewer.content import NS_PER_M, Content, Cube, Layer, Returns, grey_layer
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.json_types import JsonObject
@@ -55,7 +55,7 @@ def histogram_content(histogram: Histogram, title: str, transient: Transient | N
     """Show a histogram: its images, detections, and with its transient the expected counts and the returns."""
     sensor, counted = histogram.sensor, histogram.counts.sum(axis=2, dtype=np.int64)
     layers = [grey_layer("detections", "", counted)]
-    if has_expected(histogram):
+    if histogram.signal_known:
         layers += [
             grey_layer("expected signal", "photons", histogram.expected_signal),
             grey_layer("expected background", "photons", histogram.expected_background),
@@ -246,15 +246,12 @@ def transient_facts(transient: Transient) -> dict[str, str]:
 
 
 def histogram_facts(histogram: Histogram) -> dict[str, str]:
-    sensor, budget = histogram.sensor, histogram.budget
-    photons = f"{budget.signal:g} signal + {budget.background:g} background detections a pixel"
-    if not has_expected(histogram):  # counts without a truth, of a capture say
-        photons = f"{budget.signal + budget.background:g} detections a pixel; how many are signal is unknown"
+    sensor = histogram.sensor
     return {
         "kind": "histogram",
         "sensor": f"{sensor.name}: {sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps",
         "pixels": _size(histogram.depth_m),
-        "photon budget": photons,
+        "photon budget": histogram.budget_in_words,
         "detections": f"{int(histogram.counts.sum(dtype=np.int64)):,}",
         "detection law": str(histogram.meta.get("model", "not stated")),
         "seed": str(histogram.meta.get("seed", "none")),

@@ -115,13 +115,25 @@ class Histogram:
             | (meta or {}),
         )
 
+    @property
+    def signal_known(self) -> bool:
+        """Tell whether signal and background are told apart: nobody knows them of measured counts."""
+        return bool(np.isfinite(self.expected_signal).any())
+
+    @property
+    def budget_in_words(self) -> str:
+        """Return the photon budget as pages and notebooks show it."""
+        signal, background = self.budget.signal, self.budget.background
+        if self.signal_known:
+            return f"{signal:g} signal + {background:g} background detections a pixel"
+        return f"{signal + background:g} detections a pixel; how many are signal is unknown"
+
     def __repr__(self) -> str:
         (height, width, bins), sensor = self.counts.shape, self.sensor
         return (
             f"Histogram({height} x {width} pixels (rows x columns) x {bins} bins of "
             f"{sensor.bin_width_s * 1e12:.4g} ps, "
-            f"{int(self.counts.sum(dtype=np.int64))} detections, signal {self.budget.signal:g} + background "
-            f"{self.budget.background:g} a pixel, sensor {sensor.name!r})"
+            f"{int(self.counts.sum(dtype=np.int64))} detections in all, {self.budget_in_words}, sensor {sensor.name!r})"
         )
 
     def _repr_html_(self) -> str:
@@ -130,7 +142,7 @@ class Histogram:
         facts = {
             "pixels": f"{height} rows x {width} columns",
             "time": f"{bins} bins of {sensor.bin_width_s * 1e12:.4g} ps, sensor {sensor.name}",
-            "asked": f"{self.budget.signal:g} signal + {self.budget.background:g} background detections a pixel",
+            "photon budget": self.budget_in_words,
             "detections": f"{int(self.counts.sum(dtype=np.int64)):,}",
         }
         return html_card("Histogram", facts, self.counts.sum(axis=2, dtype=np.int64))

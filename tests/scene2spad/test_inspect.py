@@ -9,7 +9,8 @@ import pytest
 from render.transient import read_transient
 from scene2spad.cli import main
 from scene2spad.cli.results.inspect import BARS, WIDTH, drawn
-from spad.formats.histogram import read_histogram
+from spad.formats.histogram import Histogram, read_histogram, write_histogram
+from spad.sensor.model import Sensor
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,18 @@ def test_a_histogram_and_the_counts_of_a_pixel(files, capfd):
     for one in found["pixel"]["counts"]:
         counts[one["bin"]] = one["counts"]
     assert np.array_equal(counts, histogram.counts[5, 7]) and found["pixel"]["detections"] == counts.sum()
+
+
+def test_counts_of_ones_own_were_not_asked_for(files, capfd, tmp_path):
+    """Nobody knows how many of them are signal: neither `inspect` nor Python says that there is none."""
+    own = Histogram.from_counts(np.ones((2, 3, 8), int), Sensor(bins=8))
+    write_histogram(own, tmp_path / "own.h5")
+    found, sensed = message(capfd, tmp_path / "own.h5"), message(capfd, files / "gallery.h5")
+    asked = {"asked_signal", "asked_background"}
+    assert found["detections_per_pixel"] == 8 and sensed.keys() - found.keys() >= asked and sensed["asked_signal"] == 50
+    for shown in (repr(own), own._repr_html_()):
+        assert "8 detections a pixel; how many are signal is unknown" in shown
+    assert "50 signal + 50 background" in repr(read_histogram(files / "gallery.h5"))
 
 
 def test_a_pack_shows_the_view_asked_for(files, capfd):

@@ -111,14 +111,14 @@ def _of_transient(transient: Transient) -> dict[str, object]:
 def _of_histogram(histogram: Histogram) -> dict[str, object]:
     sensor, budget = histogram.sensor, histogram.budget
     rows, columns, bins = histogram.counts.shape
+    asked = {"asked_signal": budget.signal, "asked_background": budget.background} if histogram.signal_known else {}
     return {
         "rows": rows,
         "columns": columns,
         "bins": bins,
         "bin_width_s": sensor.bin_width_s,
         "sensor": sensor.name,
-        "asked_signal": budget.signal,
-        "asked_background": budget.background,
+        **asked,
         "detections_per_pixel": float(histogram.counts.sum(dtype=np.int64)) / max(rows * columns, 1),
         "depth_m": _range(histogram.depth_m),
         **_known(histogram.meta, ("scene", "seed", "model", "plan", "versions")),
