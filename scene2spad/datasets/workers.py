@@ -218,13 +218,15 @@ def _on_dask(
     from distributed import as_completed
 
     waiting = iter(runs)
-    if not _workers_of(client):
+    workers = _workers_of(client)
+    if not workers:
         log.warning("scheduler %s has no workers yet: waiting for some", client.scheduler.address)
     submitted: dict[DaskFuture, Numbers] = {}
     pending = as_completed()
     while True:
-        lanes = max(1, _workers_of(client))  # they come and go
-        for run in islice(waiting, max(0, 3 * lanes - len(submitted))):
+        if client.status == "running":  # else it is the scheduler's loss that is told next, not waited for
+            workers = _workers_of(client)
+        for run in islice(waiting, max(0, 3 * max(1, workers) - len(submitted))):
             with _explain_lost_scheduler(client):
                 future = client.submit(work, run, pure=False, retries=TRIES)
             submitted[future] = run
@@ -246,6 +248,7 @@ def _on_dask(
 
 
 def _workers_of(client: Client) -> int:
+    """Return how many workers a cluster has now: they come and go."""
     with _explain_lost_scheduler(client):
         return client.scheduler_info(n_workers=0)["n_workers"]  # their number alone, however many there are
 
