@@ -141,6 +141,14 @@ def image_row(shape: tuple[int, ...], images: int, right: float = 0.0) -> tuple[
     return figure, row, column
 
 
+def error_words(errors: dict) -> str:
+    """Say the error of a depth map, or why there is none, by its figures (`spad.estimators.depth.depth_errors`)."""
+    from spad.estimators.depth import no_error_reason  # with torch, whose import takes a second
+
+    why = no_error_reason(errors)
+    return why or f"MAE {errors['mae_mm']:,.1f} mm, {errors['within_10mm']:.0%} within 10 mm"
+
+
 def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: dict, path: Path) -> Path:
     """Draw truth, estimate and absolute error; the estimate alone where no truth is known."""
     if np.isnan(histogram.depth_m).all():
@@ -150,8 +158,7 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
     figure, axes, _ = image_row(depth_m.shape, 3)
     limits = depth_limits(histogram.depth_m)
     draw_image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
-    title = f"{method}: MAE {errors['mae_mm']:.1f} mm, {errors['within_10mm']:.0%} within 10 mm"
-    draw_image(axes[1], depth_m, title, "m", cmap=DEPTH_COLOURS, **limits)
+    draw_image(axes[1], depth_m, f"{method}: {error_words(errors)}", "m", cmap=DEPTH_COLOURS, **limits)
     error_mm = 1000 * np.abs(depth_m - histogram.depth_m)
     draw_image(axes[2], error_mm, "absolute error (colours end at 100 mm)", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
     return save(figure, path)
@@ -185,7 +192,7 @@ def draw_comparison(
         above = axes[rows * band, column]
         above.set_axis_on()
         figures = errors.get(name)
-        message = f"{name}\nMAE {figures['mae_mm']:.0f} mm" if figures and known else name
+        message = f"{name}\n{error_words(figures)}" if figures and known else name
         draw_image(above, depth, message, "m", cmap=DEPTH_COLOURS, **limits)
         if known and figures:
             below = axes[rows * band + 1, column]

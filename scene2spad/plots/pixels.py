@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from render.transient import Transient
-from scene2spad.plots.figures import DEPTH_COLOURS, ERROR_COLOURS, depth_limits, draw_image, image_row
+from scene2spad.plots.figures import DEPTH_COLOURS, ERROR_COLOURS, depth_limits, draw_image, error_words, image_row
 from scene2spad.plots.style import COLOURS, plt, save
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel
@@ -138,8 +138,7 @@ def draw_demo(
            vmax=np.quantile(histogram.expected_signal, 0.98))  # fmt: skip
     draw_image(panels["B"], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
     for key, (name, depth) in zip("CDEF", depths.items(), strict=True):
-        message = f"{name}\nMAE {errors[name]['mae_mm']:.0f} mm, {errors[name]['within_10mm']:.0%} within 10 mm"
-        draw_image(panels[key], depth, message, "m", cmap=DEPTH_COLOURS, **limits)
+        draw_image(panels[key], depth, f"{name}\n{error_words(errors[name])}", "m", cmap=DEPTH_COLOURS, **limits)
     row, column = _telling_pixel(transient)
     for key in "ABCDEF":
         panels[key].plot(column, row, "o", mfc="none", mec=COLOURS["vermilion"], ms=9)
