@@ -13,7 +13,7 @@ from scene2spad.plots.figures import DEPTH_COLOURS, ERROR_COLOURS, depth_limits,
 from scene2spad.plots.style import COLOURS, plt, save
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel
-from spad.formats.bistatic import laser_baseline_m, true_arrival_s
+from spad.formats.bistatic import time_tells_depth, true_arrival_s
 from spad.formats.histogram import Histogram
 
 SHOWN_RANKS = {"dark": 0.1, "median": 0.5, "bright": 0.9}  # among pixels of one known surface, where there are any
@@ -212,7 +212,7 @@ def _one_pixel(above: Axes, below: Axes, transient: Transient, histogram: Histog
                        textcoords="offset points", fontsize=8, ha="right", va="top")  # fmt: skip
     below.set(xlabel="time since the laser's emission [ns]", ylabel="photons per bin")
     below.legend(fontsize=8, loc="upper right")
-    if not any(laser_baseline_m(histogram)):  # else depth is no function of time alone
+    if time_tells_depth(histogram):
         metres_per_ns = SPEED_OF_LIGHT_M_PER_S / ns / 2
         depth_axis = below.secondary_xaxis("top", functions=(lambda t: t * metres_per_ns, lambda d: d / metres_per_ns))
         depth_axis.set_xlabel("depth [m]", fontsize=8)

@@ -13,6 +13,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.json_types import JsonObject
 
 NS_PER_M = 1e9 / SPEED_OF_LIGHT_M_PER_S
+METRES_PER_NS = 0.5 / NS_PER_M  # of depth, from a laser at the camera
 MAX_CELLS = 1 << 24  # of a cube: more than a browser draws at once are summed in time
 COMMON = (0.005, 0.995)  # quantiles that an image's grey scale spans
 LEVELS = 255  # of a cube of rates, on a scale of square roots
@@ -45,7 +46,7 @@ class Cube:
     start_ns: float
     step_ns: float
     drawn: Literal["bars", "line"]
-    metres_per_ns: float | None = 0.5 / NS_PER_M
+    metres_per_ns: float | None = METRES_PER_NS
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,12 @@ import numpy as np
 
 from render.transient import Transient
 from scene2spad.plots.pixels import expected_name
-from scene2spad.viewer.content import NS_PER_M, Content, Cube, Layer, Returns, grey_layer
+from scene2spad.viewer.content import METRES_PER_NS, NS_PER_M, Content, Cube, Layer, Returns, grey_layer
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.json_types import JsonObject
 from scenes.model import Camera
 from spad.detection.rates import Rates, rates_for
-from spad.formats.bistatic import baseline_of, true_arrival_s, true_path_m
+from spad.formats.bistatic import baseline_of, time_tells_depth, true_arrival_s, true_path_m
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 
@@ -88,14 +88,8 @@ def histogram_content(histogram: Histogram, title: str, transient: Transient | N
 def detections(histogram: Histogram) -> Cube:
     """Return the counts of a histogram over time."""
     step_ns = 1e9 * histogram.sensor.bin_width_s
-    depth = depth_per_ns(histogram.meta.get("transient", {}))
+    depth = METRES_PER_NS if time_tells_depth(histogram) else None
     return Cube("detections", "per bin", histogram.counts, 0.0, step_ns, "bars", depth)
-
-
-def depth_per_ns(rendered: JsonObject) -> float | None:
-    """Return metres of depth that a nanosecond is, None beside a displaced laser, by what a transient states of
-    itself."""
-    return None if any(baseline_of(rendered)) else 0.5 / NS_PER_M
 
 
 def depth_content(depth_m: np.ndarray, confidence: np.ndarray | None, meta: JsonObject, title: str) -> Content:
@@ -147,7 +141,11 @@ def light_over_path(transient: Transient) -> Cube:
     spread(cube, transient.return_pixel[seen], (near[seen] - low) / step, (far[seen] - low) / step,
            transient.radiance[seen])  # fmt: skip
     shape = (transient.height, transient.width, FRAMES)
-    start_ns, step_ns, depth = low * NS_PER_M, step * NS_PER_M, depth_per_ns(transient.meta)
+    start_ns, step_ns, depth = (
+        low * NS_PER_M,
+        step * NS_PER_M,
+        None if any(baseline_of(transient.meta)) else METRES_PER_NS,
+    )
     return Cube("light", "1/(m² sr) per step", cube.reshape(shape), start_ns, step_ns, "line", depth)
 
 

@@ -39,7 +39,7 @@ from spad.estimators.matching import (
     published_log_matched_bins,
 )
 from spad.estimators.pile_up import linearised
-from spad.formats.bistatic import laser_baseline_m, radial_depth_of, recorded_range_m
+from spad.formats.bistatic import radial_depth_of, recorded_range_m, time_tells_depth
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse, binned_pulse_slope, pulse_taps
@@ -202,9 +202,9 @@ def confidence(
 
 
 def confidence_map(histogram: Histogram, depth_m: np.ndarray, method: str = "log-matched") -> np.ndarray | None:
-    """Return the probability of each pixel's estimate that it is no chance peak, (H, W) float32; None beside a
-    displaced laser, where the distance is not the arrival time that the probability is of."""
-    if any(laser_baseline_m(histogram)):
+    """Return the probability of each pixel's estimate that it is no chance peak, (H, W) float32; None where the depth
+    is not the recorded time that the probability is of, as beside a displaced laser."""
+    if not time_tells_depth(histogram):
         return None
     counts, law = torch.from_numpy(histogram.counts), detection_law(histogram)
     return confidence(counts, torch.from_numpy(depth_m), histogram.sensor, method, law=law).numpy()

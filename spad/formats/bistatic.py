@@ -1,4 +1,4 @@
-"""Bistatic geometry: depth, optical path and arrival time where the laser stands beside the camera.
+"""From depth to recorded time and back: bistatic geometry of a displaced laser, and converters with delays.
 
 With d the distance from the camera, r the unit ray and b the laser's place relative to the camera, light travels
 p = |d r - b| + d. Points of one path lie on an ellipsoid whose foci are the laser and the camera.
@@ -17,6 +17,7 @@ from scenes.errors import InputError
 from scenes.json_types import JsonObject
 from scenes.model import Camera
 from spad.formats.histogram import Histogram
+from spad.sensor.clock import chirped, unchirped
 
 CO_LOCATED = (0.0, 0.0, 0.0)
 
@@ -56,12 +57,24 @@ def laser_baseline_m(histogram: Histogram) -> tuple[float, ...]:
     return baseline_of(histogram.meta.get("transient", {}))
 
 
-def radial_depth_of(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
-    """Convert half the optical path (H, W) [m] into distance from the camera by the histogram's own camera and laser.
+def time_tells_depth(histogram: Histogram) -> bool:
+    """Tell whether depth is half of c times the recorded time: the laser is at the camera, converters measure what
+    is."""
+    return not any(laser_baseline_m(histogram)) and not _converters_differ(histogram)
 
-    With a co-located laser, or where the histogram does not know of any, it is the same array. Raises InputError beside
-    a displaced laser where the histogram does not tell where its pixels look.
+
+def radial_depth_of(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
+    """Convert half of c times the recorded time (H, W) [m] into distance from the camera, by the histogram's own
+    converters, camera and laser.
+
+    With a co-located laser and converters that measure what is, or where the histogram does not know of any, it is the
+    same array. Raises InputError beside a displaced laser where the histogram does not tell where its pixels look.
     """
+    if _converters_differ(histogram):
+        time_s = _light_time_s(
+            2 / SPEED_OF_LIGHT_M_PER_S * np.asarray(half_path_m, np.float64), histogram.meta["zones"]
+        )
+        half_path_m = (SPEED_OF_LIGHT_M_PER_S / 2 * time_s).astype(half_path_m.dtype)
     baseline = laser_baseline_m(histogram)
     if not any(baseline):
         return half_path_m
@@ -89,12 +102,34 @@ def true_path_m(seen: Transient | Histogram) -> np.ndarray:
 
 
 def true_arrival_s(histogram: Histogram) -> np.ndarray:
-    """Return when light from the true depth arrives, (H, W) float64 [s] after the laser's emission, within the laser's
-    period; NaN where no depth is known.
+    """Return when light from the true depth is recorded, (H, W) float64 [s] after the laser's emission, within the
+    laser's period; NaN where no depth is known.
 
     A time at the record's end or later, in a period longer than the record, is one that the sensor does not record.
     """
-    return true_path_m(histogram) / SPEED_OF_LIGHT_M_PER_S % histogram.sensor.period_s
+    time_s = true_path_m(histogram) / SPEED_OF_LIGHT_M_PER_S
+    if _converters_differ(histogram):
+        clock, delay_s, chirp_hz = _converters(histogram.meta["zones"])
+        time_s = chirped(time_s / clock, chirp_hz) + delay_s
+    return time_s % histogram.sensor.period_s
+
+
+def _converters_differ(histogram: Histogram) -> bool:
+    """Tell whether zones' converters measure other times than light has."""
+    if "zones" not in histogram.meta:
+        return False
+    clock, delay_s, chirp_hz = _converters(histogram.meta["zones"])
+    return bool((clock != 1).any() or delay_s.any() or chirp_hz)
+
+
+def _light_time_s(recorded_s: np.ndarray, zones: JsonObject) -> np.ndarray:
+    """Return when the light arrived that zones recorded at these times, (H, W) [s]; 0 where a delay is longer."""
+    clock, delay_s, chirp_hz = _converters(zones)
+    return clock * unchirped(np.maximum(recorded_s - delay_s, 0), chirp_hz)
+
+
+def _converters(zones: JsonObject) -> tuple[np.ndarray, np.ndarray, float]:
+    return np.asarray(zones["clock"]), np.asarray(zones["delay_s"]), float(zones["chirp_hz"])
 
 
 def recorded_range_m(histogram: Histogram) -> np.ndarray:
@@ -109,8 +144,8 @@ def recorded_range_m(histogram: Histogram) -> np.ndarray:
 def _directions(meta: JsonObject, shape: tuple[int, ...]) -> np.ndarray | None:
     """Return unit rays (H, W, 3) of a histogram's pixels, or of its zones' centres, in the camera's frame; None where
     the camera's image is of another size."""
-    if "zone_centres" in meta:
-        x, y = (np.asarray(meta["zone_centres"][axis], dtype=np.float64) for axis in "xy")
+    if "zones" in meta:
+        x, y = (np.asarray(meta["zones"][name], dtype=np.float64) for name in ("centre_x", "centre_y"))
         ray = np.stack((x, y, np.ones_like(x)), axis=-1)
         return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     camera = meta["transient"].get("camera")

@@ -11,7 +11,7 @@ from render.transient import Transient
 from scenes.errors import require
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
-from spad.zones.sensor import ZoneArray, draw_zone_counts, zone_returns, zone_signal
+from spad.zones.sensor import ZoneArray, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
 
 
 def zone_grid(zones: ZoneArray) -> tuple[int, int, np.ndarray]:
@@ -46,8 +46,12 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
     counts = draw_zone_counts(returns, sensor, zones, seed=seed)
     signal = zone_signal(returns, sensor, zones).sum(axis=1)
     background = np.asarray(zones.background) * sensor.bins
-    lost = 1 - counts.sum() / max(1.0, float((signal + background).sum()))
-    pixel, centres = _centre_pixels(transient, zones), (zones.centre_x, zones.centre_y)
+    primary = signal + background
+    lost = 1 - expected_zone_counts(returns, sensor, zones).sum() / max(1e-30, float(primary.sum()))
+    reasons = [f"zones: {zones.count} fields of view", *_beside_image(transient, zones)]
+    if lost > 1e-9:  # beyond rounding
+        reasons[0] += f", {lost:.1%} of the detections lost to saturation"
+    pixel = _centre_pixels(transient, zones)
 
     def laid(values: np.ndarray, kind: type) -> np.ndarray:
         return values[order].reshape(rows, columns, *values.shape[1:]).astype(kind)
@@ -65,20 +69,39 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
         meta={
             "seed": seed,
             "model": "zones",
-            "plan": [f"zones: {zones.count} fields of view, {max(0.0, lost):.1%} of the detections lost to saturation"],
-            "pile_up": float((signal + background).max() / min(zones.trials)),
+            "plan": reasons,
+            "pile_up": float((primary / np.asarray(zones.trials)).max()),
             "wrapped": 0.0,
             "dark_share": 1.0,
             "brightest_pixel": brightest,
             "brightest_thousandth": brightest,
             "median_signal": float(np.median(signal)),
             "transient": {**transient.meta, "sha256": transient.sha256()},
-            # tangents as the zones are laid out: beside a displaced emitter the depth depends on them
-            "zone_centres": {
-                axis: laid(np.asarray(at), float).tolist() for axis, at in zip("xy", centres, strict=True)
-            },
+            # as the zones are laid out: what tells depth from a recorded time (`spad.formats.bistatic`)
+            "zones": {
+                name: laid(np.asarray(getattr(zones, name)), float).tolist()
+                for name in ("centre_x", "centre_y", "delay_s", "clock")
+            }
+            | {"chirp_hz": zones.chirp_hz},
         },
     )
+
+
+def _beside_image(transient: Transient, zones: ZoneArray) -> list[str]:
+    """Warn of zones that look partly beside the image: their light is what the image shows of them."""
+    half_x = math.tan(math.radians(transient.meta["camera"]["fov_deg"]) / 2)
+    seen = np.ones(zones.count)
+    for centre, width, half in (
+        (zones.centre_x, zones.width, half_x),
+        (zones.centre_y, zones.height, half_x * transient.height / transient.width),
+    ):
+        low, high = (np.asarray(centre) + sign * np.asarray(width) / 2 for sign in (-1, 1))
+        seen *= (np.minimum(high, half) - np.maximum(low, -half)).clip(0) / np.asarray(width)
+    cut = int((seen < 1 - 1e-6).sum())
+    if not cut:
+        return []
+    unseen = f"by up to {100 * (1 - seen.min()):.0f} % of their field of view"
+    return [f"warning: zones: {cut} of {zones.count} look partly beside the image, {unseen}: render wider"]
 
 
 def _centre_pixels(transient: Transient, zones: ZoneArray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """A multi-zone sensor: a few histograms, each of a field of view of several physical pixels, at close range.
 
 Every effect is one switch with a unit; with all off it is the identity sensor, which only sums each zone's light.
-Tangents are camera coordinates over depth: x right, y down. A time t is measured as t / clock + delay, and with
-a chirp that all converters share as u + chirp u^2 + delay, u = t / clock.
+Tangents are camera coordinates over depth: x right, y down. `spad.sensor.clock` says how converters measure time; they
+share one chirp.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
 from scenes.random_streams import Stream
 from spad.detection.saturation import draw_saturated, saturated
+from spad.sensor.clock import chirped
 from spad.sensor.model import Sensor
 
 # Switches that an ablation turns off one by one: name and what `without` puts in their place.
@@ -64,7 +65,7 @@ class ZoneArray:
     delay_s       electronic delay of each zone's converter [s]; off 0
     skew_s        of the delays of a zone's detectors: half of them are late by half of it, half early; off 0
     clock         real seconds per second of each zone's converter; off 1
-    chirp_hz      of all converters' clock, which slows down or speeds up after the laser has fired: see above; off 0
+    chirp_hz      of all converters' clock, which slows down or speeds up after the laser has fired; off 0
     background    primary detections an exposure and bin of each zone, dark counts and ambient light; off 0
     leak          light that the module itself reflects at a path of 0, in units of a zone's light; off 0
     echo_m2       of light that goes from the scene to the module, and once more to the scene and back: at twice the
@@ -236,14 +237,6 @@ def _ramp(at: np.ndarray, blur: np.ndarray) -> np.ndarray:
     """Integral of a step at 0 that is blurred by a box of width `blur`."""
     half = np.maximum(blur, 1e-12) / 2
     return np.where(np.abs(at) < half, (at + half) ** 2 / (4 * half), np.maximum(at, 0.0))
-
-
-def chirped(time: np.ndarray, chirp: float) -> np.ndarray:
-    """Return times as a clock measures them whose rate changes by 2 `chirp` a unit of time; a clock that slows down
-    stands still in the end, and does not run back."""
-    if chirp < 0:
-        time = np.minimum(time, -0.5 / chirp)
-    return time * (1 + chirp * time)
 
 
 def largest_chirp(bins: int) -> float:

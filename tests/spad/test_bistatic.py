@@ -10,10 +10,11 @@ from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from scenes.model import Camera
-from spad.estimators.depth import histogram_depth_m
-from spad.formats.bistatic import optical_path_m, radial_depth_m, true_arrival_s, true_path_m
+from spad.estimators.depth import confidence_map, histogram_depth_m
+from spad.formats.bistatic import optical_path_m, radial_depth_m, time_tells_depth, true_arrival_s, true_path_m
 from spad.formats.histogram import Histogram
 from spad.formats.rgbd import transient_from_rgbd
+from spad.sensor.clock import chirped, unchirped
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
 from spad.zones.histogram import sense_zones
@@ -66,26 +67,50 @@ def test_unknown_rays_beside_a_displaced_laser():
     assert np.isfinite(true_path_m(replace(cropped, meta={}))).all(), "a laser that nobody told of is at the camera"
 
 
-def test_depth_of_zones_beside_their_emitter():
-    """Narrow zones of a plane: the zones' centres, not the image's pixels, tell depth from half the path."""
-    pixels, baseline = 120, (0.1, 0.05, 0.0)
+def plane(depth_m: float, baseline_m=(0.0, 0.0, 0.0), pixels: int = 120) -> Transient:
+    """A frontal plane, a return a pixel, in a camera of 60 degrees that states no more than that."""
     camera = Camera(np.eye(4), 60.0, pixels, pixels)
     rays = camera.rays() @ camera.rotation
-    depth = 1.5 / rays[..., 2]
-    flat = transient_from_rgbd(
-        depth.astype(np.float32), np.ones((pixels, pixels)), np.zeros((pixels, pixels)), fov_deg=60.0
-    )
-    path = optical_path_m(depth, rays, baseline).ravel().astype(np.float32)
-    laser = {"mode": "flood", "baseline_m": list(baseline), "cone_deg": None}
-    lit = replace(flat, path_near_m=path, path_far_m=path, meta={"camera": {"fov_deg": 60.0}, "laser": laser})
-    assert isinstance(lit, Transient) and lit.returns == pixels**2
-    zones = ZoneArray((-0.3, 0.3), (0.2, 0.2), (0.02, 0.02), (0.02, 0.02), gain=(1e9, 1e9), baseline_m=baseline)
-    sensor = Sensor(name="s", bins=256, bin_width_s=1e-10, pulse=Pulse(3e-10))
-    histogram = sense_zones(lit, sensor, zones, seed=1)
+    depth = depth_m / rays[..., 2]
+    ones = np.ones((pixels, pixels))
+    flat = transient_from_rgbd(depth.astype(np.float32), ones, 0 * ones, fov_deg=60.0)
+    path = optical_path_m(depth, rays, baseline_m).ravel().astype(np.float32)
+    laser = {"mode": "flood", "baseline_m": list(baseline_m), "cone_deg": None}
+    return replace(flat, path_near_m=path, path_far_m=path, meta={"camera": {"fov_deg": 60.0}, "laser": laser})
+
+
+NARROW = ZoneArray((-0.3, 0.3), (0.2, 0.2), (0.02, 0.02), (0.02, 0.02), gain=(1e9, 1e9))
+ZONED = Sensor(name="s", bins=256, bin_width_s=1e-10, pulse=Pulse(3e-10))
+
+
+def test_depth_of_zones_beside_their_emitter():
+    """Narrow zones of a plane: the zones' centres, not the image's pixels, tell depth from half the path."""
+    baseline = (0.1, 0.05, 0.0)
+    histogram = sense_zones(plane(1.5, baseline), ZONED, replace(NARROW, baseline_m=baseline), seed=1)
     assert histogram.counts.sum() > 1000
     error = histogram_depth_m(histogram) - histogram.depth_m
     assert np.abs(error).max() < 0.01
-    ray = np.stack((np.array(zones.centre_x), np.array(zones.centre_y), np.ones(2)), axis=-1)[None]
+    ray = np.stack((np.array(NARROW.centre_x), np.array(NARROW.centre_y), np.ones(2)), axis=-1)[None]
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     legs = histogram.depth_m + np.linalg.norm(histogram.depth_m[..., None] * ray - baseline, axis=-1)
     assert true_arrival_s(histogram) == pytest.approx(legs / C)
+
+
+@pytest.mark.parametrize(
+    "converters", [{"delay_s": (1.2e-9, -3e-10)}, {"clock": (1.02, 0.98)}, {"chirp_hz": 4e5}, {"chirp_hz": -4e5}]
+)
+def test_depth_of_zones_whose_converters_measure_other_times(converters):
+    """A delay of 1.2 ns alone would be 18 cm."""
+    histogram = sense_zones(plane(1.5), ZONED, replace(NARROW, **converters), seed=1)
+    assert np.abs(histogram_depth_m(histogram) - histogram.depth_m).max() < 5e-3
+    centroid_s = ZONED.bin_width_s * (histogram.counts @ (np.arange(256) + 0.5)) / histogram.counts.sum(axis=2)
+    assert np.abs(true_arrival_s(histogram) - centroid_s).max() < 3e-11
+    assert not time_tells_depth(histogram) and confidence_map(histogram, histogram.depth_m) is None
+    assert time_tells_depth(sense_zones(plane(1.5), ZONED, NARROW, seed=1))
+
+
+def test_clocks_run_back_as_they_ran():
+    time = np.linspace(0, 2, 50)
+    for chirp in (0.0, 0.3, -0.2):
+        assert unchirped(chirped(time, chirp), chirp) == pytest.approx(time, abs=1e-7)
+    assert unchirped(chirped(time, -0.5), -0.5).max() == pytest.approx(1.0), "it stood still from 1 on"

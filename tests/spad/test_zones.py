@@ -11,6 +11,7 @@ from render.transient import Transient
 from scenes.errors import InputError
 from spad.detection.saturation import draw_saturated, saturated, saturated_jacobian
 from spad.formats.rgbd import transient_from_rgbd
+from spad.sensor.clock import chirped
 from spad.sensor.files import SensorFile
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse
@@ -19,7 +20,6 @@ from spad.zones.sensor import (
     EFFECTS,
     ZoneArray,
     ZoneReturns,
-    chirped,
     expected_zone_counts,
     zone_returns,
     zone_signal,
@@ -262,3 +262,17 @@ def test_the_modules_own_reflection_is_there_where_a_zone_sees_nothing():
     assert nothing == pytest.approx(some, abs=1e-3) and nothing.sum() > 900
     dark = replace(zone, leak=(0.0,))
     assert not zone_signal(zone_returns(seen_by_a_camera(np.full((9, 9), np.nan)), dark), SENSOR, dark).any()
+
+
+def test_what_zones_lose_and_where_they_look():
+    """Shot noise is no loss; pile-up is of each zone's own trials; a zone beside the image is told."""
+    zones = replace(TWO, gain=(1e4, 1e4))
+    histogram = sense_zones(view(), SENSOR, zones, seed=3)
+    assert histogram.meta["plan"] == ["zones: 2 fields of view"] and histogram.meta["pile_up"] == 0
+    bright = sense_zones(view(), SENSOR, replace(zones, gain=(1e6, 1e4), trials=(math.inf, 1e3)), seed=3)
+    signal = float(bright.expected_signal.min())
+    assert bright.meta["pile_up"] == pytest.approx(signal / 1e3, rel=1e-5)
+    assert "lost to saturation" in bright.meta["plan"][0]
+    half_view = math.tan(math.radians(30))
+    aside = replace(TWO, centre_x=(-half_view, 0.2))
+    assert "1 of 2 look partly beside the image, by up to 50 %" in sense_zones(view(), SENSOR, aside).meta["plan"][1]
