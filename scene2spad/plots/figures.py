@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +21,7 @@ ERROR_COLOURS = matplotlib.colormaps["magma"].with_extremes(bad="lightgrey")
 # What lies further beyond these quantiles than so many times their distance does not decide a colour scale.
 COMMON, FAR_BEYOND = (0.005, 0.995), 0.5
 BAR = 0.04  # width of a colour bar, of its image's
+LETTERS_PER_INCH = 12  # of a title
 PANEL_INCHES = 3.6  # the longer side of an image in the pictures of `sense` and `depth`
 
 
@@ -127,7 +129,7 @@ def image_row(shape: tuple[int, ...], images: int, right: float = 0.0) -> tuple[
     Places are computed here: matplotlib's layouts draw everything once more, half of what a picture costs.
     """
     high, wide = (max(PANEL_INCHES * side / max(shape), 0.4 * PANEL_INCHES) for side in shape)
-    edge, bar, below, above = 0.25, 0.95, 0.45 if right else 0.2, 0.75 if right else 0.4
+    edge, bar, below, above = 0.25, 0.95, 0.45 if right else 0.2, 0.75
     size = (edge + images * (wide + bar) + (right + 0.7 if right else 0.0), below + high + above)
     figure = plt.figure(figsize=size)
 
@@ -139,6 +141,12 @@ def image_row(shape: tuple[int, ...], images: int, right: float = 0.0) -> tuple[
     each = (high - 2 * gap) / 3
     column = [place(left, below + (2 - number) * (each + gap), right, each) for number in range(3)] if right else []
     return figure, row, column
+
+
+def title_above(figure: Figure, words: str) -> None:
+    """Write the longest words above all panels, in lines as wide as the figure: each panel of an upright image is
+    narrow."""
+    figure.suptitle(textwrap.fill(words, int(LETTERS_PER_INCH * figure.get_figwidth())), fontsize=10)
 
 
 def error_words(errors: dict) -> str:
@@ -153,14 +161,16 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
     """Draw truth, estimate and absolute error; the estimate alone where no truth is known."""
     if np.isnan(histogram.depth_m).all():
         figure, (only,), _ = image_row(depth_m.shape, 1)
-        draw_image(only, depth_m, f"{method}, no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
+        title_above(figure, method)
+        draw_image(only, depth_m, "no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
         return save(figure, path)
     figure, axes, _ = image_row(depth_m.shape, 3)
     limits = depth_limits(histogram.depth_m)
     draw_image(axes[0], histogram.depth_m, "true depth", "m", cmap=DEPTH_COLOURS, **limits)
-    draw_image(axes[1], depth_m, f"{method}: {error_words(errors)}", "m", cmap=DEPTH_COLOURS, **limits)
+    title_above(figure, f"{method}: {error_words(errors)}")
+    draw_image(axes[1], depth_m, "estimate", "m", cmap=DEPTH_COLOURS, **limits)
     error_mm = 1000 * np.abs(depth_m - histogram.depth_m)
-    draw_image(axes[2], error_mm, "absolute error (colours end at 100 mm)", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
+    draw_image(axes[2], error_mm, "absolute error", "mm", cmap=ERROR_COLOURS, vmin=0, vmax=100)
     return save(figure, path)
 
 

@@ -38,7 +38,10 @@ def draw_histogram(
     if known:
         _signal_to_background(images[1], histogram)
     arrival_ns = 1e9 * true_arrival_s(histogram)
-    for number, (name, (row, column)) in enumerate(shown_pixels(histogram).items()):
+    shown = shown_pixels(histogram)
+    for name in SHOWN_RANKS.keys() - shown.keys():
+        pixels[name].remove()
+    for number, (name, (row, column)) in enumerate(shown.items()):
         for image in images:
             image.plot(column, row, "o", mfc="none", mec=f"C{number + 1}", ms=8, mew=1.5)
         rate = None if expected is None else expected(row, column)
@@ -48,7 +51,7 @@ def draw_histogram(
             signal, background = (v[row, column] for v in (histogram.expected_signal, histogram.expected_background))
             photons = f"{_short(signal)} + {_short(background)} photons expected"
         pixels[name].set_title(f"{name} pixel ({row}, {column}): {photons}", fontsize=9)
-    right[-1].set_xlabel("time since the laser's emission [ns]", fontsize=9)
+    pixels[[*shown][-1]].set_xlabel("time since the laser's emission [ns]", fontsize=9)
     if known:
         photons = f"{histogram.budget.signal:g} + {histogram.budget.background:g} photons per pixel on average;"
         ranked = "right: pixels whose expected signal is above that of 10, 50 and 90 % of pixels"
@@ -79,7 +82,8 @@ def _signal_to_background(axes: Axes, histogram: Histogram) -> None:
 def shown_pixels(histogram: Histogram) -> dict[str, tuple[int, int]]:
     """Return row and column of the pixels at SHOWN_RANKS of expected signal, or of detections where no signal is known.
 
-    Ranked are pixels of one surface whose true depth is known and recorded, all pixels where there is none.
+    Ranked are pixels of one surface whose true depth is known and recorded, all pixels where there is none. Of one
+    pixel the last of its names is returned.
     """
     ranked_by = histogram.expected_signal if histogram.signal_known else histogram.counts.sum(axis=2, dtype=np.int64)
     recorded = true_arrival_s(histogram) < histogram.sensor.bins * histogram.sensor.bin_width_s
@@ -87,8 +91,8 @@ def shown_pixels(histogram: Histogram) -> dict[str, tuple[int, int]]:
     if not candidates.size:
         candidates = np.arange(histogram.depth_m.size)
     ranked = candidates[np.argsort(ranked_by.ravel()[candidates], kind="stable")]
-    places = {name: int(ranked[int(rank * (ranked.size - 1))]) for name, rank in SHOWN_RANKS.items()}
-    return {name: divmod(place, histogram.depth_m.shape[1]) for name, place in places.items()}
+    places = {int(ranked[round(rank * (ranked.size - 1))]): name for name, rank in SHOWN_RANKS.items()}
+    return {name: divmod(place, histogram.depth_m.shape[1]) for place, name in places.items()}
 
 
 def _pixel_counts(

@@ -27,6 +27,7 @@ from spad.sensor.model import PhotonBudget, Sensor
 
 Model = Literal["auto", "poisson", "first-photon", "free-running"]
 MODELS: tuple[str, ...] = ("auto", *LAWS)
+MISSED_MATTERS = 1e-3  # share of the signal that finds no bins, from which on it is told
 _HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
 
 
@@ -137,16 +138,17 @@ def _planned(
     if sensor.crosstalk:
         reasons.append(f"crosstalk: a detection fires each of its neighbours with probability {sensor.crosstalk:.3%}")
     # dead pixels detect neither what wraps nor the rest
-    detected = float(light.signal.sum()) if (rates.alive == 0).any() else budget.signal * signal.size
+    all_light = light.signal_per_pixel()
+    detected = float(all_light.sum()) if (rates.alive == 0).any() else budget.signal * signal.size
     fraction = wrapped / detected if wrapped > 0 else 0.0
     if wrapped > 0:
         reasons.append(
             f"wrap: {fraction:.3%} of the signal arrives after the period of {sensor.range_m:.3f} m and wraps"
         )
     fractions = signal_fractions(signal)
-    warning = glint_warning(fractions)
-    if warning is not None:
-        reasons.append(warning)
+    # of all light, recorded or not: a budget is of all
+    warnings = (_record_warning(sensor, detected, float(signal.sum())), glint_warning(signal_fractions(all_light)))
+    reasons += [warning for warning in warnings if warning is not None]
     meta = {
         "seed": seed,
         "model": chosen,
@@ -169,6 +171,17 @@ def _planned(
         "meta": meta,
     }
     return Exposure(transient, sensor, rates, light, LAWS[chosen], seed), truth
+
+
+def _record_warning(sensor: Sensor, detected: float, recorded: float) -> str | None:
+    """Return one line where the period is longer than the record and some of the signal arrives when there are no
+    bins; a warning where it is most of it."""
+    missed = 1 - recorded / detected if detected > 0 else 0.0
+    if sensor.bins == sensor.bins_per_period or missed < MISSED_MATTERS:
+        return None
+    record, period = (f"{1e9 * bins * sensor.bin_width_s:.4g} ns" for bins in (sensor.bins, sensor.bins_per_period))
+    words = f"record: {missed:.1%} of the signal arrives when there are no bins, {record} of a period of {period}"
+    return f"warning: {words}" if missed > 0.5 else words
 
 
 def _sha256(transient: Transient) -> str:

@@ -264,6 +264,14 @@ def test_the_figure_of_measured_counts_makes_nothing_up(scene, monkeypatch):
         assert not axes.lines
 
 
+def test_no_pixel_is_shown_twice(scene):
+    """Of two pixels the brighter one is the bright one."""
+    two = sense(
+        transient_from_rgbd(np.array([[2.0, 3.0]]), np.ones((1, 2)), np.zeros((1, 2))), Sensor(), PhotonBudget(9, 0)
+    )
+    assert pixels.shown_pixels(two) == {"median": (0, 1), "bright": (0, 0)}
+
+
 def test_the_figure_draws_true_depth_where_its_light_arrives(scene, monkeypatch):
     """A record shorter than the period, and a laser beside the camera."""
     sensor = Sensor(name="gated", bins=128, bin_width_s=9.1e-11, period_s=2.73e-8)

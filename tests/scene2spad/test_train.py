@@ -124,14 +124,14 @@ def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
     depth = run(capfd, "depth", "planes.h5", "--method", "network", "--checkpoint", "run", "--no-figure")
     assert depth["pixels"] == np.isfinite(histogram.depth_m).sum() and depth["method"] == "network-run"
     assert Path("planes-network-run.exr").is_file()
-    assert 0 < depth["posterior_within_3_bins"] <= 1
+    assert 0 < depth["confidence"] <= 1
     mean = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--decoder", "soft-argmax")
     median = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--no-figure")
     assert median["mae_mm"] < mean["mae_mm"]
     layers = OpenEXR.File("planes-network-none-s0.exr", separate_channels=True).channels()
     assert set(layers) == {"Z", "confidence"}
     sure = layers["confidence"].pixels
-    assert sure.shape == (16, 16) and sure.mean() == pytest.approx(median["posterior_within_3_bins"], abs=1e-6)
+    assert sure.shape == (16, 16) and sure.mean() == pytest.approx(median["confidence"], abs=1e-6)
 
 
 def test_codes_of_several_pixels_get_the_refined_network():

@@ -76,3 +76,17 @@ def test_dark_images_and_pile_up_of_primaries():
     assert message["pile_up"] == pytest.approx(1.0)
     assert message["detections_per_cycle"] == pytest.approx(1 / 11, rel=0.05)
     assert "100.00% primary detections a cycle" in " ".join(histogram.meta["plan"])
+
+
+@pytest.mark.parametrize(("bins", "warned"), [(100, True), (139, False), (200, False)])
+def test_signal_that_arrives_after_the_record_is_told_and_is_no_glint(bins, warned):
+    """Half of the pixels see 2 m, which arrives in bin 136.6, half 1 m: the glint's rule is of light, not of bins."""
+    rows = [[(4.0, 4.0, 1.0)], [(2.0, 2.0, 0.2)]] * 64
+    gated = Sensor(name="gated", bins=bins, period_s=SENSOR.period_s)
+    histogram = sense(transient_of(*rows), gated, PhotonBudget(50, 50), seed=1)
+    missed = 1 - float(histogram.expected_signal.mean()) / 50
+    told = [reason for reason in histogram.meta["plan"] if "when there are no bins" in reason]
+    assert bool(told) == (missed > 1e-3) == (bins < 200)
+    if told:
+        assert f"{missed:.1%} of the signal" in told[0] and told[0].startswith("warning:") == warned
+    assert len(warnings(histogram)) == warned

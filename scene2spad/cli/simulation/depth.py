@@ -173,25 +173,24 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
     """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
     from spad.estimators.depth import confidence_map, histogram_errors
 
-    label, fraction = depth_label(command), None
+    label = depth_label(command)
     start = time.perf_counter()
     if network is None:
         depth = _chosen_method(command, histogram.sensor)(histogram)
+        seconds = time.perf_counter() - start
+        sure = confidence_map(histogram, depth, command.method)
     else:
         rule = command.int8_rule or "calibrated"
-        depth, fraction, overflows = network.estimate(
-            histogram, int8=command.int8, int8_rule=rule, decoder=command.decoder
-        )
+        depth, sure, overflows = network.estimate(histogram, int8=command.int8, int8_rule=rule, decoder=command.decoder)
         if overflows:
             log.warning("%d sums of 16 bits wrapped around", overflows)
-    seconds = time.perf_counter() - start
-    sure = confidence_map(histogram, depth, command.method)
+        seconds = time.perf_counter() - start
     errors = histogram_errors(depth, histogram)
     if np.isnan(histogram.depth_m).all():
         log.info("%s: holds no true depth, so that no error can be stated", source)
     meta = {"method": label, "histogram_sha256": histogram.sha256()}
     camera = histogram.meta.get("transient", {}).get("camera")
-    write_depth(depth, out, meta | ({"camera": camera} if camera else {}), sure if network is None else fraction)
+    write_depth(depth, out, meta | ({"camera": camera} if camera else {}), sure)
     result = {
         "seconds": seconds,
         "method": label,
@@ -200,8 +199,6 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
         "unmixed": histogram_errors(depth, histogram, exclude=histogram.mixed),
         "out": str(out),
     }
-    if fraction is not None:
-        result["posterior_within_3_bins"] = float(fraction.mean())
     if command.figure:
         from scene2spad.plots import figures
 
