@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import stat
 from collections.abc import Iterator
@@ -54,6 +55,11 @@ def read_bytes(path: Path, what: str = "file") -> bytes:
         return path.read_bytes()
     except (OSError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read ({_reason(error)})") from None
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a regular file's bytes. Raises InputError naming it where it cannot be read."""
+    return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 def read_text(path: Path, what: str = "text file", *, most_bytes: int | None = None) -> str:

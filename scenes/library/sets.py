@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from scenes.errors import InputError, did_you_mean, require
-from scenes.io.inputs import read_bytes
+from scenes.io.inputs import file_sha256
 from scenes.model import Scene
 
 SETS: dict[str, str] = {
@@ -48,7 +47,7 @@ class SceneSet:
 
     def inputs_sha256(self, index: int) -> dict[str, str]:
         """Return SHA-256 of each file that a view is read from, by the file's name. InputError where one is missing."""
-        return {path.name: hashlib.sha256(read_bytes(path)).hexdigest() for path in self.inputs(index)}
+        return {path.name: file_sha256(path) for path in self.inputs(index)}
 
 
 def scene_set(name: str) -> SceneSet:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 from scenes.errors import InputError, did_you_mean, listed, require
 from scenes.files import whole_file
+from scenes.io.inputs import file_sha256
 from scenes.json_types import JsonObject
 from spad.sensor.budget import Optics
 from spad.sensor.model import PRESETS, Sensor
@@ -177,13 +178,13 @@ def read_sensor(path: Path) -> SensorFile:
     """
     contents = read_toml(Path(path))
     try:
-        return sensor_from_tables(contents)
+        return sensor_from_tables(contents, Path(path).parent)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def sensor_from_tables(contents: Mapping[str, object]) -> SensorFile:
-    """Return what the tables of a sensor file say; see `read_sensor`."""
+def sensor_from_tables(contents: Mapping[str, object], folder: Path = Path()) -> SensorFile:
+    """Return what the tables of a sensor file in `folder` say; see `read_sensor`."""
     _check_schema(contents)
     _check_keys(contents, (*TOP, *TABLES, "sources"), "")
     name = contents.get("name")
@@ -203,10 +204,20 @@ def sensor_from_tables(contents: Mapping[str, object]) -> SensorFile:
             values[table] = _pulse(tables[table], table)
     if "tdc" in tables:
         require("zones" not in tables, "zones and tdc do not go together: converters are of pixels")
-        values["tdc"] = Tdc(**tables["tdc"])
+        values["tdc"] = _converters(Tdc(**tables["tdc"]), folder)
     optics = Optics(**tables["optics"]) if "optics" in tables else None
     zones = ZoneArray(**tables["zones"]) if "zones" in tables else None
     return SensorFile(Sensor(**values), optics, zones, description, _sources(contents))
+
+
+def _converters(tdc: Tdc, folder: Path) -> Tdc:
+    """Return converters whose table of codes, if they have one of their own, lies where the sensor file's folder says
+    and is known by its hash."""
+    if tdc.has_own_table:
+        path = folder / tdc.table
+        tdc = replace(tdc, table=str(path), table_sha256=file_sha256(path))
+    tdc.ends()
+    return tdc
 
 
 def _check_schema(contents: Mapping[str, object]) -> None:
@@ -300,7 +311,8 @@ def sensor_tables(contents: SensorFile) -> dict[str, object]:
     if (tdc := sensor.tdc) is not None:
         defaults = {one.name: one.default for one in fields(Tdc)}
         used = {name: key for name, key in TDC.items() if getattr(tdc, key.field) != defaults[key.field]}
-        tables["tdc"] = dict(_written(tdc, used))
+        place = {"table": str(Path(tdc.table).resolve())} if tdc.has_own_table else {}  # wherever the sensor file goes
+        tables["tdc"] = dict(_written(tdc, used)) | place
     if optics is not None:
         tables["optics"] = dict(_written(optics, OPTICS))
     if (zones := contents.zones) is not None:

@@ -107,6 +107,8 @@ class Sensor:
         require(isinstance(self.tdc, Tdc), f"{where}: tdc {self.tdc!r} is no Tdc")
         period, bins = self.bins_per_period, self.bins
         require(bins == period, f"{where}: a tdc needs bins that cover the period, there are {bins} of {period}")
+        if not self.tdc.is_at_hand:
+            return
         try:
             self.tdc.edges(bins, self.bin_width_s)
         except InputError as error:

@@ -19,6 +19,7 @@ import numpy as np
 
 from scenes.errors import did_you_mean, require
 from scenes.files import read_arrays
+from scenes.io.inputs import file_sha256
 from scenes.random_streams import Stream
 
 Correction = Literal["none", "line", "table"]
@@ -35,6 +36,7 @@ class Tdc:
     clock_period_s   period of the clock that the fine codes divide
     table            measured codes: a table that ships (`shipped_tables`), or a .npz file with `end_ps`
                      (converters, codes), when each code ends after the clock's edge; empty: DRAWN converters are drawn
+    table_sha256     of the table's file: another file of that name is refused. A sensor file's is noted as it is read
     codes            fine codes a clock period of drawn converters; 0 with a table, which has its own
     dnl              differential nonlinearity of drawn ones: standard deviation of the widths of all codes, in codes;
                      at most sqrt(codes - 1), where one code is as wide as all
@@ -46,6 +48,7 @@ class Tdc:
 
     clock_period_s: float
     table: str = ""
+    table_sha256: str = ""
     codes: int = 0
     dnl: float = 0.0
     missing: float = 0.0
@@ -75,15 +78,29 @@ class Tdc:
         require(known, f"tdc: correction {self.correction!r} is unknown, expected {', '.join(CORRECTIONS)}")
         bits = self.correction_bits
         require(int(bits) == bits and 1 <= bits <= MAX_BITS, f"tdc: {bits} correction bits, expected 1 to {MAX_BITS}")
-        self.ends()
+        if self.is_at_hand:
+            self.ends()
+
+    @property
+    def is_at_hand(self) -> bool:
+        """Tell whether the codes are known. What a sensor has recorded can be read without its table's file."""
+        if not self.has_own_table:
+            return True
+        path = Path(self.table)
+        return path.is_file() and self.table_sha256 in ("", file_sha256(path))
+
+    @property
+    def has_own_table(self) -> bool:
+        """Tell whether the table is a file, and not one that ships."""
+        return self.table.endswith(".npz") and self.table not in shipped_tables()
 
     def ends(self) -> np.ndarray:
         """Return when each code ends, in clock periods after the clock's edge: (converters, codes) float64, read only.
 
-        Raises InputError in one line for a table that is unknown or does not fit the clock.
+        Raises InputError in one line for a table that is unknown, does not fit the clock, or has changed.
         """
         if self.table:
-            return measured_table(self.table, self.clock_period_s)
+            return measured_table(self.table, self.clock_period_s, self.table_sha256)
         return _drawn(self.codes, self.dnl, self.missing)
 
     def edges(self, bins: int, bin_width_s: float) -> np.ndarray:
@@ -105,8 +122,11 @@ def shipped_tables() -> dict[str, Path]:
 
 
 @lru_cache(maxsize=8)
-def measured_table(table: str, clock_period_s: float) -> np.ndarray:
-    """Read a measured table of code widths, shipped or a file's, as ends of codes in clock periods; kept in memory."""
+def measured_table(table: str, clock_period_s: float, sha256: str = "") -> np.ndarray:
+    """Read a measured table of code widths, shipped or a file's, as ends of codes in clock periods; kept in memory.
+
+    Raises InputError for a file that is no such table, does not fit the clock, or has another hash than `sha256`.
+    """
     shipped = shipped_tables()
     if table not in shipped:
         meant = did_you_mean(table, shipped)
@@ -116,6 +136,8 @@ def measured_table(table: str, clock_period_s: float) -> np.ndarray:
         )
     path = shipped.get(table, Path(table))
     held = read_arrays(path, "table of codes")
+    same = sha256 in ("", file_sha256(path))
+    require(same, f"{path}: is another table of codes than the sensor had, its SHA-256 does not begin {sha256[:12]}")
     require("end_ps" in held, f"{path}: holds no end_ps, there are {', '.join(held) or 'none'}")
     end = held["end_ps"]
     good = (

@@ -17,6 +17,7 @@ from spad.detection.device_patches import DevicePatches
 from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
 from spad.detection.training_patches import Patch, pack_views, sense_patches
+from spad.estimators.depth import histogram_depth_m
 from spad.formats.histogram import read_histogram, write_histogram
 from spad.reference import arrivals, code_overlap, detect_free_running, detect_synchronous, time_bin
 from spad.sensor import tdc as converters
@@ -299,3 +300,30 @@ def test_a_converter_with_one_code_gives_the_clock_period(tdc: Tdc) -> None:
 def test_the_largest_nonlinearity_leaves_every_converter_a_code(codes: int, dnl: float) -> None:
     ends = Tdc(2.5e-9, codes=codes, dnl=dnl).ends()
     assert np.isfinite(ends).all() and (ends[:, -1] == 1).all() and (np.diff(ends, axis=1) >= 0).all()
+
+
+def test_a_table_of_ones_own_lies_beside_its_sensor_file_and_a_histogram_needs_it_no_more(tmp_path, monkeypatch):
+    """Found from any folder; what was recorded is read and turned into depth without it; a changed one is refused."""
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    monkeypatch.chdir(tmp_path)
+    end_ps = np.cumsum(np.full((3, 25), 100.0), axis=1)
+    np.savez(folder / "own.npz", end_ps=end_ps)
+    written = write_sensor(SensorFile(SENSOR), folder / "own.toml").read_text().replace('"linospad2"', '"own.npz"')
+    (folder / "own.toml").write_text(written)
+    sensor = load_sensor("lab/own.toml").sensor
+    assert sensor.tdc is not None and sensor.tdc.ends() == pytest.approx(np.tile(np.arange(1, 26) / 25, (3, 1)))
+    moved = write_sensor(SensorFile(sensor), tmp_path / "moved.toml")
+    assert np.array_equal(read_sensor(moved).sensor.tdc.ends(), sensor.tdc.ends())
+
+    transient = transient_of(*[[(0.6, 0.61, 1.0)]] * 40)
+    write_histogram(sense(transient, sensor, PhotonBudget(300, 10), seed=1), tmp_path / "h.h5")
+    (folder / "own.npz").rename(tmp_path / "elsewhere.npz")
+    converters.measured_table.cache_clear()
+    found = read_histogram(tmp_path / "h.h5")
+    assert found.sensor == sensor and abs(np.median(histogram_depth_m(found)) - 0.3) < 0.02
+    with pytest.raises(InputError, match=r"own\.npz: table of codes not found"):
+        found.sensor.tdc.ends()
+    np.savez(folder / "own.npz", end_ps=end_ps**1.0001 * (2500 / 2500**1.0001))
+    with pytest.raises(InputError, match=r"own\.npz: is another table of codes"):
+        sense(transient, read_histogram(tmp_path / "h.h5").sensor, PhotonBudget(300, 10))
