@@ -17,7 +17,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -67,9 +67,14 @@ class Cost:
 
 @dataclass(frozen=True)
 class Power:
-    """Rates and powers under a load. Powers are of all pixels together, in Watts as far as the reading is right."""
+    """Rates and powers under a load. Powers are of all pixels together, in Watts as far as the reading is right.
+
+    frame_time_s       what a core works on a frame's photons; processing_* are of these alone
+    frame_end_time_s   what it then works, and waits for neighbours, at the frame's end
+    """
 
     frame_time_s: float
+    frame_end_time_s: float
     data_rate_bit_per_s: float
     processing_published_w: float
     processing_energy_w: float
@@ -85,6 +90,7 @@ def power(cost: Cost, load: Load, chip: ChipSpec | None = None) -> Power:
     energy_per_frame = chip.energy_j(cost.clocks_per_photon * load.photons) * load.pixels
     return Power(
         frame_time_s=time_s,
+        frame_end_time_s=chip.processing_time_s(1, cost.clocks_per_frame + cost.waits_per_frame),
         data_rate_bit_per_s=rate,
         processing_published_w=energy_per_frame * load.frames_per_s * time_s,
         processing_energy_w=energy_per_frame * load.frames_per_s,
@@ -114,11 +120,18 @@ def cost_of(
     stamps = np.arange(TIMESTAMPS)
     photons = CoreArray(program, (1, TIMESTAMPS), core_tables, chip=chip)
     per_photon = photons.frame(stamps, np.arange(TIMESTAMPS + 1), park=True).cycles.mean()
-    array = CoreArray(program, block, block_tables, chip=chip)
+    return replace(frame_end(program, block, block_tables, chip), clocks_per_photon=float(per_photon))
+
+
+def frame_end(
+    program: Program, block: tuple[int, int], tables: Mapping[str, np.ndarray], chip: ChipSpec | None = None
+) -> Cost:
+    """Return the cost of a frame without photons on a block of cores. InputError for a program that needs one."""
+    array = CoreArray(program, block, tables, chip=chip)
     cores = block[0] * block[1]
     frame = array.frame(np.zeros(0, np.int64), np.zeros(cores + 1, np.int64))
     waits = float(frame.stalls.mean())
-    return Cost(float(per_photon), float(frame.cycles.mean()) - waits, float(frame.out_bits.sum() / cores), waits)
+    return Cost(0.0, float(frame.cycles.mean()) - waits, float(frame.out_bits.sum() / cores), waits)
 
 
 def reference_bits(photons: float, chip: ChipSpec | None = None) -> dict[str, float]:
@@ -184,8 +197,7 @@ def sweep(
                 load = Load(count, rate, size)
                 for name, cost in {**costs, **bare}.items():
                     found = power(cost, load, chip)
-                    end_s = chip.processing_time_s(1, cost.clocks_per_frame + cost.waits_per_frame)
-                    busy = (found.frame_time_s + end_s) * rate
+                    busy = (found.frame_time_s + found.frame_end_time_s) * rate
                     rows.append(
                         {"name": name, **asdict(load), "busy": busy, "keeps_up": busy <= 1}
                         | _columns(cost.clocks_per_photon, cost.bits_per_pixel / 8, found)

@@ -67,6 +67,34 @@ def test_run_shows_what_it_cost_and_how(capfd, folder):
     assert np.array(summed["out"]).shape == (1, 32) and summed["stall_clocks"] > 0
 
 
+def test_run_prices_the_end_of_the_frame_apart_from_its_photons(capfd, folder):
+    empty = run(capfd, "ultraphase", "run", "fourier-8", "--photons", "0", "--signal", "0")
+    full = run(capfd, "ultraphase", "run", "fourier-8")
+    assert empty["clocks_per_photon"] is None and full["clocks_per_photon"] == 135
+    for result in (empty, full):
+        assert result["frame_end_clocks"] == 138
+        assert result["power_30_fps"]["frame_end_energy_w"] == pytest.approx(46 * 30 * 4 / 94.6e9)
+        assert result["power_30_fps"]["frame_end_time_s"] == pytest.approx(138 * 2.38e-9)
+    assert full["power_30_fps"]["processing_energy_w"] == pytest.approx(45 * 550 * 30 * 4 / 94.6e9)
+
+
+@pytest.mark.parametrize(
+    ("source", "photon", "end", "words"),
+    [
+        ("MOV r1, #1\nHALT", None, 6, ["80 of 80 photons unread"]),
+        ("RDT r1\nHALT", 6, 0, ["76 of 80 photons unread", "no timestamp is there"]),
+        ("MOV r1, #9\nBNT r\nRDT r2\nHALT\nr: SUB r1, r1, #1\nBNZ r1, r\nHALT", 12, 0, ["76 of", "takes longer"]),
+    ],
+)
+def test_run_says_what_a_program_leaves_unread(capfd, folder, source, photon, end, words):
+    (folder / "a.s").write_text(source + "\n")
+    assert main(["ultraphase", "run", "a.s", "--photons", "20", "--signal", "5", "--json"]) == 0
+    out, err = capfd.readouterr()
+    result = json.loads(out)
+    assert result["clocks_per_photon"] == photon and result["frame_end_clocks"] == end
+    assert len(err.splitlines()) == len(words) and all(word in err for word in words)
+
+
 def test_asm_list_and_verify(capfd, folder):
     source = folder / "mine.s"
     source.write_text((FOLDER / "coarse.s").read_text())

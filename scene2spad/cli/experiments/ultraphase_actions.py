@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,13 +17,16 @@ from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
-from ultraphase import ChipSpec, Core, CoreArray, Method, Program, assemble_file, listing, method, verify
+from ultraphase import Core, CoreArray, Method, Program, assemble_file, listing, method, verify
+from ultraphase.array import Frame
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.chip import ASSUMPTIONS
-from ultraphase.power import READINGS, Cost, Load, as_csv, measured_cost, power, reference_bits, sweep, table
+from ultraphase.power import READINGS, Cost, Load, as_csv, frame_end, measured_cost, power, reference_bits, sweep, table
 
 if TYPE_CHECKING:
     from scene2spad.cli.experiments.ultraphase import Ultraphase
+
+log = logging.getLogger(__name__)
 
 _MAX_PHOTONS = 20_000
 _MAX_WATCHED = 100
@@ -206,21 +210,40 @@ def _run(command: Ultraphase, progress: Progress) -> dict:
     offsets = np.concatenate([[0], np.cumsum([len(stream) for stream in streams])])
     array = CoreArray(program, (2, 2), tables)
     frame = array.frame(np.concatenate(streams), offsets)
-    counters, chip = frame.counters, ChipSpec()
-    per_photon = counters.instructions * chip.clocks_per_instruction / max(counters.photons, 1)
-    powers = power(Cost(per_photon, 0, frame.out_bits.sum() / 4), Load(counters.photons / 4), chip)
+    read, sent = frame.counters.photons, int(offsets[-1])
+    if read < sent:
+        log.warning(
+            "warning: %s halted with %d of %d photons unread: costs are of those read",
+            *(program.name, sent - read, sent),
+        )
+    cost = _cost(program, tables, frame)
     result = {
         "program": program.name,
         "words": len(program.words),
         "ram_bits": program.ram_bits,
-        "counters": asdict(counters),
-        "clocks_per_photon_with_frame_end": per_photon,
+        "counters": asdict(frame.counters),
+        "clocks_per_photon": cost.clocks_per_photon if read else None,
+        "frame_end_clocks": cost.clocks_per_frame,
         "stall_clocks": int(frame.stalls.sum()),
         "out_bits": int(frame.out_bits.sum()),
         "out": frame.out.tolist(),
-        "power_30_fps": asdict(powers),
+        "power_30_fps": asdict(power(cost, Load(read / 4))),
     }
     return result | _looked_at(command, program, tables, streams[0])
+
+
+def _cost(program: Program, tables: dict[str, np.ndarray], frame: Frame) -> Cost:
+    """Return the cost of a frame of 2 x 2 cores: its end is all of a frame without photons, the rest its photons'."""
+    photons, bits = frame.counters.photons, frame.out_bits.sum() / 4
+    clocks = float((frame.cycles - frame.stalls).sum())
+    try:
+        end = frame_end(program, (2, 2), tables)
+        require(4 * end.clocks_per_frame <= clocks, f"{program.name} takes longer without photons")
+    except InputError as reason:  # such as a program that reads without asking whether a photon is there
+        log.warning("warning: all clocks of the frame are counted as its photons': %s", reason)
+        end = Cost(0, 0, 0)
+    per_photon = (clocks - 4 * end.clocks_per_frame) / photons if photons else 0.0
+    return replace(end, clocks_per_photon=per_photon, bits_per_pixel=bits)
 
 
 def _timestamps(photons: float, signal: float, seed: int, core: int) -> np.ndarray:
