@@ -14,7 +14,7 @@ from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import TIMINGS
 from scene2spad.datasets.workers import check_workers
 from scene2spad.dry_runs.resources import Cost, memory, timed
-from scene2spad.networks.training import PLANES, config_of, folder_of
+from scene2spad.networks.training import check_sets, config_of, folder_of
 from scene2spad.options.networks import Train
 from scenes.errors import require
 from scenes.io.inputs import read_json_object, read_whole_lines
@@ -35,8 +35,7 @@ def dry_run(command: Train) -> dict:
     config.check_memory()
     require(bool(command.set), "train: --set without a set")
     check_workers(command.workers, least=0)
-    for path in (*command.set, *command.validation):
-        require(str(path) == PLANES or path.exists(), f"{path}: file not found")
+    check_sets(command)
     if command.init is not None:
         load_model(checkpoint_of(command.init))
     folder = folder_of(command)

@@ -1,9 +1,7 @@
-"""`train` and `evaluate`: from the command line's words to csph's configuration, and results to files."""
+"""`train`: from the command line's words to csph's configuration and sets; depth by networks and by baselines."""
 
 from __future__ import annotations
 
-import json
-import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,28 +14,21 @@ from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.codes.design import Design
-from csph.evaluation.methods import LEVEL_GROUPS, DepthEstimator, Evaluation, EvaluationPlan, Method, as_dicts, evaluate
-from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.evaluation.methods import DepthEstimator, Method
 from csph.layer import SpatialStart
 from csph.networks.model import DepthModel, load_model
 from csph.training.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
-from csph.training.views import Views, check_truth, read_views, split_views, training_parts
+from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
-from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.planes import random_planes
-from scene2spad.datasets.renders import views_at
 from scene2spad.datasets.workers import check_workers
-from scene2spad.options.networks import Evaluate, Train, check_used
-from scenes.errors import InputError, require
-from scenes.files import write_csv
-from scenes.json_types import JsonObject
+from scene2spad.options.networks import Train, check_used
+from scenes.errors import require
 from scenes.progress import Progress
 from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
 from spad.formats.histogram import Histogram
 from spad.sensor.files import load_sensor
 from spad.sensor.model import Sensor
-
-log = logging.getLogger("scene2spad")
 
 PLANES = "planes"  # the set that needs no renderer
 PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "gpu": 4000, "paper": 13851}
@@ -141,18 +132,33 @@ def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, object
     sets = [_views_of_set(path, command) for path in command.set]
     common = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
     if command.validation:
-        training, validation = sets, [read_views(path) for path in command.validation]
+        training, validation = sets, [_views_of_one_size(path) for path in command.validation]
     else:
         parts = [split_views(views) for views in sets]
         training, validation = [first for first, _ in parts], [second for _, second in parts]
-    return training, validation, {**common, "training_reach_m": max(map(training_reach_m, training))}
+    return training, validation, {**common, "training_reach_m": max(map(training_reach_m, training), default=0.0)}
 
 
 def _views_of_set(path: Path, command: Train) -> Views:
     if str(path) != PLANES:
-        return read_views(path)
+        return _views_of_one_size(path)
     pixels = SMOKE_PIXELS if command.preset == "smoke" else 64
     return random_planes(PLANE_SCENES[command.preset], size=pixels, seed=command.seed)
+
+
+def _views_of_one_size(path: Path) -> Views:
+    """Read a rendered set; InputError for views of several sizes, of which no batch is made."""
+    views = read_views(path)
+    sizes = sorted({(one.width, one.height) for one in views.transients})
+    several = " and ".join(f"{width} x {height}" for width, height in sizes[:2])
+    require(len(sizes) == 1, f"{path}: views are of several sizes ({several} pixels), training takes one size")
+    return views
+
+
+def check_sets(command: Train) -> None:
+    """Raise InputError where the run would: for a set that cannot be read or trained on, or not be validated on. Planes
+    always can, and are not drawn."""
+    views_of(replace(command, set=tuple(path for path in command.set if str(path) != PLANES)))
 
 
 def _paths(paths: Sequence[Path]) -> str | list[str]:
@@ -251,150 +257,3 @@ def baseline(name: str) -> Method:
     """Return a method without a network, by the names of `classical`."""
     depth_of = classical(name)
     return lambda histogram: histogram_depth_m(histogram, depth_of)
-
-
-def photon_levels(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
-    """Return mean (signal, background) photons of levels such as "1+100"; the paper's 16 of none. InputError for
-    others."""
-    found = []
-    for one in texts:
-        try:
-            signal, background = map(float, one.split("+"))
-        except ValueError:
-            raise InputError(f"levels {one!r}: expected SIGNAL+BACKGROUND in photons a pixel, as in 1+100") from None
-        fits = 0 < signal < math.inf and 0 <= background < math.inf
-        require(fits, f"levels {one!r}: expected signal photons above 0 and background photons of 0 or more")
-        found.append((signal, background))
-    return tuple(found) or PHOTON_LEVELS
-
-
-def run_evaluate(command: Evaluate, progress: Progress) -> dict:
-    """Return networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
-    loaded = [load_model(checkpoint_of(path)) for path in command.checkpoints]
-    require(bool(loaded), "evaluate: give at least one checkpoint")
-    models = [model for model, _, _ in loaded]
-    designs = group_names([config for _, config, _ in loaded], [*map(checkpoint_name, command.checkpoints)])
-    require(command.int8 or command.int8_rule is None, "evaluate: --int8-rule goes with --int8")
-    rule = command.int8_rule or "calibrated"
-    in_8_bits = " int8" if rule == "calibrated" else f" int8 {rule}"
-    sensor = models[0].config.sensor
-    others = [model.config.sensor.name for model in models if model.config.sensor != sensor]
-    require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
-    sensor.check_offset(command.offset)
-    views = views_at(command.set)
-    parts = training_parts(views)
-    for path, (_, config, _) in zip(command.checkpoints, loaded, strict=True):
-        _warn_of_training_views(str(path), config, parts, command.set)
-    if command.views is not None:
-        require(command.views >= 1, f"views {command.views} is below 1")
-        views = Views(views.transients[: command.views], views.scenes[: command.views])
-    check_truth(command.set, views, sensor, command.offset)
-    overflows: list[int] = []
-    methods: dict[str, Method] = {}
-    groups: dict[str, list[str]] = {}
-    for path, model, group in zip(command.checkpoints, models, designs, strict=True):
-        for suffix, int8 in (("", False), (in_8_bits, True))[: 1 + command.int8]:
-            read = {"int8": int8, "int8_rule": rule, "decoder": command.decoder}
-            methods[f"{path}{suffix}"] = network_method(model, **read, overflows=overflows)
-            groups.setdefault(f"{group}{suffix}", []).append(f"{path}{suffix}")
-    methods |= {name: baseline(name) for name in command.baselines}
-    groups |= {name: [name] for name in command.baselines}
-    tile = common_tile(models) if command.tiled else (1, 1)
-    plan = EvaluationPlan(photon_levels(command.levels), tile, command.offset, command.seed)
-    found = evaluate(methods, views, sensor, plan, progress=progress)
-    command.out.mkdir(parents=True, exist_ok=True)
-    table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
-    first = f"{designs[0]}{in_8_bits if command.int8 else ''}"
-    shown = results(found, groups, first, command.json)
-    if command.levels:
-        shown["by_level"] = by_level(found, groups, command.json)
-    return {**shown, "overflows": sum(overflows), "csv": str(table)}
-
-
-def _warn_of_training_views(name: str, config: TrainConfig, parts: dict[str, int], path: Path) -> None:
-    """Say that a network has seen views of a test set in training; `parts`: `training_parts` of the set."""
-    hashes = config.data.get("training_sha256", [])
-    seen = [parts[one] for one in ([hashes] if isinstance(hashes, str) else hashes) if one in parts]
-    if seen:
-        log.warning("%s was trained on %d views of %s: its errors there are not those of a test", name, seen[0], path)
-
-
-def _recipe(config: TrainConfig) -> str:
-    same = replace(config, seed=0, threads=0, data={"training_sha256": config.data.get("training_sha256")})
-    return json.dumps(same.to_dict(), sort_keys=True)
-
-
-def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[str]:
-    """Name the group of each checkpoint: trainings of one design and recipe by different seeds are one group.
-
-    A recipe is the training sets and every number of the configuration but the seed and the threads. Where one design
-    was trained by several, a group is named after its first checkpoint, too.
-    """
-    recipes = [(config.model.name, _recipe(config)) for config in configs]
-    several = {name for name, *_ in recipes if len({one for one in recipes if one[0] == name}) > 1}
-    firsts = dict(reversed([*zip(recipes, names, strict=True)]))
-    return [f"{one[0]} ({firsts[one]})" if one[0] in several else one[0] for one in recipes]
-
-
-def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[dict[str, object]]:
-    """Return MAE [mm] and share within 10 mm of every level and group, means over scenes; as lines unless `full`."""
-    lines: list[JsonObject] = []
-    for signal, background in dict.fromkeys((row.signal, row.background) for row in found.rows):
-        here = Evaluation([row for row in found.rows if (row.signal, row.background) == (signal, background)])
-        for name, members in groups.items():
-            found_here = {key: here.interval(members, figure=key) for key in ("mae_mm", "within_10mm")}
-            means = {key: math.nan if one is None else one.mean for key, one in found_here.items()}
-            lines.append({"signal": signal, "background": background, "method": name, **means})
-    if full:
-        return lines
-    return [
-        f"{line['signal']:g} + {line['background']:g} photons, {line['method']}: MAE {line['mae_mm']:.1f} mm, "
-        f"{line['within_10mm']:.1%} within 10 mm"
-        for line in lines
-    ]
-
-
-def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: bool) -> dict[str, object]:
-    """Return headline figures of the `first` group, every group by levels, paired differences of MAE from the first."""
-    summaries = {name: found.summary(members) for name, members in groups.items()}
-    everything = summaries[first]["all"]["all"]
-    head = {key: everything[key] for key in ("mae_mm", "rmse_mm", "within_10mm", "ssim", "mae_interval_mm")}
-    differences = {
-        levels: {
-            name: found.difference(groups[first], groups[name], levels)._asdict() for name in groups if name != first
-        }
-        for levels in LEVEL_GROUPS
-        if found.values(groups[first], levels=levels)  # chosen levels may all be of one group
-    }
-    head = {"method": first, "trainings": len(groups[first]), **head}
-    if not full:
-        return {**head, "table": _lines(summaries), "bias_by_depth": _bias(summaries[first])}
-    by_sbr = {
-        name: {group: summary[group]["all"] for group in ("low_sbr", "high_sbr")} for name, summary in summaries.items()
-    }
-    return {**head, "by_sbr": by_sbr, "methods": summaries, "mae_difference_mm": differences}
-
-
-def _lines(summaries: dict[str, dict]) -> list[str]:
-    lines = [
-        f"{'method':<40} {'MAE mm':>8} {'SBR > 0.1':>10} {'SBR <= 0.1':>11} {'mixed':>8} {'< 10 mm':>8} {'SSIM':>6}"
-    ]
-    for name, s in summaries.items():
-        every = s["all"]["all"]
-        mae = (every, s["high_sbr"]["all"], s["low_sbr"]["all"], s["all"]["mixed"])
-        cells = [_cell(line["mae_mm"], f"{width}.1f") for line, width in zip(mae, (8, 10, 11, 8), strict=True)]
-        cells += [_cell(every["within_10mm"], "8.1%"), _cell(every["ssim"], "6.3f")]
-        lines.append(f"{name[-40:]:<40} {' '.join(cells)}")
-    return lines
-
-
-def _cell(value: float | None, form: str) -> str:
-    return f"{math.nan if value is None else value:>{form}}"
-
-
-def _bias(summary: dict) -> list[str]:
-    return [
-        f"{b['near_m']:g} to {b['far_m']:g} m: mean {b['mean_mm']:+.1f}, median {b['median_mm']:+.1f} mm, "
-        f"{b['pixels']} pixels"
-        for b in summary["bias_by_depth"]
-    ]

@@ -25,7 +25,8 @@ from render.transient.packs import write_pack
 from scene2spad.bench import network as bench
 from scene2spad.cli import main
 from scene2spad.datasets.planes import FAR_M, Plane, random_planes, wall
-from scene2spad.networks.training import config_of, group_names
+from scene2spad.networks.evaluating import group_names
+from scene2spad.networks.training import config_of
 from scene2spad.options.networks import Train
 from scenes import InputError
 from spad.detection.detect import sense
@@ -271,6 +272,37 @@ def test_a_test_on_views_of_training_says_so(capfd, packed, trained, tmp_path):
         )
         assert bool(told) == said
         assert not said or 0 < int(told[0]) < 6
+
+
+def test_a_dry_training_refuses_the_sets_that_the_run_refuses(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    planes_pack(Path("one.h5"), [wall(2.0, 8), wall(3.0, 8)], "aa")
+    Path("mixed").mkdir()
+    records = [{"view": i, "scene": f"s{i}", "file": f"{i}.exr"} for i in range(2)]
+    for i, size in enumerate((8, 16)):
+        write_transient(wall(2.0, size), Path(f"mixed/{i}.exr"))
+    Path("mixed/index.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    expected = {
+        "one.h5": "a set of one scene (a) has none left to validate on",
+        "mixed": "mixed: views are of several sizes (8 x 8 and 16 x 16 pixels), training takes one size",
+    }
+    for name, words in expected.items():
+        for dry in ((), ("--dry-run",)):
+            assert words in refused(capfd, "train", *QUICK, "--out", "x", "--set", name, *dry)
+    assert run(capfd, "train", *QUICK, "--set", "one.h5", "--validation", "one.h5", "--dry-run")["dry_run"]
+
+
+def test_an_evaluation_counts_its_pixels_and_views(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    two = planes_pack(Path("two.h5"), [wall(2.0, 4), wall(9.0, 4)], "ab")
+    command = ("evaluate", "none-s0", "--baselines", "argmax", "--levels", "50+1", "--set", two, "--out", "out")
+    assert "evaluate: views 3 is outside 1 to 2 of two.h5" in refused(capfd, *command, "--views", "3")
+    found = run(capfd, *command)
+    assert (found["pixels_within_range"], found["beyond_range"]) == (32, 0)
+    assert main([*command, "--offset", "7", "--json"]) == 0
+    out, err = capfd.readouterr()
+    assert (json.loads(out)["pixels_within_range"], json.loads(out)["beyond_range"]) == (16, 16)
+    assert "two.h5: 16 of 32 pixels lie beyond the 14.99 m that the sensor records" in err
 
 
 def planes_pack(path: Path, transients, scenes) -> str:

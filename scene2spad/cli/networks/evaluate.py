@@ -23,9 +23,9 @@ def run(command: Evaluate, progress: Progress) -> dict:
         from scene2spad.datasets import published
 
         return published.run_evaluate(command, progress)
-    from scene2spad.networks import training
+    from scene2spad.networks import evaluating
 
-    return training.run_evaluate(command, progress)
+    return evaluating.run_evaluate(command, progress)
 
 
 def _check_checkpoints(paths: Sequence[Path]) -> None:
