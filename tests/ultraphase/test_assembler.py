@@ -235,6 +235,13 @@ def test_loops_and_nesting_without_end_are_refused_at_once(source, message):
     assert message in str(refused.value) and "\n" not in str(refused.value)
 
 
+def test_a_constant_that_the_source_does_not_know_is_refused():
+    for source, there in ((".equ N, 4\nMOV r1, #N\nHALT\n", "N"), ("HALT\n", "none")):
+        with pytest.raises(InputError, match=rf"^--define M: a\.s has no constant of this name, there are {there}$"):
+            assemble(source, name="a.s", constants={"M": 2})
+    assert assemble("MOV r1, #M\nHALT\n", constants={"M": 2}).instructions[0].value == 2
+
+
 def test_a_source_includes_regular_files_of_its_folder_alone(tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, read_text
 from ultraphase.assembly.isa import BY_NAME, DIRECTIONS, REGISTERS, VALUE_BITS, Instruction
 from ultraphase.assembly.program import KINDS, Program, Region
@@ -91,6 +91,7 @@ class _Assembly:
     def __init__(self, chip: ChipSpec, given: dict[str, int], read: Reader | None) -> None:
         self.chip, self.given, self.read, self.max_shift = chip, given, read, chip.max_shift
         self.values: dict[str, int] = {"MAX_SHIFT": chip.max_shift, **given}
+        self.constants: set[str] = set()  # what the source defines by .equ, or reads where it was given
         self.registers = {f"r{number}": number for number in range(REGISTERS)}
         self.regions: list[Region] = []
         self.labels: dict[str, int] = {}
@@ -209,6 +210,7 @@ class _Assembly:
     def _equ(self, cursor: Cursor, token: Token) -> None:
         name = self._new_name(cursor)
         value = self._expression(cursor)
+        self.constants.add(name)
         self.values[name] = self.given.get(name, value)
 
     def _reg(self, cursor: Cursor, token: Token) -> None:
@@ -360,6 +362,7 @@ class _Assembly:
         name = self._name(cursor.line, token)
         for known in (cursor.line.loops, self.values, more):
             if name in known:
+                self.constants |= {name} & self.given.keys()
                 return known[name]
         raise cursor.line.fail(token.column, f"{name!r} is not defined here")
 
@@ -371,6 +374,10 @@ class _Assembly:
 
     def program(self, name: str) -> Program:
         """Make the program once all labels are known: the branches find their targets; checked against the chip."""
+        there = ", ".join(sorted(self.constants)) or "none"
+        for given in self.given:
+            known = given in self.constants
+            require(known, f"--define {given}: {name} has no constant of this name, there are {there}")
         instructions = []
         for cursor, instruction, targets in self.pending:
             if targets:
