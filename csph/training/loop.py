@@ -20,7 +20,7 @@ import logging
 import math
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -235,6 +235,15 @@ def _validation_mm(module: DepthTraining) -> dict[str, float]:
     }
 
 
+def _warn_of_better(rows: Sequence[dict[str, float]], kept: Mapping[str, float]) -> None:
+    """Say where an epoch's validation RMSE was lower than that of the weights kept, which a cosine's last are."""
+    better = [row for row in rows if row["val_rmse_mm"] < kept["val_rmse_mm"]]
+    if better:
+        best = min(better, key=lambda row: row["val_rmse_mm"])
+        message = "the weights kept are of step %d, with a validation RMSE of %.1f mm; step %d had %.1f mm"
+        log.warning(message, kept["step"], kept["val_rmse_mm"], best["step"], best["val_rmse_mm"])
+
+
 def claim_run(folder: Path, config: TrainConfig) -> None:
     """Write the configuration, or see that the folder holds the same one.
 
@@ -375,15 +384,16 @@ def train(
         if runner.is_global_zero:
             save_model(module.kept, config, record.rows[-1], folder / "last.safetensors")
         runner.strategy.barrier()
-    best, last = (load_model(path)[2] for path in (folder, folder / "last.safetensors"))
+    kept, last = (load_model(path)[2] for path in (folder, folder / "last.safetensors"))
     diverged = f"{folder}: the run diverged, its validation error is no number; use a lower --rate"
-    require(math.isfinite(best["val_rmse_mm"]), diverged)
+    require(math.isfinite(kept["val_rmse_mm"]), diverged)
+    _warn_of_better(record.rows, kept)
     return {
         "steps": last["step"],
         "seconds": time.perf_counter() - start,
-        "val_rmse_mm": best["val_rmse_mm"],
-        "val_mae_mm": best["val_mae_mm"],
-        "best_step": best["step"],
+        "val_rmse_mm": kept["val_rmse_mm"],
+        "val_mae_mm": kept["val_mae_mm"],
+        "kept_step": kept["step"],
         "checkpoint": str(folder / "model.safetensors"),
         "parameters": module.model.parameters_count,
     }

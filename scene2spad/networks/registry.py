@@ -176,7 +176,7 @@ class Trained:
             "model": self.config.model.name,
             "preset": self.config.preset,
             "steps": self.config.steps,
-            "best_step": self.state.get("step"),
+            "kept_step": self.state.get("step"),
             "val_rmse_mm": self.state.get("val_rmse_mm"),
             "trained_on": file_names(self.config.data.get("training", "")),
             "shipped": self.shipped,
