@@ -1,4 +1,4 @@
-"""Coding tensors in files: .npy in, and text tables out, in decimal or as the 8-bit integers of an in-pixel core."""
+"""Coding tensors in files: .npy in, and text tables out, in decimal or rounded to 8-bit integers."""
 
 from __future__ import annotations
 

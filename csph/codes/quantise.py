@@ -1,4 +1,4 @@
-"""Coding tensors in 8 bits and sums in 16: what an in-pixel core computes, and how often it overflows."""
+"""Coding tensors in 8 bits and sums in 16, as an in-pixel core has them, and how often those overflow."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def _to_int8(values: Tensor, scale: float | None = None) -> tuple[np.ndarray, fl
 def quantised(coding: CodingTensor) -> Quantised:
     """Round every factor to the nearest of 255 steps between plus and minus its largest magnitude.
 
-    This is what an in-pixel core computes with: one 8-bit tensor, of separable factors their product in integers. A
-    tensor that is in steps already keeps them.
+    The result is one 8-bit tensor, of separable factors their product in integers. A tensor that is in steps already
+    keeps them. Programs of a core have tables of their own (`ultraphase.compiler`).
     """
     steps = coding.steps or (None, None)
     spatial = (None, 1.0) if coding.spatial is None else _to_int8(coding.spatial, steps[1])

@@ -29,7 +29,7 @@ MARKS = {
 @dataclass(frozen=True, kw_only=True)
 class Export(Common):
     """Write for other programs: a dense array (.npz, .h5) of a transient or a histogram, a point cloud (.ply) of a
-    depth map or of true depth, or a coding tensor (.txt, .npy) of a model, with --int8 in the integers of a core."""
+    depth map or of true depth, or a coding tensor (.txt, .npy) of a model, with --int8 rounded to 8 bits."""
 
     file: Positional[Path]
     """A transient or depth map (.exr), a histogram (.h5), codes (.npy), a checkpoint, or a model's name."""
@@ -42,7 +42,8 @@ class Export(Common):
     intensity: File = None
     """The histogram (.h5) whose detections become the intensity of a depth map's points (default: all 1)."""
     int8: bool = False
-    """Codes as the 8-bit integers that a core in the pixel adds, with the value of one step."""
+    """Codes rounded to 8-bit integers at full scale, with the value of one step; what an in-pixel program adds is in
+    `ultraphase compile --out`."""
     view: int = 0
     """View of a pack, from 0."""
     frame: int = 0
