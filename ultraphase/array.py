@@ -248,7 +248,7 @@ class ArrayRun:
         if not 0 <= at <= last if one.constant else _outside(at, 0, last):  # type: ignore[arg-type]
             wrong = np.atleast_1d(at)
             wrong = wrong[(wrong < 0) | (wrong > last)][0]
-            raise InputError(f"{self.program.where(word)}: RAM address {wrong} is outside the declared 0 to {last}")
+            raise InputError(self.program.outside_ram(word, int(wrong), last))
         if one.op.size == 1:
             return self.bytes, self.array._first_byte[lanes] + at
         if np.any(at & 1):

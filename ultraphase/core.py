@@ -261,7 +261,7 @@ class Core:
         raise InputError(f"{self.program.where(word)}: no timestamp is there")
 
     def _outside(self, word: int, at: int, last: int) -> None:
-        raise InputError(f"{self.program.where(word)}: RAM address {at} is outside the declared 0 to {last}")
+        raise InputError(self.program.outside_ram(word, at, last))
 
     def _odd(self, word: int, at: int) -> None:
         raise InputError(f"{self.program.where(word)}: address {at} of 16 bits is odd")

@@ -212,6 +212,24 @@ def test_core_and_array_refuse_alike(source, message):
         assert line in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("LDB r1, [600]\nHALT", "RAM address 600 is not there: the program declares no RAM"),
+        ("LDH r1, [600]\nHALT", "RAM address 600 is not there: the program declares no RAM"),
+        (".space a, u8, 1\nLDH r1, [0]\nHALT", "RAM address 0 is outside the declared 1 byte"),
+    ],
+)
+def test_a_program_without_ram_is_said_to_have_none(source, message):
+    code = assemble(source, name="p")
+    for run in (
+        lambda: Core(code).frame([]),
+        lambda: CoreArray(code, (1, 1)).frame(np.zeros(0, int), np.zeros(2, int)),
+    ):
+        with pytest.raises(InputError, match=message):
+            run()
+
+
 def test_limits_of_the_chip_are_the_specs():
     code = assemble("SHR r1, r1, #4\nHALT")
     with pytest.raises(InputError, match="shift by 4 is outside 1 to 2"):

@@ -86,6 +86,14 @@ class Program:
         file, line = self.lines[word]
         return f"{file}:{line}, word {word} ({format_instruction(self.instructions[word], self._label)})"
 
+    def outside_ram(self, word: int, address: int, last: int) -> str:
+        """Return the message for a word that touched an address outside 0 to `last`, below 0 where none fits."""
+        declared = f"0 to {last}" if last >= 0 else "1 byte"  # which holds no 16 bits
+        within = (
+            f"is outside the declared {declared}" if self.ram_bytes else "is not there: the program declares no RAM"
+        )
+        return f"{self.where(word)}: RAM address {address} {within}"
+
     def _label(self, word: int) -> str:
         return next((name for name, target in self.labels.items() if target == word), str(word))
 
