@@ -111,8 +111,24 @@ def open_histogram(path: Path, frame: int = 0) -> Histogram:
         return read_mat(path, frame)
     from spad.formats.histogram import read_histogram
 
+    _check_no_other_kind(path)
     require(not frame, f"{path}: --frame {frame} is for captures (.mat)")
     return read_histogram(path)
+
+
+def _check_no_other_kind(path: Path) -> None:
+    """Raise InputError for a file of another kind of ours, which a histogram's reader would call damaged."""
+    kinds = BY_SUFFIX.get(path.suffix.lower(), ("histogram",))
+    if "histogram" in kinds:
+        return
+    if path.suffix.lower() == ".exr":
+        kinds = tuple(kind for kind in kinds if holds_kind(path, kind)) or ("picture",)
+    cure = {
+        "transient": "; sense it first: `scene2spad sense`",
+        "codes": "; `depth` takes them by --codes-file, `compare` by --methods",
+        "network": "; `depth` takes it by --checkpoint, `compare` by --methods",
+    }
+    raise InputError(f"{path}: is of kind {kinds[0]}, expected a histogram{cure.get(kinds[0], '')}")
 
 
 def open_depth(path: Path) -> DepthMap:

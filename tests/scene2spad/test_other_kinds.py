@@ -1,0 +1,22 @@
+"""Files of another kind than a histogram are called what they are, and not damaged."""
+
+import numpy as np
+import pytest
+
+from render.transient import write_transient
+from scene2spad.cli import main
+from scene2spad.datasets.planes import wall
+
+
+@pytest.mark.parametrize("command", ["compare", "depth"])
+def test_a_file_of_another_kind_is_named(capsys, tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    write_transient(wall(2.0, 4), tmp_path / "a.exr")
+    np.save("codes.npy", np.ones((4, 1024), np.float32))
+    words = {"codes.npy": "codes.npy: is of kind codes, expected a histogram; `depth` takes them by --codes-file"}
+    if command == "compare":
+        words["a.exr"] = "a.exr: is of kind transient, expected a histogram; sense it first: `scene2spad sense`"
+    for name, said in words.items():
+        assert main([command, name]) == 2
+        message = capsys.readouterr().err
+        assert said in message and message.count("\n") == 1
