@@ -321,7 +321,7 @@ def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
         raise InputError(f"{path}: is damaged; delete it, and it is made again") from None
 
 
-def _check_scenes(job: Job, folder: SetFolder) -> None:
+def check_scenes(job: Job, folder: SetFolder) -> None:
     """Raise InputError where views are of other scenes than the set, of those found beside the project, has now, or of
     other files of the same names."""
     chosen = scene_set(job.set)
@@ -346,7 +346,7 @@ def make_set(
     """
     check_asked(job, count, workers)
     folder = SetFolder(out, job.made())
-    _check_scenes(job, folder)
+    check_scenes(job, folder)
     missing = count - sum(view < count for view in folder.records)
     todo = (view for view in range(count) if view not in folder.records)
     report = progress or (lambda what, fraction: None)
@@ -370,8 +370,8 @@ def make_set(
     if missed:
         worst = max(missed, key=lambda record: record["error"] / record["target"])
         log.warning(
-            "warning: %d of %d views end above their error target of %.2g, the worst, view %d, at %.2g; all together "
-            "(root mean square) are at %.2g, which is what a set is planned for",
+            "warning: %d of %d views end above their error target of %.4g, the worst, view %d, at %.4g; all together "
+            "(root mean square) are at %.4g, which is what a set is planned for",
             *(len(missed), len(good), worst["target"], worst["view"], worst["error"], together),
         )
     return {

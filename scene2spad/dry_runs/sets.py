@@ -6,7 +6,7 @@ from pathlib import Path
 from statistics import fmean
 
 from render.settings import MIN_PIXEL_BYTES
-from scene2spad.datasets.rendering import Job, check_asked, render_view
+from scene2spad.datasets.rendering import Job, check_asked, check_scenes, render_view
 from scene2spad.datasets.set_folder import Done, SetFolder
 from scene2spad.dry_runs.resources import memory
 from scenes.errors import InputError
@@ -19,7 +19,9 @@ TRIALS = 3  # the first compiles; the others tell what a view costs
 def dry_run(job: Job, count: int, out: Path, workers: int) -> dict:
     """Return what `make_set` would do, with memory, bytes and seconds, and what these are based on."""
     check_asked(job, count, workers)
-    records = SetFolder(out, job.made()).records
+    folder = SetFolder(out, job.made())
+    check_scenes(job, folder)
+    records = folder.records
     missing = [view for view in range(count) if view not in records]
     camera = scene_set(job.set).view(0, seed=job.seed, width=job.width, height=job.height).camera
     timings = _recorded(out, records)

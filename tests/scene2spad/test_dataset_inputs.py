@@ -12,6 +12,7 @@ from PIL import Image
 from scene2spad.datasets import published
 from scene2spad.datasets.rendering import Job, make_set
 from scene2spad.datasets.zone_captures import read_plane_captures
+from scene2spad.dry_runs.sets import dry_run
 from scenes import InputError
 
 
@@ -33,6 +34,8 @@ def test_a_set_whose_scenes_changed_is_not_continued(tmp_path: Path, monkeypatch
     photographed(tmp_path / "middlebury/Art")
     with pytest.raises(InputError, match=r"view 0 is of middlebury/Books, the set has middlebury/Art there now"):
         make_set(job, 2, out)
+    with pytest.raises(InputError, match=r"view 0 is of middlebury/Books, the set has middlebury/Art there now"):
+        dry_run(job, 2, out, 1)
 
 
 def test_a_set_whose_photographs_changed_is_not_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -46,6 +49,8 @@ def test_a_set_whose_photographs_changed_is_not_continued(tmp_path: Path, monkey
     photographed(folder, least="5\n")
     with pytest.raises(InputError, match=r"view 0 is of another dmin\.txt than middlebury/Books has now; choose"):
         make_set(job, 1, out)
+    with pytest.raises(InputError, match=r"view 0 is of another dmin\.txt than middlebury/Books has now; choose"):
+        dry_run(job, 1, out, 1)
     record = json.loads(index)
     del record["inputs_sha256"]
     (out / "index.jsonl").write_text(json.dumps(record) + "\n")
