@@ -235,8 +235,11 @@ def _validation_mm(module: DepthTraining) -> dict[str, float]:
     }
 
 
-def _warn_of_better(rows: Sequence[dict[str, float]], kept: Mapping[str, float]) -> None:
-    """Say where an epoch's validation RMSE was lower than that of the weights kept, which a cosine's last are."""
+def _check_kept(folder: Path, rows: Sequence[dict[str, float]], kept: Mapping[str, float]) -> None:
+    """Raise InputError for a run that diverged; say where an epoch's validation RMSE was lower than that of the weights
+    kept, which with one cosine are the last."""
+    diverged = f"{folder}: the run diverged, its validation error is no number; use a lower --rate"
+    require(math.isfinite(kept["val_rmse_mm"]), diverged)
     better = [row for row in rows if row["val_rmse_mm"] < kept["val_rmse_mm"]]
     if better:
         best = min(better, key=lambda row: row["val_rmse_mm"])
@@ -385,9 +388,7 @@ def train(
             save_model(module.kept, config, record.rows[-1], folder / "last.safetensors")
         runner.strategy.barrier()
     kept, last = (load_model(path)[2] for path in (folder, folder / "last.safetensors"))
-    diverged = f"{folder}: the run diverged, its validation error is no number; use a lower --rate"
-    require(math.isfinite(kept["val_rmse_mm"]), diverged)
-    _warn_of_better(record.rows, kept)
+    _check_kept(folder, record.rows, kept)
     return {
         "steps": last["step"],
         "seconds": time.perf_counter() - start,
