@@ -42,8 +42,8 @@ class Export(Common):
     intensity: File = None
     """The histogram (.h5) whose detections become the intensity of a depth map's points (default: all 1)."""
     int8: bool = False
-    """Codes rounded to 8-bit integers at full scale, with the value of one step; what an in-pixel program adds is in
-    `ultraphase compile --out`."""
+    """Codes rounded to 8-bit integers, at full scale or in the model's own steps, with the value of one step; what an
+    in-pixel program adds is in `ultraphase compile --out`."""
     view: int = 0
     """View of a pack, from 0."""
     frame: int = 0
