@@ -115,7 +115,8 @@ def as_sensor(model: ZoneModel, values: Values, sensor: Sensor, zones: ZoneArray
     found = natural(model, values)
     width = float(found["bin_width_s"][0])
     samples = tuple((model.basis.matrix @ values["pulse"] / values["pulse"].sum()).tolist())
-    periods = max(sensor.bins, round(sensor.period_s / width))
+    covered = sensor.bins == sensor.bins_per_period
+    periods = sensor.bins if covered else max(sensor.bins, round(sensor.period_s / width))
     calibrated = replace(
         sensor, bin_width_s=width, period_s=periods * width, pulse=SampledPulse(samples, width / FINE), jitter=None
     )
@@ -268,7 +269,7 @@ def calibrate(
     for name, value in _OFF.items():
         if name not in free:
             values[name] = np.full_like(values[name], value)
-    model = ZoneModel(basis, sensor.bins, zones.count, reference, narrowest_zone(captures))
+    model = ZoneModel(basis, sensor.bins, zones.count, reference, narrowest_zone(captures), sensor.bins_per_period)
     values["skew"][model.narrowest] = 0.0
     simple = ["pulse", "gain", *(name for name in ("delay", "background") if name in free)]
     everything = ["pulse", "gain", *free]

@@ -15,7 +15,7 @@ import numpy as np
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.saturation import saturated, saturated_jacobian
 from spad.sensor.clock import chirped
-from spad.zones.sensor import ZoneReturns, stray_returns, with_skew
+from spad.zones.sensor import ZoneReturns, since_emission, stray_returns, with_skew
 
 FINE = 6  # steps of the pulse in a bin
 TAIL = 2  # the same in the tail
@@ -68,12 +68,22 @@ class ZoneModel:
     """Expected counts and their derivatives for the fit's parameters; delays count in bins.
 
     Zone `reference` holds the gauge: its gain is 1 (the pulse carries the scale), its delay 0 (the pulse carries it),
-    and its clock 1 (the bin width carries it). Zone `narrowest` has no skew: the pulse carries it.
+    and its clock 1 (the bin width carries it). Zone `narrowest` has no skew: the pulse carries it. `period` is the
+    laser's in bins, at which time wraps; None where the bins cover it.
     """
 
-    def __init__(self, basis: PulseBasis, bins: int, zones: int, reference: int, narrowest: int | None = None) -> None:
+    def __init__(
+        self,
+        basis: PulseBasis,
+        bins: int,
+        zones: int,
+        reference: int,
+        narrowest: int | None = None,
+        period: int | None = None,
+    ) -> None:
         self.basis, self.bins, self.zones, self.reference = basis, bins, zones, reference
         self.narrowest = reference if narrowest is None else narrowest
+        self.period = bins if period is None else period
 
     def parameter_names(self, values: Values, free: Sequence[str]) -> list[tuple[str, int]]:
         """List the numbers that a fit changes: the gauge's are left out."""
@@ -86,16 +96,24 @@ class ZoneModel:
         # a pulse step's counts in a bin are the sum of FINE neighbouring masses
         full = np.convolve(mass, self.basis.matrix @ values["pulse"])
         at = np.arange(self.bins) * FINE + FINE - 1 - first - self.basis.first
-        inside = (at >= 0) & (at < len(full))
-        return np.where(inside, full[np.clip(at, 0, len(full) - 1)], 0.0) * values["gain"][zone]
+        return self._folded(full, at) * values["gain"][zone]
 
     def responses(self, values: Values, capture: ZoneCapture, zone: int) -> np.ndarray:
         """Return derivative of `own` with respect to the pulse, (T, K)."""
         first, mass = self._mass(values, capture, zone)
         steps = np.arange(len(self.basis.matrix))
         at = np.arange(self.bins)[:, None] * FINE + FINE - 1 - (steps + self.basis.first)[None, :] - first
-        inside = (at >= 0) & (at < len(mass))
-        return np.where(inside, mass[np.clip(at, 0, len(mass) - 1)], 0.0) @ (self.basis.matrix * values["gain"][zone])
+        return self._folded(mass, at) @ (self.basis.matrix * values["gain"][zone])
+
+    def _folded(self, held: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """Return what is held at fine steps `at` and whole periods before and after them."""
+        turn = self.period * FINE
+        found = np.zeros(at.shape)
+        for cycle in range(-(int(at.max()) // turn), (len(held) - 1 - int(at.min())) // turn + 1):
+            place = at + cycle * turn
+            inside = (place >= 0) & (place < len(held))
+            found += np.where(inside, held[np.clip(place, 0, len(held) - 1)], 0.0)
+        return found
 
     def _mass(self, values: Values, capture: ZoneCapture, zone: int) -> tuple[int, np.ndarray]:
         """Return the light of a zone that a bin would catch, by its start: the first fine step, and masses.
@@ -106,8 +124,10 @@ class ZoneModel:
         scale = 1 / (SPEED_OF_LIGHT_M_PER_S * values["clock"][zone] * step_s)
         late = values["delay"][zone] * FINE + capture.drift_s / step_s
         skew_m, chirp = values["skew"][zone] * FINE / scale, values["chirp"][0] / FINE
+        period_m = self.period * values["bin_width"][0] * SPEED_OF_LIGHT_M_PER_S
         stray = stray_returns(capture.returns[zone], values["leak"][zone], values["echo"][zone])
-        parts = [_masses(with_skew(capture.returns[zone], skew_m), scale, late, chirp)]
+        stray, direct = (since_emission(light, period_m) for light in (stray, capture.returns[zone]))
+        parts = [_masses(with_skew(direct, skew_m), scale, late, chirp)]
         for at in range(len(stray.light)):
             alone = ZoneReturns(*(column[at : at + 1] for column in stray))
             parts.append(_masses(with_skew(alone, skew_m), scale, late, chirp))

@@ -251,6 +251,16 @@ def check_chirp(sensor: Sensor, zones: ZoneArray) -> None:
     require(abs(zones.chirp_hz) <= most, f"{message}of {sensor.bin_width_s * 1e12:.4g} ps keep half of its rate")
 
 
+def since_emission(returns: ZoneReturns, period_m: float) -> ZoneReturns:
+    """Return light by its path since the last emission, `period_m` the path in one period of the laser.
+
+    A converter starts anew at each emission: its clock and its chirp act on the time since the last one.
+    """
+    near_m, far_m, light = returns
+    before_m = np.floor(near_m / period_m) * period_m
+    return ZoneReturns(near_m - before_m, far_m - before_m, light)
+
+
 def with_skew(returns: ZoneReturns, skew_m: float) -> ZoneReturns:
     """Split returns into halves, half of `skew_m` [m of path] before and behind."""
     if not skew_m:
@@ -283,28 +293,47 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
     """Return expected primary signal detections (Z, T) float64: pulses integrated over each zone's own bins, crosstalk
     added.
 
-    What arrives outside of the bins is not counted: the period of such a sensor is longer than its histogram.
-    `drift_s` delays all zones, as a laser that warms up does.
+    Time wraps at the laser's period; what arrives in a part of it without bins is not counted. `drift_s` delays all
+    zones, as a laser that warms up does.
     """
     check_chirp(sensor, zones)
+    period_m = SPEED_OF_LIGHT_M_PER_S * sensor.period_s
+    own = np.zeros((zones.count, sensor.bins))
+    for zone, seen in enumerate(returns):
+        scale = 1 / (SPEED_OF_LIGHT_M_PER_S * zones.clock[zone])
+        every = zip(seen, stray_returns(seen, zones.leak[zone], zones.echo_m2[zone]), strict=True)
+        all_light = since_emission(ZoneReturns(*(np.concatenate(pair) for pair in every)), period_m)
+        near_m, far_m, light = with_skew(all_light, zones.skew_s[zone] / scale)
+        near_s, far_s = (chirped(path * scale, zones.chirp_hz) for path in (near_m, far_m))
+        late = zones.delay_s[zone] + drift_s
+        own[zone] = _binned(ZoneReturns(near_s + late, far_s + late, light), sensor) * zones.gain[zone]
+    own = np.maximum(own, 0.0)
+    return own + zones.crosstalk * own.sum(axis=0)
+
+
+def _binned(measured: ZoneReturns, sensor: Sensor) -> np.ndarray:
+    """Integrate pulses of light at measured times, intervals [s], over the bins, folded at the period, (T,) float64.
+
+    Delays and the pulse's width carry light beyond the period's ends, into the bins of the cycles beside it.
+    """
     import torch  # takes a second, and sensors of pixels need none of it
 
     from spad.detection.flux import interval_cdf
 
-    own = np.zeros((zones.count, sensor.bins))
+    start_s, end_s, light = measured
+    if not len(light):
+        return np.zeros(sensor.bins)
+    start, length = (torch.from_numpy(value)[:, None] for value in (start_s, end_s - start_s))
     edges = torch.arange(sensor.bins + 1, dtype=torch.float64) * sensor.bin_width_s
-    for zone, seen in enumerate(returns):
-        scale = 1 / (SPEED_OF_LIGHT_M_PER_S * zones.clock[zone])
-        every = zip(seen, stray_returns(seen, zones.leak[zone], zones.echo_m2[zone]), strict=True)
-        all_light = ZoneReturns(*(np.concatenate(pair) for pair in every))
-        near_m, far_m, light = with_skew(all_light, zones.skew_s[zone] / scale)
-        near_s, far_s = (chirped(path * scale, zones.chirp_hz) for path in (near_m, far_m))
-        start = torch.from_numpy(near_s + zones.delay_s[zone] + drift_s)[:, None]
-        length = torch.from_numpy(far_s - near_s)[:, None]
-        arrived = interval_cdf(sensor.response, edges - start, length.expand(-1, len(edges)))
-        own[zone] = np.diff(torch.from_numpy(light) @ arrived) * zones.gain[zone]
-    own = np.maximum(own, 0.0)
-    return own + zones.crosstalk * own.sum(axis=0)
+    reach_s = sensor.response.reach_s
+    first = math.floor((start_s.min() - reach_s) / sensor.period_s)
+    last = math.floor((end_s.max() + reach_s) / sensor.period_s)
+    counted = np.zeros(sensor.bins)
+    for cycle in range(first, last + 1):
+        after = edges + cycle * sensor.period_s - start
+        arrived = interval_cdf(sensor.response, after, length.expand(-1, len(edges)))
+        counted += np.diff(torch.from_numpy(light) @ arrived)
+    return counted
 
 
 def zone_flux(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0) -> np.ndarray:

@@ -46,6 +46,7 @@ def photon_times(zone: int, zones: ZoneArray, rng: np.random.Generator) -> np.nd
     echoed = zones.echo_m2[zone] * sum(w / ((n + f) / 4) ** 2 for n, f, w in zip(near, far, light, strict=True))
     paths.append(rng.uniform(2 * near.min(), 2 * far.max(), rng.poisson(echoed * zones.gain[zone])))
     path = np.concatenate(paths)
+    path %= SPEED * SENSOR.period_s  # light later than a period is of the cycle after
     side = rng.choice([-0.5, 0.5], len(path))  # which half of the zone's detectors
     skew = side * zones.skew_s[zone] * zones.clock[zone] * SPEED  # as a path, before the clock
     u = (path + skew) / SPEED / zones.clock[zone]
@@ -83,9 +84,10 @@ def simulate(zones: ZoneArray, rng: np.random.Generator) -> np.ndarray:
         for other in range(2):  # scattered light has its own zone's times
             scattered = photon_times(other, zones, rng)
             times.append(scattered[rng.random(len(scattered)) < zones.crosstalk])
-        bins = np.floor(np.concatenate(times) / SENSOR.bin_width_s).astype(np.int64)
+        # delays and the pulse, too, carry light beyond the ends of the period, which the bins cover
+        bins = np.floor(np.concatenate(times) % SENSOR.period_s / SENSOR.bin_width_s).astype(np.int64)
         dark = np.repeat(np.arange(SENSOR.bins), rng.poisson(zones.background[zone], SENSOR.bins))
-        seen = np.concatenate((bins[(bins >= 0) & (bins < SENSOR.bins)], dark))
+        seen = np.concatenate((bins, dark))
         counted = detected(seen, zones.trials[zone], zones.recovery[zone], rng)
         counts[zone] = np.bincount(counted, minlength=SENSOR.bins)
     return counts

@@ -164,6 +164,33 @@ def test_delay_clock_and_crosstalk_by_their_definitions():
     assert late[:, 2:] == pytest.approx(zone_signal(one, SENSOR, zones)[:, :-2], abs=1e-9)
 
 
+@pytest.mark.parametrize("period_bins", [64, 100])
+def test_light_later_than_the_period_wraps_at_it(period_bins):
+    """A clock that is wrong by a hundredth, and one with a chirp, are so from the last emission on."""
+    sensor = replace(SENSOR, period_s=period_bins * SENSOR.bin_width_s)
+    zones = replace(TWO, clock=(1.01, 1.0), chirp_hz=1e6, delay_s=(2e-10, 0.0))
+    period_m = 299792458 * sensor.period_s
+
+    def signal(path_m: float) -> np.ndarray:
+        path = np.array([path_m])
+        return zone_signal([ZoneReturns(path, path + 0.1, np.array([5.0]))] * 2, sensor, zones)
+
+    assert signal(0.4).sum(axis=1) == pytest.approx([5.0, 5.0])
+    for turns in (1, 2):
+        assert signal(0.4 + turns * period_m) == pytest.approx(signal(0.4), abs=1e-9)
+
+
+def test_pulses_across_the_ends_of_the_period_fold_and_the_unrecorded_part_is_lost():
+    at_zero = [ZoneReturns(np.zeros(1), np.zeros(1), np.ones(1))] * 2
+    whole = zone_signal(at_zero, SENSOR, TWO)
+    assert whole.sum(axis=1) == pytest.approx([1.0, 1.0])
+    assert whole[0] == pytest.approx(whole[0][::-1]), "half of it comes before the emission"
+    gated = replace(SENSOR, period_s=100 * SENSOR.bin_width_s)
+    assert zone_signal(at_zero, gated, TWO).sum(axis=1) == pytest.approx([0.5, 0.5])
+    late = replace(TWO, delay_s=(64.5e-10, 64e-10))
+    assert zone_signal(at_zero, SENSOR, late)[0].argmax() == 0, "a delay may last into the next cycle"
+
+
 DETECTORS = 50
 
 
