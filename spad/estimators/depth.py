@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError, did_you_mean
+from scenes.errors import InputError, did_you_mean, require
 from spad.detection.detectors import LAWS
 from spad.detection.laws import LOW_FLUX
 from spad.estimators.matching import (
@@ -206,7 +206,7 @@ def confidence_map(histogram: Histogram, depth_m: np.ndarray, method: str = "log
     is not the recorded time that the probability is of, as beside a displaced laser."""
     if not time_tells_depth(histogram):
         return None
-    counts, law = torch.from_numpy(histogram.counts), detection_law(histogram)
+    counts, law = torch.from_numpy(histogram.counts), _undone_law(histogram, method)
     return confidence(counts, torch.from_numpy(depth_m), histogram.sensor, method, law=law).numpy()
 
 
@@ -237,6 +237,14 @@ def detection_law(histogram: Histogram) -> str | None:
     return law if law in LAWS else None
 
 
+def _undone_law(histogram: Histogram, method: str) -> str | None:
+    """Return `detection_law`; with `coates`, InputError for zones, which no law of a pixel's detector has acted on."""
+    zones = histogram.meta.get("model") == "zones"
+    refused = "depth method coates: undoes the pile-up of a pixel's detector; counts of a sensor of zones have none"
+    require(not (zones and method == "coates"), f"{refused}, use log-matched")
+    return detection_law(histogram)
+
+
 def histogram_depth_m(
     histogram: Histogram, estimator: str | Callable[[Tensor, Sensor], Tensor] = "log-matched"
 ) -> np.ndarray:
@@ -244,11 +252,12 @@ def histogram_depth_m(
 
     `estimator` is one of METHODS, or any function (counts (H, W, T), sensor) -> half the optical path (H, W) [m].
     With a displaced laser that half path becomes a distance by the scene's geometry (`radial_depth_of`). `coates`
-    undoes the law that made the histogram (`detection_law`). Raises InputError as `estimate_depth` does.
+    undoes the law that made the histogram (`detection_law`). Raises InputError as `estimate_depth` does, and with
+    `coates` for counts of a sensor of zones.
     """
     counts = torch.from_numpy(histogram.counts)
     if isinstance(estimator, str):
-        half_path = estimate_depth(counts, histogram.sensor, estimator, law=detection_law(histogram))
+        half_path = estimate_depth(counts, histogram.sensor, estimator, law=_undone_law(histogram, estimator))
     else:
         half_path = estimator(counts, histogram.sensor)
     return radial_depth_of(histogram, half_path.numpy())

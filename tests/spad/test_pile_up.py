@@ -7,6 +7,7 @@ import pytest
 import torch
 from test_laws import same
 
+from scenes.errors import InputError
 from spad.detection.detect import choose_model, sense
 from spad.estimators.depth import confidence_map, detection_law, estimate_depth, histogram_depth_m
 from spad.estimators.pile_up import coates, free_running_flux, linearised
@@ -73,6 +74,16 @@ def test_without_a_stated_law_it_is_the_detectors() -> None:
     assert torch.equal(linearised(rows, sensor), coates(rows, 100) * 100)
     free = replace(sensor, reset="free-running", dead_time_s=2e-9)
     assert torch.equal(linearised(rows, free), free_running_flux(rows, 100, free) * 100)
+
+
+def test_pile_up_of_zones_is_not_undone() -> None:
+    """Zones saturate by a law of their own: none of a pixel's detector has acted on their counts."""
+    sensor = Sensor(bins=64, exposure_s=100 * Sensor(bins=64).period_s)
+    zones = Histogram.from_counts(np.full((1, 2, 64), 1, np.int32), sensor, {"model": "zones"})
+    depth = histogram_depth_m(zones, "log-matched")
+    for refused in (lambda: histogram_depth_m(zones, "coates"), lambda: confidence_map(zones, depth, "coates")):
+        with pytest.raises(InputError, match=r"depth method coates: .* zones .*, use log-matched"):
+            refused()
 
 
 @pytest.mark.parametrize("reset", ["synchronous", "free-running"])
