@@ -67,6 +67,10 @@ class DetectionLaw(ABC):
     def keep(self, events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
         """Return those of given events, photons and crosstalk, that are detected."""
 
+    @abstractmethod
+    def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
+        """Return about how many of so many primary detections a pixel and exposure are detected, (P,) -> (P,)."""
+
     def counts(self, rate: np.ndarray, cycles: int, fraction: float, rng: np.random.Generator) -> np.ndarray:
         """Draw counts (P, T) from expected primary detections of a whole exposure of `cycles`, of which `fraction` is
         drawn."""
@@ -85,6 +89,10 @@ class Poisson(DetectionLaw):
     def keep(self, events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
         """Return all events."""
         return events
+
+    def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
+        """Return all."""
+        return primaries
 
     def counts(self, rate: np.ndarray, cycles: int, fraction: float, rng: np.random.Generator) -> np.ndarray:
         """Draw n_i ~ Poisson(lambda_i) in every bin."""
@@ -105,6 +113,10 @@ class FirstPhoton(DetectionLaw):
     def keep(self, events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
         """Return the first event of each pixel and cycle."""
         return first_of_each_cycle(events, sensor)
+
+    def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
+        """Return the number of cycles that hold a photon."""
+        return -sensor.cycles * np.expm1(-primaries / sensor.cycles)
 
     def counts(self, rate: np.ndarray, cycles: int, fraction: float, rng: np.random.Generator) -> np.ndarray:
         """Draw the multinomial of all cycles (`first_photon_counts`)."""
@@ -132,6 +144,10 @@ class FreeRunning(DetectionLaw):
         time = events.cycle * float(sensor.bins_per_period) + events.position
         kept = live_detections(events.pixel, time, sensor.dead_time_s / sensor.bin_width_s, ready)
         return Detections(*(column[kept] for column in events))
+
+    def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
+        """Return what a dead time leaves of photons that are uniform in time: each detection takes one of it."""
+        return primaries / (1 + primaries * sensor.dead_time_s / sensor.exposure_s)
 
 
 LAWS: dict[str, DetectionLaw] = {law.name: law for law in (Poisson(), FirstPhoton(), FreeRunning())}

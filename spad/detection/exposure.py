@@ -183,25 +183,36 @@ def _places(detected: Detections, sensor: Sensor) -> np.ndarray:
     return detected.pixel.astype(np.int32) * np.int32(sensor.bins) + detected.position.astype(np.int32)
 
 
+def _check_crosstalk_events(exposure: Exposure) -> None:
+    """Raise InputError where the detections that crosstalk is drawn from would be too many to hold.
+
+    A law that draws a block's photons at once holds those too, detected or not.
+    """
+    primaries = exposure.whole.signal_per_pixel() + exposure.whole.background
+    expected = float(exposure.law.expected(primaries, exposure.sensor).sum())
+    if exposure.law.by_bins:
+        expected = max(expected, *(float(primaries[block].sum()) for block in exposure.blocks))
+    expected *= exposure.fraction
+    if expected > MAX_CROSSTALK_EVENTS:
+        raise InputError(
+            f"crosstalk event by event: {expected:.3g} events would be held at once, the limit is "
+            f"{MAX_CROSSTALK_EVENTS}; lower the photon budget or the exposure, or take model poisson"
+        )
+
+
 def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
     """Detect event by event over the whole image: detections fire neighbours, whose detector then decides between both.
 
     A detection that a neighbour's crosstalk makes impossible keeps what it fired itself, and crosstalk fires no
-    further crosstalk: both are of second order in its probability. Raises InputError for more than 2^26 detections.
+    further crosstalk: both are of second order in its probability. Raises InputError where over 2^26 are expected.
     """
     sensor, transient = exposure.sensor, exposure.transient
+    _check_crosstalk_events(exposure)
     everything, before = [], ready.copy()
-    total = 0
     for block in exposure.blocks:
         rng, light = exposure.rng(Stream.SENSE, block), exposure.light(block)
         parts = list(exposure.law.detect(light, rng, before[block]))
         everything += [part._replace(pixel=part.pixel + block.start) for part in parts]
-        total += sum(len(part.pixel) for part in parts)
-        if total > MAX_CROSSTALK_EVENTS:
-            raise InputError(
-                f"crosstalk event by event: over {MAX_CROSSTALK_EVENTS} detections; "
-                "lower the photon budget or the exposure, or take model poisson"
-            )
     events = Detections(*(np.concatenate(columns) for columns in zip(*everything, strict=True)))
     rng = exposure.rng(Stream.CROSSTALK, slice(0, 0))
     cause, pixel = crosstalk_events(events.pixel, sensor.crosstalk, transient.height, transient.width, rng)

@@ -22,6 +22,7 @@ from spad.detection.laws import (
 from spad.estimators.pile_up import coates, free_running_flux, linearised
 from spad.formats.timestamps import Timestamps
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor.tdc import Tdc
 
 REFERENCE = Sensor()
 SMALL = Sensor(name="small", bins=64)
@@ -355,3 +356,23 @@ def test_a_histogram_larger_than_memory_is_refused_before_it_is_allocated(monkey
     monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "1e-6")
     with pytest.raises(InputError, match=r"a histogram of 1 x 1 pixels and 1024 bins: needs .* GB of memory"):
         sense(transient_of([(4.0, 4.02, 1.0)]), Sensor(), PhotonBudget(40, 60))
+
+
+@pytest.mark.parametrize(
+    ("law", "expected", "exposure"),
+    [("first-photon", "6e+09", 1e-3), ("free-running", "8.57e+08", 1.0), ("poisson", "6e+09", 1e-3)],
+)
+def test_crosstalk_of_too_many_detections_is_refused_before_any_is_drawn(law, expected, exposure, monkeypatch):
+    """First photons of 10,000 cycles would be few, but all photons of a block are drawn for them."""
+
+    def draw(*_, **__):
+        raise AssertionError("photons were drawn")
+
+    monkeypatch.setattr("spad.detection.detectors.draw_primaries", draw)
+    sensor = Sensor(crosstalk=0.01, dead_time_s=1e-8, exposure_s=exposure, tdc=Tdc(Sensor().period_s / 8, codes=128))
+    light = same(10, (3.0, 3.0, 1.0))
+    with pytest.raises(
+        InputError, match=r"crosstalk event by event: .* would be held at once, the limit is 67108864"
+    ) as caught:
+        sense(light, sensor, PhotonBudget(3e8, 3e8), model=law)
+    assert expected in str(caught.value)
