@@ -38,10 +38,10 @@ def rates_for(
     """Scale a transient to a photon budget by means.
 
     Signal: all returns times one factor, so that their mean over the image is `budget.signal`. Background: dark counts
-    are what the sensor says (or a measured map (H, W) in Hz, NaN in dead pixels), ambient light fills the mean up to
-    `budget.background`; dark counts alone above it are scaled down to it, and the reason says so. Dead pixels lose
-    their share afterwards: the others are not brighter for it. The seed places hot and dead pixels. Raises InputError
-    when there is no light to scale, and for a map of another shape or below 0.
+    are what the sensor says (or a measured map (H, W) in Hz, NaN in pixels that are dead besides the sensor's), ambient
+    light fills the mean up to `budget.background`; dark counts alone above it are scaled down to it, and the reason
+    says so. Dead pixels lose their share afterwards: the others are not brighter for it. The seed places hot and dead
+    pixels. Raises InputError when there is no light to scale, and for a map of another shape or below 0.
     """
     shape = (transient.height, transient.width)
     total = float(transient.radiance.sum(dtype=np.float64))
@@ -58,10 +58,13 @@ def rates_for(
 def detector_maps(
     sensor: Sensor, shape: tuple[int, int], dark_map_hz: np.ndarray | None, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return dark counts per second (H, W) and dead pixels (H, W) bool: a measured map's, or the sensor's."""
+    """Return dark counts per second (H, W) and dead pixels (H, W) bool: the sensor's, or a measured map's and the
+    sensor's dead pixels besides."""
+    dead = sensor.dead_pixels(*shape, seed)
     if dark_map_hz is None:
-        return sensor.dark_rate_map_hz(*shape, seed), sensor.dead_pixels(*shape, seed)
-    return check_dark_map(dark_map_hz, shape)
+        return sensor.dark_rate_map_hz(*shape, seed), dead
+    measured_hz, silent = check_dark_map(dark_map_hz, shape)
+    return measured_hz, dead | silent
 
 
 def check_dark_map(measured_hz: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -94,11 +97,12 @@ def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Fill
     Dark counts whose mean is above the asked one are scaled down to it, and their share is 1.
     """
     ambient, counted = ambient.astype(np.float64), float(dark.mean())
-    if counted > asked:
+    # a radiometric budget of dark counts alone is their mean but for rounding
+    if counted > asked * (1 + 1e-9):
         reason = f"background: {counted:g} dark counts a pixel exceed the asked {asked:g}, scaled down to it"
         _, dark_scale = background_scales(1.0, counted, asked)
         return Filled(dark * dark_scale, 1.0 if asked > 0 else 0.0, reason)
-    fraction = counted / asked if asked > 0 else 0.0
+    fraction = min(1.0, counted / asked) if asked > 0 else 0.0
     if counted > 0:
         rest = "ambient light" if ambient.sum() > 0 else "uniform over the image, the scene has no ambient light"
         reason = f"background: {fraction:.1%} dark counts ({counted:g} a pixel), the rest {rest}"

@@ -14,7 +14,7 @@ from scenes import InputError
 from scenes.io.hdf5 import add_checksum
 from spad.detection.detect import expected_in_pixel, sense
 from spad.detection.flux import expected_counts
-from spad.detection.rates import rates_for
+from spad.detection.rates import fill_background, rates_for
 from spad.formats.histogram import Histogram, read_histogram, write_histogram
 from spad.formats.timestamps import counts_from_timestamps
 from spad.sensor.model import PhotonBudget, Sensor
@@ -93,6 +93,10 @@ def test_plan_names_what_there_is():
     assert "the rest ambient light" in sense(lit, dark, PhotonBudget(10, 20)).meta["plan"][0]
     measured = sense(wall, dark, PhotonBudget(10, 20), dark_map_hz=np.full((1, 8), 300.0)).meta["plan"]
     assert not any("hot pixels" in reason for reason in measured)
+    # a third of a radiometric budget is not exact in floats: its dark counts do not exceed themselves
+    third = np.nextafter(1 / 3, 1) * np.ones((1, 8))
+    filled = fill_background(np.zeros((1, 8), np.float32), third, 1 / 3)
+    assert "exceed" not in filled.reason and filled.dark_fraction == 1 and (filled.background == third).all()
     half_dead = sense(wall, replace(REFERENCE, dead_share=0.5), PhotonBudget(10, 20)).meta
     assert half_dead["wrapped"] == pytest.approx(1)
 

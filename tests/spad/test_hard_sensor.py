@@ -135,6 +135,10 @@ def test_all_pixels_hot_and_dead_ones_and_a_measured_map() -> None:
     measured[0, 0], measured[0, 1] = np.nan, 3e4
     mapped = sense(transient, REFERENCE, PhotonBudget(10, 100), seed=8, dark_map_hz=measured)
     assert mapped.counts[0, 0].sum() == 0 and mapped.counts[0, 1].sum() > 900
+    # the sensor's own dead pixels stay dead beside a map
+    both = sense(transient, replace(REFERENCE, dead_share=0.2), PhotonBudget(10, 100), seed=8, dark_map_hz=measured)
+    silent = (dead.counts.sum(axis=2) == 0) | np.isnan(measured)
+    assert ((both.counts.sum(axis=2) == 0) == silent).all()
     for bad, words in ((measured[:, :3], "map is"), (-measured, "0 or more")):
         with pytest.raises(InputError, match=words):
             sense(transient, REFERENCE, PhotonBudget(), dark_map_hz=bad)
