@@ -19,6 +19,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require
 from scenes.limits import require_memory
 from spad.estimators.depth import estimate_depth
+from spad.formats.bistatic import CO_LOCATED, laser_baseline_m
 from spad.formats.histogram import Histogram
 from spad.formats.linospad import COUNTS, capture_histogram, frame_of
 from spad.formats.matfile import Matrix, load_mat, save_mat
@@ -48,7 +49,7 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     """
     path, sensor = Path(path), histogram.sensor
     height, width = histogram.depth_m.shape
-    check_mat(path, sensor, height, width)
+    check_mat(path, sensor, height, width, laser_baseline_m(histogram))
     pulse, taps = _pulse_file(path, height, width), _centred_taps(sensor)
     save_mat(_frame(histogram), path)
     psf = {"PSF_img": np.broadcast_to(taps, (height, width, len(taps))), "psf": taps, "pulse_len": float(len(taps))}
@@ -56,11 +57,13 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     return pulse
 
 
-def check_mat(path: Path, sensor: Sensor, height: int, width: int) -> None:
-    """Raise InputError in one line for what the layout cannot hold: bins that do not cover the period, too large a
-    frame, and the pulse of another sensor in the folder."""
+def check_mat(path: Path, sensor: Sensor, height: int, width: int, baseline_m: tuple[float, ...] = CO_LOCATED) -> None:
+    """Raise InputError in one line for what the layout cannot hold: a laser beside the camera, bins that do not cover
+    the period, too large a frame, and the pulse of another sensor in the folder."""
     bins, period = sensor.bins, sensor.bins_per_period
     require(path.suffix == ".mat", f"{path}: the output must end in .mat")
+    place = " ".join(f"{1e3 * value:g}" for value in baseline_m)
+    require(not any(baseline_m), f"{path}: the layout knows no laser beside the camera, this one is at {place} mm")
     uncovered = f"the layout needs bins that cover the period, {sensor.name} has {bins} of {period}"
     require(bins == period, f"{path}: {uncovered}")
     size = 8 * height * width * bins

@@ -229,6 +229,16 @@ def sensed(sensor: Sensor) -> Histogram:
     return sense(transient_from_rgbd(depth, image, image), sensor, PhotonBudget(1000, 1), seed=0)
 
 
+def test_a_laser_beside_the_camera_is_refused(tmp_path):
+    """The layout's rates and bins are of twice the depth, where its light does not arrive."""
+    histogram = sensed(Sensor())
+    beside = {"laser": {"baseline_m": [0.1, 0.0, -0.02]}}
+    displaced = replace(histogram, meta={**histogram.meta, "transient": beside})
+    with pytest.raises(InputError, match=r"f\.mat: the layout knows no laser beside .* is at 100 0 -20 mm"):
+        write_mat(displaced, tmp_path / "f.mat")
+    assert not [*tmp_path.iterdir()]
+
+
 def test_the_same_data_give_the_same_bytes_whenever_they_are_written(tmp_path, monkeypatch):
     """scipy's header tells the time and the system."""
     save_mat({"a": np.arange(3.0)}, tmp_path / "a.mat")
