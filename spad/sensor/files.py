@@ -7,7 +7,7 @@ A file holds `name`, `description`, the tables `histogram`, `pulse`, `jitter`, `
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from importlib.resources import files
@@ -141,6 +141,18 @@ class SensorFile:
     def __post_init__(self) -> None:
         if self.zones is not None:
             check_chirp(self.sensor, self.zones)
+            self._check_no_pixels()
+
+    def _check_no_pixels(self) -> None:
+        """Raise InputError for what only pixels have, and zones would leave without a meaning.
+
+        Efficiency and dark counts are of a chip's data sheet, whose zones have gains and backgrounds for them.
+        """
+        require(self.sensor.tdc is None, "zones and tdc do not go together: converters are of pixels")
+        ideal = Sensor()
+        for name in ("hot_fraction", "hot_rate", "dead_fraction", "reset", "dead_time", "crosstalk"):
+            same = getattr(self.sensor, DETECTOR[name].field) == getattr(ideal, DETECTOR[name].field)
+            require(same, f"zones and detector.{name} do not go together: it is of pixels")
 
 
 def preset_files() -> dict[str, Path]:
@@ -203,7 +215,6 @@ def sensor_from_tables(contents: Mapping[str, object], folder: Path = Path()) ->
         if table in tables:
             values[table] = _pulse(tables[table], table)
     if "tdc" in tables:
-        require("zones" not in tables, "zones and tdc do not go together: converters are of pixels")
         values["tdc"] = _converters(Tdc(**tables["tdc"]), folder)
     optics = Optics(**tables["optics"]) if "optics" in tables else None
     zones = ZoneArray(**tables["zones"]) if "zones" in tables else None
@@ -267,10 +278,18 @@ def _pulse(values: JsonObject, where: str) -> AnyPulse:
     if ways == ["samples"]:
         require("sample_s" in values, f"{where}.step is missing: the time step of {where}.samples")
         require("tail_s" not in values, f"{where}.tail does not go with samples")
-        return SampledPulse(values["samples"], values["sample_s"])
+        return _named(where, SampledPulse, values["samples"], values["sample_s"])
     require("sample_s" not in values, f"{where}.step goes with samples alone")
     sigma = values["sigma_s"] if "sigma_s" in values else values["fwhm_s"] / FWHM_PER_SIGMA
-    return Pulse(sigma, values.get("tail_s", 0.0))
+    return _named(where, Pulse, sigma, values.get("tail_s", 0.0))
+
+
+def _named(where: str, kind: Callable[..., AnyPulse], *values: Any) -> AnyPulse:
+    """Make a pulse; what is wrong with it is told of its table, as jitter is a pulse too."""
+    try:
+        return kind(*values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _sources(contents: Mapping[str, object]) -> dict[str, str]:

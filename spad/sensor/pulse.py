@@ -190,7 +190,10 @@ def convolved(pulse: AnyPulse, kernel: AnyPulse | None) -> AnyPulse:
     for part in (pulse, kernel):
         before, after = part.window_s(_TABLE_SIGMAS)
         count = math.ceil(before / step) + math.ceil(after / step)
-        require(count <= MAX_SAMPLES, f"pulse and jitter differ too much in width ({part.std_s:g} s and the other)")
+        message = (
+            f"pulse and jitter of {pulse.std_s:g} s and {kernel.std_s:g} s differ too much in width: the wider takes "
+        )
+        require(count <= MAX_SAMPLES, f"{message}{count} steps of {step:.3g} s, the limit is {MAX_SAMPLES}")
         tables.append(part.bin_masses((np.arange(count + 1) - math.ceil(before / step)) * step))
     both = np.convolve(tables[0], tables[1])
     require(len(both) <= MAX_SAMPLES, f"pulse and jitter together take {len(both)} steps of {step:g} s")

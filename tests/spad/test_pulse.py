@@ -233,3 +233,11 @@ def test_confidence_is_that_of_each_pixel_alone(monkeypatch: pytest.MonkeyPatch)
 
 def test_budget_sbr() -> None:
     assert PhotonBudget(5, 0).sbr == math.inf and PhotonBudget(5, 10).sbr == 0.5
+
+
+def test_kernels_that_differ_too_much_are_named_with_the_limit() -> None:
+    words = (
+        "of 1e-08 s and 1e-12 s differ too much in width: the wider takes .* steps of 6.25e-14 s, the limit is 65536"
+    )
+    with pytest.raises(InputError, match=words):
+        convolved(Pulse(1e-8 / 2**0.5, 1e-8 / 2**0.5), Pulse(1e-12 / 2**0.5, 1e-12 / 2**0.5))

@@ -55,6 +55,16 @@ WIDE = Sensor(
     crosstalk=0.003,
 )
 
+WHOLE = replace(
+    WIDE,
+    name="whole",
+    hot_share=0.0,
+    hot_rate_hz=0.0,
+    dead_share=0.0,
+    reset="synchronous",
+    dead_time_s=0.0,
+    crosstalk=0.0,
+)
 ZONES = ZoneArray(
     (-0.1, 0.1 / 3),
     (0.0, 0.2),
@@ -78,16 +88,24 @@ ZONES = ZoneArray(
 )
 
 
-@pytest.mark.parametrize("sensor", [*PRESETS.values(), WIDE], ids=lambda sensor: sensor.name)
+@pytest.mark.parametrize("sensor", [*PRESETS.values(), WIDE, WHOLE], ids=lambda sensor: sensor.name)
 @pytest.mark.parametrize("optics", [None, Optics(1e-9 / 3, 4e-4, 1.33, 2.55e-5, 0.7, 12.3, 9.4e-7)])
 def test_a_sensor_comes_back_from_its_file_to_the_last_bit(sensor, optics, tmp_path):
-    whole = SensorFile(sensor, optics, ZONES, 'all "fields"', {"histogram.bins": "a\nsheet"})
+    zones = None if sensor is WIDE else ZONES
+    whole = SensorFile(sensor, optics, zones, 'all "fields"', {"histogram.bins": "a\nsheet"})
     assert read_sensor(write_sensor(whole, tmp_path / "s.toml")) == whole
 
 
 def test_zones_of_which_some_never_saturate_come_back_from_their_file(tmp_path):
-    whole = SensorFile(WIDE, None, replace(ZONES, trials=(math.inf, 1e5)))
+    whole = SensorFile(WHOLE, None, replace(ZONES, trials=(math.inf, 1e5)))
     assert read_sensor(write_sensor(whole, tmp_path / "s.toml")) == whole
+
+
+@pytest.mark.parametrize("key", ["hot_fraction", "hot_rate", "dead_fraction", "reset", "dead_time", "crosstalk"])
+def test_what_only_pixels_have_is_refused_beside_zones(key):
+    only = {DETECTOR[key].field: getattr(WIDE, DETECTOR[key].field)}
+    with pytest.raises(InputError, match=rf"zones and detector\.{key} do not go together: it is of pixels"):
+        SensorFile(replace(WHOLE, **only), zones=ZONES)
 
 
 def test_numbers_that_no_float_holds_are_refused_in_tables_too():
@@ -151,6 +169,7 @@ def test_the_presets_that_were_there_keep_their_names_and_values():
         ("bins = 128", "bins = 1" + 5000 * "0", "a whole number beyond the 64 bits that TOML has"),
         ("bins = 128", "bins = 0x1" + 5000 * "0", "histogram.bins: a whole number beyond the 64 bits"),
         ('"200 ps"', '"200 ps"\n[detector]\npde = 1' + 400 * "0", "detector.pde: a whole number beyond the 64 bits"),
+        ('"200 ps"', '"200 ps"\n[jitter]\nfwhm = "0 ps"', "jitter: pulse sigma 0 s is outside (0, 1e-3)"),
         (
             'fwhm = "200 ps"',
             "samples = [1, 1" + 400 * "0" + ']\nstep = "9 ps"',
