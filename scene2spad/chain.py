@@ -137,7 +137,7 @@ def sense(
 
     require(isinstance(seed, Integral) and seed >= 0, f"seed {seed!r}: expected a whole number, 0 or more")
     chosen = sensor_by_name(sensor) if isinstance(sensor, str) else sensor
-    budget = optics.budget(transient, chosen) if optics is not None else PhotonBudget(signal, background)
+    budget = optics.budget(transient, chosen, seed=seed) if optics is not None else PhotonBudget(signal, background)
     return sense_exposure(transient, chosen, budget, seed=seed, model=law)
 
 

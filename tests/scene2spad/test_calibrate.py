@@ -1,17 +1,22 @@
 """The command `calibrate`: a sensor file from captures, which `sense` takes; mistakes in one line."""
 
 import json
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from render.transient import write_transient
 from scene2spad.cli import main
-from scene2spad.cli.simulation.calibrating import is_calibrated
+from scene2spad.cli.simulation.calibrating import is_calibrated, warn_of_unknown
 from scene2spad.datasets.zone_captures import read_plane_captures, render_plane, shipped_captures, zone_captures
 from spad.formats.histogram import read_histogram
 from spad.sensor.files import load_sensor, read_sensor, sensor_tables, write_sensor
+from spad.sensor.model import Sensor
 from spad.sensor.toml import format_toml
+from spad.zones.calibration import Calibration
+from spad.zones.expected_counts import PulseBasis
 from spad.zones.sensor import draw_zone_counts, zone_returns
 
 
@@ -56,8 +61,24 @@ def test_sense_takes_the_calibrated_sensor(calibrated, capfd, tmp_path, monkeypa
     assert len(light) == 9
     assert main([*options, "--signal", "500", "--background", "100"]) == 0
     assert json.loads(capfd.readouterr().out.splitlines()[-1])["mean_signal"] == pytest.approx(500, rel=1e-4)
+    assert main([*options, "--background", "500"]) == 0
+    line = "signal: 50 photons a zone, the default, and not as calibrated, since --background is given"
+    assert line in capfd.readouterr().err
+    assert main(["depth", "plane.h5", "--method", "coates"]) == 2
+    assert "depth method coates: undoes the pile-up of a pixel's detector" in capfd.readouterr().err
+    assert main(["export", "plane.h5", "--out", "plane.ply"]) == 2
+    assert "its 3 x 3 depths are not pixels of its camera's image of 28 x 28" in capfd.readouterr().err
     assert main([*options, "--radiometric"]) == 2
     assert "--radiometric does not go with a sensor of zones" in capfd.readouterr().err
+
+
+def test_parameters_that_the_captures_do_not_know_are_warned_of(caplog):
+    zones = replace(load_sensor("tmf8820").zones, trials=(1e6,) * 8 + (math.inf,), leak=(0.0,) * 8 + (3.0,))
+    known = {name: np.zeros(9) for name in ("gain", "skew_s", "background", "echo_m2", "recovery", "compression")}
+    errors = known | {"trials": np.full(9, 2e6), "leak": np.ones(9), "crosstalk": np.zeros(1)}
+    warn_of_unknown(Calibration(Sensor(), zones, errors, 1.0, {}, PulseBasis.made(0, 2, 2)))
+    (record,) = caplog.records
+    assert record.message == "standard error larger than the value, so that it is not known: trials of 8 zones"
 
 
 def test_files_that_calibrate_did_not_write_are_kept(calibrated, tmp_path, monkeypatch, capfd):
@@ -122,6 +143,7 @@ def test_captures_that_a_zone_misses_are_told_and_used(capfd, tmp_path, monkeypa
         (["halves.npz"], "counts are no whole numbers"),
         (["endless.npz"], "endless.npz: reference_counts holds values that are not finite"),
         (["huge.npz"], "huge.npz: counts holds values that are not finite, negative or above"),
+        (["mm.npz"], "mm.npz: distance_m 400 m is beyond the record of 1.75 m: are these millimetres?"),
         (["--sensor", "reference"], "has no zones"),
         (["--every", "1"], "leaves no capture"),
         (["--nearest", "0.39"], "expected 16 or more"),
@@ -136,6 +158,7 @@ def test_mistakes_end_in_one_line(arguments, words, capfd, tmp_path, monkeypatch
     np.savez(tmp_path / "thin.npz", distance_m=np.ones(3))
     distance_m, counts = np.linspace(0.1, 0.4, 20), np.ones((20, 2, 5))
     np.savez(tmp_path / "small.npz", distance_m=distance_m, counts=counts)
+    np.savez(tmp_path / "mm.npz", distance_m=1e3 * distance_m, counts=np.ones((20, 9, 128)))
     np.savez(tmp_path / "halves.npz", distance_m=distance_m, counts=0.5 * counts)
     np.savez(tmp_path / "endless.npz", distance_m=distance_m, counts=counts, reference_counts=np.full((20, 5), np.nan))
     np.savez(tmp_path / "huge.npz", distance_m=distance_m, counts=1e300 * counts)

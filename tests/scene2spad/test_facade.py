@@ -65,6 +65,19 @@ def test_depth_is_that_of_the_parts(histogram):
     assert s2s.depth_errors(by_name, histogram)["mae_mm"] < 100
 
 
+def test_optics_place_hot_pixels_by_the_seed_of_the_photons(monkeypatch):
+    seeds = []
+
+    def budget(self, transient, sensor, *, seed=0, dark_map_hz=None):
+        seeds.append(seed)
+        return s2s.PhotonBudget(10, 10)
+
+    monkeypatch.setattr(s2s.Optics, "budget", budget)
+    transient = s2s.render("plane", width=4, height=4, bounces=1)
+    s2s.sense(transient, optics=s2s.Optics(1e-9, 10e-3, 2.0, 20e-6), seed=5)
+    assert seeds == [5]
+
+
 def test_optics_compute_the_photon_budget():
     transient = s2s.render("plane", width=8, height=6, bounces=1)
     lens = {"focal_length_m": 0.01, "f_number": 2.0, "pixel_pitch_m": 20e-6}

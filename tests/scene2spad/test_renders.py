@@ -73,7 +73,7 @@ def test_depth_of_a_folder_makes_a_map_for_each(capfd, folder):
 
 def test_options_of_sensing_do_not_go_with_a_histogram(capfd, folder):
     answer(capfd, "sense", "a.exr", "--no-figure")
-    assert "--signal go with a transient (.exr)" in refused(capfd, "depth", "a.h5", "--signal", "3")
+    assert "--signal goes with a transient (.exr)" in refused(capfd, "depth", "a.h5", "--signal", "3")
     assert "is no depth" in refused(capfd, "depth", "a.exr", "--out", "a.exr")
     assert "frame" in refused(capfd, "depth", "a.exr", "--frame", "1")
     assert not (folder / "a-log-matched.exr").exists()

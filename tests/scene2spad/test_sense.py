@@ -133,11 +133,20 @@ def test_export_beside_another_sensors_pulse_is_refused_before_the_work(scene, c
     assert not (tmp_path / "t.h5").exists()
 
 
+def test_export_beside_a_displaced_laser_is_refused_before_the_work(scene, capfd, tmp_path):
+    write_transient(replace(scene, meta={**scene.meta, "laser": {"baseline_m": [0.1, 0, 0]}}), tmp_path / "b.exr")
+    status, _, err = run(capfd, "sense", "b.exr", "--export", "mat")
+    assert status == 2 and "b.mat: the layout knows no laser beside the camera" in err and "model:" not in err
+    assert not (tmp_path / "b.h5").exists()
+
+
 def test_export_by_command(scene, capfd, tmp_path):
     status, message, _ = run(capfd, "sense", "s.exr", "--export", "mat")
     assert status == 0 and (tmp_path / "s.mat").is_file() and message["export"] == "s.mat"
     assert (read_mat(tmp_path / "s.mat").counts == read_histogram(tmp_path / "s.h5").counts).all()
     assert scipy.io.loadmat(message["pulse_file"])["PSF_img"].shape[:2] == (8, 10)
+    # the layout does not say which pixels are mixed
+    assert "unmixed" not in run(capfd, "depth", "s.mat")[1] and "unmixed" in run(capfd, "depth", "s.h5")[1]
 
 
 @pytest.mark.parametrize(
@@ -149,6 +158,12 @@ def test_export_by_command(scene, capfd, tmp_path):
         (["--dark-map", "none.npy"], "none.npy"),
         (["--dark-map", "negative.npy"], "negative.npy: dark count map: rates must be finite and 0 or more"),
         (["--dark-map", "small.npy"], "small.npy: dark count map is (2, 2)"),
+        (["--dark-map", "fine.npy", "--dark-count-rate", "9"], "--dark-count-rate does not go with --dark-map"),
+        (["--dark-map", "fine.npy", "--hot-pixels", "0.1"], "--hot-pixels does not go with --dark-map"),
+        (["--dark-map", "fine.npy", "--dead-pixels", "0.1"], "--dead-pixels does not go with --dark-map"),
+        (["--jitter", "0"], "--jitter: pulse sigma 0 s is outside"),
+        (["--sensor", "tmf8820", "--pde", "0.1"], "--pde does not go with a sensor of zones"),
+        (["--sensor", "tmf8820", "--exposure", "1"], "--exposure does not go with a sensor of zones"),
         (["--radiometric", "--signal", "3"], "leave out --signal"),
         (["--pde", "2"], "PDE 2"),
         (["--dead-time", "1e-6", "--model", "first-photon"], "use free-running"),
@@ -164,6 +179,7 @@ def test_export_by_command(scene, capfd, tmp_path):
 def test_bad_options_are_refused_in_one_line(scene, capfd, tmp_path, options, words):
     np.save(tmp_path / "negative.npy", np.full((8, 10), -1.0))
     np.save(tmp_path / "small.npy", np.ones((2, 2)))
+    np.save(tmp_path / "fine.npy", np.ones((8, 10)))
     status, _, err = run(capfd, "sense", "s.exr", *options)
     lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
     assert status == 2 and len(lines) == 1 and words in lines[0] and not (tmp_path / "s.h5").exists()

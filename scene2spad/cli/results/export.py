@@ -14,6 +14,7 @@ from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
 from scene2spad.options.common import Common, File, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.io.hdf5 import HDF5_SUFFIXES
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 DENSE = (".npz", *HDF5_SUFFIXES)
@@ -121,7 +122,7 @@ def _points(command: Export, kind: str) -> int:
     depth_m, intensity, confidence, camera = _depth_of(command, kind)
     points = camera_points(depth_m, camera)
     if points is None:
-        raise InputError(f"{command.file}: does not say which camera it was seen with, so there are no points")
+        raise InputError(f"{command.file}: {_why_no_points(depth_m, camera)}, so there are no points")
     known = np.isfinite(depth_m)
     top = float(np.quantile(intensity[known], 0.995)) if known.any() else 1.0
     fraction = np.clip(intensity[known] / (top or 1.0), 0, 1)
@@ -129,7 +130,15 @@ def _points(command: Export, kind: str) -> int:
     return int(known.sum())
 
 
-def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, object] | None]:
+def _why_no_points(depth_m: np.ndarray, camera: JsonObject | None) -> str:
+    if not camera:
+        return "does not say which camera it was seen with"
+    rows, columns = depth_m.shape
+    image = f"{camera.get('height')} x {camera.get('width')}"
+    return f"its {rows} x {columns} depths are not pixels of its camera's image of {image}, as those of zones are not"
+
+
+def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, JsonObject | None]:
     """Return depth, intensity and confidence (H, W), and the camera."""
     if kind == "depth":
         found = open_depth(command.file)

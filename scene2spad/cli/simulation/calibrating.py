@@ -21,6 +21,7 @@ from scene2spad.datasets.zone_captures import (
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.sensor.files import load_sensor, read_sensor, write_sensor
+from spad.sensor.model import Sensor
 from spad.zones.calibration import (
     Calibration,
     calibrate,
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 log = logging.getLogger("scene2spad")
 
 MIN_CAPTURES = 16
+# Parameters that are 0 or more; of others, as of delays, a value near 0 may be known well.
+AMOUNTS = ("gain", "skew_s", "background", "leak", "echo_m2", "trials", "recovery", "compression", "crosstalk")
 HOW = "calibrated from"  # first words of the sources that a written file names
 
 
@@ -58,6 +61,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
     number = len(chosen.distance_m)
     enough = number >= MIN_CAPTURES
     require(enough, f"{path}: {number} captures from {command.nearest:g} m on, expected {MIN_CAPTURES} or more")
+    _check_distances(chosen, start.sensor, path)
     began = time.perf_counter()
     progress("render the plane", 0.0)
     captures = zone_captures(chosen, start.sensor, start.zones)
@@ -66,6 +70,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
     used = captures[:: command.every]
     held = [one for at, one in enumerate(captures) if at % command.every]
     fitted = calibrate(used, start.sensor, start.zones, free=command.effects, model_error=command.model_error)
+    warn_of_unknown(fitted)
     span = f"{chosen.distance_m[0]:g} to {chosen.distance_m[-1]:g} m"
     how = f"{HOW} {len(used)} captures of {path.name}, {span}"
     write_sensor(calibrated_file(start, fitted, command.out.stem, how), command.out)
@@ -92,6 +97,25 @@ def is_calibrated(path: Path) -> bool:
         return any(source.startswith(HOW) for source in read_sensor(path).sources.values())
     except InputError:
         return False
+
+
+def _check_distances(chosen: PlaneCaptures, sensor: Sensor, path: Path) -> None:
+    """Raise InputError that names the file for a distance that the bins do not reach: mostly one in other units."""
+    farthest, record_m = chosen.distance_m[-1], sensor.recorded_range_m
+    message = f"{path}: distance_m {farthest:g} m is beyond the record of {record_m:.3g} m"
+    require(farthest <= record_m, f"{message}: are these millimetres?")
+
+
+def warn_of_unknown(fitted: Calibration) -> None:
+    """Warn of amounts whose standard error is larger than they are; what was found to be 0, or endless, is known."""
+    vague = []
+    for name in AMOUNTS:
+        value = np.atleast_1d(getattr(fitted.zones, name))
+        many = int((np.isfinite(value) & (value > 0) & (fitted.errors[name] > value)).sum())
+        if many:
+            vague.append(f"{name} of {many} zones" if len(value) > 1 else name)
+    if vague:
+        log.warning("standard error larger than the value, so that it is not known: %s", ", ".join(vague))
 
 
 def _check_zones(chosen: PlaneCaptures, every: int, path: Path) -> None:

@@ -93,7 +93,8 @@ def run(command: Depth, progress: Progress) -> dict:
         log.info("%s: sensed %s", source, sensed)
     else:
         asked = [name for name in SENSING if getattr(command, name) is not None]
-        message = f"{source}: --{', --'.join(asked)} go with a transient (.exr), a histogram has been sensed"
+        go = "goes" if len(asked) == 1 else "go"
+        message = f"{source}: --{', --'.join(asked)} {go} with a transient (.exr), a histogram has been sensed"
         require(not asked, message)
         histogram, sensed = open_histogram(source, command.frame), ""
     progress(command.method, 0.1)
@@ -188,6 +189,9 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
     errors = histogram_errors(depth, histogram)
     if np.isnan(histogram.depth_m).all():
         log.info("%s: holds no true depth, so that no error can be stated", source)
+    unmixed = {}
+    if source.suffix.lower() != ".mat":  # of whose pixels nobody knows which are mixed
+        unmixed["unmixed"] = histogram_errors(depth, histogram, exclude=histogram.mixed)
     meta = {"method": label, "histogram_sha256": histogram.sha256()}
     camera = histogram.meta.get("transient", {}).get("camera")
     write_depth(depth, out, meta | ({"camera": camera} if camera else {}), sure)
@@ -196,7 +200,7 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
         "method": label,
         **errors,
         "confidence": _mean([] if sure is None else sure),
-        "unmixed": histogram_errors(depth, histogram, exclude=histogram.mixed),
+        **unmixed,
         "out": str(out),
     }
     if command.figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.detection.one_pixel import quadrature_in_pixel
 from spad.detection.rates import check_dark_map
+from spad.formats.bistatic import baseline_of
 from spad.formats.histogram import Histogram, write_histogram
 from spad.sensor.budget import Optics
 from spad.sensor.files import FWHM_PER_SIGMA, load_sensor
@@ -45,6 +47,11 @@ OPTICS = {  # options, and the fields that they set
     "filter_width": "filter_nm",
     "wavelength": "wavelength_m",
 }
+PIXELS_OF_A_MAP = ("dark_count_rate", "hot_pixels", "hot_rate", "dead_pixels")  # which a map of dark counts measures
+PIXELS_ALONE = (  # gains and backgrounds of zones are detections an exposure, whatever efficiency and exposure are
+    *("radiometric", "dark_map", "export", "dark_count_rate", "dead_time", "crosstalk", "hot_pixels", "hot_rate"),
+    *("dead_pixels", "reset", "pde", "exposure"),
+)
 DEFAULT_OPTICS = Optics(10e-9, 10e-3, 2.0, 20e-6, 0.8, 10.0, 850e-9)
 
 
@@ -77,7 +84,10 @@ def changed_sensor(sensor: Sensor, command: Sense) -> Sensor:
     hot = sensor.hot_share if command.hot_pixels is None else command.hot_pixels
     only_for(command, "sense", {"hot_rate": (hot != 0, "hot pixels (--hot-pixels)")})
     if command.jitter is not None:
-        changes["jitter"] = Pulse(command.jitter, command.jitter_tail)
+        try:
+            changes["jitter"] = Pulse(command.jitter, command.jitter_tail)
+        except InputError as error:  # speaks of a pulse
+            raise InputError(f"--jitter: {error}") from None
     require(command.jitter is not None or not command.jitter_tail, "--jitter-tail needs --jitter")
     pulse = _asked_pulse(command)
     if pulse is not None:
@@ -120,6 +130,7 @@ def run(command: Sense, progress: Progress) -> dict:
         return _run_zones(command, zones)
     sensor, optics = sensor_of(command), optics_of(command)
     budget = budget_of(command)
+    _refuse(command, PIXELS_OF_A_MAP if command.dark_map is not None else (), "--dark-map")
     source, out = _files(command)
     transient = read_transient(source)
     mat = out.with_suffix(".mat")
@@ -167,7 +178,7 @@ def _check_mat(path: Path, transient: Transient, sensor: Sensor) -> None:
     keep_foreign(path, Mark(".mat file", is_our_mat))
     for pulse in path.parent.glob(f"{PULSE_NAME}{transient.height}_*-{transient.width}.mat"):
         keep_foreign(pulse, Mark("pulse", is_our_mat))
-    check_mat(path, sensor, transient.height, transient.width)
+    check_mat(path, sensor, transient.height, transient.width, baseline_of(transient.meta))
 
 
 def is_our_mat(path: Path) -> bool:
@@ -188,14 +199,18 @@ def is_our_mat(path: Path) -> bool:
     return {"dist", "bin_hr"} <= held or {"psf", "pulse_len"} <= held
 
 
+def _refuse(command: Sense, options: Sequence[str], beside: str) -> None:
+    """Raise InputError for options, by their fields' names, that were given beside what leaves them without effect."""
+    for option in options:
+        given = getattr(command, option) not in (None, False)
+        require(not given, f"--{option.replace('_', '-')} does not go with {beside}")
+
+
 def _run_zones(command: Sense, zones: ZoneArray) -> dict:
     """Transient -> histogram of a multi-zone sensor, whose gains are its own unless a budget is asked for."""
     from spad.zones.histogram import sense_zones, with_budget
 
-    pixels_alone = ("radiometric", "dark_map", "export", "dark_count_rate", "dead_time", "crosstalk", "hot_pixels")
-    for option in (*pixels_alone, "dead_pixels", "reset"):
-        given = getattr(command, option) not in (None, False)
-        require(not given, f"--{option.replace('_', '-')} does not go with a sensor of zones")
+    _refuse(command, PIXELS_ALONE, "a sensor of zones")
     require(command.model == "auto", f"--model {command.model} does not go with a sensor of zones")
     optics_of(command)
     sensor = sensor_of(command)
@@ -203,7 +218,12 @@ def _run_zones(command: Sense, zones: ZoneArray) -> dict:
     transient = read_transient(source)
     start = time.perf_counter()
     asked = command.signal is not None or command.background is not None
-    if asked or set(zones.gain) == {1.0}:  # not calibrated
+    calibrated = set(zones.gain) != {1.0}
+    if asked or not calibrated:
+        for name, other in (("signal", "background"), ("background", "signal")):
+            if calibrated and getattr(command, name) is None:
+                message = "%s: %g photons a zone, the default, and not as calibrated, since --%s is given"
+                log.warning(message, name, DEFAULT_PHOTONS, other)
         zones = with_budget(zones, transient, sensor, budget_of(command))
     histogram = sense_zones(transient, sensor, zones, seed=command.seed)
     seconds = time.perf_counter() - start
