@@ -110,7 +110,8 @@ def true_arrival_s(histogram: Histogram) -> np.ndarray:
     time_s = true_path_m(histogram) / SPEED_OF_LIGHT_M_PER_S
     if _converters_differ(histogram):
         clock, delay_s, chirp_hz = _converters(histogram.meta["zones"])
-        time_s = chirped(time_s / clock, chirp_hz) + delay_s
+        # a converter starts anew at each emission
+        time_s = chirped(time_s % histogram.sensor.period_s / clock, chirp_hz) + delay_s
     return time_s % histogram.sensor.period_s
 
 

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from render.transient import Transient
+from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
-from spad.zones.sensor import ZoneArray, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
+from spad.zones.sensor import ZoneArray, ZoneReturns, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
 
 
 def zone_grid(zones: ZoneArray) -> tuple[int, int, np.ndarray]:
@@ -71,7 +72,7 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
             "model": "zones",
             "plan": reasons,
             "pile_up": float((primary / np.asarray(zones.trials)).max()),
-            "wrapped": 0.0,
+            "wrapped": _wrapped(returns, sensor, zones),
             "dark_share": 1.0,
             "brightest_pixel": brightest,
             "brightest_thousandth": brightest,
@@ -85,6 +86,14 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
             | {"chirp_hz": zones.chirp_hz},
         },
     )
+
+
+def _wrapped(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray) -> float:
+    """Return the share of the light that arrives later than one period after the laser's emission."""
+    period_m = SPEED_OF_LIGHT_M_PER_S * sensor.period_s
+    light = np.array([(seen.light.sum(), seen.light[seen.near_m >= period_m].sum()) for seen in returns])
+    every, late = np.asarray(zones.gain) @ light
+    return float(late / every) if every > 0 else 0.0
 
 
 def _beside_image(transient: Transient, zones: ZoneArray) -> list[str]:

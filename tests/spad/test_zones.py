@@ -303,3 +303,10 @@ def test_what_zones_lose_and_where_they_look():
     half_view = math.tan(math.radians(30))
     aside = replace(TWO, centre_x=(-half_view, 0.2))
     assert "1 of 2 look partly beside the image, by up to 50 %" in sense_zones(view(), SENSOR, aside).meta["plan"][1]
+
+
+def test_zones_tell_how_much_of_their_light_wraps():
+    """A plane at 0.3 m in a period of 0.96 m, and one at 1.2 m."""
+    sensor = replace(SENSOR, period_s=6.4e-9)
+    assert sense_zones(view(), sensor, TWO).meta["wrapped"] == 0
+    assert sense_zones(view(1.2), sensor, TWO).meta["wrapped"] == 1
