@@ -27,8 +27,8 @@ from spad.sensor.model import PhotonBudget, Sensor
 
 Model = Literal["auto", "poisson", "first-photon", "free-running"]
 MODELS: tuple[str, ...] = ("auto", *LAWS)
-MISSED_MATTERS = 1e-3  # share of the signal that finds no bins, from which on it is told
 _HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
+MISSED_MATTERS = 1e-3  # share of the signal that finds no bins, from which on it is told
 
 
 def sense(
