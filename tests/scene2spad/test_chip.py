@@ -63,7 +63,10 @@ def test_sums_that_wrap_are_counted_and_equal_torchs(name):
 
 def design_of(name: str) -> str:
     """A shipped model's name without its seed and what it was trained on."""
-    return name.rsplit("-", 1)[0].removesuffix("-mixed").removesuffix("-periodic")
+    name = name.rsplit("-", 1)[0]
+    for trained in ("-mixed", "-periodic", "-published"):
+        name = name.removesuffix(trained)
+    return name
 
 
 @pytest.mark.slow
