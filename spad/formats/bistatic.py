@@ -18,6 +18,7 @@ from scenes.json_types import JsonObject
 from scenes.model import Camera
 from spad.formats.histogram import Histogram
 from spad.sensor.clock import chirped, unchirped
+from spad.sensor.model import Sensor
 
 CO_LOCATED = (0.0, 0.0, 0.0)
 
@@ -70,11 +71,20 @@ def radial_depth_of(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray
     With a co-located laser and converters that measure what is, or where the histogram does not know of any, it is the
     same array. Raises InputError beside a displaced laser where the histogram does not tell where its pixels look.
     """
+    return _distance_m(histogram, _light_half_path_m(histogram, half_path_m))
+
+
+def _light_half_path_m(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
+    """Return half of the light's path [m], given half of c times the time that its converter recorded."""
     if _converters_differ(histogram):
-        time_s = _light_time_s(
-            2 / SPEED_OF_LIGHT_M_PER_S * np.asarray(half_path_m, np.float64), histogram.meta["zones"]
-        )
+        recorded_s = 2 / SPEED_OF_LIGHT_M_PER_S * np.asarray(half_path_m, np.float64)
+        time_s = _light_time_s(recorded_s, histogram.meta["zones"], histogram.sensor)
         half_path_m = (SPEED_OF_LIGHT_M_PER_S / 2 * time_s).astype(half_path_m.dtype)
+    return half_path_m
+
+
+def _distance_m(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
+    """Return distance from the camera [m], given half of the light's path."""
     baseline = laser_baseline_m(histogram)
     if not any(baseline):
         return half_path_m
@@ -123,10 +133,13 @@ def _converters_differ(histogram: Histogram) -> bool:
     return bool((clock != 1).any() or delay_s.any() or chirp_hz)
 
 
-def _light_time_s(recorded_s: np.ndarray, zones: JsonObject) -> np.ndarray:
-    """Return when the light arrived that zones recorded at these times, (H, W) [s]; 0 where a delay is longer."""
+def _light_time_s(recorded_s: np.ndarray, zones: JsonObject, sensor: Sensor) -> np.ndarray:
+    """Return when the light arrived that zones recorded at these times, (H, W) [s], within the laser's period; 0 where
+    that is before the emission by no more than the pulse's reach, as noise is."""
     clock, delay_s, chirp_hz = _converters(zones)
-    return clock * unchirped(np.maximum(recorded_s - delay_s, 0), chirp_hz)
+    since_s = (recorded_s - delay_s) % sensor.period_s
+    since_s = np.where(since_s > sensor.period_s - sensor.response.reach_s, 0.0, since_s)
+    return clock * unchirped(since_s, chirp_hz)
 
 
 def _converters(zones: JsonObject) -> tuple[np.ndarray, np.ndarray, float]:
@@ -138,8 +151,11 @@ def recorded_range_m(histogram: Histogram) -> np.ndarray:
 
     Beside a displaced laser it differs between pixels, and is 0 where the record is shorter than the baseline.
     """
-    end_m = np.full(histogram.depth_m.shape, histogram.sensor.recorded_range_m)
-    return np.nan_to_num(radial_depth_of(histogram, end_m))
+    sensor = histogram.sensor
+    end_m = np.full(histogram.depth_m.shape, sensor.recorded_range_m)
+    if sensor.bins < sensor.bins_per_period:  # else all that arrives within the period is recorded, however late
+        end_m = _light_half_path_m(histogram, end_m)
+    return np.nan_to_num(_distance_m(histogram, end_m))
 
 
 def _directions(meta: JsonObject, shape: tuple[int, ...]) -> np.ndarray | None:

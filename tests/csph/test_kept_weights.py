@@ -1,4 +1,4 @@
-"""Of a cosine the last weights are kept: said where an earlier epoch was better."""
+"""Keep the last weights of a cosine, and say where an earlier epoch was better."""
 
 import csv
 

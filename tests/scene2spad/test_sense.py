@@ -281,7 +281,7 @@ def test_the_figure_of_measured_counts_makes_nothing_up(scene, monkeypatch):
 
 
 def test_no_pixel_is_shown_twice(scene):
-    """Of two pixels the brighter one is the bright one."""
+    """Show the brighter one of two pixels as the bright one."""
     two = sense(
         transient_from_rgbd(np.array([[2.0, 3.0]]), np.ones((1, 2)), np.zeros((1, 2))), Sensor(), PhotonBudget(9, 0)
     )

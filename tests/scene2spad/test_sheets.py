@@ -24,7 +24,7 @@ def test_a_sheet_of_rooms_is_drawn(tmp_path, capsys):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_all_words_of_a_small_sheet_are_within_it(count, tmp_path, monkeypatch):
-    """Of one or two small views: the label of the colour bar is longer than they are wide."""
+    """Draw sheets of one and two small views, whose colour bar has a label longer than they are wide."""
     depth = np.full((12, 16), 2.0)
     drawn = []
     monkeypatch.setattr(contact_sheets, "save", lambda figure, path: drawn.append(figure) or path)

@@ -17,7 +17,7 @@ JOB = Job("hard-cases", width=12, height=9, bounces=1, grid=2)
 
 
 def test_a_scheduler_that_is_not_there_is_one_line_and_leaves_no_folder(tmp_path):
-    """What was left held no view, and refused a command that was corrected in more than its address."""
+    """Leave no folder, which would refuse a command that was corrected in more than its address."""
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="cannot be reached"):
         make_set(JOB, 1, tmp_path / "set", scheduler="nonsense")

@@ -11,7 +11,14 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from scenes.model import Camera
 from spad.estimators.depth import confidence_map, histogram_depth_m
-from spad.formats.bistatic import optical_path_m, radial_depth_m, time_tells_depth, true_arrival_s, true_path_m
+from spad.formats.bistatic import (
+    optical_path_m,
+    radial_depth_m,
+    recorded_range_m,
+    time_tells_depth,
+    true_arrival_s,
+    true_path_m,
+)
 from spad.formats.histogram import Histogram
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.clock import chirped, unchirped
@@ -97,7 +104,14 @@ def test_depth_of_zones_beside_their_emitter():
 
 
 @pytest.mark.parametrize(
-    "converters", [{"delay_s": (1.2e-9, -3e-10)}, {"clock": (1.02, 0.98)}, {"chirp_hz": 4e5}, {"chirp_hz": -4e5}]
+    "converters",
+    [
+        {"delay_s": (1.2e-9, -3e-10)},
+        {"delay_s": (2e-8, -1e-7)},
+        {"clock": (1.02, 0.98)},
+        {"chirp_hz": 4e5},
+        {"chirp_hz": -4e5},
+    ],
 )
 def test_depth_of_zones_whose_converters_measure_other_times(converters):
     """A delay of 1.2 ns alone would be 18 cm."""
@@ -105,8 +119,16 @@ def test_depth_of_zones_whose_converters_measure_other_times(converters):
     assert np.abs(histogram_depth_m(histogram) - histogram.depth_m).max() < 5e-3
     centroid_s = ZONED.bin_width_s * (histogram.counts @ (np.arange(256) + 0.5)) / histogram.counts.sum(axis=2)
     assert np.abs(true_arrival_s(histogram) - centroid_s).max() < 3e-11
+    assert (recorded_range_m(histogram) == ZONED.range_m).all(), "its bins cover the period"
     assert not time_tells_depth(histogram) and confidence_map(histogram, histogram.depth_m) is None
     assert time_tells_depth(sense_zones(plane(1.5), ZONED, NARROW, seed=1))
+
+
+def test_a_delay_takes_from_the_record_of_zones():
+    """6.4 of 20 ns are recorded, of which a delay takes 1.2."""
+    gated = replace(ZONED, bins=64, period_s=2e-8)
+    histogram = sense_zones(plane(0.5), gated, replace(NARROW, delay_s=(1.2e-9, 0.0)), seed=1)
+    assert recorded_range_m(histogram)[0] == pytest.approx(np.array([5.2e-9, 6.4e-9]) * C / 2)
 
 
 def test_clocks_run_back_as_they_ran():
