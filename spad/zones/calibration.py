@@ -47,8 +47,8 @@ _OFF = {
     "echo": 0.0,
 }
 TAIL_BINS = 48
+RISE_BINS, MOST_RISE_BINS = 2, 8
 RETURN_SIGMAS = 6.0  # of a bin's background: Poisson noise alone reaches it in 1 of 1,000 histograms at the most
-_FIRST_SKEW = 0.3  # bins: where the fit begins, as the derivative at 0 is 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def natural(model: ZoneModel, values: Values) -> dict[str, np.ndarray]:
     return {
         "gain": values["gain"] * pulse.sum(),
         "delay_s": values["delay"] * width + centroid * width / FINE,
-        "skew_s": values["skew"] * width,
+        "skew_s": np.sqrt(np.maximum(values["skew"], 0.0)) * width,
         "clock": values["clock"],
         "bin_width_s": values["bin_width"],
         "chirp_hz": values["chirp"] / width,
@@ -96,12 +96,17 @@ def natural(model: ZoneModel, values: Values) -> dict[str, np.ndarray]:
 def standard_errors(
     model: ZoneModel, values: Values, information: np.ndarray, names: Sequence[tuple[str, int]]
 ) -> dict[str, np.ndarray]:
-    """Return standard errors of the natural parameters, by the inverse Fisher information and the delta method."""
+    """Return standard errors of the natural parameters, by the inverse Fisher information and the delta method.
+
+    A skew is the root of what is fitted: its error is how far one standard error of that moves it, also at 0.
+    """
     covariance = covariance_of(information)
     centre = natural(model, values)
     slopes = {name: np.zeros((len(value), len(names))) for name, value in centre.items()}
     for column, (name, at) in enumerate(names):
         step = 1e-6 * max(abs(values[name][at]), 1e-12 if name in ("bin_width",) else 1e-3)
+        if name == "skew":
+            step = max(step, math.sqrt(covariance[column, column]))
         moved = {key: value.copy() for key, value in values.items()}
         moved[name][at] += step
         for key, value in natural(model, moved).items():
@@ -212,7 +217,7 @@ def starting_values(
         "pulse": pulse,
         "gain": gain / gain[reference],
         "delay": centre - centre[reference],
-        "skew": np.full(zones, _FIRST_SKEW),
+        "skew": np.zeros(zones),
         "clock": np.ones(zones),
         "bin_width": sensor.bin_width_s * one,
         "chirp": 0.0 * one,
@@ -224,14 +229,6 @@ def starting_values(
         "compression": np.zeros(zones),
         "crosstalk": 0.0 * one,
     }
-
-
-def narrowest_zone(captures: Sequence[ZoneCapture]) -> int:
-    """Return the zone whose returns are the sharpest: the largest share of its signal is in its two fullest bins."""
-    counts = np.array([capture.counts for capture in captures], dtype=np.float64)
-    signal = np.maximum(counts - np.median(counts, axis=2, keepdims=True), 0.0)
-    sharpness = (signal[:, :, 1:] + signal[:, :, :-1]).max(axis=2) / np.maximum(signal.sum(axis=2), 1.0)
-    return int(np.median(sharpness, axis=0).argmax())
 
 
 def check_effects(free: Sequence[str]) -> None:
@@ -248,7 +245,7 @@ def calibrate(
     *,
     free: Sequence[str] = OPTIONAL,
     model_error: float = 0.004,
-    smoothing: float = 1e4,
+    smoothing: float = 1e3,
     start: Calibration | None = None,
 ) -> Calibration:
     """Calibrate from captures in order of distance; what is not `free` stays off, the delays of the zones at 0.
@@ -269,15 +266,17 @@ def calibrate(
     for name, value in _OFF.items():
         if name not in free:
             values[name] = np.full_like(values[name], value)
-    model = ZoneModel(basis, sensor.bins, zones.count, reference, narrowest_zone(captures), sensor.bins_per_period)
-    values["skew"][model.narrowest] = 0.0
-    simple = ["pulse", "gain", *(name for name in ("delay", "background") if name in free)]
     everything = ["pulse", "gain", *free]
-    fitted = partial(fit, model, smoothing=smoothing)
+    model_of = partial(ZoneModel, basis, sensor.bins, zones.count, reference, period=sensor.bins_per_period)
     if start is None:
-        values, *_ = fitted(captures[::4], values, simple, steps=8, model_error=max(0.1, model_error))
-        values, *_ = fitted(captures[::2], values, everything, steps=6, model_error=max(0.02, model_error))
-    values, information, names = fitted(captures, values, everything, model_error=model_error)
+        simple = ["pulse", "gain", *(name for name in ("delay", "background") if name in free)]
+        first = partial(fit, model_of(), smoothing=smoothing)
+        values, *_ = first(captures[::4], values, simple, steps=8, model_error=max(0.1, model_error))
+        values, *_ = first(captures[::2], values, everything, steps=6, model_error=max(0.02, model_error))
+    narrowest = int(values["skew"].argmin())  # the pulse is as wide as it is in this zone
+    values["skew"] -= values["skew"][narrowest]
+    model = model_of(narrowest)
+    values, information, names = fit(model, captures, values, everything, model_error=model_error, smoothing=smoothing)
     calibrated = as_sensor(model, values, sensor, zones)
     bins = sum(capture.counts.size for capture in captures)
     deviance = sum(poisson_deviance(c.counts, model.expected(values, c)) for c in captures) / bins
@@ -285,9 +284,18 @@ def calibrate(
 
 
 def _basis_for(captures: Sequence[ZoneCapture], sensor: Sensor, reference: int) -> PulseBasis:
-    """Choose the pulse's steps: fine from 3 bins before the return's peak to 4 after it, coarse for TAIL_BINS more."""
+    """Choose the pulse's steps: fine from before its rise to 4 bins after its peak, coarse for TAIL_BINS more.
+
+    The rise begins where the middle capture's reference zone leaves its background; RISE_BINS more are for what its
+    noise hides and all captures together show.
+    """
     middle = middle_capture(captures)
     near_m, far_m, light = middle.returns[reference]
     path = float((near_m + far_m) @ light / (2 * light.sum()))
-    peak = int(middle.counts[reference].argmax()) - path / (SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s)
-    return PulseBasis.made(math.floor(peak) - 3, 8, min(TAIL_BINS, sensor.bins // 3))
+    counts = middle.counts[reference]
+    peak, background = int(counts.argmax()), np.median(counts)
+    raised = counts > background + 3 * np.sqrt(np.maximum(background, 1.0))
+    rise = int((~raised[:peak][::-1]).argmax()) if not raised[:peak].all() else peak
+    before = min(rise + RISE_BINS, MOST_RISE_BINS)
+    at = math.floor(peak - path / (SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s))
+    return PulseBasis.made(at - before, before + 5, min(TAIL_BINS, sensor.bins // 3))

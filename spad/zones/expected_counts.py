@@ -21,7 +21,7 @@ FINE = 6  # steps of the pulse in a bin
 TAIL = 2  # the same in the tail
 _STEPS = {
     "delay": 1e-5,
-    "skew": 1e-4,
+    "skew": 3e-3,
     "clock": 1e-6,
     "bin_width": 1e-6,
     "chirp": 1e-6,
@@ -59,8 +59,14 @@ class PulseBasis(NamedTuple):
             matrix[fine + number * step : fine + (number + 1) * step, fine + number] = 1 / step
         return cls(first_bin * FINE, matrix)
 
+    @property
+    def lengths(self) -> np.ndarray:
+        """Number of fine steps over which each of the K numbers is spread, (K,)."""
+        return (self.matrix > 0).sum(axis=0)
 
-# By name: pulse (K,); bin_width, chirp [per bin] and crosstalk (1,); all others (Z,), delay and skew in bins.
+
+# By name: pulse (K,); bin_width, chirp [per bin] and crosstalk (1,); all others (Z,), delay in bins. The number that is
+# fitted for `skew` is the square of skew_s, in bins squared: counts are nearly linear in it, also at 0.
 Values = dict[str, np.ndarray]
 
 
@@ -68,8 +74,9 @@ class ZoneModel:
     """Expected counts and their derivatives for the fit's parameters; delays count in bins.
 
     Zone `reference` holds the gauge: its gain is 1 (the pulse carries the scale), its delay 0 (the pulse carries it),
-    and its clock 1 (the bin width carries it). Zone `narrowest` has no skew: the pulse carries it. `period` is the
-    laser's in bins, at which time wraps; None where the bins cover it.
+    and its clock 1 (the bin width carries it). Zone `narrowest` has no skew: the pulse carries it. While it is None,
+    skews are relative to the reference's, and a squared skew below 0 sharpens. `period` is the laser's in bins, at
+    which time wraps; None where the bins cover it.
     """
 
     def __init__(
@@ -83,6 +90,7 @@ class ZoneModel:
     ) -> None:
         self.basis, self.bins, self.zones, self.reference = basis, bins, zones, reference
         self.narrowest = reference if narrowest is None else narrowest
+        self.signed_skew = narrowest is None
         self.period = bins if period is None else period
 
     def parameter_names(self, values: Values, free: Sequence[str]) -> list[tuple[str, int]]:
@@ -123,14 +131,16 @@ class ZoneModel:
         step_s = values["bin_width"][0] / FINE
         scale = 1 / (SPEED_OF_LIGHT_M_PER_S * values["clock"][zone] * step_s)
         late = values["delay"][zone] * FINE + capture.drift_s / step_s
-        skew_m, chirp = values["skew"][zone] * FINE / scale, values["chirp"][0] / FINE
+        chirp = values["chirp"][0] / FINE
         period_m = self.period * values["bin_width"][0] * SPEED_OF_LIGHT_M_PER_S
         stray = stray_returns(capture.returns[zone], values["leak"][zone], values["echo"][zone])
         stray, direct = (since_emission(light, period_m) for light in (stray, capture.returns[zone]))
-        parts = [_masses(with_skew(direct, skew_m), scale, late, chirp)]
-        for at in range(len(stray.light)):
-            alone = ZoneReturns(*(column[at : at + 1] for column in stray))
-            parts.append(_masses(with_skew(alone, skew_m), scale, late, chirp))
+        alone = [ZoneReturns(*(column[at : at + 1] for column in stray)) for at in range(len(stray.light))]
+        parts = []
+        for light in (direct, *alone):
+            for skewed, weight in _skewed(light, values["skew"][zone], FINE / scale):
+                start, part = _masses(skewed, scale, late, chirp)
+                parts.append((start, weight * part))
         first = min(start for start, _ in parts)
         mass = np.zeros(max(start + len(part) for start, part in parts) - first)
         for start, part in parts:
@@ -183,6 +193,15 @@ class ZoneModel:
     def _difference(self, values: Values, capture: ZoneCapture, name: str, at: int, zone: int) -> np.ndarray:
         up, down, width = _beside(values, name, at)
         return (self.own(up, capture, zone) - self.own(down, capture, zone)) / width
+
+
+def _skewed(returns: ZoneReturns, squared: float, bin_m: float) -> list[tuple[ZoneReturns, float]]:
+    """Return the light with a zone's squared skew [bins squared], as parts and their weights.
+
+    Below 0 it is the extrapolation of what a skew does: twice the light as it is, less the light that is skewed.
+    """
+    skewed = with_skew(returns, math.sqrt(abs(squared)) * bin_m)
+    return [(skewed, 1.0)] if squared >= 0 else [(returns, 2.0), (skewed, -1.0)]
 
 
 def _masses(returns: ZoneReturns, scale: float, late: float, chirp: float) -> tuple[int, np.ndarray]:
