@@ -42,15 +42,14 @@ from csph.training.config import TrainConfig
 from csph.training.data import SetData, TrainBatch
 from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.optimiser import make_optimiser
-from csph.training.resume import WholeFileCheckpoints, check_resume
+from csph.training.resume import WholeFileCheckpoints, check_resume, claim_run
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
 from csph.training.views import Views, check_direct, check_light, packed_sha256
 from csph.weights.shipped import RESUME, TIMINGS
 from render.backend.malloc import retain_freed_memory
-from scenes.errors import InputError, require
-from scenes.files import append_line, is_unclaimed, whole_file, write_csv
-from scenes.io.inputs import read_json_object
+from scenes.errors import require
+from scenes.files import append_line, write_csv
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.training_patches import PackedViews, pack_views
@@ -245,27 +244,6 @@ def _check_kept(folder: Path, rows: Sequence[dict[str, float]], kept: Mapping[st
         best = min(better, key=lambda row: row["val_rmse_mm"])
         message = "the weights kept are of step %d, with a validation RMSE of %.1f mm; step %d had %.1f mm"
         log.warning(message, kept["step"], kept["val_rmse_mm"], best["step"], best["val_rmse_mm"])
-
-
-def claim_run(folder: Path, config: TrainConfig) -> None:
-    """Write the configuration, or see that the folder holds the same one.
-
-    Raises InputError for another run's folder, and one that holds other files.
-    """
-    text = json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n"
-    path = folder / "config.json"
-    if path.is_file():
-        known = read_json_object(path, "configuration")
-        try:  # by what it says: a file of before an option was there means its default
-            same = TrainConfig.from_dict(known) == TrainConfig.from_dict(json.loads(text))
-        except InputError:
-            same = False
-        require(same, f"{folder}: holds a run with other options or another set; choose another --out")
-        return
-    require(is_unclaimed(folder), f"{folder}: is not an empty folder and holds no run; choose another --out")
-    folder.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as beside:
-        beside.write_text(text)
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,65 @@
-"""Write the state of a run as a whole file, and check it before an interrupted run goes on from it."""
+"""Claim a run's folder, write the state of a run as a whole file, and check both before an interrupted run goes on."""
 
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 
 import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import nn
 
+from csph.training.config import TrainConfig
 from csph.weights.torch_files import load_torch_file
-from scenes.errors import InputError
-from scenes.files import whole_file
+from scenes.errors import InputError, require
+from scenes.files import is_unclaimed, whole_file
+from scenes.io.inputs import read_json_object
+from scenes.json_types import JsonObject
 
 KEYS = ("state_dict", "optimizer_states", "lr_schedulers", "callbacks", "loops", "epoch", "global_step")
 CURE = "delete it to begin the run again"
+LONGEST_VALUE = 40  # characters of a value in a message
+
+
+def claim_run(folder: Path, config: TrainConfig) -> None:
+    """Write the configuration, or see that the folder holds the same one.
+
+    Raises InputError for another run's folder, with what differs, and one that holds other files.
+    """
+    path = folder / "config.json"
+    if path.is_file():
+        known = read_json_object(path, "configuration")
+        refusal = f"{folder}: holds a run with other options or another set"
+        try:  # by what it says: a file of before an option was there means its default
+            there = TrainConfig.from_dict(known).to_dict()
+        except InputError:
+            raise InputError(f"{refusal}; choose another --out") from None
+        asked = json.loads(json.dumps(config.to_dict()))
+        differing = _differences(json.loads(json.dumps(there)), asked)
+        require(not differing, f"{refusal} ({'; '.join(differing[:3])}); choose another --out")
+        return
+    require(is_unclaimed(folder), f"{folder}: is not an empty folder and holds no run; choose another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as beside:
+        beside.write_text(json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n")
+
+
+def _differences(there: JsonObject, asked: JsonObject, within: str = "") -> list[str]:
+    """List what differs between two configurations, each as its name and both values."""
+    found = []
+    for name in sorted(there.keys() | asked.keys()):
+        old, new = there.get(name), asked.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += _differences(old, new, f"{within}{name}.")
+        elif old != new:
+            found.append(f"{within}{name}: {_short(old)} there, {_short(new)} asked")
+    return found
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
 
 
 class WholeFileCheckpoints(TorchCheckpointIO):

@@ -8,13 +8,12 @@ from typing import NamedTuple
 
 import torch
 
-from csph.networks.model import DepthModel, load_model
+from csph.networks.model import DepthModel
 from csph.training.config import COUNT_BYTES, TrainConfig
-from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import TIMINGS
 from scene2spad.datasets.workers import check_workers
 from scene2spad.dry_runs.resources import Cost, memory, timed
-from scene2spad.networks.training import check_sets, config_of, folder_of
+from scene2spad.networks.training import begun_with, check_sets, config_of, folder_of
 from scene2spad.options.networks import Train
 from scenes.errors import require
 from scenes.io.inputs import read_json_object, read_whole_lines
@@ -36,8 +35,7 @@ def dry_run(command: Train) -> dict:
     require(bool(command.set), "train: --set without a set")
     check_workers(command.workers, least=0)
     check_sets(command)
-    if command.init is not None:
-        load_model(checkpoint_of(command.init))
+    begun_with(command, config)
     folder = folder_of(command)
     done = recorded_epochs(folder)
     if done is None:

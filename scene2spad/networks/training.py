@@ -17,13 +17,14 @@ from csph.codes.design import Design
 from csph.evaluation.methods import DepthEstimator, Method
 from csph.layer import SpatialStart
 from csph.networks.model import DepthModel, load_model
+from csph.training.beginning import NetworkOf, check_init
 from csph.training.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
 from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.workers import check_workers
 from scene2spad.options.networks import Train, check_used
-from scenes.errors import require
+from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
 from spad.formats.histogram import Histogram
@@ -113,6 +114,7 @@ def _check_numbers(command: Train) -> None:
     for name, value in (("devices", command.devices), ("threads", command.threads)):
         require(value is None or value >= 1, f"train: --{name} {value} is below 1")
     require(not command.init_share or command.init is not None, "train: --init-share needs --init")
+    require(command.init is None or command.init_network is None, "train: give --init or --init-network, not both")
     weights, sets = len(command.set_weights), len(command.set)
     require(weights in (0, sets), f"train: {weights} --set-weights for {sets} sets, expected one for each")
 
@@ -134,9 +136,16 @@ def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, object
     if command.validation:
         training, validation = sets, [_views_of_one_size(path) for path in command.validation]
     else:
-        parts = [split_views(views) for views in sets]
+        parts = [_split(path, views) for path, views in zip(command.set, sets, strict=True)]
         training, validation = [first for first, _ in parts], [second for _, second in parts]
     return training, validation, {**common, "training_reach_m": max(map(training_reach_m, training), default=0.0)}
+
+
+def _split(path: Path, views: Views) -> tuple[Views, Views]:
+    try:
+        return split_views(views)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def _views_of_set(path: Path, command: Train) -> Views:
@@ -179,17 +188,13 @@ def run_train(command: Train, progress: Progress) -> dict:
     config.check_memory()
     require(bool(command.set), "train: --set without a set")
     check_workers(command.workers, least=0)
-    from csph.training.beginning import NetworkOf
+    init = begun_with(command, config)
     from csph.training.loop import Hardware, train  # and Lightning, which takes seconds to import
 
     training, validation, data = views_of(command)
-    require(command.init is None or command.init_network is None, "train: give --init or --init-network, not both")
-    init: DepthModel | NetworkOf | None = None
-    begun = command.init or command.init_network
-    if begun is not None:
-        init = load_model(checkpoint_of(begun))[0]
-        init = NetworkOf(init) if command.init_network else init
-        data["init" if command.init else "init_network"] = Path(begun).name
+    for name, begun in (("init", command.init), ("init_network", command.init_network)):
+        if begun is not None:
+            data[name] = Path(begun).name
     folder = folder_of(command)
     result = train(
         replace(config, data=data),
@@ -201,6 +206,17 @@ def run_train(command: Train, progress: Progress) -> dict:
         progress=progress,
     )
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
+
+
+def begun_with(command: Train, config: TrainConfig) -> DepthModel | NetworkOf | None:
+    """Return the model, or the model whose network alone, a training begins with; InputError for one that cannot."""
+    begun = command.init or command.init_network
+    if begun is None:
+        return None
+    model = load_model(checkpoint_of(begun))[0]
+    init = NetworkOf(model) if command.init_network else model
+    check_init(init, config)
+    return init
 
 
 def folder_of(command: Train) -> Path:

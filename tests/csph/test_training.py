@@ -3,6 +3,7 @@
 import json
 import math
 import platform
+import re
 import signal
 import subprocess
 import sys
@@ -190,9 +191,10 @@ def test_a_run_that_stops_goes_on_to_the_same_weights(tmp_path):
     rows = (tmp_path / "steps" / "log.csv").read_text().splitlines()
     assert stepped["val_rmse_mm"] == pytest.approx(min(float(row.split(",")[4]) for row in rows[1:]))
     # the same folder, other numbers or another set
-    with pytest.raises(InputError, match="holds a run with other options or another set"):
+    differs = f"holds a run with other options or another set (rate: {config.rate} there, 0.0001 asked); choose"
+    with pytest.raises(InputError, match=re.escape(differs)):
         train(replace(config, rate=1e-4), *views, tmp_path / "whole")
-    with pytest.raises(InputError, match="holds a run with other options or another set"):
+    with pytest.raises(InputError, match=r"another set \(data\.training_sha256: .* there, .* asked; data\.valid"):
         train(config, *split_views(near_planes(6, seed=1)), tmp_path / "whole")
 
 

@@ -14,7 +14,7 @@ from set_folders import begun, finished
 
 from csph.codes.design import Design
 from csph.training.config import ModelConfig, TrainConfig
-from csph.training.loop import claim_run
+from csph.training.resume import claim_run
 from csph.weights.shipped import cpu_minutes
 from render.transient.packs import read_pack, write_pack
 from scene2spad.datasets.planes import random_planes

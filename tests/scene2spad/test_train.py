@@ -223,12 +223,12 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
     write_pack(displaced, Path("displaced.h5"))
     assert "the laser of a is not at the camera" in refused(capfd, *train, "displaced.h5")
     write_pack([(t, {"scene": "a"}) for t in lasers], Path("one.h5"))
-    assert "a set of one scene (a)" in refused(capfd, *train, "one.h5")
+    assert "one.h5: a set of one scene (a)" in refused(capfd, *train, "one.h5")
     assert "crops of 8 pixels are not tiled by blocks of 3 x 3" in refused(
         capfd, *train, str(packed), "--block", "256", "3", "3", "--codes", "8"
     )
     assert "does not divide" in refused(capfd, *train, str(packed), "--compression", "100")
-    assert "holds a run with other options" in refused(
+    assert "holds a run with other options or another set (seed: 0 there, 1 asked)" in refused(
         capfd, "train", *QUICK, "--seed", "1", "--set", str(packed), "--out", str(trained)
     )
     assert not Path("x").exists()
@@ -290,6 +290,15 @@ def test_a_dry_training_refuses_the_sets_that_the_run_refuses(capfd, tmp_path, m
         for dry in ((), ("--dry-run",)):
             assert words in refused(capfd, "train", *QUICK, "--out", "x", "--set", name, *dry)
     assert run(capfd, "train", *QUICK, "--set", "one.h5", "--validation", "one.h5", "--dry-run")["dry_run"]
+
+
+@pytest.mark.parametrize("option", ["--init", "--init-network"])
+def test_a_dry_training_refuses_the_beginnings_that_the_run_refuses(capfd, tmp_path, monkeypatch, option):
+    monkeypatch.chdir(tmp_path)
+    expected = {"nowhere": "nowhere", "fourier-1024x1x1-128x-periodic-s1": "cannot begin one of"}
+    for name, words in expected.items():
+        for dry in ((), ("--dry-run",)):
+            assert words in refused(capfd, "train", *QUICK, "--set", "planes", "--out", "x", option, name, *dry)
 
 
 def test_an_evaluation_counts_its_pixels_and_views(capfd, tmp_path, monkeypatch):
