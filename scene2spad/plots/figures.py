@@ -222,7 +222,8 @@ def draw_pulse(sensor: Sensor, path: Path) -> Path:
     width_ns = 1e9 * sensor.bin_width_s
     for edge in np.arange(np.ceil(-1e9 * before / width_ns), 1e9 * after / width_ns):
         axes.axvline(edge * width_ns, color="0.85", lw=0.6, zorder=0)
-    title = f"{sensor.name}: pulse with jitter; grey: bins of {1000 * width_ns:.4g} ps"
+    unequal = "" if sensor.tdc is None else ", of which its converter makes unequal ones"
+    title = f"{sensor.name}: pulse with jitter; grey: bins of {1000 * width_ns:.4g} ps{unequal}"
     axes.set(xlabel="time after arrival [ns]", ylabel="density [1/ns]", title=title)
     return save(figure, path)
 

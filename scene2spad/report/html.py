@@ -128,13 +128,13 @@ def _cell(value: object) -> str:
 
 
 def format_value(value: object) -> str:
-    """Return four digits of a number, yes or no, a dash for none; lists and dictionaries in a line."""
+    """Return four digits of a number, yes or no, a dash for none and for no number; lists and dictionaries in a line."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None or value == "":
         return "–"
     if isinstance(value, float):
-        return f"{value:.4g}" if math.isfinite(value) else "–"
+        return "–" if math.isnan(value) else f"{value:.4g}".replace("inf", "∞")
     if isinstance(value, Mapping):
         return "; ".join(f"{key}: {format_value(one)}" for key, one in value.items())
     if isinstance(value, (list, tuple)):

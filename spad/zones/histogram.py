@@ -30,7 +30,9 @@ def with_budget(zones: ZoneArray, transient: Transient, sensor: Sensor, budget: 
     Raises InputError where no light reaches a zone.
     """
     signal = zone_signal(zone_returns(transient, zones), sensor, zones).sum(axis=1).mean()
-    require(signal > 0 or budget.signal == 0, f"no light reaches a zone: {budget.signal:g} photons cannot be had")
+    record = f"the {sensor.bins * sensor.bin_width_s * 1e9:.4g} ns that {sensor.name} records"
+    message = f"no light reaches a zone within {record}: {budget.signal:g} photons cannot be had"
+    require(signal > 0 or budget.signal == 0, message)
     scale = budget.signal / signal if signal > 0 else 0.0
     background = (budget.background / sensor.bins,) * zones.count
     return replace(zones, gain=tuple(gain * scale for gain in zones.gain), background=background)

@@ -326,6 +326,8 @@ def test_published_numbers_stand_beside_ours():
         (True, "yes"),
         (None, "–"),
         (float("nan"), "–"),
+        (float("inf"), "∞"),
+        (float("-inf"), "-∞"),
         ([1, 2.5], "1, 2.5"),
         ({"a": 1}, "a: 1"),
         (1234567, "1234567"),

@@ -262,6 +262,9 @@ def test_zones_are_laid_out_as_they_look_and_take_a_budget():
     assert (again.counts == histogram.counts).all()
     with pytest.raises(InputError, match="look beside the image"):
         sense_zones(view(fov_deg=20.0), SENSOR, nine)
+    nothing = seen_by_a_camera(np.full((9, 9), np.nan))
+    with pytest.raises(InputError, match=f"within the 6.4 ns that {SENSOR.name} records: 9 photons cannot be had"):
+        with_budget(nine, nothing, SENSOR, PhotonBudget(9.0, 1.0))
 
 
 def seen_by_a_camera(depth_m: np.ndarray) -> Transient:
