@@ -1,7 +1,7 @@
 """Depth methods on rendered views at the 16 photon levels: every method sees the same photons.
 
 A method is any function of a histogram. What it gives is compared with the truth image by image, and summed up over
-all, low and high signal-to-background levels, with intervals by bootstrap over scenes (`csph.evaluation.metrics`).
+all, low and high signal-to-background levels, with intervals over scenes (`csph.evaluation.metrics`).
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from csph.evaluation.metrics import (
     TOLERANCES_MM,
     Interval,
     bias_by_depth,
-    bootstrap_mean,
     grouped_errors,
     is_low_sbr,
+    mean_over_scenes,
     paired_difference,
 )
 from csph.networks.posterior import Decoder
@@ -97,9 +97,9 @@ class Evaluation:
     def interval(
         self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
     ) -> Interval | None:
-        """Return mean over scenes with its bootstrap interval; None where there is no finite value."""
+        """Return mean over scenes with its interval; None where there is no finite value."""
         found = self.values(methods, group, levels, figure)
-        return bootstrap_mean(found) if any(np.isfinite(v).any() for v in found.values()) else None
+        return mean_over_scenes(found) if any(np.isfinite(v).any() for v in found.values()) else None
 
     def difference(self, first: Sequence[str], second: Sequence[str], levels: str = "all") -> Interval:
         """Return paired difference of MAE [mm], first - second, over scenes and levels."""

@@ -128,7 +128,7 @@ def _cell(value: object) -> str:
 
 
 def format_value(value: object) -> str:
-    """Return four digits of a number, yes or no, a dash for none and for no number; lists and dictionaries in a line."""
+    """Return four digits of a number, yes or no, a dash for none or NaN; lists and dictionaries in a line."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None or value == "":

@@ -9,10 +9,10 @@ from csph.evaluation.metrics import (
     PHOTON_LEVELS,
     TRAIN_LEVELS,
     bias_by_depth,
-    bootstrap_mean,
     grouped_errors,
     image_errors,
     is_low_sbr,
+    mean_over_scenes,
     paired_difference,
     ssim,
 )
@@ -86,38 +86,53 @@ def test_bias_by_depth_sees_a_pull_towards_mid_range():
     assert bias_by_depth(truth, truth, [0, 15], exclude=truth > 1)[0].pixels == 51
 
 
-def test_bootstrap_covers_the_mean_as_often_as_it_says():
-    rng = np.random.default_rng(5)
-    covered = 0
-    for trial in range(200):
-        values = {str(i): rng.normal(rng.normal(3, 1), 0.2, 8) for i in range(20)}
-        interval = bootstrap_mean(values, draws=400, seed=trial)
-        assert interval.low <= interval.mean <= interval.high
-        covered += interval.low <= 3 <= interval.high
-    # of 200 intervals of 95 %, less what percentile intervals of 20 clusters lack: 4 standard deviations of 0.93
-    assert 0.93 - 4 * (0.93 * 0.07 / 200) ** 0.5 < covered / 200 <= 1
+@pytest.mark.parametrize("scenes", [2, 4, 8])
+def test_intervals_over_scenes_cover_the_mean_as_often_as_they_say(scenes):
+    """Levels whose errors differ by a factor of 20 are fixed; scenes are drawn, and their errors go with the level."""
+    rng, trials = np.random.default_rng(5), 1000
+    levels = np.array([20.0, 25.0, 60.0, 150.0, 400.0])
+    hard = rng.normal(1, 0.1, (2, trials, scenes, 1))
+    first, second = (levels * h * (1 + 0.05 * rng.normal(size=(trials, scenes, 5))) for h in (hard[0], hard[1] * 1.05))
+    mean, apart = levels.mean(), -0.05 * levels.mean()
+    covered = np.zeros(2)
+    for one, other in zip(first, second, strict=True):
+        a, b = ({str(i): v for i, v in enumerate(values)} for values in (one, other))
+        for number, (interval, truth) in enumerate(((mean_over_scenes(a), mean), (paired_difference(a, b), apart))):
+            covered[number] += interval.low <= truth <= interval.high
+    assert covered / trials == pytest.approx(0.95, abs=4 * (0.95 * 0.05 / trials) ** 0.5)
 
 
-def test_bootstrap_is_by_scene_not_by_value():
+def test_intervals_hold_scenes_and_neither_levels_nor_pixels():
+    alike = {str(i): [20.0, 25.0, 60.0, 150.0, 400.0] for i in range(8)}
+    assert mean_over_scenes(alike) == (131, 131, 131)
     many = {str(i): [float(i % 2)] * 100 for i in range(8)}
     few = {str(i): [float(i % 2)] for i in range(8)}
-    wide, same = bootstrap_mean(many), bootstrap_mean(few)
-    assert wide.mean == same.mean == 0.5
-    assert wide.high - wide.low == pytest.approx(same.high - same.low, abs=0.13)  # a hundred copies say no more
-    assert math.isnan(bootstrap_mean({"one": [1.0, 2.0]}).low)
-    assert bootstrap_mean({"a": [1.0, math.nan], "b": [3.0], "c": [math.nan]}).mean == 2
+    assert mean_over_scenes(many) == mean_over_scenes(few)  # a hundred copies say no more
+    assert mean_over_scenes(few) == pytest.approx((0.5, 0.5 - 2.365 * 0.189, 0.5 + 2.365 * 0.189), abs=1e-3)
+    assert math.isnan(mean_over_scenes({"one": [1.0, 2.0]}).low)
+    assert mean_over_scenes({"a": [1.0, math.nan], "b": [3.0], "c": [math.nan]}).mean == 2
     with pytest.raises(InputError, match="no finite value"):
-        bootstrap_mean({"a": [math.nan]})
+        mean_over_scenes({"a": [math.nan]})
 
 
-def test_bootstrap_sees_what_seeds_share():
-    # two trainings, one 1 mm off in every scene: no number of scenes tells which is usual
-    seeds = {str(i): [[0.0] * 16, [1.0] * 16] for i in range(50)}
-    one = {str(i): [0.5] * 16 for i in range(50)}
-    assert bootstrap_mean(one) == (0.5, 0.5, 0.5)
-    assert bootstrap_mean(seeds) == (0.5, 0.0, 1.0)
+def test_intervals_see_what_seeds_share():
+    # three trainings, 1 mm apart in every scene: no number of scenes tells which is usual
+    seeds = {str(i): [[0.0] * 16, [1.0] * 16, [2.0] * 16] for i in range(50)}
+    assert mean_over_scenes({str(i): [0.5] * 16 for i in range(50)}) == (0.5, 0.5, 0.5)
+    assert mean_over_scenes(seeds) == pytest.approx((1, 1 - 4.303 / 3**0.5, 1 + 4.303 / 3**0.5), abs=1e-3)
     with pytest.raises(InputError, match="different numbers of seeds"):
-        bootstrap_mean({"a": [[1.0], [2.0]], "b": [[1.0]]})
+        mean_over_scenes({"a": [[1.0], [2.0]], "b": [[1.0]]})
+
+
+@pytest.mark.parametrize("seeds", [2, 3, 5])
+def test_intervals_over_scenes_and_seeds_cover_the_mean(seeds):
+    """Scenes, trainings, and what they have together: the interval covers as often as it says, or a little more."""
+    rng, trials, covered = np.random.default_rng(seeds), 1000, 0
+    for _ in range(trials):
+        values = rng.normal(0, 1, (8, 1)) + rng.normal(0, 0.5, (1, seeds)) + rng.normal(0, 0.3, (8, seeds))
+        interval = mean_over_scenes({str(i): v[:, None] for i, v in enumerate(values)})
+        covered += interval.low <= 0 <= interval.high
+    assert 0.95 - 4 * (0.95 * 0.05 / trials) ** 0.5 < covered / trials < 0.995
 
 
 def test_paired_differences_cancel_what_scenes_share():

@@ -114,7 +114,7 @@ def compared_rows(
     name: str, peers: Mapping[str, str], values: Mapping[str, Mapping[str, np.ndarray]]
 ) -> list[JsonObject]:
     """Return a row a model on the chip, beside its float peer: MAE of both, and the paired difference as a fraction of
-    the peer's, with its 95 % interval (bootstrap over scenes and levels). `holds` where no more than WITHIN is lost."""
+    the peer's, with its 95 % interval (over scenes). `holds` where no more than WITHIN is lost."""
     rows = []
     for model, peer in peers.items():
         plain, chip = values[peer], values[f"{model}{_CHIP}"]

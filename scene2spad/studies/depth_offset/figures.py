@@ -117,7 +117,7 @@ def against_compression(
     for panel in axes[1]:
         panel.set_xlabel("compression ratio")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9)
-    figure.suptitle("Error against compression; bars: 95 % bootstrap intervals over scenes and seeds")
+    figure.suptitle("Error against compression; bars: 95 % intervals over scenes and seeds")
     return save(figure, path)
 
 
