@@ -9,8 +9,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from csph.weights.shipped import shipped_names
 from scene2spad.cli.main import COMMANDS as NAMES
 from scene2spad.cli.main import main
+from scenes.library.sets import scene_set
 from spad.sensor.files import read_sensor
 
 ROOT = Path(__file__).parents[1]
@@ -26,6 +28,15 @@ def _links(page: Path) -> list[str]:
 
 def test_the_front_page_is_one_page():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= WORDS
+
+
+def test_what_pages_count_is_what_there_is():
+    networks, scenes = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("networks.md", "scenes.md"))
+    assert re.search(r"(\d+) trained networks come with the package", networks)[1] == str(len(shipped_names()))
+    listed = dict(re.findall(r"^\| `([\w-]+)` \|.*\| (\d+) \|$", scenes, re.M))
+    assert {"tabletop", "hard-cases"} <= listed.keys()
+    for name, size in listed.items():
+        assert scene_set(name).size == int(size), name
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
