@@ -12,9 +12,15 @@ from scene2spad.plots.pixels import expected_name
 from scene2spad.viewer.content import METRES_PER_NS, NS_PER_M, Content, Cube, Layer, Returns, grey_layer
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.json_types import JsonObject
-from scenes.model import Camera
 from spad.detection.rates import Rates, rates_for
-from spad.formats.bistatic import baseline_of, time_tells_depth, true_arrival_s, true_path_m
+from spad.formats.bistatic import (
+    baseline_of,
+    pixel_directions,
+    pointing_of,
+    time_tells_depth,
+    true_arrival_s,
+    true_path_m,
+)
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 
@@ -47,7 +53,7 @@ def transient_content(transient: Transient, title: str) -> Content:
         (light_over_path(transient),),
         merged_returns(transient, 1.0, "1/(m² sr)"),
         true_path_m(transient) * NS_PER_M,
-        **surface(transient.depth_m, transient.meta.get("camera"), total),
+        **surface(transient.depth_m, transient.meta, total),
     )
 
 
@@ -74,8 +80,7 @@ def histogram_content(histogram: Histogram, title: str, transient: Transient | N
         expected = expected_cube(transient, sensor, rates)
         cubes.append(replace(cubes[0], name=expected_name(histogram), values=expected, drawn="line"))
         returns = merged_returns(transient, rates.signal_scale, "photons", period_ns=1e9 * sensor.period_s)
-    camera = histogram.meta.get("transient", {}).get("camera")
-    cloud = surface(histogram.depth_m, camera, counted)
+    cloud = surface(histogram.depth_m, pointing_of(histogram.meta), counted)
     arrival_ns, record_ns = 1e9 * true_arrival_s(histogram), 1e9 * sensor.bins * sensor.bin_width_s
     missed = int((arrival_ns >= record_ns).sum())
     if missed:
@@ -98,7 +103,7 @@ def depth_content(depth_m: np.ndarray, confidence: np.ndarray | None, meta: Json
     if confidence is not None:
         layers.append(Layer("confidence", "", confidence, "gray", 0.0, 1.0))
     facts = {"kind": "depth map", "method": str(meta.get("method", "")), "pixels": _size(depth_m)}
-    return Content(title, facts, tuple(layers), **surface(depth_m, meta.get("camera"), confidence))
+    return Content(title, facts, tuple(layers), **surface(depth_m, meta, confidence))
 
 
 def depth_layer(name: str, depth_m: np.ndarray) -> Layer:
@@ -108,26 +113,19 @@ def depth_layer(name: str, depth_m: np.ndarray) -> Layer:
     return Layer(name, "m", depth_m, "depth", limits["vmin"], limits["vmax"])
 
 
-def surface(depth_m: np.ndarray, camera: JsonObject | None, value: np.ndarray | None) -> JsonObject:
-    """Return points (N, 3) in the camera's frame and their brightness; nothing where the field of view is unknown."""
-    points = camera_points(depth_m, camera)
-    if points is None:
+def surface(depth_m: np.ndarray, pointing: JsonObject, value: np.ndarray | None) -> JsonObject:
+    """Return points (N, 3) in the camera's frame and their brightness; nothing where it is not known where the pixels
+    look (`spad.formats.bistatic.pixel_directions`)."""
+    directions = pixel_directions(pointing, depth_m.shape)
+    if directions is None:
         return {}
     known = np.isfinite(depth_m)
+    points = (directions * depth_m[..., None])[known].astype(np.float32)
     if value is None:
-        return {"points": points[known].astype(np.float32)}
+        return {"points": points}
     seen = value[known].astype(float)
     top = float(np.quantile(seen, 0.98)) if seen.size else 1.0
-    return {"points": points[known].astype(np.float32), "point_value": np.clip(seen / (top or 1.0), 0, 1)}
-
-
-def camera_points(depth_m: np.ndarray, camera: JsonObject | None) -> np.ndarray | None:
-    """Return points (H, W, 3) [m] of radial depths (H, W), x right, y down, z forward; None without a camera of this
-    size."""
-    height, width = depth_m.shape
-    if not camera or (camera.get("height"), camera.get("width")) != (height, width):
-        return None
-    return Camera(np.eye(4), float(camera["fov_deg"]), width, height).rays() * depth_m[..., None]
+    return {"points": points, "point_value": np.clip(seen / (top or 1.0), 0, 1)}
 
 
 def light_over_path(transient: Transient) -> Cube:

@@ -88,7 +88,7 @@ def _distance_m(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
     baseline = laser_baseline_m(histogram)
     if not any(baseline):
         return half_path_m
-    directions = _directions(histogram.meta, histogram.depth_m.shape)
+    directions = pixel_directions(pointing_of(histogram.meta), histogram.depth_m.shape)
     if directions is None:
         rows, columns = histogram.depth_m.shape
         raise InputError(
@@ -105,7 +105,7 @@ def true_path_m(seen: Transient | Histogram) -> np.ndarray:
     baseline = baseline_of(meta.get("transient", {}))
     if not any(baseline):
         return 2.0 * seen.depth_m.astype(np.float64)
-    directions = _directions(meta, seen.depth_m.shape)
+    directions = pixel_directions(pointing_of(meta), seen.depth_m.shape)
     if directions is None:
         return np.full(seen.depth_m.shape, np.nan)
     return optical_path_m(seen.depth_m, directions, baseline)
@@ -158,15 +158,25 @@ def recorded_range_m(histogram: Histogram) -> np.ndarray:
     return np.nan_to_num(_distance_m(histogram, end_m))
 
 
-def _directions(meta: JsonObject, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Return unit rays (H, W, 3) of a histogram's pixels, or of its zones' centres, in the camera's frame; None where
-    the camera's image is of another size."""
+def pointing_of(meta: JsonObject) -> JsonObject:
+    """Return what tells where a histogram's pixels look, by its metadata: the centres of its zones, or its camera."""
     if "zones" in meta:
-        x, y = (np.asarray(meta["zones"][name], dtype=np.float64) for name in ("centre_x", "centre_y"))
+        return {"zones": {name: meta["zones"][name] for name in ("centre_x", "centre_y")}}
+    camera = meta.get("transient", {}).get("camera")
+    return {"camera": camera} if camera else {}
+
+
+def pixel_directions(pointing: JsonObject, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Return unit rays (H, W, 3) of pixels, x right, y down, z forward; None where the camera's image is of another
+    size, or none is known.
+
+    pointing: `camera` of a transient, or `zones` with their centres, (H, W) tangents.
+    """
+    if "zones" in pointing:
+        x, y = (np.asarray(pointing["zones"][name], dtype=np.float64) for name in ("centre_x", "centre_y"))
         ray = np.stack((x, y, np.ones_like(x)), axis=-1)
-        return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    camera = meta["transient"].get("camera")
-    if camera is None or (camera.get("height"), camera.get("width")) != shape:
+        return ray / np.linalg.norm(ray, axis=-1, keepdims=True) if x.shape == shape else None
+    camera = pointing.get("camera")
+    if not camera or (camera.get("height"), camera.get("width")) != shape:
         return None
-    known = Camera(**camera)
-    return known.rays() @ known.rotation
+    return Camera(np.eye(4), float(camera["fov_deg"]), camera["width"], camera["height"]).rays()

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from render.transient import write_transient
 from scene2spad.cli import main
@@ -66,8 +67,14 @@ def test_sense_takes_the_calibrated_sensor(calibrated, capfd, tmp_path, monkeypa
     assert line in capfd.readouterr().err
     assert main(["depth", "plane.h5", "--method", "coates"]) == 2
     assert "depth method coates: undoes the pile-up of a pixel's detector" in capfd.readouterr().err
-    assert main(["export", "plane.h5", "--out", "plane.ply"]) == 2
-    assert "its 3 x 3 depths are not pixels of its camera's image of 28 x 28" in capfd.readouterr().err
+    assert main(["depth", "plane.h5", "--out", "d.exr", "--no-figure"]) == 0
+    for name in ("plane.h5", "d.exr"):
+        assert main(["export", name, "--out", "plane.ply"]) == 0
+        points = trimesh.load("plane.ply").vertices
+        assert points[:, 2] == pytest.approx(np.full(9, 0.25), abs=2e-3 if name == "plane.h5" else 0.02)
+        # zones look where they look: rows from the top, columns from the left
+        assert (np.diff(points[:3, 0]) > 0.03).all() and points[0, 1] < -0.03 < 0.03 < points[8, 1]
+    capfd.readouterr()
     assert main([*options, "--radiometric"]) == 2
     assert "--radiometric does not go with a sensor of zones" in capfd.readouterr().err
 

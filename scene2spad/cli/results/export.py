@@ -116,13 +116,15 @@ def _dense(command: Export, kind: str) -> dict[str, np.ndarray]:
 
 def _points(command: Export, kind: str) -> int:
     """Write the cloud, and return how many points it has."""
-    from scene2spad.viewer.sources import camera_points
+    from spad.formats.bistatic import pixel_directions
     from spad.formats.ply import write_ply
 
-    depth_m, intensity, confidence, camera = _depth_of(command, kind)
-    points = camera_points(depth_m, camera)
-    if points is None:
-        raise InputError(f"{command.file}: {_why_no_points(depth_m, camera)}, so there are no points")
+    depth_m, intensity, confidence, pointing = _depth_of(command, kind)
+    directions = pixel_directions(pointing, depth_m.shape)
+    if directions is None:
+        why = _why_no_points(depth_m, pointing.get("camera"))
+        raise InputError(f"{command.file}: {why}, so there are no points")
+    points = directions * depth_m[..., None]
     known = np.isfinite(depth_m)
     top = float(np.quantile(intensity[known], 0.995)) if known.any() else 1.0
     fraction = np.clip(intensity[known] / (top or 1.0), 0, 1)
@@ -135,11 +137,11 @@ def _why_no_points(depth_m: np.ndarray, camera: JsonObject | None) -> str:
         return "does not say which camera it was seen with"
     rows, columns = depth_m.shape
     image = f"{camera.get('height')} x {camera.get('width')}"
-    return f"its {rows} x {columns} depths are not pixels of its camera's image of {image}, as those of zones are not"
+    return f"its {rows} x {columns} depths are not pixels of its camera's image of {image}"
 
 
-def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, JsonObject | None]:
-    """Return depth, intensity and confidence (H, W), and the camera."""
+def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, JsonObject]:
+    """Return depth, intensity and confidence (H, W), and what tells where the pixels look."""
     if kind == "depth":
         found = open_depth(command.file)
         sure = np.ones_like(found.depth_m) if found.confidence is None else found.confidence
@@ -147,12 +149,13 @@ def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.nd
         if command.intensity is not None:
             bright = open_histogram(command.intensity).counts.sum(axis=2, dtype=np.int64).astype(np.float32)
             require(bright.shape == found.depth_m.shape, f"{command.intensity}: is of another size than {command.file}")
-        return found.depth_m, bright, sure, found.meta.get("camera")
+        return found.depth_m, bright, sure, found.meta
     if kind == "histogram":
+        from spad.formats.bistatic import pointing_of
+
         histogram = open_histogram(command.file, command.frame)
         bright = histogram.counts.sum(axis=2, dtype=np.int64).astype(np.float32)
-        camera = histogram.meta.get("transient", {}).get("camera")
-        return histogram.depth_m, bright, np.ones_like(histogram.depth_m), camera
+        return histogram.depth_m, bright, np.ones_like(histogram.depth_m), pointing_of(histogram.meta)
     transient = open_transient(command.file, kind, command.view)
     bright = transient.total_radiance().astype(np.float32)
-    return transient.depth_m, bright, np.ones_like(bright), transient.meta.get("camera")
+    return transient.depth_m, bright, np.ones_like(bright), transient.meta

@@ -173,6 +173,7 @@ def _mean(values: Sequence[float] | np.ndarray) -> float:
 def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram, source: Path, out: Path) -> dict:
     """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
     from spad.estimators.depth import confidence_map, histogram_errors
+    from spad.formats.bistatic import pointing_of
 
     label = depth_label(command)
     start = time.perf_counter()
@@ -193,8 +194,7 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
     if source.suffix.lower() != ".mat":  # of whose pixels nobody knows which are mixed
         unmixed["unmixed"] = histogram_errors(depth, histogram, exclude=histogram.mixed)
     meta = {"method": label, "histogram_sha256": histogram.sha256()}
-    camera = histogram.meta.get("transient", {}).get("camera")
-    write_depth(depth, out, meta | ({"camera": camera} if camera else {}), sure)
+    write_depth(depth, out, meta | pointing_of(histogram.meta), sure)
     result = {
         "seconds": seconds,
         "method": label,
