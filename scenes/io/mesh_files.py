@@ -14,7 +14,10 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, read_bytes
-from scenes.io.mesh_declarations import check_glb, check_ply, check_stl, plain_obj, with_bare_materials
+from scenes.io.mesh_formats.glb import check_glb, with_bare_materials
+from scenes.io.mesh_formats.obj import plain_obj
+from scenes.io.mesh_formats.ply import check_ply
+from scenes.io.mesh_formats.stl import check_stl
 from scenes.io.textures import luminance, srgb_to_linear
 
 if TYPE_CHECKING:

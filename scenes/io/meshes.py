@@ -7,35 +7,28 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scenes.arrays import check_faces
-from scenes.errors import InputError, require
+from scenes.errors import InputError
+from scenes.io.mesh_colours import Paint, Part
 from scenes.io.mesh_files import (
     MAX_COORDINATE,
-    MaterialEntry,
     check_vertices,
     load_trimesh,
-    ply_texture,
-    read_material_library,
 )
-from scenes.io.textures import MAX_PIXELS, load_texture, luminance, opened_image, srgb_to_linear
 from scenes.library.things import shapes
-from scenes.model import Camera, Material, Scene, Surface, Texture
+from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing
 
 if TYPE_CHECKING:
     import trimesh
-    from PIL import Image
-    from trimesh.visual.base import Visuals
 
 EXTENSIONS = (".obj", ".ply", ".stl", ".glb")
-DEFAULT_ALBEDO = 0.6
 BACKDROP_ALBEDO = 0.55
 SENSIBLE_EXTENT_M = (0.2, 2.5)  # a model whose largest extent lies in here is taken to be in metres already
 UNITS_M = {"mm": 1e-3, "millimet": 1e-3, "cm": 1e-2, "centimet": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
@@ -52,19 +45,6 @@ TURNS = {
     "z": np.array(((1.0, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))),
 }
 ZERO_AREA = 1e-12  # a face with a smaller area than this, for a model of unit extent, is degenerate
-
-
-@dataclass(frozen=True)
-class _Part:
-    """One geometry of the file in the world of the file: triangles still as the loader left them."""
-
-    name: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray | None
-    normals: np.ndarray | None
-    visual: Visuals
-    colours: np.ndarray | None = None  # per vertex, beside a material
 
 
 def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placing = AS_IT_IS) -> Scene:
@@ -88,7 +68,7 @@ def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placin
     camera = placing.camera(_camera(centre, radius, width, height), centre)
     wall_z = low[2] - WALL_GAP_M
     around = [] if placing.bare else _around(path, camera, wall_z)
-    paint = _Paint(path, notes)
+    paint = Paint(path, notes)
     surfaces = [_surface(part, paint) for part in parts]
     return Scene(path.stem, (*surfaces, *around), camera, notes=tuple(notes))
 
@@ -145,7 +125,7 @@ def backdrop(camera: Camera, wall_z: float, least_m: float = 4.0) -> list[Surfac
 # --- Reading -----------------------------------------------------------------------------------------------------
 
 
-def _read(path: Path) -> list[_Part]:
+def _read(path: Path) -> list[Part]:
     """Read the file's triangle meshes, each moved by its node's transform, or an InputError in one line."""
     kind = path.suffix.lower()
     if kind not in EXTENSIONS:
@@ -167,7 +147,7 @@ def _read(path: Path) -> list[_Part]:
     return [replace(parts[0], name=path.stem)] if len(parts) == 1 else parts
 
 
-def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> _Part | None:
+def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
     """One mesh in world coordinates; None for points, lines and meshes without faces."""
     faces = np.asarray(getattr(mesh, "faces", ()))
     if faces.size == 0:
@@ -189,7 +169,7 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> _Part | None:
         faces = faces[:, ::-1]  # a mirrored mesh would have its faces inside out
     beside = mesh.visual if "color" in getattr(mesh.visual, "vertex_attributes", {}) else mesh
     colours = beside.vertex_attributes.get("color")
-    return _Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual, colours)
+    return Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual, colours)
 
 
 def _check_pose(pose: np.ndarray, name: str) -> None:
@@ -204,7 +184,7 @@ def _check_pose(pose: np.ndarray, name: str) -> None:
 # --- Standing upright, at a sensible size, with sound faces ----------------------------------------------------------
 
 
-def _stand(path: Path, parts: list[_Part], notes: list[str], placing: Placing) -> list[_Part]:
+def _stand(path: Path, parts: list[Part], notes: list[str], placing: Placing) -> list[Part]:
     """Return the parts y up, in metres, without useless faces, resting on y = 0 with their middle at x = z = 0."""
     up = placing.up or ("z" if path.suffix.lower() == ".stl" else "y")
     turn = TURNS[up]
@@ -257,12 +237,12 @@ def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
     return 1.0 / extent, [f"warning: no unit makes a sensible size of it, so its size is made up{kept}"]
 
 
-def _moved(part: _Part, pose: np.ndarray) -> _Part:
+def _moved(part: Part, pose: np.ndarray) -> Part:
     normals = None if part.normals is None else shapes.transform_normals(part.normals, pose)
     return replace(part, vertices=shapes.transform(part.vertices, pose), normals=normals)
 
 
-def _sound(part: _Part, notes: list[str]) -> _Part | None:
+def _sound(part: Part, notes: list[str]) -> Part | None:
     """Drop faces of no area, doubled faces and vertices that no face uses; None when nothing is left."""
     a, b, c = part.vertices[part.faces].transpose(1, 0, 2)
     flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 <= ZERO_AREA
@@ -285,103 +265,5 @@ def _sound(part: _Part, notes: list[str]) -> _Part | None:
     return replace(part, vertices=part.vertices[used], faces=faces.reshape(-1, 3), uv=uv, normals=normals)
 
 
-def _surface(part: _Part, paint: _Paint) -> Surface:
+def _surface(part: Part, paint: Paint) -> Surface:
     return Surface(part.vertices, part.faces, paint.material(part), uv=part.uv, normals=part.normals, name=part.name)
-
-
-# --- Colours ---------------------------------------------------------------------------------------------------------
-
-
-class _Paint:
-    """The materials of a file: equal colours share one Material, equal images one Texture."""
-
-    def __init__(self, path: Path, notes: list[str]) -> None:
-        self.path, self.notes = path, notes
-        self.library = read_material_library(path, notes) if path.suffix.lower() == ".obj" else {}
-        self.made: dict[object, Material] = {}
-
-    def material(self, part: _Part) -> Material:
-        """Diffuse, with the part's texture or colour as albedo, 0.6 where the file says nothing."""
-        try:
-            key, make = self._albedo(part)
-            if key not in self.made:
-                self.made[key] = Material(albedo=make(), name=f"{part.name} paint")
-        except InputError:
-            raise
-        except Exception as error:  # an image that decodes only now may be broken in many ways
-            reason = (str(error).splitlines() or ["no reason given"])[0]
-            raise InputError(f"{self.path}: broken colours of {part.name} ({reason})") from None
-        return self.made[key]
-
-    def _albedo(self, part: _Part) -> tuple[object, Callable[[], float | Texture]]:
-        """Return a key that tells the part's albedo from others, and a function that makes the albedo."""
-        source = getattr(part.visual, "material", None)
-        kind = self.path.suffix.lower()
-        if source is None:
-            value = self._vertex_colour(part)
-        elif kind == ".obj":
-            entry = self.library.get(str(source.name), MaterialEntry())
-            if entry.cut_out:
-                self.notes.append(f"{part.name}: alpha (map_d) is left out, its surface is opaque")
-            if entry.image is not None and part.uv is not None:
-                return entry.image, lambda: load_texture(entry.image)
-            value = entry.colour
-        elif kind == ".ply":
-            file, mean = ply_texture(self.path), self._mean_colour(part)
-            if file is not None and part.uv is not None:
-                return file, lambda: _file_albedo(file)
-            value = None if mean is None else float(luminance(mean))
-        else:
-            image = getattr(source, "baseColorTexture", None) or getattr(source, "image", None)
-            factor, mean = getattr(source, "baseColorFactor", None), self._mean_colour(part)
-            tint = np.ones(4) if factor is None else np.asarray(factor) / 255
-            tint[:3] *= 1 if mean is None else mean
-            if getattr(source, "alphaMode", None) in ("MASK", "BLEND"):
-                self.notes.append(f"{part.name}: alpha is left out, its surface is opaque")
-            if image is not None and part.uv is not None:
-                pixels = image.width * image.height
-                message = f"{self.path}: the texture of {part.name} has {pixels} pixels, the limit is {MAX_PIXELS}"
-                require(pixels <= MAX_PIXELS, message)
-                return (id(image), tint.tobytes()), lambda: _image_albedo(image, tint)
-            # glTF's factor is linear already
-            value = None if factor is None and mean is None else float(luminance(tint))
-        if value is None:
-            value = DEFAULT_ALBEDO
-            self.notes.append(f"{part.name}: no colour in the file, albedo {value:g}")
-        value = round(min(max(float(value), 0.0), 1.0), 9)
-        return value, lambda: value
-
-    def _mean_colour(self, part: _Part) -> np.ndarray | None:
-        """Average the colours (3,), linear, that a part has per vertex beside its material; None where it has none."""
-        if part.colours is None:
-            return None
-        colours = part.colours[:, :3]
-        most = np.iinfo(colours.dtype).max if colours.dtype.kind in "iu" else 1
-        colours = np.clip(colours / most, 0, 1)
-        self.notes.append(f"{part.name}: one mean albedo in place of its colours per vertex")
-        return np.mean(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours), axis=0)
-
-    def _vertex_colour(self, part: _Part) -> float | None:
-        """Average the colours stored per vertex or face (linear in glTF, sRGB elsewhere); None where there are none."""
-        kind = getattr(part.visual, "kind", None)
-        if kind not in ("vertex", "face"):
-            return None
-        colours = np.asarray(part.visual.vertex_colors if kind == "vertex" else part.visual.face_colors)[:, :3] / 255
-        self.notes.append(f"{part.name}: one mean albedo in place of its colours per {kind}")
-        return float(luminance(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours)).mean())
-
-
-def _file_albedo(path: Path) -> Texture:
-    """Return the texture of an sRGB image in a file."""
-    with opened_image(path, "texture") as image:
-        return _image_albedo(image, np.ones(3))
-
-
-def _image_albedo(image: Image.Image, tint: np.ndarray) -> Texture:
-    """Return the texture of an sRGB image held in memory, times a linear colour."""
-    values = np.asarray(image.convert("RGB"))
-    made = np.empty(values.shape[:2], np.float32)
-    for row in range(0, len(values), 64):  # a few at a time: in double precision an image takes 100 bytes a pixel
-        pixels = srgb_to_linear(values[row : row + 64] / 255)
-        made[row : row + 64] = np.minimum(luminance(pixels * tint[:3]), 1.0)
-    return Texture(made, "base colour")

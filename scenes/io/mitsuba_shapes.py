@@ -12,10 +12,10 @@ from scenes.arrays import check_faces
 from scenes.errors import InputError
 from scenes.io.inputs import read_bytes
 from scenes.io.mesh_files import check_vertices, load_trimesh
+from scenes.io.mesh_formats.serialized import read_serialized
 from scenes.io.mitsuba_bsdf import Look, Materials
 from scenes.io.mitsuba_nodes import Document
 from scenes.io.mitsuba_plugin import Plugin
-from scenes.io.serialized import read_serialized
 from scenes.library.things import shapes
 from scenes.model import Surface
 

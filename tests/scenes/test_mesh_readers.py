@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from scenes import InputError, Scene, Surface
-from scenes.io import meshes
+from scenes.io import mesh_colours
 from scenes.io.meshes import load_mesh
 from scenes.io.textures import luminance, srgb_to_linear
 from scenes.placing import Placing
@@ -222,6 +222,6 @@ def test_a_textures_tint_is_that_of_its_vertices_and_alpha_is_noted(tmp_path: Pa
 
 
 def test_a_texture_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(meshes, "MAX_PIXELS", 63)
+    monkeypatch.setattr(mesh_colours, "MAX_PIXELS", 63)
     path = glb(tmp_path / "a.glb", {"POSITION": CORNERS, "TEXCOORD_0": UV}, TEXTURED)
     assert "has 64 pixels, the limit is 63" in refusal(path)

@@ -9,7 +9,7 @@ import pytest
 import xml_files
 
 from scenes.errors import InputError
-from scenes.io import serialized
+from scenes.io.mesh_formats import serialized
 
 POINTS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0.5), (0, 1, 0)], float)
 FACES = np.array([(0, 1, 2), (0, 2, 3)])

@@ -98,7 +98,7 @@ def write_serialized(path: Path) -> None:
 
 
 def read_serialized(path: Path) -> Numbers:
-    from scenes.io.serialized import read_serialized
+    from scenes.io.mesh_formats.serialized import read_serialized
 
     found = read_serialized(path)
     yield found.vertices, True

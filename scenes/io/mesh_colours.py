@@ -1,0 +1,129 @@
+"""Colours of mesh files as materials: every surface is diffuse, with the luminance of the file's colour as albedo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scenes.errors import InputError, require
+from scenes.io.mesh_files import MaterialEntry, ply_texture, read_material_library
+from scenes.io.textures import MAX_PIXELS, load_texture, luminance, opened_image, srgb_to_linear
+from scenes.model import Material, Texture
+
+if TYPE_CHECKING:
+    from PIL import Image
+    from trimesh.visual.base import Visuals
+
+DEFAULT_ALBEDO = 0.6
+
+
+@dataclass(frozen=True)
+class Part:
+    """One geometry of the file in the world of the file: triangles still as the loader left them."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray | None
+    normals: np.ndarray | None
+    visual: Visuals
+    colours: np.ndarray | None = None  # per vertex, beside a material
+
+
+class Paint:
+    """The materials of a file: equal colours share one Material, equal images one Texture."""
+
+    def __init__(self, path: Path, notes: list[str]) -> None:
+        self.path, self.notes = path, notes
+        self.library = read_material_library(path, notes) if path.suffix.lower() == ".obj" else {}
+        self.made: dict[object, Material] = {}
+
+    def material(self, part: Part) -> Material:
+        """Diffuse, with the part's texture or colour as albedo, 0.6 where the file says nothing."""
+        try:
+            key, make = self._albedo(part)
+            if key not in self.made:
+                self.made[key] = Material(albedo=make(), name=f"{part.name} paint")
+        except InputError:
+            raise
+        except Exception as error:  # an image that decodes only now may be broken in many ways
+            reason = (str(error).splitlines() or ["no reason given"])[0]
+            raise InputError(f"{self.path}: broken colours of {part.name} ({reason})") from None
+        return self.made[key]
+
+    def _albedo(self, part: Part) -> tuple[object, Callable[[], float | Texture]]:
+        """Return a key that tells the part's albedo from others, and a function that makes the albedo."""
+        source = getattr(part.visual, "material", None)
+        kind = self.path.suffix.lower()
+        if source is None:
+            value = self._vertex_colour(part)
+        elif kind == ".obj":
+            entry = self.library.get(str(source.name), MaterialEntry())
+            if entry.cut_out:
+                self.notes.append(f"{part.name}: alpha (map_d) is left out, its surface is opaque")
+            if entry.image is not None and part.uv is not None:
+                return entry.image, lambda: load_texture(entry.image)
+            value = entry.colour
+        elif kind == ".ply":
+            file, mean = ply_texture(self.path), self._mean_colour(part)
+            if file is not None and part.uv is not None:
+                return file, lambda: _file_albedo(file)
+            value = None if mean is None else float(luminance(mean))
+        else:
+            image = getattr(source, "baseColorTexture", None) or getattr(source, "image", None)
+            factor, mean = getattr(source, "baseColorFactor", None), self._mean_colour(part)
+            tint = np.ones(4) if factor is None else np.asarray(factor) / 255
+            tint[:3] *= 1 if mean is None else mean
+            if getattr(source, "alphaMode", None) in ("MASK", "BLEND"):
+                self.notes.append(f"{part.name}: alpha is left out, its surface is opaque")
+            if image is not None and part.uv is not None:
+                pixels = image.width * image.height
+                message = f"{self.path}: the texture of {part.name} has {pixels} pixels, the limit is {MAX_PIXELS}"
+                require(pixels <= MAX_PIXELS, message)
+                return (id(image), tint.tobytes()), lambda: _image_albedo(image, tint)
+            # glTF's factor is linear already
+            value = None if factor is None and mean is None else float(luminance(tint))
+        if value is None:
+            value = DEFAULT_ALBEDO
+            self.notes.append(f"{part.name}: no colour in the file, albedo {value:g}")
+        value = round(min(max(float(value), 0.0), 1.0), 9)
+        return value, lambda: value
+
+    def _mean_colour(self, part: Part) -> np.ndarray | None:
+        """Average the colours (3,), linear, that a part has per vertex beside its material; None where it has none."""
+        if part.colours is None:
+            return None
+        colours = part.colours[:, :3]
+        most = np.iinfo(colours.dtype).max if colours.dtype.kind in "iu" else 1
+        colours = np.clip(colours / most, 0, 1)
+        self.notes.append(f"{part.name}: one mean albedo in place of its colours per vertex")
+        return np.mean(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours), axis=0)
+
+    def _vertex_colour(self, part: Part) -> float | None:
+        """Average the colours stored per vertex or face (linear in glTF, sRGB elsewhere); None where there are none."""
+        kind = getattr(part.visual, "kind", None)
+        if kind not in ("vertex", "face"):
+            return None
+        colours = np.asarray(part.visual.vertex_colors if kind == "vertex" else part.visual.face_colors)[:, :3] / 255
+        self.notes.append(f"{part.name}: one mean albedo in place of its colours per {kind}")
+        return float(luminance(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours)).mean())
+
+
+def _file_albedo(path: Path) -> Texture:
+    """Return the texture of an sRGB image in a file."""
+    with opened_image(path, "texture") as image:
+        return _image_albedo(image, np.ones(3))
+
+
+def _image_albedo(image: Image.Image, tint: np.ndarray) -> Texture:
+    """Return the texture of an sRGB image held in memory, times a linear colour."""
+    values = np.asarray(image.convert("RGB"))
+    made = np.empty(values.shape[:2], np.float32)
+    for row in range(0, len(values), 64):  # a few at a time: in double precision an image takes 100 bytes a pixel
+        pixels = srgb_to_linear(values[row : row + 64] / 255)
+        made[row : row + 64] = np.minimum(luminance(pixels * tint[:3]), 1.0)
+    return Texture(made, "base colour")

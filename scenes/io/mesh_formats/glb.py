@@ -1,0 +1,170 @@
+"""Check a GLB: its JSON, its accessors and the images that it uses."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import warnings
+from collections.abc import Callable, Iterator
+
+from scenes.errors import InputError, require
+from scenes.io.inputs import parse_json
+from scenes.io.textures import check_checksums
+from scenes.json_types import JsonObject
+
+_GLB_INDICES = (
+    *("buffer", "bufferView", "camera", "indices", "material", "mesh", "node", "sampler", "scene", "skin", "source"),
+    *("index", "count", "byteLength", "byteOffset", "byteStride", "children", "nodes"),
+)
+
+_GLB_USHORT, _GLB_FLOAT = 5123, 5126  # component types
+
+ReadImage = Callable[[str], bytes]
+
+
+def check_glb(content: bytes, read: ReadImage) -> None:
+    """Raise InputError unless a GLB is whole, its indices and counts are possible, and the textures it uses are there.
+
+    `read` gives the bytes of a file that the GLB names.
+    """
+    header, binary = _glb_chunks(content)
+    _check_indices(header)
+    try:
+        _check_accessors(header, len(content))
+        for mesh in header.get("meshes", []):
+            for primitive in mesh["primitives"]:
+                _check_primitive(header, primitive)
+        for number in sorted(_used_images(header)):
+            _check_image(header, number, binary, read)
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"its JSON is damaged ({type(error).__name__}: {error})") from None
+
+
+def _glb_chunks(content: bytes) -> tuple[JsonObject, bytes]:
+    """Read the JSON object and the first binary chunk."""
+    require(len(content) >= 20 and content[:4] == b"glTF", "is no GLB")
+    version, length, size, kind = struct.unpack_from("<II I4s", content, 4)
+    require(version == 2, f"glTF of version {version}, expected 2")
+    require(length == len(content), f"cut short or damaged: its header says {length} bytes, it has {len(content)}")
+    require(kind == b"JSON" and 20 + size <= length, f"its JSON chunk of {size} bytes does not fit {length} bytes")
+    header = parse_json(content[20 : 20 + size])
+    if not isinstance(header, dict):
+        raise InputError("its JSON holds no object")
+    at = 20 + size
+    if at + 8 > length:
+        return header, b""
+    size, kind = struct.unpack_from("<I4s", content, at)
+    require(at + 8 + size <= length, f"its second chunk of {size} bytes does not fit {length} bytes")
+    return header, content[at + 8 : at + 8 + size] if kind == b"BIN\0" else b""
+
+
+def _check_indices(header: JsonObject) -> None:
+    """All indices and counts are whole numbers of 0 or more: Python counts negative ones from the end."""
+    for key, value in _entries(header):
+        if key in _GLB_INDICES:
+            for number in value if isinstance(value, list) else [value]:
+                bad = isinstance(number, (int, float)) and (isinstance(number, float) or number < 0)
+                require(not bad, f"its {key} is {number}, expected a whole number of 0 or more")
+
+
+def _entries(value: object) -> Iterator[tuple[str, object]]:
+    """Every key and value of nested objects but the user's own `extras` and extensions."""
+    pending = [value]
+    while pending:
+        one = pending.pop()
+        if isinstance(one, dict):
+            yield from one.items()
+            pending.extend(inner for key, inner in one.items() if key not in ("extras", "extensions"))
+        elif isinstance(one, list):
+            pending.extend(one)
+
+
+def _check_accessors(header: JsonObject, size: int) -> None:
+    """InputError where primitives read what has no data of its own, or accessors declare more than the file has."""
+    accessors = header.get("accessors", [])
+    primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"]]
+    used = [[*one["attributes"].values(), *([one["indices"]] if "indices" in one else [])] for one in primitives]
+    read = {number for numbers in used for number in numbers}
+    for number, accessor in enumerate(accessors):
+        held = "bufferView" in accessor and "sparse" not in accessor
+        message = f"accessor {number} is sparse or compressed, which is not read; export it uncompressed"
+        require(held or number not in read, message)
+        fits = held or accessor["count"] <= size
+        require(fits, f"accessor {number} declares {accessor['count']} elements in a file of {size} bytes")
+
+
+def _check_primitive(header: JsonObject, primitive: JsonObject) -> None:
+    """Raise InputError for shapes and coordinates that trimesh drops, or takes for others."""
+    require(primitive.get("mode", 4) != 6, "a mesh is a triangle fan, which is not read; export it as triangles")
+    attributes, accessors = primitive["attributes"], header.get("accessors", [])
+    whole = "POSITION" in attributes and accessors[attributes["POSITION"]].get("normalized", False)
+    require(not whole, "positions are normalized whole numbers, which are not read; export them as floats")
+    material = header["materials"][primitive["material"]] if "material" in primitive else {}
+    base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+    if base is None:
+        return
+    moved = base.get("extensions", {}).get("KHR_texture_transform", {})
+    still = [*moved.get("offset", (0, 0)), *moved.get("scale", (1, 1)), moved.get("rotation", 0)] == [0, 0, 1, 1, 0]
+    require(still, "a base colour has a KHR_texture_transform, which is not read; bake it into the coordinates")
+    chosen = moved.get("texCoord", base.get("texCoord", 0))
+    require(chosen == 0, f"a base colour uses TEXCOORD_{chosen}, TEXCOORD_0 alone is read; export it with one set")
+    floats = "TEXCOORD_0" not in attributes or accessors[attributes["TEXCOORD_0"]]["componentType"] == _GLB_FLOAT
+    require(floats, "texture coordinates are whole numbers, which are not read; export them as floats")
+
+
+def with_bare_materials(content: bytes) -> bytes:
+    """Return a GLB in which 16-bit vertex colours have a material: trimesh keeps such of these alone as they are."""
+    header, _ = _glb_chunks(content)
+    primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" not in one]
+    colours = [(one, one["attributes"].get("COLOR_0")) for one in primitives]
+    wide = [one for one, at in colours if at is not None and header["accessors"][at]["componentType"] == _GLB_USHORT]
+    if not wide:
+        return content
+    header["materials"] = [*header.get("materials", []), {}]
+    for one in wide:
+        one["material"] = len(header["materials"]) - 1
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + struct.unpack_from("<I", content, 12)[0] :]
+    return content[:8] + struct.pack("<II4s", 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+
+
+def _used_images(header: JsonObject) -> set[int]:
+    """Images of the base colours of materials that primitives use."""
+    materials, textures = header.get("materials", []), header.get("textures", [])
+    used = {one["material"] for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" in one}
+    found = set()
+    for number in used:
+        base = materials[number].get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        if base is not None:
+            texture = textures[base["index"]]
+            webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
+            found.add(webp.get("source", texture.get("source")))
+    require(None not in found, "a base colour's texture names no image")
+    return found
+
+
+def _check_image(header: JsonObject, number: int, binary: bytes, read: ReadImage) -> None:
+    """InputError where an image is not there, or none that Pillow knows."""
+    from PIL import Image
+
+    image = header["images"][number]
+    name = image.get("uri", image.get("name", f"image {number}"))
+    if "bufferView" in image:
+        view = header["bufferViews"][image["bufferView"]]
+        if view.get("buffer", 0) != 0 or "uri" in header["buffers"][0]:
+            return  # in a file beside; trimesh reads it
+        start = view.get("byteOffset", 0)
+        data = binary[start : start + view["byteLength"]]
+    elif name.startswith("data:"):
+        return  # decoded once, by trimesh
+    else:
+        data = read(image["uri"])
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as opened:
+            check_checksums(opened)
+    except Exception as error:  # each of Pillow's formats has its own
+        raise InputError(f"texture {name[:80]!r} is no image that can be read ({type(error).__name__})") from None

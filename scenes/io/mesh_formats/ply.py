@@ -1,0 +1,162 @@
+"""Check a PLY against its header."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from scenes.errors import InputError, require
+
+_PLY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float": "f4",
+    "double": "f8",
+    "float16": "f2",
+    "float32": "f4",
+    "float64": "f8",
+    "int64": "i8",
+    "uint64": "u8",
+}
+
+
+class _Property(NamedTuple):
+    type: str
+    count_type: str | None  # of a list
+
+
+class _Element(NamedTuple):
+    name: str
+    rows: int
+    properties: list[_Property]
+
+
+def check_ply(content: bytes) -> None:
+    """Raise InputError unless a PLY holds as many values as its header says, no more and no fewer, all of them
+    numbers."""
+    elements, order, start = _ply_header(content)
+    if order is None:
+        _check_ply_text(content[start:], elements)
+        return
+    for element in elements:
+        start = _end_of_binary(content, start, element, order)
+    require(start == len(content), f"{len(content) - start} bytes more than its header says")
+
+
+def _ply_header(content: bytes) -> tuple[list[_Element], str | None, int]:
+    """Elements, byte order (None: text), and where the data begins."""
+    end = re.search(rb"^[ \t]*end_header[ \t]*\r?\n?", content, re.MULTILINE)
+    if end is None:
+        raise InputError("its header has no end_header")
+    lines = [line.split() for line in content[: end.start()].decode("latin-1").splitlines()]
+    formats = [line[1] for line in lines if len(line) > 1 and line[0] == "format"]
+    orders = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+    message = f"format {' '.join(formats) or '(none)'}, expected {', '.join(orders)}"
+    require(len(formats) == 1 and formats[0] in orders, message)
+    elements: list[_Element] = []
+    for line in lines:
+        match line:
+            case ["element", name, count]:
+                require(count.isascii() and count.isdigit() and len(count) < 19, f"{count} elements {name!r}")
+                elements.append(_Element(name, int(count), []))
+            case ["property", "list", count_type, value_type, _] if elements:
+                known = count_type in _PLY_TYPES and value_type in _PLY_TYPES
+                require(known, f"property of unknown type: {' '.join(line)}")
+                elements[-1].properties.append(_Property(_PLY_TYPES[value_type], _PLY_TYPES[count_type]))
+            case ["property", value_type, _] if elements:
+                require(value_type in _PLY_TYPES, f"property of unknown type: {' '.join(line)}")
+                elements[-1].properties.append(_Property(_PLY_TYPES[value_type], None))
+            case ["element" | "property", *_]:
+                raise InputError(f"header line {' '.join(line)!r} is not understood")
+    return elements, orders[formats[0]], end.end()
+
+
+def _check_ply_text(body: bytes, elements: list[_Element]) -> None:
+    """One line an element, each with the numbers that its properties and its lists' lengths ask for."""
+    try:
+        lines = body.decode("utf-8").rstrip().splitlines()
+    except UnicodeDecodeError:
+        raise InputError("its data are no text") from None
+    expected = sum(element.rows for element in elements)
+    require(len(lines) == expected, f"cut short or damaged: {len(lines)} lines of data, its header says {expected}")
+    at = 0
+    for element in elements:
+        rows, at = lines[at : at + element.rows], at + element.rows
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy warns of what is no number, and ends there
+            values = np.fromstring(" ".join(rows), sep=" ")
+        end = _end_of_text(values, element)
+        message = f"cut short or damaged: {len(values)} numbers for {element.rows} elements {element.name!r}"
+        require(end == len(values), f"{message}, expected {end}")
+
+
+def _end_of_text(values: np.ndarray, element: _Element) -> int:
+    """Count the numbers of a text element by its properties and the lengths of its lists."""
+    if all(one.count_type is None for one in element.properties):
+        return element.rows * len(element.properties)
+    width, places = _text_row(values, 0, element)
+    end = element.rows * width
+    if end <= len(values):
+        rows = values[:end].reshape(element.rows, width)
+        if all((rows[:, place] == rows[0, place]).all() for place in places):
+            return end
+    end = 0
+    for _ in range(element.rows):
+        end += _text_row(values, end, element)[0]
+    return end
+
+
+def _text_row(values: np.ndarray, start: int, element: _Element) -> tuple[int, list[int]]:
+    """Numbers in the row that begins at `start`, and where in it the lengths of lists stand."""
+    width, places = 0, []
+    for one in element.properties:
+        if one.count_type is not None and start + width < len(values):
+            length = values[start + width]
+            require(0 <= length <= len(values) and length == int(length), f"a list of {length:g} values")
+            places.append(width)
+            width += int(length)
+        width += 1
+    return width, places
+
+
+def _end_of_binary(content: bytes, start: int, element: _Element, order: str) -> int:
+    """Find where the rows of a binary element end. InputError for rows that are not all there, or lists of different
+    lengths."""
+    if element.rows == 0:
+        return start
+    fields: list[tuple[Any, ...]] = []
+    size = 0
+    for number, one in enumerate(element.properties):
+        length: tuple[int, ...] = ()
+        if one.count_type is not None:
+            kind = np.dtype(order + one.count_type)
+            first = content[start + size : start + size + kind.itemsize]
+            require(len(first) == kind.itemsize, "cut short: ends within its data")
+            length = (int(np.frombuffer(first, kind)[0]),)
+            require(0 <= length[0] <= len(content), f"a list of {length[0]} values")
+            fields.append((f"count{number}", kind))
+            size += kind.itemsize
+        fields.append((f"value{number}", order + one.type, length))
+        size += np.dtype(one.type).itemsize * (length[0] if length else 1)
+    end = start + element.rows * size
+    message = f"cut short or damaged: {element.rows} elements {element.name!r} take {end - start} bytes"
+    require(end <= len(content), f"{message}, {len(content) - start} are there")
+    if any(one.count_type for one in element.properties):
+        rows = np.frombuffer(content, np.dtype(fields), element.rows, start)
+        lists = [rows[name] for name, *_ in fields if name.startswith("count")]
+        even = all((counts == counts[0]).all() for counts in lists)
+        require(even, f"elements {element.name!r} have lists of different lengths, which is read from text alone")
+    return end

@@ -1,0 +1,128 @@
+"""Mitsuba's texture plugins as textures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scenes.errors import InputError
+from scenes.io.mitsuba_nodes import Document
+from scenes.io.mitsuba_plugin import Plugin
+from scenes.io.textures import load_texture, with_sharp_texels
+from scenes.model import Texture
+
+CHECKERBOARD_PIXELS = 256
+_UNREAD = Texture(np.full((1, 1), 0.5), "unread")
+
+
+class Uv:
+    """The one texture transform that all textures of a material must share, since a mesh has one set of uv."""
+
+    def __init__(self) -> None:
+        self.matrix: np.ndarray | None = None
+
+    def agree(self, plugin: Plugin, matrix: np.ndarray) -> None:
+        if self.matrix is not None and not np.allclose(self.matrix, matrix):
+            raise plugin.fail("two textures of one material have different to_uv, expected the same")
+        self.matrix = matrix
+
+
+class Textures:
+    """Reads every image once.
+
+    With `reads_images` false every image is one grey pixel: what cannot be taken then shows before images are read.
+    """
+
+    def __init__(self, document: Document, *, reads_images: bool = True) -> None:
+        self._document = document
+        self._reads_images = reads_images
+        self._images: dict[tuple[Path, bool, str], Texture] = {}
+        self._sharp: dict[int, Texture] = {}  # by the id of the image that is enlarged
+
+    def fraction(
+        self, plugin: Plugin, name: str, default: float, uv: Uv, *, channel: str = "luminance"
+    ) -> float | Texture:
+        """Return a reflectance or opacity: a number or a texture, clipped at 1 with a note."""
+        nested = plugin.nested_as(name)
+        if nested is None:
+            return clipped(plugin, name, plugin.colour(name, default))
+        texture, matrix = self.texture(nested, channel)
+        uv.agree(plugin, matrix)
+        if texture.image.max() > 1:
+            plugin.note(f"{name} over 1 is clipped to 1")
+            texture = Texture(np.minimum(texture.image, 1), texture.name)
+        return texture
+
+    def mean(self, plugin: Plugin, name: str, default: float) -> float:
+        """Return a number, or the mean of a texture where the model has no room for one."""
+        nested = plugin.nested_as(name)
+        if nested is None:
+            return plugin.colour(name, default)
+        plugin.note(f"{name} has a texture, its mean is used")
+        return float(self.texture(nested)[0].image.mean(dtype=np.float64))
+
+    def texture(self, plugin: Plugin, channel: str = "luminance") -> tuple[Texture, np.ndarray]:
+        """Return a texture and its uv transform (3x3, Mitsuba's v)."""
+        if plugin.tag != "texture":
+            raise plugin.fail("expected a texture here")
+        if plugin.type == "bitmap":
+            texture = self._bitmap(plugin, channel)
+        elif plugin.type == "checkerboard":
+            texture = _checkerboard(plugin)
+        else:
+            raise plugin.fail(f"texture {plugin.type!r} is not supported, bake it into a bitmap or checkerboard")
+        matrix = plugin.texture_transform()
+        plugin.note_unused()
+        return texture, matrix
+
+    def _bitmap(self, plugin: Plugin, channel: str) -> Texture:
+        plugin.ignore(("max_anisotropy", "cache", "format"))
+        wrap = plugin.string("wrap_mode", "repeat")
+        if wrap != "repeat":
+            plugin.note(f"wrap_mode {wrap} is taken as repeat")
+        chosen = plugin.string("channel", "all")
+        if chosen == "a":
+            channel = "alpha"
+        elif chosen != "all":
+            plugin.note(f"channel {chosen} of the image is taken as its luminance")
+        # An opacity is a share, never light: its numbers are linear whatever the file says.
+        linear = plugin.boolean("raw", False) or plugin.number("gamma", 0.0) == 1 or channel == "alpha"
+        path = self._document.file(plugin.element, plugin.string("filename"), "texture")
+        read = self.image(path, linear, channel)
+        if plugin.string("filter_type", "bilinear") == "nearest" and self._reads_images:
+            return self._with_sharp_texels(plugin, read)
+        return read
+
+    def _with_sharp_texels(self, plugin: Plugin, read: Texture) -> Texture:
+        """Return a texture that is looked up by the nearest texel: each one enlarged, as lookup is bilinear here."""
+        if id(read) not in self._sharp:
+            self._sharp[id(read)] = with_sharp_texels(read)
+        if self._sharp[id(read)] is read and read.image.size > 1:
+            plugin.note("filter_type nearest is taken as bilinear, as the image is large")
+        return self._sharp[id(read)]
+
+    def image(self, path: Path, linear: bool, channel: str) -> Texture:
+        """Return a texture file, read once."""
+        key = (path.resolve(), linear, channel)
+        if key not in self._images:
+            read = load_texture(path, linear=linear, channel=channel) if self._reads_images else _UNREAD
+            self._images[key] = read
+        return self._images[key]
+
+
+def clipped(plugin: Plugin, name: str, value: float) -> float:
+    """Return a share, 1 at most, with a note where that changes it."""
+    if value > 1 + 1e-9:
+        plugin.note(f"{name} over 1 is clipped to 1")
+    return min(value, 1.0)
+
+
+def _checkerboard(plugin: Plugin) -> Texture:
+    """Two by two squares over the unit square, color0 at the origin."""
+    dark, light = plugin.colour("color0", 0.4), plugin.colour("color1", 0.2)
+    half = np.ones((CHECKERBOARD_PIXELS // 2, CHECKERBOARD_PIXELS // 2))
+    try:
+        return Texture(np.kron([(dark, light), (light, dark)], half), "checkerboard")
+    except InputError as error:
+        raise plugin.fail(str(error)) from None
