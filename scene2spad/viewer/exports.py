@@ -6,6 +6,7 @@ from pathlib import Path
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
+from scenes.io.mesh_declarations import check_ply
 
 from scene2spad.viewer.content import Content, Cube, Layer, grey_layer
 from scene2spad.viewer.sources import depth_layer
@@ -13,7 +14,6 @@ from scenes.errors import InputError, require
 from scenes.files import read_arrays
 from scenes.io.hdf5 import open_checked, read_dataset
 from scenes.io.inputs import read_bytes
-from scenes.io.mesh_declarations import check_ply
 
 MAPS = {"expected_signal": "photons", "expected_background": "photons", "albedo": ""}
 COLUMNS = [(name, "<f4") for name in ("x", "y", "z", "intensity", "confidence")]

@@ -41,14 +41,15 @@ class Materials(Textures):
     def __init__(self, document: Document, *, reads_images: bool = True) -> None:
         super().__init__(document, reads_images=reads_images)
         self._looks: dict[Plugin, Look] = {}
-        self._default = Look(Material("diffuse", albedo=0.5, name="default"))
+        # a lamp without a bsdf is black in Mitsuba
+        self._defaults = {albedo: Look(Material("diffuse", albedo=albedo, name="default")) for albedo in (0.5, 0.0)}
 
     def of_shape(self, shape: Plugin) -> Look:
-        """Return the look of a shape; without a bsdf it is diffuse grey as in Mitsuba."""
+        """Return the look of a shape; without a bsdf it is diffuse grey as in Mitsuba, and black where it is a lamp."""
         bsdfs = shape.nested("bsdf")
         if len(bsdfs) > 1:
             raise shape.fail(f"has {len(bsdfs)} bsdfs, expected one")
-        return self.look(bsdfs[0]) if bsdfs else self._default
+        return self.look(bsdfs[0]) if bsdfs else self._defaults[0.0 if shape.nested("emitter") else 0.5]
 
     def look(self, plugin: Plugin) -> Look:
         if plugin not in self._looks:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from xml_files import OBJ, PLY, first_hit, image, load, meshes, refusal, texel, write
+from xml_files import GREY, LUMINANCE, OBJ, PLY, first_hit, image, load, meshes, refusal, texel, write
 
 from scenes.io.mitsuba_xml import load_mitsuba_xml
 from scenes.library.things import shapes
@@ -177,3 +177,14 @@ def test_sphere_area_is_within_its_stated_share() -> None:
     # A half-lit sphere: the projected area decides the energy that comes back.
     shadow = np.cross(b - a, c - a)[:, 2]
     assert 1 - shadow[shadow > 0].sum() / 2 / (4 * math.pi) < 1e-3
+
+
+def test_a_lamp_without_a_bsdf_is_black_as_in_mitsuba(tmp_path: Path, mitsuba: object) -> None:
+    """Its light is its own; with a bsdf it reflects as that says, and a shape that is no lamp is grey."""
+    lamp = '<emitter type="area"/>'
+    for inside, albedo in ((lamp, 0.0), ("", 0.5), (f'<bsdf type="diffuse">{GREY}</bsdf>{lamp}', LUMINANCE)):
+        path = write(tmp_path, f'<shape type="rectangle">{inside}</shape>')
+        (surface,) = load_mitsuba_xml(path).surfaces
+        assert surface.material.albedo == pytest.approx(albedo)
+        ((*_, seen, _),) = mitsuba(path, rays=[((0, 0, 3), (0, 0, -1))])["hits"]
+        assert np.dot(seen, (0.2126, 0.7152, 0.0722)) == pytest.approx(albedo, abs=1e-3)
