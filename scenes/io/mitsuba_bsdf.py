@@ -81,7 +81,11 @@ class Materials(Textures):
             elif plugin.type == "mask":
                 if opacity is not None:
                     raise plugin.fail("a mask inside a mask, expected one")
-                opacity = self.fraction(plugin, "opacity", 0.5, uv, channel="alpha")
+                opacity = self.fraction(plugin, "opacity", 0.5, uv)
+                if not isinstance(opacity, Texture) and 0 < opacity < 1:
+                    plugin.note(
+                        f"opacity {opacity:g} is taken as {int(opacity >= 0.5)}, no surface lets part of light by"
+                    )
                 plugin.note_unused()
             elif plugin.type != "twosided":
                 return plugin, opacity

@@ -102,18 +102,19 @@ class Document:
                 self._keep(element)
 
     def _fill_in(self, element: ElementTree.Element) -> None:
-        """Replace `$name` in all attributes of one element."""
+        """Replace `$name` in all attributes of one element: the longest known name that the text begins with."""
+        known = "|".join(re.escape(name) for name in sorted(self._defaults, key=len, reverse=True) if name) or "(?!)"
 
         def value(match: re.Match[str]) -> str:
-            if match[1] not in self._defaults:
+            if match[1] is None:
                 raise self.error(
-                    element, f'${match[1]} has no value, expected <default name="{match[1]}" value="..."/>'
+                    element, f'${match[2]} has no value, expected <default name="{match[2]}" value="..."/>'
                 )
             return self._defaults[match[1]]
 
         for key, text in element.items():
             if "$" in text:
-                filled = re.sub(r"\$(\w+)", value, text)
+                filled = re.sub(rf"\$(?:({known})|(\w+))", value, text)
                 if len(filled) > MAX_VALUE:
                     raise self.error(element, f"{key} grows over {MAX_VALUE} characters by its $names")
                 element.set(key, filled)

@@ -40,14 +40,12 @@ class Textures:
         self._images: dict[tuple[Path, bool, str], Texture] = {}
         self._sharp: dict[int, Texture] = {}  # by the id of the image that is enlarged
 
-    def fraction(
-        self, plugin: Plugin, name: str, default: float, uv: Uv, *, channel: str = "luminance"
-    ) -> float | Texture:
+    def fraction(self, plugin: Plugin, name: str, default: float, uv: Uv) -> float | Texture:
         """Return a reflectance or opacity: a number or a texture, clipped at 1 with a note."""
         nested = plugin.nested_as(name)
         if nested is None:
             return clipped(plugin, name, plugin.colour(name, default))
-        texture, matrix = self.texture(nested, channel)
+        texture, matrix = self.texture(nested)
         uv.agree(plugin, matrix)
         if texture.image.max() > 1:
             plugin.note(f"{name} over 1 is clipped to 1")
@@ -62,12 +60,12 @@ class Textures:
         plugin.note(f"{name} has a texture, its mean is used")
         return float(self.texture(nested)[0].image.mean(dtype=np.float64))
 
-    def texture(self, plugin: Plugin, channel: str = "luminance") -> tuple[Texture, np.ndarray]:
+    def texture(self, plugin: Plugin) -> tuple[Texture, np.ndarray]:
         """Return a texture and its uv transform (3x3, Mitsuba's v)."""
         if plugin.tag != "texture":
             raise plugin.fail("expected a texture here")
         if plugin.type == "bitmap":
-            texture = self._bitmap(plugin, channel)
+            texture = self._bitmap(plugin)
         elif plugin.type == "checkerboard":
             texture = _checkerboard(plugin)
         else:
@@ -76,18 +74,17 @@ class Textures:
         plugin.note_unused()
         return texture, matrix
 
-    def _bitmap(self, plugin: Plugin, channel: str) -> Texture:
+    def _bitmap(self, plugin: Plugin) -> Texture:
         plugin.ignore(("max_anisotropy", "cache", "format"))
         wrap = plugin.string("wrap_mode", "repeat")
         if wrap != "repeat":
             plugin.note(f"wrap_mode {wrap} is taken as repeat")
-        chosen = plugin.string("channel", "all")
-        if chosen == "a":
+        chosen, channel = plugin.string("channel", "all"), "luminance"
+        if chosen == "a":  # of version 0.6; else Mitsuba leaves alpha out, of opacities too
             channel = "alpha"
         elif chosen != "all":
             plugin.note(f"channel {chosen} of the image is taken as its luminance")
-        # An opacity is a share, never light: its numbers are linear whatever the file says.
-        linear = plugin.boolean("raw", False) or plugin.number("gamma", 0.0) == 1 or channel == "alpha"
+        linear = plugin.boolean("raw", False) or plugin.number("gamma", 0.0) == 1
         path = self._document.file(plugin.element, plugin.string("filename"), "texture")
         read = self.image(path, linear, channel)
         if plugin.string("filter_type", "bilinear") == "nearest" and self._reads_images:

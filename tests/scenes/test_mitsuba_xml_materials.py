@@ -9,7 +9,7 @@ import pytest
 from xml_files import GREY, LUMINANCE, first_hit, image, load, material, meshes, refusal, texel, write
 
 from scenes.io.mitsuba_xml import load_mitsuba_xml
-from scenes.io.textures import srgb_to_linear
+from scenes.io.textures import luminance, srgb_to_linear
 
 AIR = 1.000277
 
@@ -115,7 +115,8 @@ def test_textures_are_shared_scaled_and_masked(tmp_path: Path) -> None:
         '<string name="filename" value="leaf.png"/><float name="uscale" value="3"/><float name="voffset" value="0.5"/>'
     )
     leaf = f'<bsdf type="diffuse"><texture type="bitmap" name="reflectance">{file}</texture></bsdf>'
-    mask = f'<bsdf type="mask"><texture type="bitmap" name="opacity">{file}</texture>{leaf}</bsdf>'
+    alpha = f'{file}<string name="channel" value="a"/>'
+    mask = f'<bsdf type="mask"><texture type="bitmap" name="opacity">{alpha}</texture>{leaf}</bsdf>'
     scene = load(tmp_path, f'<shape type="rectangle">{mask}</shape><shape type="rectangle">{leaf}</shape>')
     one, two = scene.surfaces
     np.testing.assert_allclose(one.material.opacity.image, [[1, 0], [0, 0.2]], atol=1e-6)
@@ -125,11 +126,25 @@ def test_textures_are_shared_scaled_and_masked(tmp_path: Path) -> None:
     np.testing.assert_allclose(one.uv, [(0, 0.5), (3, 0.5), (3, -0.5), (0, -0.5)])
 
 
-def test_an_opacity_image_without_alpha_is_linear(tmp_path: Path) -> None:
-    image(tmp_path, "t.png", np.full((2, 2), 128))
-    texture = '<texture type="bitmap" name="opacity"><string name="filename" value="t.png"/></texture>'
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize("pixel", [[128, 128, 128], [255, 128, 0, 51]])
+def test_an_opacity_image_is_its_luminance_as_in_mitsuba(tmp_path: Path, pixel: list[int], raw: bool) -> None:
+    """Mitsuba linearises it unless it is raw, and leaves its alpha out (`mi.load_dict` of such a mask says 0.367)."""
+    image(tmp_path, "t.png", np.broadcast_to(pixel, (2, 2, len(pixel))))
+    values = f'<string name="filename" value="t.png"/><boolean name="raw" value="{str(raw).lower()}"/>'
+    texture = f'<texture type="bitmap" name="opacity">{values}</texture>'
     opacity = material(tmp_path, f'<bsdf type="mask">{texture}<bsdf type="diffuse"/></bsdf>').opacity
-    np.testing.assert_allclose(opacity.image, 128 / 255, rtol=1e-6)
+    levels = np.array(pixel[:3]) / 255
+    expected = luminance(levels if raw else srgb_to_linear(levels))
+    np.testing.assert_allclose(opacity.image, expected, rtol=1e-6)
+    assert len(pixel) == 3 or expected == pytest.approx(0.57165 if raw else 0.36705, abs=2e-4)
+
+
+@pytest.mark.parametrize(("opacity", "taken"), [("0.3", "0"), ("0.7", "1"), ("0", None), ("1", None)])
+def test_an_opacity_that_is_rounded_is_noted(tmp_path: Path, opacity: str, taken: str | None) -> None:
+    bsdf = f'<bsdf type="mask"><float name="opacity" value="{opacity}"/><bsdf type="diffuse"/></bsdf>'
+    notes = load(tmp_path, f'<shape type="rectangle">{bsdf}</shape>').notes
+    assert [f"opacity {opacity} is taken as {taken}" in note for note in notes] == ([] if taken is None else [True])
 
 
 def test_to_uv_and_checkerboard_are_mitsubas(tmp_path: Path, mitsuba: object) -> None:
@@ -272,3 +287,23 @@ def test_version_06_knows_two_names_of_a_matte_colour(tmp_path: Path, kind: str)
     bsdf = f'<bsdf type="{kind}"><rgb name="diffuseReflectance" value="0.1"/></bsdf>'
     assert material(tmp_path, bsdf, version="0.6.0").albedo == pytest.approx(0.1)
     assert material(tmp_path, bsdf).albedo == 0.5
+
+
+def test_a_dollar_takes_the_longest_known_name_as_in_mitsuba(tmp_path: Path, mitsuba: object) -> None:
+    """What follows the name stays: `$res_oak.png` with `res` known is the file of that resolution."""
+    for name, level in (("1k_oak.png", 60), ("2k_oak.png", 200)):
+        image(tmp_path, name, np.full((2, 2, 3), level))
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'
+    names = '<default name="res" value="1k"/><default name="re" value="bogus"/><default name="res_o" value="2k_o"/>'
+    for filename, level in (("$res_oak.png", 200), ("1k_$res_oak.png", None)):
+        body = f'{names}<shape type="rectangle"><bsdf type="diffuse">{texture.format(filename)}</bsdf></shape>'
+        if level is None:
+            assert "'1k_2k_oak.png' not found" in refusal(tmp_path, body)
+            continue
+        path = write(tmp_path, body)
+        albedo = load_mitsuba_xml(path).surfaces[0].material.albedo.image.mean()
+        assert albedo == pytest.approx(srgb_to_linear(level / 255))
+        assert mitsuba(path, rays=[((0, 0, 3), (0, 0, -1))])["hits"][0][2][0] == pytest.approx(albedo, rel=1e-3)
+    one = '<default name="res" value="1k"/>'
+    made = material(tmp_path, f'<bsdf type="diffuse">{one}{texture.format("$res_oak.png")}</bsdf>')
+    assert made.albedo.image.mean() == pytest.approx(srgb_to_linear(60 / 255))

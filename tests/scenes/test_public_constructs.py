@@ -65,7 +65,7 @@ TAKEN = {
     "twosided": (shape(bsdf("twosided", DIFFUSE)), "3.0.0", None),
     "bumpmap": (shape(bsdf("bumpmap", BITMAP.format("map") + DIFFUSE)), "3.0.0", "bumpmap is left out"),
     "normalmap": (shape(bsdf("normalmap", BITMAP.format("normalmap") + DIFFUSE)), "3.0.0", "normalmap is left out"),
-    "mask": (shape(bsdf("mask", DIFFUSE)), "3.0.0", None),
+    "mask": (shape(bsdf("mask", DIFFUSE)), "3.0.0", "opacity 0.5 is taken as 1"),
     "null": (shape(bsdf("null")) + RECTANGLE, "3.0.0", "a null bsdf lets all light pass"),
     "bitmap": (shape(bsdf("diffuse", BITMAP.format("reflectance"))), "3.0.0", None),
     "checkerboard": (shape(bsdf("diffuse", '<texture type="checkerboard" name="reflectance"/>')), "3.0.0", None),
