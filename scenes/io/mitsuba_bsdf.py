@@ -28,11 +28,13 @@ class Look:
     """A material and how its textures want the mesh's texture coordinates moved (3x3, v downwards as in Mitsuba).
 
     `inside_out`: the denser medium is outside, as of a bubble in water, so that the faces must be turned round.
+    `one_sided`: in Mitsuba its back is black.
     """
 
     material: Material
     to_uv: np.ndarray | None = None
     inside_out: bool = False
+    one_sided: bool = True
 
 
 class Materials(Textures):
@@ -42,7 +44,8 @@ class Materials(Textures):
         super().__init__(document, reads_images=reads_images)
         self._looks: dict[Plugin, Look] = {}
         # a lamp without a bsdf is black in Mitsuba
-        self._defaults = {albedo: Look(Material("diffuse", albedo=albedo, name="default")) for albedo in (0.5, 0.0)}
+        blank = {albedo: Material("diffuse", albedo=albedo, name="default") for albedo in (0.5, 0.0)}
+        self._defaults = {albedo: Look(made, one_sided=albedo > 0) for albedo, made in blank.items()}
 
     def of_shape(self, shape: Plugin) -> Look:
         """Return the look of a shape; without a bsdf it is diffuse grey as in Mitsuba, and black where it is a lamp."""
@@ -58,7 +61,7 @@ class Materials(Textures):
 
     def _build(self, plugin: Plugin) -> Look:
         uv = Uv()
-        inner, opacity = self._unwrap(plugin, uv)
+        inner, opacity, twosided = self._unwrap(plugin, uv)
         if inner.type not in _KINDS:
             raise inner.fail(_no_counterpart(inner.type))
         values = _KINDS[inner.type](self, inner, uv)
@@ -70,11 +73,16 @@ class Materials(Textures):
             material = Material(**values, opacity=1.0 if opacity is None else opacity, name=name)
         except InputError as error:
             raise inner.fail(str(error)) from None
-        return Look(material, uv.matrix, inside_out)
+        return Look(material, uv.matrix, inside_out, not (twosided or material.is_glass or material.albedo == 0))
 
-    def _unwrap(self, plugin: Plugin, uv: Uv) -> tuple[Plugin, float | Texture | None]:
-        """Find the innermost bsdf and the opacity of a mask around it."""
-        opacity = None
+    def is_one_sided(self, material: Material) -> bool:
+        """Return whether a material that was built here is black from behind in Mitsuba."""
+        looks = (*self._looks.values(), *self._defaults.values())
+        return any(look.material is material and look.one_sided for look in looks)
+
+    def _unwrap(self, plugin: Plugin, uv: Uv) -> tuple[Plugin, float | Texture | None, bool]:
+        """Find the innermost bsdf, the opacity of a mask around it, and whether both of its sides reflect."""
+        opacity, twosided = None, False
         for _ in range(MAX_NESTING):
             if plugin.type in ("bumpmap", "normalmap"):
                 plugin.note(f"{plugin.type} is left out, the surface keeps its own normals")
@@ -83,12 +91,11 @@ class Materials(Textures):
                     raise plugin.fail("a mask inside a mask, expected one")
                 opacity = self.fraction(plugin, "opacity", 0.5, uv)
                 if not isinstance(opacity, Texture) and 0 < opacity < 1:
-                    plugin.note(
-                        f"opacity {opacity:g} is taken as {int(opacity >= 0.5)}, no surface lets part of light by"
-                    )
+                    plugin.note(f"opacity {opacity:g} is taken as {int(opacity >= 0.5)}: no part of light passes")
                 plugin.note_unused()
             elif plugin.type != "twosided":
-                return plugin, opacity
+                return plugin, opacity, twosided
+            twosided = twosided or plugin.type == "twosided"
             inside = plugin.nested("bsdf")
             if not inside or (len(inside) > 1 and plugin.type != "twosided"):
                 raise plugin.fail(f"holds {len(inside)} bsdfs, expected one")

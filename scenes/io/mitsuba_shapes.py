@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from scenes.io.mitsuba_bsdf import Look, Materials
 from scenes.io.mitsuba_nodes import Document
 from scenes.io.mitsuba_plugin import Plugin
 from scenes.library.things import shapes
-from scenes.model import Surface
+from scenes.model import Camera, Surface
 
 # At 128 segments a disk's area is 4e-4 too small, at 5 subdivisions a sphere's 3e-4: under the 1e-3 that is promised.
 SEGMENTS = 128
@@ -257,6 +258,25 @@ _WAYS_ROUND = {
     **dict.fromkeys(("heightfield", "sdfgrid", "deformable"), "write it as .obj or .ply"),
     **dict.fromkeys(("ellipsoids", "ellipsoidsmesh"), "write them as spheres or meshes"),
 }
+
+
+def shows_open_back(surface: Surface, camera: Camera) -> bool:
+    """Return whether a camera looks at the back of a mesh that has an edge, as a sheet or a vessel has."""
+    x, y, z = ((surface.vertices - camera.origin) @ camera.rotation).T
+    across, down = camera.width / 2 / camera.focal_px * z, camera.height / 2 / camera.focal_px * z
+    inside = np.stack((across - x, across + x, down - y, down + y, z)) > 0
+    in_view = inside[:, surface.faces].any(axis=2).all(axis=0)  # not wholly beyond one side of the view
+    a, b, c = surface.vertices[surface.faces[in_view]].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    to_camera = camera.origin - a
+    reach = np.linalg.norm(normals, axis=1) * np.linalg.norm(to_camera, axis=1)
+    if not (np.einsum("ij,ij->i", normals, to_camera) < -1e-9 * reach).any():
+        return False
+    # one number a point and an edge: to sort rows takes a hundred times as long
+    points, corners = np.unique(surface.vertices @ (1.0, math.pi, math.e), return_inverse=True)
+    corners = np.sort(corners.ravel()[surface.faces], axis=1)
+    edges = np.concatenate([corners[:, i] * len(points) + corners[:, j] for i, j in ((0, 1), (1, 2), (0, 2))])
+    return bool((np.unique(edges, return_counts=True)[1] == 1).any())
 
 
 def _is_unseen(plugin: Plugin) -> bool:

@@ -12,7 +12,7 @@ from scenes.errors import InputError
 from scenes.io.mitsuba_bsdf import Materials
 from scenes.io.mitsuba_nodes import Document, LocatedError
 from scenes.io.mitsuba_plugin import VALUE_TAGS, Plugin
-from scenes.io.mitsuba_shapes import Shapes
+from scenes.io.mitsuba_shapes import Shapes, shows_open_back
 from scenes.model import Ambient, Camera, Scene, Surface, Texture
 
 # How far a matrix may be from a rotation and still be one that was written with few digits.
@@ -64,6 +64,9 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
     surfaces: list[Surface] = [surface for plugin in found["shape"] for surface in shapes.surfaces(plugin)]
     if not surfaces:
         raise InputError("holds no shapes that can be seen")
+    for surface in surfaces:
+        if materials.is_one_sided(surface.material) and shows_open_back(surface, camera):
+            document.notes.add("reflects from both sides, in Mitsuba the back without twosided is black", surface.name)
     stem = document.path.stem
     name = document.path.resolve().parent.name if stem == "scene" else stem
     return Scene(name or stem, tuple(surfaces), camera, ambient=ambient, notes=document.notes.lines())

@@ -188,3 +188,17 @@ def test_a_lamp_without_a_bsdf_is_black_as_in_mitsuba(tmp_path: Path, mitsuba: o
         assert surface.material.albedo == pytest.approx(albedo)
         ((*_, seen, _),) = mitsuba(path, rays=[((0, 0, 3), (0, 0, -1))])["hits"]
         assert np.dot(seen, (0.2126, 0.7152, 0.0722)) == pytest.approx(albedo, abs=1e-3)
+
+
+def test_a_black_back_that_is_seen_is_noted_once(tmp_path: Path) -> None:
+    """Notes stay rare: not of closed shapes, glass or what `twosided` holds, nor of a back that nobody looks at."""
+    turned = '<transform name="to_world">{}<translate z="3"/></transform>'
+    back, front = turned.format(""), turned.format('<rotate y="1" angle="180"/>')
+    bsdfs = {"one": '<bsdf type="diffuse"/>', "both": '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>'}
+    bsdfs |= {"glass": '<bsdf type="thindielectric"/>', "none": ""}
+    body = "".join(f'<shape type="rectangle" id="{name}">{back}{inner}</shape>' for name, inner in bsdfs.items())
+    body += f'<shape type="rectangle" id="front">{front}{bsdfs["one"]}</shape>'
+    body += "".join(f'<shape type="{kind}">{back}{bsdfs["one"]}</shape>' for kind in ("sphere", "cube"))
+    body += f'<shape type="cylinder" id="pipe">{back}{bsdfs["one"]}</shape>'
+    (note,) = load(tmp_path, body).notes
+    assert note == "reflects from both sides, in Mitsuba the back without twosided is black: one, none, pipe"
