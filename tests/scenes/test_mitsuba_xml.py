@@ -61,7 +61,7 @@ def test_camera_rays_are_mitsubas(tmp_path: Path, mitsuba: object, to_world: str
 
 def test_steps_of_a_transform_apply_in_order(tmp_path: Path) -> None:
     sensor = camera_xml(TO_WORLD["chain"], FOV[0])
-    scene = load(tmp_path, RECTANGLE, sensor=sensor)
+    scene = load(tmp_path, '<shape type="sphere"/>', sensor=sensor)
     yaw, pitch = math.radians(35), math.radians(-20)
     axis = np.array([1, 0, 0.5]) / math.hypot(1, 0.5)
     forward = np.array([math.sin(yaw), 0, math.cos(yaw)])
