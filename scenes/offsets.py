@@ -8,6 +8,7 @@ rigid  the content moves away as a whole, and the field of view narrows to hold 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal
 
@@ -27,6 +28,11 @@ def check_offset(metres: float) -> float:
     """Return `metres` if it is a distance a scene may be moved by, else an InputError."""
     require(math.isfinite(metres) and 0 <= metres <= LIMIT_M, f"offset {metres:g} m is outside 0 to {LIMIT_M:g}")
     return metres
+
+
+def check_delay(baseline_m: Iterable[float]) -> None:
+    """Raise InputError where a delay is no distance: from a laser that is displaced by this baseline."""
+    require(not any(baseline_m), "a time offset needs a co-located laser: with a baseline a delay is no distance")
 
 
 def pushed_along_rays(scene: Scene, metres: float) -> Scene:

@@ -20,6 +20,7 @@ from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
 from scenes.json_types import JsonObject
 from scenes.notebook import html_card
+from scenes.offsets import check_delay
 
 RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bounces": "bounces"}
 FLAT_PARTS = {
@@ -157,8 +158,7 @@ class Transient:
 
         Raises InputError with a displaced laser, for which a delay is no distance.
         """
-        if any(self.meta.get("laser", {}).get("baseline_m", ())):
-            raise InputError("a time offset needs a co-located laser: with a baseline a delay is no distance")
+        check_delay(self.meta.get("laser", {}).get("baseline_m", ()))
         return replace(
             self,
             path_near_m=self.path_near_m + np.float32(2 * offset_m),

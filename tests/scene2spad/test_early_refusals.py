@@ -63,3 +63,23 @@ def test_a_set_of_a_million_views_is_listed_as_it_is_rendered(tmp_path, monkeypa
     with pytest.raises(InputError, match="enough"):
         make_set(Job("rooms", width=8, height=8, bounces=1, grid=2), 1_000_000, tmp_path / "set")
     assert taken == [first]
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("wall@2 --baseline 0.1 0 0 --offset 1", "a time offset needs a co-located laser"),
+        ("wall@2 --baseline 0.1 0 0 --offset 1 --dry-run", "a time offset needs a co-located laser"),
+        ("wall@2 --sunlight 100 --ambient off", "--sunlight 100 lux and --ambient off contradict each other"),
+        ("wall@2 --sunlight 1e9", "--sunlight 1e+09 lux is outside 0 to 1e+06"),
+    ],
+)
+def test_a_render_that_cannot_be_is_refused_before_it_begins(tmp_path, capsys, monkeypatch, words, why):
+    def work(*_, **__):
+        raise AssertionError("work was begun")
+
+    monkeypatch.setattr("render.engine.render", work)
+    monkeypatch.setattr("render.engine.planned", work)
+    assert main(["render", *words.split(), "--out", str(tmp_path / "out.exr")]) == 2
+    message = capsys.readouterr().err
+    assert why in message and message.count("\n") == 1

@@ -173,6 +173,26 @@ def test_render_takes_size_camera_laser_and_sunlight(tip, tmp_path, capfd):
     assert np.median(lit) == pytest.approx(0.6 * sky, rel=0.15)
 
 
+@pytest.mark.parametrize("lux", [0, 5e4])
+def test_sunlight_replaces_lamps_and_surroundings_alike(tmp_path, capfd, lux):
+    """A grey wall with a lamp as bright as itself, under a constant light: the sky that is asked for is all it has."""
+    from render.transient import read_transient
+    from scene2spad.cli import main
+
+    body = (
+        '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><translate z="2"/></transform>'
+        '<bsdf type="diffuse"/><emitter type="area"><float name="radiance" value="7"/></emitter></shape>'
+        '<emitter type="constant"><float name="radiance" value="3"/></emitter>'
+    )
+    path, out = xml_files.write(tmp_path, body), tmp_path / "lamp.exr"
+    words = f"--sunlight {lux:g} --width 8 --bounces 1 --grid 2 --ambient on --ambient-spp 16 --no-figure"
+    assert main(["render", str(path), *words.split(), "--out", str(out)]) == 0
+    capfd.readouterr()
+    seen = read_transient(out)
+    lit = seen.ambient[np.isfinite(seen.depth_m)].astype(float)
+    assert np.median(lit) == pytest.approx(0.5 * sunlit_sky_w_per_m2_sr_nm(lux, 850e-9), rel=0.15)
+
+
 def test_a_scene_in_other_units_is_questioned(tmp_path, capfd):
     from scene2spad.cli import main
 

@@ -30,7 +30,7 @@ from scenes import Ambient, InputError, Laser, Scene
 from scenes.constants import DEFAULT_WAVELENGTH_M
 from scenes.errors import require
 from scenes.library.catalog import WIDTH, load_scene
-from scenes.offsets import check_offset
+from scenes.offsets import check_delay, check_offset
 from scenes.optics.blackbody import sunlit_sky_w_per_m2_sr_nm
 from scenes.placing import Placing
 from scenes.progress import Progress
@@ -61,7 +61,8 @@ class Render(Long):
     baseline: Annotated[Metres, may_stay_open("X Y Z")] = None
     """Laser minus camera [m], in the camera's frame: x right, y down, z forward (default: the scene's)."""
     sunlight: Annotated[float | None, may_stay_open("LUX")] = None
-    """Ambient light instead of the scene's own: an even sky as bright as sunlight of this illuminance, at 850 nm."""
+    """Ambient light instead of the scene's own, lamps too: an even sky as bright as sunlight of this illuminance, at
+    850 nm."""
     scale: Annotated[float | None, may_stay_open("METRES")] = None
     """Metres per unit of a mesh or an .xml (default: metres, or what a mesh's size suggests)."""
     up: Annotated[Literal["x", "y", "z"] | None, may_stay_open("{x,y,z}")] = None
@@ -123,12 +124,15 @@ def run(command: Render, progress: Progress) -> dict:
     check_indirect(command, "render", command.bounces, ("spp", "filter", "clamp"))
     settings = _settings(command)
     check_offset(command.offset)
+    _check_sunlight(command)
     if command.out is not None:
         output_file(command.out, ".exr", "transient")
     scene = _load(command)
     out = command.out or output_file(Path(f"{file_stem(scene.name)}.exr"), ".exr", "transient")
     scene = _lit(scene, command)
     start = time.perf_counter()
+    if command.offset and command.offset_mode == "time":
+        check_delay(scene.laser.baseline_m)
     if command.offset and command.offset_mode != "time":
         from scene2spad.datasets.moving import moved
 
@@ -198,9 +202,17 @@ def _lit(scene: Scene, command: Render) -> Scene:
         laser = replace(laser, baseline_m=command.baseline)
     if command.sunlight is None:
         return replace(scene, laser=laser)
-    require(0 <= command.sunlight <= MAX_LUX, f"--sunlight {command.sunlight:g} lux is outside 0 to {MAX_LUX:g}")
     sky = Ambient(radiance=sunlit_sky_w_per_m2_sr_nm(command.sunlight, DEFAULT_WAVELENGTH_M))
-    return replace(scene, laser=laser, ambient=sky)
+    return replace(scene.without_lights(), laser=laser, ambient=sky)
+
+
+def _check_sunlight(command: Render) -> None:
+    lux = command.sunlight
+    if lux is None:
+        return
+    require(0 <= lux <= MAX_LUX, f"--sunlight {lux:g} lux is outside 0 to {MAX_LUX:g}")
+    message = f"--sunlight {lux:g} lux and --ambient off contradict each other; leave one of them out"
+    require(lux == 0 or command.ambient != "off", message)
 
 
 def _question_unit(transient: Transient, name: str) -> None:
