@@ -11,13 +11,15 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.io.mesh_files import MaterialEntry, ply_texture, read_material_library
-from scenes.io.textures import MAX_PIXELS, load_texture, luminance, opened_image, srgb_to_linear
+from scenes.io.textures import MAX_PIXELS, image_values, load_texture, luminance, opened_image, srgb_to_linear
 from scenes.model import Material, Texture
 
 if TYPE_CHECKING:
     from PIL import Image
     from trimesh.visual.base import Visuals
+    from trimesh.visual.material import Material as TextureMaterial
 
+Albedo = tuple[object, Callable[[], "float | Texture"]]  # a key, and what makes the albedo
 DEFAULT_ALBEDO = 0.6
 
 
@@ -31,7 +33,8 @@ class Part:
     uv: np.ndarray | None
     normals: np.ndarray | None
     visual: Visuals
-    colours: np.ndarray | None = None  # per vertex, beside a material
+    colours: np.ndarray | None = None  # of a PLY, or beside the material of a GLB
+    coloured: str = "vertex"  # what has them
 
 
 class Paint:
@@ -55,43 +58,65 @@ class Paint:
             raise InputError(f"{self.path}: broken colours of {part.name} ({reason})") from None
         return self.made[key]
 
-    def _albedo(self, part: Part) -> tuple[object, Callable[[], float | Texture]]:
+    def _albedo(self, part: Part) -> Albedo:
         """Return a key that tells the part's albedo from others, and a function that makes the albedo."""
         source = getattr(part.visual, "material", None)
         kind = self.path.suffix.lower()
-        if source is None:
-            value = self._vertex_colour(part)
+        found: Albedo | float | None
+        if kind == ".ply":
+            found = self._ply_albedo(part)
+        elif source is None:
+            found = self._vertex_colour(part)
         elif kind == ".obj":
-            entry = self.library.get(str(source.name), MaterialEntry())
-            if entry.cut_out:
-                self.notes.append(f"{part.name}: alpha (map_d) is left out, its surface is opaque")
-            if entry.image is not None and part.uv is not None:
-                return entry.image, lambda: load_texture(entry.image)
-            value = entry.colour
-        elif kind == ".ply":
-            file, mean = ply_texture(self.path), self._mean_colour(part)
-            if file is not None and part.uv is not None:
-                return file, lambda: _file_albedo(file)
-            value = None if mean is None else float(luminance(mean))
+            found = self._obj_albedo(part, str(source.name))
         else:
-            image = getattr(source, "baseColorTexture", None) or getattr(source, "image", None)
-            factor, mean = getattr(source, "baseColorFactor", None), self._mean_colour(part)
-            tint = np.ones(4) if factor is None else np.asarray(factor) / 255
-            tint[:3] *= 1 if mean is None else mean
-            if getattr(source, "alphaMode", None) in ("MASK", "BLEND"):
-                self.notes.append(f"{part.name}: alpha is left out, its surface is opaque")
-            if image is not None and part.uv is not None:
-                pixels = image.width * image.height
-                message = f"{self.path}: the texture of {part.name} has {pixels} pixels, the limit is {MAX_PIXELS}"
-                require(pixels <= MAX_PIXELS, message)
-                return (id(image), tint.tobytes()), lambda: _image_albedo(image, tint)
-            # glTF's factor is linear already
-            value = None if factor is None and mean is None else float(luminance(tint))
-        if value is None:
-            value = DEFAULT_ALBEDO
-            self.notes.append(f"{part.name}: no colour in the file, albedo {value:g}")
-        value = round(min(max(float(value), 0.0), 1.0), 9)
+            found = self._glb_albedo(part, source)
+        if isinstance(found, tuple):
+            return found
+        if found is None:
+            found = DEFAULT_ALBEDO
+            self.notes.append(f"{part.name}: no colour in the file, albedo {found:g}")
+        value = round(min(max(float(found), 0.0), 1.0), 9)
         return value, lambda: value
+
+    def _obj_albedo(self, part: Part, material: str) -> Albedo | float | None:
+        entry = self.library.get(material, MaterialEntry())
+        if entry.cut_out:
+            self.notes.append(f"{part.name}: alpha (map_d) is left out, its surface is opaque")
+        if entry.opacity < 1:
+            self.notes.append(f"{part.name}: opacity {entry.opacity:g} is left out, its surface is opaque")
+        image = entry.image
+        if image is not None and self._is_mapped(part):
+            return image, lambda: load_texture(image)
+        return entry.colour
+
+    def _ply_albedo(self, part: Part) -> Albedo | float | None:
+        file = ply_texture(self.path)
+        if file is not None and self._is_mapped(part):
+            return file, lambda: _file_albedo(file)
+        mean = self._mean_colour(part)
+        return None if mean is None else float(luminance(mean))
+
+    def _glb_albedo(self, part: Part, source: TextureMaterial) -> Albedo | float | None:
+        image = getattr(source, "baseColorTexture", None) or getattr(source, "image", None)
+        factor, mean = getattr(source, "baseColorFactor", None), self._mean_colour(part)
+        tint = np.ones(4) if factor is None else np.asarray(factor) / 255
+        tint[:3] *= 1 if mean is None else mean
+        if getattr(source, "alphaMode", None) in ("MASK", "BLEND"):
+            self.notes.append(f"{part.name}: alpha is left out, its surface is opaque")
+        if image is not None and self._is_mapped(part):
+            pixels = image.width * image.height
+            message = f"{self.path}: the texture of {part.name} has {pixels} pixels, the limit is {MAX_PIXELS}"
+            require(pixels <= MAX_PIXELS, message)
+            return (id(image), tint.tobytes()), lambda: _image_albedo(image, tint)
+        # glTF's factor is linear already
+        return None if factor is None and mean is None else float(luminance(tint))
+
+    def _is_mapped(self, part: Part) -> bool:
+        """Return whether a part has texture coordinates, with a note where it has none for its image."""
+        if part.uv is None:
+            self.notes.append(f"{part.name}: its texture is left out, it has no texture coordinates")
+        return part.uv is not None
 
     def _mean_colour(self, part: Part) -> np.ndarray | None:
         """Average the colours (3,), linear, that a part has per vertex beside its material; None where it has none."""
@@ -100,7 +125,7 @@ class Paint:
         colours = part.colours[:, :3]
         most = np.iinfo(colours.dtype).max if colours.dtype.kind in "iu" else 1
         colours = np.clip(colours / most, 0, 1)
-        self.notes.append(f"{part.name}: one mean albedo in place of its colours per vertex")
+        self.notes.append(f"{part.name}: one mean albedo in place of its colours per {part.coloured}")
         return np.mean(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours), axis=0)
 
     def _vertex_colour(self, part: Part) -> float | None:
@@ -121,9 +146,8 @@ def _file_albedo(path: Path) -> Texture:
 
 def _image_albedo(image: Image.Image, tint: np.ndarray) -> Texture:
     """Return the texture of an sRGB image held in memory, times a linear colour."""
-    values = np.asarray(image.convert("RGB"))
+    values = image_values(image)
     made = np.empty(values.shape[:2], np.float32)
     for row in range(0, len(values), 64):  # a few at a time: in double precision an image takes 100 bytes a pixel
-        pixels = srgb_to_linear(values[row : row + 64] / 255)
-        made[row : row + 64] = np.minimum(luminance(pixels * tint[:3]), 1.0)
+        made[row : row + 64] = np.clip(luminance(values[row : row + 64] * tint[:3]), 0.0, 1.0)
     return Texture(made, "base colour")

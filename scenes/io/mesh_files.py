@@ -14,6 +14,7 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, read_bytes
+from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb import check_glb, with_bare_materials
 from scenes.io.mesh_formats.obj import plain_obj
 from scenes.io.mesh_formats.ply import check_ply
@@ -100,6 +101,8 @@ def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | N
             case ".obj":
                 # Comments and names in an old encoding must not stop the geometry from being read.
                 content = plain_obj(content.decode("utf-8", errors="replace").encode())
+    except NotReadError:
+        raise
     except InputError as error:
         raise InputError(f"broken {kind} file ({error})") from None
     return content, None
@@ -123,11 +126,12 @@ def check_vertices(vertices: np.ndarray, name: str) -> None:
 
 @dataclass(frozen=True)
 class MaterialEntry:
-    """Entry of an .mtl file for one material: linear luminance of Kd, file of map_Kd, whether it names a map_d."""
+    """Entry of an .mtl file for one material: linear luminance of Kd, file of map_Kd, whether it names a map_d, d."""
 
     colour: float | None = None
     image: Path | None = None
     cut_out: bool = False
+    opacity: float = 1.0
 
 
 def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEntry]:
@@ -181,7 +185,18 @@ def _read_library(library: Path) -> dict[str, MaterialEntry]:
             entries[name] = replace(entries[name], image=_map_kd(library, name, rest))
         elif key.lower() == "map_d" and name:
             entries[name] = replace(entries[name], cut_out=True)
+        elif key.lower() in ("d", "tr") and name:
+            entries[name] = replace(entries[name], opacity=_opacity(library, key.lower(), rest))
     return entries
+
+
+def _opacity(library: Path, key: str, text: str) -> float:
+    """Return what d says, or 1 less what Tr says."""
+    try:
+        value = float(text.removeprefix("-halo").split()[0])
+    except (ValueError, IndexError):
+        raise InputError(f"{library}: {key} {text.strip()!r}, expected a number") from None
+    return value if key == "d" else 1 - value
 
 
 def _kd(library: Path, text: str) -> float:

@@ -15,12 +15,15 @@ import numpy as np
 
 from scenes.arrays import check_faces
 from scenes.errors import InputError
+from scenes.io.inputs import read_bytes
 from scenes.io.mesh_colours import Paint, Part
 from scenes.io.mesh_files import (
     MAX_COORDINATE,
     check_vertices,
     load_trimesh,
 )
+from scenes.io.mesh_formats.glb import glb_notes
+from scenes.io.mesh_formats.ply import ply_colours
 from scenes.library.things import shapes
 from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing
@@ -59,7 +62,7 @@ def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placin
     """
     path = Path(path)
     parts = _read(path)
-    notes: list[str] = []
+    notes = glb_notes(read_bytes(path)) if path.suffix.lower() == ".glb" else []
     parts = _stand(path, parts, notes, placing)
     low = np.min([part.vertices.min(axis=0) for part in parts], axis=0)
     high = np.max([part.vertices.max(axis=0) for part in parts], axis=0)
@@ -168,8 +171,10 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
     if np.linalg.det(pose[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored mesh would have its faces inside out
     beside = mesh.visual if "color" in getattr(mesh.visual, "vertex_attributes", {}) else mesh
-    colours = beside.vertex_attributes.get("color")
-    return Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual, colours)
+    colours, coloured = beside.vertex_attributes.get("color"), "vertex"
+    if "_ply_raw" in mesh.metadata:  # trimesh keeps the last eight bits of a colour alone
+        colours, coloured = ply_colours(mesh.metadata["_ply_raw"])
+    return Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual, colours, coloured)
 
 
 def _check_pose(pose: np.ndarray, name: str) -> None:

@@ -62,24 +62,29 @@ def with_sharp_texels(texture: Texture) -> Texture:
 
 def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
     with opened_image(path) as image:
-        if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV", "1"):
-            image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
-        bands = image.getbands()
-        values = np.asarray(image)
+        values = image_values(image, linear=linear, channel=channel)
+    return luminance(values) if values.shape[2] == 3 else values[..., 0]
+
+
+def image_values(image: Image.Image, *, linear: bool = False, channel: str = "luminance") -> np.ndarray:
+    """Return an opened image's linear colour, (h, w, 3), or (h, w, 1) where it is grey or its alpha is asked for.
+
+    Levels of 8 and 16 bits are shares of the most that they can be. `linear` and `channel` are as in `load_texture`.
+    """
+    if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV", "1"):
+        image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
+    bands = image.getbands()
+    values = np.asarray(image)
     values = values.reshape(*values.shape[:2], -1)
     alpha = channel == "alpha" and bands[-1] == "A"
-    values = values[..., -1:] if alpha else values[..., :3]
+    values = values[..., -1:] if alpha else values[..., : 3 if len(bands) >= 3 else 1]
     if values.dtype in (np.uint8, np.uint16):
         # by table, in float32: a large image must not become many times its size
         levels = np.arange(np.iinfo(values.dtype).max + 1) / np.iinfo(values.dtype).max
         table = (levels if linear or alpha else srgb_to_linear(levels)).astype(np.float32)
-        values = table[values]
-    else:
-        values = values / (65535 if bands == ("I",) else 1)
-        values = values if linear or alpha else srgb_to_linear(values)
-    if alpha:
-        return values[..., 0]
-    return luminance(values) if len(bands) >= 3 else values[..., 0]
+        return table[values]
+    values = values / (65535 if bands == ("I",) else 1)
+    return values if linear or alpha else srgb_to_linear(values)
 
 
 @contextmanager

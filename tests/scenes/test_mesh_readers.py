@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import struct
 from pathlib import Path
 
@@ -42,13 +43,29 @@ def refusal(path: Path) -> str:
     return message
 
 
-def glb(path: Path, attributes: dict[str, np.ndarray], material: dict | None = None, **primitive: object) -> Path:
-    """Write a square: whole numbers of attributes are normalized; its one image is a grey ramp."""
+def png(values: np.ndarray, mode: str | None = None) -> bytes:
     picture = io.BytesIO()
-    Image.fromarray(np.arange(0, 256, 4, dtype=np.uint8).reshape(8, 8)).convert("RGB").save(picture, "PNG")
+    image = Image.fromarray(values)
+    (image if mode is None else image.convert(mode)).save(picture, "PNG")
+    return picture.getvalue()
+
+
+RAMP = np.arange(0, 256, 4, dtype=np.uint8).reshape(8, 8)
+
+
+def glb(
+    path: Path,
+    attributes: dict[str, np.ndarray],
+    material: dict | None = None,
+    picture: bytes = png(RAMP, "RGB"),
+    extensions: dict | None = None,
+    **primitive: object,
+) -> Path:
+    """Write a square: whole numbers of attributes are normalized; its one image is a grey ramp; `extensions` of its
+    node."""
     names = {"float32": 5126, "uint16": 5123, "uint8": 5121, "int16": 5122}
     arrays = [*attributes.values(), np.array([0, 1, 2, 0, 2, 3], np.uint16)]
-    blocks = [*(array.tobytes() for array in arrays), picture.getvalue()]
+    blocks = [*(array.tobytes() for array in arrays), picture]
     starts = np.cumsum([0, *(len(block) + -len(block) % 4 for block in blocks)]).tolist()
     views = [
         {"buffer": 0, "byteOffset": start, "byteLength": len(block)}
@@ -74,7 +91,7 @@ def glb(path: Path, attributes: dict[str, np.ndarray], material: dict | None = N
     header = {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, "extensions": extensions or {}}],
         "meshes": [{"primitives": [one]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -143,6 +160,25 @@ def test_cut_outs_of_an_obj_are_noted(tmp_path: Path) -> None:
     assert "a: alpha (map_d) is left out, its surface is opaque" in scene.notes
 
 
+@pytest.mark.parametrize(
+    ("line", "opacity"), [("d 0.25", "0.25"), ("d -halo 0.5", "0.5"), ("Tr 0.75", "0.25"), ("d 1\nTr 0", None)]
+)
+def test_a_clear_material_of_an_obj_is_noted(tmp_path: Path, line: str, opacity: str | None) -> None:
+    written(tmp_path / "a.mtl", f"newmtl a\nKd 0.5 0.5 0.5\n{line}\n")
+    scene = load_mesh(written(tmp_path / "a.obj", f"mtllib a.mtl\n{SQUARE}usemtl a\nf 1 2 3 4\n"), placing=AS_FILE)
+    found = [note for note in scene.notes if "opacity" in note]
+    assert found == ([] if opacity is None else [f"a: opacity {opacity} is left out, its surface is opaque"])
+
+
+def test_a_texture_without_coordinates_is_noted(tmp_path: Path) -> None:
+    written(tmp_path / "t.png", png(RAMP))
+    written(tmp_path / "a.mtl", "newmtl a\nKd 0.5 0.5 0.5\nmap_Kd t.png\n")
+    obj = written(tmp_path / "a.obj", f"mtllib a.mtl\n{SQUARE}usemtl a\nf 1 2 3 4\n")
+    for path in (obj, glb(tmp_path / "b.glb", {"POSITION": CORNERS}, TEXTURED)):
+        notes = load_mesh(path, placing=AS_FILE).notes
+        assert f"{path.stem}: its texture is left out, it has no texture coordinates" in notes
+
+
 # --- PLY -------------------------------------------------------------------------------------------------------------
 
 
@@ -171,6 +207,39 @@ def test_a_ply_without_its_texture_is_refused(tmp_path: Path, capfd: pytest.Capt
     Image.new("RGB", (4, 4), (128, 128, 128)).save(tmp_path / "skin.png")
     pixels = only(load_mesh(path, placing=AS_FILE)).material.albedo.image
     assert pixels == pytest.approx(np.full((4, 4), srgb_to_linear(128 / 255)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "levels"),
+    [
+        ("uchar", "128 128 128", 128 / 255),
+        ("ushort", "32896 32896 32896", 32896 / 65535),
+        ("ushort", "300 300 300", 300 / 65535),
+        ("int", "128 128 128", 128 / 255),
+        ("float", "0.5 0.5 0.5", 0.5),
+        ("double", "128 128 128", 128 / 255),
+    ],
+)
+@pytest.mark.parametrize("prefix", ["", "diffuse_"])
+def test_colours_of_a_ply_are_shares_of_what_their_type_holds(
+    tmp_path: Path, kind: str, values: str, levels: float, prefix: str
+) -> None:
+    text = ply(colour=values).replace("uchar red", f"uchar {prefix}red")
+    for name in ("red", "green", "blue"):
+        text = re.sub(rf"property uchar (?:diffuse_)?{name}", f"property {kind} {prefix}{name}", text)
+    scene = load_mesh(written(tmp_path / "a.ply", text), placing=AS_FILE)
+    assert only(scene).material.albedo == pytest.approx(float(srgb_to_linear(levels)), rel=1e-6)
+
+
+def test_a_grey_image_of_16_bits_is_read_whole(tmp_path: Path) -> None:
+    """Pillow clips such levels at 255 where it makes them RGB."""
+    deep = RAMP.astype(np.uint16) * 257
+    written(tmp_path / "deep.png", png(deep))
+    named = written(tmp_path / "a.ply", ply("comment TextureFile deep.png\n"))
+    inside = glb(tmp_path / "a.glb", {"POSITION": CORNERS, "TEXCOORD_0": UV}, TEXTURED, png(deep))
+    for path in (named, inside):
+        albedo = only(load_mesh(path, placing=AS_FILE)).material.albedo
+        np.testing.assert_allclose(albedo.image, srgb_to_linear(RAMP / 255), rtol=1e-5)
 
 
 # --- GLB -------------------------------------------------------------------------------------------------------------
@@ -225,3 +294,42 @@ def test_a_texture_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(mesh_colours, "MAX_PIXELS", 63)
     path = glb(tmp_path / "a.glb", {"POSITION": CORNERS, "TEXCOORD_0": UV}, TEXTURED)
     assert "has 64 pixels, the limit is 63" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "way_round"),
+    [
+        ("EXT_mesh_gpu_instancing", "write its instances out as nodes"),
+        ("EXT_meshopt_compression", "export it uncompressed"),
+        ("KHR_draco_mesh_compression", "export it uncompressed"),
+        ("FOO_unknown", "export it without"),
+        ("KHR_mesh_quantization", None),
+        ("KHR_texture_transform", None),
+        ("KHR_materials_clearcoat", None),
+    ],
+)
+def test_extensions_that_a_glb_needs_are_read_or_refused(tmp_path: Path, name: str, way_round: str | None) -> None:
+    path = glb(tmp_path / "a.glb", {"POSITION": CORNERS})
+    content = path.read_bytes()
+    size = struct.unpack_from("<I", content, 12)[0]
+    text = json.dumps(json.loads(content[20 : 20 + size]) | {"extensionsRequired": [name]}).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + size :]
+    head = b"glTF" + struct.pack("<IIII", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    written(path, head + text + rest)
+    if way_round is None:
+        assert load_mesh(path, placing=AS_FILE).triangles == 2
+    else:
+        assert f"needs the glTF extension {name}, which is not read; {way_round}" in refusal(path)
+
+
+def test_extensions_that_a_glb_only_uses_are_noted(tmp_path: Path) -> None:
+    names = ("KHR_materials_transmission", "KHR_materials_sheen", "KHR_materials_pbrSpecularGlossiness")
+    clear = {"extensions": {name: {} for name in names}}
+    path = glb(tmp_path / "a.glb", {"POSITION": CORNERS}, clear, extensions={"EXT_mesh_gpu_instancing": {}})
+    notes = load_mesh(path, placing=AS_FILE).notes
+    assert notes[:3] == (
+        "EXT_mesh_gpu_instancing is left out: each of 1 nodes is there once",
+        "KHR_materials_transmission left out: its surfaces are opaque",
+        "KHR_materials_sheen left out: its surfaces are diffuse",
+    )

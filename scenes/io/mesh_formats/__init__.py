@@ -3,3 +3,11 @@
 trimesh reads a text file that was cut, drops a texture that it cannot find, and takes negative indices as Python does.
 It passes over what it has no model for: what would then be seen as something else is refused, or put as it reads it.
 """
+
+from __future__ import annotations
+
+from scenes.errors import InputError
+
+
+class NotReadError(InputError):
+    """A sound file that holds what is not read."""

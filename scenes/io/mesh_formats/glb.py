@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import parse_json
+from scenes.io.mesh_formats import NotReadError
 from scenes.io.textures import check_checksums
 from scenes.json_types import JsonObject
 
@@ -19,6 +20,19 @@ _GLB_INDICES = (
 )
 
 _GLB_USHORT, _GLB_FLOAT = 5123, 5126  # component types
+
+# Extensions that files may need and are read; what is taken off a material changes no shape.
+_READ = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp")
+_READ_MATERIALS = "KHR_materials_pbrSpecularGlossiness"
+_LOOKS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights_", "EXT_materials_")  # how their names begin
+_CLEAR = ("KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_diffuse_transmission")
+_INSTANCES = "EXT_mesh_gpu_instancing"
+_WAYS_ROUND = {
+    _INSTANCES: "write its instances out as nodes",
+    "EXT_meshopt_compression": "export it uncompressed",
+    "KHR_draco_mesh_compression": "export it uncompressed",
+    "KHR_texture_basisu": "export its textures as .png or .jpg",
+}
 
 ReadImage = Callable[[str], bytes]
 
@@ -31,6 +45,7 @@ def check_glb(content: bytes, read: ReadImage) -> None:
     header, binary = _glb_chunks(content)
     _check_indices(header)
     try:
+        _check_extensions(header)
         _check_accessors(header, len(content))
         for mesh in header.get("meshes", []):
             for primitive in mesh["primitives"]:
@@ -41,6 +56,34 @@ def check_glb(content: bytes, read: ReadImage) -> None:
         if isinstance(error, InputError):
             raise
         raise InputError(f"its JSON is damaged ({type(error).__name__}: {error})") from None
+
+
+def _check_extensions(header: JsonObject) -> None:
+    """InputError for an extension that a file cannot be read without, and is not read."""
+    for name in header.get("extensionsRequired", []):
+        read = name in _READ or name.startswith(_LOOKS)
+        way_round = _WAYS_ROUND.get(name, "export it without")
+        if not read:
+            raise NotReadError(f"needs the glTF extension {name[:80]}, which is not read; {way_round}")
+
+
+def glb_notes(content: bytes) -> list[str]:
+    """Return what is left out of a sound GLB by its extensions: instances, clear surfaces, and other looks."""
+    header, _ = _glb_chunks(content)
+    notes = []
+    several = sum(_INSTANCES in node.get("extensions", {}) for node in header.get("nodes", []))
+    if several:
+        notes.append(f"{_INSTANCES} is left out: each of {several} nodes is there once")
+    primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"]]
+    used = [header["materials"][number] for number in sorted({one.get("material", -1) for one in primitives} - {-1})]
+    found = {name for material in used for name in material.get("extensions", {})} - {_READ_MATERIALS}
+    for names, words in (
+        (found & {*_CLEAR}, "its surfaces are opaque"),
+        (found - {*_CLEAR}, "its surfaces are diffuse"),
+    ):
+        if names:
+            notes.append(f"{', '.join(sorted(names))} left out: {words}")
+    return notes
 
 
 def _glb_chunks(content: bytes) -> tuple[JsonObject, bytes]:

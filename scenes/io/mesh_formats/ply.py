@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scenes.errors import InputError, require
+from scenes.json_types import JsonObject
 
 _PLY_TYPES = {
     "char": "i1",
@@ -160,3 +161,27 @@ def _end_of_binary(content: bytes, start: int, element: _Element, order: str) ->
         even = all((counts == counts[0]).all() for counts in lists)
         require(even, f"elements {element.name!r} have lists of different lengths, which is read from text alone")
     return end
+
+
+def ply_colours(elements: JsonObject) -> tuple[np.ndarray | None, str]:
+    """Return the colours (n, 3) that a PLY has per vertex, else per face, and which of the two; shares of white.
+
+    elements  as trimesh read them
+
+    Whole numbers are shares of the most that their type holds, of 255 where they have 32 bits and none is larger.
+    Fractions beyond 2 are taken as levels up to 255 too, as some programs write them.
+    """
+    for element in ("vertex", "face"):
+        properties = elements.get(element, {}).get("properties", {})
+        for names in (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue")):
+            if all(name in properties for name in names):
+                columns = [np.asarray(elements[element]["data"][name], np.float64).ravel() for name in names]
+                values = np.column_stack(columns)
+                kind = np.dtype(properties[names[0]])
+                largest = values.max(initial=0.0)
+                if kind.kind == "f":
+                    most = 255 if largest > 2 else 1
+                else:
+                    most = 255 if kind.itemsize >= 4 and largest <= 255 else np.iinfo(kind).max
+                return np.nan_to_num(values / most), element
+    return None, "vertex"
