@@ -16,8 +16,8 @@ from scenes.errors import InputError, require
 from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb import check_glb, with_bare_materials
-from scenes.io.mesh_formats.obj import plain_obj
-from scenes.io.mesh_formats.ply import check_ply
+from scenes.io.mesh_formats.obj import obj_fault, plain_obj
+from scenes.io.mesh_formats.ply import plain_ply
 from scenes.io.mesh_formats.stl import check_stl
 from scenes.io.textures import luminance, srgb_to_linear
 
@@ -34,8 +34,11 @@ class _Beside:
 
     def __init__(self, path: Path) -> None:
         self.folder, self.file_name = path.parent, path.name  # trimesh names geometry by the file
+        self.made: dict[str, bytes] = {}  # what is there in place of files
 
     def get(self, name: str) -> bytes:
+        if name.strip() in self.made:
+            return self.made[name.strip()]
         return read_bytes(file_inside(self.folder, name.strip()))
 
     def __getitem__(self, name: str) -> bytes:
@@ -53,7 +56,7 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
     """
     import trimesh
 
-    content = read_bytes(path, "mesh file")
+    content = original = read_bytes(path, "mesh file")
     beside = _Beside(path)
     try:
         content, triangles = _checked(content, kind, beside)
@@ -69,6 +72,8 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
                 process=False,
                 **options,
             )
+        if any(np.shape(getattr(mesh, "vertices", [(0, 0, 0)]))[1:] != (3,) for mesh in loaded.geometry.values()):
+            raise ValueError("vertices are not x y z")
         if triangles is not None:
             found = sum(len(getattr(mesh, "faces", ())) for mesh in loaded.geometry.values())
             require(found == triangles, f"cut short or damaged: {found} of its {triangles} triangles can be read")
@@ -79,6 +84,7 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
         reason = (str(error).splitlines() or [""])[0]
         # a missing import is how trimesh says that it cannot even guess the text encoding
         message = reason[:200] if reason and not isinstance(error, ImportError) else "content not understood"
+        message = (obj_fault(original) if kind == ".obj" else "") or message
         raise InputError(f"{path}: broken {kind} file ({message})") from None
     return loaded
 
@@ -92,7 +98,7 @@ def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | N
     try:
         match kind:
             case ".ply":
-                check_ply(content)
+                content = plain_ply(content)
             case ".stl":
                 return content, check_stl(content)
             case ".glb":
@@ -101,6 +107,7 @@ def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | N
             case ".obj":
                 # Comments and names in an old encoding must not stop the geometry from being read.
                 content = plain_obj(content.decode("utf-8", errors="replace").encode())
+                content = _with_one_library(content, beside)
     except NotReadError:
         raise
     except InputError as error:
@@ -139,21 +146,40 @@ def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEnt
 
     trimesh reads the library too, but silently drops such textures and rounds Kd to 8 bits.
     """
-    text = lenient_text(path)
+    entries: dict[str, MaterialEntry] = {}
+    for name in _library_names(lenient_text(path), path.parent):
+        if not (path.parent / name.replace("\\", "/")).exists():
+            notes.append(f"material file {name} not found")
+            continue
+        try:
+            library = file_inside(path.parent, name, "material file")
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        entries |= _read_library(library)
+    return entries
+
+
+def _library_names(text: str, folder: Path) -> list[str]:
+    """Return the material files that an OBJ names: a line is one name with blanks in it, or several names."""
     lines = [line.split(maxsplit=1) for line in map(str.strip, text.splitlines()) if line.startswith("mtllib")]
-    named = [words[1].strip() for words in lines if len(words) == 2 and words[0] == "mtllib"]
-    if not named:
-        return {}
-    if len(named) > 1:
-        notes.append(f"of {len(named)} material files only {named[0]} is read")
-    if not (path.parent / named[0].replace("\\", "/")).exists():
-        notes.append(f"material file {named[0]} not found")
-        return {}
-    try:
-        library = file_inside(path.parent, named[0], "material file")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return _read_library(library)
+    found: dict[str, None] = {}
+    for words in lines:
+        if len(words) == 2 and words[0] == "mtllib":
+            whole, names = words[1].strip(), words[1].split()
+            several = not (folder / whole).exists() and all(name.lower().endswith(".mtl") for name in names)
+            found |= dict.fromkeys(names if several else [whole])
+    return list(found)
+
+
+def _with_one_library(content: bytes, beside: _Beside) -> bytes:
+    """Return an OBJ that names one material file at most, as trimesh reads the first alone: of several all names."""
+    names = _library_names(content.decode("utf-8", errors="replace"), beside.folder)
+    if len(names) < 2:
+        return content
+    there = [name for name in names if (beside.folder / name.replace("\\", "/")).exists()]
+    lines = [line.strip() for name in there for line in beside.get(name).splitlines()]
+    beside.made["all.mtl"] = b"\n".join(line for line in lines if line.lower().startswith(b"newmtl"))
+    return b"mtllib all.mtl\n" + re.sub(rb"^mtllib.*", b"", content, flags=re.MULTILINE)
 
 
 def ply_texture(path: Path) -> Path | None:

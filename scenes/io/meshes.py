@@ -47,7 +47,7 @@ TURNS = {
     "y": np.eye(4),
     "z": np.array(((1.0, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))),
 }
-ZERO_AREA = 1e-12  # a face with a smaller area than this, for a model of unit extent, is degenerate
+ZERO_AREA = 1e-12  # m^2; a face of no larger area is degenerate; in a model under 1 m its share of the extent squared
 
 
 def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placing = AS_IT_IS) -> Scene:
@@ -156,8 +156,6 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
     if faces.size == 0:
         return None
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise InputError(f"vertices of {name} are not x y z")
     check_faces(faces, len(vertices), name)
     check_vertices(vertices, name)
     _check_pose(pose, name)
@@ -229,9 +227,9 @@ def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
         f"{name}{ends.get(name, '(?![a-z0-9])' if len(name) < 3 else '')}"
         for name in sorted(UNITS_M, key=len, reverse=True)
     )
-    stated = re.search(rf"\bunits?\b[^a-z0-9\n]{{0,9}}(?:are |in )?({names})", header, re.IGNORECASE)
-    if stated is not None and path.suffix.lower() != ".glb":
-        unit = stated[1].lower()
+    stated = re.search(rf"\bunits?\b[^a-z0-9\n]{{0,9}}(?:are |in )?({names}).*", header, re.IGNORECASE)
+    unit = "" if stated is None or path.suffix.lower() == ".glb" else stated[1].lower()
+    if stated is not None and unit and not _names_another(stated[0], UNITS_M[unit]):
         return UNITS_M[unit], [f"warning: unit {unit!r} taken from the file's own words"]
     if low <= extent <= high:
         return 1.0, []
@@ -242,6 +240,14 @@ def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
     return 1.0 / extent, [f"warning: no unit makes a sensible size of it, so its size is made up{kept}"]
 
 
+def _names_another(words: str, metres: float) -> bool:
+    """Return whether a statement of a unit names another one too, as of what a program works in and what it writes."""
+    # "in" and "m" may be other words
+    names = [name if len(name) > 2 else rf"{name}\b" for name in UNITS_M if name not in ("in", "m")]
+    named = re.findall("|".join(rf"\b{name}" for name in names), words, re.IGNORECASE)
+    return any(UNITS_M[name.lower()] != metres for name in named)
+
+
 def _moved(part: Part, pose: np.ndarray) -> Part:
     normals = None if part.normals is None else shapes.transform_normals(part.normals, pose)
     return replace(part, vertices=shapes.transform(part.vertices, pose), normals=normals)
@@ -250,7 +256,8 @@ def _moved(part: Part, pose: np.ndarray) -> Part:
 def _sound(part: Part, notes: list[str]) -> Part | None:
     """Drop faces of no area, doubled faces and vertices that no face uses; None when nothing is left."""
     a, b, c = part.vertices[part.faces].transpose(1, 0, 2)
-    flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 <= ZERO_AREA
+    zero = ZERO_AREA * min(1.0, float(np.ptp(part.vertices, axis=0).max())) ** 2
+    flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 <= zero
     # The same three points in any order are one face: its two sides reflect alike.
     _, point = np.unique(part.vertices, axis=0, return_inverse=True)
     corners = np.sort(point.ravel()[part.faces], axis=1)

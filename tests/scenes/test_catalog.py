@@ -146,12 +146,14 @@ def test_small_files_do_not_become_large_work(tmp_path):
         load_scene(str(tmp_path / "grow.xml"))
 
 
-def test_a_material_library_with_tabs_is_read_and_a_second_one_is_noted(tmp_path):
+def test_a_material_library_with_tabs_is_read_and_one_that_is_missing_is_noted(tmp_path):
     (tmp_path / "one.mtl").write_text("newmtl\ta\nKd\t1 1 1\n")
     corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
     (tmp_path / "m.obj").write_text(f"mtllib one.mtl\nmtllib two.mtl\n{corners}usemtl a\nf 1 2 3\n")
     scene = load_scene(str(tmp_path / "m.obj"))
-    assert scene.surfaces[0].material.albedo == 1 and any("only one.mtl is read" in note for note in scene.notes)
+    assert scene.surfaces[0].material.albedo == 1 and any(
+        "material file two.mtl not found" in note for note in scene.notes
+    )
     (tmp_path / "m.obj").write_text(f"mtllib \n{corners}f 1 2 3\n")
     assert load_scene(str(tmp_path / "m.obj")).surfaces[0].material.albedo == 0.6
 

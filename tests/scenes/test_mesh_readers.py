@@ -144,14 +144,54 @@ def test_indents_tabs_and_comments_change_nothing(tmp_path: Path) -> None:
         ("Unit = metres", 900),
         ("units=in", 900 * 0.0254),
         ("units in cm", 9),
+        ("System units: inches, exported in meters", 0.9),
+        ("units: inches (1 inch = 25.4 mm)", 0.9),
+        ("units: m, metres that is", 900),
     ],
 )
 def test_a_unit_is_a_whole_word(tmp_path: Path, words: str, metres: float) -> None:
-    """A comment that names no unit leaves 900 of them to be millimetres."""
+    """A comment that names no unit, or two, leaves 900 of them to be millimetres."""
     path = written(tmp_path / "a.obj", f"# {words}\nv 0 0 0\nv 900 0 0\nv 0 900 0\nf 1 2 3\n")
     assert np.ptp(load_mesh(path, placing=Placing(bare=True)).surfaces[0].vertices, axis=0).max() == pytest.approx(
         metres
     )
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("f 1 2 99", "line 5: a face's index 99, 4 are there"),
+        ("v 0,0 0,0 0,0\nf 1 2 3", "line 5: 'v 0,0 0,0 0,0' is not x y z"),
+        ("v 0 1\nf 1 2 5", "line 5: 'v 0 1' is not x y z"),
+        ("f 1 2 x", "line 5: 'f 1 2 x' is not numbers of vertices"),
+    ],
+)
+def test_a_line_of_an_obj_that_cannot_be_read_is_named(tmp_path: Path, lines: str, message: str) -> None:
+    assert message in refusal(written(tmp_path / "a.obj", f"{SQUARE}{lines}\n"))
+
+
+def test_a_comment_behind_a_face_changes_nothing(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.obj", f"{SQUARE}usemtl oak #2\nf 1 2 3 # one\nf 1 3 4 # two\n")
+    assert len(only(load_mesh(path, placing=AS_FILE)).faces) == 2
+
+
+@pytest.mark.parametrize("named", ["mtllib a.mtl b.mtl", "mtllib a.mtl\nmtllib b.mtl", "mtllib my own.mtl"])
+def test_every_material_file_is_read(tmp_path: Path, named: str) -> None:
+    """Several on a line or on lines of their own, or one with a blank in its name."""
+    a, b = "newmtl a\nKd 0 0 0\n", "newmtl b\nKd 1 1 1\n"
+    for name, text in (("a.mtl", a), ("b.mtl", b), ("my own.mtl", a + b)):
+        written(tmp_path / name, text)
+    text = f"{named}\n{SQUARE}usemtl a\nf 1 2 3\nusemtl b\nf 1 3 4\n"
+    scene = load_mesh(written(tmp_path / "a.obj", text), placing=AS_FILE)
+    assert sorted(surface.material.albedo for surface in scene.surfaces) == [0, 1]
+    assert scene.notes == ("largest extent 1 m kept",)
+
+
+def test_faces_of_a_very_small_body_are_no_degenerate_ones(tmp_path: Path) -> None:
+    """A square of one micrometre has an area of 1e-12 m^2; a needle of no width is degenerate at any size."""
+    text = SQUARE.replace(" 1", " 1e-6") + "v 5e-7 0 0\nf 1 2 3\nf 1 3 4\nf 1 5 2\n"
+    scene = load_mesh(written(tmp_path / "a.obj", text), placing=AS_FILE)
+    assert len(only(scene).faces) == 2 and "a: degenerate faces dropped: 1" in " ".join(scene.notes)
 
 
 def test_cut_outs_of_an_obj_are_noted(tmp_path: Path) -> None:
@@ -207,6 +247,18 @@ def test_a_ply_without_its_texture_is_refused(tmp_path: Path, capfd: pytest.Capt
     Image.new("RGB", (4, 4), (128, 128, 128)).save(tmp_path / "skin.png")
     pixels = only(load_mesh(path, placing=AS_FILE)).material.albedo.image
     assert pixels == pytest.approx(np.full((4, 4), srgb_to_linear(128 / 255)))
+
+
+def test_comments_of_a_ply_are_in_any_encoding(tmp_path: Path) -> None:
+    text = ply("comment Größe\n").encode("latin-1")
+    assert only(load_mesh(written(tmp_path / "a.ply", text), placing=AS_FILE)).faces.shape == (1, 3)
+
+
+def test_strips_of_a_ply_are_named(tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {name}\n" for name in "xyz")
+    text = f"{head}element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    message = refusal(written(tmp_path / "a.ply", f"{text}0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"))
+    assert message.endswith("a.ply: holds triangle strips (tristrips), which are not read; export it with faces")
 
 
 @pytest.mark.parametrize(

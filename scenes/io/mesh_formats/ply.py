@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scenes.errors import InputError, require
+from scenes.io.mesh_formats import NotReadError
 from scenes.json_types import JsonObject
 
 _PLY_TYPES = {
@@ -45,16 +46,24 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
-def check_ply(content: bytes) -> None:
-    """Raise InputError unless a PLY holds as many values as its header says, no more and no fewer, all of them
-    numbers."""
-    elements, order, start = _ply_header(content)
+def plain_ply(content: bytes) -> bytes:
+    """Return a PLY as trimesh reads it: with a header in UTF-8, whatever its comments are in.
+
+    Raises InputError unless it holds as many values as its header says, no more and no fewer, all of them numbers.
+    """
+    elements, order, first = _ply_header(content)
+    if any(element.name == "tristrips" and element.rows for element in elements):
+        raise NotReadError("holds triangle strips (tristrips), which are not read; export it with faces")
     if order is None:
-        _check_ply_text(content[start:], elements)
-        return
-    for element in elements:
-        start = _end_of_binary(content, start, element, order)
-    require(start == len(content), f"{len(content) - start} bytes more than its header says")
+        _check_ply_text(content[first:], elements)
+    else:
+        start = first
+        for element in elements:
+            start = _end_of_binary(content, start, element, order)
+        require(start == len(content), f"{len(content) - start} bytes more than its header says")
+    header = content[:first]
+    plain = header.decode("utf-8", errors="replace").encode()
+    return content if plain == header else plain + content[first:]
 
 
 def _ply_header(content: bytes) -> tuple[list[_Element], str | None, int]:
