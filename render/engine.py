@@ -124,8 +124,9 @@ def _traced_to_target(
         traced = add_samples(world, plan, settings, traced, extra, report)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
         error = estimated_error(world, plan, traced)
-    reasons = (*plan.reasons, *_bias_reasons(plan, traced, error), *clamp_reasons(plan, settings, traced, error))
-    return replace(plan, reasons=reasons), traced, error
+    reasons = (*_bias_reasons(plan, traced, error), *clamp_reasons(plan, settings, traced, error))
+    reasons += remedy_reasons(plan, traced, error)
+    return replace(plan, reasons=(*plan.reasons, *reasons)), traced, error
 
 
 def is_within_reach(error: ErrorEstimate, target: float, most: float) -> bool:
@@ -181,6 +182,12 @@ def additional_schedule(
         filter_octaves = filter_octaves_of(world, plan, settings, traced.origin_m, traced.schedule.cost + more.cost)
         return more._replace(filter_octaves=filter_octaves)
     return more
+
+
+def remedy_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
+    """State what to do where fewer paths than the pilot asked for missed the target: its estimate may be far off."""
+    remedy = "" if traced.schedule is None else traced.schedule.remedy
+    return () if not remedy or is_met(error, plan.target) else (f"indirect light: too few paths; {remedy}",)
 
 
 def clamp_reasons(plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:

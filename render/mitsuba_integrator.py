@@ -39,7 +39,9 @@ def register_integrator(name: str = NAME) -> None:
     Raises
     ------
     InputError
-        For another variant; and by the render for a shape, material or camera that has no counterpart here.
+        For another variant; and by the render for a shape, material or camera that has no counterpart here. `mi.render`
+        and `mi.load_dict` raise a RuntimeError of their own in its place: the first has it as its `__cause__`, the
+        second ends with its words.
 
     Examples
     --------

@@ -311,7 +311,10 @@ def _unfiltered(
         remedy = "force more with spp" if asked else "ask for more with an error target"
         if hopeless and plan.clamp is None:
             remedy = f"{remedy}, or {PROPOSAL}"
-        reasons.append(f"indirect light: the work of {wanted:.0f} paths a pixel would meet the target; {remedy}")
+        schedule = schedule._replace(remedy=remedy)
+        reasons.append(
+            f"indirect light: the pilot asks for the work of {wanted:.0f} paths a pixel, the limit is {limit:g}"
+        )
     spread = f"{schedule.spp.min()} to {schedule.spp.max()} paths a pixel, {schedule.reuses_paths.mean():.0%} shared"
     reasons.append(f"indirect light: {spread}; the work of {schedule.cost:.0f} paths a pixel")
     return schedule, tuple(reasons)

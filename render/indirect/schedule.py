@@ -26,7 +26,7 @@ class Schedule(NamedTuple):
 
     `batches` of samples are kept apart for the error estimate. With
     `filter_octaves` no block reuses paths, and late light is filtered over regions of these octaves. With a `clamp`
-    no path adds more.
+    no path adds more. `remedy` is what to do should fewer paths than the pilot asked for miss the target.
     """
 
     pixels: np.ndarray
@@ -34,6 +34,7 @@ class Schedule(NamedTuple):
     reuses_paths: np.ndarray
     filter_octaves: Octaves | None = None
     clamp: Clamp | None = None
+    remedy: str = ""
 
     @property
     def batches(self) -> int:

@@ -176,8 +176,23 @@ def _one_line(box: str) -> str:
     if choice is not None:
         meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2]))
         text = text.replace(choice[0], f"{choice[0]}{meant}", 1)
+    text = _unparsed(text) or text
     text = re.sub(r" no type matching .*?could be instantiated from (\[.*?\])\. Got errors.*", r" cannot be \1", text)
     return re.sub(r"For full helptext, run (.*)$", r"(see \1)", text) or "bad command line; see scene2spad --help"
+
+
+def _unparsed(text: str) -> str:
+    """Return what an option of numbers was given and what it takes instead, or "" where tyro says something else."""
+    found = re.search(r"Error parsing (--[\w-]+): (.*?) (?:Got errors|Argument helptext)", text)
+    if found is None or "..." in found[2]:
+        return ""
+    implied = {"for int()": ["INT"], "to float": ["FLOAT"]}
+    kinds = re.findall(r"\b(?:INT|FLOAT)\b", found[2]) or next((k for w, k in implied.items() if w in found[2]), [])
+    given = " ".join(re.findall(r"'(.*?)'", found[2]))
+    if not kinds or not given:
+        return ""
+    what = "whole number" if kinds[0] == "INT" else "number"
+    return f"{found[1]} {given}, expected {f'a {what}' if len(kinds) == 1 else f'{len(kinds)} {what}s'}"
 
 
 def _refuse(reason: str) -> int:

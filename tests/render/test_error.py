@@ -1,12 +1,14 @@
 """The stated error where the checked pixels are not like the image: a highlight, rare bright paths."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from render.engine import render
+from render.engine import remedy_reasons, render
 from render.error import PULSE_POWER, IndirectErrors, checked_pixels, estimate, response
+from render.indirect.schedule import Schedule
 from render.planning import PILOT_PIXELS, cell_narrowing
 from render.settings import WIDEST_GROWTH, WIDEST_INDIRECT_M, RenderSettings
 from render.transient import Transient
@@ -108,3 +110,13 @@ def test_plans_say_how_wide_cells_are_and_settings_rule():
     asked = RenderSettings(bounces=2, spp=16, grid=2, error=1e-3, indirect_tolerance_m=0.02, indirect_growth=0.0)
     plan = render(scene, asked).meta["plan"]
     assert plan["indirect_tolerance_m"] == 0.02 and plan["indirect_growth"] == 0
+
+
+@pytest.mark.parametrize(("total", "words"), [(0.03, ("indirect light: too few paths; ask",)), (0.01, ())])
+def test_more_paths_are_asked_for_only_where_the_target_is_missed(total, words):
+    """The pilot's own estimate may be 40 times too large: a remedy beside a target that is met contradicts it."""
+    plan, error = SimpleNamespace(target=0.02), SimpleNamespace(total=total)
+    empty = np.zeros(0, np.int64)
+    schedule = Schedule(empty, empty, empty, remedy="ask")
+    assert remedy_reasons(plan, SimpleNamespace(schedule=schedule), error) == words
+    assert remedy_reasons(plan, SimpleNamespace(schedule=None), error) == ()

@@ -114,6 +114,9 @@ def test_what_has_no_counterpart_is_refused_by_name(change, message):
     scene = mi.load_dict({**wall(), **change})
     with pytest.raises(InputError, match=message):
         scene.integrator().render(scene)
+    with pytest.raises(RuntimeError) as wrapped:
+        mi.render(scene)
+    assert isinstance(wrapped.value.__cause__, InputError)
 
 
 @pytest.mark.parametrize("bad", [{"temporal_bins": 0}, {"bin_width_opl": -1.0}, {"max_depth": 1}, {"error": 2.0}])

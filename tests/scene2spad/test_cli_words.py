@@ -181,3 +181,19 @@ def test_progress_also_speaks_when_piped(capsys):
     assert capsys.readouterr() == ("", "direct light: 5%\n")
     progress_lines(every_s=1e9)("direct light", 0.06)
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--width", "3.5"], "--width 3.5, expected a whole number"),
+        (["--seed", "1.5"], "--seed 1.5, expected a whole number"),
+        (["--offset", "far"], "--offset far, expected a number"),
+        (["--error", "x"], "--error x, expected a number"),
+        (["--baseline", "1", "2"], "--baseline 1 2, expected 3 numbers"),
+        (["--budget", "1", "y"], "--budget 1 y, expected 2 numbers"),
+    ],
+)
+def test_what_is_no_number_is_answered_with_what_is_expected(words, message, capsys):
+    status, _, err = run(capsys, "render", "plane", *words)
+    assert (status, err) == (2, f"scene2spad: {message}\n")
