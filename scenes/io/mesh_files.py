@@ -19,7 +19,7 @@ from scenes.io.mesh_formats.glb import check_glb, with_bare_materials
 from scenes.io.mesh_formats.obj import obj_fault, plain_obj
 from scenes.io.mesh_formats.ply import plain_ply
 from scenes.io.mesh_formats.stl import check_stl
-from scenes.io.textures import luminance, srgb_to_linear
+from scenes.io.textures import luminance
 
 if TYPE_CHECKING:
     import trimesh
@@ -226,9 +226,10 @@ def _opacity(library: Path, key: str, text: str) -> float:
 
 
 def _kd(library: Path, text: str) -> float:
+    """Return the luminance of Kd, which is a reflectance by the format's text, and in Blender's files: linear."""
     try:
         colour = [float(word) for word in text.split()[:3]]
-        return float(luminance(srgb_to_linear(np.clip(colour * 3 if len(colour) == 1 else colour, 0, 1))))
+        return float(luminance(np.clip(colour * 3 if len(colour) == 1 else colour, 0, 1)))
     except ValueError:
         raise InputError(f"{library}: Kd {text.strip()!r}, expected three numbers") from None
 
