@@ -199,6 +199,7 @@ def lenient_text(path: Path) -> str:
 
 def _read_library(library: Path) -> dict[str, MaterialEntry]:
     entries: dict[str, MaterialEntry] = {}
+    stated: set[str] = set()  # by d
     name = ""
     for line in lenient_text(library).splitlines():
         key, rest = (*line.split(maxsplit=1), "", "")[:2]
@@ -211,7 +212,9 @@ def _read_library(library: Path) -> dict[str, MaterialEntry]:
             entries[name] = replace(entries[name], image=_map_kd(library, name, rest))
         elif key.lower() == "map_d" and name:
             entries[name] = replace(entries[name], cut_out=True)
-        elif key.lower() in ("d", "tr") and name:
+        elif key.lower() in ("d", "tr") and name and not (key.lower() == "tr" and name in stated):
+            # where both are given, programs disagree on what Tr is
+            stated |= {name} if key.lower() == "d" else set()
             entries[name] = replace(entries[name], opacity=_opacity(library, key.lower(), rest))
     return entries
 

@@ -201,7 +201,7 @@ def test_cut_outs_of_an_obj_are_noted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "opacity"), [("d 0.25", "0.25"), ("d -halo 0.5", "0.5"), ("Tr 0.75", "0.25"), ("d 1\nTr 0", None)]
+    ("line", "opacity"), [("d 0.25", "0.25"), ("d -halo 0.5", "0.5"), ("Tr 0.75", "0.25"), ("d 1\nTr 1", None)]
 )
 def test_a_clear_material_of_an_obj_is_noted(tmp_path: Path, line: str, opacity: str | None) -> None:
     written(tmp_path / "a.mtl", f"newmtl a\nKd 0.5 0.5 0.5\n{line}\n")
