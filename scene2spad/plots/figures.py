@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -49,6 +50,27 @@ def draw_image(axes: Axes, image: np.ndarray, title: str, unit: str, **options: 
     bar = axes.figure.colorbar(shown, cax=beside, extend=_beyond(image, *shown.get_clim()))
     bar.set_label(unit, fontsize=8)
     bar.ax.tick_params(labelsize=8)
+
+
+def draw_depth_row(
+    row: Sequence[Axes], message: str, truth: np.ndarray, maps: Sequence[tuple[str, np.ndarray]]
+) -> None:
+    """Show the truth and labelled estimates of it beside each other, on the truth's colours, half a standard deviation
+    wider than its depths; the ends of the colour bar are pointed where estimates lie beyond them."""
+    known = truth[np.isfinite(truth)]
+    margin = 0.5 * known.std()
+    low, high = float(known.min() - margin), float(known.max() + margin)
+    for axes, (label, depth) in zip(row, [("truth", truth), *maps], strict=True):
+        shown = axes.imshow(depth, interpolation="nearest", cmap=DEPTH_COLOURS, vmin=low, vmax=high)
+        axes.set(xticks=[], yticks=[])
+        error = 1e3 * np.nanmean(np.abs(depth - truth))
+        mae = f"MAE {error:,.{1 if error < 100 else 0}f} mm"
+        axes.set_title(label if depth is truth else f"{label}\n{mae}".strip(), fontsize=7.5)
+    row[0].set_ylabel(message, fontsize=8)
+    every = np.concatenate([depth.ravel() for _, depth in maps])
+    bar = row[-1].figure.colorbar(shown, ax=row[-1], fraction=0.06, pad=0.03, extend=_beyond(every, low, high))
+    bar.set_label("depth [m]", fontsize=7)
+    bar.ax.tick_params(labelsize=7)
 
 
 def display(radiance: np.ndarray, white: float = 0.99) -> np.ndarray:

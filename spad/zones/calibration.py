@@ -47,7 +47,7 @@ _OFF = {
     "echo": 0.0,
 }
 TAIL_BINS = 48
-RISE_BINS, MOST_RISE_BINS = 2, 8
+RISE_BINS, RISE_BINS_LIMIT = 2, 8
 RETURN_SIGMAS = 6.0  # of a bin's background: Poisson noise alone reaches it in 1 of 1,000 histograms at the most
 
 
@@ -296,6 +296,6 @@ def _basis_for(captures: Sequence[ZoneCapture], sensor: Sensor, reference: int) 
     peak, background = int(counts.argmax()), np.median(counts)
     raised = counts > background + 3 * np.sqrt(np.maximum(background, 1.0))
     rise = int((~raised[:peak][::-1]).argmax()) if not raised[:peak].all() else peak
-    before = min(rise + RISE_BINS, MOST_RISE_BINS)
+    before = min(rise + RISE_BINS, RISE_BINS_LIMIT)
     at = math.floor(peak - path / (SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s))
     return PulseBasis.made(at - before, before + 5, min(TAIL_BINS, sensor.bins // 3))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 
-from scene2spad.plots.figures import DEPTH_COLOURS, depth_limits, draw_image
+from scene2spad.plots.figures import DEPTH_COLOURS, depth_limits, draw_depth_row, draw_image
 
 
 def room(pixels: int = 64) -> np.ndarray:
@@ -39,5 +39,18 @@ def test_the_colour_bar_points_to_what_lies_beyond_it(odd, extend):
     try:
         draw_image(axes, depth, "depth", "m", cmap=DEPTH_COLOURS, **depth_limits(depth))
         assert axes.images[0].colorbar.extend == extend
+    finally:
+        plt.close(figure)
+
+
+@pytest.mark.parametrize(("odd", "extend"), [(3.0, "neither"), (120.0, "max")])
+def test_the_colour_bar_of_a_row_points_to_estimates_beyond_it(odd, extend):
+    truth, estimate = room(), room()
+    estimate[3, 5] = odd
+    figure, row = plt.subplots(1, 3)
+    try:
+        draw_depth_row(row, "10 + 10", truth, [("one", truth + 0.1), ("other", estimate)])
+        assert row[2].images[0].colorbar.extend == extend
+        assert row[0].get_title() == "truth" and row[1].get_title() == "one\nMAE 100 mm"
     finally:
         plt.close(figure)

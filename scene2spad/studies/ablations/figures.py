@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm
 
 from csph.evaluation.methods import Row
 from scene2spad.networks.registry import Trained
-from scene2spad.plots.figures import DEPTH_COLOURS, plain_log, plt, save
+from scene2spad.plots.figures import draw_depth_row, plain_log, plt, save
 
 LIMIT_MM = 50.0  # of the axis where errors are as small as the paper's; wider where half of a model's images are not
 LOGARITHMIC = 3.0  # where models' medians lie so far apart a linear axis shows the worst alone
@@ -48,18 +48,7 @@ def draw(
     above.colorbar(points, ax=panel, pad=0.01).set_label("signal / background", fontsize=8)
     axes = below.subplots(len(lines), count + 1, squeeze=False)
     for row, (level, truth, maps) in zip(axes, lines, strict=True):
-        known = truth[np.isfinite(truth)]
-        margin = 0.5 * known.std()
-        colours = {"cmap": DEPTH_COLOURS, "vmin": known.min() - margin, "vmax": known.max() + margin}
-        for one, depth in zip(row, [truth, *maps], strict=True):
-            shown = one.imshow(depth, interpolation="nearest", **colours)
-            one.set(xticks=[], yticks=[])
-            error = 1e3 * np.nanmean(np.abs(depth - truth))
-            one.set_title("truth" if depth is truth else f"MAE {error:,.1f} mm", fontsize=7.5)
-        row[0].set_ylabel(level, fontsize=8)
-        bar = below.colorbar(shown, ax=row[-1], fraction=0.06, pad=0.03)
-        bar.set_label("depth [m]", fontsize=7)
-        bar.ax.tick_params(labelsize=7)
+        draw_depth_row(row, level, truth, [("", depth) for depth in maps])
     marked = f"; {GENERATED} numbers that generate Fourier codes" if any(GENERATED in label for label in labels) else ""
     figure.suptitle(f"{title}\nwhite circle: mean, line: median{marked}", fontsize=10)
     return save(figure, path)

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from csph import CodingTensor, Design, make_coding
 from csph.evaluation.metrics import is_low_sbr
 from scene2spad.networks.registry import ModelSpec, Trained
-from scene2spad.plots.figures import DEPTH_COLOURS, plain_log, plt, save
+from scene2spad.plots.figures import draw_depth_row, plain_log, plt, save
 from scene2spad.plots.style import COLOURS as OKABE_ITO
 from scene2spad.plots.style import MARKERS, look
 from scene2spad.studies import tensors as tensor_figures
@@ -150,18 +150,7 @@ def depth_images(
     size = (2.1 * (len(designs) + 1) + 1.4, 1.75 * len(lines) + 0.6)
     figure, axes = plt.subplots(len(lines), len(designs) + 1, figsize=size, layout="constrained", squeeze=False)
     for row, (message, truth, maps) in zip(axes, lines, strict=True):
-        known = truth[np.isfinite(truth)]
-        margin = 0.5 * known.std()
-        colours = {"cmap": DEPTH_COLOURS, "vmin": known.min() - margin, "vmax": known.max() + margin}
-        for panel, (name, depth) in zip(row, {"truth": truth, **maps}.items(), strict=True):
-            shown = panel.imshow(depth, interpolation="nearest", **colours)
-            panel.set(xticks=[], yticks=[])
-            error = 1e3 * np.nanmean(np.abs(depth - truth))
-            panel.set_title(name if name == "truth" else f"{name}\nMAE {error:,.0f} mm", fontsize=7.5)
-        row[0].set_ylabel(message, fontsize=8)
-        bar = figure.colorbar(shown, ax=row[-1], fraction=0.06, pad=0.03)
-        bar.set_label("depth [m]", fontsize=7)
-        bar.ax.tick_params(labelsize=7)
+        draw_depth_row(row, message, truth, [*maps.items()])
     gap = "\n" if len(designs) < 3 else ", "
     message = f"Depth at {compression}x: as it is{gap}and 7 m farther in time{gap}[signal, background] photons"
     figure.suptitle(message, fontsize=11)
