@@ -49,8 +49,8 @@ def test_the_colour_bar_of_a_row_points_to_estimates_beyond_it(odd, extend):
     estimate[3, 5] = odd
     figure, row = plt.subplots(1, 3)
     try:
-        draw_depth_row(row, "10 + 10", truth, [("one", truth + 0.1), ("other", estimate)])
+        draw_depth_row(row, "10 + 10", truth, [("one", truth + 0.2), ("other", estimate)])
         assert row[2].images[0].colorbar.extend == extend
-        assert row[0].get_title() == "truth" and row[1].get_title() == "one\nMAE 100 mm"
+        assert row[0].get_title() == "truth" and row[1].get_title() == "one\nMAE 200 mm"
     finally:
         plt.close(figure)
