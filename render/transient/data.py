@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from render.transient.exr_chunks import is_complete
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
 from scenes.json_types import JsonObject
@@ -224,6 +225,8 @@ def _write_exr(transient: Transient, path: Path) -> None:
         OpenEXR.File(parts).write(str(path))
     except RuntimeError as error:
         raise OSError(str(error)) from None
+    if not is_complete(path):
+        raise OSError("its last bytes were lost: is the disk full?")
 
 
 def _ragged(values: np.ndarray, transient: Transient) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from render.transient import Transient, read_transient, write_transient
+from render.transient.data import exr_bytes
 from render.transient.samples import Samples, merge, to_returns
 from scenes import InputError
 from scenes.files import ATTRIBUTE
@@ -145,6 +147,24 @@ def test_write_leaves_nothing_behind_when_it_fails(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(InputError, match="does not exist"):
         write_transient(make(), tmp_path / "nowhere" / "t.exr")
+
+
+@pytest.mark.parametrize("lost", [1, 700, 6000])
+def test_the_last_bytes_that_a_full_disk_takes_are_missed(tmp_path, lost):
+    """OpenEXR swallows the error of its last buffer: the file ended early, and nothing was said."""
+    transient = make(300, 6, 8)  # of few kilobytes: they all lie in that buffer
+    write_transient(transient, tmp_path / "t.exr")
+    size = (tmp_path / "t.exr").stat().st_size
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size - lost, unlimited[1]))
+    try:
+        with pytest.raises(InputError, match=r"u.exr: cannot be written \(its last bytes were lost"):
+            write_transient(transient, tmp_path / "u.exr")
+        with pytest.raises(OSError, match="is the disk full"):
+            exr_bytes(transient)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert [path.name for path in tmp_path.iterdir()] == ["t.exr"]
 
 
 def test_invalid_returns_are_refused_in_the_constructor():
