@@ -31,6 +31,7 @@ from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, MAX_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
 from render.transient import Transient
 from render.transient.samples import to_returns
+from scenes.errors import told_apart
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.model import Scene
@@ -215,9 +216,10 @@ def _bias_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tup
         return ()
     if error.bias == 0:
         return ("filter: biased, by less than the noise of as many paths shows",)
-    message = f"filter: biased by {error.bias:.2g}, measured against the same paths without it"
+    bias, target = told_apart(error.bias, plan.target)
+    message = f"filter: biased by {bias}, measured against the same paths without it"
     if error.bias > plan.target:
-        message += f", more than the target of {plan.target:.2g}: render without a filter"
+        message += f", more than the target of {target}: render without a filter"
     return (message,)
 
 

@@ -15,6 +15,7 @@ from scenes.constants import (
     REFERENCE_PULSE_SIGMA_S,
     SPEED_OF_LIGHT_M_PER_S,
 )
+from scenes.errors import told_apart
 
 BIN_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PERIOD_S / REFERENCE_BINS
 SIGMA_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PULSE_SIGMA_S
@@ -243,12 +244,13 @@ def is_met(error: ErrorEstimate, target: float) -> bool:
 
 def target_verdict(error: ErrorEstimate, target: float, pixels: int) -> str:
     """Say in one line whether the stated error meets the target; where a few pixels rule a missed one, say so."""
+    stated, limit = told_apart(error.total, target)
     if is_met(error, target):
-        message = f"error: {error.total:.2g} stated, meets the target of {target:.2g}"
+        message = f"error: {stated} stated, meets the target of {limit}"
         if error.pixel_median > UNEVEN * error.total:
             message += f"; the median pixel's is {error.pixel_median:.2g}, as bright ones rule the sum"
         return message
-    message = f"warning: the stated error of {error.total:.2g} MISSES the target of {target:.2g}"
+    message = f"warning: the stated error of {stated} MISSES the target of {limit}"
     message += f"; the median pixel's is {error.pixel_median:.2g}"
     if is_ruled_by_few(error, pixels):
         rest = error.total * math.sqrt(1 - error.worst_share)

@@ -40,3 +40,12 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
     """
     close = get_close_matches(word, list(choices), n=1, cutoff=0.6)
     return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def told_apart(value: float, limit: float, digits: int = 2) -> tuple[str, str]:
+    """Return two numbers with so many digits, or with the fewest more that tell them apart.
+
+    Example: `told_apart(0.0203, 0.02)` is ("0.0203", "0.02"), where two digits would show 0.02 twice.
+    """
+    texts = ((f"{value:.{n}g}", f"{limit:.{n}g}") for n in range(digits, 18))
+    return next((pair for pair in texts if pair[0] != pair[1]), (f"{value:.{digits}g}", f"{limit:.{digits}g}"))

@@ -24,7 +24,7 @@ import numpy as np
 from render.settings import FILTERED_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
 from scene2spad.datasets.set_folder import Done, SetFolder, file_name
 from scene2spad.datasets.workers import Run, check_workers, executor
-from scenes.errors import InputError, require
+from scenes.errors import InputError, require, told_apart
 from scenes.files import whole_file
 from scenes.io.inputs import read_json_object
 from scenes.library.sets import LARGEST, scene_set
@@ -140,7 +140,7 @@ def render_views(job: Job, views: Sequence[int]) -> list[Done]:
     return [render_view(job, view) for view in views]
 
 
-def _direct_errors(job: Job, views: Sequence[int]) -> list[float]:
+def _direct_errors(job: Job, grid: int, views: Sequence[int]) -> list[float]:
     """`render.planning.direct_error` of some views; NaN of one that cannot be rendered, which its record will say."""
     from render.planning import direct_error
     from render.scene.traced_scene import TracedScene
@@ -151,7 +151,7 @@ def _direct_errors(job: Job, views: Sequence[int]) -> list[float]:
             try:
                 scene = _scene(job, view)
                 world = _world(job, view, scene) or TracedScene(scene)
-                found.append(direct_error(world, job.settings(), _seed(job, view)))
+                found.append(direct_error(world, job.settings(), _seed(job, view), grid))
             except Exception:  # as in `render_view`
                 log.debug("view %d cannot be planned", view, exc_info=True)
                 found.append(math.nan)
@@ -299,7 +299,7 @@ def check_sides(sides: Iterable[int]) -> None:
 
 def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
     """Give all views as many rays as the errors of some of the first places ask for, however many views are asked."""
-    from render.planning import rays_for_all
+    from render.planning import measured_rays_for_all
 
     path = folder.path / "grid.json"
     if not path.is_file():
@@ -307,10 +307,12 @@ def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
         each = scene_set(job.set).views_per_place
         some = range(0, each, -(-each // OF_A_PLACE))
         places = [tuple(place * each + view for view in some) for place in range(PLANNED_PLACES)]
-        found = run(partial(_direct_errors, job), places, lambda view, why: math.nan)
-        errors = sorted(error for error in found if math.isfinite(error))
-        # None: each place by itself
-        grid, edge_threshold = rays_for_all(errors, job.settings()) if errors else (None, None)
+
+        def errors_at(grid: int) -> list[float]:
+            found = run(partial(_direct_errors, job, grid), places, lambda view, why: math.nan)
+            return sorted(error for error in found if math.isfinite(error))
+
+        grid, edge_threshold, errors = measured_rays_for_all(errors_at, job.settings())  # None: each place by itself
         with whole_file(path) as beside:
             beside.write_text(json.dumps({"grid": grid, "edge_threshold": edge_threshold, "errors": errors}) + "\n")
     try:
@@ -334,6 +336,13 @@ def check_scenes(job: Job, folder: SetFolder) -> None:
         changed = [name for name in inputs if not isinstance(kept, dict) or kept.get(name) != inputs[name]]
         message = f"{folder.path}: view {view} is of another {', '.join(changed)} than {now} has now"
         require(not changed, f"{message}; choose another --out")
+
+
+def _verdict(together: float, records: Sequence[dict]) -> tuple[str, str]:
+    """Say the root mean square of the views' errors, and whether that is within the one of their targets."""
+    target = math.sqrt(np.mean([record["target"] ** 2 for record in records]))
+    error, limit = told_apart(together, target, digits=4)
+    return error, f"within {limit}" if together <= target else f"above {limit}"
 
 
 def make_set(
@@ -369,10 +378,11 @@ def make_set(
     together = math.sqrt(np.mean([record["error"] ** 2 for record in good]))
     if missed:
         worst = max(missed, key=lambda record: record["error"] / record["target"])
+        error, target = told_apart(worst["error"], worst["target"], digits=4)
         log.warning(
-            "warning: %d of %d views end above their error target of %.4g, the worst, view %d, at %.4g; all together "
-            "(root mean square) are at %.4g, which is what a set is planned for",
-            *(len(missed), len(good), worst["target"], worst["view"], worst["error"], together),
+            "warning: %d of %d views end above their error target of %s, the worst, view %d, at %s; all together "
+            "(root mean square) are at %s, %s, which is what a set is planned for",
+            *(len(missed), len(good), target, worst["view"], error, *_verdict(together, good)),
         )
     return {
         "scenes": len(good),

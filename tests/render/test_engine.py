@@ -24,7 +24,7 @@ from render.error import (
 from render.image_error import estimated_error
 from render.indirect.launch_layout import BLOCK
 from render.indirect.schedule import Schedule, reallocated
-from render.planning import bounces_for, make_plan, rays_for_all
+from render.planning import bounces_for, make_plan
 from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
 from render.transient.samples import Samples
@@ -84,21 +84,6 @@ def test_light_stays_in_a_white_tube_that_few_pixels_see():
     planned, few, many = (light[name][inside].sum() for name in names)
     assert few < 0.9 * many and planned == pytest.approx(many, rel=0.02)
     assert light[8].sum() > 0.96 * light[60].sum()
-
-
-def test_many_views_get_the_rays_that_their_mean_squared_error_asks_for():
-    """Errors fall with at least the power 1.3 of the grid, 0.7 of the edges; direct light alone has all that is aimed
-    at."""
-    alone = RenderSettings(bounces=1, error=0.01, target_fraction=1.0)
-    for errors in ([0.01], [0.0, 0.01 * 2**0.5]):
-        assert rays_for_all(errors, alone) == pytest.approx((4, 0.5), abs=1e-5)
-    assert rays_for_all([0.0101 * 2**1.3], alone)[0] == 8
-    assert rays_for_all([0.0], alone)[0] == 2 and rays_for_all([1.0], alone)[0] == 16
-    grid, fraction = rays_for_all([0.012], alone)
-    assert grid == 4 and 0.012 * (fraction / 0.5) ** 0.7 == pytest.approx(0.01)
-    assert rays_for_all([0.01], RenderSettings(error=0.01, target_fraction=1.0))[0] > 4
-    half = RenderSettings(error=0.01, direct_fraction=0.5)
-    assert rays_for_all([0.005 * 2**1.3 * 1.001], half)[0] == 8
 
 
 def test_the_least_paths_of_an_open_plan_can_be_asked_for():

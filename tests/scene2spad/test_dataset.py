@@ -231,7 +231,9 @@ def test_views_above_their_error_target_are_counted(tmp_path, caplog, monkeypatc
     assert result["error_together"] == pytest.approx(np.sqrt(np.mean([record["error"] ** 2 for record in records])))
     message, worst = caplog.records[-1].getMessage(), max(record["error"] for record in records)
     assert message.startswith(f"warning: {missed} of 3 views end above their error target of 0.0001, the worst, view ")
-    assert f", at {worst:.4g}; " in message
+    assert f", at {worst:.4g}; " in message and ", within 0.0001, which is what a set is planned for" in message
+    make_set(replace(CLI_JOB, error=1e-4, grid=1), 3, tmp_path / "missed")
+    assert ", above 0.0001, which is what a set is planned for" in caplog.records[-1].getMessage()
     assert read_transient(tmp_path / "set" / records[0]["file"]).meta["target_met"] == records[0]["target_met"]
     assert make_set(replace(CLI_JOB, error=1.0), 3, tmp_path / "easy")["target_missed"] == 0
 
