@@ -8,6 +8,7 @@
     timings.jsonl       seconds of each epoch
     energy.csv          energy of a learned temporal code by groups of time bins, now and then from the start on
     last.safetensors    weights after the last step
+    training-views.txt  short hashes of the views that it is trained on, by which `evaluate` knows them again
     resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
 
 Devices, precision and several GPUs are Lightning's; nothing here knows how many there are.
@@ -45,7 +46,7 @@ from csph.training.optimiser import make_optimiser
 from csph.training.resume import WholeFileCheckpoints, check_resume, claim_run
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
-from csph.training.views import Views, check_direct, check_light, packed_sha256
+from csph.training.views import Views, check_direct, check_light, packed_sha256, write_seen
 from csph.weights.shipped import RESUME, TIMINGS
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import require
@@ -349,6 +350,7 @@ def train(
         runner = _trainer(config, record, hardware)
     module = DepthTraining(config, init)
     claim_run(folder, config)  # once the model is known to be possible
+    write_seen(folder, _listed(training))
     if config.threads:
         torch.set_num_threads(config.threads)
     retain_freed_memory()

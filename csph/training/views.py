@@ -10,13 +10,15 @@ from typing import NamedTuple
 import numpy as np
 
 from render.transient import Transient, read_transient
-from render.transient.packs import read_pack
+from render.transient.packs import depth_steps, read_pack
 from scenes.errors import require
+from scenes.files import whole_file
 from scenes.io.set_index import read_set_index
 from scenes.json_types import JsonObject
 from spad.detection.training_patches import PackedViews, pack_views
 from spad.sensor.model import Sensor
 
+SEEN, KEY_DIGITS = "training-views.txt", 12  # of a run: the keys of the views that it was trained on
 VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
 
 
@@ -115,3 +117,28 @@ def training_parts(views: Views) -> dict[str, int]:
     parts = [views, split_views(views)[0]] if several else [views]
     parts = [part for part in parts if len({one.depth_m.shape for one in part.transients}) == 1]
     return {packed_sha256(pack_views(part.transients)): len(part.transients) for part in parts}
+
+
+def view_key(view: Transient) -> str:
+    """Return a short hash of what a view shows: true depth as a pack holds it, and which pixels are mixed.
+
+    The same for a view in a folder, which has finer steps, and in the pack that is made of it.
+    """
+    sha = hashlib.sha256(f"{view.height}x{view.width}".encode())
+    sha.update(depth_steps(view.depth_m).astype("<f8").tobytes())
+    sha.update(view.mixed.astype(np.uint8).tobytes())
+    return sha.hexdigest()[:KEY_DIGITS]
+
+
+def write_seen(folder: Path, sets: Iterable[Views]) -> None:
+    """Keep the keys of all training views in a run's folder, sorted, one a line."""
+    keys = sorted({view_key(view) for views in sets for view in views.transients})
+    with whole_file(folder / SEEN) as beside:
+        beside.write_text("".join(f"{key}\n" for key in keys))
+
+
+def read_seen(checkpoint: Path) -> set[str] | None:
+    """Return the keys of the views that a run's folder, or a checkpoint in one, was trained on; None where nobody kept
+    them, as of runs of before."""
+    path = (checkpoint if checkpoint.is_dir() else checkpoint.parent) / SEEN
+    return set(path.read_text(errors="replace").split()) if path.is_file() else None

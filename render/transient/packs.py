@@ -145,7 +145,7 @@ def _arrays(view: Transient) -> dict[str, np.ndarray]:
     """Convert a transient to the pack's whole numbers, in the types that they have in memory."""
     near, far = view.path_near_m.astype(np.float64), view.path_far_m.astype(np.float64)
     centre, width = np.rint((near + far) / (2 * PATH_STEP_M)), np.rint((far - near) / WIDTH_STEP_M)
-    depth = np.maximum(np.rint(np.nan_to_num(view.depth_m) / DEPTH_STEP_M), 1)
+    depth = depth_steps(view.depth_m)
     limits = (("path", centre, 2**30), ("width of a return", width, 65535), ("depth", depth, 2**30))
     for name, values, most in limits:
         require(
@@ -156,7 +156,7 @@ def _arrays(view: Transient) -> dict[str, np.ndarray]:
     order = np.lexsort((_interval(centre, width)[0], view.return_pixel))  # rounding may swap neighbours
     arrays = {
         "count": counts,
-        "depth": np.where(np.isnan(view.depth_m), NO_DEPTH, depth),
+        "depth": depth,
         "mixed": view.mixed,
         "albedo": np.rint(np.clip(view.albedo.astype(np.float64), 0, 1) * 255),
         "ambient": _encoded(view.ambient, AMBIENT_STEPS),
@@ -166,6 +166,11 @@ def _arrays(view: Transient) -> dict[str, np.ndarray]:
         "bounces": view.bounces[order],
     }
     return {name: arrays[name].astype(dtype) for name, dtype in (PER_VIEW | PER_RETURN).items()}
+
+
+def depth_steps(depth_m: np.ndarray) -> np.ndarray:
+    """Return depth in steps of DEPTH_STEP_M as a pack holds it, at least 1; NO_DEPTH for NaN. Float64, unbounded."""
+    return np.where(np.isnan(depth_m), NO_DEPTH, np.maximum(np.rint(np.nan_to_num(depth_m) / DEPTH_STEP_M), 1))
 
 
 def _is_first(counts: np.ndarray) -> np.ndarray:

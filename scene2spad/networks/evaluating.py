@@ -13,7 +13,7 @@ from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, EvaluationPlan, Me
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.networks.model import load_model
 from csph.training.config import TrainConfig
-from csph.training.views import Views, check_truth, training_parts
+from csph.training.views import Views, check_truth, read_seen, training_parts, view_key
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.renders import views_at
@@ -56,14 +56,18 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
     sensor.check_offset(command.offset)
     views = views_at(command.set)
-    parts = training_parts(views)
-    for path, (_, config, _) in zip(command.checkpoints, loaded, strict=True):
-        _warn_of_training_views(str(path), config, parts, command.set)
+    whole = views
     if command.views is not None:
         there = len(views.transients)
         fits = 1 <= command.views <= there
         require(fits, f"evaluate: views {command.views} is outside 1 to {there} of {command.set}")
         views = Views(views.transients[: command.views], views.scenes[: command.views])
+    for path, (_, config, _) in zip(command.checkpoints, loaded, strict=True):
+        seen = read_seen(checkpoint_of(path))
+        number = _as_a_whole(config, whole) if seen is None else sum(view_key(v) in seen for v in views.transients)
+        if number:
+            message = "%s was trained on %d views of %s: its errors there are not those of a test"
+            log.warning(message, path, number, command.set)
     check_truth(command.set, views, sensor, command.offset)
     overflows: list[int] = []
     methods: dict[str, Method] = {}
@@ -101,12 +105,12 @@ def _counted(found: Evaluation, path: Path, range_m: float) -> dict[str, int]:
     return {"pixels_within_range": within, "beyond_range": beyond}
 
 
-def _warn_of_training_views(name: str, config: TrainConfig, parts: dict[str, int], path: Path) -> None:
-    """Say that a network has seen views of a test set in training; `parts`: `training_parts` of the set."""
-    hashes = config.data.get("training_sha256", [])
+def _as_a_whole(config: TrainConfig, views: Views) -> int:
+    """Return how many views of a set a run was trained on that kept one hash of all: 0 unless they are the whole set,
+    or the part of it that `training_parts` knows."""
+    hashes, parts = config.data.get("training_sha256", []), training_parts(views)
     seen = [parts[one] for one in ([hashes] if isinstance(hashes, str) else hashes) if one in parts]
-    if seen:
-        log.warning("%s was trained on %d views of %s: its errors there are not those of a test", name, seen[0], path)
+    return seen[0] if seen else 0
 
 
 def _recipe(config: TrainConfig) -> str:

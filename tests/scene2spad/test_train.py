@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -257,21 +256,6 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
     assert not Path("x").exists()
     assert "outside 0 to the sensor's range" in refused(capfd, *evaluate, "--offset", "20")
     assert "file not found" in refused(capfd, "evaluate", "nowhere", "--set", str(packed))
-
-
-def test_a_test_on_views_of_training_says_so(capfd, packed, trained, tmp_path):
-    """Also where a run split its set itself; not of views that it has not seen."""
-    others = tmp_path / "others.h5"
-    views = random_planes(6, size=16, seed=9)
-    write_pack(((t, {"scene": s}) for t, s in zip(views.transients, views.scenes, strict=True)), others)
-    out = ("--levels", "50+1", "--views", "1", "--baselines", "argmax", "--out", str(tmp_path / "out"))
-    for path, said in ((packed, True), (others, False)):
-        assert main(["evaluate", str(trained), "--set", str(path), *out]) == 0
-        told = re.findall(
-            rf"was trained on (\d+) views of {path}: its errors there are not those", capfd.readouterr().err
-        )
-        assert bool(told) == said
-        assert not said or 0 < int(told[0]) < 6
 
 
 def test_a_dry_training_refuses_the_sets_that_the_run_refuses(capfd, tmp_path, monkeypatch):
