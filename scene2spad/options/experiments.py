@@ -107,7 +107,8 @@ class Study(Long):
     preset: Literal["smoke", "laptop", "paper"] = "laptop"
     """Of studies of trained models: smoke trains two for seconds and tests them on two small views; laptop and paper
     say how models are trained with --retrain. Of `study real-data`, how captures are rendered: 32 x 32 pixels of direct
-    light, 256 x 256 to 5 %, to 2 %. Of `study transport`, 2, 12 or 24 scenes, 24, 88 or 176 pixels wide."""
+    light, 256 x 256 to 5 %, to 2 %. Of `study transport`, 2, 12 or 24 scenes, 24, 88 or 176 pixels wide. Of `study
+    render-error`, smoke is one view at two coarse qualities, in a minute."""
     pdf: bool = False
     """Write each figure as PDF as well, as wide as a paper's column (3.5 in) or page (7.16 in)."""
     models: Annotated[Path | None, may_stay_open("FOLDER")] = None

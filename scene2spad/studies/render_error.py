@@ -21,7 +21,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,8 +49,28 @@ FINE, FINE_MERGING = (16, 4096), 0.1  # and returns hardly merged, which is most
 RUNS = 2  # renders of each quality, with other noise
 DRAWS = 3  # of photons, for every render
 LEVELS = ((10.0, 10.0), (10.0, 200.0), (50.0, 50.0))
+# `smoke` shows that it runs
+SMOKE_QUALITIES, SMOKE_FINE, SMOKE_DRAWS, SMOKE_LEVELS, SMOKE_VIEWS = ((1, 16), (2, 32)), (4, 128), 2, LEVELS[:1], 1
 BASELINE = "log-matched"
 PIXEL_BLOCK = 1024  # pixels whose expected counts are held at once
+
+
+class Plan(NamedTuple):
+    """Extent of the study: qualities, the fine one beside them, draws of photons, photon levels, and views at most."""
+
+    qualities: tuple[tuple[int, int], ...]
+    fine: tuple[int, int]
+    draws: int
+    levels: tuple[tuple[float, float], ...]
+    views: int
+
+
+def plan_of(command: Study) -> Plan:
+    """Return the extent of a command's preset: of `smoke` a minute on two cores, of the others what the page shows."""
+    if command.preset == "smoke":
+        views = min(command.views, SMOKE_VIEWS)
+        return Plan(SMOKE_QUALITIES, SMOKE_FINE, SMOKE_DRAWS, SMOKE_LEVELS, views)
+    return Plan(QUALITIES, FINE, DRAWS, LEVELS, command.views)
 
 
 @dataclass(frozen=True)
@@ -83,20 +103,24 @@ def run(command: Study, progress: Progress) -> dict:
     sensor = _sensor_of(models)
     methods = {BASELINE: baseline(BASELINE), **{path: network_method(model) for path, model in models.items()}}
     tile = common_tile([*models.values()])
-    cache, plan = command.cache or default_folder(), [*((q, r) for q in QUALITIES for r in range(RUNS)), (FINE, 0)]
-    fine = [_views(command, of.name, FINE, run, cache, progress) for run in range(2)]
+    extent, cache = plan_of(command), command.cache or default_folder()
+    sets = [*((q, r) for q in extent.qualities for r in range(RUNS)), (extent.fine, 0)]
+    fine = [_views(command, extent.fine, run, cache, progress) for run in range(2)]
     rows: list[Row] = []
-    for number, (quality, again) in enumerate(plan):
-        progress(f"grid {quality[0]}, {quality[1]} paths", 0.2 + 0.8 * number / len(plan))
-        views = fine[0] if quality == FINE else _views(command, of.name, quality, again, cache, progress)
+    for number, (quality, again) in enumerate(sets):
+        progress(f"grid {quality[0]}, {quality[1]} paths", 0.2 + 0.8 * number / len(sets))
+        is_fine = quality == extent.fine
+        views = fine[0] if is_fine else _views(command, quality, again, cache, progress)
         own = statistics.fmean(t.meta["relative_error"]["total"] for t in views.transients)
-        measured = math.nan if quality == FINE else measured_error(views.transients, *(v.transients for v in fine))
-        for method, found in errors_of(methods, views, sensor, tile, command.seed).items():
+        measured = math.nan if is_fine else measured_error(views.transients, *(v.transients for v in fine))
+        plans = [EvaluationPlan(extent.levels, tile, seed=command.seed + draw) for draw in range(extent.draws)]
+        for method, found in errors_of(methods, views, sensor, plans).items():
             rows.append(Row(*quality, again, own, measured, method, *found))
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv([asdict(row) for row in rows], command.out / "render-error.csv")
     shown: list[Any] = [asdict(row) for row in rows] if command.json else _lines(rows, list(methods))
-    return {"views": command.views, "photons": [list(level) for level in LEVELS], "rows": shown, "csv": str(table)}
+    photons = [list(level) for level in extent.levels]
+    return {"preset": command.preset, "views": extent.views, "photons": photons, "rows": shown, "csv": str(table)}
 
 
 def _sensor_of(models: Mapping[str, DepthModel]) -> Sensor:
@@ -107,13 +131,14 @@ def _sensor_of(models: Mapping[str, DepthModel]) -> Sensor:
     return next(iter(found.values()), Sensor())
 
 
-def _views(command: Study, name: str, quality: tuple[int, int], again: int, cache: Path, progress: Progress) -> Views:
+def _views(command: Study, quality: tuple[int, int], again: int, cache: Path, progress: Progress) -> Views:
     """All views at one quality, from the cache or rendered into it one by one."""
-    grid, spp = quality
-    merging = FINE_MERGING if quality == FINE else 1.0
+    (grid, spp), extent = quality, plan_of(command)
+    merging = FINE_MERGING if quality == extent.fine else 1.0
     size = command.width, command.height
+    name = scene_set(command.scene_set).name
     job = Job(name, command.seed, *size, bounces=BOUNCES, spp=spp, grid=grid, merging=merging)
-    transients = [_view(job, view, again, cache, progress) for view in range(command.views)]
+    transients = [_view(job, view, again, cache, progress) for view in range(extent.views)]
     return Views(tuple(transients), tuple(str(t.meta["scene"]) for t in transients))
 
 
@@ -155,16 +180,18 @@ def _expected(transient: Transient) -> Iterator[np.ndarray]:
 
 
 def errors_of(
-    methods: Mapping[str, Method], views: Views, sensor: Sensor, tile: tuple[int, int], seed: int
+    methods: Mapping[str, Method], views: Views, sensor: Sensor, plans: Sequence[EvaluationPlan]
 ) -> dict[str, tuple[float, float]]:
-    """Return {method: (MAE [mm], its standard error from the draws of photons)}, the mean over views and levels."""
+    """Return {method: (MAE [mm], its standard error from the draws of photons)}, the mean over views and levels; each
+    of two plans or more is a draw."""
     draws: dict[str, list[float]] = {name: [] for name in methods}
-    for draw in range(DRAWS):
-        found = evaluate(methods, views, sensor, EvaluationPlan(LEVELS, tile, seed=seed + draw))
+    for plan in plans:
+        found = evaluate(methods, views, sensor, plan)
         for name, values in draws.items():
             values.append(statistics.fmean(r.mae_mm for r in found.rows if r.method == name and r.group == "all"))
     return {
-        name: (statistics.fmean(values), statistics.stdev(values) / math.sqrt(DRAWS)) for name, values in draws.items()
+        name: (statistics.fmean(values), statistics.stdev(values) / math.sqrt(len(plans)))
+        for name, values in draws.items()
     }
 
 

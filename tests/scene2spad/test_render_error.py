@@ -77,6 +77,15 @@ def test_table(capfd, tmp_path, monkeypatch):
     assert [path for path in kept if path.stat().st_mtime_ns != times[path]] == kept[:1]
 
 
+def test_smoke_is_one_view_at_coarse_qualities(capfd, tmp_path):
+    """It took ten minutes, as `laptop` does."""
+    small = ["--width", "8", "--height", "6", "--cache", str(tmp_path / "cache"), "--out", str(tmp_path / "out")]
+    status, found, message = run(capfd, "--preset", "smoke", *small)
+    assert status == 0, message
+    assert found["preset"] == "smoke" and found["views"] == 1 and len(found["rows"]) == 5
+    assert max(row["spp"] for row in found["rows"]) <= 256 and len([*(tmp_path / "cache").iterdir()]) == 6
+
+
 def test_mistakes_end_in_one_line(capfd, tmp_path):
     out = ["--out", str(tmp_path)]
     for given, output in (
