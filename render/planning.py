@@ -127,7 +127,7 @@ def rays_for_all(errors: Sequence[float], settings: RenderSettings) -> tuple[int
     the coarser one follows more edges: that costs no more than finer cells everywhere (measured in rooms).
     Below PILOT_GRID the grid is a guess, and `measured_rays_for_all` begins with it.
     """
-    ideal = PILOT_GRID * _share_of_allowed(errors, settings) ** (1 / GRID_POWER)
+    ideal = PILOT_GRID * _times_allowed(errors, settings) ** (1 / GRID_POWER)
     ideal = min(max(ideal, GRIDS[0]), GRIDS[-1])
     grid = math.floor(ideal + 1e-6)
     return grid, default_edge_threshold(grid) * (grid / ideal) ** (GRID_POWER / THRESHOLD_POWER)
@@ -156,13 +156,13 @@ def measured_rays_for_all(
 def _edges_for_all(errors: Sequence[float], grid: int, settings: RenderSettings) -> float | None:
     """Return the `edge_threshold` at which views of these errors at a grid below PILOT_GRID meet their target together;
     None where the next grid costs less."""
-    share = _share_of_allowed(errors, settings)
-    threshold = default_edge_threshold(grid) * min(1, 1 / share if share else 1) ** (1 / COARSE_THRESHOLD_POWER)
+    ratio = _times_allowed(errors, settings)
+    threshold = default_edge_threshold(grid) * min(1, 1 / ratio if ratio else 1) ** (1 / COARSE_THRESHOLD_POWER)
     return threshold if threshold >= default_edge_threshold(grid + 1) else None
 
 
-def _share_of_allowed(errors: Sequence[float], settings: RenderSettings) -> float:
-    """Return the root mean square of errors in that which direct light may have."""
+def _times_allowed(errors: Sequence[float], settings: RenderSettings) -> float:
+    """Return the root mean square of errors, over that which direct light may have."""
     target = DEFAULT_ERROR if settings.error is None else settings.error
     return math.sqrt(np.mean(np.square(errors))) / (_direct_fraction(settings, settings.bounces == 1) * target)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from scenes.errors import InputError, did_you_mean, require
+from scenes.errors import InputError, did_you_mean, require, require_kind
 from scenes.progress import Progress
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def sense(
     *,
     signal: float = 50.0,
     background: float = 50.0,
-    sensor: Sensor | str = "reference",
+    sensor: Sensor | str | Path = "reference",
     optics: Optics | None = None,
     law: Law = "auto",
     seed: int = 0,
@@ -106,8 +106,8 @@ def sense(
     signal, background : float
         Mean detections per pixel and exposure, over all pixels. The background includes dark counts. With `optics`
         they are computed instead.
-    sensor : Sensor or str
-        A sensor, or the name of a preset: reference, iccv2023-train, linospad.
+    sensor : Sensor, str or Path
+        A sensor, the name of a preset (as of ``scene2spad sense``), or a sensor file (.toml); not one of zones.
     optics : Optics, optional
         Laser energy, lens and filter: the photon budget is computed from them.
     law : str
@@ -132,11 +132,17 @@ def sense(
     >>> s2s.sense(transient, signal=20, background=5).counts.shape
     (6, 8, 1024)
     """
+    from render.transient import Transient
     from spad.detection.detect import sense as sense_exposure
-    from spad.sensor.model import PhotonBudget, sensor_by_name
+    from spad.sensor.budget import Optics
+    from spad.sensor.files import pixel_sensor
+    from spad.sensor.model import PhotonBudget
 
+    require_kind(transient, Transient, "sense", " of `render` or `read_transient`")
+    if optics is not None:
+        require_kind(optics, Optics, "sense: optics")
     require(isinstance(seed, Integral) and seed >= 0, f"seed {seed!r}: expected a whole number, 0 or more")
-    chosen = sensor_by_name(sensor) if isinstance(sensor, str) else sensor
+    chosen = pixel_sensor(sensor)
     budget = optics.budget(transient, chosen, seed=seed) if optics is not None else PhotonBudget(signal, background)
     return sense_exposure(transient, chosen, budget, seed=seed, model=law)
 
@@ -177,7 +183,9 @@ def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | Dep
     (8, 8)
     """
     from spad.estimators.depth import METHODS, histogram_depth_m
+    from spad.formats.histogram import Histogram
 
+    require_kind(histogram, Histogram, "estimate_depth", " of `sense`, `read_histogram` or `read_mat`")
     if isinstance(method, str) and method in METHODS:
         return histogram_depth_m(histogram, method)
     from csph import CodingTensor
@@ -196,7 +204,7 @@ def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | Dep
     return method.estimate(histogram).depth_m
 
 
-def coding_tensor(code: str, codes: int, sensor: Sensor | str = "reference", *, seed: int = 0) -> CodingTensor:
+def coding_tensor(code: str, codes: int, sensor: Sensor | str | Path = "reference", *, seed: int = 0) -> CodingTensor:
     """Make the coding tensor of a pixel on its own: K codes of all time bins.
 
     Parameters
@@ -206,8 +214,8 @@ def coding_tensor(code: str, codes: int, sensor: Sensor | str = "reference", *, 
         rows, cos and -sin at whole bins.
     codes : int
         The number K of codes, at least 2.
-    sensor : Sensor or str
-        The sensor whose bins are coded.
+    sensor : Sensor, str or Path
+        The sensor whose bins are coded, as `sense` takes it.
     seed : int
         Seed of random codes.
 
@@ -228,9 +236,9 @@ def coding_tensor(code: str, codes: int, sensor: Sensor | str = "reference", *, 
     (16, 1024)
     """
     from csph import CodingTensor, temporal_code
-    from spad.sensor.model import sensor_by_name
+    from spad.sensor.files import pixel_sensor
 
-    chosen = sensor_by_name(sensor) if isinstance(sensor, str) else sensor
+    chosen = pixel_sensor(sensor)
     return CodingTensor(f"{code}-{codes}", temporal_code(code, codes, chosen.bins, chosen, seed))
 
 
@@ -265,7 +273,9 @@ def depth_errors(depth_m: np.ndarray, histogram: Histogram, *, unmixed: bool = F
     0.0
     """
     from spad.estimators.depth import histogram_errors
+    from spad.formats.histogram import Histogram
 
+    require_kind(histogram, Histogram, "depth_errors", " as the truth")
     exclude = histogram.mixed if unmixed else None
     return histogram_errors(depth_m, histogram, exclude=exclude)
 

@@ -26,6 +26,13 @@ def require(condition: bool, message: str) -> None:
         raise InputError(message)
 
 
+def require_kind(value: object, kind: type, where: str, hint: str = "") -> None:
+    """Raise InputError unless `value` is of the class `kind`; `where` is the function that was called, `hint` what
+    gives one."""
+    article = "an" if kind.__name__[0] in "AEIOU" else "a"
+    require(isinstance(value, kind), f"{where}: expected {article} {kind.__name__}{hint}, not {type(value).__name__}")
+
+
 def listed(names: Iterable[str]) -> str:
     """Join the first MAX_NAMES of distinct names by commas, and count the rest."""
     distinct = list(dict.fromkeys(names))

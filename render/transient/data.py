@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from render.transient.exr_chunks import is_complete
-from scenes.errors import InputError
+from scenes.errors import InputError, require_kind
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
 from scenes.json_types import JsonObject
 from scenes.notebook import html_card
@@ -178,6 +178,7 @@ class Transient:
 
 def write_transient(transient: Transient, path: Path) -> None:
     """Write the multi-part EXR, whole or not at all. Raises InputError where the path cannot be written."""
+    require_kind(transient, Transient, "write_transient")
     with whole_file(path) as beside:
         _write_exr(transient, beside)
 

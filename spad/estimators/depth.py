@@ -276,9 +276,7 @@ def depth_errors(
     counted: empty (truth NaN), beyond_range (truth at the range, one for all or (H, W), or beyond), missing (estimate
     NaN).
     """
-    estimate, truth = (
-        np.asarray(value.cpu() if isinstance(value, Tensor) else value, dtype=np.float64) for value in (estimate, truth)
-    )
+    estimate, truth = map(_metres, (estimate, truth))
     keep = (
         np.ones(truth.shape, bool)
         if exclude is None
@@ -300,6 +298,13 @@ def depth_errors(
         }
     counted = {"empty": int(empty.sum()), "beyond_range": int(beyond.sum()), "missing": int(missing.sum())}
     return {**figures, "pixels": int(error.size), **counted}
+
+
+def _metres(depth: Tensor | np.ndarray) -> np.ndarray:
+    array = np.asarray(depth.cpu() if isinstance(depth, Tensor) else depth)
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"depth map: values are {array.dtype}, expected real numbers")
+    return array.astype(np.float64)
 
 
 def no_error_reason(errors: Mapping[str, float | int]) -> str | None:

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.errors import InputError
+from scenes.errors import InputError, require_kind
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.hdf5 import USER_BLOCK, add_checksum, describe, open_checked, read_dataset
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.notebook import html_card
 from spad.formats.timestamps import counts_from_timestamps, timestamps_from_counts
+from spad.sensor.files import pixel_sensor
 from spad.sensor.model import PhotonBudget, Sensor
 
 TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
@@ -71,13 +72,13 @@ class Histogram:
             array.setflags(write=False)
 
     @classmethod
-    def from_counts(cls, counts: np.ndarray, sensor: Sensor, meta: JsonObject | None = None) -> Histogram:
+    def from_counts(cls, counts: np.ndarray, sensor: Sensor | str | Path, meta: JsonObject | None = None) -> Histogram:
         """Make a histogram of measured counts whose truth nobody knows.
 
         Parameters
         ----------
         counts : (H, W, T) whole numbers from 0 on, one for each pixel and time bin
-        sensor : what recorded them; its number of bins is T
+        sensor : what recorded them, or its name or file (.toml); its number of bins is T
         meta : what is to be kept beside them, anything JSON holds
 
         Returns
@@ -95,7 +96,7 @@ class Histogram:
         >>> Histogram.from_counts(np.ones((2, 3, 8), int), Sensor(bins=8)).timestamps()[0].shape
         (48,)
         """
-        counts = np.asarray(counts)
+        counts, sensor = np.asarray(counts), pixel_sensor(sensor)
         if counts.ndim != 3 or counts.shape[2] != sensor.bins or counts.dtype.kind not in "iufb":
             raise InputError(f"histogram: counts are {counts.dtype}{counts.shape}, expected (H, W, {sensor.bins})")
         least, most = (float(f(counts)) if counts.size else 0.0 for f in (np.min, np.max))
@@ -171,6 +172,7 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
     """
     import h5py
 
+    require_kind(histogram, Histogram, "write_histogram")
     meta = {**histogram.meta, "sensor": histogram.sensor.to_dict(), "budget": histogram.budget.to_dict()}
     packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     buffer = io.BytesIO()  # HDF5 itself does not survive a full disk

@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from scenes.errors import InputError, did_you_mean, listed, require
+from scenes.errors import InputError, did_you_mean, listed, require, require_kind
 from scenes.files import whole_file
 from scenes.io.inputs import file_sha256
 from scenes.json_types import JsonObject
@@ -180,6 +180,17 @@ def load_sensor(name: str) -> SensorFile:
     names = sensor_names()
     meant = did_you_mean(name, names)
     raise InputError(f"sensor {name!r} is unknown{meant}, expected a file (.toml) or one of {', '.join(names)}")
+
+
+def pixel_sensor(given: Sensor | str | Path) -> Sensor:
+    """Return the sensor that is given, or that of a preset or file (.toml) as `load_sensor`; InputError for one of
+    zones, whose pixels nobody has, and anything else."""
+    if isinstance(given, str | Path):
+        found = load_sensor(str(given))
+        require(found.zones is None, f"sensor {given} has zones, expected one of pixels; `scene2spad sense` takes it")
+        return found.sensor
+    require_kind(given, Sensor, "sensor", " or its name")
+    return given
 
 
 def read_sensor(path: Path) -> SensorFile:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from functools import reduce
+from numbers import Real
 from typing import Literal
 
 import numpy as np
@@ -255,6 +256,7 @@ class PhotonBudget:
 
     def __post_init__(self) -> None:
         for label, value in (("signal", self.signal), ("background", self.background)):
+            require(isinstance(value, Real), f"photon budget: {label} {value!r} is no number")
             good = math.isfinite(value) and 0 <= value <= 1e9
             require(good, f"photon budget: {label} {value:g} photons per pixel is outside 0 to 1e9")
 

@@ -13,6 +13,7 @@ from processes import run_process
 import scene2spad as s2s
 from spad.estimators.depth import histogram_depth_m
 
+WALL = s2s.transient_from_rgbd(np.full((4, 4), 2.0), np.ones((4, 4)), np.ones((4, 4)))
 WITHOUT_ERRORS = ("models",)
 HEAVY = ("mitsuba", "drjit", "torch", "matplotlib", "scipy", "h5py", "OpenEXR", "trimesh")
 
@@ -95,9 +96,32 @@ def test_optics_compute_the_photon_budget():
         (lambda h: s2s.estimate_depth(h, "log-machted"), "log-matched"),
         (lambda h: s2s.load_model("nosuch"), "nosuch"),
         (lambda h: s2s.coding_tensor("furier", 8), "furier"),
+        (lambda h: s2s.sense(h), "sense: expected a Transient of `render` or `read_transient`, not Histogram"),
+        (lambda h: s2s.sense("x.exr"), "expected a Transient .* not str"),
+        (lambda h: s2s.sense(WALL, signal="10"), "signal '10' is no number"),
+        (lambda h: s2s.sense(WALL, sensor=3), "sensor: expected a Sensor or its name, not int"),
+        (lambda h: s2s.sense(WALL, sensor="swisspad3"), "did you mean 'swissspad3'"),
+        (lambda h: s2s.sense(WALL, sensor="tmf8820"), "tmf8820 has zones, expected one of pixels"),
+        (lambda h: s2s.sense(WALL, optics=3), "sense: optics: expected an Optics, not int"),
+        (lambda h: s2s.estimate_depth(WALL), "estimate_depth: expected a Histogram .* not Transient"),
+        (lambda h: s2s.estimate_depth(h.counts, s2s.coding_tensor("gray", 16)), "expected a Histogram .* not ndarray"),
+        (lambda h: s2s.Histogram.from_counts(h.counts, None), "sensor: expected a Sensor or its name, not NoneType"),
+        (lambda h: s2s.depth_errors(h.depth_m + 1j, h), "values are complex64, expected real numbers"),
+        (lambda h: s2s.depth_errors(h.depth_m, WALL), "expected a Histogram as the truth, not Transient"),
+        (lambda h: s2s.write_histogram(WALL, Path("x.h5")), "expected a Histogram, not Transient"),
+        (lambda h: s2s.write_transient(h, Path("x.exr")), "expected a Transient, not Histogram"),
     ],
 )
 def test_mistakes_are_one_line(histogram, call, message):
     with pytest.raises(s2s.InputError, match=message) as caught:
         call(histogram)
     assert "\n" not in str(caught.value)
+
+
+def test_sensors_are_taken_by_name_wherever_one_is_asked_for(histogram):
+    """Those that come as files, too, as on the command line; and files."""
+    sensed = s2s.sense(WALL, sensor="swissspad3")
+    assert sensed.sensor.name == "swissspad3"
+    again = s2s.Histogram.from_counts(sensed.counts, "swissspad3")
+    assert again.sensor == sensed.sensor and s2s.coding_tensor("gray", 8, "pf32").temporal.shape[0] == 8
+    assert s2s.Histogram.from_counts(histogram.counts, histogram.sensor).sensor == histogram.sensor
