@@ -37,19 +37,21 @@ PARTS = ("first", "further")
 # differences have their sign in the lowest bit
 STORED_VIEW, STORED = PER_VIEW | {"depth": np.uint32}, PER_RETURN | {"centre": np.uint32}
 CHUNK = 1 << 16  # returns
+# `%g` would cut a step's digits off, and nothing but these attributes tells another program how to read the codes
+LOGARITHMIC = f"code c > 0 is 2^(c / {{steps}} - {OCTAVES}), 0 is 0"
 NOTES = {  # unit and description of every dataset of the file
     "count": ("1", "returns of the pixel, view x row x column"),
-    "depth": (f"{DEPTH_STEP_M:g} m", "radial depth, as difference from the plane through its neighbours; sign lowest"),
+    "depth": (f"{DEPTH_STEP_M} m", "radial depth, as difference from the plane through its neighbours; sign lowest"),
     "mixed": ("1", "whether the pixel sees surfaces more than 50 mm apart"),
     "albedo": ("1/255", "diffuse reflectance at the pixel's centre"),
-    "ambient": ("W/(m^2 sr nm)", f"steady spectral radiance, logarithmic: {AMBIENT_STEPS} steps an octave"),
+    "ambient": ("W/(m^2 sr nm)", f"steady spectral radiance: {LOGARITHMIC.format(steps=AMBIENT_STEPS)}"),
     "start": ("1", "returns of view v are start[v] to start[v + 1]"),
     "meta": ("1", "JSON of every view's record, UTF-8"),
 }
 OF_RETURNS = {
-    "centre": (f"{PATH_STEP_M:g} m", "middle of the interval of path length, as difference; sign lowest"),
-    "width": (f"{WIDTH_STEP_M:g} m", "length of the interval of path length"),
-    "radiance": ("1/(m^2 sr)", f"per joule, logarithmic as difference: {RADIANCE_STEPS} steps an octave"),
+    "centre": (f"{PATH_STEP_M} m", "middle of the interval of path length, as difference; sign lowest"),
+    "width": (f"{WIDTH_STEP_M} m", "length of the interval of path length"),
+    "radiance": ("1/(m^2 sr)", f"per joule: {LOGARITHMIC.format(steps=RADIANCE_STEPS)}; kept as difference of codes"),
     "bounces": ("1", "surfaces met, 1 for direct light"),
 }
 NOTES |= {f"{part} {name}": note for part in PARTS for name, note in OF_RETURNS.items()}

@@ -99,9 +99,9 @@ def transient_from_rgbd(
     1 / b^2 of its footprint, so that an edge gives two returns and no depth in between; labels are those of the sample
     at the pixel's centre, ambient light is the mean. `fov_deg` is the full horizontal angle that the cosine of
     incidence is taken with, from the depth image itself; None for surfaces that face the camera. Samples without
-    depth (NaN or 0) return nothing; a pixel whose samples lie more than 50 mm apart, or partly nowhere, is mixed.
+    depth (not finite, or 0) return nothing; a pixel with samples more than 50 mm apart, or partly nowhere, is mixed.
     `depth_m` [m], `albedo` and `ambient` [W/(m2 sr nm)] are (H, W). Raises InputError for images of other shapes, sides
-    that `block` does not divide, and albedo or ambient light that is negative or not finite.
+    that `block` does not divide, negative depth, and albedo or ambient light that is negative or not finite.
     """
     depth, albedo, ambient = _alike(depth_m, albedo, ambient)
     require(
@@ -110,6 +110,8 @@ def transient_from_rgbd(
     )
     good = np.isfinite(albedo) & np.isfinite(ambient) & (albedo >= 0) & (ambient >= 0)
     require(bool(good.all()), "RGB-D images: albedo and ambient light must be finite and 0 or more")
+    least = float(depth.min(initial=0.0, where=depth < 0))
+    require(least >= 0, f"RGB-D images: a depth of {least:g} m, expected 0 or more, or none (NaN)")
     seen = np.isfinite(depth) & (depth > 0)
     depth = np.where(seen, depth, np.nan)
     cosine = np.ones_like(depth) if fov_deg is None else cosine_of_incidence(depth, fov_deg)

@@ -1,5 +1,6 @@
 """Packs: what comes back, how exactly, and what is refused."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -134,3 +135,15 @@ def test_what_is_too_dark_for_a_pack_is_dark(tmp_path):
     write_pack([(replace(VIEWS[0], radiance=radiance), {})], tmp_path / "dark.h5")
     got = np.sort(read_pack(tmp_path / "dark.h5")[0].radiance)[-4:]
     assert got.tolist() == [0, 0, 0, 2.0**-31]
+
+
+def test_attributes_tell_another_program_how_to_read_steps_and_codes(packed):
+    """Steps were cut off, and a logarithmic code had no zero point."""
+    with h5py.File(packed) as file:
+        steps = {name: float(file[name].attrs["unit"].removesuffix(" m")) for name in ("depth", "first centre")}
+        described, codes = str(file["ambient"].attrs["description"]), file["ambient"][0].astype(float)
+    assert steps == {"depth": DEPTH_STEP_M, "first centre": PATH_STEP_M}
+    found = re.search(r"code c > 0 is 2\^\(c / (\d+) - (\d+)\), 0 is 0", described)
+    assert found is not None
+    light = np.where(codes > 0, 2 ** (codes / int(found[1]) - int(found[2])), 0)
+    np.testing.assert_allclose(light, read_pack(packed)[0].ambient, rtol=1e-6)

@@ -338,3 +338,13 @@ def test_radiance_above_a_bright_sky_is_no_radiance_in_si() -> None:
         EXAMPLE.budget(replace(lit, ambient=np.full((1, 2), 1.4, np.float32)), SENSOR)
     words = ("1.4 W/(m2 sr nm)", "above 0.5", "--signal and --background instead of --radiometric")
     assert all(word in str(error.value) for word in words) and "\n" not in str(error.value)
+
+
+def test_a_negative_depth_is_refused():
+    """Z axes that point backwards are common: such an image had no return, without a word."""
+    depth, one = np.full((2, 3), 2.0), np.ones((2, 3))
+    depth[1, 2] = -3.5
+    with pytest.raises(InputError, match=r"RGB-D images: a depth of -3.5 m, expected 0 or more, or none \(NaN\)"):
+        transient_from_rgbd(depth, one, one)
+    depth[1, 1:] = np.nan, 0
+    assert transient_from_rgbd(depth, one, one).returns == 4
