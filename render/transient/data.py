@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from render.transient.exr_chunks import is_complete
+from render.transient.exr_files import write_exr
 from scenes.errors import InputError, require_kind
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
 from scenes.json_types import JsonObject
@@ -222,12 +222,7 @@ def _write_exr(transient: Transient, path: Path) -> None:
         for name, channels in FLAT_PARTS.items()
     ]
     parts.append(OpenEXR.Part(deep_header, deep, "transient"))
-    try:
-        OpenEXR.File(parts).write(str(path))
-    except RuntimeError as error:
-        raise OSError(str(error)) from None
-    if not is_complete(path):
-        raise OSError("its last bytes were lost: is the disk full?")
+    write_exr(OpenEXR.File(parts), path)
 
 
 def _ragged(values: np.ndarray, transient: Transient) -> np.ndarray:

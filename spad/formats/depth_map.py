@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from render.transient.exr_files import write_exr
 from scenes.errors import InputError
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.textures import read_flat_exr
@@ -25,10 +26,7 @@ def write_depth(depth_m: np.ndarray, path: Path, meta: JsonObject, confidence: n
         ATTRIBUTE: seal({**meta, "unit": "m"}, "depth", _sha256(channels)),
     }
     with whole_file(path) as beside:
-        try:
-            OpenEXR.File(header, channels).write(str(beside))
-        except RuntimeError as error:
-            raise OSError(str(error)) from None
+        write_exr(OpenEXR.File(header, channels), beside)
 
 
 def read_depth(path: Path) -> tuple[np.ndarray, np.ndarray | None, JsonObject]:

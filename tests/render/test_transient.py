@@ -11,9 +11,11 @@ import pytest
 
 from render.transient import Transient, read_transient, write_transient
 from render.transient.data import exr_bytes
+from render.transient.exr_files import is_complete
 from render.transient.samples import Samples, merge, to_returns
 from scenes import InputError
 from scenes.files import ATTRIBUTE
+from spad.formats.depth_map import write_depth
 
 
 def make(returns: int = 2000, height: int = 12, width: int = 16, seed: int = 0) -> Transient:
@@ -165,6 +167,34 @@ def test_the_last_bytes_that_a_full_disk_takes_are_missed(tmp_path, lost):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
     assert [path.name for path in tmp_path.iterdir()] == ["t.exr"]
+
+
+@pytest.mark.parametrize("height", [1, 16, 40])
+def test_every_cut_of_a_file_is_seen(tmp_path, height):
+    """Of a flat file in one part, a depth map, as of a transient in three."""
+    depth = np.random.default_rng(0).random((height, 9)).astype(np.float32)
+    write_depth(depth, tmp_path / "depth.exr", {})
+    write_transient(make(50, height, 9), tmp_path / "transient.exr")
+    for name in ("depth", "transient"):
+        whole = (tmp_path / f"{name}.exr").read_bytes()
+        assert is_complete(tmp_path / f"{name}.exr")
+        for size in range(0, len(whole), 7 if len(whole) < 3000 else 97):
+            (tmp_path / "cut.exr").write_bytes(whole[:size])
+            assert not is_complete(tmp_path / "cut.exr"), size
+        (tmp_path / "cut.exr").write_bytes(whole[:-1])
+        assert not is_complete(tmp_path / "cut.exr")
+
+
+def test_the_last_bytes_of_a_depth_map_are_missed_too(tmp_path):
+    depth = np.random.default_rng(0).random((20, 20)).astype(np.float32)
+    write_depth(depth, tmp_path / "t.exr", {})
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "t.exr").stat().st_size - 100, unlimited[1]))
+    try:
+        with pytest.raises(InputError, match=r"u.exr: cannot be written \(its last bytes were lost"):
+            write_depth(depth, tmp_path / "u.exr", {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
 
 
 def test_invalid_returns_are_refused_in_the_constructor():
