@@ -83,6 +83,13 @@ def _alike(*images: np.ndarray) -> list[np.ndarray]:
     return arrays
 
 
+def _check_values(depth: np.ndarray, albedo: np.ndarray, ambient: np.ndarray) -> None:
+    good = np.isfinite(albedo) & np.isfinite(ambient) & (albedo >= 0) & (ambient >= 0)
+    require(bool(good.all()), "RGB-D images: albedo and ambient light must be finite and 0 or more")
+    least = float(depth.min(initial=0.0, where=depth < 0))
+    require(least >= 0, f"RGB-D images: a depth of {least:g} m, expected 0 or more, or none (NaN)")
+
+
 def transient_from_rgbd(
     depth_m: np.ndarray,
     albedo: np.ndarray,
@@ -108,10 +115,7 @@ def transient_from_rgbd(
         block >= 1 and all(side % block == 0 for side in depth.shape),
         f"RGB-D images of {depth.shape[0]} x {depth.shape[1]} are no whole number of blocks of {block}",
     )
-    good = np.isfinite(albedo) & np.isfinite(ambient) & (albedo >= 0) & (ambient >= 0)
-    require(bool(good.all()), "RGB-D images: albedo and ambient light must be finite and 0 or more")
-    least = float(depth.min(initial=0.0, where=depth < 0))
-    require(least >= 0, f"RGB-D images: a depth of {least:g} m, expected 0 or more, or none (NaN)")
+    _check_values(depth, albedo, ambient)
     seen = np.isfinite(depth) & (depth > 0)
     depth = np.where(seen, depth, np.nan)
     cosine = np.ones_like(depth) if fov_deg is None else cosine_of_incidence(depth, fov_deg)
