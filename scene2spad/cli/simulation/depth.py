@@ -41,7 +41,8 @@ class Depth(Common):
     """A histogram written by `sense` (.h5), a frame or capture of the published family (.mat), a transient (.exr), or
     the folder of a set or of transients."""
     out: File = None
-    """The depth map (.exr) to write (default: the file's and the method's name); of a folder, the folder for them."""
+    """The depth map (.exr) to write (default: the file's and the method's name, with "sensed" between them for a
+    transient); of a folder, the folder for them."""
     method: Literal[
         "argmax", "matched", "log-matched", "correlation", "lmf-published", "coates", "compressive", "network"
     ] = "log-matched"
@@ -86,9 +87,12 @@ def run(command: Depth, progress: Progress) -> dict:
     source = input_file(command.file)
     if source.suffix.lower() == ".safetensors":
         raise InputError(f"{source}: is a checkpoint, expected a histogram; give it as --method network --checkpoint")
-    out = output_file(command.out or source.with_name(f"{source.stem}-{label}.exr"), ".exr", "depth")
+    is_transient = source.suffix.lower() == ".exr" and holds_kind(source, "transient")
+    # not the name of the map of `FILE.h5`, which other photons are in
+    stem = f"{source.stem}-sensed" if is_transient else source.stem
+    out = output_file(command.out or source.with_name(f"{stem}-{label}.exr"), ".exr", "depth")
     network = _network(command)
-    if source.suffix.lower() == ".exr" and holds_kind(source, "transient"):
+    if is_transient:
         histogram, sensed = _sensed(command, source, command.seed)
         log.info("%s: sensed %s", source, sensed)
     else:
