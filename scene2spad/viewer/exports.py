@@ -6,7 +6,6 @@ from pathlib import Path
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
-from scenes.io.mesh_declarations import check_ply
 
 from scene2spad.viewer.content import Content, Cube, Layer, grey_layer
 from scene2spad.viewer.sources import depth_layer
@@ -14,6 +13,7 @@ from scenes.errors import InputError, require
 from scenes.files import read_arrays
 from scenes.io.hdf5 import open_checked, read_dataset
 from scenes.io.inputs import read_bytes
+from scenes.io.mesh_formats.ply import plain_ply
 
 MAPS = {"expected_signal": "photons", "expected_background": "photons", "albedo": ""}
 COLUMNS = [(name, "<f4") for name in ("x", "y", "z", "intensity", "confidence")]
@@ -100,7 +100,7 @@ def cloud_content(path: Path) -> Content:
     known = HEADER in _columns(content)
     require(known, f"{path}: no point cloud that `export` wrote (x y z intensity confidence); render a mesh")
     try:
-        check_ply(content)
+        plain_ply(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     rows = np.frombuffer(content.partition(b"end_header\n")[2], np.dtype(COLUMNS))
