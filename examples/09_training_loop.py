@@ -20,7 +20,7 @@ class Photons(Dataset):
     def __getitem__(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return counts (1, T, H, W) and depth [m] (H, W); the number is the seed."""
         histogram = s2s.sense(VIEWS[number % len(VIEWS)], signal=20, background=10, seed=number)
-        return torch.from_numpy(histogram.counts).movedim(2, 0)[None].float(), torch.from_numpy(histogram.depth_m)
+        return torch.from_numpy(histogram.counts).movedim(2, 0)[None].float(), torch.from_numpy(histogram.depth_m.copy())
 
 
 # %%
@@ -36,4 +36,4 @@ for step, (counts, depth_m) in enumerate(DataLoader(Photons(), batch_size=2)):
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
-    print(f"step {step}: cross-entropy {float(loss):.3f}")
+    print(f"step {step}: cross-entropy {loss.item():.3f}")

@@ -15,7 +15,7 @@ from scenes.errors import InputError, require
 from ultraphase.assembly.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
 from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
-from ultraphase.core import WATCHDOG_STEPS, Core, Counters, region_contents
+from ultraphase.core import WATCHDOG_STEPS, Core, Counters, port_timestamps, region_contents
 
 _RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
 # In step, a turn costs about as much for one core as for hundreds: so few finish their timestamps one after the other.
@@ -87,10 +87,7 @@ class CoreArray:
         good = offsets.shape == (lanes + 1,) and offsets[0] == 0 and offsets[-1] == len(timestamps)
         good = good and bool((np.diff(offsets) >= 0).all())
         require(good, f"timestamp offsets: expected {lanes + 1} that rise from 0 to the {len(timestamps)} timestamps")
-        port = np.asarray(timestamps).astype(np.int64)
-        in_range = not port.size or (port.min() >= 0 and port.max() < 1 << 16)
-        require(bool(in_range), f"timestamps are outside 0 to {(1 << 16) - 1}")
-        return ArrayRun(self, port, offsets, park).to_end()
+        return ArrayRun(self, port_timestamps(timestamps), offsets, park).to_end()
 
     def contents(self, region: str) -> np.ndarray:
         """Return numbers in a region of every core's RAM, (cores, count)."""

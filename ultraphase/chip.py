@@ -6,6 +6,7 @@ plotting script. The chip's instruction set is not public: the emulated one is U
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from scenes.errors import require
@@ -49,6 +50,14 @@ class ChipSpec:
         good = self.ram_bits % 16 == 0 and 16 <= self.ram_bits <= 1 << 19
         require(good, f"chip: {self.ram_bits} bits of RAM, expected a multiple of 16 from 16 to 524288")
         require(1 <= self.max_shift <= 31, f"chip: max_shift {self.max_shift}, expected 1 to 31")
+        for name in ("cores", "spads_per_core"):
+            rows, columns = getattr(self, name)
+            require(rows >= 1 and columns >= 1, f"chip: {name} {rows} x {columns}, expected 1 or more each")
+        clocks = self.clocks_per_instruction
+        require(clocks >= 1, f"chip: {clocks} clocks an instruction, expected 1 or more")
+        for name in ("clock_s", "energy_per_instruction_j", "io_voltage_v", "io_load_f"):
+            number = getattr(self, name)
+            require(0 < number < math.inf, f"chip: {name} {number:g}, expected above 0")
         require(1 <= self.timestamp_bits <= 16, f"chip: {self.timestamp_bits} bits a timestamp, expected 1 to 16")
 
     @property

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.tables import INT8_SCALE, spatial_sum
 from ultraphase.verify import Tabulated
 
+T = TypeVar("T")
 COLUMNS = (
     *("name", "seconds", "cpu_seconds", "error", "pixels", "photons"),
     *("instructions_per_second", "photons_per_second"),
@@ -39,7 +42,7 @@ def run(command: Bench, progress: Progress) -> dict:
     rows = []
     for number, name in enumerate(names):
         progress(name, number / len(names))
-        rows += _one(method(name), command.seed)
+        rows += _one(method(name), command.seed, command.repeats)
     if not command.quick:
         progress("megapixel", 0.9)
         rows += [time_megapixel(method(name), command.seed, command.repeats) for name in _MEGAPIXEL_PROGRAMS]
@@ -72,35 +75,42 @@ def _counts(pixels: int, seed: int) -> np.ndarray:
     return counts
 
 
-def _one(chosen: Method, seed: int) -> list[dict]:
+def _timed(run: Callable[[], T], repeats: int) -> tuple[np.ndarray, T]:
+    """Return median clocks of `repeats` warm runs, and what the last returned; the first run is not counted."""
+    run()
+    spent = []
+    for _ in range(max(repeats, 1)):
+        start = _clocks()
+        found = run()
+        spent.append(_clocks() - start)
+    return np.median(spent, axis=0), found
+
+
+def _one(chosen: Method, seed: int, repeats: int) -> list[dict]:
     """One program: a core alone, an array of cores, and its tabulated form, on the same photons."""
     program, tables = chosen.program(), chosen.tables(int8_temporal(chosen))
     rows_columns = (16, 32)
     counts = _counts(rows_columns[0] * rows_columns[1], seed)
     stamps, offsets = timestamps_of(counts.reshape(*rows_columns, -1))
-    start = _clocks()
-    array = CoreArray(program, rows_columns, tables)
-    frame = array.frame(stamps, offsets)
-    arrays = _clocks() - start
-    start = _clocks()
-    proof = _proof(chosen)
-    proven = _clocks() - start
-    start = _clocks()
-    sums = proof.frame(counts)
-    tabulated = _clocks() - start
-    for _ in range(2):  # the first compiles the program
+    arrays, frame = _timed(lambda: CoreArray(program, rows_columns, tables).frame(stamps, offsets), repeats)
+    proven, proof = _timed(lambda: _proof(chosen), repeats)
+    tabulated, sums = _timed(lambda: proof.frame(counts), repeats)
+
+    def run_alone() -> Core:
         core = Core(program, tables)
         core.start(stamps[: offsets[1]], park=True)
-        start = _clocks()
         core.run()
-        alone = _clocks() - start
+        return core
+
+    alone, core = _timed(run_alone, repeats)
     held = np.concatenate([core.contents(region.name) for region in program.state])
-    pixels, work = len(counts), frame.counters
+    pixels, work, differs = len(counts), frame.counters, _left(chosen, sums) != frame.out
     return [
         _row(f"{chosen.name}: core alone", alone, held != sums[0], 1, core.counters.instructions, offsets[1]),
-        _row(f"{chosen.name}: array", arrays, _left(chosen, sums) != frame.out, pixels, work.instructions, len(stamps)),
-        _row(f"{chosen.name}: proof", proven, np.zeros(1, bool), TIMESTAMPS, 0, proof.states * TIMESTAMPS),
-        _row(f"{chosen.name}: tabulated", tabulated, np.zeros(1, bool), pixels, 0, len(stamps)),
+        _row(f"{chosen.name}: array", arrays, differs, pixels, work.instructions, len(stamps)),
+        # a proof that does not hold ends the bench: it has no error to count
+        _row(f"{chosen.name}: proof", proven, None, TIMESTAMPS, None, proof.states * TIMESTAMPS),
+        _row(f"{chosen.name}: tabulated", tabulated, differs, pixels, None, len(stamps)),
     ]
 
 
@@ -114,42 +124,41 @@ def _left(chosen: Method, sums: np.ndarray, shape: tuple[int, int] = (16, 32)) -
     return spatial_sum(cores, np.full((down * right, chosen.codes), INT8_SCALE)).reshape(len(cores), -1)
 
 
-def _row(name: str, spent: np.ndarray, differs: np.ndarray, pixels: int, instructions: int, photons: int) -> dict:
+def _row(
+    name: str, spent: np.ndarray, differs: np.ndarray | None, pixels: int, instructions: int | None, photons: int
+) -> dict:
+    """Return a row of the table: `error` counts integers that differ, None where none are compared."""
     seconds, cpu_seconds = spent.tolist()
     return {
         "name": name,
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
-        "error": int(np.count_nonzero(differs)),
+        "error": None if differs is None else int(np.count_nonzero(differs)),
         "pixels": pixels,
         "photons": int(photons),
-        "instructions_per_second": instructions / seconds,
+        "instructions_per_second": None if instructions is None else instructions / seconds,
         "photons_per_second": photons / seconds,
     }
 
 
 def time_megapixel(chosen: Method, seed: int, repeats: int) -> dict:
-    """Time a frame of 2^20 pixels from uint8 histograms by the tabulated form, two threads, best of `repeats`; a block
-    of it is compared with the integer product."""
+    """Time a frame of 2^20 pixels from uint8 histograms by the tabulated form, two threads, the median of `repeats`; a
+    block of it is compared with the integer product."""
     import torch  # noqa: F401  # products of bytes are used where it is loaded
 
     proof, block = _proof(chosen), _counts(_BLOCK, seed)
     histograms = np.concatenate([np.roll(block, shift, axis=1) for shift in range(MEGAPIXEL // _BLOCK)])
     halves = np.array_split(histograms, 2)
-    runs, sums = [], np.empty(0)
     with ThreadPoolExecutor(2) as threads:
-        for _ in range(max(repeats, 1)):
-            start = _clocks()
-            parts = list(threads.map(proof.frame, halves))
-            runs.append(_clocks() - start)
-            sums = parts[-1]
+        spent, parts = _timed(lambda: list(threads.map(proof.frame, halves)), repeats)
+    sums = parts[-1]
     last = halves[-1][-2048:].astype(np.int64) @ proof.table
     photons = int(block.sum(dtype=np.int64)) * (MEGAPIXEL // _BLOCK)
     return _row(
         f"{chosen.name}: megapixel",
-        np.min(runs, axis=0),
+        spent,
         proof.limited(last) != sums[-2048:],
         MEGAPIXEL,
-        0,
+        None,
         photons,
     )

@@ -23,13 +23,13 @@ class Bench(Common):
     """Image sides, pixels (default: 64 128 256 of flash, lamp and gallery, 64 128 of artist and groove, 64 256 of
     hall and hall-lamp, 64 of washroom)."""
     only: tuple[str, ...] = ()
-    """Cases of `bench hard-cases` (default: all)."""
+    """Cases of `bench hard-cases`, or programs of `bench emulate` (default: all)."""
     quick: bool = False
     """No 256 pixels, and flash and lamp alone at 128; no slow hard cases."""
     peer: Literal["mitransient", "none"] = "mitransient"
     """The renderer beside ours; none measures ours alone, against its own finer results."""
     repeats: int = 3
-    """Warm runs of each quality; their median is reported."""
+    """Warm runs of each quality; their median is reported. `sense` takes 3 or more, `encode` three times as many."""
     seeds: int = 3
     """Runs of different seeds that the error is averaged over."""
     memory: bool = False
@@ -44,6 +44,13 @@ class Bench(Common):
     """Folder for the table (.csv) and the pictures (.png)."""
 
 
+# Options that some stages of the bench read, and which ones; the others are of all stages.
+STAGES_OF: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("scenes", "sizes", "peer", "seeds", "memory", "cache"), ("render",)),
+    "only": ("hard-cases", "emulate"),
+    "data": ("render", "sense"),
+    "set": ("sense",),
+}
 ABLATIONS = ("spatial-block", "tensor-size", "fourier")
 StudyName = Literal[
     "tensors",

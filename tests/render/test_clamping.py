@@ -163,18 +163,18 @@ def test_a_pilot_that_asks_too_much_spends_little(monkeypatch):
     direct = light(1, None).direct
 
     def schedule(times: float) -> tuple[float, str]:
-        """Cost and reasons where the pilot finds that many times the noise that the largest plan could meet."""
+        """Cost and remedy where the pilot finds that many times the noise that the largest plan could meet."""
         power, each = power_of(direct)
         noise = times * plan.noise**2 * power / each * tracing.MAX_SPP / 12
         monkeypatch.setattr(tracing, "pilot_noise", lambda *_, **__: (np.full(12, noise), np.full(12, 1e9 * noise)))
-        found, reasons = tracing.planned_schedule(world, plan, settings, direct, np.zeros(len(PIXELS)), 1)
-        return found.cost, " ".join(reasons)
+        found, _ = tracing.planned_schedule(world, plan, settings, direct, np.zeros(len(PIXELS)), 1)
+        return found.cost, found.remedy
 
     assert schedule(0.5)[0] == pytest.approx(tracing.MAX_SPP / 2, rel=0.05)
-    cost, told = schedule(5)
-    assert cost == pytest.approx(tracing.MAX_SPP, rel=0.05) and "--clamp" not in told
-    cost, told = schedule(20)
-    assert cost == pytest.approx(tracing.MAX_SPP_BY_DEFAULT, rel=0.05) and "--clamp" in told
+    cost, remedy = schedule(5)
+    assert cost == pytest.approx(tracing.MAX_SPP, rel=0.05) and "--clamp" not in remedy
+    cost, remedy = schedule(20)
+    assert cost == pytest.approx(tracing.MAX_SPP_BY_DEFAULT, rel=0.05) and "--clamp" in remedy
 
 
 @pytest.mark.parametrize("clamp", [0.0, -1.0, 1e7, float("nan")])

@@ -331,3 +331,18 @@ def test_absent_mitransient_ends_in_one_line(capfd, tmp_path, monkeypatch):
     monkeypatch.setattr("scene2spad.bench.rendering.peers.available", lambda: False)
     status, _, err = bench(capfd, tmp_path, "--scenes", "groove", "--sizes", "8")
     assert status == 2 and "pip install 'scene2spad[bench]'" in err
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (["sense", "--sizes", "64"], "bench sense: --sizes 64 is for render"),
+        (["encode", "--memory"], "bench encode: --memory is for render"),
+        (["network", "--only", "fourier-16"], "bench network: --only fourier-16 is for hard-cases and emulate"),
+    ],
+)
+def test_options_of_other_stages_are_refused(asked, words, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", *asked]) == 2
+    assert words in capfd.readouterr().err
+    assert not any(tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -238,6 +239,30 @@ def test_limits_of_the_chip_are_the_specs():
         Core(code, chip=ChipSpec(program_words=1))
     with pytest.raises(InputError, match="64 bits of RAM, 48 bits over the 16"):
         assemble(".space a, u8, 8\nHALT", chip=ChipSpec(ram_bits=16))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"clock_s": 0.0}, "chip: clock_s 0, expected above 0"),
+        ({"clock_s": math.nan}, "chip: clock_s nan, expected above 0"),
+        ({"energy_per_instruction_j": -1.0}, "chip: energy_per_instruction_j -1, expected above 0"),
+        ({"clocks_per_instruction": 0}, "chip: 0 clocks an instruction, expected 1 or more"),
+        ({"cores": (0, 6)}, "chip: cores 0 x 6, expected 1 or more each"),
+    ],
+)
+def test_chips_that_cannot_be_are_refused(changed, message):
+    with pytest.raises(InputError, match=message):
+        ChipSpec(**changed)
+
+
+@pytest.mark.parametrize("wrong", [[63.9], [1.0, 2.0], np.zeros((2, 2), int)])
+def test_timestamps_that_are_no_whole_numbers_are_refused(wrong):
+    code = assemble("HALT")
+    with pytest.raises(InputError, match="expected whole numbers in one dimension"):
+        Core(code).start(wrong)
+    with pytest.raises(InputError, match="expected whole numbers in one dimension"):
+        CoreArray(code, (1, 1)).frame(np.asarray(wrong), np.array([0, len(wrong)]))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 
-from scene2spad.options.experiments import Bench
+from scene2spad.options.common import only_for
+from scene2spad.options.experiments import STAGES_OF, Bench
 from scenes.errors import InputError
 from scenes.progress import Progress
 
@@ -14,4 +15,7 @@ def run(command: Bench, progress: Progress) -> dict:
     for name, value in (("seeds", command.seeds), ("repeats", command.repeats)):
         if not 1 <= value <= 1000:
             raise InputError(f"bench: {name} {value} is outside 1 to 1000")
-    return importlib.import_module(f"scene2spad.bench.{command.stage.replace('-', '_')}").run(command, progress)
+    stage = command.stage
+    purposes = {name: (stage in stages, " and ".join(stages)) for name, stages in STAGES_OF.items()}
+    only_for(command, f"bench {stage}", purposes)
+    return importlib.import_module(f"scene2spad.bench.{stage.replace('-', '_')}").run(command, progress)
