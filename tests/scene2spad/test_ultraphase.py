@@ -189,7 +189,9 @@ def test_the_tables_come_from_csph():
 
 def test_bench_rows_agree_bit_for_bit(capfd, folder):
     result = run(capfd, "bench", "emulate", "--quick", "--only", "coarse-64", "separable-8", "--out", "bench")
-    assert len(result["rows"]) == 8 and all(row["error"] == 0 and row["seconds"] > 0 for row in result["rows"])
+    assert len(result["rows"]) == 8 and all(row["seconds"] > 0 for row in result["rows"])
+    for row in result["rows"]:  # a proof that does not hold raises
+        assert row["error"] == (None if row["name"].endswith("proof") else 0)
     assert (folder / "bench" / "bench-emulate.csv").is_file()
 
 
