@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from render.transient.exr_files import write_exr
-from scenes.errors import InputError, require_kind
+from scenes.errors import InputError, require, require_kind
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
 from scenes.json_types import JsonObject
 from scenes.notebook import html_card
-from scenes.offsets import check_delay
+from scenes.offsets import LIMIT_M, check_delay
 
 RETURN_FIELDS = {"path_near_m": "Z", "path_far_m": "ZBack", "radiance": "Y", "bounces": "bounces"}
 FLAT_PARTS = {
@@ -157,9 +157,12 @@ class Transient:
     def delayed(self, offset_m: float) -> Transient:
         """Return the same scene `offset_m` farther in time alone (a `time` offset): paths + 2 offset, depth + offset.
 
-        Raises InputError with a displaced laser, for which a delay is no distance.
+        A negative offset brings it nearer, at most until the nearest return begins at the laser. Raises InputError for
+        other offsets, and with a displaced laser, for which a delay is no distance.
         """
         check_delay(self.meta.get("laser", {}).get("baseline_m", ()))
+        least = -float(self.path_near_m.min(initial=2 * LIMIT_M)) / 2
+        require(least <= offset_m <= LIMIT_M, f"time offset {offset_m:g} m is outside {least:g} to {LIMIT_M:g}")
         return replace(
             self,
             path_near_m=self.path_near_m + np.float32(2 * offset_m),

@@ -35,21 +35,29 @@ def input_file(path: Path) -> Path:
     return path
 
 
-def output_file(path: Path, suffix: str, kind: str) -> Path:
+def output_file(path: Path, suffix: str, kind: str, made: Path | None = None) -> Path:
     """Return an output path that can be written later, with its picture: checked before the work, not after it.
 
     Results of the same kind may be written again; any other file is not overwritten.
+    made   folder that the command makes first: the output may lie in it, or in one above it, that is not there yet
     """
     if path.suffix.lower() not in (HDF5_SUFFIXES if suffix in HDF5_SUFFIXES else (suffix,)):
         raise InputError(f"{path}: the output must end in {suffix}")
     for target in (path, picture(path, kind)):
-        check_target(target)
+        check_target(target, made=made)
     keep_foreign(path, Mark(kind, lambda found: holds_kind(found, kind)))
     return path
 
 
-def check_target(path: Path, source: Path | None = None) -> None:
-    """Raise InputError for a file that cannot be written: no folder for it, a folder of its name, or the source."""
+def check_target(path: Path, source: Path | None = None, made: Path | None = None) -> None:
+    """Raise InputError for a file that cannot be written: no folder for it, a folder of its name, or the source.
+
+    Whether the folder `made`, and those above it, can be made is for `output_folder` to check.
+    """
+    if made is not None and not path.parent.exists():
+        folder = made.resolve()
+        if path.parent.resolve() in (folder, *folder.parents):
+            return
     if not path.parent.is_dir():
         raise InputError(f"{path}: folder {path.parent} does not exist")
     if not os.access(path.parent, os.W_OK):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from scenes.errors import printable, require
 from scenes.io.inputs import read_json_object
@@ -60,14 +60,20 @@ class Found:
 
     def caption(self, path: Path) -> str:
         """Return its place in the folder and its day, and how many older ones of its name were passed over."""
-        day = time.strftime("%Y-%m-%d", time.gmtime(path.stat().st_mtime))
         older = len(self.files.get(path.name, [])) - 1
-        return f"{path.relative_to(self.root)}, {day}{f'; {older} older of that name not shown' if older > 0 else ''}"
+        return f"{self.place(path)}{f'; {older} older of that name not shown' if older > 0 else ''}"
+
+    def place(self, path: Path) -> str:
+        """Return its place in the folder and its day."""
+        return f"{path.relative_to(self.root)}, {time.strftime('%Y-%m-%d', time.gmtime(path.stat().st_mtime))}"
 
     def read(self, path: Path, reader: Callable[[Path], Content]) -> Content | None:
         """Return what a reader makes of a file; None, and a problem, where it cannot."""
         try:
             return reader(path)
+        except UnidentifiedImageError:  # its message holds an address in memory, another one each time
+            self.problem(f"{path.relative_to(self.root)}: is no picture")
+            return None
         except UNREADABLE as error:
             message = " ".join(str(error).split())[:120]
             self.problem(f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {message})")

@@ -17,6 +17,7 @@ from typing import Any
 from scene2spad.options.experiments import Report
 from scene2spad.report import html
 from scene2spad.report import published as beside_print
+from scene2spad.report.evaluations import read_summary
 from scene2spad.report.files import CONFIGURATIONS, Found, gather, read_png, read_rows, rows_in
 from scene2spad.report.plan import NEVER, SECTIONS, Item, Picture, Table
 from scenes.errors import InputError, require
@@ -159,6 +160,8 @@ def _rows_of(one: Table, found: Found) -> tuple[list[dict] | None, Path | None]:
 
 
 def _table(one: Table, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
+    if one.evaluation:
+        return _evaluations(one, item, found, absent)
     rows, path = _rows_of(one, found)
     if path is None or rows is None:
         return _absent(one.file, item.command, path, absent)
@@ -166,6 +169,22 @@ def _table(one: Table, item: Item, found: Found, absent: dict[str, list[str]]) -
         return html.paragraph(f"{one.shows}: none in {found.caption(path)}.")
     found.tables += 1
     return html.table(rows, f"{one.shows} ({found.caption(path)})")
+
+
+def _evaluations(one: Table, item: Item, found: Found, absent: dict[str, list[str]]) -> str:
+    """Return the means of every evaluation, a table for each folder, in the order of their names."""
+    newest = found.newest(one.file)
+    tables = []
+    for path in sorted(found.files.get(one.file, [])):
+        summary = found.read(path, read_summary)
+        if summary is not None and summary.rows:
+            views, levels = (
+                f"{count} {noun}{'s' * (count != 1)}"
+                for count, noun in ((summary.views, "view"), (summary.levels, "photon level"))
+            )
+            tables.append(html.table(summary.rows, f"{one.shows}: {views} at {levels} ({found.place(path)})"))
+    found.tables += len(tables)
+    return "\n".join(tables) or _absent(one.file, item.command, newest, absent)
 
 
 def _named(name: str, item: Item, found: Found, absent: dict[str, list[str]]) -> str:

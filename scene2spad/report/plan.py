@@ -17,12 +17,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class Table:
-    """A table by its file's name, of a .json the list of rows under `key`; `columns`: these alone."""
+    """A table by its file's name, of a .json the list of rows under `key`; `columns`: these alone. `evaluation`: that
+    of an `evaluate`; the means of every folder's are shown."""
 
     file: str
     shows: str
     key: str = ""
     columns: tuple[str, ...] = ()
+    evaluation: bool = False
 
 
 @dataclass(frozen=True)
@@ -335,7 +337,7 @@ _BEYOND = Section(
             "evaluate",
             "Trained networks beside classical estimators",
             "scene2spad evaluate CHECKPOINTS --set SET",
-            data=("evaluation.csv",),
+            tables=(Table("evaluation.csv", "Means over scenes and photon levels", evaluation=True),),
         ),
         Item(
             "demo",

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import resource
 from dataclasses import replace
 from pathlib import Path
@@ -217,6 +218,15 @@ def test_delay_moves_paths_by_twice_the_offset():
     assert np.allclose(later.mean_path_m(), transient.mean_path_m() + 14, atol=1e-5, equal_nan=True)
     assert np.allclose(later.depth_m, transient.depth_m + 7, equal_nan=True)
     assert (later.radiance == transient.radiance).all() and later.delayed(1.0).meta["time_offset_m"] == 8.0
+
+
+@pytest.mark.parametrize("offset", [-100.0, np.nan, np.inf, 1e300])
+def test_a_delay_that_cannot_be_is_named(offset):
+    transient = make()
+    with pytest.raises(InputError, match=rf"^time offset {re.escape(f'{offset:g}')} m is outside -[\d.]+ to 10000$"):
+        transient.delayed(offset)
+    nearest = float(transient.path_near_m.min())
+    assert transient.delayed(-nearest / 2).path_near_m.min() == 0
 
 
 @pytest.mark.parametrize("layer", ["ambient", "error"])

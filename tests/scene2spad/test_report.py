@@ -265,7 +265,35 @@ def test_an_empty_folder_makes_a_page_of_what_is_missing(tmp_path, capfd):
 
 
 def test_the_same_results_give_the_same_page(tree, capfd):
-    assert made(tree, capfd)[1] == made(tree, capfd)[1]
+    put(tree / "study/codes.png", b"")
+    first, second = made(tree, capfd), made(tree, capfd)
+    assert first == second and "study/codes.png: is no picture" in first[0]["problems"]
+
+
+def test_means_of_every_evaluation_are_shown_with_their_places(tree, capfd):
+    """Those that `evaluate` forms: each scene counts by its mean over views and levels."""
+    head = (
+        "method,scene,view,signal,background,group,mae_mm,rmse_mm,within_1mm,within_5mm,within_10mm,within_20mm,ssim,"
+        "pixels,missing,beyond_range\n"
+    )
+    lines = [
+        f"{name},{scene},{view},1,{background},{group},{mae},{mae + 8},0.1,0.2,0.625,0.5,"
+        f"{0.875 if group == 'all' else 'nan'},9,0,0"
+        for name in ("run/net.ckpt", "argmax")
+        for scene, view, background, all_mm in (("a", 0, 1, 10), ("a", 0, 100, 30), ("b", 1, 1, 113))
+        for group, mae in (("all", all_mm + (name == "argmax")), ("mixed", all_mm + 200.5))
+    ]  # fmt: skip
+    put(tree / "evaluate/near/evaluation.csv", head + "\n".join(lines) + "\n")
+    put(tree / "evaluate/far/evaluation.csv", head + lines[0] + "\n", age=9)
+    put(tree / "evaluate/other/evaluation.csv", "method,mae_mm\nargmax,3\n")
+    message, text = made(tree, capfd)
+    part = Page(text[text.index('<section id="evaluate"') :].partition("</section>")[0])
+    assert "method MAE [mm] MAE of mixed pixels [mm] RMSE [mm] within 10 mm [%] SSIM" in part.words
+    # mean of 20 and 113, not of three images
+    assert "run/net.ckpt 66.5 267 74.5 62.5 0.875" in part.words and "argmax 67.5 267 75.5 62.5 0.875" in part.words
+    assert "2 views at 2 photon levels (evaluate/near/evaluation.csv, 2023-11-14)" in part.words
+    assert "1 view at 1 photon level (evaluate/far/evaluation.csv" in part.words and "not shown" not in part.words
+    assert any(line.startswith("evaluate/other/evaluation.csv: cannot be read") for line in message["problems"])
 
 
 def test_mistakes_end_in_one_line(tree, tmp_path, capfd):

@@ -75,6 +75,16 @@ def test_views_of_several_sizes_are_not_packed(tmp_path, capsys):
     assert not (tmp_path / "set").exists()
 
 
+def test_a_pack_may_lie_in_a_folder_that_the_set_makes(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    argv = ["dataset", "rooms", "--count", "1", "--width", "8", "--bounces", "1", "--error", "0.3", "--no-ambient"]
+    assert main([*argv, "--out", "out/set", "--pack", "elsewhere/set.h5"]) == 2
+    assert "elsewhere/set.h5: folder elsewhere does not exist" in capsys.readouterr().err
+    assert main([*argv, "--out", "out/set", "--pack", "out/set.h5"]) == 0
+    assert (tmp_path / "out/set.h5").is_file()
+    assert main([*argv, "--out", "other/set", "--pack", "other/set/pack.h5", "--dry-run"]) == 0
+
+
 def test_a_damaged_view_is_named_with_what_mends_it(small, tmp_path):
     view = small / "views/000001.exr"
     view.write_bytes(view.read_bytes()[:-40] + bytes(40))

@@ -131,7 +131,7 @@ def test_sweep_refuses_what_does_not_fit_and_goes_on(capfd, folder):
         (["run", "fourier-8", "--photons", "10"], "50 signal of 10"),
         (["run", "fourier-8", "--photons", "1", "2"], "2 photon counts"),
         (["run", "fourier-8", "--photons", "1e9"], "20000"),
-        (["run", "fourier-8", "--trace", "-1"], "--trace -1"),
+        (["run", "fourier-8", "--trace", "-1"], "--trace -1 is outside 0 to 100000"),
         (["run", "fourier-8", "--watch", "nothing"], "nothing"),
         (["sweep", "--fps", "0"], "0 frames"),
         (["sweep", "--pixels", "0"], "0 pixels"),

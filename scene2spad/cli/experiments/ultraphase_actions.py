@@ -258,8 +258,8 @@ def _looked_at(command: Ultraphase, program: Program, tables: dict, stream: np.n
     """Trace and watch of the first core alone, as far as it runs without its neighbours."""
     shown = {}
     own = {name: values.reshape(-1, values.shape[-1])[0] for name, values in tables.items()}
+    require(0 <= command.trace <= 100_000, f"--trace {command.trace} is outside 0 to 100000")
     if command.trace:
-        require(0 < command.trace <= 100_000, f"--trace {command.trace} is outside 1 to 100000")
         core = Core(program, own)
         core.start(stream, park=True)
         shown["trace"] = [str(step) for step in core.trace(command.trace)]

@@ -76,9 +76,9 @@ def run(command: Dataset, progress: Progress) -> dict:
         of.name, command.seed, command.width, command.height, command.bounces, command.spp, command.grid, error,
         command.offset, command.offset_mode, command.ambient, command.ambient_spp, filter=command.filter,
     )  # fmt: skip
-    if command.pack is not None:
-        output_file(command.pack, ".h5", "pack")
     out = command.out or Path("out") / file_stem(of.name)
+    if command.pack is not None:
+        output_file(command.pack, ".h5", "pack", made=out)
     output_folder(out, "the set")
     count = command.count if command.count is not None else of.size or 100
     if command.pack is not None:
