@@ -20,7 +20,8 @@ class Photons(Dataset):
     def __getitem__(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return counts (1, T, H, W) and depth [m] (H, W); the number is the seed."""
         histogram = s2s.sense(VIEWS[number % len(VIEWS)], signal=20, background=10, seed=number)
-        return torch.from_numpy(histogram.counts).movedim(2, 0)[None].float(), torch.from_numpy(histogram.depth_m.copy())
+        counts = torch.from_numpy(histogram.counts).movedim(2, 0)[None].float()
+        return counts, torch.from_numpy(histogram.depth_m.copy())
 
 
 # %%
