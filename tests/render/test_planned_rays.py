@@ -1,4 +1,4 @@
-"""How many rays all views of a set take, and how a missed target is said."""
+"""Test how many rays all views of a set take, and how a missed target is said."""
 
 from dataclasses import replace
 

@@ -172,7 +172,7 @@ def test_the_last_bytes_that_a_full_disk_takes_are_missed(tmp_path, lost):
 
 @pytest.mark.parametrize("height", [1, 16, 40])
 def test_every_cut_of_a_file_is_seen(tmp_path, height):
-    """Of a flat file in one part, a depth map, as of a transient in three."""
+    """Find it in a flat file of one part, a depth map, as in a transient of three."""
     depth = np.random.default_rng(0).random((height, 9)).astype(np.float32)
     write_depth(depth, tmp_path / "depth.exr", {})
     write_transient(make(50, height, 9), tmp_path / "transient.exr")

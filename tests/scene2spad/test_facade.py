@@ -119,7 +119,7 @@ def test_mistakes_are_one_line(histogram, call, message):
 
 
 def test_sensors_are_taken_by_name_wherever_one_is_asked_for(histogram):
-    """Those that come as files, too, as on the command line; and files."""
+    """Take those that come as files, too, as on the command line; and files."""
     sensed = s2s.sense(WALL, sensor="swissspad3")
     assert sensed.sensor.name == "swissspad3"
     again = s2s.Histogram.from_counts(sensed.counts, "swissspad3")

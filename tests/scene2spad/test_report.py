@@ -271,7 +271,7 @@ def test_the_same_results_give_the_same_page(tree, capfd):
 
 
 def test_means_of_every_evaluation_are_shown_with_their_places(tree, capfd):
-    """Those that `evaluate` forms: each scene counts by its mean over views and levels."""
+    """Show those that `evaluate` forms: each scene counts by its mean over views and levels."""
     head = (
         "method,scene,view,signal,background,group,mae_mm,rmse_mm,within_1mm,within_5mm,within_10mm,within_20mm,ssim,"
         "pixels,missing,beyond_range\n"

@@ -290,7 +290,7 @@ def test_version_06_knows_two_names_of_a_matte_colour(tmp_path: Path, kind: str)
 
 
 def test_a_dollar_takes_the_longest_known_name_as_in_mitsuba(tmp_path: Path, mitsuba: object) -> None:
-    """What follows the name stays: `$res_oak.png` with `res` known is the file of that resolution."""
+    """Keep what follows the name: `$res_oak.png` with `res` known is the file of that resolution."""
     for name, level in (("1k_oak.png", 60), ("2k_oak.png", 200)):
         image(tmp_path, name, np.full((2, 2, 3), level))
     texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'

@@ -180,7 +180,7 @@ def test_sphere_area_is_within_its_stated_share() -> None:
 
 
 def test_a_lamp_without_a_bsdf_is_black_as_in_mitsuba(tmp_path: Path, mitsuba: object) -> None:
-    """Its light is its own; with a bsdf it reflects as that says, and a shape that is no lamp is grey."""
+    """Show its own light alone; with a bsdf it reflects as that says, and a shape that is no lamp is grey."""
     lamp = '<emitter type="area"/>'
     for inside, albedo in ((lamp, 0.0), ("", 0.5), (f'<bsdf type="diffuse">{GREY}</bsdf>{lamp}', LUMINANCE)):
         path = write(tmp_path, f'<shape type="rectangle">{inside}</shape>')

@@ -1,4 +1,4 @@
-"""What each mesh format needs beside trimesh: what files declare of themselves is checked against what is in them.
+"""Check what mesh files declare of themselves against what is in them: what each format needs beside trimesh.
 
 trimesh reads a text file that was cut, drops a texture that it cannot find, and takes negative indices as Python does.
 It passes over what it has no model for: what would then be seen as something else is refused, or put as it reads it.
