@@ -13,6 +13,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
+from small_runs import QUICK
 
 from csph.codes.design import Design
 from csph.evaluation.metrics import PHOTON_LEVELS
@@ -32,8 +33,6 @@ from spad.detection.detect import sense
 from spad.formats.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
-QUICK = ["--preset", "smoke", "--threads", "1"]
-
 
 def run(capfd, *argv: str) -> dict:
     status = main([*argv, "--json"])
@@ -49,22 +48,6 @@ def refused(capfd, *argv: str) -> str:
     lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
     assert status == 2 and out == "" and len(lines) == 1 and "Traceback" not in err
     return lines[0]
-
-
-@pytest.fixture(scope="module")
-def packed(tmp_path_factory) -> Path:
-    """Six scenes of planes as a pack."""
-    path = tmp_path_factory.mktemp("set") / "planes.h5"
-    views = random_planes(6, size=16, seed=4)
-    write_pack(((t, {"scene": s}) for t, s in zip(views.transients, views.scenes, strict=True)), path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def trained(packed, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("run") / "learned"
-    assert main(["train", *QUICK, "--set", str(packed), "--out", str(folder)]) == 0
-    return folder
 
 
 def test_planes_of_few_pixels_return_no_light_from_behind_the_camera():

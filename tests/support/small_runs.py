@@ -1,0 +1,3 @@
+"""Options of the quickest training."""
+
+QUICK = ["--preset", "smoke", "--threads", "1"]
