@@ -306,7 +306,9 @@ def test_artists_living_room() -> None:
     leaves = [surface for surface in scene.surfaces if surface.material.name == "Leaves"]
     assert len(leaves) > 1 and len({id(leaf.material) for leaf in leaves}) == 1
     opacity = leaves[0].material.opacity
-    assert isinstance(opacity, Texture) and opacity.image.min() == 0 and opacity.image.max() == 1
+    # Mitsuba's `mask` of this image lets through what its luminance leaves, 0.0452 at least: alpha has no part in it.
+    assert isinstance(opacity, Texture) and opacity.image.max() == 1
+    assert opacity.image.min() == pytest.approx(0.045227, abs=1e-5)
     assert scene.ambient.environment is not None and scene.ambient.environment.image.shape == (1024, 2048)
     assert {s.material.kind for s in scene.surfaces} >= {"dielectric", "conductor", "roughconductor", "roughplastic"}
     assert all(surface.uv is not None for surface in scene.surfaces)
