@@ -20,9 +20,9 @@ from render.error import (
 )
 from render.indirect.integrator import image_cells
 from render.indirect.path_cells import coarsened
-from render.indirect.probe import ProbePixels
 from render.pipeline import LightSamples
 from render.planning import CHECK_REFINEMENT, cone_width_px, finer_pilot
+from render.probe import ProbePixels
 from render.scene.traced_scene import TracedScene
 from render.settings import Plan
 from render.transient.samples import concatenate, no_samples, select_pixels

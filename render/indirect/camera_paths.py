@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, Floats, UInts
-from render.indirect.glossy import camera_share, glossy_of
+from render.indirect.glossy import camera_share, finite_ratio, glossy_of
 from render.indirect.launch_layout import (
     BLOCK,
     LaunchLayout,
@@ -27,6 +27,7 @@ from render.indirect.launch_layout import (
     traced_members,
 )
 from render.indirect.light_vertices import (
+    Connection,
     LightVertices,
     Scattered,
     connections_per_vertex,
@@ -35,7 +36,7 @@ from render.indirect.light_vertices import (
 )
 from render.indirect.path_space_filter import Point, late_from, point_of
 from render.indirect.path_suffixes import PathSuffixes, Slots, SuffixTask, slots_for, trace_suffixes
-from render.indirect.primary_vertices import Connection, PrimaryVertices, connect_primary_vertices, reuses_early_paths
+from render.indirect.primary_vertices import PrimaryVertices, connect_primary_vertices, reuses_early_paths
 from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, kept, parts_of, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
 
@@ -43,10 +44,14 @@ PLAIN_GOLDEN = 2654435769  # bits of the golden ratio, in units of 2^-32
 
 
 class PathBatch(NamedTuple):
-    """Paths of a launch, the light vertices that they were connected to, and the batch that each path belongs to."""
+    """Paths of a launch, the light vertices that they were connected to, and the batch that each path belongs to.
+
+    `retro` is light that comes back over x1 (`render.indirect.retro_paths`), one connection or none.
+    """
 
     primary: PrimaryVertices
     connections: tuple[Connection, ...]
+    retro: tuple[Connection, ...]
     suffixes: PathSuffixes
     light_vertices: LightVertices | None
     batch: UInts
@@ -93,12 +98,13 @@ def trace_paths(task: PathTask) -> PathBatch:
     )
     work = partial(_paths, reuses_paths=reuses_paths, connections=connections, members=members)
     key = "paths", reuses_paths, connections, members, connects_suffixes(world)
-    primary, near, suffixes, batch = world.recordings.call(world, key, work, *given)
+    primary, near, retro, suffixes, batch = world.recordings.call(world, key, work, *given)
     late_m = dr.full(Float, dr.inf if reuses_paths else 0, lanes) if from_m is None else primary[-2]
     point = None if from_m is None else Point(*primary[-1])
     return PathBatch(
         PrimaryVertices(primary[0], interaction_from_parts(primary[1]), *primary[2:-2], late_m, point),  # type: ignore[call-arg]
         tuple(Connection(*light) for light in near),
+        tuple(Connection(*light) for light in retro),
         PathSuffixes(interaction_from_parts(suffixes[0]), *suffixes[1:]),
         light_vertices,
         batch,
@@ -125,7 +131,7 @@ class _Given(NamedTuple):
 
 def _paths(
     world: TracedScene, *given: Array, reuses_paths: bool, connections: int, members: int
-) -> tuple[tuple, tuple, tuple, Array]:
+) -> tuple[tuple, tuple, tuple, tuple, Array]:
     """Trace the parts of `PathBatch`, in plain tuples, which recordings look into."""
     given = _Given(*given)
     slots, keys, from_m = Slots(*given.slots), given.keys, given.from_m
@@ -167,10 +173,11 @@ def _paths(
     near = connect_primary_vertices(world, primary, light_vertices, batch, first, connections)
     reused = reuses_paths or (from_m is not None and reuses_early_paths(world))
     task = SuffixTask(light_vertices, connections, batch, pixel, random, slots, reused)
-    suffixes = trace_suffixes(world, primary, Scattered(sample, weight[0]), task)
+    suffixes, retro = trace_suffixes(world, primary, Scattered(sample, weight[0]), task)
     of_primary = receiver, parts_of(si), *map(_of_any_length, primary[2:-1]), None if point is None else tuple(point)
     of_suffixes = parts_of(suffixes.si), *map(_of_any_length, suffixes[1:])
-    return of_primary, tuple(tuple(light) for light in near), of_suffixes, batch
+    lights = (tuple(tuple(light) for light in connections) for connections in (near, retro))
+    return of_primary, *lights, of_suffixes, batch
 
 
 def _of_any_length(values: Floats) -> Array:
@@ -207,12 +214,18 @@ def energy_by_bounces(
     beyond = suffixes.own_onward.numpy() * suffixes.values.numpy().reshape(-1, dr.width(traced.batch))
     if suffixes.ratios is not None:
         lanes = dr.arange(UInt32, dr.width(suffixes.ratios)) % dr.width(traced.batch)
-        ratio = suffixes.ratios * dr.gather(Float, suffixes.own_ratio, lanes)
+        ratio = finite_ratio(suffixes.ratios * dr.gather(Float, suffixes.own_ratio, lanes))
+        if suffixes.own_retro is not None:
+            first = dr.arange(UInt32, dr.width(suffixes.ratios)) < dr.width(traced.batch)
+            ratio += dr.gather(Float, suffixes.own_retro, lanes, first)
         beyond *= camera_share(ratio).numpy().reshape(beyond.shape)
     energy = np.zeros(bounces + 1)
     near = [part.numpy() for part in (suffixes.own_value, *(n.value for n in traced.connections))]
     energy[2] = sum(part.sum(dtype=np.float64) for part in near)
     noise = sum(float(np.square(part, dtype=np.float64).sum()) for part in (*near, beyond))
+    back = [light.value.numpy() for light in traced.retro]
+    noise += sum(float(np.square(part, dtype=np.float64).sum()) for part in back)
     by_slot = beyond.sum(axis=1, dtype=np.float64)
     energy[3:] = by_slot.reshape(max(vertices, 1), -1).sum(axis=1)[:vertices]
+    energy[3:4] += sum(part.sum(dtype=np.float64) for part in back)
     return energy / spp, noise / spp

@@ -163,9 +163,10 @@ def camera_share(ratio: Floats) -> Array:
     return dr.rcp(1 + finite_ratio(ratio))
 
 
-def light_share(ratio: Floats) -> Array:
-    """Return c, which paths from the laser keep, of a path whose two densities have the ratio a / b."""
-    return finite_ratio(ratio) * camera_share(ratio)
+def light_share(ratio: Floats, other: Floats = 0) -> Array:
+    """Return c, which paths from the laser keep, of a path whose two densities have the ratio a / b; `other` is the
+    density of a third way over b."""
+    return finite_ratio(ratio) * camera_share(finite_ratio(ratio) + other)
 
 
 def finite_ratio(ratio: Floats) -> Array:
@@ -189,7 +190,7 @@ def ratio_of_light_path(world: TracedScene, pixel: UInts, x: Interactions, towar
     to_laser = world.laser - x.p
     light = dr.normalize(to_laser)
     begun = dr.gather(Float, glossy.sampling_density, pixel, active) * RATIO * dr.abs(dr.dot(x.n, light))
-    begun *= _density(x, x.to_local(light), x.to_local(towards), active)
+    begun *= lobe_density(x, x.to_local(light), x.to_local(towards), active)
     return dr.select(active, begun / (dr.abs(dr.dot(x.n, towards)) * dr.squared_norm(to_laser)), 0)
 
 
@@ -201,7 +202,7 @@ def ratio_at_camera(
     to_eye = world.eye - y.p
     eye = dr.normalize(to_eye)
     if density is None:
-        density = _density(y, y.to_local(eye), y.to_local(towards), active)
+        density = lobe_density(y, y.to_local(eye), y.to_local(towards), active)
     return dr.abs(dr.dot(y.n, towards)) * dr.squared_norm(to_eye) / (dr.abs(dr.dot(y.n, eye)) * density)
 
 
@@ -212,7 +213,7 @@ def reversal(si: Interactions, out: Vectors, density: Floats, active: Masks) -> 
     The way came from `si.wi` and goes `out`, which was sampled with that `density`; both in the shading frame. 1 for
     diffuse surfaces.
     """
-    return _density(si, out, si.wi, active) * dr.abs(out.z) / (density * dr.abs(si.wi.z))
+    return lobe_density(si, out, si.wi, active) * dr.abs(out.z) / (density * dr.abs(si.wi.z))
 
 
 def reversal_of_sample(si: Interactions, sample: LobeSamples, active: Masks) -> Array:
@@ -221,7 +222,7 @@ def reversal_of_sample(si: Interactions, sample: LobeSamples, active: Masks) -> 
     return dr.select(smooth, 1, reversal(si, sample.wo, sample.pdf, active & ~smooth))
 
 
-def _density(si: Interactions, seen_from: Vectors, towards: Vectors, active: Masks) -> Array:
+def lobe_density(si: Interactions, seen_from: Vectors, towards: Vectors, active: Masks) -> Array:
     """Compute the density per solid angle with which the lobes of a surface, seen from one direction, sample
     another; both in its shading frame."""
     seen = interaction_from_parts(parts_of(si))

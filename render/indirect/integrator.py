@@ -16,7 +16,6 @@ from render.indirect.launch_layout import BLOCK, LaunchLayout, make_launch, trac
 from render.indirect.light_tracing import trace_light_paths
 from render.indirect.path_cells import Cells, MomentHistogram, coarsened, make_cells, quantum_for, require_rows
 from render.indirect.path_space_filter import PathSpaceFilter
-from render.indirect.probe import Probe, ProbePixels, make_probe, probe_splats, read_probe
 from render.indirect.reuse import (
     CONNECTIONS_PER_LAUNCH,
     FILTERED_PATHS_PER_LAUNCH,
@@ -25,6 +24,7 @@ from render.indirect.reuse import (
     add_reused_light,
 )
 from render.indirect.schedule import Schedule
+from render.probe import Probe, ProbePixels, make_probe, probe_splats, read_probe
 from render.scene.traced_scene import TracedScene, dr
 from render.transient.samples import Samples, concatenate, no_samples, packed
 

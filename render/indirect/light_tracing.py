@@ -31,10 +31,12 @@ from render.indirect.glossy import (
     is_glossy,
     laser_rays,
     light_share,
+    lobe_density,
     ratio_at_camera,
     ratio_of_light_path,
     reversal_of_sample,
 )
+from render.indirect.retro_paths import has_retro_paths, retro_ratio
 from render.scene.rays import (
     first_opaque,
     in_beam,
@@ -101,7 +103,7 @@ def _trace_launch(
     random = mi.PCG32(initstate=mi.UInt64(key[0]), initseq=mi.UInt64(key[1]))
     si, path, sample, value, active = _sample_first_vertex(world, pixel, number, batch, keys, random)
     begun, start, ratio = Bool(True), mi.SurfaceInteraction3f(si), dr.zeros(Float, lanes)
-    slot = dr.zeros(UInt32, lanes)
+    slot, way_back = dr.zeros(UInt32, lanes), dr.full(Float, 1, lanes)
     while active:
         towards, before = spawn(si, si.to_world(sample.wo)), mi.Point3f(si.p)
         si, transmission, leg, _ = first_opaque(world, towards, active, before)
@@ -118,7 +120,11 @@ def _trace_launch(
         out = si.to_local((world.eye - si.p) / distance)
         light = si.bsdf().eval(mi.BSDFContext(), si, out, active)[0] * value
         light *= passed / dr.square(distance)
-        light *= light_share(ratio * ratio_at_camera(world, si, -towards.d, active))
+        own, other = finite_ratio(ratio * ratio_at_camera(world, si, -towards.d, active)), Float(0)
+        if dr.hint(has_retro_paths(world), mode="scalar"):
+            start_way = dr.normalize(start.p - before)
+            other = dr.select(slot == 1, retro_ratio(world, si, before, start_way, way_back, active), 0)
+        light *= light_share(own, other)
         light *= shading_ratio(si, si.wi) / shading_ratio(si, out) * (distance / local.z) ** 3
         light = dr.select(active & seen & dr.isfinite(light), dr.maximum(light, 0), 0)
         dr.scatter(targets, target, slot * stride + place, active)
@@ -132,6 +138,9 @@ def _trace_launch(
         active &= (through > 0) & (random.next_float32() < survive)
         value *= through / survive * shading_ratio(si, si.wi) / shading_ratio(si, sample.wo)
         active &= dr.isfinite(value)
+        if dr.hint(has_retro_paths(world), mode="scalar"):
+            smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+            way_back = dr.select(smooth, dr.inf, lobe_density(si, sample.wo, si.wi, active & ~smooth))
         ratio = finite_ratio(ratio / reversal_of_sample(si, sample, active))
     return targets, paths, values
 

@@ -70,6 +70,16 @@ class LightVertices(NamedTuple):
     each: UInts
 
 
+class Connection(NamedTuple):
+    """Light that x1 reflects of a lit point: radiance, path to the laser, direction to the point, and whether x1
+    reflects it diffusely."""
+
+    value: Floats
+    path: Floats
+    direction: Vectors
+    diffuse: Masks
+
+
 def sample_light_vertices(world: TracedScene, lanes: int, batches: int, key: tuple[UInts, UInts]) -> LightVertices:
     """Return points where uniform directions of the laser's cone meet a surface, for a launch of so many paths."""
     wanted = min(MAX_POINTS, max(int(lanes * POINTS_PER_PATH), 1))

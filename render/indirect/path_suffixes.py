@@ -15,6 +15,7 @@ from render.indirect.glossy import (
     reversal_of_sample,
 )
 from render.indirect.light_vertices import (
+    Connection,
     LightVertices,
     Scattered,
     connect_to_light_vertex,
@@ -24,6 +25,7 @@ from render.indirect.light_vertices import (
     mis_weight_sampled,
 )
 from render.indirect.primary_vertices import PrimaryVertices, sampling_techniques
+from render.indirect.retro_paths import ReachedVertex, connect_retro
 from render.scene.rays import first_opaque, kept, laser_light, sample_bsdf, shape_index, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
@@ -39,6 +41,7 @@ class PathSuffixes(NamedTuple):
     reusable, onward    whether the block may use the laser's light at x2, and what lies beyond
     own_value           what the pixel itself gets of the laser's light at x2
     own_onward          factor of what lies beyond: `values` with their `paths` from x2 to the laser, `length` of them
+    own_retro           q / p of `render.indirect.retro_paths` in the direction from x2 to x3; None without such paths
     own_ratio, ratios   where light paths are traced: factors that x1 with x2, and what lies beyond, have in the ratio
                         of densities that decides what these take of such a value (`render.indirect.glossy`)
     soonest_m           the shortest of these paths and `laser_path` that carries light
@@ -59,6 +62,7 @@ class PathSuffixes(NamedTuple):
     own_value: Floats
     own_onward: Floats
     own_ratio: Floats
+    own_retro: Floats
     values: Floats
     paths: Floats
     ratios: Floats
@@ -114,14 +118,13 @@ class SuffixTask(NamedTuple):
 
 def trace_suffixes(
     world: TracedScene, primary: PrimaryVertices, scattered: Scattered, task: SuffixTask
-) -> PathSuffixes:
-    """Trace suffixes in sampled directions.
+) -> tuple[PathSuffixes, tuple[Connection, ...]]:
+    """Trace suffixes in sampled directions; return them, and light that comes back over x1 if there is any.
 
     If they are reused, x2 on a rough coat is not connected to light vertices: what it reflects diffusely depends on
     where it is seen from, and light of connections is handed on as one number.
     """
     (sample, weight), (light_vertices, connections, _, pixel, random, _, reused) = scattered, task
-    context = mi.BSDFContext()
     x1, alive = primary.si, primary.valid & (weight > 0)
     direction = x1.to_world(sample.wo)
     si, passed, leg, _ = first_opaque(world, spawn(x1, direction), alive, x1.p)
@@ -129,32 +132,31 @@ def trace_suffixes(
     own = dr.select(alive, primary.transmission * weight * passed, 0)
     to_laser, irradiance, laser_path = laser_light(world, si, pixel, alive, seen_by_camera=None)
     density = None if light_vertices is None else density_of(world, si, to_laser) * connections
-    value = si.bsdf().eval(context, si, si.to_local(to_laser), alive)[0] * irradiance
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), alive)[0] * irradiance
     if light_vertices is not None:
         value *= mis_weight_sampled(
             world, x1, scattered, si, density, sampling_techniques(primary, leg + laser_path), alive
         )
     # what is reflected by a mirror in the first place cannot be read backwards
     readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    onward, onward_weight = sample_bsdf(si, random, alive)
-    onward_weight = onward_weight[0]
-    own_ratio, at_x2 = None, Float(1)
+    onward, (onward_weight, *_) = sample_bsdf(si, random, alive)
+    own_ratio, own_retro, at_x2 = None, None, Float(1)
+    back: tuple[Connection, ...] = ()
     if has_light_paths(world):
         own_ratio = dr.select(readable, ratio_at_camera(world, x1, direction, readable, sample.pdf), 0)
         value *= camera_share(own_ratio * ratio_at_laser(world, si, -direction, readable))
+        at_vertex = ReachedVertex(x1, sample, own, own_ratio, leg, si, readable)
+        own_retro, back = connect_retro(world, at_vertex, onward, pixel, random)
         at_x2 = dr.maximum(finite_ratio(reversal_of_sample(si, onward, alive)), MIN_REVERSAL)
         own_ratio = finite_ratio(own_ratio * at_x2)
     value = dr.select(alive & dr.isfinite(value), own * value, 0)
-    connectable = Bool(alive)
-    if reused and world.has_rough_coats:
-        connectable &= dr.gather(Float, world.rough_coats, shape_index(si), alive) == 0
+    connectable = _connectable(world, si, alive, reused=reused)
     scale = dr.select(onward_weight > 0, onward_weight, 1)
     state = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, connectable, at_x2)
     soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
     light = _trace_suffix(world, task, state, alive, soonest)
-    reusable = alive & (dr.gather(Float, world.allows_reuse, shape_index(si), alive) > 0)
-    reusable &= primary.allows_reuse & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    return PathSuffixes(
+    reusable = primary.allows_reuse & _shares(world, si, sample, alive)
+    suffixes = PathSuffixes(
         kept(si),
         direction,
         alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection),
@@ -170,8 +172,23 @@ def trace_suffixes(
         value,
         own * scale,
         own_ratio,
+        own_retro,
         *light,
     )
+    return suffixes, back
+
+
+def _connectable(world: TracedScene, x2: Interactions, alive: Masks, *, reused: bool) -> Array:
+    """Return whether x2 is connected to light vertices: not on a rough coat if suffixes are `reused`."""
+    if reused and world.has_rough_coats:
+        return alive & (dr.gather(Float, world.rough_coats, shape_index(x2), alive) == 0)
+    return Bool(alive)
+
+
+def _shares(world: TracedScene, x2: Interactions, sample: LobeSamples, alive: Masks) -> Array:
+    """Return whether other pixels may use x2, as far as it and the `sample` of x1 decide."""
+    shared = alive & (dr.gather(Float, world.allows_reuse, shape_index(x2), alive) > 0)
+    return shared & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
 
 
 class _SuffixState(NamedTuple):

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts, Vectors
+from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts
 from render.indirect.glossy import camera_share, ratio_at_camera
 from render.indirect.launch_layout import BLOCK
-from render.indirect.light_vertices import LightVertices, connect_to_light_vertex, connects_suffixes, light_vertex_index
+from render.indirect.light_vertices import (
+    Connection,
+    LightVertices,
+    connect_to_light_vertex,
+    connects_suffixes,
+    light_vertex_index,
+)
 from render.indirect.path_space_filter import Point
 from render.scene.traced_scene import Float, TracedScene, dr
 
@@ -32,14 +38,6 @@ class PrimaryVertices(NamedTuple):
     def early_m(self) -> Array:
         """Return `late_m` of the vertices that allow reuse, 0 for others."""
         return dr.select(self.allows_reuse, self.late_m, 0)
-
-
-class Connection(NamedTuple):
-    """Light that x1 reflects of a lit point: radiance, path to the laser, and direction to the point."""
-
-    value: Floats
-    path: Floats
-    direction: Vectors
 
 
 def reuses_early_paths(world: TracedScene) -> bool:
@@ -71,7 +69,7 @@ def connect_primary_vertices(
         )
         if ratio is not None:
             light *= camera_share(ratio * ratio_at_camera(world, primary.si, direction, primary.valid))
-        found.append(Connection(light * primary.transmission, path, direction))
+        found.append(Connection(light * primary.transmission, path, direction, primary.valid))
     return tuple(found)
 
 

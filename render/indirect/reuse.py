@@ -32,6 +32,7 @@ from render.indirect.launch_layout import BLOCK
 from render.indirect.light_vertices import diffuse_fraction, mis_weight_bsdf
 from render.indirect.path_space_filter import UNIT_WEIGHT, ArrivingLight, PathSpaceFilter
 from render.indirect.primary_vertices import reuses_early_paths
+from render.indirect.retro_paths import has_retro_paths, retro_ratio
 from render.scene.rays import interaction_from_parts, parts_of, segment, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
@@ -142,13 +143,14 @@ class _Ends(NamedTuple):
 
 class _Connections(NamedTuple):
     """Connections of every pair: leg x1 to x2 [m], pixel radiance of x2's laser light and factor of the light from
-    beyond x2, both before division by a density; the ratio of x1 with x2 or None; and the sums of the sampling
-    densities over each group."""
+    beyond x2, both before division by a density; the ratio of x1 with x2, and `retro_ratio` of what follows, or None;
+    and the sums of the sampling densities over each group."""
 
     leg: Floats
     value: Floats
     onward: Masks
     ratio: Floats
+    retro: Floats
     density: Floats
     onward_density: Array
 
@@ -190,7 +192,9 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
             dr.gather(Float, ends.density, suffix, active),
             BLOCK,
         )
-    ratio = None
+    ratio, retro = None, None
+    if has_retro_paths(world):
+        retro = retro_ratio(world, si1, si2.p, si2.to_world(onward), density3, going)
     if has_light_paths(world):
         ratio = ratio_at_camera(world, si1, direction, active, density1)
         value2 *= camera_share(ratio * ratio_at_laser(world, si2, -direction, active))
@@ -200,18 +204,19 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
     onward_density = dr.select(going & (value3[0] > 0), density * density3, 0)
     value = dr.select(active, reach * value2 * irradiance, 0)
     onward = dr.select(going, reach * value3[0], 0)
-    dr.eval(leg, value, onward, ratio, density, onward_density)
-    return leg, value, onward, ratio, dr.block_sum(density, BLOCK), dr.block_sum(onward_density, BLOCK)
+    dr.eval(leg, value, onward, ratio, retro, density, onward_density)
+    return leg, value, onward, ratio, retro, dr.block_sum(density, BLOCK), dr.block_sum(onward_density, BLOCK)
 
 
 class _Weights(NamedTuple):
     """Weighted connections of every pair: leg from x1 to x2 [m], radiance of x2's laser light, factor of the light from
-    beyond x2, and the ratio of x1 with x2 or None."""
+    beyond x2, and the ratio of x1 with x2, and `retro_ratio` of what follows, or None."""
 
     leg: Floats
     first: UInts
     onward: Masks
     ratio: Floats
+    retro: Floats
 
 
 def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
@@ -225,9 +230,10 @@ def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
     )
     dr.eval(pairs.number)
     made = _Connections(*world.recordings.call(world, "pairs", _connect, pairs.number, pairs.chosen, *ends))
-    density, onward_density = (dr.gather(Float, total, pairs.group) for total in made[4:])
+    density, onward_density = (dr.gather(Float, total, pairs.group) for total in (made.density, made.onward_density))
     first = dr.select(density > 0, made.value / density, 0)
-    return _Weights(made.leg, first, dr.select(onward_density > 0, made.onward / onward_density, 0), made.ratio)
+    onward = dr.select(onward_density > 0, made.onward / onward_density, 0)
+    return _Weights(made.leg, first, onward, made.ratio, made.retro)
 
 
 def pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
@@ -243,6 +249,7 @@ def pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
         weights.first,
         weights.onward,
         weights.ratio,
+        weights.retro,
     )
 
 
@@ -260,13 +267,14 @@ def own_lanes(paths: PathBatch) -> _Lanes:
         suffixes.own_value,
         suffixes.own_onward,
         suffixes.own_ratio,
+        suffixes.own_retro,
     )
 
 
 class _Lanes(NamedTuple):
     """Contributions of lanes: pixel and batch; suffix; paths from camera to x1 and on to x2; path from the laser up to
     which light is reused; radiance of x2's laser light, factor of the light from beyond x2; the ratio of x1 with x2, or
-    None without light paths."""
+    None without light paths, and `retro_ratio` of what follows, or None without retro paths."""
 
     receiver: UInts
     batch: UInts
@@ -277,6 +285,7 @@ class _Lanes(NamedTuple):
     first: UInts
     onward: Masks
     ratio: Floats
+    retro: Floats
 
 
 @dr.syntax
@@ -290,8 +299,8 @@ def add_lanes(
     own: bool,
 ) -> None:
     """Add the light of lanes to sums; `own`: that of a pixel's own path, connected at its first vertices too."""
-    receiver, batch, suffix, path1, leg, early_m, first, onward, ratio = lanes
-    connections, suffixes = paths.connections, paths.suffixes
+    receiver, batch, suffix, path1, leg, early_m, first, onward, ratio, retro = lanes
+    connections, suffixes = (*paths.connections, *paths.retro), paths.suffixes
     laser_path, last = (dr.gather(type(c), c, suffix) for c in (suffixes.laser_path, suffixes.length))
     stride = dr.opaque(UInt32, dr.width(paths.batch))
     step, total = dr.zeros(UInt32, dr.width(suffix)), dr.zeros(Float, dr.width(suffix))
@@ -304,7 +313,10 @@ def add_lanes(
         slot = (step - 1 - connection_count) * stride + suffix
         later = onward * dr.gather(Float, suffixes.values, slot, beyond)
         if dr.hint(ratio is not None, mode="scalar"):
-            later *= camera_share(ratio * dr.gather(Float, suffixes.ratios, slot, beyond))
+            others = finite_ratio(ratio * dr.gather(Float, suffixes.ratios, slot, beyond))
+            if dr.hint(retro is not None, mode="scalar"):
+                others += dr.select(step == connection_count + 1, retro, 0)  # x3's light
+            later *= camera_share(others)
         radiance = dr.select(beyond, later, first)
         path = leg + dr.select(beyond, dr.gather(Float, suffixes.paths, slot, beyond), laser_path)
         if dr.hint(own, mode="scalar"):
@@ -312,7 +324,8 @@ def add_lanes(
             for number, light in enumerate(connections):
                 near = step == 1 + number
                 radiance, path = dr.select(near, light.value, radiance), dr.select(near, light.path, path)
-                towards, diffuse = dr.select(near, light.direction, towards), near | diffuse
+                towards = dr.select(near, light.direction, towards)
+                diffuse = dr.select(near, light.diffuse, diffuse)
             adding = going & ~((path < early_m) & dr.select(beyond, suffixes.onward, suffixes.reusable & (step == 0)))
             radiance = sums.clamped(receiver, batch, path1 + path, radiance, going, adding)
             if dr.hint(path_filter is not None, mode="scalar"):
