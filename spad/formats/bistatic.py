@@ -149,13 +149,17 @@ def _converters(zones: JsonObject) -> tuple[np.ndarray, np.ndarray, float]:
 def recorded_range_m(histogram: Histogram) -> np.ndarray:
     """Return the depth (H, W) [m] of each pixel whose return arrives when the last bin ends; errors are of nearer ones.
 
-    Beside a displaced laser it differs between pixels, and is 0 where the record is shorter than the baseline.
+    Beside a displaced laser it differs between pixels, and is 0 where the record is shorter than the baseline. It is 0
+    as well where a converter's delay moves the return of the true depth out of a record shorter than the period.
     """
     sensor = histogram.sensor
     end_m = np.full(histogram.depth_m.shape, sensor.recorded_range_m)
-    if sensor.bins < sensor.bins_per_period:  # else all that arrives within the period is recorded, however late
-        end_m = _light_half_path_m(histogram, end_m)
-    return np.nan_to_num(_distance_m(histogram, end_m))
+    if sensor.bins == sensor.bins_per_period:  # all that arrives within the period is recorded, however late
+        return np.nan_to_num(_distance_m(histogram, end_m))
+    range_m = np.nan_to_num(_distance_m(histogram, _light_half_path_m(histogram, end_m)))
+    if _converters_differ(histogram):
+        range_m[true_arrival_s(histogram) >= sensor.bins * sensor.bin_width_s] = 0.0
+    return range_m
 
 
 def pointing_of(meta: JsonObject) -> JsonObject:

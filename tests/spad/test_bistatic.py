@@ -10,7 +10,7 @@ from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from scenes.model import Camera
-from spad.estimators.depth import confidence_map, histogram_depth_m
+from spad.estimators.depth import confidence_map, histogram_depth_m, histogram_errors
 from spad.formats.bistatic import (
     optical_path_m,
     radial_depth_m,
@@ -129,6 +129,18 @@ def test_a_delay_takes_from_the_record_of_zones():
     gated = replace(ZONED, bins=64, period_s=2e-8)
     histogram = sense_zones(plane(0.5), gated, replace(NARROW, delay_s=(1.2e-9, 0.0)), seed=1)
     assert recorded_range_m(histogram)[0] == pytest.approx(np.array([5.2e-9, 6.4e-9]) * C / 2)
+
+
+@pytest.mark.parametrize("delay_s", [9e-9, -3e-9, 2e-9])
+def test_beyond_range_counts_the_zones_whose_return_a_delay_moves_out_of_the_record(delay_s):
+    """6.4 of 20 ns are recorded. Light of two zones takes 2 and 5 ns; a third gets there late enough to wrap."""
+    gated = replace(ZONED, bins=64, period_s=2e-8)
+    time_s = np.array([[2e-9, 5e-9, 13e-9]])
+    zones = {"clock": np.ones((1, 3)), "delay_s": np.full((1, 3), delay_s), "chirp_hz": 0.0}
+    histogram = replace(histogram_of(time_s * C / 2, gated), meta={"zones": zones})
+    held = (time_s + delay_s) % gated.period_s < gated.bins * gated.bin_width_s
+    errors = histogram_errors(histogram.depth_m, histogram)
+    assert (errors["pixels"], errors["beyond_range"]) == (held.sum(), (~held).sum())
 
 
 def test_clocks_run_back_as_they_ran():
