@@ -36,7 +36,8 @@ NOTES = {  # unit and description of every dataset of the file
 class Histogram:
     """Photon counts of every pixel and time bin.
 
-    counts               (H, W, T) int32
+    counts               (H, W, T) int32; the array that was given, which can be written to: torch warns of one that
+                         cannot and `torch.from_numpy(histogram.counts)` is to share its memory
     sensor, budget       what recorded it
     depth_m              (H, W) float32 truth: radial depth at the pixel centre, NaN where nothing is
     mixed                (H, W) bool: surfaces more than 50 mm apart in the pixel

@@ -1,6 +1,7 @@
 """Detections follow Poisson's law, are seeded, and survive their file."""
 
 import json
+import warnings
 from dataclasses import replace
 
 import h5py
@@ -148,6 +149,17 @@ def test_timestamps_and_counts_convert_exactly():
     stamps, offsets = histogram.timestamps()
     assert stamps.dtype == np.uint16 and offsets.dtype == np.int64 and offsets[-1] == histogram.counts.sum()
     assert (counts_from_timestamps(stamps, offsets, 1024).reshape(histogram.counts.shape) == histogram.counts).all()
+
+
+def test_torch_shares_the_counts_without_a_warning():
+    """Which it gives for arrays that cannot be written to: counts can, the truth beside them cannot."""
+    histogram = Histogram.from_counts(np.ones((2, 3, 8), np.int32), Sensor(bins=8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        shared = torch.from_numpy(histogram.counts)
+    assert shared.data_ptr() == histogram.counts.ctypes.data
+    with pytest.raises(ValueError, match="read-only"):
+        histogram.depth_m[0, 0] = 1
 
 
 def test_empty_histogram_survives_its_file(tmp_path):
