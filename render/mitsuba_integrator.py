@@ -40,8 +40,8 @@ def register_integrator(name: str = NAME) -> None:
     ------
     InputError
         For another variant; and by the render for a shape, material or camera that has no counterpart here. `mi.render`
-        and `mi.load_dict` raise a RuntimeError of their own in its place: the first has it as its `__cause__`, the
-        second ends with its words.
+        and `mi.load_dict` raise a RuntimeError of their own in its place, whose first line they write: the first has it
+        as its `__cause__`, the second ends with its words. `scene.integrator().render(scene)` raises it as it is.
 
     Examples
     --------

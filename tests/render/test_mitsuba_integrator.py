@@ -121,8 +121,9 @@ def test_what_has_no_counterpart_is_refused_by_name(change, message):
 
 @pytest.mark.parametrize("bad", [{"temporal_bins": 0}, {"bin_width_opl": -1.0}, {"max_depth": 1}, {"error": 2.0}])
 def test_settings_out_of_range_are_refused(bad):
-    with pytest.raises((InputError, RuntimeError), match=next(iter(bad))):
+    with pytest.raises(RuntimeError) as wrapped:
         mi.load_dict({"type": "scene2spad", **bad})
+    assert next(iter(bad)) in str(wrapped.value).splitlines()[-1], "the reason is the last line"
 
 
 @pytest.mark.slow
