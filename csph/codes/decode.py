@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from csph.codes.tensor import CodingTensor, encode
-from scenes.errors import InputError
+from csph.codes.tensor import CodingTensor, as_tensor, encode
+from scenes.errors import InputError, require_kind
 from spad.estimators.depth import by_pixels, correlate, depth_in_range, grid_peak, noise_free_bias_m
 from spad.sensor.model import Sensor
 from spad.sensor.template import FINE_STEP, pulse_taps
@@ -67,14 +68,17 @@ def _bias_m(coding: CodingTensor, sensor: Sensor) -> float:
     return noise_free_bias_m(lambda counts: _raw_depth(encode(counts, coding), coding, sensor), sensor)
 
 
-def decode_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
+def decode_depth(codes: Tensor | np.ndarray, coding: CodingTensor, sensor: Sensor) -> Tensor:
     """Return depth [m] at the highest score <y, C h(tau)> / |C h(tau)| over arrivals tau, (..., K) -> (...,) float32.
 
-    h(tau) is the binned pulse. Searched over the bin centres, then over a grid of eighths of a bin and a parabola; of
-    equal scores the first, of neighbours that score alike their middle; the noise-free answer is subtracted as in
-    `spad.estimators.depth`. NaN where all codes are zero. Raises InputError for another number of codes or bins, and
-    codes that are not finite.
+    `codes` may be a numpy array. h(tau) is the binned pulse. Searched over the bin centres, then over a grid of
+    eighths of a bin and a parabola; of equal scores the first, of neighbours that score alike their middle; the
+    noise-free answer is subtracted as in `spad.estimators.depth`. NaN where all codes are zero. Raises InputError for
+    another number of codes or bins, and codes that are not finite.
     """
+    require_kind(coding, CodingTensor, "decode_depth", " of `coding_tensor`")
+    require_kind(sensor, Sensor, "decode_depth")
+    codes = as_tensor(codes)
     if coding.bins != sensor.bins:
         raise InputError(f"coding tensor {coding.name} has {coding.bins} bins, sensor {sensor.name} has {sensor.bins}")
     if coding.codes < 2:

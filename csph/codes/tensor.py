@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from csph.codes.photons import encode_photons, photon_table
-from scenes.errors import InputError, require
+from scenes.errors import InputError, require, require_kind
 from spad.estimators.depth import by_pixels
 
 
@@ -130,6 +130,7 @@ def full_tensor(temporal: Tensor, spatial: Tensor | None) -> Tensor:
 
 
 def _per_pixel(coding: CodingTensor) -> None:
+    require_kind(coding, CodingTensor, "codes of a pixel", " of `coding_tensor`")
     single = coding.rows == coding.columns == 1
     require(single, f"coding tensor {coding.name} is over {coding.rows} x {coding.columns} pixels, expected 1 x 1")
 
@@ -142,7 +143,8 @@ def as_tensor(values: Tensor | np.ndarray) -> Tensor:
     if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
         return torch.from_numpy(np.require(values, requirements=["C", "W"]))
     if not isinstance(values, Tensor):
-        raise InputError(f"expected a tensor or an array of numbers, got {type(values).__name__}")
+        got = f"an array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
+        raise InputError(f"expected a tensor or an array of numbers, got {got}")
     return values
 
 
@@ -164,13 +166,15 @@ def encode(counts: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
     return codes.reshape(*counts.shape[:-1], coding.codes)
 
 
-def encode_timestamps(timestamps: Tensor, offsets: Tensor, coding: CodingTensor) -> Tensor:
+def encode_timestamps(timestamps: Tensor | np.ndarray, offsets: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
     """Return the sum of the columns of C that a pixel's detections name, without a histogram: (P, K) float32.
 
     timestamps (N,) bin of each detection, any integer type, pixel after pixel; offsets (P + 1,) where each pixel's
-    begin, and the end: 0 .. N. A pixel without detections gives zeros. Raises InputError for bad offsets or bins.
+    begin, and the end: 0 .. N; both may be numpy arrays, as of `Histogram.timestamps`. A pixel without detections gives
+    zeros. Raises InputError for bad offsets or bins.
     """
     _per_pixel(coding)
+    timestamps, offsets = as_tensor(timestamps), as_tensor(offsets)
     table = coding.table.to(timestamps.device)
     codes = encode_photons(timestamps, offsets, table, coding.block, (coding.bins, 1, 1), name=coding.name)
     return codes.flatten(1)

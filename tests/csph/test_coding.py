@@ -13,6 +13,7 @@ from csph import CodingTensor, decode_depth, encode, encode_timestamps, truncate
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from spad.estimators.depth import cramer_rao_m, grid_peak
+from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse
 
@@ -215,3 +216,30 @@ def test_read_only_arrays_are_encoded_without_a_warning():
     assert torch.equal(codes, encode(torch.ones(2, 16), coding))
     with pytest.raises(InputError, match="got list"):
         encode([[1, 2]], coding)
+
+
+def test_arrays_of_a_histogram_are_encoded_and_decoded_as_tensors_are():
+    """`Histogram.timestamps` gives arrays of uint16 and int64."""
+    coding = fourier(8, 64)
+    histogram = Histogram.from_counts(np.random.default_rng(1).poisson(0.2, (3, 4, 64)), SMALL)
+    stamps, offsets = histogram.timestamps()
+    codes = encode_timestamps(stamps, offsets, coding)
+    assert torch.equal(codes, encode_timestamps(torch.from_numpy(stamps), torch.from_numpy(offsets), coding))
+    assert torch.equal(decode_depth(codes.numpy(), coding, SMALL), decode_depth(codes, coding, SMALL))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda coding: encode_timestamps([1, 2], [0, 2], coding), "a tensor or an array of numbers, got list"),
+        (lambda coding: encode_timestamps(np.ones(2), np.array([0, 2]), coding), "expected integers"),
+        (lambda coding: encode_timestamps(np.array([1]), np.array([0, 1]), "gray"), "a CodingTensor .* not str"),
+        (lambda coding: decode_depth([0.0] * 8, coding, SMALL), "a tensor or an array of numbers, got list"),
+        (lambda coding: decode_depth(np.ones(8, complex), coding, SMALL), "got an array of complex128"),
+        (lambda coding: decode_depth(np.ones(8), coding, "reference"), "decode_depth: expected a Sensor, not str"),
+        (lambda coding: decode_depth(np.ones(8), "fourier", SMALL), "expected a CodingTensor .* not str"),
+    ],
+)
+def test_what_is_no_array_is_refused_in_one_line(call, message):
+    with pytest.raises(InputError, match=message):
+        call(fourier(8, 64))
