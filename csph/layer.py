@@ -32,7 +32,7 @@ from csph.codes.quantise import (
 )
 from csph.codes.temporal import circle_of, orthogonal_start, temporal_code, uniform_start
 from csph.codes.tensor import CodingTensor, full_tensor
-from scenes.errors import require
+from scenes.errors import require, require_kind
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse
 
@@ -70,8 +70,9 @@ def make_coding(
     entries of one code of that part; a spatial part may begin orthogonal instead, with the same mean square. `sensor`
     (default: the reference) lends its pulse to Gray Fourier.
 
-    Raises InputError where K does not fit the code.
+    Raises InputError where K does not fit the code, and for what is no Design.
     """
+    require_kind(design, Design, "make_coding")
     (bins, rows, columns), codes = design.block, design.codes
     if design.full:
         return CodingTensor(design.name, uniform_start((codes, bins, rows, columns), design.size, seed))
@@ -103,7 +104,8 @@ class CompressiveLayer(nn.Module):
 
     Sums are in float32 whatever the counts' type and autocast, in float64 where the weights are.
 
-    Raises InputError for options and parts that do not go together, and a background of another shape.
+    Raises InputError for options and parts that do not go together, objects of another kind, and a background of
+    another shape.
     """
 
     temporal: Tensor
@@ -123,10 +125,12 @@ class CompressiveLayer(nn.Module):
         background: Tensor | None = None,
     ) -> None:
         super().__init__()
+        require_kind(coding, CodingTensor, "CompressiveLayer", " (`CompressiveLayer.of` takes a Design)")
         parts = {"temporal": coding.temporal, "spatial": coding.spatial}
         unknown = [name for name in learned if parts.get(name) is None]
         require(not unknown, f"coding tensor {coding.name} has no part {', '.join(unknown)} to learn")
         self.name, self.block, self.codes, self.computed = coding.name, coding.block, coding.codes, coding.computed
+        require_kind(options or LayerOptions(), LayerOptions, "CompressiveLayer: options")
         self.options = options or LayerOptions()
         for name, part in parts.items():
             copied = None if part is None else part.clone()

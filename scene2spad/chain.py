@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -76,15 +76,26 @@ def render(
     from scenes.library.catalog import load_scene
     from scenes.model import Scene
 
-    known = [field.name for field in fields(RenderSettings)]
-    for name in settings:
-        if name not in known:
-            raise InputError(f"render: setting {name!r} is unknown{did_you_mean(name, known)}")
+    _check_settings(settings, [field.name for field in fields(RenderSettings)])
     if not isinstance(scene, Scene):
         scene = load_scene(str(scene), seed=seed, width=width, height=height)
     elif width is not None or height is not None:
         raise InputError("render: a Scene has its own camera; width and height go with a name or a file")
     return render_scene(scene, RenderSettings(**settings), seed=seed, progress=progress)
+
+
+def _check_settings(settings: dict[str, Any], known: list[str]) -> None:
+    """Raise InputError for unknown settings, and for those that are no numbers and have to be."""
+    for name, value in settings.items():
+        require(name in known, f"render: setting {name!r} is unknown{did_you_mean(name, known)}")
+        if value is None or name == "refraction":
+            continue
+        if name == "budget":
+            pair = isinstance(value, tuple | list | np.ndarray) and len(value) == 2
+            good = pair and all(isinstance(one, Real) for one in value)
+            require(good, f"render: budget {value!r}, expected two numbers: signal and background photons a pixel")
+        else:
+            require(isinstance(value, Real | np.bool_), f"render: {name} {value!r}, expected a number")
 
 
 def sense(

@@ -92,6 +92,11 @@ def test_optics_compute_the_photon_budget():
     [
         (lambda h: s2s.render("plane", eror=0.1), "setting 'eror' is unknown; did you mean 'error'"),
         (lambda h: s2s.render(s2s.load_scene("plane"), width=8), "own camera"),
+        (lambda h: s2s.render("plane", budget=3), "budget 3, expected two numbers: signal and background photons"),
+        (lambda h: s2s.render("plane", budget=(3,)), r"budget \(3,\), expected two numbers"),
+        (lambda h: s2s.render("plane", budget=("a", 3)), r"budget \('a', 3\), expected two numbers"),
+        (lambda h: s2s.render("plane", error="0.1"), "render: error '0.1', expected a number"),
+        (lambda h: s2s.CompressiveLayer(s2s.Design()), "a CodingTensor .*`CompressiveLayer.of` .* not Design"),
         (lambda h: s2s.render("galery"), "gallery"),
         (lambda h: s2s.estimate_depth(h, "log-machted"), "log-matched"),
         (lambda h: s2s.load_model("nosuch"), "nosuch"),
