@@ -238,7 +238,7 @@ def coding_tensor(code: str, codes: int, sensor: Sensor | str | Path = "referenc
     Raises
     ------
     InputError
-        For an unknown code, or more codes than it has.
+        For an unknown code, a number of codes that is not whole (8.0 is none), or more codes than it has.
 
     Examples
     --------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 
 from scenes.errors import InputError, did_you_mean, require
 
@@ -23,7 +24,7 @@ class Design:
     spatial_learned  the spatial part of a fixed temporal code is learned ("fourier+learned")
     zero_mean        rows are held to sum to zero over Mt; None: all but coarse histograms, as published
 
-    Raises InputError for an unknown code, and more codes than it has.
+    Raises InputError for an unknown code, and a number of codes that is not whole or more than it has.
     """
 
     code: str = "learned"
@@ -39,8 +40,9 @@ class Design:
         good = len(self.block) == 3 and all(isinstance(n, int) and n >= 1 for n in self.block)
         require(good, f"block {self.block}: expected three positive numbers of bins, rows and columns")
         most = self.size if self.code in ("learned", "random") else self.block[0]
-        message = f"{self.codes} codes over a block of {self.block_name}, expected 1 to {most} for {self.code} codes"
-        require(1 <= self.codes <= most, message)
+        expected = f"expected a whole number from 1 to {most} for {self.code} codes"
+        whole = isinstance(self.codes, Integral) and not isinstance(self.codes, bool) and 1 <= self.codes <= most
+        require(whole, f"{self.codes!r} codes over a block of {self.block_name}, {expected}")
         free = self.code in ("learned", "random")
         require(free or not self.full, f"design {self.code}: full coding tensors are learned or random")
         if self.zero_mean is None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from numbers import Integral
 
 import numpy as np
 import torch
@@ -40,7 +41,7 @@ def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 
     """Return (K, Mt) float32 of one of FIXED_CODES; the sensor lends its pulse to the Gray codes, the seed is
     `random`'s.
 
-    Raises InputError for another name and for K that does not fit the code.
+    Raises InputError for another name and for K that is no whole number or does not fit the code.
     """
     makers = {
         "fourier": lambda: truncated_fourier(codes, bins),
@@ -53,7 +54,8 @@ def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 
     }
     meant = did_you_mean(name, FIXED_CODES)
     require(name in makers, f"temporal code {name!r} is unknown{meant}, expected one of {', '.join(FIXED_CODES)}")
-    require(codes >= 1, f"{name} code: {codes} codes, expected 1 or more")
+    whole = isinstance(codes, Integral) and not isinstance(codes, bool) and codes >= 1
+    require(whole, f"{name} code: {codes!r} codes, expected a whole number, 1 or more")
     return makers[name]()
 
 

@@ -29,14 +29,14 @@ BRIGHT_SKY_W_PER_M2_SR_NM = 0.5
 class Optics:
     """The lens, the filter and the laser's pulses.
 
-    pulse_energy_j    energy of one laser pulse, over the whole cone
+    pulse_energy_j    energy of one laser pulse, over the whole cone; 0: the laser is off
     focal_length_m, f_number    aperture diameter = focal length / f-number
     pixel_pitch_m     side of a pixel's active square (fill factor included)
     transmission      of lens and filter at the laser's wavelength
     filter_nm         width of the band that the filter lets through
     wavelength_m      of the laser
 
-    Raises InputError for values that are not above 0.
+    Raises InputError for values that are not above 0, a pulse energy below 0, and a transmission above 1.
     """
 
     pulse_energy_j: float
@@ -50,8 +50,9 @@ class Optics:
     def __post_init__(self) -> None:
         for name in ("pulse_energy_j", "focal_length_m", "f_number", "pixel_pitch_m", "filter_nm", "wavelength_m"):
             value = getattr(self, name)
-            good = math.isfinite(value) and (value > 0 or (name == "pulse_energy_j" and value == 0))
-            require(good, f"optics: {name} {value:g} must be finite and above 0")
+            off = name == "pulse_energy_j"  # which a laser may be: background alone
+            good = math.isfinite(value) and (value > 0 or (off and value == 0))
+            require(good, f"optics: {name} {value:g} must be finite and {'0 or more' if off else 'above 0'}")
         require(0 < self.transmission <= 1, f"optics: transmission {self.transmission:g} is outside (0, 1]")
 
     @property

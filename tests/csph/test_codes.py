@@ -157,6 +157,9 @@ def test_random_codes_follow_their_seed_and_range():
         ("fourier", 63, 64, "even number"),
         ("fourier", 0, 64, "1 or more"),
         ("haar", 4, 64, "'haar' is unknown"),
+        ("fourier", 8.0, 64, "8.0 codes, expected a whole number"),
+        ("random", "8", 64, "'8' codes, expected a whole number"),
+        ("hadamard", True, 64, "True codes, expected a whole number"),
     ],
 )
 def test_codes_that_do_not_fit_end_in_one_line(name, codes, bins, message):
@@ -180,6 +183,7 @@ def test_gray_fourier_takes_any_pulse():
     [
         (lambda: ModelConfig(design=Design("learned", (256, 1, 1), 1)), "leaves zeros"),
         (lambda: Design("furier", (256, 1, 1), 4), "did you mean 'fourier'"),
+        (lambda: Design("learned", (256, 1, 1), 4.0), "4.0 codes over a block of 256 x 1 x 1, expected a whole number"),
         (lambda: Design.named("lerned", (256, 1, 1), codes=4), "did you mean 'learned'"),
         (lambda: temporal_code("hadamrd", 4, 256, Sensor()), "did you mean 'hadamard'"),
     ],

@@ -329,6 +329,14 @@ def test_bad_optics_are_refused(bad: dict) -> None:
         replace(EXAMPLE, **bad)
 
 
+def test_a_laser_that_is_off_leaves_the_background() -> None:
+    transient = transient_of([(2.0, 2.1, 3e-4)], [(4.0, 4.0, 2e-4)], ambient=[0.02, 0.03])
+    dark = replace(EXAMPLE, pulse_energy_j=0.0).budget(transient, SENSOR)
+    assert dark == PhotonBudget(0.0, EXAMPLE.budget(transient, SENSOR).background)
+    with pytest.raises(InputError, match="pulse_energy_j -1 must be finite and 0 or more"):
+        replace(EXAMPLE, pulse_energy_j=-1.0)
+
+
 def test_radiance_above_a_bright_sky_is_no_radiance_in_si() -> None:
     """Sunlit white paper is below the limit, a lamp of a picture's scene far above it."""
     paper = sunlight_w_per_m2_nm(1e5, 850e-9) / math.pi
