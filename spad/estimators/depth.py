@@ -274,7 +274,7 @@ def depth_errors(
 
     mae_mm, rmse_mm, median_mm (signed) and within_10mm (share strictly under 10 mm) over `pixels` pixels; left out and
     counted: empty (truth NaN), beyond_range (truth at the range, one for all or (H, W), or beyond), missing (estimate
-    NaN).
+    NaN or infinite).
     """
     estimate, truth = map(_metres, (estimate, truth))
     keep = (
@@ -286,7 +286,7 @@ def depth_errors(
         raise InputError(f"depth of shape {estimate.shape}, truth {truth.shape} and mask {keep.shape} must be alike")
     empty = keep & np.isnan(truth)
     beyond = keep & (truth >= range_m)
-    missing = keep & ~empty & ~beyond & np.isnan(estimate)
+    missing = keep & ~empty & ~beyond & ~np.isfinite(estimate)
     error = (estimate - truth)[keep & ~empty & ~beyond & ~missing] * 1e3
     figures = {"mae_mm": math.nan, "rmse_mm": math.nan, "median_mm": math.nan, "within_10mm": math.nan}
     if error.size:

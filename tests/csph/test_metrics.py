@@ -40,6 +40,14 @@ def test_errors_by_hand():
     assert errors["within_10mm"] in (0.6, 0.8)
 
 
+@pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf])
+def test_infinite_estimates_are_missing_as_nan_is(nothing):
+    errors = image_errors(np.array([[1.004, nothing]]), np.array([[1.0, 2.0]]), 15.0)
+    assert (errors["pixels"], errors["missing"]) == (1, 1)
+    assert errors["mae_mm"] == pytest.approx(4) and errors["rmse_mm"] == pytest.approx(4)
+    assert errors["within_5mm"] == errors["within_10mm"] == 1
+
+
 def test_groups_by_hand():
     truth = np.full((8, 8), 2.0)
     truth[0] = np.linspace(1, 3, 8)
