@@ -89,6 +89,13 @@ def output_folder(path: Path, contents: str) -> Path:
     return path
 
 
+def beside_folder(folder: Path, ending: str) -> Path:
+    """Return the path beside a folder, of its name and an ending, written as the folder is."""
+    if folder.name in ("", ".."):  # "." has no name in its path
+        return folder / ".." / f"{folder.resolve().name}{ending}"
+    return folder.with_name(f"{folder.name}{ending}")
+
+
 def file_stem(name: str) -> str:
     """Return the name of a scene or a set as a file's: - for /."""
     return name.replace("/", "-")

@@ -106,6 +106,16 @@ def test_files_of_one_name_have_pages_of_their_own(tmp_path, capfd):
     assert {page.name for page in tmp_path.glob("*.html")} == {"c.dense.html", "c.h5.dense.html"}
 
 
+def test_the_page_of_a_folder_is_named_as_the_folder_is_given(tmp_path, monkeypatch):
+    (tmp_path / "a/set").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert page_of(Path("a/set"), "set") == Path("a/set.set.html")
+    assert page_of(tmp_path / "a/set", "set") == tmp_path / "a/set.set.html"
+    monkeypatch.chdir(tmp_path / "a/set")
+    assert page_of(Path(), "set") == Path("../set.set.html")
+    assert page_of(Path(".."), "set") == Path("../../a.set.html")
+
+
 def test_hdf5_files_may_end_in_hdf5(tmp_path, capfd):
     """Counts, sets in one file and dense arrays, in every command that reads or writes them."""
     histogram, dense, pack = (str(tmp_path / name) for name in ("a.hdf5", "dense.hdf5", "set.HDF5"))

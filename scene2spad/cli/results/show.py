@@ -20,7 +20,15 @@ from scene2spad.cli.opening import (
     open_transient,
     transient_of,
 )
-from scene2spad.cli.paths import PDF_FIGURE, PNG_FIGURE, Mark, check_target, holds_at_start, keep_foreign
+from scene2spad.cli.paths import (
+    PDF_FIGURE,
+    PNG_FIGURE,
+    Mark,
+    beside_folder,
+    check_target,
+    holds_at_start,
+    keep_foreign,
+)
 from scene2spad.options.common import Common, File, Positional, only_for
 from scenes.errors import InputError, require
 from scenes.io.inputs import read_text, read_whole_lines
@@ -93,11 +101,12 @@ def page_of(path: Path, kind: str) -> Path:
     With the kind, as pictures have it: a transient and its histogram have one name. Of endings that stand for one kind
     the first is left out, and all but it are in the name.
     """
-    source = path.resolve() if path.is_dir() else path
-    # a run's folder and a model's name have no ending
+    if path.is_dir():
+        return beside_folder(path, f".{kind}.html")
+    # a model's name has no ending
     usual = "" if kind == "network" else next((end for end, kinds in BY_SUFFIX.items() if kind in kinds), "")
-    name = source.stem if usual and source.suffix == usual and not path.is_dir() else source.name
-    return source.with_name(f"{name}.{kind}.html")
+    name = path.stem if usual and path.suffix == usual else path.name
+    return path.with_name(f"{name}.{kind}.html")
 
 
 def _content(command: Show, kind: str) -> Content:

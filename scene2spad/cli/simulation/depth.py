@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import numpy as np
 
 from scene2spad.cli.opening import open_histogram, open_transient, pixel_sensor
-from scene2spad.cli.paths import holds_kind, input_file, output_file, picture
+from scene2spad.cli.paths import beside_folder, holds_kind, input_file, output_file, picture
 from scene2spad.methods import depth_method
 from scene2spad.options.common import Common, Count, File, Number, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
@@ -147,7 +147,7 @@ def _run_folder(command: Depth, label: str, progress: Progress) -> dict:
 
     folder = command.file
     files = transient_files(folder)
-    out = command.out or folder.resolve().with_name(f"{folder.resolve().name}-{label}")
+    out = command.out or beside_folder(folder, f"-{label}")
     require(out.resolve().parent.is_dir(), f"{out}: folder {out.parent} does not exist")
     require(not out.is_file(), f"{out}: is a file, expected a folder for the depth maps")
     require(out.resolve() != folder.resolve(), f"{out}: is the folder of the transients")
