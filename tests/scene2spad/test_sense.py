@@ -13,11 +13,12 @@ from matplotlib.axes import Axes
 
 from render.transient import write_transient
 from scene2spad.bench import estimators
-from scene2spad.bench.sense import alternating, one_law, relief
+from scene2spad.bench.sense import alternating, first_photon_totals, max_deviation, one_law, poisson_totals, relief
 from scene2spad.cli import main
 from scene2spad.plots import pixels
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel, sense
+from spad.detection.laws import first_photon_counts
 from spad.formats.bistatic import true_arrival_s
 from spad.formats.depth_map import read_depth
 from spad.formats.histogram import Histogram, read_histogram, write_histogram
@@ -217,6 +218,17 @@ def test_measuring_tools():
     assert one_law(counts[0], rng.poisson(np.linspace(2, 4, 8), (500, 8))) < 1e-6
 
 
+def test_deviations_from_closed_forms_are_of_the_law_that_drew_the_counts():
+    """At 0.5 photons a cycle first photons are far from Poisson's law; the largest of 64 normal deviates is below 5."""
+    rng = np.random.default_rng(1)
+    flux = np.linspace(0.5, 1.5, 64) / 128 * np.ones((50, 1))
+    counts = first_photon_counts(flux, 2000, rng)
+    assert max_deviation(counts, first_photon_totals(flux, 2000)) < 5
+    assert max_deviation(counts, poisson_totals(2000 * flux)) > 10
+    assert max_deviation(rng.poisson(2000 * flux), poisson_totals(2000 * flux)) < 5
+    assert max_deviation(counts[:, ::-1], first_photon_totals(flux, 2000)) > 10
+
+
 @pytest.mark.slow
 def test_bench_sense(tmp_path, capfd):
     status, message, _ = run(capfd, "bench", "sense", "--quick", "--out", str(tmp_path / "b"), "--data", str(tmp_path))
@@ -224,6 +236,7 @@ def test_bench_sense(tmp_path, capfd):
     names = [row["name"] for row in message["rows"]]
     assert sum("numpy" in name for name in names) == 2 and any("training batch" in name for name in names)
     assert all(row["same_law_p"] is None or row["same_law_p"] > 1e-4 for row in message["rows"])
+    assert all(row["error"] < 0.02 and row["max_deviation_se"] < 6 for row in message["rows"]), message["rows"]
     with (tmp_path / "b" / "bench-sense.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(message["rows"])
 
