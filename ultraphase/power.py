@@ -45,7 +45,10 @@ class Load:
 
     def __post_init__(self) -> None:
         require(0 <= self.photons <= 1e9, f"load: {self.photons:g} photons a frame and pixel is outside 0 to 1e9")
-        require(0 < self.frames_per_s <= 1e9, f"load: {self.frames_per_s:g} frames a second is outside 0 to 1e9")
+        require(
+            0 < self.frames_per_s <= 1e9,
+            f"load: {self.frames_per_s:g} frames a second, expected more than 0, at most 1e9",
+        )
         require(1 <= self.pixels <= 1 << 40, f"load: {self.pixels} pixels is outside 1 to 2^40")
 
 

@@ -116,6 +116,18 @@ def open_histogram(path: Path, frame: int = 0) -> Histogram:
     return read_histogram(path)
 
 
+def open_for_depth(path: Path, frame: int = 0) -> Histogram:
+    """Read a histogram as `open_histogram` does; InputError, naming the file, for one that cannot tell depth."""
+    from spad.formats.bistatic import check_pointing
+
+    histogram = open_histogram(path, frame)
+    try:
+        check_pointing(histogram)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return histogram
+
+
 def _check_no_other_kind(path: Path) -> None:
     """Raise InputError for a file of another kind of ours, which a histogram's reader would call damaged."""
     kinds = BY_SUFFIX.get(path.suffix.lower(), ("histogram",))

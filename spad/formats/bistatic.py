@@ -85,17 +85,26 @@ def _light_half_path_m(histogram: Histogram, half_path_m: np.ndarray) -> np.ndar
 
 def _distance_m(histogram: Histogram, half_path_m: np.ndarray) -> np.ndarray:
     """Return distance from the camera [m], given half of the light's path."""
+    directions = check_pointing(histogram)
+    return half_path_m if directions is None else radial_depth_m(half_path_m, directions, laser_baseline_m(histogram))
+
+
+def check_pointing(histogram: Histogram) -> np.ndarray | None:
+    """Return unit rays (H, W, 3) of the pixels beside a displaced laser, None beside one that is at the camera.
+
+    Raises InputError where the histogram does not tell where its pixels look: then it has no depth.
+    """
     baseline = laser_baseline_m(histogram)
     if not any(baseline):
-        return half_path_m
-    directions = pixel_directions(pointing_of(histogram.meta), histogram.depth_m.shape)
+        return None
+    pointing, shape = pointing_of(histogram.meta), histogram.depth_m.shape
+    directions = pixel_directions(pointing, shape)
     if directions is None:
-        rows, columns = histogram.depth_m.shape
-        raise InputError(
-            f"histogram of {rows} x {columns} pixels beside a laser at {baseline} m: its camera has another image, so "
-            "nothing tells where its pixels look"
-        )
-    return radial_depth_m(half_path_m, directions, baseline)
+        why = "its camera has another image" if pointing else "it states no camera"
+        place = " ".join(f"{value:g}" for value in baseline)
+        what = f"histogram of {shape[0]} x {shape[1]} pixels beside a laser at {place} m"
+        raise InputError(f"{what}: {why}, so nothing tells where its pixels look")
+    return directions
 
 
 def true_path_m(seen: Transient | Histogram) -> np.ndarray:

@@ -76,6 +76,17 @@ def test_depth_beside_a_displaced_laser_has_no_confidence(scene, capfd, tmp_path
     assert read_depth(tmp_path / "beside-log-matched.exr")[1] is None
 
 
+@pytest.mark.parametrize("line", [["depth", "blind.h5"], ["compare", "blind.h5", "--methods", "argmax"]])
+def test_a_histogram_beside_a_displaced_laser_without_a_camera_is_refused_by_name(scene, capfd, tmp_path, line):
+    assert run(capfd, "sense", "s.exr")[0] == 0
+    histogram = read_histogram(tmp_path / "s.h5")
+    meta = {**histogram.meta, "transient": {"laser": {"baseline_m": [0.1, 0.0, 0.0]}}}
+    write_histogram(replace(histogram, meta=meta), tmp_path / "blind.h5")
+    assert main(line) == 2
+    words = "blind.h5: histogram of 8 x 10 pixels beside a laser at 0.1 0 0 m: it states no camera"
+    assert words in capfd.readouterr().err
+
+
 def test_depth_beyond_the_record_says_that_no_pixel_is_in_range(scene, capfd):
     """The scene begins at 2 m, and 100 bins of the reference sensor end at 1.46 m."""
     assert run(capfd, "sense", "s.exr", "--bins", "100", "--period", "1e-7")[0] == 0

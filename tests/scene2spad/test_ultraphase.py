@@ -133,7 +133,7 @@ def test_sweep_refuses_what_does_not_fit_and_goes_on(capfd, folder):
         (["run", "fourier-8", "--photons", "1e9"], "20000"),
         (["run", "fourier-8", "--trace", "-1"], "--trace -1 is outside 0 to 100000"),
         (["run", "fourier-8", "--watch", "nothing"], "nothing"),
-        (["sweep", "--fps", "0"], "0 frames"),
+        (["sweep", "--fps", "0"], "load: 0 frames a second, expected more than 0, at most 1e9"),
         (["sweep", "--pixels", "0"], "0 pixels"),
         (["sweep", "--codes", "7"], "7 codes"),
         (["table", "--out", "nowhere/t.csv"], "nowhere"),
@@ -143,6 +143,11 @@ def test_mistakes_end_in_one_line(capfd, folder, argv, message):
     (folder / "bad.s").write_text("HALT\n  ADD r1\n".replace("ADD r1", "JMP 3"))
     assert message in refused(capfd, "ultraphase", *argv)
     assert [path.name for path in folder.iterdir()] == ["bad.s"]
+
+
+def test_a_load_that_cannot_be_is_refused_before_the_programs_run(capfd, folder, monkeypatch):
+    monkeypatch.setattr("scene2spad.cli.experiments.ultraphase_actions.all_costs", None)
+    assert "load: -1 frames a second" in refused(capfd, "ultraphase", "sweep", "--fps", "2", "-1")
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -285,5 +286,7 @@ def _sweep(command: Ultraphase, progress: Progress) -> dict:
                     refused[one.name] = str(reason)
     for text, values in (("photons", command.photons), ("fps", command.fps), ("pixels", command.pixels)):
         require(len(values) > 0, f"ultraphase sweep: --{text} needs a number")
+    for photons, frames_per_s, pixels in product(command.photons, command.fps, command.pixels):
+        Load(photons, frames_per_s, pixels)  # refused where it cannot be, before the programs run
     rows = sweep(all_costs(progress, methods), command.photons, command.fps, command.pixels)
     return {"rows": rows, "refused": refused, "readings": READINGS, **_write(command.out, as_csv(rows))}

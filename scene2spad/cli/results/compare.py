@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from scene2spad.cli.opening import open_histogram
+from scene2spad.cli.opening import open_for_depth
 from scene2spad.cli.paths import PNG_FIGURE, Mark, begins, check_target, input_file, keep_foreign, picture
 from scene2spad.options.common import Common, File, Positional
 from scenes.errors import require
@@ -52,7 +52,7 @@ def run(command: Compare, progress: Progress) -> dict:
         check_target(target, source)
     keep_foreign(out, TABLE)
     keep_foreign(figure, PNG_FIGURE)
-    histogram = open_histogram(source, command.frame)
+    histogram = open_for_depth(source, command.frame)
     methods = {name: depth_method(name, histogram.sensor, seed=command.seed) for name in command.methods}
     rows, depths = [], {}
     for number, (name, method) in enumerate(methods.items()):

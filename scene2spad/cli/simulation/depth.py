@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import numpy as np
 
-from scene2spad.cli.opening import open_histogram, open_transient, pixel_sensor
+from scene2spad.cli.opening import open_for_depth, open_transient, pixel_sensor
 from scene2spad.cli.paths import beside_folder, holds_kind, input_file, output_file, picture
 from scene2spad.methods import depth_method
 from scene2spad.options.common import Common, Count, File, Number, Positional, may_stay_open, only_for
@@ -100,7 +100,7 @@ def run(command: Depth, progress: Progress) -> dict:
         go = "goes" if len(asked) == 1 else "go"
         message = f"{source}: --{', --'.join(asked)} {go} with a transient (.exr), a histogram has been sensed"
         require(not asked, message)
-        histogram, sensed = open_histogram(source, command.frame), ""
+        histogram, sensed = open_for_depth(source, command.frame), ""
     progress(command.method, 0.1)
     result = _estimated(command, network, histogram, source, out)
     result = ({"sensed": sensed} if sensed else {}) | result
