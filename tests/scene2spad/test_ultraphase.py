@@ -145,6 +145,12 @@ def test_mistakes_end_in_one_line(capfd, folder, argv, message):
     assert [path.name for path in folder.iterdir()] == ["bad.s"]
 
 
+@pytest.mark.parametrize("asked", [("--trace", "-1"), ("--watch", "nothing")])
+def test_what_to_look_at_is_checked_before_the_run(capfd, folder, monkeypatch, asked):
+    monkeypatch.setattr("scene2spad.cli.experiments.ultraphase_actions.CoreArray", None)
+    assert asked[1] in refused(capfd, "ultraphase", "run", "fourier-8", *asked)
+
+
 def test_a_load_that_cannot_be_is_refused_before_the_programs_run(capfd, folder, monkeypatch):
     monkeypatch.setattr("scene2spad.cli.experiments.ultraphase_actions.all_costs", None)
     assert "load: -1 frames a second" in refused(capfd, "ultraphase", "sweep", "--fps", "2", "-1")

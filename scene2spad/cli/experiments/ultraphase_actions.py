@@ -204,6 +204,9 @@ def _run(command: Ultraphase, progress: Progress) -> dict:
     require(good, f"{command.signal:g} signal of {photons:g} photons: expected 0 to {_MAX_PHOTONS}, signal among them")
     family = chosen.family if chosen else ""
     require(family not in ("learned", "addressed"), f"{program.name}: has no frame of 2 x 2 pixels to run")
+    require(0 <= command.trace <= 100_000, f"--trace {command.trace} is outside 0 to 100000")
+    if command.watch:
+        program.region(command.watch)  # refused where there is none
     tables: dict[str, np.ndarray] = {}
     if chosen is not None:
         tables = chosen.tables(int8_temporal(chosen), fixed_spatial(chosen))
@@ -259,7 +262,6 @@ def _looked_at(command: Ultraphase, program: Program, tables: dict, stream: np.n
     """Trace and watch of the first core alone, as far as it runs without its neighbours."""
     shown = {}
     own = {name: values.reshape(-1, values.shape[-1])[0] for name, values in tables.items()}
-    require(0 <= command.trace <= 100_000, f"--trace {command.trace} is outside 0 to 100000")
     if command.trace:
         core = Core(program, own)
         core.start(stream, park=True)
