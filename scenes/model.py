@@ -73,7 +73,7 @@ class Material:
                 the same peak, and ggx the longer tails
     specular    scale of the specular reflectance (plastic, conductor)
     ior         interior index of refraction (plastic, dielectric)
-    eta, k      complex index of a conductor; (0, 1) is a perfect mirror
+    eta, k      complex index of a conductor; (0, 1) is a perfect mirror. Metals by name have theirs at 650 nm
     opacity     share of the surface that is there (cut-out masks), number or texture
     """
 

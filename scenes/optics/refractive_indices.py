@@ -1,4 +1,5 @@
-"""Indices of refraction of media and metals by name."""
+"""Indices of refraction of media and metals by name: of media at 589 nm, of metals at 650 nm, whatever the laser's
+wavelength."""
 
 # Refractive indices at the sodium line, the names that the file format knows and that exported scenes use.
 INDICES = {
