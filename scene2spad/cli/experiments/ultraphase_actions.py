@@ -7,12 +7,12 @@ import re
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
 from scene2spad.options.common import only_for
+from scene2spad.options.experiments import Ultraphase
 from scene2spad.studies.power.program_tables import all_costs, fixed_spatial, int8_temporal, verified
 from scenes.errors import InputError, require
 from scenes.files import whole_file
@@ -23,9 +23,6 @@ from ultraphase.array import Frame
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.chip import ASSUMPTIONS
 from ultraphase.power import READINGS, Cost, Load, as_csv, frame_end, measured_cost, power, reference_bits, sweep, table
-
-if TYPE_CHECKING:
-    from scene2spad.cli.experiments.ultraphase import Ultraphase
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from scene2spad.datasets.zone_captures import (
     within,
     zone_captures,
 )
+from scene2spad.options.simulation import Calibrate
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.sensor.files import load_sensor, read_sensor, write_sensor
@@ -33,9 +33,6 @@ from spad.zones.calibration import (
 )
 from spad.zones.expected_counts import ZoneCapture
 from spad.zones.sensor import expected_zone_counts
-
-if TYPE_CHECKING:
-    from scene2spad.cli.simulation.calibrate import Calibrate
 
 log = logging.getLogger("scene2spad")
 

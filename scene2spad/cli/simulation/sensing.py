@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from render.transient import Transient, read_transient
 from scene2spad.cli.paths import Mark, begins, check_target, input_file, keep_foreign, output_file, picture
 from scene2spad.options.common import only_for
+from scene2spad.options.simulation import Sense
 from scenes.errors import InputError, require
 from scenes.files import read_array
 from scenes.io.hdf5 import HDF5_SUFFIXES
@@ -30,9 +31,6 @@ from spad.sensor.files import FWHM_PER_SIGMA, load_sensor
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, read_pulse
 from spad.zones.sensor import ZoneArray
-
-if TYPE_CHECKING:
-    from scene2spad.cli.simulation.sense import Sense
 
 log = logging.getLogger("scene2spad")
 
