@@ -31,7 +31,8 @@ class Card:
     cpu_minutes   of its training; None where they were not recorded
     val_mae_mm    on its validation set, as the model was decoded then
     init          model whose weights, or network alone, its training began with; None: random weights
-    errors        MAE [mm] by set and level, where `ship` was told
+    errors        MAE [mm] by set and level, where `ship` was told; of the studies' models also by the page that states
+                  them, named with the set; empty where none were recorded
     not_for       what it must not be used for: what follows from its training, and `limits` measured on it
     """
 

@@ -1,6 +1,7 @@
 """Cards of shipped models; training on a machine without a renderer and a command line."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -23,6 +24,18 @@ def test_every_shipped_model_has_a_card():
         assert card.levels.startswith("signal ") and len(card.not_for) >= 2
     (long,) = [card for card in found if card.name == "learned-1024x4x4-128x-s0"]
     assert "depths beyond those of its training set" in long.not_for[-1] and long.compression == 128
+
+
+def test_errors_that_cards_take_from_a_page_stand_on_it():
+    root, taken = WEIGHTS.parents[1], 0
+    for card in cards():
+        for where, levels in card.errors.items():
+            page = re.search(r"\((docs/[\w-]+\.md)\)$", where)
+            if page is not None:
+                numbers = set(re.findall(r"\d+(?:,\d{3})*(?:\.\d+)?", (root / page[1]).read_text(encoding="utf-8")))
+                assert {f"{value:,}" for value in levels.values()} <= numbers, (card.name, where)
+                taken += 1
+    assert taken > 50
 
 
 def test_a_shipped_run_tells_its_cpu_minutes_and_errors(tmp_path):

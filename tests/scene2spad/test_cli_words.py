@@ -1,6 +1,7 @@
 """What the command line says to somebody who mistyped, or gave a file of another kind."""
 
 import io
+import json
 import sys
 from pathlib import Path
 
@@ -197,3 +198,15 @@ def test_progress_also_speaks_when_piped(capsys):
 def test_what_is_no_number_is_answered_with_what_is_expected(words, message, capsys):
     status, _, err = run(capsys, "render", "plane", *words)
     assert (status, err) == (2, f"scene2spad: {message}\n")
+
+
+def test_a_card_says_what_was_not_recorded(capfd):
+    """In words on the terminal; JSON keeps null and an empty object."""
+    name = "learned-256x4x4-128x-tdc-s0"
+    assert main(["models", name]) == 0
+    assert "errors: not recorded\n" in capfd.readouterr().out
+    assert main(["models", "none-s0"]) == 0
+    out = capfd.readouterr().out
+    assert "cpu_minutes: not recorded\n" in out and "7 m farther: 31, as it is: 31" in out
+    assert main(["models", name, "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["errors"] == {}

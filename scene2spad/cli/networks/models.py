@@ -9,10 +9,12 @@ from typing import Annotated
 
 from scene2spad.options.common import Common, Positional, may_stay_open
 from scenes.errors import InputError
+from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 IMPORT = "import"
+UNKNOWN = "not recorded"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +44,8 @@ def run(command: Models, progress: Progress) -> dict:
     from csph.weights.shipped import CARD
 
     if command.name:
-        return read_card(shipped_model(command.name).with_name(CARD)).to_dict()
+        whole = read_card(shipped_model(command.name).with_name(CARD)).to_dict()
+        return whole if command.json else _readable(whole)
     found = cards()
     if command.json:
         return {"models": [card.to_dict() for card in found]}
@@ -54,6 +57,12 @@ def run(command: Models, progress: Progress) -> dict:
         )
         lines.append(f"{message}; not for {'; '.join(card.not_for)}")
     return {"models": lines}
+
+
+def _readable(card: JsonObject) -> JsonObject:
+    """Return a card for the terminal, which says what was not recorded."""
+    unknown = {name: UNKNOWN for name in ("errors", "cpu_minutes", "val_mae_mm") if card[name] in (None, {})}
+    return card | unknown
 
 
 def _import(command: Models) -> dict:
