@@ -63,8 +63,8 @@ def executor(workers: int, scheduler: str | None) -> Iterator[Run]:
 
         def run(work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]) -> Iterator[Result]:
             results: Generator[Result, None, None]
-            if client is not None:
-                results = _on_dask(client, work, runs, lost)
+            if client is not None and scheduler is not None:
+                results = _on_dask(client, scheduler, work, runs, lost)
             elif workers == 1:
                 results = (result for some in runs for number in some for result in work((number,)))
             else:
@@ -209,7 +209,7 @@ def _cluster_logs_off() -> Iterator[None]:
 
 
 def _on_dask(
-    client: Client, work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]
+    client: Client, address: str, work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]
 ) -> Generator[Result, None, None]:
     """Use a cluster's workers, a few tasks each in flight, so that results do not heap up; a dead worker's move on.
 
@@ -218,16 +218,16 @@ def _on_dask(
     from distributed import as_completed
 
     waiting = iter(runs)
-    workers = _workers_of(client)
+    workers = _workers_of(client, address)
     if not workers:
-        log.warning("scheduler %s has no workers yet: waiting for some", client.scheduler.address)
+        log.warning("scheduler %s has no workers yet: waiting for some", address)
     submitted: dict[DaskFuture, Numbers] = {}
     pending = as_completed()
     while True:
         if client.status == "running":  # else it is the scheduler's loss that is told next, not waited for
-            workers = _workers_of(client)
+            workers = _workers_of(client, address)
         for run in islice(waiting, max(0, 3 * max(1, workers) - len(submitted))):
-            with _explain_lost_scheduler(client):
+            with _explain_lost_scheduler(client, address):
                 future = client.submit(work, run, pure=False, retries=TRIES)
             submitted[future] = run
             pending.add(future)
@@ -236,7 +236,7 @@ def _on_dask(
         future = next(pending)
         run = submitted.pop(future)
         done: list[Result] | None
-        with _explain_lost_scheduler(client):
+        with _explain_lost_scheduler(client, address):
             done, error = _outcome(future)
         future.release()
         if done is not None:
@@ -247,9 +247,9 @@ def _on_dask(
             yield lost(run[0], f"its workers died: {' '.join(str(error).split())[:300]}")
 
 
-def _workers_of(client: Client) -> int:
+def _workers_of(client: Client, address: str) -> int:
     """Return how many workers a cluster has now: they come and go."""
-    with _explain_lost_scheduler(client):
+    with _explain_lost_scheduler(client, address):
         return client.scheduler_info(n_workers=0)["n_workers"]  # their number alone, however many there are
 
 
@@ -268,8 +268,10 @@ def _outcome(future: DaskFuture[list[Result]]) -> tuple[list[Result] | None, Bas
 
 
 @contextmanager
-def _explain_lost_scheduler(client: Client) -> Iterator[None]:
-    """InputError in one line where the scheduler does not answer any more; it is told by errors of several types."""
+def _explain_lost_scheduler(client: Client, address: str) -> Iterator[None]:
+    """InputError in one line where the scheduler does not answer any more; it is told by errors of several types.
+
+    A client that has given up knows no address any more, hence `address`."""
     try:
         yield
     except (Exception, asyncio.CancelledError) as error:
@@ -277,5 +279,5 @@ def _explain_lost_scheduler(client: Client) -> Iterator[None]:
         lost = isinstance(error, (CancelledError, asyncio.CancelledError, OSError))
         if client.status == "running" and not lost:
             raise
-        message = f"scheduler {client.scheduler.address}: has gone away; what is finished stays"
+        message = f"scheduler {address}: has gone away; what is finished stays"
         raise InputError(f"{message}, and the same command goes on from it") from None

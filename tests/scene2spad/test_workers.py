@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from scene2spad.datasets.workers import executor
+from scenes.errors import InputError
 
 INTERRUPTING = """
 import signal
@@ -75,3 +76,24 @@ def test_a_cluster_whose_workers_join_later_has_work_for_all_of_them():
         cluster.wait_for_workers(4)
         next(results)
         assert len(taken) == 1 + 3 * 4
+
+
+def test_a_scheduler_that_is_lost_for_good_is_named(monkeypatch):
+    """A client that has given up has no scheduler any more, whose address could be asked for."""
+    distributed = pytest.importorskip("distributed")
+
+    class GivenUp:
+        status, scheduler = "closed", None
+
+        def __init__(self, address, timeout):
+            pass
+
+        def scheduler_info(self, n_workers):
+            raise OSError("gone")
+
+        def close(self, timeout):
+            pass
+
+    monkeypatch.setattr(distributed, "Client", GivenUp)
+    with pytest.raises(InputError, match=r"^scheduler tcp://a:1: has gone away"), executor(1, "tcp://a:1") as run:
+        list(run(list, [(0,)], lambda number, why: why))
