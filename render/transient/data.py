@@ -87,7 +87,9 @@ class Transient:
             array = getattr(self, name)
             if array.dtype != dtype or array.shape != size:
                 raise InputError(f"transient: {name} is {array.dtype}{array.shape}, expected {np.dtype(dtype)}{size}")
-            array.setflags(write=False)
+            frozen = array.view()  # the caller's own array can still be written to
+            frozen.setflags(write=False)
+            object.__setattr__(self, name, frozen)
         if self.offsets[0] != 0 or (np.diff(self.offsets) < 0).any():
             raise InputError("transient: offsets do not rise from 0")
         good = (

@@ -70,7 +70,9 @@ class Histogram:
                 raise InputError(f"histogram: {name} is {array.shape}, expected {self.counts.shape[:2]}")
             if array.dtype.kind == "f" and (np.isinf(array) | (array < 0)).any():
                 raise InputError(f"histogram: {name} holds infinite or negative values")
-            array.setflags(write=False)
+            frozen = array.view()  # the caller's own array can still be written to
+            frozen.setflags(write=False)
+            object.__setattr__(self, name, frozen)
 
     @classmethod
     def from_counts(cls, counts: np.ndarray, sensor: Sensor | str | Path, meta: JsonObject | None = None) -> Histogram:
@@ -78,7 +80,7 @@ class Histogram:
 
         Parameters
         ----------
-        counts : (H, W, T) whole numbers from 0 on, one for each pixel and time bin
+        counts : (H, W, T) whole numbers from 0 on, one for each pixel and time bin; they are copied
         sensor : what recorded them, or its name or file (.toml); its number of bins is T
         meta : what is to be kept beside them, anything JSON holds
 
@@ -105,7 +107,7 @@ class Histogram:
             raise InputError(f"histogram: counts from {least:g} to {most:g}, expected whole numbers from 0 to 2^31 - 1")
         unknown = np.full(counts.shape[:2], np.nan, np.float32)
         return cls(
-            counts=np.ascontiguousarray(counts, np.int32),
+            counts=np.array(counts, np.int32, order="C"),  # a copy: buffers are used again
             sensor=sensor,
             budget=PhotonBudget(0.0, float(counts.sum(dtype=float) / max(unknown.size, 1))),
             depth_m=unknown,

@@ -199,3 +199,18 @@ def test_measured_counts_become_a_histogram_without_truth(tmp_path) -> None:
     read = read_histogram(tmp_path / "made.h5")
     assert np.array_equal(read.counts, counts) and np.isnan(read.depth_m).all()
     assert read.budget.background == counts.sum() / 6
+
+
+def test_arrays_of_the_caller_are_neither_kept_nor_frozen() -> None:
+    buffer, sensor, made = np.zeros((1, 2, 8), np.int32), Sensor(bins=8), []
+    for frame in range(2):  # one buffer, used again
+        buffer[:] = frame
+        made.append(Histogram.from_counts(buffer, sensor))
+    assert [histogram.counts.max() for histogram in made] == [0, 1]
+    depth_m = np.ones((1, 2), np.float32)
+    histogram = replace(made[0], depth_m=depth_m)
+    depth_m[0, 0] = 2.0
+    assert not histogram.depth_m.flags.writeable
+    transient = same(2, (4.0, 4.0, 1.0))
+    radiance = transient.radiance.copy()
+    assert not replace(transient, radiance=radiance).radiance.flags.writeable and radiance.flags.writeable
