@@ -102,7 +102,7 @@ def sense(
     transient: Transient,
     *,
     signal: float = 50.0,
-    background: float = 50.0,
+    background: float | None = None,
     sensor: Sensor | str | Path = "reference",
     optics: Optics | None = None,
     law: Law = "auto",
@@ -114,9 +114,9 @@ def sense(
     ----------
     transient : Transient
         What `render` or `read_transient` gives.
-    signal, background : float
-        Mean detections per pixel and exposure, over all pixels. The background includes dark counts. With `optics`
-        they are computed instead.
+    signal, background : float, optional
+        Mean detections per pixel and exposure, over all pixels. The background includes dark counts; left out, it is
+        50, or the sensor's dark counts if they are more. With `optics` both are computed instead.
     sensor : Sensor, str or Path
         A sensor, the name of a preset (as of ``scene2spad sense``), or a sensor file (.toml); not one of zones.
     optics : Optics, optional
@@ -145,6 +145,7 @@ def sense(
     """
     from render.transient import Transient
     from spad.detection.detect import sense as sense_exposure
+    from spad.detection.rates import default_background
     from spad.sensor.budget import Optics
     from spad.sensor.files import pixel_sensor
     from spad.sensor.model import PhotonBudget
@@ -154,6 +155,8 @@ def sense(
         require_kind(optics, Optics, "sense: optics")
     require(isinstance(seed, Integral) and seed >= 0, f"seed {seed!r}: expected a whole number, 0 or more")
     chosen = pixel_sensor(sensor)
+    if optics is None and background is None:
+        background = default_background(transient, chosen, seed=seed)
     budget = optics.budget(transient, chosen, seed=seed) if optics is not None else PhotonBudget(signal, background)
     return sense_exposure(transient, chosen, budget, seed=seed, model=law)
 

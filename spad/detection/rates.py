@@ -40,8 +40,8 @@ def rates_for(
     Signal: all returns times one factor, so that their mean over the image is `budget.signal`. Background: dark counts
     are what the sensor says (or a measured map (H, W) in Hz, NaN in pixels that are dead besides the sensor's), ambient
     light fills the mean up to `budget.background`; dark counts alone above it are scaled down to it, and the reason
-    says so. Dead pixels lose their share afterwards: the others are not brighter for it. The seed places hot and dead
-    pixels. Raises InputError when there is no light to scale, and for a map of another shape or below 0.
+    warns of it. Dead pixels lose their share afterwards: the others are not brighter for it. The seed places hot and
+    dead pixels. Raises InputError when there is no light to scale, and for a map of another shape or below 0.
     """
     shape = (transient.height, transient.width)
     total = float(transient.radiance.sum(dtype=np.float64))
@@ -53,6 +53,17 @@ def rates_for(
     reasons = (filled.reason, *_odd_pixels(sensor, dead, measured=dark_map_hz is not None))
     background, alive = np.where(dead, 0.0, filled.background), np.where(dead, 0.0, 1.0)
     return Rates(scale, background, filled.dark_fraction, reasons, alive, sensor.converter_map(*shape, seed))
+
+
+def default_background(
+    transient: Transient, sensor: Sensor, *, dark_map_hz: np.ndarray | None = None, seed: int = 0
+) -> float:
+    """Return the mean background where none is asked for: 50 detections a pixel, or the dark counts if they are more.
+
+    So dark counts are always those of the sensor, and ambient light fills what they leave of 50.
+    """
+    dark_hz, _ = detector_maps(sensor, (transient.height, transient.width), dark_map_hz, seed)
+    return max(PhotonBudget().background, float((dark_hz * sensor.exposure_s).mean()))
 
 
 def detector_maps(
@@ -99,7 +110,7 @@ def fill_background(ambient: np.ndarray, dark: np.ndarray, asked: float) -> Fill
     ambient, counted = ambient.astype(np.float64), float(dark.mean())
     # a radiometric budget of dark counts alone is their mean but for rounding
     if counted > asked * (1 + 1e-9):
-        reason = f"background: {counted:g} dark counts a pixel exceed the asked {asked:g}, scaled down to it"
+        reason = f"warning: background: {counted:g} dark counts a pixel exceed the asked {asked:g}, scaled down to it"
         _, dark_scale = background_scales(1.0, counted, asked)
         return Filled(dark * dark_scale, 1.0 if asked > 0 else 0.0, reason)
     fraction = min(1.0, counted / asked) if asked > 0 else 0.0

@@ -111,6 +111,10 @@ def test_detector_options_reach_the_sensor(scene, capfd, tmp_path):
     assert sensor.jitter.tail_s == 1e-10 and len(sensor.pulse.samples) == 40 and sensor.hot_rate_hz == 1e4
     status, message, _ = run(capfd, "sense", "s.exr", "--dark-map", "d.npy")
     assert status == 0 and message["dark_share"] == pytest.approx(3 / 50)
+    status, message, err = run(capfd, "sense", "s.exr", "--dark-count-rate", "6000")
+    assert status == 0 and message["mean_background"] == pytest.approx(200) and "scaled down" not in err
+    status, message, err = run(capfd, "sense", "s.exr", "--dark-count-rate", "6000", "--background", "40")
+    assert status == 0 and message["mean_background"] == pytest.approx(40) and "warning: background" in err
 
 
 def test_a_sensor_file_is_the_sensor_and_options_change_it(scene, capfd, tmp_path):

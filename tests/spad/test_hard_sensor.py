@@ -8,12 +8,15 @@ import torch
 from test_flux import transient_of
 from test_laws import same
 
+import scene2spad as s2s
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from spad.detection.detect import sense, sense_timestamps
+from spad.detection.rates import default_background
 from spad.estimators.depth import METHODS, estimate_depth
 from spad.formats.histogram import Histogram, read_histogram, write_histogram
-from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor.files import pixel_sensor
+from spad.sensor.model import PRESETS, PhotonBudget, Pulse, Sensor
 
 REFERENCE = Sensor()
 MODELS = ("poisson", "first-photon", "free-running")
@@ -118,6 +121,24 @@ def test_dark_counts_alone_above_the_asked_background(background: float) -> None
     assert histogram.expected_background.mean() == pytest.approx(background)
     if background:
         assert histogram.meta["dark_share"] == 1.0 and "scaled down" in " ".join(histogram.meta["plan"])
+
+
+def test_dark_counts_above_the_default_background_are_the_sensors() -> None:
+    transient = same(30, (4.0, 4.0, 1.0))
+    for rate_hz in (300.0, 9000.0):  # 10 and 300 dark counts in an exposure of 1 / 30 s
+        sensor = replace(REFERENCE, dark_count_rate_hz=rate_hz)
+        histogram = s2s.sense(transient, sensor=sensor, seed=7)
+        dark = rate_hz / 30
+        assert histogram.expected_background == pytest.approx(max(50.0, dark))
+        assert histogram.meta["dark_share"] == pytest.approx(min(1.0, dark / 50))
+        assert not any(reason.startswith("warning: background") for reason in histogram.meta["plan"])
+    asked = s2s.sense(transient, sensor=sensor, background=100.0).meta["plan"]
+    assert any(reason.startswith("warning: background: 300 dark counts") for reason in asked)
+
+
+@pytest.mark.parametrize("name", [*PRESETS, "linospad2", "pf32", "swissspad3"])
+def test_dark_counts_of_presets_leave_the_default_background_as_it_was(name: str) -> None:
+    assert default_background(same(64, (4.0, 4.0, 1.0)), pixel_sensor(name)) == 50.0
 
 
 def test_all_pixels_hot_and_dead_ones_and_a_measured_map() -> None:

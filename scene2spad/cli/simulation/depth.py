@@ -128,12 +128,15 @@ def _sensed(command: Depth, source: Path, seed: int) -> tuple[Histogram, str]:
     """Return the histogram of a transient, and the words that say what it was sensed with."""
     from scene2spad.cli.simulation.sensing import DEFAULT_PHOTONS
     from spad.detection.detect import sense
+    from spad.detection.rates import default_background
     from spad.sensor.model import PhotonBudget
 
     only_for(command, str(source), {"frame": (False, "captures (.mat)")})
     sensor = pixel_sensor(command.sensor, source)
-    signal, background = (DEFAULT_PHOTONS if value is None else value for value in (command.signal, command.background))
     transient = open_transient(source, "transient", 0)
+    signal, background = command.signal, command.background
+    signal = DEFAULT_PHOTONS if signal is None else signal
+    background = default_background(transient, sensor, seed=seed) if background is None else background
     histogram = sense(transient, sensor, PhotonBudget(signal, background), seed=seed)
     default = ", the defaults" if command.signal is None and command.background is None else ""
     return histogram, (

@@ -23,7 +23,7 @@ from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.detection.one_pixel import quadrature_in_pixel
-from spad.detection.rates import check_dark_map
+from spad.detection.rates import check_dark_map, default_background
 from spad.formats.bistatic import baseline_of
 from spad.formats.histogram import Histogram, write_histogram
 from spad.sensor.budget import Optics
@@ -137,6 +137,9 @@ def run(command: Sense, progress: Progress) -> dict:
     dark_map = None if command.dark_map is None else read_dark_map(command.dark_map, transient)
     if optics is not None:
         budget = optics.budget(transient, sensor, seed=command.seed, dark_map_hz=dark_map)
+    elif command.background is None:
+        background = default_background(transient, sensor, dark_map_hz=dark_map, seed=command.seed)
+        budget = replace(budget, background=background)
     start = time.perf_counter()
     histogram = sense(
         transient, sensor, budget, seed=command.seed, model=command.model, dark_map_hz=dark_map, progress=progress
