@@ -52,7 +52,8 @@ def sense(
     Crosstalk is added where the sensor has it. `dark_map_hz` (H, W) takes the place of the sensor's dark count rate,
     NaN in dead pixels. Every 1024 pixels have a stream of their own, SeedSequence(seed, spawn_key=(stage, 0, block)).
     `meta` holds the plan, `pile_up`: the expected primary detections per cycle of the brightest pixel, before dead time
-    and pile-up take theirs (what is counted after them is in `counts`); the share of signal detections that wrapped
+    and pile-up take theirs (what is counted after them is in `counts`), within the bins where the detector is armed at
+    every cycle, else over the whole period; the share of signal detections that wrapped
     around the period, the share of the background that is dark counts, the shares of the signal in the brightest pixel
     and in the brightest thousandth of pixels, and the median pixel's signal (`spad.detection.glints`). Raises
     InputError for an unknown law, first-photon where the dead time is longer than the period, and more than 2^31 - 1
@@ -132,13 +133,13 @@ def _planned(
     signal, wrapped = expected_signal(transient, sensor, rates, light)
     # background falls on the whole period, also where it has no bins
     background = rates.background * (sensor.bins / sensor.bins_per_period)
-    pile_up = float((signal + background).max(initial=0) / sensor.cycles)
+    all_light = light.signal_per_pixel()
+    pile_up = _pile_up(model, sensor, signal + background, all_light + rates.background.ravel())
     chosen, reason = choose_model(model, pile_up, sensor)
     reasons = [*rates.reasons, reason]
     if sensor.crosstalk:
         reasons.append(f"crosstalk: a detection fires each of its neighbours with probability {sensor.crosstalk:.3%}")
     # dead pixels detect neither what wraps nor the rest
-    all_light = light.signal_per_pixel()
     detected = float(all_light.sum()) if (rates.alive == 0).any() else budget.signal * signal.size
     fraction = wrapped / detected if wrapped > 0 else 0.0
     if wrapped > 0:
@@ -171,6 +172,13 @@ def _planned(
         "meta": meta,
     }
     return Exposure(transient, sensor, rates, light, LAWS[chosen], seed), truth
+
+
+def _pile_up(model: str, sensor: Sensor, recorded: np.ndarray, over_period: np.ndarray) -> float:
+    """Return the primary detections per cycle of the brightest pixel: those within the record where the detector is
+    armed at every cycle, else of the whole period, as those outside the record blind it, too."""
+    armed_by_dead_time = model == "free-running" or (model != "first-photon" and not sensor.armed_every_cycle)
+    return float((over_period if armed_by_dead_time else recorded).max(initial=0) / sensor.cycles)
 
 
 def _record_warning(sensor: Sensor, detected: float, recorded: float) -> str | None:

@@ -55,10 +55,12 @@ class DetectionLaw(ABC):
     name: ClassVar[str]
     independent: ClassVar[bool] = False  # no detection keeps another one from being made
     by_bins: ClassVar[bool] = True  # whether `counts` draws every bin at once
+    whole_period: ClassVar[bool] = False  # whether detections outside a shorter record blind the detector, too
 
     @abstractmethod
     def detect(self, light: BlockLight, rng: np.random.Generator, ready: np.ndarray) -> Iterator[Detections]:
-        """Yield the detections of a block, a number of cycles at a time.
+        """Yield the detections of a block, a number of cycles at a time; those of a `whole_period` law may lie
+        outside the record.
 
         ready (P,) is when each pixel is armed first, in bins; it is moved on to when it is armed after the last one.
         """
@@ -126,7 +128,7 @@ class FirstPhoton(DetectionLaw):
 class FreeRunning(DetectionLaw):
     """A detector that is blind for its dead time after each detection, and armed at once when that is over."""
 
-    name, by_bins = "free-running", False
+    name, by_bins, whole_period = "free-running", False, True
 
     def detect(self, light: BlockLight, rng: np.random.Generator, ready: np.ndarray) -> Iterator[Detections]:
         """Yield the detections of as many cycles at a time as memory allows."""
@@ -135,7 +137,7 @@ class FreeRunning(DetectionLaw):
         edges = [first + (last - first) * piece // pieces for piece in range(pieces + 1)]
         for start, stop in pairwise(edges):
             fraction = (stop - start) / round(sensor.cycles)
-            events = draw_primaries(light.flux, sensor, rng, fraction=fraction, fractional=True)
+            events = draw_primaries(light.flux, sensor, rng, fraction=fraction, fractional=True, whole_period=True)
             cycle = rng.integers(start, stop, len(events.pixel))
             yield self.keep(Detections(events.pixel, cycle, events.position), sensor, ready)
 

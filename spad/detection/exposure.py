@@ -79,6 +79,13 @@ class Exposure:
         mine = converter.reshape(-1)[events.pixel + first]
         return events._replace(position=time_codes(events.position, mine, edges))
 
+    def recorded(self, events: Detections) -> Detections:
+        """Return the detections that find a bin: a detector blinds itself also in the part of the period without."""
+        if not self.law.whole_period or self.sensor.bins == self.sensor.bins_per_period:
+            return events
+        seen = events.position < self.sensor.bins
+        return Detections(*(column[seen] for column in events))
+
     @property
     def adds_crosstalk(self) -> bool:
         """Return whether crosstalk only adds to counts: no detection keeps another one from being made."""
@@ -176,7 +183,8 @@ def _block(exposure: Exposure, block: slice, ready: np.ndarray) -> np.ndarray:
         rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()
         return law.counts(rate, round(exposure.sensor.cycles), exposure.fraction, rng)
     parts = law.detect(light, rng, ready)
-    return np.concatenate([_places(exposure.coded(part, block.start), exposure.sensor) for part in parts])
+    recorded = (exposure.coded(exposure.recorded(part), block.start) for part in parts)
+    return np.concatenate([_places(part, exposure.sensor) for part in recorded])
 
 
 def _places(detected: Detections, sensor: Sensor) -> np.ndarray:
@@ -220,7 +228,7 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
     cause, pixel = cause[seen], pixel[seen]
     fired = Detections(pixel, events.cycle[cause], events.position[cause])
     both = Detections(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
-    detected = exposure.coded(exposure.law.keep(both, sensor, ready), 0)
+    detected = exposure.coded(exposure.recorded(exposure.law.keep(both, sensor, ready)), 0)
     places = np.sort(detected.pixel * np.int64(sensor.bins) + detected.position.astype(np.int64))
     edges = [block.start * sensor.bins for block in exposure.blocks]
     edges.append(exposure.rates.alive.size * sensor.bins)

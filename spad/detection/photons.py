@@ -69,9 +69,15 @@ def light_of(transient: Transient, sensor: Sensor, rates: Rates, pixels: slice) 
 
 
 def draw_primaries(
-    light: PixelFlux, sensor: Sensor, rng: np.random.Generator, *, fraction: float = 1.0, fractional: bool = False
+    light: PixelFlux,
+    sensor: Sensor,
+    rng: np.random.Generator,
+    *,
+    fraction: float = 1.0,
+    fractional: bool = False,
+    whole_period: bool = False,
 ) -> PhotonEvents:
-    """Draw primary detections within the sensor's bins in a share of the exposure.
+    """Draw primary detections within the sensor's bins in a share of the exposure, or over the whole period.
 
     Whole bins (int64), or positions within them (float64) where a dead time, or a converter, needs to know.
     """
@@ -98,7 +104,7 @@ def draw_primaries(
         at = np.empty(len(pixel), np.int32)
         _fold(position, period, at[:total])
         at[total:] = _uniform_bins(rng, period, rest)
-    if sensor.bins == period:
+    if sensor.bins == period or whole_period:
         return PhotonEvents(pixel, at)
     seen = at < sensor.bins  # the rest of the period has no bins: nothing is detected there
     return PhotonEvents(pixel[seen], at[seen])
