@@ -95,7 +95,8 @@ def signal_per_bin(
         start, bins = start - edges.reach, bins + 2 * edges.reach
     # rows of equal length make a dense table; rounding lengths up only adds bins in which nothing arrives
     bins = (bins + LENGTH_STEP - 1) // LENGTH_STEP * LENGTH_STEP
-    signal = torch.zeros(count * period, dtype=torch.float64, device=device)
+    recorded = sensor.bins  # the rest of a longer period needs no memory
+    signal = torch.zeros(count * recorded, dtype=torch.float64, device=device)
     wrapped = 0.0
     for size in torch.unique(bins).tolist():
         for rows in torch.split(torch.nonzero(bins == size).squeeze(1), max(1, BLOCK_ENTRIES // size)):
@@ -111,9 +112,12 @@ def signal_per_bin(
             mass = arrived.diff(dim=1).clamp_(min=0) * energy[rows, None]
             index = start[rows, None] + steps[:-1]
             wrapped += float((mass * (index >= period)).sum())
-            index = (owner[rows, None] * period + index.remainder_(period)).ravel()
-            signal.scatter_add_(0, index, mass.ravel())
-    return signal.reshape(count, period)[:, : sensor.bins], wrapped
+            index = index.remainder_(period)
+            place = owner[rows, None] * recorded + index
+            if recorded < period:
+                place, mass = place[index < recorded], mass[index < recorded]
+            signal.scatter_add_(0, place.ravel(), mass.ravel())
+    return signal.reshape(count, recorded), wrapped
 
 
 def expected_counts(

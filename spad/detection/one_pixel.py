@@ -26,16 +26,19 @@ def quadrature_in_pixel(
     pixel, period = row * transient.width + column, sensor.bins_per_period
     rates = rates_for(transient, sensor, budget, seed=seed)
     light = light_of(transient, sensor, rates, slice(pixel, pixel + 1))
-    edges = np.arange(period + 1.0)
-    if rates.converter is not None and sensor.code_edges is not None:
+    edges = np.arange(sensor.bins + 1.0)  # of the record: a longer period has none elsewhere
+    unequal = rates.converter is not None and sensor.code_edges is not None
+    if rates.converter is not None and sensor.code_edges is not None:  # the bins cover the period then
         edges = sensor.code_edges[rates.converter.reshape(-1)[pixel]]
     width, pulse = sensor.bin_width_s, sensor.response
     arrival, energy = quadrature_points(light.start, light.length, light.signal, sensor)
     # an edge may lie some bins from where it is meant to be
-    reach = math.ceil(float(np.abs(edges - np.arange(period + 1)).max())) + 1
+    reach = math.ceil(float(np.abs(edges - np.arange(sensor.bins + 1)).max())) + 1
     before, after = (math.ceil(part / width) + reach for part in pulse.window_s(WINDOW_SIGMAS))
     number = np.floor(arrival).astype(np.int64)[:, None] + np.arange(-before, after + 2)
-    at = edges[number % period] + number // period * period
+    at = edges[number % period] + number // period * period if unequal else number.astype(float)
     mass = pulse.bin_masses((at - arrival[:, None]) * width) * energy[:, None]
-    signal = np.bincount((number[:, :-1] % period).ravel(), mass.ravel(), minlength=period)
-    return (signal + light.background[0] / period * np.diff(edges))[: sensor.bins]
+    place = number[:, :-1] % period
+    seen = place < sensor.bins
+    signal = np.bincount(place[seen], mass[seen], minlength=sensor.bins)
+    return signal + light.background[0] / period * np.diff(edges)

@@ -101,13 +101,18 @@ def draw_primaries(
         at = np.concatenate((np.mod(position, period), rng.random(rest) * period))
         at[at >= period] = 0  # a tiny negative position rounds up to the period itself
     else:
-        at = np.empty(len(pixel), np.int32)
+        at = np.empty(len(pixel), _bin_type(period))
         _fold(position, period, at[:total])
         at[total:] = _uniform_bins(rng, period, rest)
     if sensor.bins == period or whole_period:
         return PhotonEvents(pixel, at)
     seen = at < sensor.bins  # the rest of the period has no bins: nothing is detected there
     return PhotonEvents(pixel[seen], at[seen])
+
+
+def _bin_type(period: int) -> type[np.int32] | type[np.int64]:
+    """Return the integers that hold every bin of a period."""
+    return np.int32 if period <= 1 << 31 else np.int64
 
 
 def _fold(position: np.ndarray, period: int, out: np.ndarray) -> None:
@@ -122,7 +127,7 @@ def _fold(position: np.ndarray, period: int, out: np.ndarray) -> None:
 def _uniform_bins(rng: np.random.Generator, period: int, size: int) -> np.ndarray:
     """Draw uniform integers from 0 to period - 1, (size,); powers of two to 2^16 from a quarter of a random word."""
     if period & (period - 1) or period > 1 << 16:
-        return rng.integers(0, period, size, dtype=np.int32)
+        return rng.integers(0, period, size, dtype=_bin_type(period))
     words = rng.integers(0, 1 << 64, -(-size // 4), dtype=np.uint64)
     return words.view(np.uint16)[:size] & np.uint16(period - 1)
 

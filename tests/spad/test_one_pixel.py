@@ -1,11 +1,13 @@
 """Rates of one pixel by quadrature in numpy against the closed form in torch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from test_flux import transient_of
 
-from spad.detection.detect import expected_in_pixel
+from spad.detection.detect import expected_in_pixel, sense
 from spad.detection.flux import interval_cdf
 from spad.detection.one_pixel import quadrature_in_pixel
 from spad.detection.photons import PixelFlux, late_signal
@@ -33,6 +35,18 @@ def test_quadrature_is_the_closed_form(name):
         exact = expected_in_pixel(transient, sensor, budget, 0, column, seed=3)
         found = quadrature_in_pixel(transient, sensor, budget, 0, column, seed=3)
         assert found.shape == exact.shape and np.abs(found - exact).max() < tolerance * exact.max(), name
+
+
+@pytest.mark.parametrize("law", ["poisson", "free-running"])
+def test_a_short_record_of_a_very_long_period_needs_no_memory_of_the_period(law):
+    """1e10 bins of 1 ps in 10 ms: 80 GB a pixel if each had its number, and more than 32 bits count."""
+    sensor = Sensor(bins=4000, bin_width_s=1e-12, period_s=1e-2, exposure_s=10.0, pulse=Pulse(1e-10))
+    transient, budget = transient_of([(0.6, 0.6, 1.0)]), PhotonBudget(4000, 2e5)
+    exact, found = (f(transient, sensor, budget, 0, 0) for f in (expected_in_pixel, quadrature_in_pixel))
+    assert exact.sum() == pytest.approx(4000 + 2e5 * 4000 / 1e10) and np.abs(found - exact).max() < 1e-6 * exact.max()
+    counts = sense(transient, replace(sensor, reset="free-running"), budget, seed=1, model=law).counts[0, 0]
+    assert abs(counts.sum() - 4000) < 4.5 * np.sqrt(4000)
+    assert abs(np.average(np.arange(4000) + 0.5, weights=counts) - 0.6 / 299792458 * 1e12) < 4.5 * 100 / np.sqrt(4000)
 
 
 @pytest.mark.parametrize("name", SENSORS)
