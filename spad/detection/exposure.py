@@ -30,6 +30,8 @@ Finished = TypeVar("Finished")
 STREAM_PIXELS = 1024
 # From this many primary detections a bin on, drawing every bin is cheaper than drawing every photon (measured).
 DENSE_FROM = 4.0
+# Photons, or bins, that a thread holds at once: a block with more is drawn in parts. None of up to 4096 bins has more.
+MAX_HELD = 1 << 24
 MAX_CROSSTALK_EVENTS = 1 << 26
 
 
@@ -157,7 +159,7 @@ def thread_count() -> int:
 def _draw(
     exposure: Exposure, finish: Callable[[slice, np.ndarray], Finished], progress: Progress | None, ready: np.ndarray
 ) -> list[Finished]:
-    """Call finish(block, detected) for every block, on `thread_count()` threads.
+    """Call finish(pixels, detected) for every block or part of it, on `thread_count()` threads.
 
     What was detected: counts (P, T), or places pixel x T + bin (N,) int32 in no order, pixels counted from the block's.
     """
@@ -170,14 +172,39 @@ def _draw(
             if progress is not None:
                 progress("sense", start / len(blocks))
             group = blocks[start : start + 4 * workers]
-            finished += pool.map(lambda block: finish(block, _block(exposure, block, ready[block])), group)
+            for drawn in pool.map(lambda block: _block(exposure, block, ready, finish), group):
+                finished += drawn
     return finished
 
 
-def _block(exposure: Exposure, block: slice, ready: np.ndarray) -> np.ndarray:
-    """Draw the detections of a block: places, or counts (P, T) where every bin is drawn at once."""
-    law, rng, light = exposure.law, exposure.rng(Stream.SENSE, block), exposure.light(block)
-    if law.by_bins and light.primaries > DENSE_FROM * exposure.sensor.bins * light.flux.pixels:
+def _block(
+    exposure: Exposure, block: slice, ready: np.ndarray, finish: Callable[[slice, np.ndarray], Finished]
+) -> list[Finished]:
+    """Draw the detections of a block, and call `finish` with as many of its pixels as can be held at once."""
+    rng = exposure.rng(Stream.SENSE, block)
+    return [finish(part, draw_part(exposure, part, ready[part], rng)) for part in _parts(exposure, block)]
+
+
+def _is_dense(exposure: Exposure, light: BlockLight) -> bool:
+    return exposure.law.by_bins and light.primaries > DENSE_FROM * exposure.sensor.bins * light.flux.pixels
+
+
+def _parts(exposure: Exposure, block: slice) -> Iterator[slice]:
+    """Yield a block's pixels in parts that hold at most MAX_HELD photons or bins each."""
+    light, pixels = exposure.light(block), block.stop - block.start
+    held = exposure.sensor.bins * pixels if _is_dense(exposure, light) else light.primaries
+    if held <= MAX_HELD or pixels == 1 or not exposure.law.by_bins:  # event by event it is cut into cycles
+        yield block
+        return
+    middle = block.start + pixels // 2
+    yield from _parts(exposure, slice(block.start, middle))
+    yield from _parts(exposure, slice(middle, block.stop))
+
+
+def draw_part(exposure: Exposure, block: slice, ready: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw the detections of some pixels: places, or counts (P, T) where every bin is drawn at once."""
+    law, light = exposure.law, exposure.light(block)
+    if _is_dense(exposure, light):
         from spad.detection.flux import expected_counts  # with torch, whose import takes a second
 
         rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()

@@ -11,6 +11,7 @@ from test_flux import transient_of
 from scenes import InputError
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel, sense, sense_timestamps, stream_timestamps
+from spad.detection.exposure import draw_part
 from spad.detection.laws import (
     Detections,
     add_crosstalk,
@@ -379,6 +380,28 @@ def test_a_dead_time_of_seconds_takes_no_more_memory_than_one_of_nanoseconds():
     blind = sum(fraction * counts.roll(int(d), -1) for fraction, d in zip(within, far, strict=True))
     plain = -torch.log1p(-counts / (short.cycles - blind))
     assert torch.allclose(free_running_flux(counts, short.cycles, short), plain, rtol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["poisson", "first-photon"])
+def test_blocks_of_very_many_photons_are_drawn_in_parts(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One pixel of 40 is far brighter: its bins are drawn at once, those around it photon by photon, all by one law."""
+    returns = [[(0.5, 0.9, 1.0)] for _ in range(40)]
+    returns[17] = [(0.5, 0.9, 400.0)]
+    scene, budget = transient_of(*returns), PhotonBudget(100.0, 20.0)
+    scene = replace(scene, ambient=np.ones((1, 40), np.float32))
+    sensor = replace(SMALL, exposure_s=1e5 * SMALL.period_s)
+    usual = sense(scene, sensor, budget, seed=1, model=model).counts
+    shapes = []
+    monkeypatch.setattr("spad.detection.exposure.MAX_HELD", 200)
+    recording = lambda *given: shapes.append(draw_part(*given)) or shapes[-1]  # noqa: E731
+    monkeypatch.setattr("spad.detection.exposure.draw_part", recording)
+    drawn = sense(scene, sensor, budget, seed=2, model=model).counts
+    assert max(array.size for array in shapes) < 200 + 5 * np.sqrt(200) and any(array.ndim == 2 for array in shapes)
+    assert np.array_equal(sense_timestamps(scene, sensor, budget, seed=2, model=model).counts(), drawn)
+    both = np.stack([usual[0].sum(axis=0), drawn[0].sum(axis=0)])
+    assert stats.chi2_contingency(both[:, both.sum(axis=0) > 20]).pvalue > 1e-3
+    pixels = np.stack([usual.sum(axis=2)[0], drawn.sum(axis=2)[0]])
+    assert (np.abs(pixels[0] - pixels[1]) < 5 * np.sqrt(pixels.sum(axis=0)) + 1).all()
 
 
 def test_a_histogram_larger_than_memory_is_refused_before_it_is_allocated(monkeypatch):
