@@ -153,12 +153,15 @@ def sense(
     require_kind(transient, Transient, "sense", " of `render` or `read_transient`")
     if optics is not None:
         require_kind(optics, Optics, "sense: optics")
-    require(isinstance(seed, Integral) and seed >= 0, f"seed {seed!r}: expected a whole number, 0 or more")
+    whole = isinstance(seed, Integral) and not isinstance(seed, bool) and seed >= 0
+    require(whole, f"seed {seed!r}: expected a whole number, 0 or more")
     chosen = pixel_sensor(sensor)
-    if optics is None and background is None:
-        background = default_background(transient, chosen, seed=seed)
-    budget = optics.budget(transient, chosen, seed=seed) if optics is not None else PhotonBudget(signal, background)
-    return sense_exposure(transient, chosen, budget, seed=seed, model=law)
+    if optics is not None:
+        budget = optics.budget(transient, chosen, seed=seed)
+    else:
+        asked = default_background(transient, chosen, seed=seed) if background is None else background
+        budget = PhotonBudget(signal, asked)
+    return sense_exposure(transient, chosen, budget, seed=int(seed), model=law)
 
 
 def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | DepthModel = "log-matched") -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from numbers import Integral, Real
 
 MAX_NAMES = 8
 
@@ -31,6 +32,22 @@ def require_kind(value: object, kind: type, where: str, hint: str = "") -> None:
     gives one."""
     article = "an" if kind.__name__[0] in "AEIOU" else "a"
     require(isinstance(value, kind), f"{where}: expected {article} {kind.__name__}{hint}, not {type(value).__name__}")
+
+
+def require_number(value: object, what: str) -> float:
+    """Return a real number as Python's own, which JSON holds, or an InputError that names `what` was given.
+
+    NumPy's numbers become float, int and float stay as they are; truth values and text are no numbers.
+    """
+    require(isinstance(value, Real) and not isinstance(value, bool), f"{what} {value!r}, expected a number")
+    return value if type(value) in (int, float) else float(value)  # type: ignore[return-value, arg-type]
+
+
+def require_whole(value: object, what: str) -> int:
+    """Return a whole number as Python's int, or an InputError: 20.0 and truth values are none."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    require(whole, f"{what} {value!r}, expected a whole number")
+    return int(value)  # type: ignore[call-overload]
 
 
 def listed(names: Iterable[str]) -> str:

@@ -186,9 +186,15 @@ def write_csv(rows: Sequence[Mapping[str, object]], path: Path) -> Path:
 
 def seal(meta: JsonObject, kind: str, arrays_sha256: str) -> str:
     """Return the JSON that a file of ours carries: `meta`, its kind and schema, and a SHA-256 over these and the
-    arrays."""
+    arrays.
+
+    Raises InputError for metadata that JSON cannot hold.
+    """
     body = {**meta, "kind": kind, "schema": SCHEMAS[kind]}
-    return json.dumps({**body, "sha256": _digest(body, arrays_sha256)}, sort_keys=True)
+    try:
+        return json.dumps({**body, "sha256": _digest(body, arrays_sha256)}, sort_keys=True)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{kind}: its metadata hold what JSON cannot: {error}") from None
 
 
 def open_seal(text: str, kind: str) -> tuple[JsonObject, str]:

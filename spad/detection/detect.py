@@ -151,7 +151,7 @@ def _planned(
     warnings = (_record_warning(sensor, detected, float(signal.sum())), glint_warning(signal_fractions(all_light)))
     reasons += [warning for warning in warnings if warning is not None]
     meta = {
-        "seed": seed,
+        "seed": int(seed),
         "model": chosen,
         "plan": reasons,
         "pile_up": pile_up,

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError, require
+from scenes.errors import InputError, require, require_whole
 from scenes.limits import require_memory
 from spad.estimators.depth import estimate_depth
 from spad.formats.bistatic import CO_LOCATED, laser_baseline_m
@@ -174,6 +174,7 @@ def read_mat(path: Path, frame: int = 0) -> Histogram:
     Raises InputError in one line for a file that is none of these, and a frame that is not there.
     """
     path = Path(path)
+    frame = require_whole(frame, f"{path}: frame")
     contents = load_mat(path)
     if COUNTS in contents:
         capture = frame_of(contents, path, frame)

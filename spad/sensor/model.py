@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from functools import reduce
 from numbers import Real
@@ -12,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError, did_you_mean, require
+from scenes.errors import InputError, did_you_mean, require, require_number, require_whole
 from scenes.json_types import JsonObject
 from scenes.random_streams import Stream
 from spad.sensor.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
@@ -20,6 +19,10 @@ from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_fr
 from spad.sensor.tdc import Tdc
 
 Reset = Literal["synchronous", "free-running"]
+NUMBERS = (  # fields of a sensor that are one number each
+    *("bin_width_s", "period_s", "exposure_s", "pde", "hot_share", "hot_rate_hz", "dead_share", "dead_time_s"),
+    "crosstalk",
+)
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Sensor:
     crosstalk             probability that a detection fires a given one of the four neighbours, at the same time
     tdc                   converters whose codes are not equally wide (`Tdc`); None: every bin is as wide as the others
 
-    Raises InputError for values out of range, naming the sensor.
+    Raises InputError for values out of range or of another kind, naming the sensor.
     """
 
     name: str = "reference"
@@ -62,9 +65,10 @@ class Sensor:
     tdc: Tdc | None = None
 
     def __post_init__(self) -> None:
+        require(isinstance(self.name, str), f"sensor: name {self.name!r}, expected text")
         where = f"sensor {self.name}"
-        in_range = int(self.bins) == self.bins and 1 <= self.bins <= 65536
-        require(in_range, f"{where}: {self.bins} bins is outside 1 to 65536")
+        self._normalise(where)
+        require(1 <= self.bins <= 65536, f"{where}: {self.bins} bins is outside 1 to 65536")
         width = self.bin_width_s
         require(
             math.isfinite(width) and 1e-15 <= width <= 1e-3, f"{where}: bin width {width:g} s is outside 1e-15 to 1e-3"
@@ -80,14 +84,28 @@ class Sensor:
         )
         self._check_detector(where)
 
+    def _normalise(self, where: str) -> None:
+        """Make numbers Python's own, as files hold them. Raises InputError for what is no number."""
+        object.__setattr__(self, "bins", require_whole(self.bins, f"{where}: bins"))
+        for label in NUMBERS:
+            value = getattr(self, label)
+            if value is not None or label != "period_s":
+                object.__setattr__(self, label, require_number(value, f"{where}: {label}"))
+        rate = self.dark_count_rate_hz
+        if isinstance(rate, tuple | list | np.ndarray) and np.ndim(rate) == 1:
+            rows = tuple(float(require_number(row, f"{where}: dark_count_rate_hz of a row")) for row in rate)
+            require(len(rows) > 0, f"{where}: dark count rates of no row")
+            object.__setattr__(self, "dark_count_rate_hz", rows)
+        else:
+            what = f"{where}: dark_count_rate_hz"
+            good = isinstance(rate, Real) and not isinstance(rate, bool)
+            require(good, f"{what} {rate!r}, expected a number, or one for each image row")
+            object.__setattr__(self, "dark_count_rate_hz", require_number(rate, what))
+
     def _check_detector(self, where: str) -> None:
         kinds = (Pulse, SampledPulse)
         require(isinstance(self.pulse, kinds), f"{where}: {self.pulse!r} is no pulse")
         require(self.jitter is None or isinstance(self.jitter, kinds), f"{where}: jitter {self.jitter!r} is no pulse")
-        if isinstance(self.dark_count_rate_hz, Iterable):
-            rows = tuple(map(float, self.dark_count_rate_hz))
-            object.__setattr__(self, "dark_count_rate_hz", rows)
-            require(len(rows) > 0, f"{where}: dark count rates of no row")
         for rate in (*self._dark_rows, self.hot_rate_hz):
             require(
                 math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite"
@@ -256,7 +274,8 @@ class PhotonBudget:
 
     def __post_init__(self) -> None:
         for label, value in (("signal", self.signal), ("background", self.background)):
-            require(isinstance(value, Real), f"photon budget: {label} {value!r} is no number")
+            value = require_number(value, f"photon budget: {label}")
+            object.__setattr__(self, label, value)
             good = math.isfinite(value) and 0 <= value <= 1e9
             require(good, f"photon budget: {label} {value:g} photons per pixel is outside 0 to 1e9")
 

@@ -70,7 +70,7 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
         expected_signal=laid(signal, np.float32),
         expected_background=laid(background, np.float32),
         meta={
-            "seed": seed,
+            "seed": int(seed),
             "model": "zones",
             "plan": reasons,
             "pile_up": float((primary / np.asarray(zones.trials)).max()),

@@ -103,7 +103,7 @@ def test_optics_compute_the_photon_budget():
         (lambda h: s2s.coding_tensor("furier", 8), "furier"),
         (lambda h: s2s.sense(h), "sense: expected a Transient of `render` or `read_transient`, not Histogram"),
         (lambda h: s2s.sense("x.exr"), "expected a Transient .* not str"),
-        (lambda h: s2s.sense(WALL, signal="10"), "signal '10' is no number"),
+        (lambda h: s2s.sense(WALL, signal="10"), "signal '10', expected a number"),
         (lambda h: s2s.sense(WALL, sensor=3), "sensor: expected a Sensor or its name, not int"),
         (lambda h: s2s.sense(WALL, sensor="swisspad3"), "did you mean 'swissspad3'"),
         (lambda h: s2s.sense(WALL, sensor="tmf8820"), "tmf8820 has zones, expected one of pixels"),

@@ -186,6 +186,40 @@ def test_bad_detectors_are_refused_in_one_line(bad: dict) -> None:
     assert "\n" not in str(refused.value) and "sensor reference" in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"bins": 20.0},
+        {"bins": True},
+        {"bins": "10"},
+        {"dark_count_rate_hz": "5"},
+        {"dark_count_rate_hz": True},
+        {"name": 3},
+    ]
+    + [{"bin_width_s": "1 ns"}, {"pde": None}, {"exposure_s": None}, {"dead_time_s": [1.0]}, {"crosstalk": 1j}]
+    + [{"dark_count_rate_hz": ["5"]}, {"dark_count_rate_hz": np.ones((2, 2))}, {"dark_count_rate_hz": np.array(1.0)}],
+    ids=str,
+)
+def test_fields_of_a_sensor_of_the_wrong_kind_are_named(bad: dict) -> None:
+    [name] = bad
+    with pytest.raises(InputError, match=f"sensor.*: {name}.* expected"):
+        Sensor(**bad)
+
+
+def test_numbers_of_numpy_are_kept_as_pythons_own(tmp_path) -> None:
+    sensor = Sensor(bins=np.int64(64), exposure_s=np.float32(0.125), dark_count_rate_hz=np.array([1, 2.0]))
+    made = s2s.sense(
+        same(3, (4.0, 4.0, 1.0)), signal=np.float32(5), background=np.int64(3), sensor=sensor, seed=np.int64(2)
+    )
+    assert type(sensor.bins) is int and type(sensor.exposure_s) is float and type(made.meta["seed"]) is int
+    write_histogram(made, tmp_path / "made.h5")
+    read = read_histogram(tmp_path / "made.h5")
+    assert read.sensor == sensor and read.budget == PhotonBudget(5, 3)
+    with pytest.raises(InputError, match=r"metadata hold what JSON cannot: .*ndarray"):
+        write_histogram(replace(made, meta={"angles": np.ones(3)}), tmp_path / "other.h5")
+    assert not (tmp_path / "other.h5").exists()
+
+
 def test_auto_says_why() -> None:
     few, many = PhotonBudget(10, 10), PhotonBudget(1e5, 10)
     scene = same(4, (4.0, 4.0, 1.0))

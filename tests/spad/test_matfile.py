@@ -196,6 +196,12 @@ def test_numbers_that_no_frame_has_are_refused_in_one_line(name, value, tmp_path
         read_mat(tmp_path / "f.mat")
 
 
+@pytest.mark.parametrize("frame", [1.0, "1", True])
+def test_a_frame_that_is_no_whole_number_is_refused(frame, tmp_path):
+    with pytest.raises(InputError, match=r"frame .* expected a whole number"):
+        read_mat(tmp_path / "capture.mat", frame)
+
+
 def test_a_pulse_that_is_no_preset_is_read_by_its_taps(tmp_path):
     slow = Pulse(300e-12, 400e-12)
     histogram = sensed(Sensor(pulse=slow))
