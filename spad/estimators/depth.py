@@ -238,7 +238,13 @@ def detection_law(histogram: Histogram) -> str | None:
 
 
 def _undone_law(histogram: Histogram, method: str) -> str | None:
-    """Return `detection_law`; with `coates`, InputError for zones, which no law of a pixel's detector has acted on."""
+    """Return `detection_law`; with `coates`, InputError for zones, which no law of a pixel's detector has acted on, and
+    for what a .mat file held, which tells no law."""
+    if method == "coates" and histogram.meta.get("layout") == "mat":
+        raise InputError(
+            "depth method coates: a .mat file holds no exposure, dead time and law, which undoing pile-up needs; use "
+            "log-matched, the histogram (.h5), or Histogram.from_counts with the sensor that recorded the counts"
+        )
     zones = histogram.meta.get("model") == "zones"
     refused = "depth method coates: undoes the pile-up of a pixel's detector; counts of a sensor of zones have none"
     require(not (zones and method == "coates"), f"{refused}, use log-matched")
@@ -253,7 +259,7 @@ def histogram_depth_m(
     `estimator` is one of METHODS, or any function (counts (H, W, T), sensor) -> half the optical path (H, W) [m].
     With a displaced laser that half path becomes a distance by the scene's geometry (`radial_depth_of`). `coates`
     undoes the law that made the histogram (`detection_law`). Raises InputError as `estimate_depth` does, and with
-    `coates` for counts of a sensor of zones.
+    `coates` for counts of a sensor of zones or from a .mat file.
     """
     counts = torch.from_numpy(histogram.counts)
     if isinstance(estimator, str):

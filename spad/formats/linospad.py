@@ -117,7 +117,7 @@ def capture_histogram(capture: Capture, sensor: Sensor | None = None) -> Histogr
     require(whole, "holds counts that are no whole numbers of 32 bits")
     columns_first = capture.counts.astype(np.int32).T.toarray().reshape(side, side, bins)
     counts = np.ascontiguousarray(columns_first.swapaxes(0, 1))
-    return Histogram.from_counts(counts, sensor, {"plan": ["read from a capture"]})
+    return Histogram.from_counts(counts, sensor, {"plan": ["read from a capture"], "layout": "mat"})
 
 
 def rebinning(bins: int, new_bins: int) -> scipy.sparse.csr_matrix:

@@ -18,6 +18,7 @@ import torch
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require, require_whole
 from scenes.limits import require_memory
+from spad.detection.laws import LOW_FLUX
 from spad.estimators.depth import estimate_depth
 from spad.formats.bistatic import CO_LOCATED, laser_baseline_m
 from spad.formats.histogram import Histogram
@@ -44,6 +45,7 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     ours, in whole bins from 1 without the published offset of one. `bin` is the fullest bin of the noise-free pulse,
     as published. `bin_hr` and the estimates are of the arrival, which is the pulse's centroid, moved by as much as
     that bin stands off it on average.
+    The layout holds no exposure, dead time and law, so that pile-up in its counts cannot be undone (`pile_up_warning`).
     Where nothing is, and where nothing was detected, bins are 1: published loaders subtract 1 from unsigned numbers.
     Raises InputError as `check_mat` does, and where the file cannot be written.
     """
@@ -55,6 +57,17 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     psf = {"PSF_img": np.broadcast_to(taps, (height, width, len(taps))), "psf": taps, "pulse_len": float(len(taps))}
     save_mat(psf, pulse)
     return pulse
+
+
+def pile_up_warning(histogram: Histogram) -> str | None:
+    """Return one line where pile-up matters, which nobody can undo who has the .mat file alone; else None."""
+    pile_up = float(histogram.meta.get("pile_up", 0.0))
+    if pile_up <= LOW_FLUX:
+        return None
+    return (
+        f"the .mat layout holds no exposure, dead time and law: with {pile_up:.2%} primary detections a cycle in the "
+        "brightest pixel its counts are distorted by pile-up, which cannot be undone from that file"
+    )
 
 
 def check_mat(path: Path, sensor: Sensor, height: int, width: int, baseline_m: tuple[float, ...] = CO_LOCATED) -> None:
@@ -254,5 +267,6 @@ def _histogram(contents: Mapping[str, Matrix], path: Path) -> Histogram:
         albedo=albedo.astype(np.float16),
         expected_signal=np.full((height, width), signal, np.float32),
         expected_background=np.full((height, width), background, np.float32),
-        meta={"model": "poisson", "plan": ["read from a .mat file"], "pile_up": 0.0, "wrapped": 0.0, "dark_share": 0.0},
+        meta={"model": "poisson", "plan": ["read from a .mat file"], "pile_up": 0.0, "wrapped": 0.0, "dark_share": 0.0}
+        | {"layout": "mat"},  # which knows no exposure, dead time or law: those of the sensor are not the recording's
     )

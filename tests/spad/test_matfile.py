@@ -17,7 +17,7 @@ from spad.detection.detect import sense
 from spad.estimators.depth import histogram_depth_m
 from spad.formats.histogram import Histogram
 from spad.formats.linospad import read_linospad
-from spad.formats.mat import read_mat, write_mat
+from spad.formats.mat import pile_up_warning, read_mat, write_mat
 from spad.formats.matfile import checked_contents, load_mat, save_mat
 from spad.formats.rgbd import published_taps, transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
@@ -194,6 +194,19 @@ def test_numbers_that_no_frame_has_are_refused_in_one_line(name, value, tmp_path
     saved(tmp_path / "f.mat", **{key: array if key == name else contents[key] for key in contents if key[0] != "_"})
     with np.errstate(over="ignore"), pytest.raises(InputError, match=r"^[^\n]*f\.mat: [^\n]*$"):
         read_mat(tmp_path / "f.mat")
+
+
+def test_pile_up_of_a_frame_is_not_undone_with_a_made_up_exposure(tmp_path):
+    sensor = Sensor(bins=200, bin_width_s=5e-10, exposure_s=1e-3)
+    wall = transient_from_rgbd(np.full((4, 4), 3.0), np.ones((4, 4)), np.ones((4, 4)))
+    strong, weak = (sense(wall, sensor, PhotonBudget(photons, 10)) for photons in (3000, 5))
+    assert "holds no exposure" in pile_up_warning(strong) and pile_up_warning(weak) is None
+    write_mat(strong, tmp_path / "strong.mat")
+    read = read_mat(tmp_path / "strong.mat")
+    with pytest.raises(InputError, match=r"coates: a .mat file holds no exposure.* Histogram.from_counts"):
+        histogram_depth_m(read, "coates")
+    around = histogram_depth_m(Histogram.from_counts(read.counts, sensor), "coates")
+    assert np.array_equal(around, histogram_depth_m(strong, "coates"), equal_nan=True)
 
 
 @pytest.mark.parametrize("frame", [1.0, "1", True])

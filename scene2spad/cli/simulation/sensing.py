@@ -150,8 +150,11 @@ def run(command: Sense, progress: Progress) -> dict:
     write_histogram(histogram, out)
     result = {"seconds": seconds, **summary(histogram), "out": str(out)}
     if command.export == "mat":
-        from spad.formats.mat import write_mat
+        from spad.formats.mat import pile_up_warning, write_mat
 
+        warning = pile_up_warning(histogram)
+        if warning is not None:
+            log.warning("%s: %s", mat, warning)
         result.update({"pulse_file": str(write_mat(histogram, mat)), "export": str(mat)})
     if command.figure:
         from scene2spad.plots.pixels import draw_histogram
