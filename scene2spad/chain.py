@@ -153,15 +153,16 @@ def sense(
     require_kind(transient, Transient, "sense", " of `render` or `read_transient`")
     if optics is not None:
         require_kind(optics, Optics, "sense: optics")
+    _check_seed(seed)
+    chosen = pixel_sensor(sensor)
+    background = default_background(transient, chosen, seed=seed) if background is None else background
+    budget = PhotonBudget(signal, background) if optics is None else optics.budget(transient, chosen, seed=seed)
+    return sense_exposure(transient, chosen, budget, seed=int(seed), model=law)
+
+
+def _check_seed(seed: int) -> None:
     whole = isinstance(seed, Integral) and not isinstance(seed, bool) and seed >= 0
     require(whole, f"seed {seed!r}: expected a whole number, 0 or more")
-    chosen = pixel_sensor(sensor)
-    if optics is not None:
-        budget = optics.budget(transient, chosen, seed=seed)
-    else:
-        asked = default_background(transient, chosen, seed=seed) if background is None else background
-        budget = PhotonBudget(signal, asked)
-    return sense_exposure(transient, chosen, budget, seed=int(seed), model=law)
 
 
 def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | DepthModel = "log-matched") -> np.ndarray:

@@ -54,6 +54,10 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
     reasons = [f"zones: {zones.count} fields of view", *_beside_image(transient, zones)]
     if lost > 1e-9:  # beyond rounding
         reasons[0] += f", {lost:.1%} of the detections lost to saturation"
+    wrapped = _wrapped(returns, sensor, zones)
+    if wrapped > 0:
+        late = f"arrives after the period of {sensor.range_m:.3f} m and wraps"
+        reasons.append(f"wrap: {wrapped:.3%} of the light {late}")
     pixel = _centre_pixels(transient, zones)
 
     def laid(values: np.ndarray, kind: type) -> np.ndarray:
@@ -74,8 +78,8 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
             "model": "zones",
             "plan": reasons,
             "pile_up": float((primary / np.asarray(zones.trials)).max()),
-            "wrapped": _wrapped(returns, sensor, zones),
-            "dark_share": 1.0,
+            "wrapped": wrapped,
+            "dark_share": None,  # a zone's background is not told apart
             "brightest_pixel": brightest,
             "brightest_thousandth": brightest,
             "median_signal": float(np.median(signal)),

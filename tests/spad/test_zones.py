@@ -312,4 +312,6 @@ def test_zones_tell_how_much_of_their_light_wraps():
     """A plane at 0.3 m in a period of 0.96 m, and one at 1.2 m."""
     sensor = replace(SENSOR, period_s=6.4e-9)
     assert sense_zones(view(), sensor, TWO).meta["wrapped"] == 0
-    assert sense_zones(view(1.2), sensor, TWO).meta["wrapped"] == 1
+    late = sense_zones(view(1.2), sensor, TWO).meta
+    assert late["wrapped"] == 1 and any(line.startswith("wrap: 100.000% of the light") for line in late["plan"])
+    assert late["dark_share"] is None, "a zone's background is not told apart"
