@@ -128,6 +128,14 @@ def open_for_depth(path: Path, frame: int = 0) -> Histogram:
     return histogram
 
 
+def _is_cube(path: Path) -> bool:
+    """Tell whether a .npy file holds an array of three dimensions: counts, and no codes."""
+    try:
+        return np.load(path, mmap_mode="r", allow_pickle=False).ndim == 3
+    except (OSError, ValueError, EOFError):
+        return False
+
+
 def _check_no_other_kind(path: Path) -> None:
     """Raise InputError for a file of another kind of ours, which a histogram's reader would call damaged."""
     kinds = BY_SUFFIX.get(path.suffix.lower(), ("histogram",))
@@ -135,7 +143,11 @@ def _check_no_other_kind(path: Path) -> None:
         return
     if path.suffix.lower() == ".exr":
         kinds = tuple(kind for kind in kinds if holds_kind(path, kind)) or ("picture",)
+    if kinds[0] == "codes" and _is_cube(path):
+        kinds = ("dense",)
     cure = {
+        "dense": "; in Python scene2spad.Histogram.from_counts takes its counts (H, W, T) with their sensor, and "
+        "scene2spad.write_histogram makes the file",
         "transient": "; sense it first: `scene2spad sense`",
         "codes": "; `depth` takes them by --codes-file, `compare` by --methods",
         "network": "; `depth` takes it by --checkpoint, `compare` by --methods",

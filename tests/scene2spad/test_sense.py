@@ -201,6 +201,16 @@ def test_bad_options_are_refused_in_one_line(scene, capfd, tmp_path, options, wo
     assert status == 2 and len(lines) == 1 and words in lines[0] and not (tmp_path / "s.h5").exists()
 
 
+def test_dense_counts_are_told_how_they_become_a_histogram(scene, capfd):
+    np.save("counts.npy", np.ones((2, 3, 8), np.int32))
+    np.savez("counts.npz", data=np.ones((2, 3, 8), np.int32))
+    for name in ("counts.npy", "counts.npz"):
+        status, _, err = run(capfd, "depth", name)
+        assert status == 2 and f"{name}: is of kind dense" in err and "Histogram.from_counts" in err
+    np.save("codes.npy", np.ones((4, 8)))
+    assert "is of kind codes" in run(capfd, "depth", "codes.npy")[2]
+
+
 def test_table_of_estimators():
     rows = estimators.table([("a", relief(6, 7))], sensor_by_name("reference"), [(30, 300)], seed=1)
     assert len(rows) == 6 * 3 and {row["group"] for row in rows} == {"all", "unmixed", "mixed"}
