@@ -94,6 +94,14 @@ def test_the_worked_example_of_the_photon_budget_runs(tmp_path, monkeypatch, cap
     assert message["model"] == "first-photon"
 
 
+def test_the_worked_example_of_the_processor_gives_the_codes_that_the_page_says():
+    text = (ROOT / "docs/ultraphase.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    names: dict = {}
+    exec(compile(block, "ultraphase.md", "exec"), names)
+    assert (names["codes"] == names["histogram"].counts @ names["fourier"].matrix(names["temporal"]).T).all()
+
+
 def test_the_sensor_file_of_the_guide_is_one(tmp_path):
     """With the page's tables of optics, jitter and a time-to-digital converter; and with those of zones."""
     page = (ROOT / "docs/sensors.md").read_text(encoding="utf-8")

@@ -87,7 +87,7 @@ class CoreArray:
         good = offsets.shape == (lanes + 1,) and offsets[0] == 0 and offsets[-1] == len(timestamps)
         good = good and bool((np.diff(offsets) >= 0).all())
         require(good, f"timestamp offsets: expected {lanes + 1} that rise from 0 to the {len(timestamps)} timestamps")
-        return ArrayRun(self, port_timestamps(timestamps), offsets, park).to_end()
+        return ArrayRun(self, port_timestamps(timestamps, self.program), offsets, park).to_end()
 
     def contents(self, region: str) -> np.ndarray:
         """Return numbers in a region of every core's RAM, (cores, count)."""

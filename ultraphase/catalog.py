@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +118,8 @@ class Method:
             constants["SHIFT"] = (TIMESTAMPS // self.codes).bit_length() - 1
             if self.shift_step is not None:
                 constants["STEP"] = self.shift_step
-        return assemble_file(FOLDER / f"{self.family}.s", constants, chip, name=self.name)
+        program = assemble_file(FOLDER / f"{self.family}.s", constants, chip, name=self.name)
+        return replace(program, timestamps=(SPADS if self.family == "addressed" else 1) * TIMESTAMPS)
 
     def tables(self, temporal: np.ndarray | None = None, weights: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return tables for `CoreArray`: from the int8 temporal tensor (K, Mt), and of spatial weights (..., K) a

@@ -145,6 +145,7 @@ def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
         needs = f"needs {ram.total:,} bytes of RAM a core ({ram}), {chip.ram_bytes:,} are there"
         raise InputError(f"code {code.name} {needs}; {_what_fits(code, chip)}")
     source, order, program = _program(code, chip)
+    program = replace(program, timestamps=chip.timestamps)
     return Compiled(code, program, source, order, ram, _matrix(code, chip), chip)
 
 

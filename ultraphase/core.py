@@ -79,13 +79,18 @@ class _BasicBlock:
     times: int = 0
 
 
-def port_timestamps(timestamps: Iterable[int] | np.ndarray) -> np.ndarray:
-    """Return timestamps (N,) as the port takes them, int64. InputError for other than whole numbers of 16 bits."""
+def port_timestamps(timestamps: Iterable[int] | np.ndarray, program: Program) -> np.ndarray:
+    """Return timestamps (N,) as the port takes them, int64. InputError for other than whole numbers of 16 bits, and for
+    those that the program does not know."""
     held = timestamps if isinstance(timestamps, np.ndarray) else np.array(list(timestamps))
     whole = held.ndim == 1 and (held.dtype.kind in "iu" or not held.size)
     require(whole, f"timestamps are {held.dtype}{held.shape}, expected whole numbers in one dimension")
     in_range = not held.size or (int(held.min()) >= 0 and int(held.max()) < 1 << 16)
     require(in_range, f"timestamps are outside 0 to {(1 << 16) - 1}")
+    known = program.timestamps
+    if known is not None and held.size:
+        most = int(held.max())
+        require(most < known, f"program {program.name}: timestamp {most} is outside 0 to {known - 1}, its range")
     return held.astype(np.int64)
 
 
@@ -135,8 +140,9 @@ class Core:
 
     def start(self, timestamps: Iterable[int], *, park: bool = False) -> None:
         """Begin a frame of these timestamps at word 0. With `park` it does not end: the core stops where it would wait
-        for another timestamp. Raises InputError for timestamps that the port has no bits for."""
-        port = port_timestamps(timestamps).tolist()
+        for another timestamp. Raises InputError for timestamps that the port has no bits for, or the program does not
+        know."""
+        port = port_timestamps(timestamps, self.program).tolist()
         self._port, self._read, self._stop_at_wait, self._stopped, self._attached_to_array = port, 0, park, False, False
         self.out.clear()
         self.word = 0

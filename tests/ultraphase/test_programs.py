@@ -281,3 +281,20 @@ def test_shifts_that_change_nothing_or_divide_by_zero_are_refused(name, message)
     with pytest.raises(InputError, match=message):
         method(name)
     assert method("coarse-16-shift-2").program().instructions != method("coarse-16").program().instructions
+
+
+@pytest.mark.parametrize("name", ["coarse-16", "fourier-8", "separable-8"])
+def test_timestamps_beyond_a_programs_range_are_refused(name):
+    """A table of 1,024 timestamps would fold a record of 1,536 bins into them, without a word."""
+    program, chosen = method(name).program(), method(name)
+    bins = chosen.temporal_bins
+    tables = chosen.tables(np.zeros((chosen.codes, bins), np.int64)) if bins else {}
+    offsets = np.array([0, 1])
+    for refusing in (
+        lambda: Core(program, tables).start([1024]),
+        lambda: CoreArray(program, (1, 1), tables).frame(np.array([1535]), offsets),
+    ):
+        with pytest.raises(InputError, match=rf"program {name}: timestamp \d+ is outside 0 to 1023"):
+            refusing()
+    Core(program, tables).start([1023])
+    assert method("addressed-4").program().timestamps == 16 * 1024

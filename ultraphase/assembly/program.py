@@ -46,6 +46,7 @@ class Program:
 
     lines    (file, line number) of every instruction, for messages
     labels   name -> word
+    timestamps   how many it knows, from 0 on; larger ones are refused, as tables would fold them. None: all of 16 bits
     """
 
     name: str
@@ -53,6 +54,7 @@ class Program:
     regions: tuple[Region, ...]
     labels: Mapping[str, int]
     lines: tuple[tuple[str, int], ...]
+    timestamps: int | None = None
 
     @property
     def words(self) -> tuple[int, ...]:
