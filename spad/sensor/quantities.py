@@ -17,6 +17,9 @@ UNITS: dict[str, dict[str, int]] = {
     "bandwidth": {"nm": 0, "um": 3},
     "energy": {"J": 0, "mJ": -3, "uJ": -6, "nJ": -9, "pJ": -12, "fJ": -15},
 }
+# Both characters that are read as micro, and counts per second.
+_MICRO = str.maketrans({"\u00b5": "u", "\u03bc": "u"})
+_PER_SECOND = {"cps": "Hz", "1/s": "Hz", "kcps": "kHz", "mcps": "MHz"}
 _QUANTITY = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf)\s*(\S*)\s*")
 
 
@@ -43,8 +46,9 @@ def parse_quantity(value: object, dimension: str, where: str, *, signed: bool = 
     found = _QUANTITY.fullmatch(value)
     if found is None:
         raise InputError(f"{where}: {value!r} is no number with a unit, expected {example}")
-    digits, unit = found.groups()
-    meant = "".join(f"; did you mean '{known}'?" for known in units if known.lower() == unit.lower())
+    digits, unit = found[1], found[2].translate(_MICRO)
+    close = _PER_SECOND.get(unit.lower(), unit)
+    meant = "".join(f"; did you mean '{known}'?" for known in units if known.lower() == close.lower())
     named = f"the unit {unit}" if unit else "no unit"
     require(unit in units, f"{where}: {value!r} has {named}, expected {example}{meant}")
     try:

@@ -209,6 +209,8 @@ def test_dense_counts_are_told_how_they_become_a_histogram(scene, capfd):
         assert status == 2 and f"{name}: is of kind dense" in err and "Histogram.from_counts" in err
     np.save("codes.npy", np.ones((4, 8)))
     assert "is of kind codes" in run(capfd, "depth", "codes.npy")[2]
+    argv = ("depth", "s.h5", "--method", "compressive", "--codes-file", "c.csv")
+    assert "--codes-file c.csv: expected codes (K, T) in a .npy file" in run(capfd, *argv)[2]
 
 
 def test_table_of_estimators():

@@ -245,6 +245,8 @@ def _check_codes(command: Depth) -> None:
     """Raise InputError for options of codes that the method, or a file of codes, leaves without a meaning."""
     compressive, own = command.method == "compressive", command.codes_file is not None
     purpose = "--method compressive"
+    array = command.codes_file is None or command.codes_file.suffix == ".npy"
+    require(array, f"--codes-file {command.codes_file}: expected codes (K, T) in a .npy file")
     only_for(command, "depth", dict.fromkeys(("code", "codes", "codes_file"), (compressive, purpose)))
     only_for(command, "depth", dict.fromkeys(("code", "codes"), (not own, f"{purpose} without --codes-file")))
 
