@@ -315,7 +315,11 @@ def _sources(contents: Mapping[str, object]) -> dict[str, str]:
 
 
 def write_sensor(contents: SensorFile, path: Path) -> Path:
-    """Write a sensor file, whole or not at all; `read_sensor` returns the same. Returns the path."""
+    """Write a sensor file, whole or not at all. Returns the path.
+
+    `read_sensor` returns the same, but for the path of a converter's own table, which is written as an absolute one, so
+    that the sensor file can be anywhere: the two differ in `tdc.table` where that was relative.
+    """
     path = Path(path)
     require(path.suffix == ".toml", f"{path}: the output must end in .toml")
     with whole_file(path) as beside:

@@ -32,7 +32,7 @@ class Sensor:
     bins, bin_width_s     the histogram: bin i covers [i, i+1) bin widths after the laser's emission
     pulse, jitter         the laser's pulse and the detector's timing jitter, a second kernel; `response` is both
     period_s              laser period, a whole number of bin widths (None: the histogram covers it); time wraps at it
-    exposure_s            exposure of one frame; cycles = exposure / period
+    exposure_s            exposure of one frame; cycles = exposure / period, of which the nearest whole number is drawn
     pde                   photon detection efficiency at the laser's wavelength: radiometric budgets count with it
     dark_count_rate_hz    dark counts per second and pixel, uniform in time: a number, or one for each image row, used
                           again from the first where the image has more rows
@@ -169,7 +169,7 @@ class Sensor:
 
     @property
     def cycles(self) -> float:
-        """Return the number of laser cycles in one exposure."""
+        """Return the number of laser cycles in one exposure, not rounded; `sense` draws the nearest whole number."""
         return self.exposure_s / self.period_s
 
     @property

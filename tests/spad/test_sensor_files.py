@@ -136,9 +136,9 @@ def test_micro_has_two_characters_and_counts_per_second_are_hertz():
     for micro in "u\u00b5\u03bc":
         assert parse_quantity(f"33 {micro}s", "time", "x") == 33e-6
         assert parse_quantity(f"2 {micro}m2", "area", "x") == 2e-12
-    for given, meant in (("cps", "Hz"), ("kcps", "kHz")):
+    for unit, meant in (("cps", "Hz"), ("kcps", "kHz")):
         with pytest.raises(InputError, match=f"did you mean '{meant}'"):
-            parse_quantity(f"100 {given}", "rate", "x")
+            parse_quantity(f"100 {unit}", "rate", "x")
 
 
 def test_a_width_is_read_as_sigma_or_as_full_width_at_half_maximum(tmp_path):

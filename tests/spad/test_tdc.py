@@ -2,6 +2,7 @@
 corrections, and one line for every mistake."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -327,3 +328,22 @@ def test_a_table_of_ones_own_lies_beside_its_sensor_file_and_a_histogram_needs_i
     np.savez(folder / "own.npz", end_ps=end_ps**1.0001 * (2500 / 2500**1.0001))
     with pytest.raises(InputError, match=r"own\.npz: is another table of codes"):
         sense(transient, read_histogram(tmp_path / "h.h5").sensor, PhotonBudget(300, 10))
+
+
+def test_a_sensor_file_with_an_own_table_comes_back_but_for_the_tables_path(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.savez("own.npz", end_ps=np.cumsum(np.full((3, 25), 100.0), axis=1))
+    text = write_sensor(SensorFile(SENSOR), Path("own.toml")).read_text().replace('"linospad2"', '"own.npz"')
+    Path("own.toml").write_text(text)
+    first = read_sensor(Path("own.toml")).sensor
+    second = read_sensor(write_sensor(SensorFile(first), Path("again.toml"))).sensor
+    assert second.tdc.table == str(tmp_path / "own.npz") and first.tdc.table == "own.npz"
+    assert replace(second, tdc=replace(second.tdc, table=first.tdc.table)) == first
+
+
+@pytest.mark.parametrize(("cycles", "drawn"), [(10.4, 10), (10.6, 11)])
+def test_the_nearest_whole_number_of_cycles_is_drawn(cycles: float, drawn: int) -> None:
+    """At 30 photons a cycle every cycle has a first one."""
+    sensor = Sensor(bins=64, exposure_s=cycles * Sensor(bins=64).period_s)
+    histogram = sense(transient_of([(0.5, 0.5, 1.0)]), sensor, PhotonBudget(30 * cycles, 0), model="first-photon")
+    assert histogram.counts.sum() == drawn
