@@ -70,7 +70,8 @@ class Depth(Common):
     sensor: Annotated[str | None, may_stay_open("NAME")] = None
     """Sensor preset or file (.toml) that a transient is sensed with (default: reference)."""
     signal: Number = None
-    """Mean signal photons per pixel that a transient is sensed with (default: 50)."""
+    """Mean signal photons per pixel that a transient is sensed with (default: 50, or the sensor's dark counts
+    if they are more)."""
     background: Number = None
     """Mean background photons per pixel that a transient is sensed with (default: 50)."""
     figure: bool = True
