@@ -32,8 +32,7 @@ class Sense(Common):
     """Mean signal photons per pixel and exposure (default: 50, or what the --radiometric optics give)."""
     background: Number = None
     """Mean background photons per pixel and exposure, dark counts included (default: 50, or the sensor's dark
-    counts if they are more, or what the --radiometric
-    optics give)."""
+    counts if they are more, or what the --radiometric optics give)."""
     dark_count_rate: Number = None
     """Dark counts per second and pixel [Hz] (default: the preset's)."""
     dark_map: File = None
