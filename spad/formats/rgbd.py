@@ -88,8 +88,6 @@ def _check_values(depth: np.ndarray, albedo: np.ndarray, ambient: np.ndarray) ->
     require(bool(good.all()), "RGB-D images: albedo and ambient light must be finite and 0 or more")
     least = float(depth.min(initial=0.0, where=depth < 0))
     require(least >= 0, f"RGB-D images: a depth of {least:g} m, expected 0 or more, or none (NaN)")
-    known = bool((np.isfinite(depth) & (depth > 0)).any())
-    require(known, "RGB-D images: no pixel has a depth (all NaN, infinite or 0), expected metres")
 
 
 def transient_from_rgbd(
@@ -110,8 +108,7 @@ def transient_from_rgbd(
     incidence is taken with, from the depth image itself; None for surfaces that face the camera. Samples without
     depth (not finite, or 0) return nothing; a pixel with samples more than 50 mm apart, or partly nowhere, is mixed.
     `depth_m` [m], `albedo` and `ambient` [W/(m2 sr nm)] are (H, W). Raises InputError for images of other shapes, sides
-    that `block` does not divide, negative depth, no depth at all, and albedo or ambient light that is negative or not
-    finite.
+    that `block` does not divide, negative depth, and albedo or ambient light that is negative or not finite.
     """
     depth, albedo, ambient = _alike(depth_m, albedo, ambient)
     require(

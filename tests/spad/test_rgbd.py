@@ -356,11 +356,3 @@ def test_a_negative_depth_is_refused():
         transient_from_rgbd(depth, one, one)
     depth[1, 1:] = np.nan, 0
     assert transient_from_rgbd(depth, one, one).returns == 4
-
-
-@pytest.mark.parametrize("nothing", [math.nan, math.inf, 0.0])
-def test_a_depth_map_without_a_depth_is_refused(nothing: float):
-    """A transient without any return would be sensed as darkness."""
-    one = np.ones((2, 2))
-    with pytest.raises(InputError, match="no pixel has a depth"):
-        transient_from_rgbd(np.full((2, 2), nothing), one, one)
