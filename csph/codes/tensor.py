@@ -145,6 +145,7 @@ def as_tensor(values: Tensor | np.ndarray) -> Tensor:
     if not isinstance(values, Tensor):
         got = f"an array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
         raise InputError(f"expected a tensor or an array of numbers, got {got}")
+    require(not values.is_complex(), f"expected real numbers, got {values.dtype}: real and imaginary part are two rows")
     return values
 
 

@@ -208,8 +208,10 @@ class DepthModel(nn.Module):
         (default: `TILE`; smaller images in tiles only if it is given) whose halo holds all that the network sees.
         `int8`: codes of 8-bit weights summed in 16 bits (`csph.codes.quantise.quantised`), or with the rule
         "published" of weights rounded to 8 bits and summed in float32 (`published_int8`); the decoder keeps float32.
-        Raises InputError for another sensor's histogram.
+        Raises InputError for another sensor's histogram, and for tiles of no pixel.
         """
+        whole = tile is None or (isinstance(tile, int) and tile >= 1)
+        require(whole, f"tiles of {tile!r} pixels, expected a whole number of 1 or more")
         require(int8_rule in INT8_RULES, f"8-bit rule {int8_rule!r} is unknown, expected {' or '.join(INT8_RULES)}")
         self.check_histogram(histogram)
         device = next(self.parameters()).device

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from csph.networks.published import soft_argmax
+from scenes.errors import require
 
 Decoder = Literal["soft-argmax", "median"]
 DECODERS: tuple[Decoder, ...] = ("soft-argmax", "median")
@@ -43,7 +44,8 @@ def confidence(logits: Tensor, position: Tensor, within: float = CONFIDENT_BINS)
 
 def decoded(logits: Tensor, decoder: Decoder) -> Tensor:
     """Return position of the answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C), by `soft_argmax` or
-    `posterior_median`."""
+    `posterior_median`. Raises InputError for another decoder."""
+    require(decoder in DECODERS, f"decoder {decoder!r} is unknown, expected {' or '.join(DECODERS)}")
     return posterior_median(logits) if decoder == "median" else soft_argmax(logits)
 
 

@@ -38,6 +38,7 @@ def photon_levels(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
             raise InputError(f"levels {one!r}: expected SIGNAL+BACKGROUND in photons a pixel, as in 1+100") from None
         fits = 0 < signal < math.inf and 0 <= background < math.inf
         require(fits, f"levels {one!r}: expected signal photons above 0 and background photons of 0 or more")
+        require((signal, background) not in found, f"levels {one!r}: given twice, whose pixels would count twice")
         found.append((signal, background))
     return tuple(found) or PHOTON_LEVELS
 

@@ -243,3 +243,11 @@ def test_arrays_of_a_histogram_are_encoded_and_decoded_as_tensors_are():
 def test_what_is_no_array_is_refused_in_one_line(call, message):
     with pytest.raises(InputError, match=message):
         call(fourier(8, 64))
+
+
+def test_complex_codes_and_counts_are_refused() -> None:
+    """Their imaginary part, all sines of a Fourier code, was dropped."""
+    waves = torch.exp(2j * math.pi * torch.arange(4)[:, None] * torch.arange(64) / 64)
+    for call in (lambda: CodingTensor("waves", waves), lambda: encode(waves, fourier(4, 64))):
+        with pytest.raises(InputError, match="real and imaginary part are two rows"):
+            call()

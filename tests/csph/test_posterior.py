@@ -16,6 +16,7 @@ from csph.networks.model import DepthModel
 from csph.networks.posterior import confidence, decoded, posterior_median
 from csph.training.config import ModelConfig
 from scene2spad.datasets.planes import random_planes
+from scenes.errors import InputError
 from spad.detection.detect import sense
 from spad.formats.histogram import TRUTH
 from spad.sensor.model import PhotonBudget, Sensor
@@ -163,3 +164,17 @@ def test_answers_do_not_depend_on_mixed_precision(kind):
         with torch.autocast("cpu", dtype=kind):
             found = decoded(logits, decoder)
         assert found.dtype == torch.float32 and torch.equal(found, exact)
+
+
+def test_decoders_by_another_name_are_refused():
+    """They were the soft-argmax, unsaid."""
+    with pytest.raises(InputError, match="'Median' is unknown, expected soft-argmax or median"):
+        decoded(torch.zeros(1, 8, 2, 2), "Median")
+
+
+@pytest.mark.parametrize("tile", [-5, 0, 2.5])
+def test_tiles_of_no_pixel_are_refused(tile):
+    """Their depth was whatever the memory held."""
+    model = DepthModel(ModelConfig(front="counts", sensor=SMALL))
+    with pytest.raises(InputError, match=r"tiles of .* expected a whole number"):
+        model.estimate(None, tile=tile)
