@@ -83,7 +83,7 @@ class Cluster:
         return self.warm.start(code, self.folder, self.folder / "cluster.txt")
 
     def _answers(self) -> bool:
-        """Whether somebody else answers: a socket may be given this very port, and then connects to itself."""
+        """Return whether somebody else answers: a socket may be given this very port, and then connects to itself."""
         with socket.socket() as asking:
             there = asking.connect_ex(("127.0.0.1", self.port)) == 0
             return there and asking.getsockname() != asking.getpeername()

@@ -107,7 +107,7 @@ def one_law(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 class Totals(NamedTuple):
-    """What a law expects of the total of each bin over the image, (T,) each: its mean, and its variance."""
+    """Hold what a law expects of the total of each bin over the image, (T,) each: its mean, and its variance."""
 
     mean: np.ndarray
     variance: np.ndarray
