@@ -125,8 +125,7 @@ def trace_suffixes(
     where it is seen from, and light of connections is handed on as one number.
     """
     (sample, weight), (light_vertices, connections, _, pixel, random, _, reused) = scattered, task
-    x1, alive = primary.si, primary.valid & (weight > 0)
-    direction = x1.to_world(sample.wo)
+    x1, alive, direction = primary.si, primary.valid & (weight > 0), primary.si.to_world(sample.wo)
     si, passed, leg, _ = first_opaque(world, spawn(x1, direction), alive, x1.p)
     alive &= si.is_valid()
     own = dr.select(alive, primary.transmission * weight * passed, 0)
@@ -145,7 +144,8 @@ def trace_suffixes(
     if has_light_paths(world):
         own_ratio = dr.select(readable, ratio_at_camera(world, x1, direction, readable, sample.pdf), 0)
         value *= camera_share(own_ratio * ratio_at_laser(world, si, -direction, readable))
-        at_vertex = ReachedVertex(x1, sample, own, own_ratio, leg, si, readable)
+        goes_on = readable & (task.slots.count > 0)  # x3 is a surface more
+        at_vertex = ReachedVertex(x1, sample, own, own_ratio, leg, si, goes_on)
         own_retro, back = connect_retro(world, at_vertex, onward, pixel, random)
         at_x2 = dr.maximum(finite_ratio(reversal_of_sample(si, onward, alive)), MIN_REVERSAL)
         own_ratio = finite_ratio(own_ratio * at_x2)

@@ -39,8 +39,8 @@ def mirrored_wall(laser: Laser = LASERS["flash"], metal: Material = METAL) -> Sc
     return Scene("mirrored wall", (quad(strip, metal), quad(beside, paint), quad(behind, paint)), view, laser)
 
 
-def totals(scene: Scene, spp: int, seed: int, *, filtered: bool = False) -> np.ndarray:
-    forced = {"bounces": 3, "spp": spp, "grid": 2, "filter": filtered, "edge_threshold": 1.0}
+def totals(scene: Scene, spp: int, seed: int, *, filtered: bool = False, bounces: int = 3) -> np.ndarray:
+    forced = {"bounces": bounces, "spp": spp, "grid": 2, "filter": filtered, "edge_threshold": 1.0}
     settings = RenderSettings(**forced, direct_tolerance_m=1e-3)
     plan = Plan(**forced, direct_tolerance_m=1e-3, ambient=False, reasons=())
     traced = trace(TracedScene(scene), plan, settings, seed=seed, pilot=np.arange(SIDE**2))
@@ -152,6 +152,12 @@ def test_a_block_of_one_pixel_has_the_ratios_of_its_own_paths() -> None:
     by_reuse, own = lanes.retro.numpy()[onward * BLOCK], paths.suffixes.own_retro.numpy()[onward]
     assert (own > 0).sum() > 500
     np.testing.assert_allclose(by_reuse, own, rtol=0.02)
+
+
+def test_light_of_two_surfaces_holds_none_of_three() -> None:
+    """The flash lights no wall that the metal shows, so that all indirect light is of three surfaces."""
+    assert totals(mirrored_wall(), 64, 1, bounces=2).sum() == 0
+    assert totals(mirrored_wall(), 64, 1).sum() > 0.1
 
 
 def test_a_filter_leaves_the_light_as_it_is() -> None:
