@@ -80,7 +80,7 @@ def test_removed_energy_is_what_an_independent_reference_has_more():
     edges_m = np.linspace(0, 40, 3)
     plain = np.array([path_traced(scene(), edges_m, bounces=3, spp=128, seed=s).sum() for s in range(8)])
     direct = path_traced(scene(), edges_m, bounces=1, spp=512, seed=99).sum()
-    runs = [light(s, 1.0, spp=64) for s in range(8)]
+    runs = [light(s, 0.5, spp=64) for s in range(8)]
     lacking = plain - direct - np.array([totals(run).sum() for run in runs])
     removed = np.array([run.indirect.removed.pixels.sum() for run in runs])
     error = np.hypot(lacking.std(ddof=1), removed.std(ddof=1)) / np.sqrt(8)
