@@ -31,6 +31,7 @@ PLANNED = 0.96
 MIN_NOISE_FRACTION = 0.1  # of that square, which noise of indirect light may have, however much direct light takes
 # Time of a cell in that of a path: where many paths are to come, finer cells leave them more of the error.
 CELL_COST = 0.25
+SHARED_NOISE = 0.5  # of paths that neighbours share, in that of as many own ones (0.3 to 1.5 in rooms)
 # The pilot's pixels are not compared with those beside them, so that it shows 1.3 to 1.4 times the error of cells at
 # grids of 4 to 8 (measured in rooms); most of that is not planned for.
 PILOT_SHOWS = 1.25
@@ -207,17 +208,18 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
     reasons.append(why)
     bounces, spp, paths, more_reasons = _indirect(world, settings, pixels, fine, target, seed)
     fraction = _direct_fraction(settings, direct_alone)
-    planned = PLANNED * settings.target_fraction * target**2
-    grid, off, why = _grid(world, settings, pixels, fraction * target, paths, planned)
+    aim, paths = _aim(settings, target, paths)
+    planned = PLANNED * settings.target_fraction * aim**2
+    grid, off, why = _grid(world, settings, pixels, fraction * aim, paths, planned)
     if settings.grid is None and grid < _grid_for_cone(world):
         grid, width_px = _grid_for_cone(world), cone_width_px(world)
         why = f"direct light: {grid} x {grid} rays a pixel, as the laser's cone is {width_px:.2g} pixels wide"
     reasons += [why, *more_reasons]
     tolerance_m = settings.direct_tolerance_m
     if tolerance_m is None:
-        tolerance_m = float(np.clip(TOLERANCE_M_PER_ERROR * target, 1e-4, WIDEST_TOLERANCE_M))
+        tolerance_m = float(np.clip(TOLERANCE_M_PER_ERROR * aim, 1e-4, WIDEST_TOLERANCE_M))
     mirrors = any(surface.material.kind in ("conductor", "dielectric") for surface in world.scene.surfaces)
-    narrowing = cell_narrowing(target, world.has_glints or mirrors)
+    narrowing = cell_narrowing(aim, world.has_glints or mirrors)
     width_m, growth = settings.indirect_tolerance_m, settings.indirect_growth
     fraction = default_edge_threshold(grid) if settings.edge_threshold is None else settings.edge_threshold
     ambient, ambient_noise, why = _ambient(world, settings, target)
@@ -248,8 +250,7 @@ def cell_narrowing(target: float, polished: bool) -> float:
 
 
 def _ambient(world: TracedScene, settings: RenderSettings, target: float) -> tuple[bool, float, str]:
-    """Decide whether to render steady ambient light, to which noise, and say why: only if there is any, and a photon
-    budget has room for it.
+    """Decide whether to render ambient light, to which noise, and say why: if there is any that a budget has room for.
 
     Noise that would make an error of AMBIENT_FRACTION of the target beside the signal of the budget's photons, or where
     there is no budget beside as many signal photons as background.
@@ -363,12 +364,22 @@ def _indirect(
         lines.append(f"bounces: {bounces}, forced")
     if bounces == 1:
         return 1, 0, 0.0, [*lines, "indirect light: none, what it adds is less than may be left out"]
-    if settings.spp is not None:
-        lines.append(f"indirect light: the work of {settings.spp} paths a pixel, forced")
-        return bounces, settings.spp, 0.0, lines
     power = float((fine**2).sum())
     paths = noise * PULSE_POWER / (PLANNED * settings.target_fraction * target**2 * power) if power > 0 else 0.0
-    return bounces, None, 0.0 if settings.filter else paths, lines
+    if settings.spp is not None:
+        lines.append(f"indirect light: the work of {settings.spp} paths a pixel, forced")
+    return bounces, settings.spp, 0.0 if settings.filter else paths, lines
+
+
+def _aim(settings: RenderSettings, target: float, paths: float) -> tuple[float, float]:
+    """Return the error that direct light and merging are planned for, and the paths a pixel beside them: the target,
+    or what forced paths leave where no target was asked for and that is less. As many own paths as `paths` meet it."""
+    if settings.spp is None:
+        return target, paths
+    left = SHARED_NOISE * target * math.sqrt(paths / settings.spp)
+    if settings.error is not None or settings.budget is not None or not 0 < left < target:
+        return target, 0.0
+    return left, settings.spp
 
 
 def bounces_for(energy: np.ndarray, allowed: float, least: int = 1) -> tuple[int, float]:

@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from render.engine import planned
 from render.error import estimate, target_verdict
 from render.planning import measured_rays_for_all, rays_for_all
+from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
+from scenes.library.catalog import load_scene
 
 
 def test_many_views_get_the_rays_that_their_mean_squared_error_asks_for():
@@ -52,3 +55,19 @@ def test_an_error_just_above_its_target_shows_the_digits_that_tell_them_apart():
     stated = replace(estimate(one, one), total=0.02003)
     assert "error of 0.02003 MISSES the target of 0.02;" in target_verdict(stated, 0.02, 4)
     assert "error: 0.02 stated, meets the target of 0.02" in target_verdict(replace(stated, total=0.02), 0.02, 4)
+
+
+def test_direct_light_keeps_up_with_the_noise_of_many_forced_paths():
+    """With 1,024 paths forced direct light kept the default target of 0.02: the render had four times their noise.
+
+    A target that is asked for stays what it is, and so does the default where forced paths leave more noise.
+    """
+    world = TracedScene(load_scene("living-room", width=24, height=24))
+
+    def plan(**settings):
+        return planned(world, RenderSettings(bounces=3, **settings))
+
+    few, many, asked = plan(spp=4), plan(spp=1024), plan(spp=1024, error=0.02)
+    assert many.grid >= few.grid + 3 and many.direct_tolerance_m < 0.5 * few.direct_tolerance_m
+    assert (few.grid, few.direct_tolerance_m) == (asked.grid, asked.direct_tolerance_m)
+    assert few.target == many.target == asked.target == 0.02

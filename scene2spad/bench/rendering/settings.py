@@ -84,7 +84,7 @@ def qualities(method: Method, transport: str, size: int, quick: bool) -> tuple[i
 def grid_beside(spp: int) -> int:
     """Return direct rays a pixel side that go with indirect `spp`, so that direct light costs least error for its
     time."""
-    return 4 if spp < 16 else 5 if spp < 64 else 7 if spp < 256 else 9
+    return 4 if spp < 16 else 5 if spp < 64 else 7 if spp < 128 else 9 if spp < 256 else 12
 
 
 def reference_passes(transport: str, size: int) -> tuple[int, int]:
