@@ -6,12 +6,12 @@ import json
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, EvaluationPlan, Method, as_dicts, evaluate
 from csph.evaluation.metrics import PHOTON_LEVELS
-from csph.networks.model import load_model
+from csph.networks.model import DepthModel, load_model, tensors_sha256
 from csph.training.config import TrainConfig
 from csph.training.views import Views, check_truth, read_seen, training_parts, view_key
 from csph.weights.cards import checkpoint_of
@@ -48,6 +48,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     loaded = [load_model(checkpoint_of(path)) for path in command.checkpoints]
     require(bool(loaded), "evaluate: give at least one checkpoint")
     models = [model for model, _, _ in loaded]
+    check_different(models, command.checkpoints)
     designs = group_names([config for _, config, _ in loaded], [*map(checkpoint_name, command.checkpoints)])
     require(command.int8 or command.int8_rule is None, "evaluate: --int8-rule goes with --int8")
     rule = command.int8_rule or "calibrated"
@@ -114,18 +115,39 @@ def _as_a_whole(config: TrainConfig, views: Views) -> int:
     return seen[0] if seen else 0
 
 
+def check_different(models: Sequence[DepthModel], paths: Sequence[Path]) -> None:
+    """Raise InputError for the same weights given twice: they are one training, whatever they are called."""
+    first: dict[tuple[str, str], Path] = {}
+    for model, path in zip(models, paths, strict=True):
+        # in half precision, in which models are shipped
+        halved = tensors_sha256({name: value.half() for name, value in model.state_dict().items()})
+        key = (halved, json.dumps(asdict(model.config), sort_keys=True))
+        require(key not in first, f"evaluate: {first.get(key)} and {path} are the same weights; give them once")
+        first[key] = path
+
+
 def _recipe(config: TrainConfig) -> str:
-    same = replace(config, seed=0, threads=0, data={"training_sha256": config.data.get("training_sha256")})
-    return json.dumps(same.to_dict(), sort_keys=True)
+    """Return what trainings by different seeds have in common, the weights that they began with included."""
+    kept = {key: config.data.get(key) for key in ("training_sha256", "init_sha256")}
+    # of the weights or the network alone; the names of the same weights do not count
+    kept |= {"network_alone": "init_network" in config.data}
+    return json.dumps(replace(config, seed=0, threads=0, data=kept).to_dict(), sort_keys=True)
 
 
 def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[str]:
     """Name the group of each checkpoint: trainings of one design and recipe by different seeds are one group.
 
-    A recipe is the training sets and every number of the configuration but the seed and the threads. Where one design
-    was trained by several, a group is named after its first checkpoint, too.
+    A recipe is the training sets, the weights that it begins with, and every number of the configuration but the seed
+    and the threads. Where one design was trained by several, a group is named after its first checkpoint, too. A second
+    checkpoint of one recipe and seed is no further training, and is a group of its own.
     """
-    recipes = [(config.model.name, _recipe(config)) for config in configs]
+    recipes: list[tuple[str, ...]] = []
+    trainings = set()
+    for config, name in zip(configs, names, strict=True):
+        one = (config.model.name, _recipe(config))
+        again = (one, config.seed) in trainings
+        trainings.add((one, config.seed))
+        recipes.append((*one, name) if again else one)
     several = {name for name, *_ in recipes if len({one for one in recipes if one[0] == name}) > 1}
     firsts = dict(reversed([*zip(recipes, names, strict=True)]))
     return [f"{one[0]} ({firsts[one]})" if one[0] in several else one[0] for one in recipes]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.networks.model import load_model
 from csph.training.config import ModelConfig, preset
 from csph.weights.cards import checkpoint_of
+from csph.weights.shipped import ship
 from render.transient import write_transient
 from render.transient.packs import write_pack
 from scene2spad.bench import network as bench
@@ -168,6 +170,34 @@ def test_trainings_by_other_recipes_are_groups_of_their_own():
     ]
     names = group_names([coded, *others], ["a", "b", "c", "d", "e"])
     assert names == [f"fourier 1024x1x1 K8, compact ({one})" for one in "abcde"]
+
+
+def test_what_a_training_began_with_is_of_its_recipe():
+    """Another start is another recipe, whatever the seed; names of the same weights do not count. A second checkpoint
+    of one seed is no further training."""
+    config = preset("smoke", ModelConfig(front="matched"))
+    begun = replace(config, seed=1, data={"init": "a", "init_sha256": "1" * 64})
+    others = [
+        replace(begun, seed=2, data={"init": "b", "init_sha256": "1" * 64}),
+        replace(begun, seed=3, data={"init": "a", "init_sha256": "2" * 64}),
+        replace(begun, seed=4, data={"init_network": "a", "init_sha256": "1" * 64}),
+        replace(begun, seed=5, init_share=0.5),
+        replace(config, threads=2),
+    ]
+    named = group_names([config, begun, *others], [*"abcdefg"])
+    assert [name.removeprefix("no compression, compact ") for name in named] == [f"({one})" for one in "abbdefg"]
+
+
+def test_the_same_weights_twice_are_refused(capfd, packed, trained, tmp_path):
+    """Under another name, and as they are shipped, in half precision: they counted as two seeds."""
+    copy = tmp_path / "copy.safetensors"
+    shutil.copy(trained / "model.safetensors", copy)
+    for other in (copy, ship(trained, "half", tmp_path)):
+        said = refused(
+            capfd, "evaluate", str(trained), str(other), "--set", str(packed), "--out", str(tmp_path / "out")
+        )
+        assert f"{trained} and {other} are the same weights; give them once" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_models_are_listed_with_their_limits(capfd):
