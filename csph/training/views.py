@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from spad.detection.training_patches import PackedViews, pack_views
 from spad.sensor.model import Sensor
 
 SEEN, KEY_DIGITS = "training-views.txt", 12  # of a run: the keys of the views that it was trained on
+SEED_NOTE = re.compile(r"procedural, \w+ view \d+ of seed (\d+)")  # of a scene of an endless set
 VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
 
 
@@ -41,6 +43,7 @@ def read_views(path: Path) -> Views:
         packed = read_pack(path)
         transients, scenes = list(packed), [_scene(meta, i) for i, meta in enumerate(packed.metas)]
     require(bool(transients), f"{path}: the set is empty")
+    scenes = scenes_by_seed(scenes, transients)
     for transient, scene in zip(transients, scenes, strict=True):
         displaced = any(transient.meta.get("laser", {}).get("baseline_m", (0, 0, 0)))
         require(not displaced, f"{path}: the laser of {scene} is not at the camera, its path is not twice the depth")
@@ -56,6 +59,26 @@ def _from_folder(path: Path) -> tuple[list[Transient], list[str]]:
 def _scene(meta: JsonObject, number: int) -> str:
     """Return the scene that a view shows: views of one place are not independent, whatever their numbers."""
     return str(meta.get("place", meta.get("scene", number)))
+
+
+def set_seed(meta: JsonObject) -> int | None:
+    """Return the seed of the endless set that a view's scene is of, by the scene's notes; None where they name none."""
+    notes = meta.get("notes")
+    found = [SEED_NOTE.match(note) for note in notes if isinstance(note, str)] if isinstance(notes, list) else []
+    return next((int(one[1]) for one in found if one is not None), None)
+
+
+def name_with_seed(scene: str, view: Transient) -> str:
+    """Return a scene's name with the seed of its set: the same number under another seed is another scene."""
+    seed = set_seed(view.meta)
+    suffix = f" of seed {seed}"
+    return scene if seed is None or scene.endswith(suffix) else f"{scene}{suffix}"
+
+
+def scenes_by_seed(scenes: Sequence[str], transients: Sequence[Transient]) -> list[str]:
+    """Return the scenes' names, with the seeds of their sets where there are several."""
+    several = len({set_seed(view.meta) for view in transients}) > 1
+    return [name_with_seed(*pair) for pair in zip(scenes, transients, strict=True)] if several else list(scenes)
 
 
 def split_views(views: Views, fraction: float = VALIDATION_FRACTION) -> tuple[Views, Views]:

@@ -47,6 +47,7 @@ def pack_set(folder: Path, path: Path, progress: Progress | None = None, *, coun
             except InputError as error:
                 raise InputError(f"{error}; delete it, and `dataset` renders it again") from None
             kept = {key: transient.meta[key] for key in ("camera", "laser", "scene_sha256")}
+            kept["notes"] = transient.meta.get("notes", [])  # they name the seed of the set
             yield transient, record | kept | {"time_offset_m": transient.meta.get("time_offset_m", 0.0)}
 
     return write_pack(views(), path)

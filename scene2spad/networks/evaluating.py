@@ -16,7 +16,7 @@ from csph.training.config import TrainConfig
 from csph.training.views import Views, check_truth, read_seen, training_parts, view_key
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
-from scene2spad.datasets.renders import views_at
+from scene2spad.datasets.renders import unsure_scenes, views_at
 from scene2spad.networks.training import baseline, common_tile, network_method
 from scene2spad.options.networks import Evaluate
 from scenes.errors import InputError, require
@@ -90,7 +90,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     shown = results(found, groups, first, command.json)
     if command.levels:
         shown["by_level"] = by_level(found, groups, command.json)
-    shown |= _counted(found, command.set, sensor.recorded_range_m)
+    shown |= _counted(found, command.set, sensor.recorded_range_m) | _scenes_counted(command.set, views)
     return {**shown, "overflows": sum(overflows), "csv": str(table)}
 
 
@@ -105,6 +105,18 @@ def _counted(found: Evaluation, path: Path, range_m: float) -> dict[str, int]:
         message = "%s: %d of %d pixels lie beyond the %.4g m that the sensor records: errors are of the others"
         log.warning(message, path, beyond, within + beyond, range_m)
     return {"pixels_within_range": within, "beyond_range": beyond}
+
+
+def _scenes_counted(path: Path, views: Views) -> dict[str, int]:
+    """Count the scenes that intervals are over, and the views whose scene is known by a name alone, which a warning
+    tells."""
+    scenes, unsure = len(set(views.scenes)), unsure_scenes(path, views)
+    if unsure:
+        message = (
+            "%s: scenes of %d of %d views are known by name alone: intervals count each name as one scene, %d in all"
+        )
+        log.warning(message, path, unsure, len(views.scenes), scenes)
+    return {"scenes": scenes, "unsure_scenes": unsure}
 
 
 def _as_a_whole(config: TrainConfig, views: Views) -> int:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,8 +99,46 @@ def test_evaluate_takes_views_of_several_sizes(capfd, folder):
     assert found["mae_mm"] > 0
 
 
+def test_a_folder_of_views_has_the_scenes_of_its_sets(capfd, folder):
+    """Views of one room were several scenes in a folder, and one in the set; rooms of two seeds with one number were
+    one."""
+    shown = {}
+    for seed in (0, 7):
+        for number in (0, 1, 6):
+            meta = {"scene": f"rooms/val/{number}", "notes": [f"procedural, val view {number} of seed {seed}: camera"]}
+            shown[f"{seed}-{number}"] = replace(wall(2.0 + 0.1 * len(shown)), meta=meta)
+    (folder / "views").mkdir()
+    for name, view in shown.items():
+        write_transient(view, folder / f"views/{name}.exr")
+    room = "rooms/val/room"
+    expected = [f"{room} {number} of seed {seed}" for seed in (0, 7) for number in (0, 0, 1)]
+    assert [*views_at(folder / "views").scenes] == expected
+    asked = ("evaluate", MODEL, "--levels", "10+10", "--baselines", "argmax", "--set")
+    found = answer(capfd, *asked, "views")
+    assert found["scenes"] == 4 and found["unsure_scenes"] == 0
+    # as in the set and in its pack, whose index names the places
+    for path in (folder / "views").glob("7-*"):
+        path.unlink()
+    assert [*views_at(folder / "views").scenes] == [f"{room} 0", f"{room} 0", f"{room} 1"]
+
+
+def test_scenes_known_by_name_alone_are_told(capfd, folder):
+    """Two views of an RGB-D camera: their file does not say of what. Nor of which seed a numbered view is."""
+    asked = ["evaluate", MODEL, "--levels", "10+10", "--baselines", "argmax", "--set", "renders"]
+    assert main(asked) == 0
+    said = capfd.readouterr().err
+    assert (
+        "renders: scenes of 2 of 2 views are known by name alone: intervals count each name as one scene, 1 in" in said
+    )
+    write_transient(replace(wall(2.5), meta={"scene": "rooms/val/3"}), folder / "renders/c.exr")
+    write_transient(replace(wall(2.6), meta={"scene": "tabletop/bowl"}), folder / "renders/d.exr")
+    assert answer(capfd, *asked)["unsure_scenes"] == 3
+
+
 def test_a_set_is_read_in_the_order_of_its_index(capfd, folder):
     answer(capfd, "dataset", "clutter", "--count", "2", "--width", "8", "--bounces", "1", "--out", "set")
     assert [path.name for path in transient_files(folder / "set")] == ["000000.exr", "000001.exr"]
+    assert [*views_at(folder / "set/views").scenes] == [*views_at(folder / "set").scenes]
+    assert [*views_at(folder / "set").scenes] == ["clutter/train/0", "clutter/train/1"]
     found = answer(capfd, "depth", "set", "--no-figure", "--out", "maps")
     assert found["views"] == 2 and (folder / "maps/000001-log-matched.exr").is_file()
