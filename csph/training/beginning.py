@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Set
 from dataclasses import asdict, replace
 from typing import NamedTuple
 
@@ -11,17 +12,41 @@ from csph.layer import LayerOptions
 from csph.networks.model import DepthModel
 from csph.training.config import ModelConfig, TrainConfig, grows
 from scenes.errors import require
+from scenes.json_types import JsonObject
 
 log = logging.getLogger("csph")
 
 
-class NetworkOf(NamedTuple):
-    """A trained model whose network alone a training begins with."""
+class WeightsOf(NamedTuple):
+    """A trained model that a training begins with, and what it was trained on in its turn.
+
+    ancestors   the model and those before it, nearest first: SHA-256 of each one's weights and, where they are known,
+                of its training sets (`csph.training.lineage`)
+    seen        keys of the views that all of them were trained on (`csph.training.views.view_key`)
+    """
 
     model: DepthModel
+    ancestors: tuple[JsonObject, ...] = ()
+    seen: Set[str] = frozenset()
 
 
-def check_init(init: DepthModel | NetworkOf | None, config: TrainConfig) -> None:
+class NetworkOf(NamedTuple):
+    """A trained model whose network alone a training begins with; the rest as in `WeightsOf`."""
+
+    model: DepthModel
+    ancestors: tuple[JsonObject, ...] = ()
+    seen: Set[str] = frozenset()
+
+
+Beginning = DepthModel | WeightsOf | NetworkOf
+
+
+def what_is_known(init: Beginning) -> WeightsOf | NetworkOf:
+    """Return the model that a training begins with, and what it was trained on: nothing is known of a bare model."""
+    return WeightsOf(init) if isinstance(init, DepthModel) else init
+
+
+def check_init(init: Beginning | None, config: TrainConfig) -> None:
     """Raise InputError unless a trained model fits the one to be trained, but for converters of its sensor; and for a
     share of the weights of none. Warn where only switches of the layer differ: the network then meets other inputs."""
     network_alone = isinstance(init, NetworkOf)
@@ -29,7 +54,7 @@ def check_init(init: DepthModel | NetworkOf | None, config: TrainConfig) -> None
     require(not shared, f"training: init_share {config.init_share:g} needs a model to begin with")
     if init is None:
         return
-    mine, other = config.model, (init.model if isinstance(init, NetworkOf) else init).config
+    mine, other = config.model, what_is_known(init).model.config
     names = ("network", "sensor") if network_alone else ("front", "network", "design", "sensor")
     bare = [replace(one, sensor=replace(one.sensor, name="", tdc=None)) for one in (mine, other)]
     differ = [name for name in names if name != "network" and getattr(bare[0], name) != getattr(bare[1], name)]

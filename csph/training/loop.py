@@ -9,6 +9,7 @@
     energy.csv          energy of a learned temporal code by groups of time bins, now and then from the start on
     last.safetensors    weights after the last step
     training-views.txt  short hashes of the views that it is trained on, by which `evaluate` knows them again
+    ancestor-views.txt  those of the models that it began with, where they are known
     resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
 
 Devices, precision and several GPUs are Lightning's; nothing here knows how many there are.
@@ -38,7 +39,7 @@ from csph.networks.grid import on_published_grid, published_target
 from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
 from csph.networks.posterior import DECODERS
 from csph.networks.published import soft_argmax
-from csph.training.beginning import NetworkOf, check_init
+from csph.training.beginning import Beginning, NetworkOf, check_init, what_is_known
 from csph.training.config import TrainConfig
 from csph.training.data import SetData, TrainBatch
 from csph.training.loss import decoded_error, kl_divergence, total_variation
@@ -75,14 +76,14 @@ class DepthTraining(pl.LightningModule):
     """KL divergence to the pulse at the label, plus total variation and coherence where asked; Adam or Muon, and an
     average of the weights where asked."""
 
-    def __init__(self, config: TrainConfig, init: DepthModel | NetworkOf | None = None) -> None:
+    def __init__(self, config: TrainConfig, init: Beginning | None = None) -> None:
         super().__init__()
         self.config = config
         self.model = DepthModel(config.model, config.seed)
         if isinstance(init, NetworkOf):
             self.model.begin_with_network(init.model)
         elif init is not None:
-            self.model.begin_with(init)
+            self.model.begin_with(what_is_known(init).model)
         self.averaged: DepthModel | None = None
         # a plain list: no part of the state, since a run that goes on begins with the same model
         self.begun = [part.detach().clone() for part in self.model.parameters()] if config.init_share else []
@@ -264,17 +265,16 @@ def _listed(views: Views | Sequence[Views]) -> list[Views]:
     return [views] if isinstance(views, Views) else list(views)
 
 
-def _with_hashes(
-    config: TrainConfig, sets: Sequence[Sequence[PackedViews]], init: DepthModel | NetworkOf | None
-) -> TrainConfig:
+def _with_hashes(config: TrainConfig, sets: Sequence[Sequence[PackedViews]], init: Beginning | None) -> TrainConfig:
     """Return the configuration with the SHA-256 of its sets and of the weights it begins with: a run that goes on must
-    have begun with the same."""
-    data: dict[str, str | list[str]] = {}
+    have begun with the same. Beside them what those weights were trained on, as far as it is known."""
+    data: JsonObject = {}
     for name, packs in zip(("training", "validation"), sets, strict=True):
         hashes = [packed_sha256(packed) for packed in packs]
         data[f"{name}_sha256"] = hashes[0] if len(hashes) == 1 else hashes
     if init is not None:
-        data["init_sha256"] = weights_sha256(init.model if isinstance(init, NetworkOf) else init)
+        data["init_sha256"] = weights_sha256(what_is_known(init).model)
+        data["ancestors"] = [*what_is_known(init).ancestors] or [{"sha256": data["init_sha256"]}]
     return replace(config, data={**config.data, **data})
 
 
@@ -324,17 +324,17 @@ def train(
     validation: Views | Sequence[Views],
     folder: Path,
     *,
-    init: DepthModel | NetworkOf | None = None,
+    init: Beginning | None = None,
     hardware: Hardware = ANY_HARDWARE,
     progress: Progress | None = None,
 ) -> JsonObject:
     """Run a configuration to its end in a folder, or go on where an interrupted run of the same configuration stopped.
 
     Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
-    the same design to begin with, instead of random weights, or `NetworkOf` one of any design on the same sensor, whose
-    codes begin anew. No result depends on `hardware`, but for the order of sums on several devices. Returns steps,
-    seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of parameters. Raises
-    InputError for sets or an `init` that do not fit, indirect light on the published grid, and another run's folder.
+    the same design to begin with (`WeightsOf`: with what it was trained on), or `NetworkOf` one of any design on the
+    same sensor, whose codes begin anew. No result depends on `hardware`, but for the order of sums on several devices.
+    Returns steps, seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of
+    parameters. Raises InputError for sets or an `init` that do not fit, and another run's folder.
     """
     config.check_memory()
     check_init(init, config)
@@ -350,7 +350,7 @@ def train(
         runner = _trainer(config, record, hardware)
     module = DepthTraining(config, init)
     claim_run(folder, config)  # once the model is known to be possible
-    write_seen(folder, _listed(training))
+    write_seen(folder, _listed(training), frozenset() if init is None else what_is_known(init).seen)
     if config.threads:
         torch.set_num_threads(config.threads)
     retain_freed_memory()

@@ -35,8 +35,10 @@ def claim_run(folder: Path, config: TrainConfig) -> None:
             there = TrainConfig.from_dict(known).to_dict()
         except InputError:
             raise InputError(f"{refusal}; choose another --out") from None
-        asked = json.loads(json.dumps(config.to_dict()))
-        differing = _differences(json.loads(json.dumps(there)), asked)
+        stood, asked = (json.loads(json.dumps(one)) for one in (there, config.to_dict()))
+        for one in (stood, asked):  # runs of before kept none; the hash of what a run began with decides
+            one["data"].pop("ancestors", None)
+        differing = _differences(stood, asked)
         require(not differing, f"{refusal} ({'; '.join(differing[:3])}); choose another --out")
         return
     require(is_unclaimed(folder), f"{folder}: is not an empty folder and holds no run; choose another --out")

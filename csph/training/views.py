@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from spad.detection.training_patches import PackedViews, pack_views
 from spad.sensor.model import Sensor
 
 SEEN, KEY_DIGITS = "training-views.txt", 12  # of a run: the keys of the views that it was trained on
+ANCESTORS_SEEN = "ancestor-views.txt"  # of a run: those that the models it began with were trained on
 SEED_NOTE = re.compile(r"procedural, \w+ view \d+ of seed (\d+)")  # of a scene of an endless set
 VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
 
@@ -143,25 +144,40 @@ def training_parts(views: Views) -> dict[str, int]:
 
 
 def view_key(view: Transient) -> str:
-    """Return a short hash of what a view shows: true depth as a pack holds it, and which pixels are mixed.
+    """Return a short hash of what a view shows: its true depth as a pack holds it.
 
-    The same for a view in a folder, which has finer steps, and in the pack that is made of it.
+    The same for a view in a folder, which has finer steps, and in the pack that is made of it; with indirect light and
+    without. Which pixels are mixed does not count: two renders of a view may differ in it.
     """
-    sha = hashlib.sha256(f"{view.height}x{view.width}".encode())
-    sha.update(depth_steps(view.depth_m).astype("<f8").tobytes())
-    sha.update(view.mixed.astype(np.uint8).tobytes())
-    return sha.hexdigest()[:KEY_DIGITS]
+    return _short_hash(_shown(view))
 
 
-def write_seen(folder: Path, sets: Iterable[Views]) -> None:
-    """Keep the keys of all training views in a run's folder, sorted, one a line."""
-    keys = sorted({view_key(view) for views in sets for view in views.transients})
-    with whole_file(folder / SEEN) as beside:
-        beside.write_text("".join(f"{key}\n" for key in keys))
+def _shown(view: Transient) -> bytes:
+    return f"{view.height}x{view.width}".encode() + depth_steps(view.depth_m).astype("<f8").tobytes()
 
 
-def read_seen(checkpoint: Path) -> set[str] | None:
-    """Return the keys of the views that a run's folder, or a checkpoint in one, was trained on; None where nobody kept
-    them, as of runs of before."""
-    path = (checkpoint if checkpoint.is_dir() else checkpoint.parent) / SEEN
-    return set(path.read_text(errors="replace").split()) if path.is_file() else None
+def _short_hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:KEY_DIGITS]
+
+
+def is_seen(view: Transient, keys: Set[str]) -> bool:
+    """Tell whether a view is among those of some keys, of runs of before, too, whose keys held the mixed pixels."""
+    before = _short_hash(_shown(view) + view.mixed.astype(np.uint8).tobytes())
+    return not keys.isdisjoint((view_key(view), before))
+
+
+def write_seen(folder: Path, sets: Iterable[Views], inherited: Set[str] = frozenset()) -> None:
+    """Keep the keys of all training views in a run's folder, sorted, one a line; beside them, if any, the `inherited`
+    ones of the models that the run began with."""
+    own = {view_key(view) for views in sets for view in views.transients}
+    for name, keys in ((SEEN, own), (ANCESTORS_SEEN, inherited)):
+        if keys or name == SEEN:
+            with whole_file(folder / name) as beside:
+                beside.write_text("".join(f"{key}\n" for key in sorted(keys)))
+
+
+def read_seen(checkpoint: Path, name: str = SEEN) -> frozenset[str] | None:
+    """Return the keys of the views that a run's folder, or a checkpoint in one, was trained on (SEEN), or its ancestors
+    (ANCESTORS_SEEN); None where nobody kept them, as of runs of before."""
+    path = (checkpoint if checkpoint.is_dir() else checkpoint.parent) / name
+    return frozenset(path.read_text(errors="replace").split()) if path.is_file() else None

@@ -7,13 +7,15 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 
 from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, EvaluationPlan, Method, as_dicts, evaluate
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.networks.model import DepthModel, load_model, tensors_sha256
 from csph.training.config import TrainConfig
-from csph.training.views import Views, check_truth, read_seen, training_parts, view_key
+from csph.training.lineage import count_seen
+from csph.training.views import Views, check_truth, training_parts
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.renders import unsure_scenes, views_at
@@ -64,12 +66,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         fits = 1 <= command.views <= there
         require(fits, f"evaluate: views {command.views} is outside 1 to {there} of {command.set}")
         views = Views(views.transients[: command.views], views.scenes[: command.views])
-    for path, (_, config, _) in zip(command.checkpoints, loaded, strict=True):
-        seen = read_seen(checkpoint_of(path))
-        number = _as_a_whole(config, whole) if seen is None else sum(view_key(v) in seen for v in views.transients)
-        if number:
-            message = "%s was trained on %d views of %s: its errors there are not those of a test"
-            log.warning(message, path, number, command.set)
+    warn_of_seen(command, [config for _, config, _ in loaded], views, whole)
     check_truth(command.set, views, sensor, command.offset)
     overflows: list[int] = []
     methods: dict[str, Method] = {}
@@ -119,12 +116,23 @@ def _scenes_counted(path: Path, views: Views) -> dict[str, int]:
     return {"scenes": scenes, "unsure_scenes": unsure}
 
 
-def _as_a_whole(config: TrainConfig, views: Views) -> int:
-    """Return how many views of a set a run was trained on that kept one hash of all: 0 unless they are the whole set,
-    or the part of it that `training_parts` knows."""
-    hashes, parts = config.data.get("training_sha256", []), training_parts(views)
-    seen = [parts[one] for one in ([hashes] if isinstance(hashes, str) else hashes) if one in parts]
-    return seen[0] if seen else 0
+def warn_of_seen(command: Evaluate, configs: Sequence[TrainConfig], views: Views, whole: Views) -> None:
+    """Warn of networks that were trained on views they are evaluated on, themselves or by way of those that they began
+    with; `whole` is the set that the views are of."""
+    parts = cache(lambda: training_parts(whole))
+    for path, config in zip(command.checkpoints, configs, strict=True):
+        seen = count_seen(checkpoint_of(path), config, views, parts)
+        if seen.own:
+            message = "%s was trained on %d views of %s: its errors there are not those of a test"
+            log.warning(message, path, seen.own, command.set)
+        if seen.inherited:
+            message = (
+                "%s began with a model that was trained on %d views of %s: its errors there are not those of a test"
+            )
+            log.warning(message, path, seen.inherited, command.set)
+        if seen.unknown:
+            message = "%s began with %s: whether on views of %s, is not known"
+            log.info(message, path, ", ".join(seen.unknown), command.set)
 
 
 def check_different(models: Sequence[DepthModel], paths: Sequence[Path]) -> None:

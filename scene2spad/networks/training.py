@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,9 +17,11 @@ from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.codes.design import Design
 from csph.evaluation.methods import DepthEstimator, Method
 from csph.layer import SpatialStart
-from csph.networks.model import DepthModel, load_model
-from csph.training.beginning import NetworkOf, check_init
+from csph.networks.model import DepthModel
+from csph.training.beginning import NetworkOf, WeightsOf, check_init
 from csph.training.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
+from csph.training.lineage import begin_with
+from csph.training.overlap import overlap
 from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
@@ -30,6 +33,8 @@ from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
 from spad.formats.histogram import Histogram
 from spad.sensor.files import load_sensor
 from spad.sensor.model import Sensor
+
+log = logging.getLogger("scene2spad")
 
 PLANES = "planes"  # the set that needs no renderer
 PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "gpu": 4000, "paper": 13851}
@@ -138,7 +143,23 @@ def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, object
     else:
         parts = [_split(path, views) for path, views in zip(command.set, sets, strict=True)]
         training, validation = [first for first, _ in parts], [second for _, second in parts]
+    check_apart(command, training, validation)
     return training, validation, {**common, "training_reach_m": max(map(training_reach_m, training), default=0.0)}
+
+
+def check_apart(command: Train, training: Sequence[Views], validation: Sequence[Views]) -> None:
+    """Raise InputError where a validation set holds nothing but training views. Warn of validation views that are
+    trained on, and of those whose scenes are: also of sets that share scenes, each of which is split by itself."""
+    found = overlap(training, validation)
+    if found.same_views and command.validation:
+        for path, views in zip(command.validation, validation, strict=True):
+            one = overlap(training, [views])
+            message = f"train: --validation {path}: all its {one.views} views are in --set, too, and are trained on"
+            require(one.same_views < one.views, f"{message}; give views of other scenes")
+    if found.same_scenes:
+        cure = "give --validation views of other scenes"
+        message = "%d of %d validation views are trained on, %d show scenes that are: validation errors are too low; %s"
+        log.warning(message, found.same_views, found.views, found.same_scenes, cure)
 
 
 def _split(path: Path, views: Views) -> tuple[Views, Views]:
@@ -208,13 +229,12 @@ def run_train(command: Train, progress: Progress) -> dict:
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
 
 
-def begun_with(command: Train, config: TrainConfig) -> DepthModel | NetworkOf | None:
+def begun_with(command: Train, config: TrainConfig) -> WeightsOf | NetworkOf | None:
     """Return the model, or the model whose network alone, a training begins with; InputError for one that cannot."""
     begun = command.init or command.init_network
     if begun is None:
         return None
-    model = load_model(checkpoint_of(begun))[0]
-    init = NetworkOf(model) if command.init_network else model
+    init = begin_with(checkpoint_of(begun), network_alone=command.init_network is not None)
     check_init(init, config)
     return init
 

@@ -286,7 +286,8 @@ def test_a_dry_training_refuses_the_sets_that_the_run_refuses(capfd, tmp_path, m
     for name, words in expected.items():
         for dry in ((), ("--dry-run",)):
             assert words in refused(capfd, "train", *QUICK, "--out", "x", "--set", name, *dry)
-    assert run(capfd, "train", *QUICK, "--set", "one.h5", "--validation", "one.h5", "--dry-run")["dry_run"]
+    planes_pack(Path("other.h5"), [wall(4.0, 8)], "b")
+    assert run(capfd, "train", *QUICK, "--set", "one.h5", "--validation", "other.h5", "--dry-run")["dry_run"]
 
 
 @pytest.mark.parametrize("option", ["--init", "--init-network"])

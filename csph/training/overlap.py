@@ -1,0 +1,52 @@
+"""Views and scenes that are trained on and validated on, too: errors there say nothing of other scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from csph.training.views import Views, name_with_seed, set_seed, view_key
+from render.transient import Transient
+
+
+class Overlap(NamedTuple):
+    """Numbers of validation views: all, those that are trained on, and those of scenes that are trained on."""
+
+    views: int
+    same_views: int
+    same_scenes: int
+
+
+def overlap(training: Sequence[Views], validation: Sequence[Views]) -> Overlap:
+    """Count the validation views that are among the training views, and those whose scenes are.
+
+    Sets of different seeds have scenes of the same names, and packs of before name no seed: scenes are the same where
+    both name and seed are, or a view of each shows the same surfaces by the same camera.
+    """
+    trained_views = {view_key(view) for views in training for view in views.transients}
+    trained_scenes = {key for views in training for keys in _keys_by_scene(views).values() for key in keys}
+    number = same_views = same_scenes = 0
+    for views in validation:
+        shared = {scene for scene, keys in _keys_by_scene(views).items() if keys & trained_scenes}
+        number += len(views.scenes)
+        same_views += sum(view_key(view) in trained_views for view in views.transients)
+        same_scenes += sum(scene in shared for scene in views.scenes)
+    return Overlap(number, same_views, same_scenes)
+
+
+def _keys_by_scene(views: Views) -> dict[str, set[str]]:
+    found: dict[str, set[str]] = {}
+    for view, scene in zip(views.transients, views.scenes, strict=True):
+        found.setdefault(scene, set()).update(_scene_keys(view, scene))
+    return found
+
+
+def _scene_keys(view: Transient, scene: str) -> set[str]:
+    """Return what tells the scene of a view: what it shows, its surfaces and camera, its name with the set's seed."""
+    keys = {view_key(view)}
+    digest = view.meta.get("scene_sha256")
+    if isinstance(digest, str):
+        keys.add(digest)
+    if set_seed(view.meta) is not None:
+        keys.add(name_with_seed(scene, view))
+    return keys
