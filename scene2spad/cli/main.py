@@ -169,7 +169,10 @@ def parse_command(argv: list[str]) -> Common:
 def _one_line(box: str) -> str:
     """tyro explains errors in a box of several lines: its sentences in one line."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)
-    lines = [re.sub(r"[│╭╮╰╯─|]+", " ", line).strip() for line in plain.splitlines()]
+    written = plain.splitlines()
+    if plain.startswith(("╭", " ")):  # the box's title, which stands again in the first sentence; a space without UTF-8
+        written = written[1:]
+    lines = [re.sub(r"[│╭╮╰╯─|]+", " ", line).strip() for line in written]
     text = " ".join(line for line in lines if line and not set(line) <= set("-=_ "))
     text = re.sub(r"\s+", " ", text).removeprefix("Parsing error ").removeprefix("Invalid choice ").strip()
     choice = re.search(r"invalid choice '(.*?)' for argument '.*?'\. Expected one of \((.*?)\)", text)

@@ -49,6 +49,14 @@ def test_a_mistyped_word_is_answered_with_the_one_that_was_meant(words, meant, c
     assert "Unrecognized options Unrecognized" not in err and "invalid choice invalid" not in err.lower()
 
 
+def test_a_word_too_many_is_told_once(capsys):
+    """tyro's box has its title above the same words."""
+    status, _, err = run(capsys, "evaluate", "none-s0", "--set", "a.h5", "b.h5")
+    assert status == 2 and err == "scene2spad: Unrecognized options: b.h5 (see scene2spad evaluate --help)\n"
+    status, _, err = run(capsys, "evaluate", "none-s0", "--set")
+    assert status == 2 and err.startswith("scene2spad: Missing value for argument '--set'") and err.count("\n") == 1
+
+
 def test_alone_it_prints_its_help_and_version_its_version(capsys):
     status, out, _ = run(capsys)
     assert status == 0 and "render" in out and "usage" in out.lower()
