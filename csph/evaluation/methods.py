@@ -7,12 +7,14 @@ all, low and high signal-to-background levels, with intervals over scenes (`csph
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 
+from csph.evaluation.exposures import Plans, asked_law
 from csph.evaluation.metrics import (
     PHOTON_LEVELS,
     TOLERANCES_MM,
@@ -30,7 +32,7 @@ from scenes.errors import require
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from scenes.random_streams import Stream
-from spad.detection.detect import sense
+from spad.detection.detect import Model, sense
 from spad.formats.bistatic import recorded_range_m
 from spad.formats.histogram import TRUTH, Histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -54,7 +56,8 @@ class DepthEstimator(Protocol):
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one group of pixels of one image; `pixels` counted, `missing` had no estimate and were left out."""
+    """One method on one group of pixels of one image; `pixels` counted, `missing` had no estimate and were left out;
+    `law` drew the photons (tables without it are older, and of Poisson's)."""
 
     method: str
     scene: str
@@ -72,14 +75,22 @@ class Row:
     pixels: int
     missing: int
     beyond_range: int
+    law: str = "poisson"
 
 
 @dataclass
 class Evaluation:
-    """Rows of every method and image, and each method's estimates beside the truth, for what depends on depth."""
+    """Rows of every method and image, each method's estimates beside the truth, for what depends on depth, and what the
+    plans of the exposures say."""
 
     rows: list[Row] = field(default_factory=list)
     depths: dict[str, list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
+    plans: Plans = field(default_factory=Plans)
+
+    def laws(self) -> dict[str, int]:
+        """Return how many exposures each detection law drew."""
+        exposures = dict.fromkeys((row.view, row.signal, row.background, row.law) for row in self.rows)
+        return dict(Counter(law for *_, law in exposures))
 
     def values(
         self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
@@ -133,12 +144,15 @@ class EvaluationPlan:
     tile       rows and columns of which images are cut to whole numbers after sensing
     offset_m   moves the scenes away in time alone (`Transient.delayed`)
     seed       of the photons
+    law        detection law, as of `spad.sense`; None: poisson, which networks are trained by, up to 1 % detections a
+               cycle in the mean pixel of a level, and auto above
     """
 
     levels: Sequence[tuple[float, float]] = PHOTON_LEVELS
     tile: tuple[int, int] = (1, 1)
     offset_m: float = 0.0
     seed: int = 0
+    law: Model | None = "poisson"
 
 
 PUBLISHED_LEVELS = EvaluationPlan()
@@ -169,7 +183,9 @@ def evaluate(
         for number, (signal, background) in enumerate(plan.levels):
             report(f"{scene}, {signal:g} + {background:g} photons", (view * len(plan.levels) + number) / total)
             draw = np.random.SeedSequence(plan.seed, spawn_key=(Stream.EVALUATE, view, number)).generate_state(1)[0]
-            histogram = sense(moved, sensor, PhotonBudget(signal, background), seed=int(draw), model="poisson")
+            budget = PhotonBudget(signal, background)
+            histogram = sense(moved, sensor, budget, seed=int(draw), model=asked_law(plan.law, sensor, budget))
+            result.plans.add(histogram, f"{scene}, {signal:g} + {background:g} photons", plan.law is None)
             histogram = _tiled(histogram, plan.tile)
             for name, method in methods.items():
                 estimate = method(histogram)
@@ -195,7 +211,8 @@ def _rows(
     groups = grouped_errors(estimate, histogram.depth_m, histogram.mixed, recorded_range_m(histogram))
     for group, errors in groups.items():
         kept = {key: errors[key] for key in (*FIGURES, "pixels", "missing", "beyond_range")}
-        yield Row(method, scene, view, *level, group, ssim=errors.get("ssim", math.nan), **kept)
+        law = histogram.meta["model"]
+        yield Row(method, scene, view, *level, group, ssim=errors.get("ssim", math.nan), law=law, **kept)
 
 
 def as_dicts(rows: Iterable[Row]) -> list[JsonObject]:

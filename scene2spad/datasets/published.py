@@ -265,6 +265,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     require(not command.levels, "evaluate: --levels does not go with --set published, whose 16 levels are the paper's")
     given = {
         "--decoder": command.decoder,
+        "--law": command.law,
         "--tiled": command.tiled,
         "--views": command.views,
         "--int8": command.int8,

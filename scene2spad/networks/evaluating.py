@@ -79,16 +79,34 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     methods |= {name: baseline(name) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
     tile = common_tile(models) if command.tiled else (1, 1)
-    plan = EvaluationPlan(photon_levels(command.levels), tile, command.offset, command.seed)
+    plan = EvaluationPlan(photon_levels(command.levels), tile, command.offset, command.seed, command.law)
     found = evaluate(methods, views, sensor, plan, progress=progress)
+    _report_plans(found, command.law)
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
     first = f"{designs[0]}{in_8_bits if command.int8 else ''}"
     shown = results(found, groups, first, command.json)
     if command.levels:
         shown["by_level"] = by_level(found, groups, command.json)
+    shown["laws"] = found.laws()
     shown |= _counted(found, command.set, sensor.recorded_range_m) | _scenes_counted(command.set, views)
     return {**shown, "overflows": sum(overflows), "csv": str(table)}
+
+
+def _report_plans(found: Evaluation, law: str | None) -> None:
+    """Log what the plans of all exposures say, each line once, and by default where pile-up was left out."""
+    for message in found.plans.messages():
+        log.log(logging.WARNING if message.startswith("warning:") else logging.INFO, "%s", message)
+    left_out = found.plans.left_out
+    if law is None and left_out is not None:
+        log.info(
+            "law: poisson, the default; in %d of %d exposures pile-up matters in the brightest pixel (up to %.2g%% "
+            "primary detections a cycle: %s), which --law auto draws",
+            left_out.exposures,
+            found.plans.exposures,
+            100 * left_out.pile_up,
+            left_out.where,
+        )
 
 
 def _counted(found: Evaluation, path: Path, range_m: float) -> dict[str, int]:
@@ -181,7 +199,7 @@ def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> lis
         for name, members in groups.items():
             found_here = {key: here.interval(members, figure=key) for key in ("mae_mm", "within_10mm")}
             means = {key: math.nan if one is None else one.mean for key, one in found_here.items()}
-            lines.append({"signal": signal, "background": background, "method": name, **means})
+            lines.append({"signal": signal, "background": background, "method": name, **means, "laws": here.laws()})
     if full:
         return lines
     return [

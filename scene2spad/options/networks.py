@@ -139,6 +139,12 @@ class Evaluate(Common):
     """Estimators of `depth`, and CODE-K decoded without a network."""
     levels: tuple[str, ...] = ()
     """Photon levels, mean signal + background a pixel, as in 1+100 3+3 (default: the paper's 16); each gets a line."""
+    law: Annotated[
+        Literal["auto", "poisson", "first-photon", "free-running"] | None,
+        may_stay_open("{auto,poisson,first-photon,free-running}"),
+    ] = None
+    """Detection law; auto chooses for every exposure by its brightest pixel, as `sense` does (default: poisson, which
+    networks are trained by, up to 1 % detections a cycle in the mean pixel of a level; auto above)."""
     views: Count = None
     """Only the first N views (default: all)."""
     offset: float = 0.0

@@ -30,7 +30,7 @@ def read_summary(path: Path) -> Summary:
     a table of another kind."""
     from csph.evaluation.methods import Evaluation, Row  # loads PyTorch, which a page without evaluations does not need
 
-    texts = ("method", "scene", "group")
+    texts = ("method", "scene", "group", "law")
     read = [{key: str(v) if key in texts else v for key, v in row.items()} for row in read_rows(path)]
     found = Evaluation([Row(**row) for row in read])  # type: ignore[arg-type]
     rows = []

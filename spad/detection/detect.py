@@ -205,6 +205,14 @@ def _versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in ("scene2spad", "numpy", "torch")}
 
 
+def mean_pixel_law(sensor: Sensor, budget: PhotonBudget) -> tuple[str, float]:
+    """Return the law that `auto` would choose were every pixel as bright as the mean one, and that pixel's primary
+    detections per cycle."""
+    recorded = budget.signal + budget.background * (sensor.bins / sensor.bins_per_period)
+    pile_up = _pile_up("auto", sensor, np.array([recorded]), np.array([budget.signal + budget.background]))
+    return choose_model("auto", pile_up, sensor)[0], pile_up
+
+
 def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
     """Choose the detection law for `pile_up` primary detections per cycle in the brightest pixel, and say why.
 

@@ -257,7 +257,14 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
         assert f"levels '{level}': expected" in refused(capfd, *evaluate, "--levels", level)
     paper = refused(capfd, "evaluate", str(trained), "--set", "published", "--levels", "1+1")
     assert "--levels does not go with --set published" in paper
-    for more in (("--int8",), ("--tiled",), ("--views", "2"), ("--decoder", "median"), ("--baselines", "argmax")):
+    for more in (
+        ("--int8",),
+        ("--tiled",),
+        ("--views", "2"),
+        ("--decoder", "median"),
+        ("--law", "auto"),
+        ("--baselines", "argmax"),
+    ):
         paper = refused(capfd, "evaluate", str(trained), "--set", "published", *more)
         assert f"{more[0]} does not go with --set published" in paper
     far = refused(capfd, "evaluate", str(trained), "--set", "published", "--baselines", "--offset", "20")

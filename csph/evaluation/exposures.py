@@ -1,0 +1,73 @@
+"""Laws that the exposures of an evaluation are drawn by, and what their plans say, once for all of them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from spad.detection.detect import Model, choose_model, mean_pixel_law
+from spad.formats.histogram import Histogram
+from spad.sensor.model import PhotonBudget, Sensor
+
+BY_DEFAULT = "model: poisson as asked"  # begins the line that says nothing where nobody asked
+
+
+def asked_law(law: Model | None, sensor: Sensor, budget: PhotonBudget) -> Model:
+    """Return the law to ask `sense` for: the one given, or, for None, poisson up to 1 % detections a cycle in the mean
+    pixel, which networks are trained by, and auto above."""
+    if law is not None:
+        return law
+    return "poisson" if mean_pixel_law(sensor, budget)[0] == "poisson" else "auto"
+
+
+class Told(NamedTuple):
+    """A line of the plans: of how many exposures one alike was, and the words, pile-up and place of that with most."""
+
+    exposures: int
+    words: str
+    pile_up: float
+    where: str
+
+
+@dataclass
+class Plans:
+    """What the plans of an evaluation's exposures say: lines that differ in numbers alone are one.
+
+    exposures  how many there were
+    lines      by the line without its numbers
+    left_out   exposures by the Poisson law for which `auto` would have taken another, whose pile-up is left out
+    """
+
+    exposures: int = 0
+    lines: dict[str, Told] = field(default_factory=dict)
+    left_out: Told | None = None
+
+    def add(self, histogram: Histogram, where: str, by_default: bool) -> None:
+        """Count the plan of one exposure; `by_default`: nobody asked for its law."""
+        meta, self.exposures = histogram.meta, self.exposures + 1
+        pile_up = float(meta["pile_up"])
+        if meta["model"] == "poisson" and choose_model("auto", pile_up, histogram.sensor)[0] != "poisson":
+            self.left_out = _counted(self.left_out, "", pile_up, where)
+        for words in meta["plan"]:
+            if by_default and words.startswith(BY_DEFAULT):
+                continue
+            kind = re.sub(r"\d\S*", "#", words)
+            self.lines[kind] = _counted(self.lines.get(kind), words, pile_up, where)
+
+    def messages(self) -> list[str]:
+        """Return every line with the numbers of the exposure with most pile-up, and how many exposures had it."""
+        if self.exposures == 1:
+            return [line.words for line in self.lines.values()]
+        return [
+            f"{line.words} ({line.exposures} of {self.exposures} exposures, numbers of {line.where})"
+            for line in self.lines.values()
+        ]
+
+
+def _counted(line: Told | None, words: str, pile_up: float, where: str) -> Told:
+    """Return a line counted once more, with these words where they are of more pile-up than it had."""
+    exposures = 1 if line is None else line.exposures + 1
+    if line is None or pile_up > line.pile_up:
+        return Told(exposures, words, pile_up, where)
+    return line._replace(exposures=exposures)
