@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -13,10 +14,13 @@ from csph.training.config import COUNT_BYTES, TrainConfig
 from csph.weights.shipped import TIMINGS
 from scene2spad.datasets.workers import check_workers
 from scene2spad.dry_runs.resources import Cost, memory, timed
+from scene2spad.networks.level_warnings import level_warnings
 from scene2spad.networks.training import begun_with, check_sets, config_of, folder_of
 from scene2spad.options.networks import Train
 from scenes.errors import require
 from scenes.io.inputs import read_json_object, read_whole_lines
+
+log = logging.getLogger("scene2spad")
 
 PILOT_STEPS = 3
 
@@ -36,6 +40,8 @@ def dry_run(command: Train) -> dict:
     check_workers(command.workers, least=0)
     check_sets(command)
     begun_with(command, config)
+    for warning in level_warnings(config):
+        log.warning("%s", warning)
     folder = folder_of(command)
     done = recorded_epochs(folder)
     if done is None:

@@ -26,6 +26,7 @@ from csph.training.views import Views, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.workers import check_workers
+from scene2spad.networks.level_warnings import level_warnings
 from scene2spad.options.networks import Train, check_used
 from scenes.errors import InputError, require
 from scenes.progress import Progress
@@ -213,6 +214,9 @@ def run_train(command: Train, progress: Progress) -> dict:
     from csph.training.loop import Hardware, train  # and Lightning, which takes seconds to import
 
     training, validation, data = views_of(command)
+    first = training[0].transients[0]
+    for warning in level_warnings(config, first.height, first.width):
+        log.warning("%s", warning)
     for name, begun in (("init", command.init), ("init_network", command.init_network)):
         if begun is not None:
             data[name] = Path(begun).name
