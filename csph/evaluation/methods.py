@@ -78,6 +78,9 @@ class Row:
     law: str = "poisson"
 
 
+KeepMap = Callable[[Row, np.ndarray, Histogram], None]
+
+
 @dataclass
 class Evaluation:
     """Rows of every method and image, each method's estimates beside the truth, for what depends on depth, and what the
@@ -165,11 +168,13 @@ def evaluate(
     plan: EvaluationPlan = PUBLISHED_LEVELS,
     *,
     progress: Progress | None = None,
+    keep: KeepMap | None = None,
 ) -> Evaluation:
     """Sense every view at every level of the plan and apply all methods to it.
 
-    Sets rendered with other offsets than in time are given as they are. Raises InputError for an empty set or no
-    method, an image smaller than a tile, and what the methods raise.
+    `keep` is given every depth map, with its row of all pixels and the histogram that it is of. Sets rendered with
+    other offsets than in time are given as they are. Raises InputError for an empty set or no method, an image smaller
+    than a tile, and what the methods raise.
     """
     require(bool(views.transients) and bool(methods), "evaluation: no view or no method")
     for transient, scene in zip(views.transients, views.scenes, strict=True):  # told now, not after an hour
@@ -189,7 +194,10 @@ def evaluate(
             histogram = _tiled(histogram, plan.tile)
             for name, method in methods.items():
                 estimate = method(histogram)
-                result.rows += _rows(name, scene, view, (signal, background), estimate, histogram)
+                rows = [*_rows(name, scene, view, (signal, background), estimate, histogram)]
+                result.rows += rows
+                if keep is not None:
+                    keep(rows[0], estimate, histogram)
                 known = np.isfinite(histogram.depth_m) & (histogram.depth_m < recorded_range_m(histogram))
                 result.depths[name].append((estimate[known], histogram.depth_m[known]))
     return result

@@ -266,6 +266,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     given = {
         "--decoder": command.decoder,
         "--law": command.law,
+        "--maps": command.maps,
         "--tiled": command.tiled,
         "--views": command.views,
         "--int8": command.int8,

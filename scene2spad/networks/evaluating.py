@@ -19,6 +19,7 @@ from csph.training.views import Views, check_truth, training_parts
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.renders import unsure_scenes, views_at
+from scene2spad.networks.depth_maps import map_writer
 from scene2spad.networks.training import baseline, common_tile, network_method
 from scene2spad.options.networks import Evaluate
 from scenes.errors import InputError, require
@@ -80,7 +81,9 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     groups |= {name: [name] for name in command.baselines}
     tile = common_tile(models) if command.tiled else (1, 1)
     plan = EvaluationPlan(photon_levels(command.levels), tile, command.offset, command.seed, command.law)
-    found = evaluate(methods, views, sensor, plan, progress=progress)
+    folder = command.out / "maps"
+    keep = map_writer(folder, methods) if command.maps else None
+    found = evaluate(methods, views, sensor, plan, progress=progress, keep=keep)
     _report_plans(found, command.law)
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
@@ -90,7 +93,8 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         shown["by_level"] = by_level(found, groups, command.json)
     shown["laws"] = found.laws()
     shown |= _counted(found, command.set, sensor.recorded_range_m) | _scenes_counted(command.set, views)
-    return {**shown, "overflows": sum(overflows), "csv": str(table)}
+    shown |= {"overflows": sum(overflows), "csv": str(table)}
+    return shown | ({"maps": str(folder)} if command.maps else {})
 
 
 def _report_plans(found: Evaluation, law: str | None) -> None:

@@ -258,6 +258,7 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
     paper = refused(capfd, "evaluate", str(trained), "--set", "published", "--levels", "1+1")
     assert "--levels does not go with --set published" in paper
     for more in (
+        ("--maps",),
         ("--int8",),
         ("--tiled",),
         ("--views", "2"),

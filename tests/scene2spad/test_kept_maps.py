@@ -1,0 +1,38 @@
+"""Depth maps that `evaluate --maps` keeps."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from render.transient.packs import write_pack
+from scene2spad.cli import main
+from scene2spad.datasets.planes import wall
+from scene2spad.networks.depth_maps import map_writer
+from scenes.errors import InputError
+from spad.formats.depth_map import read_depth
+
+
+def test_every_map_has_the_errors_of_its_row(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_pack([(wall(distance, 4), {"scene": f"walls/{distance:g}"}) for distance in (2.0, 3.0)], Path("walls.h5"))
+    command = ["evaluate", "none-s0", "--set", "walls.h5", "--levels", "50+1", "2+0.5", "--baselines", "argmax"]
+    assert main([*command, "--out", "out", "--json", "--maps"]) == 0
+    assert json.loads(capfd.readouterr().out)["maps"] == "out/maps"
+    with Path("out/evaluation.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["group"] == "all"]
+    assert len(rows) == len([*Path("out/maps").rglob("*.exr")]) == 8
+    for row in rows:
+        level = f"{float(row['signal']):g}+{float(row['background']):g}"
+        scene, distance = row["scene"].replace("/", "-"), float(row["scene"].removeprefix("walls/"))
+        depth, _, meta = read_depth(Path(f"out/maps/{row['method']}/{row['view']}-{scene}-{level}.exr"))
+        truth = wall(distance, 4).depth_m
+        assert meta["method"] == row["method"] and depth.shape == (4, 4)
+        assert 1e3 * np.nanmean(np.abs(depth - truth)) == pytest.approx(float(row["mae_mm"]), rel=1e-3)
+
+
+def test_two_methods_do_not_share_a_folder(tmp_path):
+    with pytest.raises(InputError, match="maps of runs-a and runs/a would have one folder, runs-a"):
+        map_writer(tmp_path, ["runs/a", "argmax", "runs-a"])
