@@ -21,7 +21,7 @@ def asked_law(law: Model | None, sensor: Sensor, budget: PhotonBudget) -> Model:
     return "poisson" if mean_pixel_law(sensor, budget)[0] == "poisson" else "auto"
 
 
-class Told(NamedTuple):
+class PlanLine(NamedTuple):
     """A line of the plans: of how many exposures one alike was, and the words, pile-up and place of that with most."""
 
     exposures: int
@@ -40,8 +40,8 @@ class Plans:
     """
 
     exposures: int = 0
-    lines: dict[str, Told] = field(default_factory=dict)
-    left_out: Told | None = None
+    lines: dict[str, PlanLine] = field(default_factory=dict)
+    left_out: PlanLine | None = None
 
     def add(self, histogram: Histogram, where: str, by_default: bool) -> None:
         """Count the plan of one exposure; `by_default`: nobody asked for its law."""
@@ -65,9 +65,9 @@ class Plans:
         ]
 
 
-def _counted(line: Told | None, words: str, pile_up: float, where: str) -> Told:
+def _counted(line: PlanLine | None, words: str, pile_up: float, where: str) -> PlanLine:
     """Return a line counted once more, with these words where they are of more pile-up than it had."""
     exposures = 1 if line is None else line.exposures + 1
     if line is None or pile_up > line.pile_up:
-        return Told(exposures, words, pile_up, where)
+        return PlanLine(exposures, words, pile_up, where)
     return line._replace(exposures=exposures)
