@@ -79,7 +79,7 @@ class Row:
 
     run             which noise: 0 is the set's own, as `dataset` renders it
     error           that the renders estimated of themselves; 0 where they had no more than one path to judge by
-    measured        against the fine renders; NaN for these
+    measured        against the fine renders; NaN for these, which the table shows as "-"
     mae_mm          mean over views, photon levels and draws
     mae_std_mm      standard error of that mean, from the draws of photons alone
     """
@@ -169,6 +169,7 @@ def _nrmse(found: Transient, a: Transient, b: Transient) -> float:
     for x, first, second in zip(*map(_expected, (found, a, b)), strict=True):
         square += float(((x - first) * (x - second)).sum())
         power += float((first * second).sum())
+    require(power > 0, f"a view of {a.meta.get('scene')}: no light returns, a render of it has no error")
     return math.sqrt(max(square, 0.0) / power)
 
 
@@ -183,12 +184,20 @@ def errors_of(
     methods: Mapping[str, Method], views: Views, sensor: Sensor, plans: Sequence[EvaluationPlan]
 ) -> dict[str, tuple[float, float]]:
     """Return {method: (MAE [mm], its standard error from the draws of photons)}, the mean over views and levels; each
-    of two plans or more is a draw."""
+    of two plans or more is a draw.
+
+    Raises InputError for a view without an error: nothing of it lies within the range, or a method estimates nothing.
+    """
     draws: dict[str, list[float]] = {name: [] for name in methods}
     for plan in plans:
-        found = evaluate(methods, views, sensor, plan)
+        found = [row for row in evaluate(methods, views, sensor, plan).rows if row.group == "all"]
+        for row in found:
+            scene, level = views.scenes[row.view], f"{row.signal:g} + {row.background:g} photons"
+            why = f"no pixel has a true depth within {sensor.recorded_range_m:.4g} m"
+            why = why if not row.pixels + row.missing else f"{row.method} estimates no depth at {level}"
+            require(math.isfinite(row.mae_mm), f"view {row.view} ({scene}) has no error: {why}; choose other views")
         for name, values in draws.items():
-            values.append(statistics.fmean(r.mae_mm for r in found.rows if r.method == name and r.group == "all"))
+            values.append(statistics.fmean(row.mae_mm for row in found if row.method == name))
     return {
         name: (statistics.fmean(values), statistics.stdev(values) / math.sqrt(len(plans)))
         for name, values in draws.items()
@@ -200,5 +209,7 @@ def _lines(rows: Sequence[Row], methods: Sequence[str]) -> list[str]:
     for first in range(0, len(rows), len(methods)):
         row, *_ = group = rows[first : first + len(methods)]
         errors = "  ".join(f"{r.mae_mm:8.2f} +- {r.mae_std_mm:.2f}" for r in group)
-        lines.append(f"{row.grid:>4} {row.spp:>6} {row.run:>3} {row.error:>8.2%} {row.measured:>8.2%}  {errors}")
+        # of the fine renders nothing is measured: the others are measured against them
+        measured = f"{row.measured:.2%}" if math.isfinite(row.measured) else "-"
+        lines.append(f"{row.grid:>4} {row.spp:>6} {row.run:>3} {row.error:>8.2%} {measured:>8}  {errors}")
     return lines

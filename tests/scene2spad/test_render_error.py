@@ -7,11 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from csph.evaluation.methods import EvaluationPlan
+from csph.training.views import Views
 from render.transient import read_transient
 from scene2spad.cli import main
-from scene2spad.datasets.planes import random_planes
+from scene2spad.datasets.planes import random_planes, wall
 from scene2spad.datasets.rendering import Job, render_view
+from scene2spad.networks.training import baseline
 from scene2spad.studies import render_error
+from scenes import InputError
 from spad.detection.flux import signal_per_bin
 from spad.sensor.model import Sensor
 
@@ -84,6 +88,26 @@ def test_smoke_is_one_view_at_coarse_qualities(capfd, tmp_path):
     assert status == 0, message
     assert found["preset"] == "smoke" and found["views"] == 1 and len(found["rows"]) == 5
     assert max(row["spp"] for row in found["rows"]) <= 256 and len([*(tmp_path / "cache").iterdir()]) == 6
+    # the fine renders have no measured error, and the table says no nan
+    assert main(["study", "render-error", "--preset", "smoke", *small]) == 0
+    last = [line for line in capfd.readouterr().out.splitlines() if " +- " in line][-1].split()
+    assert last[:3] == ["4", "128", "0"] and last[4] == "-" and "nan" not in "".join(last)
+
+
+def test_views_without_an_error_are_refused():
+    """Their mean was NaN, in a traceback or the table."""
+    far = Views((wall(20.0, 8),), ("far",))
+    plans = [EvaluationPlan([(10.0, 10.0)], seed=seed) for seed in range(2)]
+    methods = {"log-matched": baseline("log-matched"), "none": lambda h: np.full_like(h.depth_m, np.nan)}
+    with pytest.raises(InputError, match=r"view 0 \(far\) has no error: no pixel has a true depth within 14\.99 m"):
+        render_error.errors_of(methods, far, Sensor(), plans)
+    near = Views((wall(2.0, 8),), ("near",))
+    with pytest.raises(InputError, match=r"view 0 \(near\) .*: none estimates no depth at 10 \+ 10 photons"):
+        render_error.errors_of(methods, near, Sensor(), plans)
+    clean = near.transients[0]
+    dark = replace(clean, radiance=np.zeros_like(clean.radiance))
+    with pytest.raises(InputError, match="no light returns, a render of it has no error"):
+        render_error.measured_error([dark], [dark], [dark])
 
 
 def test_mistakes_end_in_one_line(capfd, tmp_path):
