@@ -73,6 +73,19 @@ def test_a_file_of_another_kind_is_named_with_the_command_that_takes_it(tmp_path
     assert status == 2 and "expected a transient" in err
 
 
+def test_a_folder_or_file_as_model_is_one_line(tmp_path, capsys, monkeypatch):
+    """Paths were taken into the depth map's name, and OpenEXR gave a traceback."""
+    READERS["histogram"].make(tmp_path / "a.h5")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    for model in (str(tmp_path / "run"), "./run", "run", "no/where", "..", "a.h5"):
+        status, _, err = run(capsys, "depth", "a.h5", "--method", "network", "--model", model)
+        assert status == 2 and f"--model {model!r}: expected a name" in err and "--checkpoint" in err
+        assert len(err.strip().splitlines()) == 1
+    status, _, err = run(capsys, "depth", "a.h5", "--method", "network", "--model", "nonne-s0")
+    assert status == 2 and "model 'nonne-s0' is unknown, like none-s0" in err
+
+
 def test_depth_maps_of_two_checkpoints_have_two_names():
     from scene2spad.cli.simulation.depth import Depth, depth_label
 

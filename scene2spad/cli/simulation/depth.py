@@ -81,6 +81,7 @@ class Depth(Common):
 def run(command: Depth, progress: Progress) -> dict:
     """Run the command: one file or a folder of transients -> depth maps, error figures and pictures."""
     _check_codes(command)
+    _check_model(command)
     label = depth_label(command)
     if command.file.is_dir():
         result = _run_folder(command, label, progress)
@@ -250,6 +251,19 @@ def _check_codes(command: Depth) -> None:
     require(array, f"--codes-file {command.codes_file}: expected codes (K, T) in a .npy file")
     only_for(command, "depth", dict.fromkeys(("code", "codes", "codes_file"), (compressive, purpose)))
     only_for(command, "depth", dict.fromkeys(("code", "codes"), (not own, f"{purpose} without --codes-file")))
+
+
+def _check_model(command: Depth) -> None:
+    """Raise InputError for a path as --model, which names results, and is a name that comes with the package."""
+    model = command.model
+    if model is None:
+        return
+    hint = "expected a name that `models` lists; a run's folder or a checkpoint goes with --checkpoint"
+    require(Path(model).name == model, f"--model {model!r}: {hint}")
+    from csph.weights.shipped import shipped_file
+
+    shipped = shipped_file(model).is_file()
+    require(shipped or not Path(model).exists(), f"--model {model!r}: {hint}")
 
 
 def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:
