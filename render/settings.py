@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Literal, get_args
 
-from scenes.errors import InputError
+import numpy as np
+
+from scenes.errors import InputError, require_number
 from scenes.json_types import JsonObject
 
 MAX_BOUNCES = 63
@@ -103,23 +105,28 @@ class RenderSettings:
             value = getattr(self, name)
             if isinstance(value, bool):  # which Python compares as 0 and 1
                 raise InputError(f"render: {name} {value} is no number, as it has to be from {low} to {high}")
-            if value is not None and not low <= value <= high:
+            if value is not None and not low <= require_number(value, f"render: {name}") <= high:
                 raise InputError(f"render: {name} {value} is outside {low} to {high}")
             if value is not None and name in WHOLE and not isinstance(value, Integral):
                 raise InputError(f"render: {name} {value!r} is no whole number, as it has to be from {low} to {high}")
         if self.refraction is not None and self.refraction not in get_args(Refraction):
             raise InputError(f"render: refraction {self.refraction!r}, expected {' or '.join(get_args(Refraction))}")
         if self.budget is not None:
-            signal, background = self.budget
+            pair = list(self.budget) if isinstance(self.budget, tuple | list | np.ndarray) else []
+            if len(pair) != 2 or not all(isinstance(mean, Real) for mean in pair):
+                expected = "expected two numbers: signal and background photons a pixel"
+                raise InputError(f"render: budget {self.budget!r}, {expected}")
+            signal, background = (require_number(mean, "render: budget of") for mean in pair)
+            object.__setattr__(self, "budget", (signal, background))
             if not (math.isfinite(signal) and math.isfinite(background) and signal > 0 and background >= 0):
                 raise InputError(
                     f"render: budget of {signal:g} signal, {background:g} background photons is not positive"
                 )
         if self.budget is not None and self.error is not None:
             raise InputError("render: give an error target or a photon budget, not both")
-        tolerance = self.direct_tolerance_m
-        if tolerance is not None and tolerance != 0 and not 1e-4 <= tolerance <= 10:
-            raise InputError(f"render: direct_tolerance_m {tolerance:g} is neither 0 nor 1e-4 to 10")
+        tolerance, where = self.direct_tolerance_m, "render: direct_tolerance_m"
+        if tolerance is not None and require_number(tolerance, where) != 0 and not 1e-4 <= tolerance <= 10:
+            raise InputError(f"{where} {tolerance:g} is neither 0 nor 1e-4 to 10")
 
 
 @dataclass(frozen=True)

@@ -88,13 +88,7 @@ def _check_settings(settings: dict[str, Any], known: list[str]) -> None:
     """Raise InputError for unknown settings, and for those that are no numbers and have to be."""
     for name, value in settings.items():
         require(name in known, f"render: setting {name!r} is unknown{did_you_mean(name, known)}")
-        if value is None or name == "refraction":
-            continue
-        if name == "budget":
-            pair = isinstance(value, tuple | list | np.ndarray) and len(value) == 2
-            good = pair and all(isinstance(one, Real) for one in value)
-            require(good, f"render: budget {value!r}, expected two numbers: signal and background photons a pixel")
-        else:
+        if value is not None and name not in ("refraction", "budget"):
             require(isinstance(value, Real | np.bool_), f"render: {name} {value!r}, expected a number")
 
 
