@@ -31,8 +31,8 @@ from csph.codes.quantise import (
     wrapped_sums,
 )
 from csph.codes.temporal import circle_of, orthogonal_start, temporal_code, uniform_start
-from csph.codes.tensor import CodingTensor, full_tensor
-from scenes.errors import require, require_kind
+from csph.codes.tensor import CodingTensor, as_tensor, full_tensor
+from scenes.errors import normalise_fields, require, require_kind, require_whole
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse
 
@@ -62,6 +62,9 @@ class LayerOptions:
     pulse_in_codes: bool = False
     int8: bool = False
 
+    def __post_init__(self) -> None:
+        normalise_fields(self, "layer")
+
 
 def make_coding(
     design: Design, sensor: Sensor | None = None, seed: int = 0, spatial_start: SpatialStart = "uniform"
@@ -73,6 +76,9 @@ def make_coding(
     Raises InputError where K does not fit the code, and for what is no Design.
     """
     require_kind(design, Design, "make_coding")
+    require_kind(sensor or Sensor(), Sensor, "make_coding: sensor")
+    require(spatial_start in STARTS, f"spatial_start {spatial_start!r} is unknown, expected one of {', '.join(STARTS)}")
+    seed = require_whole(seed, "make_coding: seed")
     (bins, rows, columns), codes = design.block, design.codes
     if design.full:
         return CodingTensor(design.name, uniform_start((codes, bins, rows, columns), design.size, seed))
@@ -104,6 +110,10 @@ class CompressiveLayer(nn.Module):
 
     Sums are in float32 whatever the counts' type and autocast, in float64 where the weights are.
 
+    `torch.func.functional_call` runs it with other weights, and `backward` and `torch.autograd.functional.jacobian`
+    give its first derivatives. It has no batching rule and no second derivative: `vmap`, `grad` and `jacrev` of
+    `torch.func` end in a RuntimeError, and `torch.autograd.functional.hessian` raises with `strict`, else gives zeros.
+
     Raises InputError for options and parts that do not go together, objects of another kind, and a background of
     another shape.
     """
@@ -127,6 +137,8 @@ class CompressiveLayer(nn.Module):
         super().__init__()
         require_kind(coding, CodingTensor, "CompressiveLayer", " (`CompressiveLayer.of` takes a Design)")
         parts = {"temporal": coding.temporal, "spatial": coding.spatial}
+        named = f"CompressiveLayer: learned {learned!r}, expected names of parts, as in ('temporal',)"
+        require(isinstance(learned, list | tuple), named)
         unknown = [name for name in learned if parts.get(name) is None]
         require(not unknown, f"coding tensor {coding.name} has no part {', '.join(unknown)} to learn")
         self.name, self.block, self.codes, self.computed = coding.name, coding.block, coding.codes, coding.computed
@@ -159,17 +171,12 @@ class CompressiveLayer(nn.Module):
         **options: bool,
     ) -> CompressiveLayer:
         """Return the layer of a design at its start; `options` are switches of LayerOptions."""
-        switches = LayerOptions(zero_mean=bool(design.zero_mean))
-        return cls(
-            make_coding(design, sensor, seed, spatial_start),
-            learned=design.learned,
-            options=replace(switches, **options),
-            sensor=sensor,
-        )
+        coding = make_coding(design, sensor, seed, spatial_start)
+        switches = replace(LayerOptions(zero_mean=bool(design.zero_mean)), **options)
+        return cls(coding, learned=design.learned, options=switches, sensor=sensor)
 
     def _pulse(self, sensor: Sensor) -> Tensor | None:
-        """Compute h_i(tau) on a circle of Mt bins, (Mt, Mt) float32, column tau the arrival at a bin centre; None where
-        no option uses it."""
+        """Compute h_i(tau) on a circle of Mt bins, (Mt, Mt) float32, tau at bin centres; None where nothing uses it."""
         if not (self.options.pulse_in_codes or self.options.pulse_in_decoder):
             return None
         circle = circle_of(self.block[0], sensor)
@@ -179,11 +186,10 @@ class CompressiveLayer(nn.Module):
     def _background(self, shape: Tensor | None) -> Tensor | None:
         if shape is None:
             return None
-        good = (
-            shape.ndim == 1 and bool(shape.isfinite().all()) and len(shape) % self.block[0] == 0 and bool(shape.any())
-        )
+        shape = as_tensor(shape)
+        good = shape.ndim == 1 and bool(shape.isfinite().all()) and len(shape) % self.block[0] == 0
         message = f"background of shape {tuple(shape.shape)}: expected finite values over time, a multiple of"
-        require(good, f"{message} {self.block[0]} bins, not all zero")
+        require(good and bool(shape.any()), f"{message} {self.block[0]} bins, not all zero")
         return (shape / shape.abs().max()).float()
 
     def _blurred(self, weights: Tensor) -> Tensor:
@@ -226,8 +232,7 @@ class CompressiveLayer(nn.Module):
 
     @torch.no_grad()
     def take_ranges(self, other: CompressiveLayer) -> None:
-        """Take the clipping ranges that another layer of the same codes, over smaller blocks, has learned with
-        `int8`."""
+        """Take the clipping ranges that another `int8` layer of the same codes, over smaller blocks, has learned."""
         for mine, theirs in ((self.temporal_range, other.temporal_range), (self.spatial_range, other.spatial_range)):
             if mine is not None and theirs is not None:
                 mine.copy_(theirs)
@@ -238,9 +243,8 @@ class CompressiveLayer(nn.Module):
         if not self.options.int8:
             return quantised(self.coding())
         temporal = _as_int8(*self._temporal_steps())
-        return from_factors(
-            self.name, temporal, (None, 1.0) if self.spatial is None else _as_int8(*self._spatial_steps())
-        )
+        spatial = (None, 1.0) if self.spatial is None else _as_int8(*self._spatial_steps())
+        return from_factors(self.name, temporal, spatial)
 
     def weights(self) -> Tensor:
         """Return (K, Mt, Mr, Mc) that counts are encoded with: the constraint and the pulse applied."""
@@ -280,7 +284,7 @@ class CompressiveLayer(nn.Module):
     def encode(self, counts: Tensor) -> Tensor:
         """Return codes (B, K, T/Mt, R/Mr, C/Mc) of counts (B, 1, T, R, C). Raises InputError for counts of another
         shape or type, or that blocks do not tile."""
-        with torch.autocast(counts.device.type, enabled=False):
+        with blocks.in_full(counts):
             return self._encode_int8(counts) if self.options.int8 else self._encode_exactly(counts)
 
     def encode_mean(self, mean_counts: Tensor) -> Tensor:
@@ -288,7 +292,7 @@ class CompressiveLayer(nn.Module):
 
         Raises InputError as `encode`.
         """
-        with torch.autocast(mean_counts.device.type, enabled=False):
+        with blocks.in_full(mean_counts):
             return self._encode_exactly(mean_counts)
 
     def _encode_exactly(self, counts: Tensor) -> Tensor:
@@ -317,7 +321,7 @@ class CompressiveLayer(nn.Module):
     def sum_excess(self, counts: Tensor) -> Tensor:
         """Return the mean excess () of all cores' sums over 16 bits, in units of half that range, of counts
         (B, 1, T, R, C) with `int8`; its gradient widens the clipping range."""
-        with torch.autocast(counts.device.type, enabled=False):
+        with blocks.in_full(counts):
             sums, _ = self._core_sums(counts)
             return (sums.abs() / HALF_RANGE - 1).relu().mean()
 
@@ -327,12 +331,12 @@ class CompressiveLayer(nn.Module):
         See `encode_photons`. Raises InputError with `int8`, whose sums are each core's.
         """
         require(not self.options.int8, f"coding tensor {self.name}: int8 codes are made from histograms")
-        with torch.autocast(timestamps.device.type, enabled=False):
+        with blocks.in_full(timestamps):
             return encode_photons(timestamps, offsets, photon_table(self.weights()), self.block, size, name=self.name)
 
     def decode(self, codes: Tensor) -> Tensor:
         """Return ZN(C~)^T ZN(y), (B, 1, T, R, C), of codes (B, K, T/Mt, R/Mr, C/Mc), or an InputError for others."""
-        with torch.autocast(codes.device.type, enabled=False):
+        with blocks.in_full(codes):
             return self._projected(self._checked(codes))
 
     def back_project(self, codes: Tensor) -> Tensor:
@@ -340,7 +344,7 @@ class CompressiveLayer(nn.Module):
 
         Raises InputError for codes of another shape.
         """
-        with torch.autocast(codes.device.type, enabled=False):
+        with blocks.in_full(codes):
             return self._projected(self._checked(codes), normalise=False)
 
     def _checked(self, codes: Tensor) -> Tensor:
@@ -350,7 +354,7 @@ class CompressiveLayer(nn.Module):
 
     def forward(self, counts: Tensor) -> Tensor:
         """Return `decode(encode(counts))`, (B, 1, T, R, C), the input of the depth network. Raises as `encode`."""
-        with torch.autocast(counts.device.type, enabled=False):
+        with blocks.in_full(counts):
             return self._projected(self.encode(counts))
 
     def _unit(self, codes: Tensor, normalise: bool) -> Tensor:

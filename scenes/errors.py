@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import fields
 from difflib import get_close_matches
 from numbers import Integral, Real
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 MAX_NAMES = 8
 
@@ -48,6 +53,24 @@ def require_whole(value: object, what: str) -> int:
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     require(whole, f"{what} {value!r}, expected a whole number")
     return int(value)  # type: ignore[call-overload]
+
+
+def normalise_fields(owner: DataclassInstance, where: str) -> None:
+    """Make fields of a frozen dataclass that are annotated as int, float, bool or str Python's own, as JSON holds them.
+
+    Raises InputError that names the first field of another kind, its value, and what is expected; `where` comes first.
+    Its module must postpone annotations, which then are the words that the source has.
+    """
+    for item in fields(owner):
+        value, what = getattr(owner, item.name), f"{where}: {item.name}"
+        if item.type == "int":
+            object.__setattr__(owner, item.name, require_whole(value, what))
+        elif item.type == "float":
+            object.__setattr__(owner, item.name, require_number(value, what))
+        elif item.type == "bool":
+            require(isinstance(value, bool), f"{what} {value!r}, expected True or False")
+        elif item.type == "str":
+            require(isinstance(value, str), f"{what} {value!r}, expected text")
 
 
 def listed(names: Iterable[str]) -> str:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from csph.autograd import Context, applied
-from scenes.errors import require
+from scenes.errors import require, require_kind
 
 EPSILON = 1e-5  # of zero-normalisation, as published
 FORMED = 4  # entries for each count, at most, of a separable coding tensor that is formed
@@ -23,6 +23,13 @@ COUNT_TYPES = (
     *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
     *(torch.uint8, torch.int8, torch.uint16, torch.int16, torch.int32, torch.int64),
 )
+
+
+def in_full(values: Tensor) -> torch.autocast:
+    """Return the context in which sums over `values` keep their type, whatever autocast is on. Raises InputError for
+    what is no tensor, as a numpy array."""
+    require_kind(values, Tensor, "counts or codes", " (`torch.from_numpy` makes one)")
+    return torch.autocast(values.device.type, enabled=False)
 
 
 def check_counts(counts: Tensor, block: tuple[int, int, int]) -> None:

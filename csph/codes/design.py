@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
 
-from scenes.errors import InputError, did_you_mean, require
+from scenes.errors import InputError, did_you_mean, normalise_fields, require
 
 CODES = ("learned", "fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 _QUARTER_WAVE = ("fourier", "gray", "fourier-published", "gray-published")
@@ -24,7 +25,8 @@ class Design:
     spatial_learned  the spatial part of a fixed temporal code is learned ("fourier+learned")
     zero_mean        rows are held to sum to zero over Mt; None: all but coarse histograms, as published
 
-    Raises InputError for an unknown code, and a number of codes that is not whole or more than it has.
+    Raises InputError for an unknown code, fields of another kind, and a number of codes that is not whole or more than
+    it has.
     """
 
     code: str = "learned"
@@ -35,14 +37,16 @@ class Design:
     zero_mean: bool | None = None
 
     def __post_init__(self) -> None:
-        meant = did_you_mean(self.code, CODES)
+        object.__setattr__(self, "block", _block_of(self.block))
+        meant = did_you_mean(str(self.code), CODES)
         require(self.code in CODES, f"design {self.code!r} is unknown{meant}, expected one of {', '.join(CODES)}")
-        good = len(self.block) == 3 and all(isinstance(n, int) and n >= 1 for n in self.block)
-        require(good, f"block {self.block}: expected three positive numbers of bins, rows and columns")
         most = self.size if self.code in ("learned", "random") else self.block[0]
         expected = f"expected a whole number from 1 to {most} for {self.code} codes"
         whole = isinstance(self.codes, Integral) and not isinstance(self.codes, bool) and 1 <= self.codes <= most
         require(whole, f"{self.codes!r} codes over a block of {self.block_name}, {expected}")
+        normalise_fields(self, "design")
+        known = self.zero_mean is None or isinstance(self.zero_mean, bool)
+        require(known, f"design: zero_mean {self.zero_mean!r}, expected True, False or None")
         free = self.code in ("learned", "random")
         require(free or not self.full, f"design {self.code}: full coding tensors are learned or random")
         if self.zero_mean is None:
@@ -63,6 +67,8 @@ class Design:
         K is given, or follows from the compression ratio Mt Mr Mc / K, which must divide. A fixed code alone has no
         spatial part: over several pixels it needs +learned. Raises InputError.
         """
+        require(isinstance(name, str), f"design {name!r}: expected CODE or CODE+learned")
+        block = _block_of(block)
         code, plus, second = name.partition("+")
         require(not plus or second == "learned", f"design {name!r}: expected CODE or CODE+learned")
         known = f"expected one of {', '.join(CODES)}, or CODE+learned"
@@ -136,6 +142,15 @@ class Design:
         """Count the numbers that a sensor stores: `parameters`, with the temporal part computed on the fly where it can
         be."""
         return self.parameters if self.computed is None else self.computed + self.spatial_parameters
+
+
+def _block_of(block: Sequence[int]) -> tuple[int, int, int]:
+    """Return a block as three of Python's whole numbers. Raises InputError for anything else."""
+    sides = list(block) if isinstance(block, list | tuple) else []
+    good = len(sides) == 3 and all(isinstance(n, Integral) and not isinstance(n, bool) and int(n) >= 1 for n in sides)
+    require(good, f"block {block!r}: expected three positive numbers of bins, rows and columns")
+    bins, rows, columns = map(int, sides)
+    return bins, rows, columns
 
 
 def codes_for(block: tuple[int, int, int], compression: float) -> int:

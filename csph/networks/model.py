@@ -25,7 +25,7 @@ from csph.networks.posterior import Decoder, confidence, decoded
 from csph.networks.published import DeepBoosting, parameters_of
 from csph.networks.refined import Refined
 from csph.training.config import ModelConfig, TrainConfig, grows
-from scenes.errors import InputError, require
+from scenes.errors import InputError, require, require_kind, require_whole
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.inputs import regular_file
 from scenes.json_types import JsonObject
@@ -70,6 +70,8 @@ class DepthModel(nn.Module):
 
     def __init__(self, config: ModelConfig, seed: int = 0) -> None:
         super().__init__()
+        require_kind(config, ModelConfig, "DepthModel")
+        seed = require_whole(seed, "DepthModel: seed")
         self.config = config
         self.layer: CompressiveLayer | None = None
         if config.design is not None:
@@ -127,6 +129,7 @@ class DepthModel(nn.Module):
         bin."""
         if self.layer is not None:
             return self.layer(counts)
+        require_kind(counts, Tensor, "counts", " (`torch.from_numpy` makes one)")
         if self.config.front == "counts":
             return counts.float()
         if self.config.front == "matched":

@@ -9,11 +9,11 @@ from typing import Any, Literal
 from csph.codes.design import Design
 from csph.codes.temporal import MAX_SEED
 from csph.evaluation.metrics import TRAIN_LEVELS
-from csph.layer import STARTS, SpatialStart
+from csph.layer import STARTS, LayerOptions, SpatialStart
 from csph.networks.grid import GRIDS, Grid
 from csph.networks.posterior import Decoder
-from csph.training.levels import CONTINUOUS, Levels
-from scenes.errors import InputError, require
+from csph.training.levels import CONTINUOUS, Levels, checked_levels
+from scenes.errors import InputError, did_you_mean, listed, normalise_fields, require, require_number, told_apart
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
@@ -44,6 +44,13 @@ def grows(smaller: str, larger: str) -> bool:
     return smaller in HELD.get(larger, (larger,))
 
 
+def _check_choices(owner: object, where: str, **choices: tuple[str, ...]) -> None:
+    """Raise InputError unless each named attribute is one of its choices."""
+    for name, known in choices.items():
+        value = getattr(owner, name)
+        require(value in known, f"{where}{name} {value!r} is unknown, expected one of {', '.join(known)}")
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """Configuration of a depth model: all that stands between counts and depth.
@@ -59,7 +66,7 @@ class ModelConfig:
     grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with print
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
 
-    Raises InputError for parts that do not go together.
+    Raises InputError for parts of another kind, and those that do not go together.
     """
 
     front: Front = "codes"
@@ -71,13 +78,16 @@ class ModelConfig:
     spatial_start: SpatialStart = "uniform"
 
     def __post_init__(self) -> None:
-        require(self.front in FRONTS, f"front {self.front!r} is unknown, expected one of {', '.join(FRONTS)}")
-        require(self.network in NETWORKS, f"network {self.network!r} is unknown, expected {', '.join(NETWORKS)}")
-        named = isinstance(self.layer, dict) and all(isinstance(value, bool) for value in self.layer.values())
+        _check_choices(self, "", front=FRONTS, network=NETWORKS, grid=GRIDS, spatial_start=STARTS)
+        designed = self.design is None or isinstance(self.design, Design)
+        require(designed, f"design {self.design!r}, expected a Design (`Design.named` makes one of a name)")
+        require(isinstance(self.sensor, Sensor), f"sensor {self.sensor!r}, expected a Sensor (`sensor_by_name`)")
+        named = isinstance(self.layer, dict)
+        named = named and all(isinstance(k, str) and isinstance(on, bool) for k, on in self.layer.items())
         require(named, f"layer {self.layer!r}: expected switches by name")
-        require(self.grid in GRIDS, f"grid {self.grid!r} is unknown, expected one of {', '.join(GRIDS)}")
-        known = self.spatial_start in STARTS
-        require(known, f"spatial start {self.spatial_start!r} is unknown, expected one of {', '.join(STARTS)}")
+        known = [item.name for item in fields(LayerOptions)]
+        for name in self.layer:
+            require(name in known, f"layer {name}: is unknown{did_you_mean(name, known)}, expected {listed(known)}")
         coded = self.front == "codes"
         require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
         switches = ", ".join(sorted(name for name, on in self.layer.items() if on))
@@ -211,6 +221,8 @@ class TrainConfig:
     init_share: float = 0.0
 
     def __post_init__(self) -> None:
+        require(isinstance(self.model, ModelConfig), f"training: model {self.model!r}, expected a ModelConfig")
+        normalise_fields(self, "training")
         for name in ("epochs", "steps_per_epoch", "batch", "crop", "decay_steps", "validation_views"):
             require(getattr(self, name) >= 1, f"training: {name} {getattr(self, name)} is below 1")
         require(self.steps <= MAX_STEPS, f"training: {self.steps} steps are above {MAX_STEPS}")
@@ -218,37 +230,37 @@ class TrainConfig:
         require(0 < self.rate < 1, f"training: learning rate {self.rate:g} is outside 0 to 1")
         require(0 < self.decay <= 1, f"training: decay {self.decay:g} is outside (0, 1]")
         require(0 <= self.seed <= MAX_SEED, f"training: seed {self.seed} is outside 0 to {MAX_SEED}")
-        good = 0 <= self.tv_weight < math.inf
-        require(good, f"training: weight {self.tv_weight:g} of the total variation is negative or infinite")
-        require(0 <= self.time_offset_m < math.inf, f"training: time offset {self.time_offset_m:g} m is negative")
+        # what is moved beyond the range has no label: `data.check_offset` knows how near the sets begin
+        reach, sensor = self.model.sensor.recorded_range_m, self.model.sensor.name
+        offset, most = told_apart(self.time_offset_m, reach, 4)
+        expected = f"expected from 0 to less than {most} m, the range of sensor {sensor}"
+        require(0 <= self.time_offset_m < reach, f"training: time offset {offset} m, {expected}")
         require(self.precision in PRECISIONS, f"precision {self.precision!r}: expected {', '.join(PRECISIONS)}")
         rows, columns = self.model.block[1:]
         fits = self.crop % rows == 0 and self.crop % columns == 0
         require(fits, f"training: crops of {self.crop} pixels are not tiled by blocks of {rows} x {columns}")
-        require(bool(self.levels), "training: no photon level")
-        listed = not isinstance(self.levels, str)
-        require(listed or self.levels == CONTINUOUS, f"training: levels {self.levels!r}, expected a list or continuous")
+        object.__setattr__(self, "levels", checked_levels(self.levels))
+        require(isinstance(self.data, dict), f"training: data {self.data!r}, expected entries by name")
         self._check_recipe()
 
     def _check_recipe(self) -> None:
-        known = self.optimiser in OPTIMISERS
-        require(known, f"training: optimiser {self.optimiser!r} is unknown, expected one of {', '.join(OPTIMISERS)}")
+        _check_choices(self, "training: ", optimiser=OPTIMISERS, schedule=SCHEDULES, sense_on=SENSE_ON)
         ours = self.optimiser == "adam" or self.model.network in HELD
         require(ours, f"training: optimiser muon is for {', '.join(HELD)}, not network {self.model.network}")
-        known = self.schedule in SCHEDULES
-        require(known, f"training: schedule {self.schedule!r} is unknown, expected one of {', '.join(SCHEDULES)}")
-        require(self.sense_on in SENSE_ON, f"training: sense_on {self.sense_on!r}, expected {' or '.join(SENSE_ON)}")
         require(self.warmup >= 0, f"training: warm-up of {self.warmup} steps is negative")
         require(0 < self.rate_end <= 1, f"training: rate_end {self.rate_end:g} is outside (0, 1]")
         require(0 <= self.average < 1, f"training: average {self.average:g} is outside [0, 1)")
         require(0 <= self.init_share < 1, f"training: init_share {self.init_share:g} is outside [0, 1)")
-        good = math.isfinite(self.decoded_weight) and self.decoded_weight >= 0
-        require(good, f"training: weight {self.decoded_weight:g} of the decoded error is negative")
-        good = 0 <= self.coherence < math.inf
-        require(good, f"training: weight {self.coherence:g} of the coherence is negative or infinite")
+        terms = {"tv_weight": "total variation", "decoded_weight": "decoded error", "coherence": "coherence"}
+        for name, term in terms.items():
+            weight = getattr(self, name)
+            require(0 <= weight < math.inf, f"training: weight {weight:g} of the {term} is negative or infinite")
         several = math.prod(self.model.block[1:]) > 1
         refusal = f"training: weight {self.coherence:g} of the coherence is for codes over several pixels"
         require(several or not self.coherence, f"{refusal}, not {self.model.name}")
+        good = isinstance(self.weights, list | tuple)
+        require(good, f"training: weights {self.weights!r}, expected a number for each training set")
+        object.__setattr__(self, "weights", tuple(require_number(one, "training: set weight") for one in self.weights))
         weighted = all(math.isfinite(weight) and weight > 0 for weight in self.weights)
         require(weighted, f"training: set weights {', '.join(map(str, self.weights))} are not all positive")
         if self.window:
@@ -282,12 +294,9 @@ class TrainConfig:
             model = dict(values["model"])
             design = model.pop("design")
             sensor = Sensor.from_dict(model.pop("sensor"))
-            if design is not None:
-                design = Design(**{**design, "block": tuple(design["block"])})
-            levels = values["levels"]
-            levels = levels if isinstance(levels, str) else tuple(tuple(level) for level in levels)
-            made = {"model": ModelConfig(design=design, sensor=sensor, **model), "levels": levels}
-            return cls(**{**values, **made, "weights": tuple(values.get("weights", ()))})
+            design = None if design is None else Design(**{**design, "block": design["block"]})
+            made = {"model": ModelConfig(design=design, sensor=sensor, **model), "levels": values["levels"]}
+            return cls(**{**values, **made})
         except (KeyError, TypeError, AttributeError) as error:
             raise InputError(f"its configuration cannot be read ({' '.join(str(error).split())[:120]})") from None
 
@@ -326,15 +335,7 @@ RECIPE: dict[str, Any] = {
     "validation_views": 24,
 }
 PRESETS: dict[str, dict[str, Any]] = {
-    "smoke": {
-        **RECIPE,
-        "epochs": 2,
-        "steps_per_epoch": 4,
-        "batch": 2,
-        "crop": 8,
-        "validation_views": 1,
-        "warmup": 2,
-    },
+    "smoke": {**RECIPE, "epochs": 2, "steps_per_epoch": 4, "batch": 2, "crop": 8, "validation_views": 1, "warmup": 2},
     "laptop": {**RECIPE, "epochs": 12, "steps_per_epoch": 650},
     "workstation": {**RECIPE, "epochs": 24, "steps_per_epoch": 1500, "warmup": 400},
     # for a GPU, which senses its patches itself: three times the pixels of `workstation`

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 import numpy as np
+
+from scenes.errors import require
+from scenes.random_streams import Stream
 
 CONTINUOUS = "continuous"
 SIGNAL = (1.0, 100.0)  # mean signal photons, log-uniform
@@ -14,6 +18,35 @@ HARD_WEIGHT = 0.6  # below 1, strong backgrounds are drawn more often than log-u
 
 Level = tuple[float, float]
 Levels = tuple[Level, ...] | str
+
+
+def checked_levels(levels: Levels) -> Levels:
+    """Return levels as a tuple of pairs, or "continuous". Raises InputError for anything else, none, and photons that
+    cannot be."""
+    if isinstance(levels, str):
+        require(levels == CONTINUOUS, f"training: levels {levels!r}, expected a list or {CONTINUOUS}")
+        return levels
+    expected = "expected pairs of signal and background photons, finite and not negative"
+    pairs = list(levels) if isinstance(levels, list | tuple) else [levels]
+    require(bool(pairs), "training: no photon level")
+    for pair in pairs:
+        good = isinstance(pair, list | tuple) and len(pair) == 2
+        good = good and all(isinstance(mean, Real) and 0 <= float(mean) < math.inf for mean in pair)
+        require(good, f"training: level {pair!r}, {expected}")
+    return tuple((float(signal), float(background)) for signal, background in pairs)
+
+
+def dealt_levels(levels: tuple[Level, ...], views: int, first: int = 0) -> list[Level]:
+    """Deal levels to views, from the `first`-th on: every one once in each round of as many views as there are levels.
+
+    A round has an order of its own, drawn from its number alone: in step with nothing that a set may repeat, as the
+    views of a room do, and the same for every training.
+    """
+    rounds = range(first // len(levels), (first + views) // len(levels) + 1)
+    orders = [np.random.default_rng(np.random.SeedSequence(n, spawn_key=(Stream.VALIDATE,))) for n in rounds]
+    dealt = [levels[i] for order in orders for i in order.permutation(len(levels))]
+    skipped = first % len(levels)
+    return dealt[skipped : skipped + views]
 
 
 def draw_level(rng: np.random.Generator, levels: Levels) -> Level:

@@ -50,7 +50,7 @@ from csph.training.snapshots import CodeEnergy
 from csph.training.views import Views, check_direct, check_light, packed_sha256, write_seen
 from csph.weights.shipped import RESUME, TIMINGS
 from render.backend.malloc import retain_freed_memory
-from scenes.errors import require
+from scenes.errors import require, require_kind
 from scenes.files import append_line, write_csv
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
@@ -261,8 +261,15 @@ class Hardware:
 ANY_HARDWARE = Hardware()
 
 
-def _listed(views: Views | Sequence[Views]) -> list[Views]:
-    return [views] if isinstance(views, Views) else list(views)
+def _listed(views: Views | Sequence[Views], which: str) -> list[Views]:
+    """Return one set or several as a list. Raises InputError for none, sets without a view, and other objects."""
+    several = [views] if isinstance(views, Views) else views
+    good = isinstance(several, list | tuple) and len(several) > 0
+    require(good, f"train: {which} {several!r}, expected Views of one set or a list of several (`read_views`)")
+    for one in several:
+        require_kind(one, Views, f"train: {which}", " of `read_views`")
+        require(len(one.transients) > 0, f"train: {which}: a set has no view")
+    return list(several)
 
 
 def _with_hashes(config: TrainConfig, sets: Sequence[Sequence[PackedViews]], init: Beginning | None) -> TrainConfig:
@@ -318,6 +325,15 @@ def _trainer(config: TrainConfig, record: Record, hardware: Hardware) -> pl.Trai
     return runner
 
 
+def _fit(runner: pl.Trainer, module: DepthTraining, data: SetData, resume: Path) -> None:
+    """Run Lightning's loop to its end, from the state in `resume` on where there is one."""
+    with _quiet():
+        try:
+            runner.fit(module, data, ckpt_path=resume if resume.is_file() else None, weights_only=True)
+        except SystemExit:  # what Lightning makes of Ctrl-C
+            raise KeyboardInterrupt from None
+
+
 def train(
     config: TrainConfig,
     training: Views | Sequence[Views],
@@ -334,23 +350,27 @@ def train(
     the same design to begin with (`WeightsOf`: with what it was trained on), or `NetworkOf` one of any design on the
     same sensor, whose codes begin anew. No result depends on `hardware`, but for the order of sums on several devices.
     Returns steps, seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of
-    parameters. Raises InputError for sets or an `init` that do not fit, and another run's folder.
+    parameters. Raises InputError for no set, sets or an `init` that do not fit, indirect light on the published grid,
+    and another run's folder.
     """
+    require_kind(config, TrainConfig, "train", " of `preset`")
+    given = [_listed(training, "training"), _listed(validation, "validation")]
+    folder = Path(folder)
     config.check_memory()
     check_init(init, config)
-    sets = [[pack_views(one.transients) for one in _listed(views)] for views in (training, validation)]
+    sets = [[pack_views(one.transients) for one in some] for some in given]
     config = _with_hashes(config, sets, init)
     if config.model.grid == "published":
-        check_direct([*_listed(training), *_listed(validation)])
+        check_direct([*given[0], *given[1]])
         sets = [[on_published_grid(packed, config.model.sensor) for packed in packs] for packs in sets]
-    check_light([_listed(views) for views in (training, validation)], sets, config.model.sensor)
+    check_light(given, sets, config.model.sensor)
     module_data = SetData(sets[0], sets[1], config, hardware.workers)
     record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():
         runner = _trainer(config, record, hardware)
     module = DepthTraining(config, init)
     claim_run(folder, config)  # once the model is known to be possible
-    write_seen(folder, _listed(training), frozenset() if init is None else what_is_known(init).seen)
+    write_seen(folder, given[0], frozenset() if init is None else what_is_known(init).seen)
     if config.threads:
         torch.set_num_threads(config.threads)
     retain_freed_memory()
@@ -359,11 +379,7 @@ def train(
     if resume.is_file():
         check_resume(resume, module)
     if not (folder / "last.safetensors").is_file():
-        with _quiet():
-            try:
-                runner.fit(module, module_data, ckpt_path=resume if resume.is_file() else None, weights_only=True)
-            except SystemExit:  # what Lightning makes of Ctrl-C
-                raise KeyboardInterrupt from None
+        _fit(runner, module, module_data, resume)
         if runner.is_global_zero:
             save_model(module.kept, config, record.rows[-1], folder / "last.safetensors")
         runner.strategy.barrier()

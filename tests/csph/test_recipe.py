@@ -287,7 +287,7 @@ def test_training_senses_on_the_device_when_asked(tmp_path):
     there = sensed_batch(packs, config.model.sensor, (config.crop, config.crop), window, requests)
     assert torch.equal(here.depth_m.nan_to_num(-1), there.depth_m.nan_to_num(-1))
     assert torch.equal(here.valid, there.valid) and torch.equal(here.first_bin, there.first_bin)
-    with pytest.raises(InputError, match="sense_on 'gpu', expected host or device"):
+    with pytest.raises(InputError, match="sense_on 'gpu' is unknown, expected one of host, device"):
         replace(config, sense_on="gpu")
 
 
