@@ -18,8 +18,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.training.config import WINDOW_STEP, TrainConfig
-from csph.training.levels import draw_level
-from scenes.errors import require
+from csph.training.levels import dealt_levels, draw_level
+from scenes.errors import require, told_apart
 from scenes.random_streams import Stream
 from spad.detection.device_patches import DevicePatches
 from spad.detection.training_patches import Batch, PackedViews, Patch, joined, sense_patches
@@ -81,8 +81,8 @@ class Samples(Dataset):
 
 
 class Frames(Dataset):
-    """Whole validation frames of one set, as far as blocks tile them: view after view, each at one level, levels in
-    turn; the 16 test levels where training draws from a continuous range."""
+    """Whole validation frames of one set, as far as blocks tile them: view after view, each at one level, which are
+    dealt out (`dealt_levels`); the 16 test levels where training draws from a continuous range."""
 
     def __init__(self, packed: PackedViews, config: TrainConfig, views: int | None = None, source: int = 0) -> None:
         scenes, rows, columns = packed.depth_m.shape
@@ -90,21 +90,37 @@ class Frames(Dataset):
         self.size = (rows // height * height, columns // width * width)
         fits = min(self.size) > 0
         require(fits, f"validation views of {columns} x {rows} pixels are smaller than a block of {width} x {height}")
-        self.levels = PHOTON_LEVELS if isinstance(config.levels, str) else config.levels
+        levels = PHOTON_LEVELS if isinstance(config.levels, str) else config.levels
         # spread over the scenes, so that a few views are not all of the first
-        count = min(views or config.validation_views, scenes * len(self.levels))
-        self.chosen = [round(i * scenes * len(self.levels) / count) for i in range(count)]
+        count = min(views or config.validation_views, scenes * len(levels))
+        self.chosen = [round(i * scenes * len(levels) / count) // len(levels) for i in range(count)]
+        # a set goes on where the one before it ended, so that several of few views do not all leave out the same levels
+        self.levels = dealt_levels(levels, count, source * count)
         self.config, self.scenes, self.source = config, scenes, source
 
     def __len__(self) -> int:
         return len(self.chosen)
 
     def __getitem__(self, number: int) -> Request:
-        scene, turn = divmod(self.chosen[number], len(self.levels))
-        signal, background = self.levels[(number + turn) % len(self.levels)]
+        scene, (signal, background) = self.chosen[number], self.levels[number]
         # sets after the first have noise of their own
         key = (self.config.seed, Stream.VALIDATE, number, *((self.source,) if self.source else ()))
         return Request(self.source, Patch(scene, 0, 0, signal, background, key))
+
+
+def check_offset(training: Sequence[PackedViews], config: TrainConfig) -> None:
+    """Raise InputError for random delays that move all of a training set beyond the sensor's range: what is beyond it
+    has no label, and such patches train nothing."""
+    if not config.time_offset_m:
+        return
+    sensor = config.model.sensor
+    for packed in training:
+        nearest = float(np.min(packed.depth_m, initial=np.inf, where=np.isfinite(packed.depth_m)))
+        limit = sensor.recorded_range_m - nearest
+        left = f"the range of sensor {sensor.name}, {sensor.recorded_range_m:.4g} m, less the nearest depth of the set"
+        asked, most = told_apart(config.time_offset_m, limit, 4)
+        message = f"training: time offset {asked} m leaves nothing to train on, expected less than {most} m ({left})"
+        require(config.time_offset_m < limit, message)
 
 
 def sensed_batch(
@@ -194,6 +210,7 @@ class SetData(pl.LightningDataModule):
         self.training, self.validation, self.config, self.workers = training, validation, config, workers
         self.sensing: DeviceSensing | None = None
         Samples(training, config, 0)
+        check_offset(training, config)
         views = -(-config.validation_views // len(validation))
         self.frames = [Frames(packed, config, views, source) for source, packed in enumerate(validation)]
 
