@@ -9,14 +9,15 @@ from render.settings import Plan, RenderSettings
 from render.transient.samples import Samples
 from scene2spad.bench.rendering.settings import Method, grid_beside
 
-MERGED_M = 0.0  # nothing is merged: a histogram follows at once
+MERGED_M = 0.0  # no direct returns are merged: a histogram follows at once
+CELL_M = 0.02  # of indirect light: cells as wide as the histogram's bins (29 mm) would straddle them
 
 
 def trace(world: TracedScene, method: Method, bounces: int, quality: int, seed: int) -> Samples:
     """Return merged samples of all pixels, nothing planned or estimated: every setting is forced."""
     grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality), quality)
     threshold = default_edge_threshold(grid)
-    plan = Plan(bounces, spp, grid, False, (), threshold, MERGED_M, filter=method.filter)
+    plan = Plan(bounces, spp, grid, False, (), threshold, MERGED_M, CELL_M, filter=method.filter)
     settings = RenderSettings(
         bounces=bounces,
         spp=spp,
