@@ -13,7 +13,7 @@ from csph.networks.blockwise import BlockMixer, mixers_for
 from csph.networks.model import DepthModel
 from csph.training.beginning import NetworkOf, check_init
 from csph.training.config import ModelConfig, preset
-from csph.training.loop import DepthTraining, train
+from csph.training.loop import DepthTraining
 from scenes.errors import InputError
 from spad.sensor.model import Sensor
 
@@ -132,11 +132,11 @@ def test_codes_in_8_bits_keep_their_ranges_across_blocks():
     assert ours.scale == theirs.scale
 
 
-def test_other_switches_are_named_where_they_are_why(tmp_path):
+def test_other_switches_are_named_where_they_are_why():
     small = DepthModel(ModelConfig(design=INNER, sensor=SMALL), 1)
     model = replace(small.config, design=LARGER[0], layer={"keep_mean": True})
     with pytest.raises(InputError, match=r"cannot begin one of .* on reference: --layer none and keep_mean"):
-        train(preset("smoke", model, crop=8), [], [], tmp_path / "run", init=small)
+        check_init(small, preset("smoke", model, crop=8))
 
 
 def test_other_switches_of_the_same_design_are_warned_of(caplog):
@@ -161,7 +161,7 @@ def test_other_switches_of_the_same_design_are_warned_of(caplog):
     assert not warnings(small, per_pixel_norm=True, int8=True) and not warnings(NetworkOf(small))
 
 
-def test_what_cannot_begin_is_refused_in_one_line(tmp_path):
+def test_what_cannot_begin_is_refused_in_one_line():
     small = DepthModel(ModelConfig(design=INNER, sensor=SMALL), 1)
     for model in (
         replace(small.config, design=Design("learned", (64, 2, 2), 8)),
@@ -169,4 +169,4 @@ def test_what_cannot_begin_is_refused_in_one_line(tmp_path):
         replace(small.config, design=Design("fourier", (16, 2, 2), 4)),
     ):
         with pytest.raises(InputError, match=r"learned 16x2x2 K4, compact on reference cannot begin one of"):
-            train(preset("smoke", model, crop=8), [], [], tmp_path / "run", init=small)
+            check_init(small, preset("smoke", model, crop=8))
