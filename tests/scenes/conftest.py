@@ -13,8 +13,10 @@ import pytest
 # Mitsuba answers from a process of its own: importing it here would fix the LLVM library for all other tests.
 ORACLE = """
 import json, sys
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+dr.set_thread_count(2)  # with one (1 CPU) Mitsuba waits for ever for an EXR file
 mi.set_variant("scalar_rgb")
 numbers = lambda v: np.array(v, float).ravel().tolist()
 for line in sys.stdin:
