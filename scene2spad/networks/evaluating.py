@@ -60,13 +60,8 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     others = [model.config.sensor.name for model in models if model.config.sensor != sensor]
     require(not others, f"evaluate: checkpoints of sensors {sensor.name} and {', '.join(others)} see other photons")
     sensor.check_offset(command.offset)
-    views = views_at(command.set)
-    whole = views
-    if command.views is not None:
-        there = len(views.transients)
-        fits = 1 <= command.views <= there
-        require(fits, f"evaluate: views {command.views} is outside 1 to {there} of {command.set}")
-        views = Views(views.transients[: command.views], views.scenes[: command.views])
+    whole = views_at(command.set)
+    views = _first_views(whole, command)
     warn_of_seen(command, [config for _, config, _ in loaded], views, whole)
     check_truth(command.set, views, sensor, command.offset)
     overflows: list[int] = []
@@ -95,6 +90,16 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     shown |= _counted(found, command.set, sensor.recorded_range_m) | _scenes_counted(command.set, views)
     shown |= {"overflows": sum(overflows), "csv": str(table)}
     return shown | ({"maps": str(folder)} if command.maps else {})
+
+
+def _first_views(whole: Views, command: Evaluate) -> Views:
+    """Return the views of a set that are asked for. Raises InputError for more than there are."""
+    if command.views is None:
+        return whole
+    there = len(whole.transients)
+    fits = 1 <= command.views <= there
+    require(fits, f"evaluate: views {command.views} is outside 1 to {there} of {command.set}")
+    return Views(whole.transients[: command.views], whole.scenes[: command.views])
 
 
 def _report_plans(found: Evaluation, law: str | None) -> None:
