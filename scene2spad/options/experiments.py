@@ -17,11 +17,13 @@ class Bench(Common):
 
     stage: Positional[Literal["render", "sense", "encode", "network", "emulate", "hard-cases"]] = "render"
     """Stage to measure."""
-    scenes: tuple[Literal["flash", "lamp", "artist", "gallery", "groove", "hall", "hall-lamp", "washroom"], ...] = ()
+    scenes: tuple[
+        Literal["flash", "lamp", "artist", "artist-lamp", "gallery", "groove", "hall", "hall-lamp", "washroom"], ...
+    ] = ()
     """Scenes of `bench render` (default: all)."""
     sizes: tuple[int, ...] = ()
-    """Image sides, pixels (default: 64 128 256 of flash, lamp and gallery, 64 128 of artist and groove, 64 256 of
-    hall and hall-lamp, 64 of washroom)."""
+    """Image sides, pixels (default: 64 128 256 of flash, lamp and gallery, 64 128 of artist, artist-lamp and groove,
+    64 256 of hall and hall-lamp, 64 of washroom)."""
     only: tuple[str, ...] = ()
     """Cases of `bench hard-cases`, or programs of `bench emulate` (default: all)."""
     quick: bool = False

@@ -19,6 +19,7 @@ SCENES = {
     "flash": "the built-in living room, 34 degrees, lit by a flash that fills the field of view",
     "lamp": "the built-in living room, its own camera, lit by an isotropic lamp at the camera",
     "artist": "an artist's living room (Mitsuba XML), 34 degrees, lit by the same flash",
+    "artist-lamp": "the same with its own camera, lit by an isotropic lamp there",
     "gallery": "a bare room with six finely meshed bodies, 60 degrees, lit by an isotropic lamp at the camera",
     "groove": "a 90-degree V-groove, 34 degrees, lit by the same flash",
     "hall": "a varnished stairwell, 34 degrees, lit by the same flash",
@@ -29,6 +30,7 @@ SIZES = {
     "flash": (64, 128, 256),
     "lamp": (64, 128, 256),
     "artist": (64, 128),
+    "artist-lamp": (64, 128),
     "gallery": (64, 128, 256),
     "groove": (64, 128),
     "hall": (64, 256),
@@ -36,7 +38,7 @@ SIZES = {
     "washroom": (64,),
 }
 QUICK_SIZES = dict.fromkeys(SCENES, (64,)) | {"flash": (64, 128), "lamp": (64, 128)}
-LAMPS = ("lamp", "gallery", "hall-lamp")
+LAMPS = ("lamp", "artist-lamp", "gallery", "hall-lamp")
 _BUILT_IN = {"groove": "corner", "flash": "living-room", "lamp": "living-room", "hall-lamp": "hall"}
 ARTIST_FILE = Path("scenes/living-room/scene.xml")  # below the data folder
 MIRROR_ALBEDO = 0.5
@@ -106,7 +108,7 @@ def data_folder(given: Path | None) -> Path:
 
 def bench_scene(name: str, size: int, data: Path | None = None) -> Scene:
     """Return one of SCENES, `size` x `size` pixels. Raises InputError where the artist's file is absent."""
-    if name == "artist":
+    if name.startswith("artist"):
         path = data_folder(data) / ARTIST_FILE
         if not path.is_file():
             raise InputError(f"{path}: file not found (--data or SCENE2SPAD_DATA tell the folder)")
