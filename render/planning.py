@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from render.settings import (
     Plan,
     RenderSettings,
 )
-from render.transient.samples import select_pixels
 from scenes.errors import InputError
 from scenes.model import Material
 
@@ -52,10 +50,6 @@ PILOT_GRID = 4
 CELLS_ACROSS_CONE, MAX_HALF_ANGLE = 8, math.radians(80)
 # Errors of direct light fall at least with this power of the grid (1.2 to 1.9 in rooms); trusted so far beyond a grid.
 GRID_POWER, EXTRAPOLATED = 1.3, 2
-THRESHOLD_POWER = 0.7  # with which they fall as fewer edges are left alone (0.7 at grid 4, 0.5 at 5)
-# Below PILOT_GRID they rise with a power of 1.4 to 2.8, which views and their size decide: they are measured there. As
-# fewer edges are left alone they fall with one of 0.4 to 0.7 at grid 2, 0.2 to 0.6 at 3 (rooms and clutter).
-COARSE_THRESHOLD_POWER = 0.4
 # Merging direct returns within 1 mm makes an error of 5e-4 on the reference sensor (measured): a tenth of the target.
 TOLERANCE_M_PER_ERROR = 0.2
 WIDEST_TOLERANCE_M = 0.005
@@ -109,66 +103,7 @@ def finer_pilot(world: TracedScene, pixels: np.ndarray, grid: int, edge_threshol
     return pilot_response(world, pixels, CHECK_REFINEMENT * grid, edge_threshold / CHECK_REFINEMENT)
 
 
-def direct_error(world: TracedScene, settings: RenderSettings, seed: int, grid: int = PILOT_GRID) -> float:
-    """Return nRMSE of a view's direct light at a grid, by more rays a side in some of its pixels, as a render states
-    it."""
-    camera, checked = world.scene.camera, pilot_pixels(world, seed)
-    tolerance_m = WIDEST_TOLERANCE_M if settings.direct_tolerance_m is None else settings.direct_tolerance_m
-    light = direct_light(world, np.arange(camera.height * camera.width), grid, tolerance_m)
-    coarse = response(select_pixels(light.samples, checked), checked)
-    return estimate(coarse, finer_pilot(world, checked, grid, default_edge_threshold(grid))).total
-
-
-def rays_for_all(errors: Sequence[float], settings: RenderSettings) -> tuple[int, float]:
-    """Return grid and `edge_threshold` at which many views together, their mean squared error, meet direct light's
-    target.
-
-    `errors` are some views' `direct_error`. One choice for all costs less than each view's own: rays grow with the
-    square of the grid, so that the views that need most would take most of them for the least gain. Between two grids
-    the coarser one follows more edges: that costs no more than finer cells everywhere (measured in rooms).
-    Below PILOT_GRID the grid is a guess, and `measured_rays_for_all` begins with it.
-    """
-    ideal = PILOT_GRID * _times_allowed(errors, settings) ** (1 / GRID_POWER)
-    ideal = min(max(ideal, GRIDS[0]), GRIDS[-1])
-    grid = math.floor(ideal + 1e-6)
-    return grid, default_edge_threshold(grid) * (grid / ideal) ** (GRID_POWER / THRESHOLD_POWER)
-
-
-def measured_rays_for_all(
-    errors_at: Callable[[int], list[float]], settings: RenderSettings
-) -> tuple[int | None, float | None, list[float]]:
-    """Return grid and `edge_threshold` as `rays_for_all`, and the errors at PILOT_GRID; `errors_at` a grid measures
-    those of some views. Below PILOT_GRID a grid is taken only if errors that are measured there say so. None without
-    any: each view is to plan for itself.
-    """
-    errors = errors_at(PILOT_GRID)
-    if not errors:
-        return None, None, errors
-    grid, threshold = rays_for_all(errors, settings)
-    while grid < PILOT_GRID:
-        found = errors_at(grid)
-        enough = _edges_for_all(found, grid, settings) if found else None
-        if enough is not None:
-            return grid, enough, errors
-        grid, threshold = grid + 1, default_edge_threshold(grid + 1)
-    return grid, threshold, errors
-
-
-def _edges_for_all(errors: Sequence[float], grid: int, settings: RenderSettings) -> float | None:
-    """Return the `edge_threshold` at which views of these errors at a grid below PILOT_GRID meet their target together;
-    None where the next grid costs less."""
-    ratio = _times_allowed(errors, settings)
-    threshold = default_edge_threshold(grid) * min(1, 1 / ratio if ratio else 1) ** (1 / COARSE_THRESHOLD_POWER)
-    return threshold if threshold >= default_edge_threshold(grid + 1) else None
-
-
-def _times_allowed(errors: Sequence[float], settings: RenderSettings) -> float:
-    """Return the root mean square of errors, over that which direct light may have."""
-    target = DEFAULT_ERROR if settings.error is None else settings.error
-    return math.sqrt(np.mean(np.square(errors))) / (_direct_fraction(settings, settings.bounces == 1) * target)
-
-
-def _direct_fraction(settings: RenderSettings, direct_alone: bool) -> float:
+def direct_fraction_of(settings: RenderSettings, direct_alone: bool) -> float:
     """Return the part of the target nRMSE that direct light may use: its own, or all that is planned where there is no
     other light."""
     return math.sqrt(settings.target_fraction) if direct_alone else settings.direct_fraction
@@ -207,8 +142,12 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
     target, why = _target(settings, fine)
     reasons.append(why)
     bounces, spp, paths, more_reasons = _indirect(world, settings, pixels, fine, target, seed)
-    fraction = _direct_fraction(settings, direct_alone)
+    fraction = direct_fraction_of(settings, direct_alone)
     aim, paths = _aim(settings, target, paths)
+    if aim < target:
+        reasons.append(
+            f"direct light and merging: planned for an error of {aim:.2g}, as the forced paths leave no more"
+        )
     planned = PLANNED * settings.target_fraction * aim**2
     grid, off, why = _grid(world, settings, pixels, fraction * aim, paths, planned)
     if settings.grid is None and grid < _grid_for_cone(world):
@@ -331,7 +270,8 @@ def _grid(
     grid = min(offs, key=lambda g: CELL_COST * g**2 + paths / max(1 - offs[g] ** 2 / squared, MIN_NOISE_FRACTION))
     why = f"direct light: {grid} x {grid} rays a pixel, error {offs[grid]:.2g} by twice as many a side"
     if offs[grid] > allowed:
-        return grid, allowed, f"{why}: its share of the target needs more; force grid"
+        asked = settings.spp is None or settings.error is not None
+        return grid, allowed, f"{why}: its share of the target needs more; force grid" if asked else why
     return grid, offs[grid], why
 
 

@@ -13,7 +13,7 @@ from csph.layer import STARTS, LayerOptions, SpatialStart
 from csph.networks.grid import GRIDS, Grid
 from csph.networks.posterior import Decoder
 from csph.training.levels import CONTINUOUS, Levels, checked_levels
-from scenes.errors import InputError, did_you_mean, listed, normalise_fields, require, require_number, told_apart
+from scenes.errors import InputError, did_you_mean, listed, normalise_fields, require, require_number
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
@@ -230,11 +230,10 @@ class TrainConfig:
         require(0 < self.rate < 1, f"training: learning rate {self.rate:g} is outside 0 to 1")
         require(0 < self.decay <= 1, f"training: decay {self.decay:g} is outside (0, 1]")
         require(0 <= self.seed <= MAX_SEED, f"training: seed {self.seed} is outside 0 to {MAX_SEED}")
-        # what is moved beyond the range has no label: `data.check_offset` knows how near the sets begin
-        reach, sensor = self.model.sensor.recorded_range_m, self.model.sensor.name
-        offset, most = told_apart(self.time_offset_m, reach, 4)
-        expected = f"expected from 0 to less than {most} m, the range of sensor {sensor}"
-        require(0 <= self.time_offset_m < reach, f"training: time offset {offset} m, {expected}")
+        # delays are drawn from 0 to this, and what they move beyond the range has no label: `data.warn_of_unlabelled`
+        most, sensor = 2 * self.model.sensor.recorded_range_m, self.model.sensor.name
+        expected = f"expected from 0 to {most:.4g} m, twice the range of sensor {sensor}"
+        require(0 <= self.time_offset_m <= most, f"training: time offset {self.time_offset_m:g} m, {expected}")
         require(self.precision in PRECISIONS, f"precision {self.precision!r}: expected {', '.join(PRECISIONS)}")
         rows, columns = self.model.block[1:]
         fits = self.crop % rows == 0 and self.crop % columns == 0

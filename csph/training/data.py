@@ -6,6 +6,7 @@ the number of workers, and one that goes on after an interruption the patches th
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
@@ -19,11 +20,13 @@ from torch.utils.data import DataLoader, Dataset
 from csph.evaluation.metrics import PHOTON_LEVELS
 from csph.training.config import WINDOW_STEP, TrainConfig
 from csph.training.levels import dealt_levels, draw_level
-from scenes.errors import require, told_apart
+from scenes.errors import require
 from scenes.random_streams import Stream
 from spad.detection.device_patches import DevicePatches
 from spad.detection.training_patches import Batch, PackedViews, Patch, joined, sense_patches
 from spad.sensor.model import Sensor
+
+log = logging.getLogger("csph")
 
 FULL_LENGTH_FRACTION = 0.1  # of a run with windows, its last: on all bins
 
@@ -108,19 +111,16 @@ class Frames(Dataset):
         return Request(self.source, Patch(scene, 0, 0, signal, background, key))
 
 
-def check_offset(training: Sequence[PackedViews], config: TrainConfig) -> None:
-    """Raise InputError for random delays that move all of a training set beyond the sensor's range: what is beyond it
-    has no label, and such patches train nothing."""
-    if not config.time_offset_m:
-        return
-    sensor = config.model.sensor
-    for packed in training:
-        nearest = float(np.min(packed.depth_m, initial=np.inf, where=np.isfinite(packed.depth_m)))
-        limit = sensor.recorded_range_m - nearest
-        left = f"the range of sensor {sensor.name}, {sensor.recorded_range_m:.4g} m, less the nearest depth of the set"
-        asked, most = told_apart(config.time_offset_m, limit, 4)
-        message = f"training: time offset {asked} m leaves nothing to train on, expected less than {most} m ({left})"
-        require(config.time_offset_m < limit, message)
+def warn_of_unlabelled(training: Sequence[PackedViews], config: TrainConfig) -> None:
+    """Warn of random delays that move all of a training set beyond the sensor's range: what is beyond it has no label,
+    and such patches train nothing."""
+    most_m, range_m = config.time_offset_m, config.model.sensor.recorded_range_m
+    for number, packed in enumerate(training):
+        nearest_m = float(np.min(packed.depth_m, initial=np.inf, where=np.isfinite(packed.depth_m)))
+        beyond = min((most_m + nearest_m - range_m) / most_m, 1.0) if most_m else 0.0
+        if beyond > 0:
+            message = "time offset %.4g m: %.2g %% of the delays leave no label in training set %d (range %.4g m)"
+            log.warning(message, most_m, 100 * beyond, number + 1, range_m)
 
 
 def sensed_batch(
@@ -210,7 +210,7 @@ class SetData(pl.LightningDataModule):
         self.training, self.validation, self.config, self.workers = training, validation, config, workers
         self.sensing: DeviceSensing | None = None
         Samples(training, config, 0)
-        check_offset(training, config)
+        warn_of_unlabelled(training, config)
         views = -(-config.validation_views // len(validation))
         self.frames = [Frames(packed, config, views, source) for source, packed in enumerate(validation)]
 

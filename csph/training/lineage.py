@@ -73,12 +73,13 @@ def count_seen(
     """Count the views that a model or its ancestors were trained on: by their keys where a run's folder holds them,
     else by the hashes of whole sets and of parts of them (`parts` returns `training_parts`, which takes time)."""
     own, kept = (read_seen(checkpoint, name) for name in (SEEN, ANCESTORS_SEEN))
-    ancestors = ancestors_of(config)
+    ancestors, there = ancestors_of(config), len(views.transients)
     number = _as_a_whole(config.data, parts) if own is None else sum(is_seen(one, own) for one in views.transients)
     inherited = [_as_a_whole(one, parts) for one in ancestors]
     inherited.append(sum(is_seen(one, kept or frozenset()) for one in views.transients))
     unknown = [str(one.get("name") or "unnamed weights") for one in ancestors if "training_sha256" not in one]
-    return SeenViews(number, max(inherited), tuple(unknown))
+    # a part of a set may be evaluated on, whose hash is that of the whole
+    return SeenViews(min(number, there), min(max(inherited), there), tuple(unknown))
 
 
 def _as_a_whole(data: JsonObject, parts: Callable[[], Mapping[str, int]]) -> int:

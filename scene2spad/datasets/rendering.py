@@ -141,9 +141,9 @@ def render_views(job: Job, views: Sequence[int]) -> list[Done]:
 
 
 def _direct_errors(job: Job, grid: int, views: Sequence[int]) -> list[float]:
-    """`render.planning.direct_error` of some views; NaN of one that cannot be rendered, which its record will say."""
-    from render.planning import direct_error
+    """Return `direct_error` of some views; NaN of one that cannot be rendered, which its record will say."""
     from render.scene.traced_scene import TracedScene
+    from render.set_planning import direct_error
 
     found = []
     for view in views:
@@ -299,7 +299,7 @@ def check_sides(sides: Iterable[int]) -> None:
 
 def _with_grid(job: Job, folder: SetFolder, run: Run, report: Progress) -> Job:
     """Give all views as many rays as the errors of some of the first places ask for, however many views are asked."""
-    from render.planning import measured_rays_for_all
+    from render.set_planning import measured_rays_for_all
 
     path = folder.path / "grid.json"
     if not path.is_file():

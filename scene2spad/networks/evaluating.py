@@ -149,16 +149,12 @@ def warn_of_seen(command: Evaluate, configs: Sequence[TrainConfig], views: Views
     parts = cache(lambda: training_parts(whole))
     for path, config in zip(command.checkpoints, configs, strict=True):
         seen = count_seen(checkpoint_of(path), config, views, parts)
-        if seen.own:
-            message = "%s was trained on %d views of %s: its errors there are not those of a test"
-            log.warning(message, path, seen.own, command.set)
-        if seen.inherited:
-            message = (
-                "%s began with a model that was trained on %d views of %s: its errors there are not those of a test"
-            )
-            log.warning(message, path, seen.inherited, command.set)
+        for how, number in (("was trained", seen.own), ("began with a model that was trained", seen.inherited)):
+            if number:
+                message = "%s %s on %d views of %s: its errors there are not those of a test"
+                log.warning(message, path, how, number, command.set)
         if seen.unknown:
-            message = "%s began with %s: whether on views of %s, is not known"
+            message = "%s goes back to weights named %s; whether those were trained on views of %s is not recorded"
             log.info(message, path, ", ".join(seen.unknown), command.set)
 
 

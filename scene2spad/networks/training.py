@@ -22,7 +22,7 @@ from csph.training.beginning import NetworkOf, WeightsOf, check_init
 from csph.training.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
 from csph.training.lineage import begin_with
 from csph.training.overlap import overlap
-from csph.training.views import Views, read_views, split_views
+from csph.training.views import Views, is_seen, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.workers import check_workers
@@ -214,6 +214,7 @@ def run_train(command: Train, progress: Progress) -> dict:
     from csph.training.loop import Hardware, train  # and Lightning, which takes seconds to import
 
     training, validation, data = views_of(command)
+    warn_of_inherited(init, validation)
     first = training[0].transients[0]
     for warning in level_warnings(config, first.height, first.width):
         log.warning("%s", warning)
@@ -241,6 +242,17 @@ def begun_with(command: Train, config: TrainConfig) -> WeightsOf | NetworkOf | N
     init = begin_with(checkpoint_of(begun), network_alone=command.init_network is not None)
     check_init(init, config)
     return init
+
+
+def warn_of_inherited(init: WeightsOf | NetworkOf | None, validation: Sequence[Views]) -> None:
+    """Warn of validation views that a model to begin with, or one before it, was trained on."""
+    if init is None or not init.seen:
+        return
+    number = sum(is_seen(view, init.seen) for views in validation for view in views.transients)
+    if number:
+        there = sum(len(views.transients) for views in validation)
+        message = "the model to begin with was trained on %d of %d validation views: validation errors are too low"
+        log.warning(message, number, there)
 
 
 def folder_of(command: Train) -> Path:

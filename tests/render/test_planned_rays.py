@@ -7,8 +7,8 @@ import pytest
 
 from render.engine import planned
 from render.error import estimate, target_verdict
-from render.planning import measured_rays_for_all, rays_for_all
 from render.scene.traced_scene import TracedScene
+from render.set_planning import measured_rays_for_all, rays_for_all
 from render.settings import RenderSettings
 from scenes.library.catalog import load_scene
 

@@ -164,7 +164,7 @@ def test_places_that_cannot_be_planned_are_left_out_of_the_plan(tmp_path, monkey
             raise error
         return error
 
-    monkeypatch.setattr("render.planning.direct_error", direct_error)
+    monkeypatch.setattr("render.set_planning.direct_error", direct_error)
     result = make_set(job, 1, tmp_path)
     planned = json.loads((tmp_path / "grid.json").read_text())
     assert result["scenes"] == 1 and planned["errors"] == [0.02]

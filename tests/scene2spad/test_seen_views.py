@@ -83,6 +83,12 @@ def test_views_of_an_ancestors_training_are_known(capfd, packed, trained, grandc
             said = capfd.readouterr().err
             assert re.findall(rf"began with a model that was trained on (\d+) views of {path}", said) == expected
             assert f"was trained on 5 views of {path}: its" not in said.replace("model that was trained", "")
+        assert main(["evaluate", str(model), "--set", str(packed), "--views", "2", *out]) == 0
+        assert f"trained on 2 views of {packed}" in capfd.readouterr().err  # no more than are evaluated
+    asked = ["--set", str(others), "--validation", str(packed), "--init", str(grandchild), "--out", str(tmp_path / "n")]
+    assert main(["train", *QUICK, *asked]) == 0
+    said = "the model to begin with was trained on 5 of 6 validation views: validation errors are too low"
+    assert said in capfd.readouterr().err
     ship(grandchild, "shipped", tmp_path)
     assert read_card(tmp_path / "shipped/card.json").init == "child"
     assert [*ancestors_of(load_model(tmp_path / "shipped/model.safetensors")[1])] == ancestors
@@ -112,7 +118,9 @@ def test_shipped_models_of_before_know_their_shipped_ancestors(capfd, packed, tm
     assert other == {"name": parent["name"], "sha256": "0" * 64}
     out = ("--levels", "50+1", "--baselines", "argmax", "--out", str(tmp_path / "out"))
     assert main(["evaluate", "none-published-s0", "--set", str(packed), *out]) == 0
-    said = "none-published-s0 began with none-mixed-s0, after 4,800 steps on the published grid: whether on views of"
+    said = (
+        "none-published-s0 goes back to weights named none-mixed-s0, after 4,800 steps on the published grid; whether"
+    )
     assert said in capfd.readouterr().err
 
 
