@@ -56,13 +56,16 @@ class Plans:
             self.lines[kind] = _counted(self.lines.get(kind), words, pile_up, where)
 
     def messages(self) -> list[str]:
-        """Return every line with the numbers of the exposure with most pile-up, and how many exposures had it."""
+        """Return every line, how many exposures had it where not all had, and of which one its numbers are, if it has
+        any: of the one with most pile-up."""
         if self.exposures == 1:
             return [line.words for line in self.lines.values()]
-        return [
-            f"{line.words} ({line.exposures} of {self.exposures} exposures, numbers of {line.where})"
-            for line in self.lines.values()
-        ]
+        return [self._message(line) for line in self.lines.values()]
+
+    def _message(self, line: PlanLine) -> str:
+        some = [f"{line.exposures} of {self.exposures} exposures"] if line.exposures < self.exposures else []
+        notes = some + ([f"numbers of {line.where}"] if re.search(r"\d", line.words) else [])
+        return f"{line.words} ({', '.join(notes)})" if notes else line.words
 
 
 def _counted(line: PlanLine | None, words: str, pile_up: float, where: str) -> PlanLine:

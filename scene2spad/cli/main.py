@@ -177,8 +177,10 @@ def _one_line(box: str) -> str:
     text = re.sub(r"\s+", " ", text).removeprefix("Parsing error ").removeprefix("Invalid choice ").strip()
     choice = re.search(r"invalid choice '(.*?)' for argument '.*?'\. Expected one of \((.*?)\)", text)
     if choice is not None:
-        meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2]))
-        text = text.replace(choice[0], f"{choice[0]}{meant}", 1)
+        # an option that may stay open has None among its choices, in any order
+        known = sorted(set(re.findall(r"'(.*?)'", choice[2])) - {"None"})
+        expected = choice[0].replace(choice[2], ", ".join(map(repr, known)))
+        text = text.replace(choice[0], f"{expected}{did_you_mean(choice[1], known)}", 1)
     text = _unparsed(text) or text
     text = re.sub(r" no type matching .*?could be instantiated from (\[.*?\])\. Got errors.*", r" cannot be \1", text)
     return re.sub(r"For full helptext, run (.*)$", r"(see \1)", text) or "bad command line; see scene2spad --help"

@@ -1,4 +1,4 @@
-"""Depth maps of an evaluation, kept as `depth` writes them: one file of every method, view and photon level."""
+"""Depth maps of an evaluation: a file of every method, view and photon level, of the channel Z without confidence."""
 
 from __future__ import annotations
 
@@ -13,6 +13,12 @@ from scenes.errors import require
 from spad.formats.bistatic import pointing_of
 from spad.formats.depth_map import write_depth
 from spad.formats.histogram import Histogram
+
+
+def check_free(folder: Path) -> None:
+    """Raise InputError for a folder of maps that holds something: maps of two evaluations are not told apart."""
+    free = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    require(free, f"evaluate: {folder}: is not empty, and would mix maps of two evaluations; remove it or change --out")
 
 
 def map_writer(folder: Path, methods: Iterable[str]) -> KeepMap:

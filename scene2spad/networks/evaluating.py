@@ -19,7 +19,7 @@ from csph.training.views import Views, check_truth, training_parts
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.renders import unsure_scenes, views_at
-from scene2spad.networks.depth_maps import map_writer
+from scene2spad.networks.depth_maps import check_free, map_writer
 from scene2spad.networks.training import baseline, common_tile, network_method
 from scene2spad.options.networks import Evaluate
 from scenes.errors import InputError, require
@@ -48,6 +48,9 @@ def photon_levels(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     """Return networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
+    levels, folder = photon_levels(command.levels), command.out / "maps"
+    if command.maps:
+        check_free(folder)
     loaded = [load_model(checkpoint_of(path)) for path in command.checkpoints]
     require(bool(loaded), "evaluate: give at least one checkpoint")
     models = [model for model, _, _ in loaded]
@@ -75,8 +78,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     methods |= {name: baseline(name) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
     tile = common_tile(models) if command.tiled else (1, 1)
-    plan = EvaluationPlan(photon_levels(command.levels), tile, command.offset, command.seed, command.law)
-    folder = command.out / "maps"
+    plan = EvaluationPlan(levels, tile, command.offset, command.seed, command.law)
     keep = map_writer(folder, methods) if command.maps else None
     found = evaluate(methods, views, sensor, plan, progress=progress, keep=keep)
     _report_plans(found, command.law)

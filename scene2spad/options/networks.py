@@ -155,6 +155,6 @@ class Evaluate(Common):
     """Rounding of weights with --int8: 255 steps over each factor's own range (default), or over -1 to 1 as
     published."""
     maps: bool = False
-    """Write all depth maps as well, as `depth` does: maps/METHOD/VIEW-SCENE-SIGNAL+BACKGROUND.exr below --out."""
+    """Write all depth maps as well, without confidence: maps/METHOD/VIEW-SCENE-SIGNAL+BACKGROUND.exr below --out."""
     out: Path = Path("out/evaluate")
     """Folder for the table (.csv)."""

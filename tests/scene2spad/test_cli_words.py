@@ -57,6 +57,12 @@ def test_a_word_too_many_is_told_once(capsys):
     assert status == 2 and err.startswith("scene2spad: Missing value for argument '--set'") and err.count("\n") == 1
 
 
+def test_an_option_that_may_stay_open_lists_its_choices_alone(capsys):
+    status, _, err = run(capsys, "evaluate", "a", "--set", "b", "--law", "poison")
+    expected = "Expected one of ('auto', 'first-photon', 'free-running', 'poisson'); did you mean 'poisson'?"
+    assert status == 2 and expected in err and "None" not in err
+
+
 def test_alone_it_prints_its_help_and_version_its_version(capsys):
     status, out, _ = run(capsys)
     assert status == 0 and "render" in out and "usage" in out.lower()

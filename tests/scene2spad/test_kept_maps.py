@@ -27,10 +27,26 @@ def test_every_map_has_the_errors_of_its_row(capfd, tmp_path, monkeypatch):
     for row in rows:
         level = f"{float(row['signal']):g}+{float(row['background']):g}"
         scene, distance = row["scene"].replace("/", "-"), float(row["scene"].removeprefix("walls/"))
-        depth, _, meta = read_depth(Path(f"out/maps/{row['method']}/{row['view']}-{scene}-{level}.exr"))
+        depth, confidence, meta = read_depth(Path(f"out/maps/{row['method']}/{row['view']}-{scene}-{level}.exr"))
         truth = wall(distance, 4).depth_m
-        assert meta["method"] == row["method"] and depth.shape == (4, 4)
+        assert meta["method"] == row["method"] and depth.shape == (4, 4) and confidence is None
         assert 1e3 * np.nanmean(np.abs(depth - truth)) == pytest.approx(float(row["mae_mm"]), rel=1e-3)
+
+
+def test_maps_of_two_evaluations_do_not_mix(capfd, tmp_path):
+    """Told before models and set are read: the set is none here. So are wrong levels."""
+    (tmp_path / "maps").mkdir()
+    command = ["evaluate", "none-s0", "--set", str(tmp_path / "none.h5"), "--out", str(tmp_path)]
+    assert main([*command, "--maps"]) == 2 and "none.h5: file not found" in capfd.readouterr().err
+    (tmp_path / "maps" / "argmax").mkdir()
+    for more, words in (
+        (["--maps"], f"{tmp_path / 'maps'}: is not empty, and would mix maps of two evaluations"),
+        (["--levels", "nan+1"], "levels 'nan+1': expected"),
+        (["--levels", "1+1", "1+1"], "levels '1+1': given twice"),
+    ):
+        assert main([*command, *more]) == 2
+        message = capfd.readouterr().err
+        assert words in message and message.count("\n") == 1
 
 
 def test_two_methods_do_not_share_a_folder(tmp_path):
