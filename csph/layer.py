@@ -10,8 +10,7 @@ S.5.2; a convolution and a transposed convolution with stride = kernel there, ma
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -32,38 +31,10 @@ from csph.codes.quantise import (
 )
 from csph.codes.temporal import circle_of, orthogonal_start, temporal_code, uniform_start
 from csph.codes.tensor import CodingTensor, as_tensor, full_tensor
-from scenes.errors import normalise_fields, require, require_kind, require_whole
+from csph.layer_options import STARTS, LayerOptions, SpatialStart, check_switches
+from scenes.errors import require, require_choice, require_kind, require_whole
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse
-
-SpatialStart = Literal["uniform", "orthogonal"]
-STARTS: tuple[str, ...] = ("uniform", "orthogonal")
-
-
-@dataclass(frozen=True)
-class LayerOptions:
-    """Switches of the layer; the defaults are the published layer.
-
-    zero_mean         rows of C are held to sum to zero over Mt: a uniform background then encodes to zero
-    per_pixel_norm    one norm for all time blocks of a pixel (or block of pixels): which time block holds the return
-                      is then not lost, and blocks without signal are not amplified
-    keep_mean         the mean over K stays. Taken away, it leaves one sign bit of K = 2 and nothing of K = 1, and the
-                      back-projection of Fourier series no longer moves with a delay
-    pulse_in_decoder  back-project with the codes of a returning pulse, C h(tau), instead of those of one bin
-    pulse_in_codes    encode and back-project with codes smoothed by the pulse
-    int8              train for the chip: each factor in 255 steps within a range that is learned, sums of 16 bits that
-                      wrap (a core's, before its spatial weight); rounding is passed straight through backward
-    """
-
-    zero_mean: bool = True
-    per_pixel_norm: bool = False
-    keep_mean: bool = False
-    pulse_in_decoder: bool = False
-    pulse_in_codes: bool = False
-    int8: bool = False
-
-    def __post_init__(self) -> None:
-        normalise_fields(self, "layer")
 
 
 def make_coding(
@@ -77,7 +48,7 @@ def make_coding(
     """
     require_kind(design, Design, "make_coding")
     require_kind(sensor or Sensor(), Sensor, "make_coding: sensor")
-    require(spatial_start in STARTS, f"spatial_start {spatial_start!r} is unknown, expected one of {', '.join(STARTS)}")
+    require_choice(spatial_start, STARTS, "spatial_start")
     seed = require_whole(seed, "make_coding: seed")
     (bins, rows, columns), codes = design.block, design.codes
     if design.full:
@@ -138,7 +109,8 @@ class CompressiveLayer(nn.Module):
         require_kind(coding, CodingTensor, "CompressiveLayer", " (`CompressiveLayer.of` takes a Design)")
         parts = {"temporal": coding.temporal, "spatial": coding.spatial}
         named = f"CompressiveLayer: learned {learned!r}, expected names of parts, as in ('temporal',)"
-        require(isinstance(learned, list | tuple), named)
+        words = isinstance(learned, list | tuple) and all(isinstance(part, str) for part in learned)
+        require(words, named)
         unknown = [name for name in learned if parts.get(name) is None]
         require(not unknown, f"coding tensor {coding.name} has no part {', '.join(unknown)} to learn")
         self.name, self.block, self.codes, self.computed = coding.name, coding.block, coding.codes, coding.computed
@@ -170,7 +142,11 @@ class CompressiveLayer(nn.Module):
         spatial_start: SpatialStart = "uniform",
         **options: bool,
     ) -> CompressiveLayer:
-        """Return the layer of a design at its start; `options` are switches of LayerOptions."""
+        """Return the layer of a design at its start; `options` are switches of LayerOptions.
+
+        Raises InputError for switches that it has not.
+        """
+        check_switches(options)
         coding = make_coding(design, sensor, seed, spatial_start)
         switches = replace(LayerOptions(zero_mean=bool(design.zero_mean)), **options)
         return cls(coding, learned=design.learned, options=switches, sensor=sensor)

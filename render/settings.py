@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from scenes.errors import InputError, require_number
+from scenes.errors import InputError, normalise_fields, require_number
 from scenes.json_types import JsonObject
 
 MAX_BOUNCES = 63
@@ -109,8 +109,12 @@ class RenderSettings:
                 raise InputError(f"render: {name} {value} is outside {low} to {high}")
             if value is not None and name in WHOLE and not isinstance(value, Integral):
                 raise InputError(f"render: {name} {value!r} is no whole number, as it has to be from {low} to {high}")
-        if self.refraction is not None and self.refraction not in get_args(Refraction):
-            raise InputError(f"render: refraction {self.refraction!r}, expected {' or '.join(get_args(Refraction))}")
+        normalise_fields(self, "render")
+        if not (self.ambient is None or isinstance(self.ambient, bool)):
+            raise InputError(f"render: ambient {self.ambient!r}, expected True, False or None")
+        bends, ways = self.refraction, get_args(Refraction)
+        if bends is not None and not (isinstance(bends, str) and bends in ways):
+            raise InputError(f"render: refraction {bends!r}, expected {' or '.join(ways)}")
         if self.budget is not None:
             pair = list(self.budget) if isinstance(self.budget, tuple | list | np.ndarray) else []
             if len(pair) != 2 or not all(isinstance(mean, Real) for mean in pair):

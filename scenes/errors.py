@@ -39,6 +39,13 @@ def require_kind(value: object, kind: type, where: str, hint: str = "") -> None:
     require(isinstance(value, kind), f"{where}: expected {article} {kind.__name__}{hint}, not {type(value).__name__}")
 
 
+def require_choice(value: object, known: Iterable[str], what: str) -> None:
+    """Raise InputError unless a word is among those known; `what` it chooses comes first."""
+    words = tuple(known)
+    good = isinstance(value, str) and value in words
+    require(good, f"{what} {value!r} is unknown, expected one of {', '.join(words)}")
+
+
 def require_number(value: object, what: str) -> float:
     """Return a real number as Python's own, which JSON holds, or an InputError that names `what` was given.
 

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
 
-from scenes.errors import InputError, did_you_mean, normalise_fields, require
+import numpy as np
+
+from scenes.errors import InputError, did_you_mean, normalise_fields, require, require_number
 
 CODES = ("learned", "fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 _QUARTER_WAVE = ("fourier", "gray", "fourier-published", "gray-published")
@@ -39,7 +41,8 @@ class Design:
     def __post_init__(self) -> None:
         object.__setattr__(self, "block", _block_of(self.block))
         meant = did_you_mean(str(self.code), CODES)
-        require(self.code in CODES, f"design {self.code!r} is unknown{meant}, expected one of {', '.join(CODES)}")
+        word = isinstance(self.code, str) and self.code in CODES
+        require(word, f"design {self.code!r} is unknown{meant}, expected one of {', '.join(CODES)}")
         most = self.size if self.code in ("learned", "random") else self.block[0]
         expected = f"expected a whole number from 1 to {most} for {self.code} codes"
         whole = isinstance(self.codes, Integral) and not isinstance(self.codes, bool) and 1 <= self.codes <= most
@@ -144,18 +147,19 @@ class Design:
         return self.parameters if self.computed is None else self.computed + self.spatial_parameters
 
 
-def _block_of(block: Sequence[int]) -> tuple[int, int, int]:
+def _block_of(block: Sequence[int] | np.ndarray) -> tuple[int, int, int]:
     """Return a block as three of Python's whole numbers. Raises InputError for anything else."""
+    block = block.tolist() if isinstance(block, np.ndarray) else block
     sides = list(block) if isinstance(block, list | tuple) else []
     good = len(sides) == 3 and all(isinstance(n, Integral) and not isinstance(n, bool) and int(n) >= 1 for n in sides)
-    require(good, f"block {block!r}: expected three positive numbers of bins, rows and columns")
+    require(good, f"block {block!r}: expected three positive whole numbers of bins, rows and columns")
     bins, rows, columns = map(int, sides)
     return bins, rows, columns
 
 
 def codes_for(block: tuple[int, int, int], compression: float) -> int:
     """Return K = Mt Mr Mc / CR. Raises InputError unless it is a whole number of at least 1."""
-    size = math.prod(block)
+    size, compression = math.prod(block), require_number(compression, "compression ratio")
     whole = math.isfinite(compression) and compression > 0 and size % compression == 0 and size >= compression
     message = f"compression ratio {compression:g} does not divide the {size} counts of a block of"
     require(whole, f"{message} {' x '.join(map(str, block))}")

@@ -8,10 +8,10 @@ from dataclasses import asdict, replace
 from typing import NamedTuple
 
 from csph.codes.nested import holds
-from csph.layer import LayerOptions
+from csph.layer_options import LayerOptions
 from csph.networks.model import DepthModel
 from csph.training.config import ModelConfig, TrainConfig, grows
-from scenes.errors import require
+from scenes.errors import require, require_kind
 from scenes.json_types import JsonObject
 
 log = logging.getLogger("csph")
@@ -42,8 +42,11 @@ Beginning = DepthModel | WeightsOf | NetworkOf
 
 
 def what_is_known(init: Beginning) -> WeightsOf | NetworkOf:
-    """Return the model that a training begins with, and what it was trained on: nothing is known of a bare model."""
-    return WeightsOf(init) if isinstance(init, DepthModel) else init
+    """Return the model that a training begins with, and what it was trained on: nothing is known of a bare model.
+    Raises InputError for anything else."""
+    known = init if isinstance(init, WeightsOf | NetworkOf) else WeightsOf(init)
+    require_kind(known.model, DepthModel, "train: init", " of `load_model`")
+    return known
 
 
 def check_init(init: Beginning | None, config: TrainConfig) -> None:

@@ -9,11 +9,11 @@ from typing import Any, Literal
 from csph.codes.design import Design
 from csph.codes.temporal import MAX_SEED
 from csph.evaluation.metrics import TRAIN_LEVELS
-from csph.layer import STARTS, LayerOptions, SpatialStart
+from csph.layer_options import STARTS, SpatialStart, check_switches
 from csph.networks.grid import GRIDS, Grid
 from csph.networks.posterior import Decoder
 from csph.training.levels import CONTINUOUS, Levels, checked_levels
-from scenes.errors import InputError, did_you_mean, listed, normalise_fields, require, require_number
+from scenes.errors import InputError, normalise_fields, require, require_choice, require_number
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.sensor.model import Sensor
@@ -47,8 +47,7 @@ def grows(smaller: str, larger: str) -> bool:
 def _check_choices(owner: object, where: str, **choices: tuple[str, ...]) -> None:
     """Raise InputError unless each named attribute is one of its choices."""
     for name, known in choices.items():
-        value = getattr(owner, name)
-        require(value in known, f"{where}{name} {value!r} is unknown, expected one of {', '.join(known)}")
+        require_choice(getattr(owner, name), known, f"{where}{name}")
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class ModelConfig:
     front    what the network sees: the back-projection of codes; without compression the counts, or their correlation
              with the pulse (`spad.estimators.matching.normalised_correlation`); or one-hot argmax
     design   the codes, with `front` = "codes"
-    layer    switches of `csph.layer.LayerOptions` that differ from the published layer
+    layer    switches of `csph.layer_options.LayerOptions` that differ from the published layer
     network  compact; blockwise, the compact one that sees codes and places in a block, too; refined, the blockwise one
              that looks at the codes a second time; periodic, the compact one on a circle of time, for Fourier codes of
              the whole range; published; or published with logits of any sign, which cannot die
@@ -82,12 +81,7 @@ class ModelConfig:
         designed = self.design is None or isinstance(self.design, Design)
         require(designed, f"design {self.design!r}, expected a Design (`Design.named` makes one of a name)")
         require(isinstance(self.sensor, Sensor), f"sensor {self.sensor!r}, expected a Sensor (`sensor_by_name`)")
-        named = isinstance(self.layer, dict)
-        named = named and all(isinstance(k, str) and isinstance(on, bool) for k, on in self.layer.items())
-        require(named, f"layer {self.layer!r}: expected switches by name")
-        known = [item.name for item in fields(LayerOptions)]
-        for name in self.layer:
-            require(name in known, f"layer {name}: is unknown{did_you_mean(name, known)}, expected {listed(known)}")
+        check_switches(self.layer)
         coded = self.front == "codes"
         require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
         switches = ", ".join(sorted(name for name, on in self.layer.items() if on))
@@ -290,10 +284,10 @@ class TrainConfig:
     def from_dict(cls, values: JsonObject) -> TrainConfig:
         """Raise InputError for an entry that is missing or unknown."""
         try:
-            model = dict(values["model"])
+            model = {**values["model"]}
             design = model.pop("design")
             sensor = Sensor.from_dict(model.pop("sensor"))
-            design = None if design is None else Design(**{**design, "block": design["block"]})
+            design = None if design is None else Design(**design)
             made = {"model": ModelConfig(design=design, sensor=sensor, **model), "levels": values["levels"]}
             return cls(**{**values, **made})
         except (KeyError, TypeError, AttributeError) as error:
@@ -374,12 +368,14 @@ def preset(name: str, model: ModelConfig, **changes: object) -> TrainConfig:
     peaks, `paper` has the published total variation and a tenth of the learning rate. `levels` may be "paper". The
     published network is trained by Adam with every preset.
     """
-    require(name in PRESETS, f"preset {name!r} is unknown, expected one of {', '.join(PRESETS)}")
+    require_choice(name, PRESETS, "preset")
+    require(isinstance(model, ModelConfig), f"preset: model {model!r}, expected a ModelConfig")
     known = {item.name for item in fields(TrainConfig)}
     given = {key: value for key, value in changes.items() if value is not None}
     require(given.keys() <= known, f"unknown options {', '.join(sorted(given.keys() - known))}")
+    levels = given.get("levels")
     oracle = {"rate": 1e-4, "tv_weight": PUBLISHED_TV} if name == "paper" and model.front != "codes" else {}
-    if given.get("levels") == "paper":
+    if isinstance(levels, str) and levels == "paper":
         given["levels"] = TRAIN_LEVELS
     values: dict[str, Any] = {"model": model, "preset": name, **PRESETS[name], **oracle, **given}
     if "optimiser" not in given and model.network not in HELD:

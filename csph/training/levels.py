@@ -21,17 +21,19 @@ Levels = tuple[Level, ...] | str
 
 
 def checked_levels(levels: Levels) -> Levels:
-    """Return levels as a tuple of pairs, or "continuous". Raises InputError for anything else, none, and photons that
-    cannot be."""
+    """Return levels, pairs or rows of an array, as a tuple of pairs, or "continuous". Raises InputError for anything
+    else, none, levels without signal, and photons that cannot be."""
     if isinstance(levels, str):
         require(levels == CONTINUOUS, f"training: levels {levels!r}, expected a list or {CONTINUOUS}")
         return levels
-    expected = "expected pairs of signal and background photons, finite and not negative"
+    expected = "expected pairs of signal and background photons, finite and not negative, signal above 0"
+    levels = levels.tolist() if isinstance(levels, np.ndarray) else levels
     pairs = list(levels) if isinstance(levels, list | tuple) else [levels]
     require(bool(pairs), "training: no photon level")
     for pair in pairs:
         good = isinstance(pair, list | tuple) and len(pair) == 2
-        good = good and all(isinstance(mean, Real) and 0 <= float(mean) < math.inf for mean in pair)
+        good = good and all(isinstance(mean, Real) and not isinstance(mean, bool) for mean in pair)
+        good = good and 0 < float(pair[0]) < math.inf and 0 <= float(pair[1]) < math.inf
         require(good, f"training: level {pair!r}, {expected}")
     return tuple((float(signal), float(background)) for signal, background in pairs)
 

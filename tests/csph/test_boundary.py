@@ -10,7 +10,8 @@ import torch
 from csph.codes.design import Design
 from csph.layer import CompressiveLayer, LayerOptions, make_coding
 from csph.networks.model import DepthModel, save_model
-from csph.training.config import ModelConfig, TrainConfig
+from csph.training.beginning import WeightsOf
+from csph.training.config import ModelConfig, TrainConfig, preset
 from csph.training.loop import train
 from csph.training.views import Views
 from scene2spad.datasets.planes import random_planes
@@ -19,6 +20,7 @@ from scenes import InputError
 DESIGN = Design("learned", (64, 2, 2), 8)
 MODEL = ModelConfig(design=DESIGN)
 COUNTS = np.zeros((1, 1, 1024, 4, 4), np.int64)
+WORDS = np.array(["a", "b"])  # whose comparison with a word is no truth value
 PLANES = random_planes(1, size=16, seed=0)
 
 
@@ -36,6 +38,9 @@ PLANES = random_planes(1, size=16, seed=0)
         (lambda: CompressiveLayer.of(DESIGN, int8="yes"), "layer: int8 'yes', expected True or False"),
         (lambda: CompressiveLayer.of(DESIGN, spatial_start="flat"), "spatial_start 'flat' is unknown, expected one of"),
         (lambda: make_coding(DESIGN, seed=1.5), "seed 1.5, expected a whole number"),
+        (lambda: CompressiveLayer(make_coding(DESIGN), learned=[1]), r"learned \[1\], expected names of parts"),
+        (lambda: CompressiveLayer.of(DESIGN, foo=True), "layer foo: is unknown, expected zero_mean"),
+        (lambda: make_coding(DESIGN, spatial_start=WORDS), "spatial_start array.* is unknown, expected one of uniform"),
         (lambda: LayerOptions(keep_mean=1), "layer: keep_mean 1, expected True or False"),
         (lambda: DepthModel(DESIGN), "DepthModel: expected a ModelConfig, not Design"),
         (lambda: DepthModel(MODEL, seed="a"), "seed 'a', expected a whole number"),
@@ -63,10 +68,16 @@ def test_layers_and_models_take_what_they_say(call, message):
         ),
         (lambda: Design("learned", (64, 2, 2), 8, full="yes"), "full 'yes', expected True or False"),
         (lambda: Design("learned", (64, 2, 2), 8, zero_mean="yes"), "zero_mean 'yes', expected True, False or None"),
-        (lambda: Design("learned", 64, 8), "block 64: expected three positive numbers"),
-        (lambda: Design("learned", (64, True, 2), 8), "block .*: expected three positive numbers"),
+        (lambda: Design("learned", 64, 8), "block 64: expected three positive whole numbers"),
+        (lambda: Design("learned", (64, True, 2), 8), "block .*: expected three positive whole numbers"),
         (lambda: Design(3), "design 3 is unknown, expected one of learned"),
         (lambda: Design.named(None, (64, 2, 2), codes=8), "design None: expected CODE or CODE.learned"),
+        (lambda: Design(WORDS), "design array.* is unknown, expected one of learned"),
+        (lambda: Design.named("learned", (64, 2, 2), compression="a"), "compression ratio 'a', expected a number"),
+        (lambda: ModelConfig(front=WORDS), "front array.* is unknown, expected one of codes"),
+        (lambda: preset("smoke", "learned"), "preset: model 'learned', expected a ModelConfig"),
+        (lambda: preset(["smoke"], MODEL), r"preset \['smoke'\] is unknown, expected one of smoke"),
+        (lambda: TrainConfig.from_dict({"model": "abc"}), "its configuration cannot be read"),
         (lambda: TrainConfig(model="learned"), "training: model 'learned', expected a ModelConfig"),
     ],
 )
@@ -93,6 +104,8 @@ def test_configurations_of_models_are_checked(make, message):
         ({"levels": (10.0, 10.0)}, "level 10.0, expected pairs"),
         ({"levels": ((10.0, "a"),)}, r"level \(10.0, 'a'\), expected pairs"),
         ({"levels": ((10.0, math.nan),)}, "nan.*, expected pairs .* finite and not negative"),
+        ({"levels": ((0, 10.0),)}, r"level \(0, 10.0\), expected pairs .* signal above 0"),
+        ({"levels": ((True, 2),)}, r"level \(True, 2\), expected pairs"),
         ({"levels": ((-1.0, 10.0),)}, r"level \(-1.0, 10.0\), expected pairs"),
     ],
 )
@@ -108,6 +121,9 @@ def test_numbers_of_numpy_become_those_that_json_holds(tmp_path):
     config = TrainConfig(model=ModelConfig(design=design), epochs=np.int64(2), rate=np.float32(0.5), levels=[(10, 10)])
     assert design == Design("fourier", (64, 1, 1), 8) and hash(design) == hash(Design("fourier", (64, 1, 1), 8))
     assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert design == Design("fourier", np.array([64, 1, 1]), 8)
+    counts_model, array = ModelConfig(front="counts"), np.array([[1, 2.0]])
+    assert preset("smoke", counts_model, levels=array) == preset("smoke", counts_model, levels=((1, 2),))
     model = DepthModel(config.model, seed=np.int64(3))
     save_model(model, config, {}, tmp_path / "model.safetensors")
     counts = torch.from_numpy(COUNTS)
@@ -128,6 +144,13 @@ def test_numbers_of_numpy_become_those_that_json_holds(tmp_path):
 def test_trainings_without_sets_are_refused(training, validation, message, tmp_path):
     with pytest.raises(InputError, match=message):
         train(TrainConfig(model=MODEL), training, validation, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("init", ["none-mixed-s0", WeightsOf("none-mixed-s0")])
+def test_a_training_begins_with_a_model_and_nothing_else(init, tmp_path):
+    with pytest.raises(InputError, match="train: init: expected a DepthModel of `load_model`, not str"):
+        train(TrainConfig(model=MODEL), PLANES, PLANES, tmp_path / "run", init=init)
     assert not (tmp_path / "run").exists()
 
 

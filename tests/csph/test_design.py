@@ -86,7 +86,7 @@ def test_names_and_learned_parts():
         (lambda: Design("learned", (4, 2, 2), 17), "17 codes over a block of 4 x 2 x 2, expected a whole number"),
         (lambda: Design("fourier", (16, 2, 2), 17), "expected a whole number from 1 to 16"),
         (lambda: Design("learned", (4, 2, 2), 0), "0 codes"),
-        (lambda: Design("learned", (4, 0, 2), 1), "three positive numbers"),
+        (lambda: Design("learned", (4, 0, 2), 1), "three positive whole numbers"),
         (lambda: Design("haar"), "'haar' is unknown"),
         (lambda: Design("fourier", (64, 1, 1), 4, full=True), "full coding tensors are learned or random"),
         (lambda: Design.named("fourier", (64, 4, 4), codes=4), "no spatial part: fourier.learned"),

@@ -96,6 +96,13 @@ def test_optics_compute_the_photon_budget():
         (lambda h: s2s.render("plane", budget=(3,)), r"budget \(3,\), expected two numbers"),
         (lambda h: s2s.render("plane", budget=("a", 3)), r"budget \('a', 3\), expected two numbers"),
         (lambda h: s2s.render("plane", error="0.1"), "render: error '0.1', expected a number"),
+        (lambda h: s2s.RenderSettings(filter="x"), "render: filter 'x', expected True or False"),
+        (lambda h: s2s.RenderSettings(adaptive="no"), "render: adaptive 'no', expected True or False"),
+        (lambda h: s2s.RenderSettings(ambient="x"), "render: ambient 'x', expected True, False or None"),
+        (
+            lambda h: s2s.RenderSettings(refraction=np.array(["a", "b"])),
+            "refraction array.*, expected straight or bent",
+        ),
         (lambda h: s2s.RenderSettings(budget=3), "budget 3, expected two numbers: signal and background photons"),
         (lambda h: s2s.RenderSettings(budget="ab"), "budget 'ab', expected two numbers"),
         (lambda h: s2s.RenderSettings(budget=(10, "a")), r"budget \(10, 'a'\), expected two numbers"),
