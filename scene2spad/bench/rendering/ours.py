@@ -17,7 +17,9 @@ def trace(world: TracedScene, method: Method, bounces: int, quality: int, seed: 
     """Return merged samples of all pixels, nothing planned or estimated: every setting is forced."""
     grid, spp = (quality, 1) if method.unit == "grid" else (grid_beside(quality), quality)
     threshold = default_edge_threshold(grid)
-    plan = Plan(bounces, spp, grid, False, (), threshold, MERGED_M, CELL_M, filter=method.filter)
+    # a pilot would leave the filter out where it does not pay
+    adaptive = not method.filter
+    plan = Plan(bounces, spp, grid, False, (), threshold, MERGED_M, CELL_M, adaptive=adaptive, filter=method.filter)
     settings = RenderSettings(
         bounces=bounces,
         spp=spp,

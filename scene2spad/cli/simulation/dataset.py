@@ -49,7 +49,8 @@ class Dataset(Long):
     spp: Count = None
     """Indirect light paths per pixel (default: planned for each view)."""
     filter: bool = False
-    """Average late indirect light over small regions of surfaces, as `render` does: faster, and biased."""
+    """Average late indirect light over small regions of surfaces, as `render` does: biased, and in sets of small views
+    slower."""
     grid: Count = None
     """Direct rays per pixel side (default: planned, one for all views of an endless set)."""
     error: Number = None

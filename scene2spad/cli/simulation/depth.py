@@ -70,10 +70,10 @@ class Depth(Common):
     sensor: Annotated[str | None, may_stay_open("NAME")] = None
     """Sensor preset or file (.toml) that a transient is sensed with (default: reference)."""
     signal: Number = None
-    """Mean signal photons per pixel that a transient is sensed with (default: 50, or the sensor's dark counts
-    if they are more)."""
+    """Mean signal photons per pixel that a transient is sensed with (default: 50)."""
     background: Number = None
-    """Mean background photons per pixel that a transient is sensed with (default: 50)."""
+    """Mean background photons per pixel that a transient is sensed with (default: 50, or the sensor's dark counts
+    if they are more)."""
     figure: bool = True
     """Draw estimate, truth and error beside the file."""
 
