@@ -108,10 +108,11 @@ def test_noise_falls_and_the_bias_goes_with_more_paths():
     """
     scene = room()
     world, pixels = TracedScene(scene), np.arange(24 * 24)
-    fine = render(scene, RenderSettings(bounces=4, spp=8192, grid=4), seed=99, world=world)
+    fine = render(scene, RenderSettings(bounces=4, spp=8192, grid=4, direct_tolerance_m=0.004), seed=99, world=world)
 
     def late(spp: int, filtered: bool, seed: int) -> np.ndarray:
-        given = RenderSettings(bounces=4, spp=spp, grid=4, filter=filtered, adaptive=filtered)
+        way = {"filter": filtered, "adaptive": filtered}
+        given = RenderSettings(bounces=4, spp=spp, grid=4, direct_tolerance_m=0.004, **way)
         transient = render(scene, given, seed=seed, world=world)
         direct = transient.bounces == 1
         assert np.array_equal(transient.radiance[direct], fine.radiance[fine.bounces == 1])
