@@ -32,7 +32,7 @@ class PlanLine(NamedTuple):
 
 @dataclass
 class Plans:
-    """What the plans of an evaluation's exposures say: lines that differ in numbers alone are one.
+    """Collect what the plans of an evaluation's exposures say: lines that differ in numbers alone are one.
 
     exposures  how many there were
     lines      by the line without its numbers

@@ -1,4 +1,4 @@
-"""What a model was trained on before it was trained: by its configuration, and by what lies in its run's folder.
+"""Tell what a model was trained on before it was trained: by its configuration, and by what lies in its run's folder.
 
 A run that begins with a model keeps `data["ancestors"]`, nearest first: `name`, `sha256` of the weights, and
 `training_sha256` of the training sets, where they are known. The keys of the ancestors' views lie in the run's folder.

@@ -162,8 +162,9 @@ def _short_hash(content: bytes) -> str:
 
 def is_seen(view: Transient, keys: Set[str]) -> bool:
     """Tell whether a view is among those of some keys, of runs of before, too, whose keys held the mixed pixels."""
-    before = _short_hash(_shown(view) + view.mixed.astype(np.uint8).tobytes())
-    return not keys.isdisjoint((view_key(view), before))
+    shown = _shown(view)
+    before = shown + view.mixed.astype(np.uint8).tobytes()
+    return not keys.isdisjoint((_short_hash(shown), _short_hash(before)))
 
 
 def write_seen(folder: Path, sets: Iterable[Views], inherited: Set[str] = frozenset()) -> None:

@@ -1,4 +1,4 @@
-"""What training leaves out at its photon levels: pile-up at the highest, the sensor's dark counts at the lowest."""
+"""Warn of what training leaves out at its photon levels: pile-up at the highest, the sensor's dark counts at the lowest."""
 
 from __future__ import annotations
 

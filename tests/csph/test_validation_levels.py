@@ -31,7 +31,7 @@ def levels_of(packed: PackedViews, views: int, source: int = 0) -> list[tuple[in
 
 @pytest.mark.parametrize("views", [5, 8, 16, 18, 24, 48, 50, 96, 768])
 def test_every_level_is_seen_as_often_as_the_number_of_views_allows(rooms, views):
-    """Of 16 levels, 768 views, each of the set at each level, saw the 8 even ones, and 18 views 13."""
+    """Count each level: of 16, 768 views, each of the set at each level, saw the 8 even ones, and 18 views 13."""
     seen = Counter(level for _, level in levels_of(rooms, views))
     assert sum(seen.values()) == views and len(seen) == min(views, 16)
     assert max(seen.values()) - min(seen.values()) <= 1

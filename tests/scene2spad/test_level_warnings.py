@@ -1,4 +1,4 @@
-"""What `train` warns of: photon levels that its sensor has pile-up at, or more dark counts than."""
+"""Test what `train` warns of: photon levels that its sensor has pile-up at, or more dark counts than."""
 
 from dataclasses import replace
 

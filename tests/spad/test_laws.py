@@ -51,8 +51,7 @@ def test_poisson_dispersion(rate: float, dense_from: float, monkeypatch: pytest.
     bins, pixels = (4, 4000) if rate < 1e5 else (1, 400)
     sensor = Sensor(bins=bins, bin_width_s=1e-9)
     counts = sense(same(pixels, (1.0, 1.0, 1.0)), sensor, PhotonBudget(0, rate * bins), seed=3, model="poisson").counts
-    counts = counts.astype(float)
-    number = counts.size
+    counts, number = counts.astype(float), counts.size
     # sum of n is Poisson(number rate): 1e-4 two-sided, exact; (n - rate)^2 has mean rate, variance rate + 2 rate^2
     total = counts.sum()
     low, high = stats.poisson.ppf([5e-5, 1 - 5e-5], number * rate)
