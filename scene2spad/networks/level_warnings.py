@@ -1,4 +1,4 @@
-"""Warn of what training leaves out at its photon levels: pile-up at the highest, the sensor's dark counts at the lowest."""
+"""Warn of what training leaves out: pile-up at the highest photon level, the sensor's dark counts at the lowest."""
 
 from __future__ import annotations
 
