@@ -151,25 +151,20 @@ class CellTree:
         start = self.used
         child = np.arange(start, start + 4 * len(parents), 4, dtype=np.int32)
         self.child[parents] = child
-        new = self._add(
+        self._add(
             np.repeat(self.rank[parents], 4),
             (2 * self.column[parents, None] + _CHILD_COLUMN).ravel(),
             (2 * self.row[parents, None] + _CHILD_ROW).ravel(),
             np.repeat(self.level[parents] + 1, 4),
         )
-        most = np.zeros(self.used, np.int32)  # level down to which a cell is to be cut
-        most[new] = np.where(self.flags[new] & LARGE, levels, 0)
         places = Place(*(getattr(self, name) for name in Place._fields))
         cells = Cells(*(getattr(self, name) for name in Cells._fields))
         tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
-        one, other, bits = child_edges(tree, places, cells, parents, start, float(self.least))
-        self.mixed[self.rank[one[_having(bits, MIXED)]]] = True
-        for bit, deepest in ((CUT, levels), (GLINT, levels + GLINT_LEVELS)):
-            worth = _having(bits, bit)
-            most[one[worth]] = deepest
-            most[other[worth]] = deepest
-        cut = np.flatnonzero(most > 0)
-        return cut[(self.child[cut] < 0) & (self.level[cut] < most[cut])]
+        bits = child_edges(tree, places, cells, parents, start, float(self.least))[: self.used]
+        self.mixed[self.rank[_having(bits, MIXED)]] = True
+        marked = _having(bits, CUT | GLINT)
+        deepest = np.where(bits[marked] & GLINT, levels + GLINT_LEVELS, levels)
+        return marked[(self.child[marked] < 0) & (self.level[marked] < deepest)]
 
 
 def _having(bits: np.ndarray, wanted: int) -> np.ndarray:
