@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from numbers import Integral
 from typing import NamedTuple
 
@@ -119,13 +120,15 @@ def trace(
     pixels = np.arange(camera.height * camera.width)
     report("direct light", 0.05)
     direct = direct_light(world, pixels, plan.grid, plan.direct_tolerance_m, edge_threshold=plan.edge_threshold)
-    trim_memory(len(pixels))
+    # direct light alone takes little, and to map it anew half as long as tracing it
+    trim = partial(trim_memory, len(pixels)) if plan.bounces > 1 else lambda: None
+    trim()
     radiance = np.bincount(direct.samples.pixel, weights=direct.samples.radiance, minlength=len(pixels))
     uneven = UNEVEN * float(np.linalg.norm(radiance))
     # the image method finds light of more surfaces than asked for, too
     most = MAX_BOUNCES if settings.bounces is None else settings.bounces
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m, uneven, most)
-    trim_memory(len(pixels))
+    trim()
     mirrored = np.bincount(specular.samples.pixel, weights=specular.samples.radiance, minlength=len(pixels))
     checked = NOT_CHECKED if pilot is None else checked_pixels(pilot, radiance + mirrored)
     rays, indirect, schedule = direct.rays, None, None
@@ -146,7 +149,7 @@ def trace(
         )
         rays += schedule.rays(plan.bounces)
     reasons = (*specular.notes, *scale.reasons, *reasons)
-    samples, counts = light.finished(lambda: trim_memory(len(pixels))), (direct.clipped, rays)
+    samples, counts = light.finished(trim), (direct.clipped, rays)
     return LightSamples(
         samples, ends, indirect, scale.origin_m, direct.mixed, *counts, schedule, reasons, checked, scale.brightest
     )

@@ -123,8 +123,7 @@ def child_edges(tree: Tree, places: Place, cells: Cells, parents: np.ndarray, st
         tuple(mi.Int32(column) for column in (tree.rank_of, tree.child)),
         tuple(UInt32(column.view(np.uint32)) for column in places),
         _seen(cells),
-        upload(UInt32, parents, number),
-        lane,
+        (lane, upload(UInt32, parents, number)),
         counts,
         dr.opaque(Float, float(least)),
         bits,
@@ -197,9 +196,9 @@ def _first_edges(cells: tuple, path_intervals: tuple, lane: UInts, counts: tuple
 
 @recorded
 def _child_edges(
-    tree: tuple, places: tuple, cells: tuple, parent: UInts, lane: UInts, counts: tuple, least: Floats, bits: UInts
+    tree: tuple, places: tuple, cells: tuple, sides: tuple, counts: tuple, least: Floats, bits: UInts
 ) -> UInts:
-    (rank_of, child), (grid, width, first, pixels) = tree, counts
+    (rank_of, child), (lane, parent), (grid, width, first, pixels) = tree, sides, counts
     places, cells = Place(*places), Cells(*cells)
     side = lane & (SIDES - 1)  # left, right, above, below
     beyond, upright = side & 1, side < 2  # whether the way leads to higher columns or rows; along the columns
