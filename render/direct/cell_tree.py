@@ -8,9 +8,9 @@ from render.direct.edges import CUT, GLINT, MIXED, Cells, Place, Tree, child_edg
 from render.direct.footprints import CLIPPED, LARGE, Footprints, trace
 from render.scene.traced_scene import TracedScene, aligned
 
-# Refinement ends at this many cells a side of a pixel, however fine the grid it started from; at highlights of polished
-# metal it goes on for so many levels, since all of a pixel's light may come from a hundredth of its width.
-MAX_CELLS = 64
+# Refinement ends at this many cells a side of a pixel or more, however fine the grid it started from; at highlights of
+# polished metal it goes on for so many levels, since all of a pixel's light may come from a hundredth of its width.
+MAX_CELLS = 128
 GLINT_LEVELS = 2
 # A wire that runs through the image is followed by at most this many launches.
 MAX_LAUNCHES = 256

@@ -58,7 +58,7 @@ def direct_light(
     """Return direct returns of the given flat pixel indices (sorted, each once), merged within `tolerance_m`.
 
     Every pixel starts as grid x grid cells, one ray and footprint each (`render.direct.footprints`). A cell is cut in
-    four, at most `refine` times and down to 1/MAX_CELLS of a pixel, where
+    four, at most `refine` times and down to 1/MAX_CELLS of a pixel or less, where
     - its footprint is not small, so that first order no longer describes it; or
     - it and a neighbouring cell lie on different surfaces, or one is in shadow, or one is painted darker: an edge runs
       through one of them.
@@ -92,7 +92,7 @@ def _chunk(
     world: TracedScene, pixels: np.ndarray, grid: int, tolerance_m: float, refine: int, edge_threshold: float
 ) -> DirectLight:
     tree = CellTree(world, pixels, grid)
-    touched = tree.refine(max(0, min(refine, int(math.log2(MAX_CELLS / grid)))), edge_threshold / grid**2)
+    touched = tree.refine(max(0, min(refine, math.ceil(math.log2(MAX_CELLS / grid)))), edge_threshold / grid**2)
     clipped = tree.clip()
     # pixels that were left alone are a table of equal cells; what was cut is a list
     plain = _merge_plain(tree, np.flatnonzero(~touched), tolerance_m)
