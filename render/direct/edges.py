@@ -224,6 +224,8 @@ def _child_edges(
     leaf_x, leaf_y = (((2 * (to >> mi.Int32(below)) + 1) << mi.Int32(below + 1)) for to in there)
     half = 0.5 / Float(grid << (level + 1))
     narrow, wide = 2 * half, dr.select(cut, 2 * half, 4 * half * Float(UInt32(1) << below))
+    # marks are written one by one: a recording that first saw a small image would spread them over copies for each
+    # thread, and write beyond those of a larger one
     marks = [dr.select((cell.flags & LARGE) != 0, CUT, UInt32(0)) for cell in here]
     for i in range(2):
         x = 4 * mi.Int32(column) + 1 + dr.select(upright, 2 * mi.Int32(beyond), 2 * i)
@@ -232,11 +234,11 @@ def _child_edges(
         between = _compared(here[i], beside[i], Float(to_x) * half, Float(to_y) * half, wide, rank == found.rank, least)
         between = dr.select(found.exists, between, 0)
         marks[i] |= between
-        dr.scatter_reduce(dr.ReduceOp.Or, bits, between, other[i], between != 0)
+        dr.scatter_reduce(dr.ReduceOp.Or, bits, between, other[i], between != 0, dr.ReduceMode.Direct)
     down, right = dr.select(upright, narrow, 0), dr.select(upright, 0, narrow)
     siblings = _compared(here[0], here[1], right, down, narrow, Bool(True), least)
     for index, mark in zip(one, marks, strict=True):
-        dr.scatter_reduce(dr.ReduceOp.Or, bits, mark | siblings, index, (mark | siblings) != 0)
+        dr.scatter_reduce(dr.ReduceOp.Or, bits, mark | siblings, index, (mark | siblings) != 0, dr.ReduceMode.Direct)
     return bits
 
 
