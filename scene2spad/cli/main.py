@@ -125,17 +125,34 @@ def _check_words(argv: list[str]) -> None:
             raise InputError(
                 f"{name}: no option {option}{did_you_mean(option, options)} (see scene2spad {name} --help)"
             )
+    _check_given_once(name, argv[1:])
+
+
+def _check_given_once(name: str, words: list[str]) -> None:
+    """Raise InputError for an option that stands twice: the parser would take the last one's values alone."""
+    given: set[str] = set()
+    lists = {_option(one.name) for one in fields(options_of(name)) if "..." in str(one.type)}
+    for word in words:
+        option = word.partition("=")[0].replace("_", "-")
+        if option.startswith("--") and option != "--help":
+            hint = f"; write all its values behind one {option}" if option in lists else ", expected once"
+            require(option not in given, f"{name}: {option} is given twice{hint}")
+            given.add(option)
 
 
 def option_words(name: str) -> set[str]:
     """Return the words that a command takes as options, with their dashes."""
     known = fields(options_of(name))
-    options = {f"--{field.name.rstrip('_').replace('_', '-')}" for field in known}
+    options = {_option(field.name) for field in known}
     return (
         options
         | {f"--no-{field.name.replace('_', '-')}" for field in known if field.type in ("bool", bool)}
         | {"--help"}
     )
+
+
+def _option(field: str) -> str:
+    return f"--{field.rstrip('_').replace('_', '-')}"
 
 
 def _print_completion(argv: list[str]) -> int:

@@ -57,6 +57,24 @@ def test_a_word_too_many_is_told_once(capsys):
     assert status == 2 and err.startswith("scene2spad: Missing value for argument '--set'") and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["ultraphase", "list", "a.s", "--define", "SHIFT=5", "--define", "K=32"],
+            "ultraphase: --define is given twice; write all its values behind one --define",
+        ),
+        (["render", "plane", "--width", "3", "--width=4"], "render: --width is given twice, expected once"),
+        (["study", "tensors", "--scene_set", "a", "--scene-set", "b"], "study: --scene-set is given twice"),
+        (["demo", "--json", "--json"], "demo: --json is given twice, expected once"),
+    ],
+)
+def test_an_option_given_twice_is_refused(words, message, capsys):
+    """Of options with several values the first ones were lost without a word."""
+    status, out, err = run(capsys, *words)
+    assert status == 2 and not out and err.startswith(f"scene2spad: {message}") and err.count("\n") == 1
+
+
 def test_an_option_that_may_stay_open_lists_its_choices_alone(capsys):
     status, _, err = run(capsys, "evaluate", "a", "--set", "b", "--law", "poison")
     expected = "Expected one of ('auto', 'first-photon', 'free-running', 'poisson'); did you mean 'poisson'?"

@@ -26,7 +26,8 @@ def instructions(draw, words: int = 64, max_shift: int = 4):
             fields["value"] = draw(constant if fields["constant"] else register)
         elif kind == "m":
             fields["constant"] = draw(st.booleans())
-            fields["value"] = draw(constant)
+            in_ram = st.integers(0, 512 // op.size - 1).map(lambda place, size=op.size: place * size)
+            fields["value"] = draw(in_ram if fields["constant"] else constant)
             fields["rs"] = 0 if fields["constant"] else draw(register)
         elif kind == "n":
             fields["value"] = draw(st.integers(1, max_shift))
@@ -145,6 +146,14 @@ def test_given_constants_win():
         (".space a, u9, 4", "1:11: kind 'u9'"),
         (".space a, u8, 0", "1:8: a: 0 values"),
         (".table a, u8, 3, 1, 2", "1:8: a: 2 values for 3 places"),
+        (".table a, u8, 3, 1, 2, 300", "1:24: a: 300 is outside 0 to 255, those of u8"),
+        (".table a, s8, 2, -129, 0", "1:18: a: -129 is outside -128 to 127"),
+        (".space a, s16, 4\n  LDH r1, [-4]", "2:12: RAM address -4 is outside 0 to 510"),
+        (".space a, s16, 4\n  STH [a + 3], r1", "2:8: RAM address 3 of 16 bits is odd"),
+        ("LDB r1, [600]", "1:10: RAM address 600 is outside 0 to 511"),
+        (".equ K, 3\n.equ K, 4\nHALT", "2:6: 'K' is defined already"),
+        (".eqv K, 3", "1:1: unknown directive '.eqv'; did you mean '.equ'?"),
+        ("addn r1, r1, #1", "1:1: unknown instruction 'addn'; did you mean 'ADD'?"),
         (".for k in 0..2\nHALT", "1:1: .for without .end"),
         (".end", "1:1: unknown directive '.end'"),
         ("l{k}: HALT", "1:1: 'l{k}': k is no loop variable"),
@@ -240,6 +249,28 @@ def test_a_constant_that_the_source_does_not_know_is_refused():
         with pytest.raises(InputError, match=rf"^--define M: a\.s has no constant of this name, there are {there}$"):
             assemble(source, name="a.s", constants={"M": 2})
     assert assemble("MOV r1, #M\nHALT\n", constants={"M": 2}).instructions[0].value == 2
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (".space K, u8, 4\nMOV r1, #K\nHALT\n", "a.s:1:8: --define K: 'K' is RAM here, expected a constant (.equ)"),
+        ("MOV r1, #K\n.table K, u8, 1, 4\nHALT\n", "a.s:2:8: --define K: 'K' is RAM here"),
+        ("K: MOV r1, #1\nHALT\n", "a.s:1:1: --define K: 'K' is a label here"),
+        (".reg K, r3\nMOV K, #1\nHALT\n", "a.s:1:6: --define K: 'K' is a register here"),
+        (".equ N, 2\n.for K in 1..N\nMOV r1, #K\n.end\nHALT\n", "a.s has no constant of this name, there are N"),
+        (".equ K, 3\n.equ K, 4\nMOV r1, #K\nHALT\n", "a.s:2:6: 'K' is defined already"),
+    ],
+)
+def test_a_given_name_that_is_no_constant_of_the_source_is_refused(source, message):
+    with pytest.raises(InputError) as refused:
+        assemble(source, name="a.s", constants={"K": 2})
+    assert message in str(refused.value)
+
+
+def test_a_given_constant_may_stand_beside_a_loop_variable_of_its_name():
+    source = ".equ n, 5\nMOV r2, #n\n.for n in 0..1\nMOV r1, #n\n.end\nHALT\n"
+    assert [one.value for one in assemble(source, constants={"n": 7}).instructions[:3]] == [7, 0, 1]
 
 
 def test_a_source_includes_regular_files_of_its_folder_alone(tmp_path):

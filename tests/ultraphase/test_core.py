@@ -191,9 +191,9 @@ def test_watch_shows_each_change():
     [
         ("MOV r1, #64\nLDB r2, [r1]\nHALT", "RAM address 64 is outside the declared 0 to 63"),
         ("MOV r1, #-1\nSTB [r1 + 0], r2\nHALT", "RAM address -1"),
-        ("LDH r2, [63]\nHALT", "RAM address 63 is outside the declared 0 to 62"),
+        ("LDH r2, [r2 + 63]\nHALT", "RAM address 63 is outside the declared 0 to 62"),
         ("MOV r1, #3\nADDM [r1 + 2], r2\nHALT", "address 5 of 16 bits is odd"),
-        ("LDH r1, [3]\nHALT", "address 3 of 16 bits is odd"),
+        ("LDH r1, [r1 + 3]\nHALT", "address 3 of 16 bits is odd"),
         ("RDT r1\nRDT r1\nHALT", "2, word 1 (RDT r1): no timestamp is there"),
         ("MOV r1, #1", "runs behind its last instruction"),
         ("a: JMP a", "no progress"),
@@ -216,8 +216,8 @@ def test_core_and_array_refuse_alike(source, message):
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("LDB r1, [600]\nHALT", "RAM address 600 is not there: the program declares no RAM"),
-        ("LDH r1, [600]\nHALT", "RAM address 600 is not there: the program declares no RAM"),
+        ("LDB r1, [400]\nHALT", "RAM address 400 is not there: the program declares no RAM"),
+        ("LDH r1, [400]\nHALT", "RAM address 400 is not there: the program declares no RAM"),
         (".space a, u8, 1\nLDH r1, [0]\nHALT", "RAM address 0 is outside the declared 1 byte"),
     ],
 )

@@ -1,43 +1,47 @@
 """The assembler: source text to `Program`.
 
 One statement a line, `;` begins a comment. Numbers are decimal, 0x or 0b; constants are expressions of + - * / % and
-parentheses over numbers, `.equ` names, region names (their byte address) and loop variables.
-
-    NAME:                        label; `{h}` in a name is the value of the loop variable h
-    OP operand, operand, ...     see `isa.OPS`; constants after `#`, RAM operands as [register + constant]
-    .equ NAME, value             constant; one handed to `assemble` wins over it. MAX_SHIFT is the chip's
-    .reg NAME, register          another name for a register, from here on; `r1 + n` is the n-th after r1
-    .table NAME, kind, count[, values]   RAM filled before the program runs; kind is u8, s8 or s16
-    .space NAME, kind, count     RAM that the program writes
-    .for h in a..b / .end        the lines between, once for every h from a to b, both included
-    .include "file"              the lines of another file; inside a loop they see its variables
+parentheses over numbers, `.equ` names, region names (their byte address) and loop variables. A line is `NAME:` (a
+label), `OP operand, operand, ...` (see `isa.OPS`), or one of the DIRECTIVES below.
 
 Errors are InputErrors that begin with file, line and column.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from scenes.errors import InputError, require
+import numpy as np
+
+from scenes.errors import InputError, did_you_mean
 from scenes.io.inputs import file_inside, read_text
 from ultraphase.assembly.isa import BY_NAME, DIRECTIONS, REGISTERS, VALUE_BITS, Instruction
+from ultraphase.assembly.names import Names, name_of
 from ultraphase.assembly.program import KINDS, Program, Region
 from ultraphase.assembly.source import Cursor, Line, Token, source_lines
 from ultraphase.chip import ChipSpec
 
-_REGISTER = re.compile(r"r(\d+)\Z")
 _MAX_STATEMENTS = 20_000
 _MAX_INCLUDES = 8  # inside one another
-_MAX_NESTED = 32  # parentheses and signs, and loops
+_MAX_NESTED = 32  # loops
 _MAX_REPEATED = 1 << 18  # lines of all loops' turns, those of loops inside others counted each time
 _MAX_BYTES = 1 << 22
-_MAX_VALUE = 1 << 31
-_MAX_DIGITS = 64
 
+# What each takes, and what it does.
+DIRECTIVES: dict[str, tuple[str, str]] = {
+    ".equ": ("NAME, value", "a constant; `--define NAME=VALUE` wins over it. MAX_SHIFT is the chip's"),
+    ".reg": ("NAME, register", "another name for a register, from here on; `r1 + n` is the n-th after r1"),
+    ".table": (
+        "NAME, kind, count[, values]",
+        "RAM that is filled before the program runs; kind is u8, s8 or s16. Without values they come by `--table`",
+    ),
+    ".space": ("NAME, kind, count", "RAM that the program writes, zero at first"),
+    ".for": ("NAME in FIRST..LAST", "the lines to `.end`, once for every value of NAME, FIRST and LAST included"),
+    ".end": ("", "ends the lines of `.for`"),
+    ".include": ('"FILE"', "the lines of another file of the same folder; inside a loop they see its variables"),
+}
 Reader = Callable[[str], str]
 
 
@@ -89,12 +93,9 @@ class _Assembly:
     """State of an assembly while its lines are taken in order; labels are resolved last, as branches may look ahead."""
 
     def __init__(self, chip: ChipSpec, given: dict[str, int], read: Reader | None) -> None:
-        self.chip, self.given, self.read, self.max_shift = chip, given, read, chip.max_shift
-        self.values: dict[str, int] = {"MAX_SHIFT": chip.max_shift, **given}
-        self.constants: set[str] = set()  # what the source defines by .equ, or reads where it was given
-        self.registers = {f"r{number}": number for number in range(REGISTERS)}
+        self.chip, self.read, self.max_shift = chip, read, chip.max_shift
+        self.names = Names(given, {"MAX_SHIFT": chip.max_shift})
         self.regions: list[Region] = []
-        self.labels: dict[str, int] = {}
         self.pending: list[tuple[Cursor, Instruction, dict[str, Token]]] = []
         self.includes = self.statements = self.repeated = self.loops = 0
 
@@ -129,9 +130,9 @@ class _Assembly:
         variable = cursor.take("name", "a loop variable")
         if cursor.take("name", "'in'").text != "in":
             raise head.fail(variable.column, "expected: .for NAME in FIRST..LAST")
-        first = self._expression(cursor)
+        first = self.names.expression(cursor)
         cursor.expect("..")
-        last = self._expression(cursor)
+        last = self.names.expression(cursor)
         cursor.end()
         column = head.tokens[0].column
         if self.loops >= _MAX_NESTED:
@@ -149,7 +150,7 @@ class _Assembly:
         cursor = Cursor(line)
         tokens = line.tokens
         while len(tokens) > cursor.at + 1 and tokens[cursor.at + 1].text == ":":
-            self._label(cursor)
+            self.names.label(cursor, len(self.pending))
         if cursor.next.kind == "end":
             return
         token = cursor.take("name", "an instruction, a label or a directive")
@@ -163,28 +164,9 @@ class _Assembly:
             self._instruction(cursor, token.text.upper())
             cursor.end()
         else:
-            raise line.fail(
-                token.column, f"unknown {'directive' if token.text[0] == '.' else 'instruction'} {token.text!r}"
-            )
-
-    def _label(self, cursor: Cursor) -> None:
-        token = cursor.take("name", "a label")
-        name = self._name(cursor.line, token)
-        if name in self.labels or name in self.values or name in self.registers:
-            raise cursor.line.fail(token.column, f"{name!r} is defined already")
-        self.labels[name] = len(self.pending)
-        cursor.expect(":")
-
-    @staticmethod
-    def _name(line: Line, token: Token) -> str:
-        """Fill in the {h} of a name."""
-
-        def value(found: re.Match[str]) -> str:
-            if found[1] not in line.loops:
-                raise line.fail(token.column, f"{token.text!r}: {found[1]} is no loop variable here")
-            return str(line.loops[found[1]])
-
-        return re.sub(r"\{(\w+)\}", value, token.text)
+            what, known = ("directive", DIRECTIVES) if token.text[0] == "." else ("instruction", BY_NAME)
+            meant = did_you_mean(token.text if what == "directive" else token.text.upper(), known)
+            raise line.fail(token.column, f"unknown {what} {token.text!r}{meant}")
 
     def _include(self, line: Line) -> None:
         at = line.tokens[-1]
@@ -198,119 +180,122 @@ class _Assembly:
         self.take([replace(one, loops=line.loops) for one in source_lines(at.text, text)])
         self.includes -= 1
 
-    def _new_name(self, cursor: Cursor, *, rebind: bool = False) -> str:
-        token = cursor.take("name", "a name")
-        name = self._name(cursor.line, token)
-        taken = name in self.labels or (name in self.values and name not in self.given) or bool(_REGISTER.match(name))
-        if taken or (name in self.registers and not rebind):
-            raise cursor.line.fail(token.column, f"{name!r} is defined already")
-        cursor.expect(",")
-        return name
-
     def _equ(self, cursor: Cursor, token: Token) -> None:
-        name = self._new_name(cursor)
-        value = self._expression(cursor)
-        self.constants.add(name)
-        self.values[name] = self.given.get(name, value)
+        name = self.names.new(cursor, "a constant")
+        self.names.define(name, self.names.expression(cursor), constant=True)
 
     def _reg(self, cursor: Cursor, token: Token) -> None:
-        name = self._new_name(cursor, rebind=True)
+        name = self.names.new(cursor, "a register")
         at = cursor.next
-        number = self._expression(cursor, self.registers)
+        number = self.names.expression(cursor, self.names.registers)
         if not 0 <= number < REGISTERS:
             raise cursor.line.fail(at.column, f"register {number} is outside r0 to r{REGISTERS - 1}")
-        self.registers[name] = number
+        self.names.registers[name] = number
 
     def _region(self, cursor: Cursor, token: Token) -> None:
         at = cursor.next
-        name = self._new_name(cursor)
+        name = self.names.new(cursor, "RAM")
         kind = cursor.take("name", "u8, s8 or s16")
         if kind.text not in KINDS:
             raise cursor.line.fail(kind.column, f"kind {kind.text!r}, expected one of {', '.join(KINDS)}")
         cursor.expect(",")
-        count = self._expression(cursor)
+        count = self.names.expression(cursor)
         if not 1 <= count <= 1 << 20:
             raise cursor.line.fail(at.column, f"{name}: {count} values, expected 1 or more")
         values = []
         while token.text == ".table" and cursor.mark(","):
-            values.append(self._expression(cursor))
+            values.append(self._table_value(cursor, name, kind.text))
         if values and len(values) != count:
             raise cursor.line.fail(at.column, f"{name}: {len(values)} values for {count} places")
         size = KINDS[kind.text].itemsize
         end = max((region.end for region in self.regions), default=0)
         address = -(-end // size) * size
         self.regions.append(Region(name, kind.text, count, address, token.text == ".table", tuple(values)))
-        self.values[name] = address
+        self.names.define(name, address)
+
+    def _table_value(self, cursor: Cursor, name: str, kind: str) -> int:
+        at = cursor.next
+        value = self.names.expression(cursor)
+        limits = np.iinfo(KINDS[kind])
+        if not limits.min <= value <= limits.max:
+            raise cursor.line.fail(
+                at.column, f"{name}: {value} is outside {limits.min} to {limits.max}, those of {kind}"
+            )
+        return value
 
     def _instruction(self, cursor: Cursor, name: str) -> None:
         fields: dict[str, int | bool] = {}
         targets: dict[str, Token] = {}
-        for number, kind in enumerate(BY_NAME[name].takes):
+        op = BY_NAME[name]
+        for number, kind in enumerate(op.takes):
             if number:
                 cursor.expect(",")
-            self._operand(cursor, kind, fields, targets)
+            if kind == "m":
+                self._ram_operand(cursor, fields, op.size)
+            else:
+                self._operand(cursor, kind, fields, targets)
         self.pending.append((cursor, Instruction(name, **fields), targets))  # type: ignore[arg-type]
 
     def _operand(self, cursor: Cursor, kind: str, fields: dict[str, int | bool], targets: dict[str, Token]) -> None:
         if kind in "dt":
-            fields["rd"] = self._register(cursor)
+            fields["rd"] = self.names.register(cursor)
         elif kind == "s":
-            fields["rs"] = self._register(cursor)
+            fields["rs"] = self.names.register(cursor)
         elif kind == "v":
             fields["constant"] = cursor.mark("#")
-            fields["value"] = self._constant(cursor) if fields["constant"] else self._register(cursor)
+            fields["value"] = self._constant(cursor) if fields["constant"] else self.names.register(cursor)
         elif kind == "n":
             cursor.expect("#")
             at = cursor.next
-            fields["value"] = self._expression(cursor)
+            fields["value"] = self.names.expression(cursor)
             if not 1 <= fields["value"] <= self.max_shift:
                 raise cursor.line.fail(at.column, f"shift by {fields['value']} is outside 1 to {self.max_shift}")
         elif kind == "b":
             cursor.expect("#")
             at = cursor.next
-            fields["bit"] = self._expression(cursor)
+            fields["bit"] = self.names.expression(cursor)
             if not 0 <= fields["bit"] < 32:
                 raise cursor.line.fail(at.column, f"bit {fields['bit']} is outside 0 to 31")
         elif kind == "l":
             targets["target"] = cursor.take("name", "a label")
-        elif kind == "x":
+        else:
             token = cursor.take("name", "a direction")
             if token.text not in DIRECTIONS:
                 raise cursor.line.fail(token.column, f"direction {token.text!r}, expected {', '.join(DIRECTIONS)}")
             fields["value"] = DIRECTIONS.index(token.text)
-        else:
-            self._ram_operand(cursor, fields)
 
-    def _ram_operand(self, cursor: Cursor, fields: dict[str, int | bool]) -> None:
+    def _ram_operand(self, cursor: Cursor, fields: dict[str, int | bool], size: int) -> None:
         """Parse [register + constant] in any order, or one of the two alone."""
         cursor.expect("[")
         at, base, offset = cursor.next, None, 0
         sign = 1
         while True:
-            token = cursor.next
-            if token.kind == "name" and self._name(cursor.line, token) in self.registers:
+            if self.names.at_register(cursor):
                 if base is not None or sign < 0:
                     raise cursor.fail("one base register at the most, and not subtracted")
-                base = self._register(cursor)
+                base = self.names.register(cursor)
             else:
-                offset += sign * self._product(cursor, {})
+                offset += sign * self.names.product(cursor, {})
             if cursor.mark("]"):
                 break
             sign = 1 if cursor.mark("+") else -1
             if sign < 0:
                 cursor.expect("-")
+        if base is None:
+            self._check_address(cursor.line, at, offset, size)
         fields |= {"constant": base is None, "rs": base or 0, "value": self._in_word(cursor.line, at, offset)}
 
-    def _register(self, cursor: Cursor) -> int:
-        token = cursor.take("name", "a register")
-        name = self._name(cursor.line, token)
-        if name not in self.registers:
-            raise cursor.line.fail(token.column, f"{name!r} is no register; constants begin with #")
-        return self.registers[name]
+    def _check_address(self, line: Line, at: Token, address: int, size: int) -> None:
+        """Raise InputError for an address that no run can reach; those with a register are checked as they run."""
+        last = self.chip.ram_bytes - size
+        if not 0 <= address <= last:
+            raise line.fail(at.column, f"RAM address {address} is outside 0 to {last}")
+        if address % size:
+            raise line.fail(at.column, f"RAM address {address} of 16 bits is odd")
 
     def _constant(self, cursor: Cursor) -> int:
         at = cursor.next
-        return self._in_word(cursor.line, at, self._expression(cursor))
+        return self._in_word(cursor.line, at, self.names.expression(cursor))
 
     @staticmethod
     def _in_word(line: Line, at: Token, value: int) -> int:
@@ -319,76 +304,20 @@ class _Assembly:
             raise line.fail(at.column, f"constant {value} is outside {-most} to {most - 1}")
         return value
 
-    def _expression(self, cursor: Cursor, more: Mapping[str, int] | None = None) -> int:
-        total = self._product(cursor, more or {})
-        while cursor.next.kind == "mark" and cursor.next.text in ("+", "-"):
-            sign = 1 if cursor.mark("+") else -1
-            if sign < 0:
-                cursor.expect("-")
-            total += sign * self._product(cursor, more or {})
-        return total
-
-    def _product(self, cursor: Cursor, more: Mapping[str, int]) -> int:
-        total = self._atom(cursor, more)
-        while cursor.next.kind == "mark" and cursor.next.text in ("*", "/", "%"):
-            operator = cursor.take("mark", "an operator")
-            right = self._atom(cursor, more)
-            if operator.text != "*" and right == 0:
-                raise cursor.line.fail(operator.column, "division by zero")
-            total = total * right if operator.text == "*" else total // right if operator.text == "/" else total % right
-            if abs(total) >= _MAX_VALUE:
-                raise cursor.line.fail(operator.column, f"{total} does not fit into 32 bits")
-        return total
-
-    def _atom(self, cursor: Cursor, more: Mapping[str, int]) -> int:
-        if cursor.depth > _MAX_NESTED:
-            raise cursor.fail(f"more than {_MAX_NESTED} parentheses or signs deep")
-        if cursor.next.text in ("-", "("):
-            cursor.depth += 1
-            negative = cursor.mark("-")
-            value = -self._atom(cursor, more) if negative else self._parenthesis(cursor, more)
-            cursor.depth -= 1
-            return value
-        token = cursor.next
-        if token.kind == "number":
-            cursor.at += 1
-            base = {"0x": 16, "0b": 2}.get(token.text[:2].lower(), 10)
-            # Python refuses to convert very long decimals
-            value = int(token.text, base) if len(token.text) <= _MAX_DIGITS else _MAX_VALUE
-            if value >= _MAX_VALUE:
-                raise cursor.line.fail(token.column, f"{token.text} does not fit into 32 bits")
-            return value
-        token = cursor.take("name", "a number or a name")
-        name = self._name(cursor.line, token)
-        for known in (cursor.line.loops, self.values, more):
-            if name in known:
-                self.constants |= {name} & self.given.keys()
-                return known[name]
-        raise cursor.line.fail(token.column, f"{name!r} is not defined here")
-
-    def _parenthesis(self, cursor: Cursor, more: Mapping[str, int]) -> int:
-        cursor.expect("(")
-        value = self._expression(cursor, more)
-        cursor.expect(")")
-        return value
-
     def program(self, name: str) -> Program:
         """Make the program once all labels are known: the branches find their targets; checked against the chip."""
-        there = ", ".join(sorted(self.constants)) or "none"
-        for given in self.given:
-            known = given in self.constants
-            require(known, f"--define {given}: {name} has no constant of this name, there are {there}")
+        self.names.check_given(name)
         instructions = []
         for cursor, instruction, targets in self.pending:
             if targets:
                 token = targets["target"]
-                label = self._name(cursor.line, token)
-                if label not in self.labels:
+                label = name_of(cursor.line, token)
+                if label not in self.names.labels:
                     raise cursor.line.fail(token.column, f"label {label!r} is not defined")
-                target = min(self.labels[label], 511)  # one past the store's largest is refused by Program.check
+                target = min(self.names.labels[label], 511)  # one past the store's largest is refused by Program.check
                 instruction = Instruction(**{**vars(instruction), "target": target})
             instructions.append(instruction)
         places = tuple((cursor.line.file, cursor.line.number) for cursor, _, _ in self.pending)
-        program = Program(name, tuple(instructions), tuple(self.regions), self.labels, places)
+        program = Program(name, tuple(instructions), tuple(self.regions), self.names.labels, places)
         program.check(self.chip)
         return program
