@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from scene2spad.options.common import Common, Count, File, Long, Positional, may_stay_open
+from scene2spad.options.common import Common, Count, File, Long, Number, Positional, may_stay_open
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +168,7 @@ class Report(Common):
 class Ultraphase(Common):
     """Compressive histograms as programs on the emulated UltraPhase processor: `table` (Supplementary Figure 5 beside
     the emulation), `compile MODEL` (a trained model's codes), `run PROGRAM`, `asm FILE`, `list FILE`, `verify PROGRAM`,
-    `sweep`."""
+    `sweep`. docs/ultraphase-instructions.md has the instructions and directives."""
 
     action: Positional[Literal["table", "compile", "run", "asm", "list", "verify", "sweep"]] = "table"
     """Action: tabulate or sweep the chip's power, or compile, run, assemble, list or verify a program."""
@@ -179,14 +179,21 @@ class Ultraphase(Common):
     """Make the tables so many bits smaller, so that sums of bright pixels fit 16 bits (compile): 0 to 4 (default: 1; a
     model that was trained for the chip keeps the ranges that it learned)."""
     define: tuple[str, ...] = ()
-    """Constants of a source file, as NAME=VALUE."""
+    """Constants of a source file, as NAME=VALUE; all behind one --define: --define K=8 SHIFT=7."""
+    table: tuple[str, ...] = ()
+    """Contents of the tables of a source file, as NAME=FILE.npy with whole numbers of shape (count,), or (rows,
+    columns, count) for each core its own (run, verify)."""
     out: File = None
     """File for the words (asm: one hexadecimal word a line), the listing (list; compile: with the tables) or the rows
     (table, sweep: .csv)."""
     photons: tuple[float, ...] = (550.0,)
     """Photons a pixel and frame, background included; `run` takes one number, `sweep` several."""
-    signal: float = 50.0
-    """Photons of one laser return among --photons (run)."""
+    signal: Number = None
+    """Photons of one laser return among --photons, the rest spread evenly over time (run; default: 50, or all where
+    these are fewer)."""
+    timestamps: File = None
+    """Photons of the frame instead of a made-up return (run): timestamps of every core, a .npy of shape (N,) from 0 to
+    1023; or a histogram of `sense` (.h5), whose pixels have a core each."""
     fps: tuple[float, ...] = (30.0,)
     """Frames a second (sweep)."""
     codes: tuple[int, ...] = ()
@@ -194,6 +201,7 @@ class Ultraphase(Common):
     pixels: tuple[int, ...] = (4, 1048576)
     """Pixels of the sensor (sweep)."""
     trace: int = 0
-    """Show this many instructions of one core (run)."""
+    """Show this many instructions of one core, the first ones of core (0, 0) with clock and line; of a frame that
+    fails, the last ones of the core that failed (run)."""
     watch: str = ""
-    """Show every change of this region of one core's RAM, 100 at the most (run)."""
+    """Show the changes of this region of one core's RAM, 100 at the most, as --trace does (run)."""

@@ -58,9 +58,10 @@ def test_table(capfd, folder):
 def test_run_shows_what_it_cost_and_how(capfd, folder):
     result = run(capfd, "ultraphase", "run", "fourier-8", "--photons", "100", "--signal", "40", "--trace", "9")
     assert result["counters"]["photons"] == 400 and result["out_bits"] == 4 * 8 * 16
-    assert len(result["trace"]) == 9 and "RDT" in result["trace"][1]
+    assert len(result["trace"]) == 9 and result["trace"][1].split()[:4] == ["6", "fourier.s:14", "1", "RDT"]
     again = run(capfd, "ultraphase", "run", "fourier-8", "--photons", "100", "--signal", "40", "--watch", "codes")
-    assert again["out"] == result["out"] and len(again["watch"]) == 100  # the first hundred changes
+    assert again["out"] == result["out"] and len(again["watch"]) == 100
+    assert again["watch_cut"] == "the first 100 changes; the next one is at clock 1716, after 13 of 100 photons"
     other = run(capfd, "ultraphase", "run", "fourier-8", "--photons", "100", "--signal", "40", "--seed", "1")
     assert other["out"] != result["out"]
     summed = run(capfd, "ultraphase", "run", "separable-8")
@@ -95,6 +96,13 @@ def test_run_says_what_a_program_leaves_unread(capfd, folder, source, photon, en
     assert len(err.splitlines()) == len(words) and all(word in err for word in words)
 
 
+def test_run_makes_all_of_few_photons_signal(capfd, folder):
+    few = run(capfd, "ultraphase", "run", "coarse-64", "--photons", "10")
+    assert few == run(capfd, "ultraphase", "run", "coarse-64", "--photons", "10", "--signal", "10")
+    usual = run(capfd, "ultraphase", "run", "coarse-64")
+    assert usual == run(capfd, "ultraphase", "run", "coarse-64", "--photons", "550", "--signal", "50")
+
+
 def test_asm_list_and_verify(capfd, folder):
     source = folder / "mine.s"
     source.write_text((FOLDER / "coarse.s").read_text())
@@ -104,6 +112,12 @@ def test_asm_list_and_verify(capfd, folder):
     proof = run(capfd, "ultraphase", "verify", "mine.s")
     assert proof["verified"] and proof["overflow"] == "saturates" and proof["adds"] == {"least": 0, "most": 1}
     assert run(capfd, "ultraphase", "verify", "separable-8")["clocks_mean"] == 147
+
+
+def test_compile_counts_cores_as_the_supplement_does(capfd, folder):
+    """Rows first: the chip has 3 x 6 cores (S.2), the design is 256 x 4 x 4."""
+    result = run(capfd, "ultraphase", "compile", "learned-16x4x4-128x-s0")
+    assert result["array"] == "blocks of 4 x 4 cores need a larger array than the fabricated 3 x 6"
 
 
 def test_sweep_refuses_what_does_not_fit_and_goes_on(capfd, folder):
@@ -127,10 +141,13 @@ def test_sweep_refuses_what_does_not_fit_and_goes_on(capfd, folder):
         (["asm", "missing.s"], "missing.s"),
         (["asm", "bad.s"], "bad.s:2:7"),
         (["asm", "bad.s", "--define", "K"], "NAME=VALUE"),
+        (["asm", "bad.s", "--define", "K=1", "K=2"], "--define K=2: K is given twice"),
         (["run", "fourier-8", "--define", "K=3"], "--define"),
-        (["run", "fourier-8", "--photons", "10"], "50 signal of 10"),
+        (["run", "fourier-8", "--photons", "10", "--signal", "11"], "--signal 11 is outside 0 to 10"),
+        (["run", "fourier-8", "--signal", "-1"], "--signal -1 is outside 0 to 550"),
+        (["run", "fourier-8", "--signal", "nan"], "--signal nan is outside 0 to 550"),
         (["run", "fourier-8", "--photons", "1", "2"], "2 photon counts"),
-        (["run", "fourier-8", "--photons", "1e9"], "20000"),
+        (["run", "fourier-8", "--photons", "1e9"], "--photons 1e+09 is outside 0 to 20000"),
         (["run", "fourier-8", "--trace", "-1"], "--trace -1 is outside 0 to 100000"),
         (["run", "fourier-8", "--watch", "nothing"], "nothing"),
         (["sweep", "--fps", "0"], "load: 0 frames a second, expected more than 0, at most 1e9"),
@@ -147,7 +164,7 @@ def test_mistakes_end_in_one_line(capfd, folder, argv, message):
 
 @pytest.mark.parametrize("asked", [("--trace", "-1"), ("--watch", "nothing")])
 def test_what_to_look_at_is_checked_before_the_run(capfd, folder, monkeypatch, asked):
-    monkeypatch.setattr("scene2spad.cli.experiments.ultraphase_actions.CoreArray", None)
+    monkeypatch.setattr("scene2spad.cli.experiments.ultraphase_run.CoreArray", None)
     assert asked[1] in refused(capfd, "ultraphase", "run", "fourier-8", *asked)
 
 

@@ -77,7 +77,23 @@ OPS: tuple[Op, ...] = (
     Op("OUTH", "s", "16 bits leave the sensor"),
 )
 BY_NAME = {op.name: op for op in OPS}
+_OPERANDS = {
+    "d": "rd",
+    "s": "rs",
+    "t": "rt",
+    "v": "rv or #constant",
+    "n": "#amount",
+    "b": "#bit",
+    "l": "label",
+    "m": "[address]",
+    "x": "direction",
+}
 _CODE = {op.name: code for code, op in enumerate(OPS)}
+
+
+def operands(op: Op) -> str:
+    """Return what an instruction takes, as its reference writes it: `rd, rs, rv or #constant`."""
+    return ", ".join(_OPERANDS[kind] for kind in op.takes)
 
 
 _HALF, _MASK = 1 << 31, (1 << 32) - 1
