@@ -193,7 +193,7 @@ class Ultraphase(Common):
     these are fewer)."""
     timestamps: File = None
     """Photons of the frame instead of a made-up return (run): timestamps of every core, a .npy of shape (N,) from 0 to
-    1023; or a histogram of `sense` (.h5), whose pixels have a core each."""
+    1023; or a histogram of `sense` (.h5), whose pixels have a core each and give their photons in the order of time."""
     fps: tuple[float, ...] = (30.0,)
     """Frames a second (sweep)."""
     codes: tuple[int, ...] = ()
