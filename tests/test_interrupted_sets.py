@@ -225,4 +225,4 @@ def test_an_address_where_nobody_listens_is_one_line(tmp_path, capsys, monkeypat
     assert main([*SET, "--out", str(tmp_path / "set"), "--scheduler", address]) == 2
     message = capsys.readouterr().err
     assert message.startswith(f"scene2spad: scheduler {address}: cannot be reached") and message.count("\n") == 1
-    assert main([*SET, "--out", str(tmp_path / "set"), "--count", "1"]) == 0
+    assert main([*SET[:-1], "1", "--out", str(tmp_path / "set")]) == 0
