@@ -14,8 +14,9 @@ import numpy as np
 from scenes.errors import InputError, require
 from ultraphase.assembly.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
 from ultraphase.assembly.program import Program
-from ultraphase.chip import ChipSpec
-from ultraphase.core import WATCHDOG_STEPS, Core, Counters, port_timestamps, region_contents
+from ultraphase.chip import ChipSpec, whole_pair
+from ultraphase.core import WATCHDOG_STEPS, Core, Counters, block_ends, region_contents, require_loadable
+from ultraphase.port import core_offsets, port_timestamps
 
 _RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
 # In step, a turn costs about as much for one core as for hundreds: so few finish their timestamps one after the other.
@@ -50,6 +51,7 @@ class CoreArray:
     tables   contents by name, one row (count,) for all cores or (rows, columns, count)
 
     RAM and registers stay from frame to frame and may be set: `ram` (cores, bytes) uint8, `registers` (16, cores).
+    `words` (cores,) are where the cores of the last frame wait for another timestamp, -1 where they do not.
     Raises InputError as `Core` does, and for cores that wait for each other, saying who waits where for whom.
     """
 
@@ -61,9 +63,10 @@ class CoreArray:
         *,
         chip: ChipSpec | None = None,
     ) -> None:
+        require_loadable(program, tables, "CoreArray")
+        shape = whole_pair(shape, "core array of shape")
         self.program, self.shape, self.chip = program, shape, chip or ChipSpec()
         program.check(self.chip)
-        require(min(shape) >= 1, f"core array of {shape[0]} x {shape[1]} cores, expected 1 x 1 or more")
         lanes = shape[0] * shape[1]
         flat = {n: np.asarray(t) for n, t in (tables or {}).items()}
         flat = {n: t.reshape(lanes, -1) if t.shape[:-1] == shape else t for n, t in flat.items()}
@@ -71,23 +74,28 @@ class CoreArray:
         image = program.image(flat, lanes)
         self.ram[:, : image.shape[1]] = image
         self.registers = np.zeros((REGISTERS, lanes), np.int64)
+        self.words = np.full(lanes, -1)
         self._lane = np.arange(lanes)
         self._first_byte = self._lane * self.chip.ram_bytes
         row, column = np.divmod(self._lane, shape[1])
         self.place = (column & 1) | (row & 1) << 1
         self._neighbour = [_neighbours(row + down, column + right, shape) for down, right in STEPS]
 
-    def frame(self, timestamps: np.ndarray, offsets: np.ndarray, *, park: bool = False) -> Frame:
+    def frame(self, timestamps: np.ndarray, offsets: np.ndarray, *, park: bool = False, resume: bool = False) -> Frame:
         """Return one frame to HALT on every core; with `park` to where a core would wait for another timestamp.
 
         timestamps (N,) core after core, in the order of detection; offsets (cores + 1,) where each core's begin.
+        `resume` goes on where the cores were parked, not at word 0: with what the frame before left, and its cost.
         """
-        lanes = len(self._lane)
-        offsets = np.asarray(offsets, np.int64)
-        good = offsets.shape == (lanes + 1,) and offsets[0] == 0 and offsets[-1] == len(timestamps)
-        good = good and bool((np.diff(offsets) >= 0).all())
-        require(good, f"timestamp offsets: expected {lanes + 1} that rise from 0 to the {len(timestamps)} timestamps")
-        return ArrayRun(self, port_timestamps(timestamps, self.program), offsets, park).to_end()
+        port = port_timestamps(timestamps, self.program)
+        run = ArrayRun(self, port, core_offsets(offsets, len(self._lane), len(port)), park)
+        if resume:
+            waits = bool((self.words >= 0).all())
+            require(waits, f"program {self.program.name}: no photon is waited for (BNT) where the frame would go on")
+            run.word[:] = self.words
+        frame = run.to_end()
+        self.words = np.where(run.status == _PARKED, run.word, -1)
+        return frame
 
     def contents(self, region: str) -> np.ndarray:
         """Return numbers in a region of every core's RAM, (cores, count)."""
@@ -98,17 +106,6 @@ def _neighbours(row: np.ndarray, column: np.ndarray, shape: tuple[int, int]) -> 
     """Return the lane at (row, column), -1 where there is none."""
     there = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
     return np.where(there, row * shape[1] + column, -1)
-
-
-def _block_ends(program: Program) -> list[int]:
-    """Find for every word the first one behind its basic block."""
-    starts = set(program.labels.values()) | {one.target for one in program.instructions if "l" in one.op.takes}
-    ends = [0] * len(program.instructions)
-    for word in reversed(range(len(ends))):
-        one = program.instructions[word]
-        parts = "l" in one.op.takes or one.name in ("HALT", "SEND", "RECV") or word + 1 in starts
-        ends[word] = word + 1 if parts or word + 1 == len(ends) else ends[word + 1]
-    return ends
 
 
 def _outside(value: np.ndarray, low: int, high: int) -> int:
@@ -139,7 +136,7 @@ class ArrayRun:
         self.ram_bytes = self.program.ram_bytes
         self.changed = True  # the status of some core
         self.code = [self._kind(one) for one in self.program.instructions]
-        self.block_end = _block_ends(self.program)
+        self.block_end = block_ends(self.program)
 
     def to_end(self) -> Frame:
         patience, events, look, live = WATCHDOG_STEPS, 0, 0, self.array._lane
@@ -157,7 +154,7 @@ class ArrayRun:
             word = int(words.min())
             index = live[words == word]
             if word >= len(self.code):
-                raise InputError(f"program {self.program.name}: runs behind its last instruction")
+                raise InputError(f"{self.program.where(word - 1)}: runs behind its last instruction")
             self._block(word, slice(None) if index.size == self.status.size else index, index)
             patience = WATCHDOG_STEPS if self.events != events else patience - 1
             events = self.events
@@ -375,7 +372,12 @@ class ArrayRun:
         words = np.concatenate([words for _, words, _ in self.out] or [np.zeros(0, np.int64)])
         bits = np.concatenate([np.full(index.size, size) for index, _, size in self.out] or [np.zeros(0, np.int64)])
         cores, counts = np.unique(owner, return_counts=True)
-        require(counts.size == 0 or bool((counts == counts[0]).all()), "cores put out different numbers of words")
+        other = int(np.argmax(counts != counts[0])) if counts.size else 0
+        if other:
+            parts = (f"core {self._name(cores[n])} {counts[n]}" for n in (0, other))
+            raise InputError(
+                f"program {self.program.name}: cores put out different numbers of words: {', '.join(parts)}"
+            )
         order = np.argsort(owner, kind="stable")
         ops = [one.op for one in self.program.instructions]
         instructions = int(self.instructions.sum())

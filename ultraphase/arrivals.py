@@ -28,6 +28,7 @@ from scenes.errors import InputError, require
 from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
 from ultraphase.core import WATCHDOG_STEPS, Core
+from ultraphase.port import port_timestamps, whole_timestamps
 
 # What the instructions up to the next branch do, how many they are, and which instruction asks the port
 _Step: TypeAlias = tuple[Callable[[], int], int, str]
@@ -78,15 +79,15 @@ class TimedCore(Core):
 
         clocks (N,) when each photon comes, rising, 0 to frame_clocks; timestamps (N,) as the port tells them. Without
         `drain` it stops where the program would end the frame: there the cores of a block need each other.
-        Raises InputError for other clocks, and as `run` does.
+        Raises InputError for other clocks, for timestamps that `start` refuses, and as `run` does.
         """
-        times = np.asarray(clocks, np.float64)
-        good = times.shape == np.shape(timestamps) and times.ndim == 1 and bool((np.diff(times) >= 0).all())
+        times, port = np.asarray(clocks, np.float64), port_timestamps(timestamps, self.program)
+        good = times.shape == port.shape and times.ndim == 1 and bool((np.diff(times) >= 0).all())
         good = good and (not times.size or (times[0] >= 0 and times[-1] < frame_clocks))
         require(good, f"arrivals: expected rising clocks from 0 to below {frame_clocks}, one for each timestamp")
         self.start([])
         self._frame_is_over, self._drains = False, drain
-        waiting, stamps = times.tolist(), np.asarray(timestamps).tolist()
+        waiting, stamps = times.tolist(), port.tolist()
         now = came = lost = steps = 0
         idle: _Idle | None = None
         per, word = self.chip.clocks_per_instruction, self.word
@@ -178,15 +179,16 @@ def periodic_arrivals(
     """Return clocks of photons that a pulsed laser brings: every timestamp in a laser cycle drawn at random, at its
     place in the period. A cycle may hold several, as with the SPADs of one core.
 
-    timestamps (N,) of 0 .. 1023 over the period -> clocks (N,) rising, and the timestamps in that order. Raises
-    InputError for a frame that is shorter than the period.
+    timestamps (N,) whole numbers over the period, 0 to 1023 of the chip's 10 bits -> clocks (N,) rising, and the
+    timestamps in that order. Raises InputError for other timestamps, and a frame that is shorter than the period.
     """
     chip = chip or ChipSpec()
+    stamps = whole_timestamps(timestamps, chip.timestamps, "arrivals: ")
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(11,)))
     period = period_s / chip.clock_s
     fits = frame_clocks >= period
     require(fits, f"arrivals: a frame of {frame_clocks:g} clocks is shorter than the laser period of {period:g} clocks")
-    cycles = random.integers(0, int(frame_clocks // period), len(timestamps))
-    clocks = (cycles + (np.asarray(timestamps) + random.random(len(timestamps))) / chip.timestamps) * period
+    cycles = random.integers(0, int(frame_clocks // period), len(stamps))
+    clocks = (cycles + (stamps + random.random(len(stamps))) / chip.timestamps) * period
     order = np.argsort(clocks, kind="stable")
-    return clocks[order], np.asarray(timestamps)[order]
+    return clocks[order], stamps[order]

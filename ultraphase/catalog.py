@@ -159,7 +159,7 @@ class Method:
 def method(name: str) -> Method:
     """Return the method of a name such as `fourier-16`, or `coarse-16-shift-2`: shifts of at most 2 bits an
     instruction."""
-    found = re.fullmatch(r"([a-z]+)-(\d{1,4})(?:-shift-(\d{1,2}))?", name)
+    found = re.fullmatch(r"([a-z]+)-(\d{1,4})(?:-shift-(\d{1,2}))?", name) if isinstance(name, str) else None
     if not found or found[1] not in FAMILIES:
         raise InputError(f"program {name!r}: expected a file (.s) or FAMILY-K with one of {', '.join(FAMILIES)}")
     return Method(found[1], int(found[2]), int(found[3]) if found[3] else None)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from scenes.errors import require
+from scenes.errors import InputError, normalise_fields, require, require_whole
 
 ASSUMPTIONS: dict[str, str] = {
     "instruction set": "UltraPhase-constrained, ours: the chip's is not public; logic, 32-bit arithmetic, data, links",
@@ -22,6 +22,18 @@ ASSUMPTIONS: dict[str, str] = {
     "energy": "every instruction costs the published energy; idle cores, links, SPADs and converters cost nothing",
     "one core, one pixel": "as in S.2; a core shared by 4 x 4 SPADs receives their timestamps without addresses",
 }
+
+
+def whole_pair(value: object, what: str) -> tuple[int, int]:
+    """Return (rows, columns) as Python's whole numbers. Raises InputError that names `what` was given, for other than
+    two, and for one below 1."""
+    try:
+        first, second = value  # type: ignore[misc]
+    except (TypeError, ValueError):
+        raise InputError(f"{what} {value!r}, expected two whole numbers (rows, columns)") from None
+    rows, columns = require_whole(first, what), require_whole(second, what)
+    require(rows >= 1 and columns >= 1, f"{what} {rows} x {columns}, expected 1 or more each")
+    return rows, columns
 
 
 @dataclass(frozen=True)
@@ -46,13 +58,13 @@ class ChipSpec:
     max_shift: int = 4
 
     def __post_init__(self) -> None:
+        normalise_fields(self, "chip")
         require(1 <= self.program_words <= 512, f"chip: {self.program_words} program words, expected 1 to 512")
         good = self.ram_bits % 16 == 0 and 16 <= self.ram_bits <= 1 << 19
         require(good, f"chip: {self.ram_bits} bits of RAM, expected a multiple of 16 from 16 to 524288")
         require(1 <= self.max_shift <= 31, f"chip: max_shift {self.max_shift}, expected 1 to 31")
         for name in ("cores", "spads_per_core"):
-            rows, columns = getattr(self, name)
-            require(rows >= 1 and columns >= 1, f"chip: {name} {rows} x {columns}, expected 1 or more each")
+            object.__setattr__(self, name, whole_pair(getattr(self, name), f"chip: {name}"))
         clocks = self.clocks_per_instruction
         require(clocks >= 1, f"chip: {clocks} clocks an instruction, expected 1 or more")
         for name in ("clock_s", "energy_per_instruction_j", "io_voltage_v", "io_load_f"):

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from scenes.errors import InputError, require
+from scenes.errors import InputError, require, require_kind
 from ultraphase.assembly.isa import REGISTERS, Instruction, format_instruction
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.assembly.translate import source
 from ultraphase.chip import ChipSpec
+from ultraphase.port import port_timestamps
 
 WATCHDOG_STEPS = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
 _STOP = -1
@@ -79,21 +80,6 @@ class _BasicBlock:
     times: int = 0
 
 
-def port_timestamps(timestamps: Iterable[int] | np.ndarray, program: Program) -> np.ndarray:
-    """Return timestamps (N,) as the port takes them, int64. InputError for other than whole numbers of 16 bits, and for
-    those that the program does not know."""
-    held = timestamps if isinstance(timestamps, np.ndarray) else np.array(list(timestamps))
-    whole = held.ndim == 1 and (held.dtype.kind in "iu" or not held.size)
-    require(whole, f"timestamps are {held.dtype}{held.shape}, expected whole numbers in one dimension")
-    in_range = not held.size or (int(held.min()) >= 0 and int(held.max()) < 1 << 16)
-    require(in_range, f"timestamps are outside 0 to {(1 << 16) - 1}")
-    known = program.timestamps
-    if known is not None and held.size:
-        most = int(held.max())
-        require(most < known, f"program {program.name}: timestamp {most} is outside 0 to {known - 1}, its range")
-    return held.astype(np.int64)
-
-
 class Core:
     """A core with its program and RAM; both stay from frame to frame.
 
@@ -113,6 +99,7 @@ class Core:
         chip: ChipSpec | None = None,
         place: tuple[int, int] = (0, 0),
     ) -> None:
+        require_loadable(program, tables, "Core")
         self.program, self.chip = program, chip or ChipSpec()
         program.check(self.chip)
         self.registers = [0] * REGISTERS
@@ -281,7 +268,14 @@ class Core:
         raise InputError(f"{self.program.where(word)}: address {at} of 16 bits is odd")
 
     def _stuck(self, word: int) -> int:
-        raise InputError(f"program {self.program.name}: runs behind its last instruction")
+        raise InputError(f"{self.program.where(word - 1)}: runs behind its last instruction")
+
+
+def require_loadable(program: Program, tables: Mapping[str, np.ndarray] | None, where: str) -> None:
+    """Raise InputError unless these are a program and its tables by name; `where` is the class that loads them."""
+    require_kind(program, Program, where, " of `assemble`, `assemble_file` or `method(NAME).program()`")
+    named = tables is None or isinstance(tables, Mapping)
+    require(named, f"{where}: tables of type {type(tables).__name__}, expected contents by name")
 
 
 @lru_cache(maxsize=4096)
@@ -289,6 +283,17 @@ def _compiled(statements: str) -> CodeType:
     """Compile statements into a function `does`, for any core."""
     text = "def does():\n    " + statements.replace("\n", "\n    ")
     return compile(text, "<instructions>", "exec")
+
+
+def block_ends(program: Program) -> list[int]:
+    """Return for every word the first one behind its basic block."""
+    starts = set(program.labels.values()) | {one.target for one in program.instructions if "l" in one.op.takes}
+    ends = [0] * len(program.instructions)
+    for word in reversed(range(len(ends))):
+        one = program.instructions[word]
+        parts = "l" in one.op.takes or one.name in ("HALT", "SEND", "RECV") or word + 1 in starts
+        ends[word] = word + 1 if parts or word + 1 == len(ends) else ends[word + 1]
+    return ends
 
 
 def region_contents(program: Program, ram: np.ndarray, region: str) -> np.ndarray:

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from scenes.errors import require
+from scenes.errors import normalise_fields, require, require_kind
 from scenes.json_types import JsonObject
 from ultraphase.array import CoreArray
 from ultraphase.assembly.program import Program
@@ -44,6 +44,7 @@ class Load:
     pixels: int = 4
 
     def __post_init__(self) -> None:
+        normalise_fields(self, "load")
         require(0 <= self.photons <= 1e9, f"load: {self.photons:g} photons a frame and pixel is outside 0 to 1e9")
         require(
             0 < self.frames_per_s <= 1e9,
@@ -87,6 +88,7 @@ class Power:
 
 def power(cost: Cost, load: Load, chip: ChipSpec | None = None) -> Power:
     """Return both readings of the processing power (module docstring), and readout power = rate C V^2."""
+    require_kind(cost, Cost, "power", " of `measured_cost` or `cost_of`")
     chip = chip or ChipSpec()
     time_s = chip.processing_time_s(load.photons, cost.clocks_per_photon)
     rate = chip.data_rate_bit_per_s(cost.bits_per_pixel, load.pixels, load.frames_per_s)

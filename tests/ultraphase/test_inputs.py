@@ -1,0 +1,134 @@
+"""What users give cores, chips and loads: refused in one line that names the value and the limit, or taken as it is."""
+
+import re
+
+import numpy as np
+import pytest
+
+from scenes.errors import InputError
+from ultraphase import ChipSpec, Core, CoreArray, assemble, method
+from ultraphase.arrivals import TimedCore, periodic_arrivals
+from ultraphase.power import Cost, Load, power
+
+COARSE = method("coarse-16").program()
+
+
+def refused(call) -> str:
+    with pytest.raises(InputError) as error:
+        call()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "message"),
+    [
+        (np.array([5, 1024]), "timestamp 1024 is outside 0 to 1023"),
+        (np.array([5, 70000]), "timestamp 70000 is outside 0 to 65535"),
+        (np.array([-2, 5]), "timestamp -2 is outside 0 to"),
+        (np.array([3.7, 5.0]), "expected whole numbers in one dimension"),
+        (7, "timestamps are 7, expected whole numbers"),
+    ],
+)
+def test_every_way_into_a_core_checks_its_timestamps(stamps, message):
+    clocks = np.array([0.0, 5000.0])
+    ways = (
+        lambda: Core(COARSE).frame(stamps),
+        lambda: CoreArray(COARSE, (1, 1)).frame(stamps, np.array([0, 2])),
+        lambda: TimedCore(COARSE).timed_frame(clocks, stamps, 100_000),
+    )
+    for way in ways:
+        assert message in refused(way)
+    assert message.split(" is outside")[0] in refused(lambda: periodic_arrivals(stamps, 100_000, seed=0))
+
+
+def test_timestamps_of_a_pulsed_laser_are_those_of_the_chip():
+    assert "timestamp 256 is outside 0 to 255" in refused(
+        lambda: periodic_arrivals(np.array([256]), 100_000, seed=0, chip=ChipSpec(timestamp_bits=8))
+    )
+
+
+def test_offsets_that_are_not_whole_are_refused():
+    """Cut to whole numbers they gave a photon to another core."""
+    array = CoreArray(COARSE, (1, 2))
+    stamps = np.array([10, 20, 30])
+    assert "offsets are of type float64, expected whole" in refused(lambda: array.frame(stamps, np.array([0, 1.9, 3])))
+    assert array.frame(stamps, [0, 2, 3]).counters.photons == 3
+
+
+@pytest.mark.parametrize("shape", [4, (2.0, 2), (2, 2, 1), "22", None, (0, 2)])
+def test_shapes_of_an_array_are_two_whole_numbers(shape):
+    message = refused(lambda: CoreArray(COARSE, shape))
+    assert message.startswith("core array of shape ") and "expected" in message
+
+
+@pytest.mark.parametrize("kind", [Core, CoreArray, TimedCore])
+def test_a_core_takes_a_program_and_tables_by_name(kind):
+    assert "expected a Program" in refused(lambda: kind("fourier-8"))
+    assert "not Method" in refused(lambda: kind(method("fourier-8")))
+    quarter = np.zeros(256, int)
+    call = (method("fourier-8").program(), *(((1, 1),) if kind is CoreArray else ()), quarter)
+    assert "tables of type ndarray, expected contents by name" in refused(lambda: kind(*call))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("ram_bits", 4096.0, "a whole number"),
+        ("ram_bits", "4096", "a whole number"),
+        ("program_words", 256.5, "a whole number"),
+        ("clocks_per_instruction", 2.5, "a whole number"),
+        ("timestamp_bits", True, "a whole number"),
+        ("max_shift", None, "a whole number"),
+        ("clock_s", "1", "a number"),
+        ("cores", 3, "two whole numbers (rows, columns)"),
+        ("cores", (3,), "two whole numbers (rows, columns)"),
+        ("spads_per_core", (4, 4.0), "a whole number"),
+    ],
+)
+def test_fields_of_a_chip_are_of_their_kind(field, value, expected):
+    message = refused(lambda: ChipSpec(**{field: value}))
+    assert message.startswith(f"chip: {field} ") and message.endswith(f"expected {expected}")
+
+
+def test_numbers_of_numpy_become_pythons():
+    chip = ChipSpec(ram_bits=np.int64(4096), clock_s=np.float32(1e-9), cores=[np.int32(3), 6])
+    assert type(chip.ram_bits) is int and type(chip.clock_s) is float and chip.cores == (3, 6)
+    assert CoreArray(COARSE, np.array([1, 2])).shape == (1, 2)
+
+
+@pytest.mark.parametrize("wrong", [{"pixels": 2.5}, {"pixels": "4"}, {"photons": "550"}, {"frames_per_s": None}])
+def test_fields_of_a_load_are_of_their_kind(wrong):
+    (name, value), *_ = wrong.items()
+    assert f"load: {name} {value!r}, expected a" in refused(lambda: Load(**wrong))
+
+
+def test_power_takes_a_cost():
+    assert "expected a Cost" in refused(lambda: power(None, Load()))
+    assert power(Cost(24, 0, 0), Load(0)).processing_energy_w == 0
+
+
+def test_names_of_programs_are_text():
+    assert "program None: expected a file (.s) or FAMILY-K" in refused(lambda: method(None))
+
+
+def test_a_program_that_runs_on_is_shown_where():
+    code = assemble("MOV r1, #1\nADD r1, r1, #2", name="p")
+    for run in (
+        lambda: Core(code).frame([]),
+        lambda: list(started(code).trace()),
+        lambda: CoreArray(code, (1, 1)).frame(np.zeros(0, int), np.zeros(2, int)),
+    ):
+        assert refused(run) == "p:2, word 1 (ADD r1, r1, #2): runs behind its last instruction"
+
+
+def started(code) -> Core:
+    core = Core(code)
+    core.start([])
+    return core
+
+
+def test_cores_that_put_out_different_numbers_of_words_are_named():
+    code = assemble("ID r1\nBBC r1, #0, one\nOUTH r1\none: OUTH r1\nHALT", name="p")
+    message = refused(lambda: CoreArray(code, (1, 2)).frame(np.zeros(0, int), np.zeros(3, int)))
+    assert re.fullmatch(r"program p: cores put out .* words: core \(0, 0\) 1, core \(0, 1\) 2", message)
