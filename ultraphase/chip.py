@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from scenes.errors import InputError, normalise_fields, require, require_whole
 
@@ -24,11 +25,11 @@ ASSUMPTIONS: dict[str, str] = {
 }
 
 
-def whole_pair(value: object, what: str) -> tuple[int, int]:
+def whole_pair(value: Any, what: str) -> tuple[int, int]:
     """Return (rows, columns) as Python's whole numbers. Raises InputError that names `what` was given, for other than
     two, and for one below 1."""
     try:
-        first, second = value  # type: ignore[misc]
+        first, second = value
     except (TypeError, ValueError):
         raise InputError(f"{what} {value!r}, expected two whole numbers (rows, columns)") from None
     rows, columns = require_whole(first, what), require_whole(second, what)

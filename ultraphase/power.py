@@ -25,7 +25,7 @@ from scenes.errors import normalise_fields, require, require_kind
 from scenes.json_types import JsonObject
 from ultraphase.array import CoreArray
 from ultraphase.assembly.program import Program
-from ultraphase.catalog import PUBLISHED, TIMESTAMPS, Method
+from ultraphase.catalog import PUBLISHED, Method
 from ultraphase.chip import ChipSpec
 
 MICRO, KILO = 1e6, 1e-3
@@ -58,15 +58,24 @@ class Cost:
     """A program's clocks and bits.
 
     clocks_per_photon   mean over timestamps
-    clocks_per_frame    the frame's end, mean over the cores of a block: not in the published table
+    clocks_per_frame    a frame without photons, which is its end and what comes before its first photon, mean over the
+                        cores of a block: not in the published table
     bits_per_pixel      what leaves the sensor a frame and pixel
     waits_per_frame     clocks more at the frame's end in which a core waits for a neighbour: time, but no energy
+    slowest_per_frame   clocks and waits of the block's slowest core, which decides how many frames a second there can
+                        be; 0 where all cores take the mean
     """
 
     clocks_per_photon: float
     clocks_per_frame: float
     bits_per_pixel: float
     waits_per_frame: float = 0.0
+    slowest_per_frame: float = 0.0
+
+    @property
+    def frame_end_clocks(self) -> float:
+        """Return the clocks from a frame's last photon to the next frame's first: of the slowest core of a block."""
+        return max(self.slowest_per_frame, self.clocks_per_frame + self.waits_per_frame)
 
 
 @dataclass(frozen=True)
@@ -74,7 +83,7 @@ class Power:
     """Rates and powers under a load. Powers are of all pixels together, in Watts as far as the reading is right.
 
     frame_time_s       what a core works on a frame's photons; processing_* are of these alone
-    frame_end_time_s   what it then works, and waits for neighbours, at the frame's end
+    frame_end_time_s   what the slowest core of a block then works, and waits for neighbours, at the frame's end
     """
 
     frame_time_s: float
@@ -95,7 +104,7 @@ def power(cost: Cost, load: Load, chip: ChipSpec | None = None) -> Power:
     energy_per_frame = chip.energy_j(cost.clocks_per_photon * load.photons) * load.pixels
     return Power(
         frame_time_s=time_s,
-        frame_end_time_s=chip.processing_time_s(1, cost.clocks_per_frame + cost.waits_per_frame),
+        frame_end_time_s=chip.processing_time_s(1, cost.frame_end_clocks),
         data_rate_bit_per_s=rate,
         processing_published_w=energy_per_frame * load.frames_per_s * time_s,
         processing_energy_w=energy_per_frame * load.frames_per_s,
@@ -121,10 +130,15 @@ def cost_of(
     block_tables: Mapping[str, np.ndarray],
     chip: ChipSpec | None = None,
 ) -> Cost:
-    """Return `measured_cost` of any program: tables of one core, and of the block of cores whose codes leave as one."""
-    stamps = np.arange(TIMESTAMPS)
-    photons = CoreArray(program, (1, TIMESTAMPS), core_tables, chip=chip)
-    per_photon = photons.frame(stamps, np.arange(TIMESTAMPS + 1), park=True).cycles.mean()
+    """Return `measured_cost` of any program: tables of one core, and of the block of cores whose codes leave as one.
+
+    What a program does before its first photon is part of the frame without photons: a photon's clocks are those from
+    where the core waits for it to where it waits for the next. InputError for a program that waits for none.
+    """
+    count = program.timestamps or (chip or ChipSpec()).timestamps
+    photons = CoreArray(program, (1, count), core_tables, chip=chip)
+    photons.frame(np.zeros(0, np.int64), np.zeros(count + 1, np.int64), park=True)
+    per_photon = photons.frame(np.arange(count), np.arange(count + 1), park=True, resume=True).cycles.mean()
     return replace(frame_end(program, block, block_tables, chip), clocks_per_photon=float(per_photon))
 
 
@@ -136,7 +150,8 @@ def frame_end(
     cores = block[0] * block[1]
     frame = array.frame(np.zeros(0, np.int64), np.zeros(cores + 1, np.int64))
     waits = float(frame.stalls.mean())
-    return Cost(0.0, float(frame.cycles.mean()) - waits, float(frame.out_bits.sum() / cores), waits)
+    works, slowest = float(frame.cycles.mean()) - waits, float(frame.cycles.max())
+    return Cost(0.0, works, float(frame.out_bits.sum() / cores), waits, slowest)
 
 
 def reference_bits(photons: float, chip: ChipSpec | None = None) -> dict[str, float]:
@@ -162,9 +177,7 @@ def table(costs: dict[str, Cost], chip: ChipSpec | None = None) -> list[JsonObje
                 "recomputed": _columns(printed.clocks, printed.bytes_per_pixel, again),
                 "emulated": {
                     **_columns(costs[name].clocks_per_photon, costs[name].bits_per_pixel / 8, ours),
-                    "frame_end_clocks": costs[name].clocks_per_frame,
-                    "frame_end_waits": costs[name].waits_per_frame,
-                    "frame_end_uw_energy": ours.frame_end_energy_w * MICRO,
+                    **_end_columns(costs[name], ours),
                 },
                 "residual_clocks": costs[name].clocks_per_photon - printed.clocks,
             }
@@ -185,6 +198,15 @@ def _columns(clocks: float, bytes_per_pixel: float, found: Power) -> dict[str, f
     }
 
 
+def _end_columns(cost: Cost, found: Power) -> dict[str, float]:
+    """Make the columns of the frame's end, which the published table does not have."""
+    return {
+        "frame_end_clocks": cost.clocks_per_frame,
+        "frame_end_waits": cost.waits_per_frame,
+        "frame_end_uw_energy": found.frame_end_energy_w * MICRO,
+    }
+
+
 def sweep(
     costs: dict[str, Cost],
     photons: Iterable[float],
@@ -193,7 +215,11 @@ def sweep(
     chip: ChipSpec | None = None,
 ) -> list[JsonObject]:
     """Return a row for every program, photon count, frame rate and number of pixels, with the two references beside
-    them."""
+    them.
+
+    processing_uw, processing_uw_energy   of the photons alone, as published; the frame's end stands beside them
+    busy, keeps_up                        share of the time that the slowest core of a block works: photons and end
+    """
     chip, rates, sizes, rows = chip or ChipSpec(), tuple(frame_rates), tuple(pixels), []
     for count in photons:
         bare = {name: Cost(0, 0, bits) for name, bits in reference_bits(count, chip).items()}
@@ -206,6 +232,7 @@ def sweep(
                     rows.append(
                         {"name": name, **asdict(load), "busy": busy, "keeps_up": busy <= 1}
                         | _columns(cost.clocks_per_photon, cost.bits_per_pixel / 8, found)
+                        | _end_columns(cost, found)
                     )
     return rows
 

@@ -13,6 +13,18 @@ from ultraphase.assembly.program import KINDS, Program
 from ultraphase.chip import ChipSpec
 from ultraphase.products import photon_sums
 
+# What a photon finds in the registers, in the order of the states (see `verify`); from then on what the one before left
+_REGISTERS = ("new", "left", "uninitialised", "left", "zero", "random", "left")
+_WORDS = {
+    "new": "",
+    "left": ", after another photon of the frame",
+    "again": ", after another photon of the frame",
+    "uninitialised": ", with random registers before the frame",
+    "zero": ", with registers at 0 that photons change",
+    "random": ", with random registers where photons change them",
+}
+_LONG_FRAME = 300  # photons
+
 
 @dataclass(frozen=True, eq=False)
 class Tabulated:
@@ -70,44 +82,44 @@ def verify(
 
     program      with `tables` for its RAM
     matrix       (numbers in RAM, timestamps) integers; None skips the comparison
-    timestamps   how many there are (the matrix' columns, else the chip's)
-    States: all zero, all at the top, all at the bottom, random; of 8-bit counters every uniform value. Registers are
-    random.
+    timestamps   how many there are (the matrix' columns, else the program's or the chip's)
+    States: RAM all zero, all at the top, all at the bottom, random; of 8-bit counters every uniform value. Registers as
+    a new frame has them up to its first photon, with zeros and with random numbers before it; as another photon left
+    them; and 0 or random where any photon so far changed them. A photon goes on where the core waits for it, so that
+    what comes before the loop runs once a frame, and its clocks are none of the photon's. Last, whole frames.
 
-    Raises InputError if what a photon adds, or how long it takes, depends on the state; if it changes a table or lets
-    words out; and where the program differs from the matrix, saying at which timestamp and number.
+    Raises InputError if what a photon adds, or how long it takes, depends on the state; if the frame ends at a photon;
+    if the program changes a table, lets words out, or writes other than zeros before the first photon; and where it
+    differs from the matrix, saying at which timestamp and number.
     """
     chip = chip or ChipSpec()
-    count = timestamps or (chip.timestamps if matrix is None else matrix.shape[1])
+    count = timestamps or ((program.timestamps or chip.timestamps) if matrix is None else matrix.shape[1])
     require(bool(program.state), f"program {program.name}: declares no .space, there is nothing to verify")
-    array = CoreArray(program, (1, count), tables, chip=chip)
-    kinds = np.concatenate([np.full(region.count, region.kind) for region in program.state])
-    low, high = (np.array([getattr(np.iinfo(KINDS[kind]), end) for kind in kinds], np.int64) for end in ("min", "max"))
-    tables_before = _table_bytes(program, array)
-    random = np.random.default_rng(seed)
+    bench = _Bench(program, CoreArray(program, (1, count), tables, chip=chip), np.random.default_rng(seed))
+    low, high = bench.low, bench.high
     added = clocks = None
-    wraps = np.ones(len(kinds), bool)
+    wraps = np.ones(len(low), bool)
     states = 0
-    for before in _states(low, high, random):
-        after, frame = _run(program, array, before, random)
-        require(not frame.out.size, f"program {program.name}: words leave the sensor before the frame is over")
-        same_tables = np.array_equal(_table_bytes(program, array), tables_before)
-        require(same_tables, f"program {program.name}: a photon changes a table")
-        if added is None:
-            added, clocks, saturates = after, frame.cycles[0], (after >= 0).all(axis=0)
+    for before in _states(low, high, bench.random):
+        registers = _REGISTERS[states] if states < len(_REGISTERS) else "again"
+        after, taken = bench.photon(before, registers)
+        if added is None or clocks is None:
+            added, clocks, saturates = after, taken, (after >= 0).all(axis=0)
         exact = before + added
         if wraps.any():
             wraps = wraps & (after == (exact - low) % (high - low + 1) + low).all(axis=0)
         if saturates.any():
             saturates = saturates & (after == np.minimum(exact, high)).all(axis=0)
-        slow, bad = frame.cycles[0] != clocks, ~(wraps | saturates)
+        slow, bad = taken != clocks, ~(wraps | saturates)
         if bad.any() or slow.any():
-            raise InputError(_not_additive(program, bad, before, after, added, slow))
+            raise InputError(bench.not_additive(bad, before, after, added, slow) + _WORDS[registers])
         states += 1
     assert added is not None and clocks is not None, "a program that was run on no state"
+    found = Tabulated(program.name, added, low, high, saturates & ~wraps, clocks, states)
+    bench.whole_frames(found)
     if matrix is not None:
         _compare(program, added, np.asarray(matrix))
-    return Tabulated(program.name, added, low, high, saturates & ~wraps, clocks, states)
+    return found
 
 
 def _states(low: np.ndarray, high: np.ndarray, random: np.random.Generator) -> Iterator[np.ndarray]:
@@ -121,45 +133,121 @@ def _states(low: np.ndarray, high: np.ndarray, random: np.random.Generator) -> I
             yield low + value
 
 
-def _run(
-    program: Program, array: CoreArray, before: np.ndarray, random: np.random.Generator
-) -> tuple[np.ndarray, Frame]:
-    """Run one photon of every timestamp, each on a core in the state `before`; return the numbers in RAM after it, and
-    the frame."""
-    at = 0
-    for region in program.state:
-        part = before[at : at + region.count].astype(KINDS[region.kind])
-        array.ram[:, region.address : region.end] = part.view(np.uint8)
-        at += region.count
-    array.registers[:] = random.integers(-(1 << 31), 1 << 31, array.registers.shape)
-    lanes = array.shape[1]
-    frame = array.frame(np.arange(lanes), np.arange(lanes + 1), park=True)
-    after = np.concatenate([array.contents(region.name) for region in program.state], axis=1)
-    return after.astype(np.int64), frame
+class _Bench:
+    """One core for every timestamp, and what is known of its program so far.
 
+    changed   (16,) bool: registers that are other after a photon than before it, for any timestamp and state
+    """
 
-def _table_bytes(program: Program, array: CoreArray) -> np.ndarray:
-    parts = [array.ram[:, region.address : region.end] for region in program.regions if region.table]
-    return np.concatenate([array.ram[:, :0], *parts], axis=1)
-
-
-def _not_additive(
-    program: Program,
-    bad: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-    added: np.ndarray,
-    slow: np.ndarray,
-) -> str:
-    names = [f"{region.name}[{n}]" for region in program.state for n in range(region.count)]
-    if bad.any():
-        number = int(np.flatnonzero(bad)[0])
-        t = int(np.argmax(after[:, number] != before[number] + added[:, number]))
-        return (
-            f"program {program.name} is not additive: timestamp {t} takes {names[number]} from {before[number]} to "
-            f"{after[t, number]}, from 0 to {added[t, number]}"
+    def __init__(self, program: Program, array: CoreArray, random: np.random.Generator) -> None:
+        self.program, self.array, self.random = program, array, random
+        kinds = np.concatenate([np.full(region.count, region.kind) for region in program.state])
+        self.low, self.high = (
+            np.array([getattr(np.iinfo(KINDS[kind]), end) for kind in kinds], np.int64) for end in ("min", "max")
         )
-    return f"program {program.name}: how long timestamp {int(np.flatnonzero(slow)[0])} takes depends on RAM"
+        self.changed = np.zeros(len(array.registers), bool)
+        self.tables = self._table_bytes()
+
+    def photon(self, before: np.ndarray, registers: str) -> tuple[np.ndarray, np.ndarray]:
+        """Run one photon of every timestamp, each on a core with `before` in its RAM: (numbers after it, clocks)."""
+        array, count = self.array, self.array.shape[1]
+        order = np.arange(count)
+        if registers in ("new", "uninitialised"):
+            self._begin(random=registers == "uninitialised")
+        elif registers != "again":
+            order = self.random.permutation(count)  # not behind a photon of the same timestamp
+        if registers == "zero":
+            array.registers[self.changed] = 0
+        elif registers == "random":
+            array.registers[self.changed] = self._random_words()[self.changed]
+        self._set(before)
+        found = array.registers.copy()
+        frame = array.frame(order, np.arange(count + 1), park=True, resume=True)
+        self._check(frame, "a photon")
+        require(bool((array.words >= 0).all()), f"program {self.program.name}: the frame ends at a photon")
+        self.changed |= (array.registers != found).any(axis=1)
+        after, clocks = self._numbers(), frame.cycles[0]
+        back = np.argsort(order)
+        return (after, clocks) if registers == "again" else (after[back], clocks[back])
+
+    def whole_frames(self, found: Tabulated) -> None:
+        """Raise InputError if frames of many photons leave other numbers than the table."""
+        cores, count = min(4, self.array.shape[1]), self.array.shape[1]
+        self._set(np.zeros(len(self.low), np.int64))
+        self.array.registers[:] = 0
+        stamps = self.random.integers(0, count, (cores, _LONG_FRAME))
+        offsets = np.minimum(np.arange(count + 1), cores) * _LONG_FRAME
+        self._check(self.array.frame(stamps.reshape(-1), offsets, park=True), "a photon")
+        right = found.frame(np.stack([np.bincount(row, minlength=count) for row in stamps]))
+        held = self._numbers()[:cores]
+        if not np.array_equal(held, right):
+            core, number = np.argwhere(held != right)[0]
+            raise InputError(
+                f"program {self.program.name} is not additive: {_LONG_FRAME} photons leave {held[core, number]} in "
+                f"{self._name(number)}, what each adds alone is {right[core, number]}"
+            )
+
+    def _begin(self, *, random: bool) -> None:
+        """Begin a frame with zeros in RAM on every core, up to where it waits for the first photon."""
+        array, count = self.array, self.array.shape[1]
+        self._set(np.zeros(len(self.low), np.int64))
+        array.registers[:] = self._random_words() if random else 0
+        frame = array.frame(np.zeros(0, np.int64), np.zeros(count + 1, np.int64), park=True)
+        self._check(frame, "what comes before the first photon")
+        waits = bool((array.words >= 0).all())
+        require(waits, f"program {self.program.name}: ends without waiting for a photon (BNT)")
+        held = self._numbers()
+        if held.any():
+            core, number = np.argwhere(held)[0]
+            raise InputError(
+                f"program {self.program.name}: {self._name(number)} is {held[core, number]} before the first photon of "
+                "a frame that begins with zeros"
+            )
+
+    def _check(self, frame: Frame, what: str) -> None:
+        require(not frame.out.size, f"program {self.program.name}: words leave the sensor before the frame is over")
+        same = np.array_equal(self._table_bytes(), self.tables)
+        require(same, f"program {self.program.name}: {what} changes a table")
+
+    def _random_words(self) -> np.ndarray:
+        return self.random.integers(-(1 << 31), 1 << 31, self.array.registers.shape)
+
+    def _set(self, numbers: np.ndarray) -> None:
+        at = 0
+        for region in self.program.state:
+            part = numbers[at : at + region.count].astype(KINDS[region.kind])
+            self.array.ram[:, region.address : region.end] = part.view(np.uint8)
+            at += region.count
+
+    def _numbers(self) -> np.ndarray:
+        parts = [self.array.contents(region.name) for region in self.program.state]
+        return np.concatenate(parts, axis=1).astype(np.int64)
+
+    def _table_bytes(self) -> np.ndarray:
+        parts = [self.array.ram[:, region.address : region.end] for region in self.program.regions if region.table]
+        return np.concatenate([self.array.ram[:, :0], *parts], axis=1)
+
+    def _name(self, number: int) -> str:
+        return [f"{region.name}[{n}]" for region in self.program.state for n in range(region.count)][number]
+
+    def not_additive(
+        self, bad: np.ndarray, before: np.ndarray, after: np.ndarray, added: np.ndarray, slow: np.ndarray
+    ) -> str:
+        """Return which timestamp and number show it."""
+        if not bad.any():
+            t = int(np.flatnonzero(slow)[0])
+            return f"program {self.program.name}: how long timestamp {t} takes depends on RAM or registers"
+        number = int(np.flatnonzero(bad)[0])
+        low, high = self.low[number], self.high[number]
+        exact = before[number] + added[:, number]
+        wrong = after[:, number] != exact
+        neither = wrong & (after[:, number] != np.minimum(exact, high))
+        neither &= after[:, number] != (exact - low) % (high - low + 1) + low
+        t = int(np.argmax(neither if neither.any() else wrong))
+        return (
+            f"program {self.program.name} is not additive: timestamp {t} takes {self._name(number)} from "
+            f"{before[number]} to {after[t, number]}, from 0 to {added[t, number]}"
+        )
 
 
 def _compare(program: Program, added: np.ndarray, matrix: np.ndarray) -> None:

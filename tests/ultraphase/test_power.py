@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from scenes.errors import InputError
-from ultraphase import ChipSpec, method
+from ultraphase import ChipSpec, Core, CoreArray, assemble, method, verify
 from ultraphase.catalog import PUBLISHED
-from ultraphase.power import Cost, Load, as_csv, measured_cost, power, reference_bits, sweep, table
+from ultraphase.power import Cost, Load, as_csv, cost_of, measured_cost, power, reference_bits, sweep, table
 
 
 def test_speed_is_the_published_140_million_operations():
@@ -95,6 +95,63 @@ def test_sweep_has_every_combination_and_says_what_is_too_fast():
     assert not one["keeps_up"] and one["busy"] == pytest.approx((1e6 * 255 + 258) * 2.38e-9 * 1000)
     assert all(r["keeps_up"] for r in rows if r["photons"] == 550)
     assert next(r for r in rows if r["name"] == "raw timestamps")["bytes_per_pixel"] == 550 * 10 / 8
+
+
+def test_sweep_and_table_price_the_end_of_the_frame_alike():
+    found, load = costs(), Load()
+    swept = {row["name"]: row for row in sweep(found, (load.photons,), (load.frames_per_s,), (load.pixels,))}
+    for row in table(found):
+        columns = row["emulated"]
+        assert columns == {name: swept[row["name"]][name] for name in columns}
+        joules = columns["frame_end_clocks"] / 3 / 94.6e9
+        assert columns["frame_end_uw_energy"] == pytest.approx(1e6 * joules * load.pixels * load.frames_per_s)
+    assert swept["raw timestamps"]["frame_end_uw_energy"] == 0
+
+
+def test_the_slowest_core_of_a_block_decides_how_many_frames_a_second_there_can_be():
+    chosen = method("separable-16")
+    cost, tables = measured_cost(chosen, tensor("separable-16")), chosen.tables(tensor("separable-16"))
+    frame = CoreArray(chosen.program(), (2, 2), tables).frame(np.zeros(0, int), np.zeros(5, int))
+    slowest_s = frame.cycles.max() * ChipSpec().clock_s
+    for rate, keeps_up in ((1.001 / slowest_s, False), (0.999 / slowest_s, True)):
+        row = sweep({"separable": cost}, (0,), (rate,), (4,))[0]
+        assert row["busy"] == pytest.approx(rate * slowest_s) and row["keeps_up"] == keeps_up
+    assert power(cost, Load()).frame_end_time_s == pytest.approx(slowest_s)
+
+
+PROLOGUE = """
+.space sum, s16, 1
+      MOV r1, #3
+loop: BNT idle
+      RDT r2
+      ADDM [sum], r1
+      JMP loop
+idle: BFE end
+      JMP loop
+end:  MOV r4, #0
+      STH [sum], r4
+      HALT
+"""
+
+
+def test_what_comes_before_the_loop_is_paid_once_a_frame():
+    """Of proof, cost and frames alike: a photon's clocks are what one more photon takes."""
+    program = assemble(PROLOGUE)
+    cost = cost_of(program, (1, 1), {}, {})
+    assert (verify(program).clocks == cost.clocks_per_photon).all()
+    for photons in (0, 1, 40):
+        _, counters = Core(program).frame(np.arange(photons))
+        assert counters.cycles == cost.clocks_per_frame + photons * cost.clocks_per_photon
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_cost_is_of_the_chips_timestamps(bits):
+    """A timestamp in the last quarter takes an instruction more."""
+    chip = ChipSpec(timestamp_bits=bits)
+    program = assemble(PROLOGUE.replace("ADDM", f"BBC r2, #{bits - 1}, s\nBBC r2, #{bits - 2}, s\nMOV r3, #0\ns: ADDM"))
+    clocks = verify(program, chip=chip).clocks
+    assert len(clocks) == 1 << bits
+    assert cost_of(program, (1, 1), {}, {}, chip).clocks_per_photon == clocks.mean()
 
 
 @pytest.mark.parametrize("bad", [{"photons": -1}, {"frames_per_s": 0}, {"pixels": 0}])

@@ -248,6 +248,70 @@ def test_programs_that_are_not_additive_are_refused(body, message):
         verify(assemble(ADAPTIVE.format(body=body), name="adaptive"))
 
 
+COUNTS = "loop: BNT idle\nRDT r1\n{body}\nJMP loop\nidle: BFE end\nJMP loop\nend: HALT"
+
+
+@pytest.mark.parametrize(
+    ("before", "body", "message"),
+    [
+        ("MOV r9, #0\n", "ADD r9, r9, #1\nADDM [sum], r9", "is not additive.*after another photon"),
+        ("", "BNZ r9, loop\nMOV r9, #1\nADDM [sum], r9", "depends on RAM or registers, after another photon"),
+        ("", "ADDM [sum], r9", "is not additive.*with random registers before the frame"),
+        ("MOV r9, #2\n", "BZ r9, add\nSUB r9, r9, #1\nadd: ADDM [sum], r1", "how long timestamp"),
+        ("MOV r9, #20\nMOV r8, #-1\n", "ADD r8, r8, #1\nBLT r8, r9, one\nJMP two\none: MOV r3, #1\nADDM [sum], r3\n"
+         "JMP loop\ntwo: MOV r3, #2\nADDM [sum], r3", "is not additive"),
+        ("MOV r9, #0\nMOV r8, #30\n", "ADD r9, r9, #1\nMOV r3, #1\nXOR r7, r9, r8\nBZ r7, skip\nJMP add\n"
+         "skip: MOV r3, #2\nadd: ADDM [sum], r3", "is not additive: 300 photons leave"),
+    ],
+)  # fmt: skip
+def test_programs_wrong_from_a_later_photon_on_are_refused(before, body, message):
+    """The first photon of a frame adds what it should; the second, the thirty-first or one after another does not."""
+    source = ".space sum, s16, 2\n" + before + COUNTS.format(body=body)
+    with pytest.raises(InputError, match=message):
+        verify(assemble(source, name="late"))
+
+
+@pytest.mark.parametrize("name", ["fourier-8", "separable-8"])
+def test_a_phase_that_is_cleared_before_the_loop_alone_is_refused(name):
+    chosen = method(name)
+    text, clears = (FOLDER / f"{chosen.family}.s").read_text(), "        MOV  p, #0"
+    line = next(line for line in text.splitlines() if line.startswith(clears))
+    moved = text.replace(line + "\n", "").replace("loop:", clears + "\nloop:", 1)
+    program = assemble(moved.replace("K, 16", "K, 8"), name="moved", read=lambda file: (FOLDER / file).read_text())
+    with pytest.raises(InputError, match="is not additive"):
+        verify(program, chosen.matrix(tensor(name)), chosen.tables(tensor(name)))
+    stamps = [700, 300]  # the first photon is right, both are not
+    for photons, right in ((stamps[:1], True), (stamps, False)):
+        core = Core(program, chosen.tables(tensor(name)))
+        core.start(photons, park=True)
+        core.run()
+        histogram = np.bincount(photons, minlength=1024)
+        assert np.array_equal(core.contents("codes"), chosen.matrix(tensor(name)) @ histogram) == right
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("MOV r1, #1\nHALT", r"ends without waiting for a photon \(BNT\)"),
+        ("b: BNT b\nRDT r1\nADDM [sum], r1\nHALT", "the frame ends at a photon"),
+        ("MOV r1, #5\nSTH [sum], r1\n" + COUNTS.format(body=""), r"sum\[0\] is 5 before the first photon"),
+        ("OUTH r1\n" + COUNTS.format(body=""), "words leave the sensor"),
+    ],
+)
+def test_programs_that_are_no_table_are_refused(source, message):
+    with pytest.raises(InputError, match=message):
+        verify(assemble(".space sum, s16, 2\n" + source, name="other"))
+
+
+def test_what_is_set_before_the_loop_and_stays_is_proved():
+    source = ".space sum, s16, 2\nMOV r9, #3\nMOV r2, #0\nSTH [sum], r2\n" + COUNTS.format(body="ADDM [sum], r9")
+    assert verify(assemble(source, name="constant")).table.tolist() == [[3, 0]] * 1024
+    # as long, and adds as much, before and after two photons
+    alike = "BNZ r9, more\nJMP add\nmore: SUB r9, r9, #1\nadd: ADDM [sum], r1"
+    table = verify(assemble(".space sum, s16, 2\nMOV r9, #2\n" + COUNTS.format(body=alike))).table
+    assert table[:, 0].tolist() == list(range(1024))
+
+
 def test_a_photon_may_not_change_a_table():
     source = ".table t, u8, 2, 1, 2\n" + ADAPTIVE.format(body="STB [t], r1")
     with pytest.raises(InputError, match="a photon changes a table"):
