@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.errors import InputError, require
+from scenes.errors import InputError, normalise_fields, require
 from ultraphase.assembly.assembler import assemble_file
 from ultraphase.assembly.program import Program
 from ultraphase.chip import ChipSpec
-from ultraphase.tables import INT8_SCALE, block_matrix, coarse_matrix, fourier_matrix, quarter_wave
+from ultraphase.tables import INT8_SCALE, block_matrix, coarse_matrix, fourier_matrix, quarter_wave, require_waves
 
 FOLDER = Path(__file__).parent / "programs"
 SPATIAL_BLOCK = (2, 2)
@@ -72,6 +72,7 @@ class Method:
     shift_step: int | None = None
 
     def __post_init__(self) -> None:
+        normalise_fields(self, "program")
         require(self.family in FAMILIES, f"program family {self.family!r}, expected one of {', '.join(FAMILIES)}")
         if self.family == "coarse":
             good = self.codes in (2, 4, 8, 16, 32, 64, 128, 256, 512)
@@ -112,18 +113,19 @@ class Method:
         return {**wide, "separable": TIME_BLOCK, "learned": TIME_BLOCK}.get(self.family, 0)
 
     def program(self, chip: ChipSpec | None = None) -> Program:
-        """Return assembled, and checked against the chip. Raises InputError for what is over."""
-        constants = {"K": self.codes}
+        """Return assembled, and checked against the chip. Raises InputError for what is over, and for a chip of other
+        timestamps than the program's."""
+        constants, timestamps = {"K": self.codes}, self._timestamps(chip)
         if self.family == "coarse":
-            constants["SHIFT"] = (TIMESTAMPS // self.codes).bit_length() - 1
+            constants["SHIFT"] = (timestamps // self.codes).bit_length() - 1
             if self.shift_step is not None:
                 constants["STEP"] = self.shift_step
         program = assemble_file(FOLDER / f"{self.family}.s", constants, chip, name=self.name)
-        return replace(program, timestamps=(SPADS if self.family == "addressed" else 1) * TIMESTAMPS)
+        return replace(program, timestamps=(SPADS if self.family == "addressed" else 1) * timestamps)
 
     def tables(self, temporal: np.ndarray | None = None, weights: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Return tables for `CoreArray`: from the int8 temporal tensor (K, Mt), and of spatial weights (..., K) a
-        core."""
+        core. Raises InputError for a tensor that the program does not compute."""
         if self.temporal_bins == 0:
             return {}
         if temporal is None:
@@ -135,11 +137,22 @@ class Method:
             tables["weight"] = np.full(self.codes, INT8_SCALE) if weights is None else weights
         return tables
 
-    def matrix(self, temporal: np.ndarray | None = None) -> np.ndarray:
+    def _timestamps(self, chip: ChipSpec | None) -> int:
+        """Return how many the chip has: tables of other programs than coarse ones are for 1,024."""
+        count = (chip or ChipSpec()).timestamps
+        if self.family == "coarse":
+            require(2 * self.codes <= count, f"program {self.name}: {self.codes} bins of the chip's {count} timestamps")
+            return count
+        other = f"the chip has {count:,}; `compile_code` makes programs for those"
+        require(count == TIMESTAMPS, f"program {self.name}: is for {TIMESTAMPS:,} timestamps, {other}")
+        return count
+
+    def matrix(self, temporal: np.ndarray | None = None, chip: ChipSpec | None = None) -> np.ndarray:
         """Return the integer matrix (numbers in RAM, timestamps) that the program computes, from the int8 temporal
         tensor."""
+        timestamps = self._timestamps(chip)
         if self.family == "coarse":
-            return coarse_matrix(self.codes, TIMESTAMPS)
+            return coarse_matrix(self.codes, timestamps)
         if temporal is None:
             raise InputError(f"program {self.name}: needs an int8 temporal tensor (K, {self.temporal_bins})")
         self._check(temporal)
@@ -151,9 +164,13 @@ class Method:
         return fourier if self.family == "fourier" else block_matrix(fourier, TIMESTAMPS)
 
     def _check(self, temporal: np.ndarray) -> None:
-        shape, found = (self.codes, self.temporal_bins), f"{temporal.dtype} {temporal.shape}"
-        good = temporal.shape == shape and temporal.dtype.kind in "iu"
-        require(good, f"program {self.name}: temporal tensor is {found}, expected integers of shape {shape}")
+        where, shape = f"program {self.name}", (self.codes, self.temporal_bins)
+        array = isinstance(temporal, np.ndarray)
+        found = f"{temporal.dtype} {temporal.shape}" if array else f"of type {type(temporal).__name__}"
+        good = array and temporal.shape == shape and temporal.dtype.kind in "iu"
+        require(good, f"{where}: temporal tensor is {found}, expected integers of shape {shape} (`int8_codes`)")
+        if self.family != "learned":
+            require_waves(temporal, range(1, self.codes // 2 + 1), where)
 
 
 def method(name: str) -> Method:

@@ -181,11 +181,13 @@ def _fourier_fits(code: IntegerCode, cores: int, chip: ChipSpec) -> bool:
 
 def _counters(code: IntegerCode, chip: ChipSpec) -> Compiled:
     """Compile a coarse histogram: a program of the catalogue."""
+    gates = f"{code.bins} bins, expected all {chip.timestamps} timestamps of the chip"
+    require(code.bins == chip.timestamps, f"code {code.name}: counters over {gates}")
     chosen = Method("coarse", code.codes)
     program = chosen.program(chip)
     ram = Layout(0, 0, 0, program.ram_bytes)
     text = (FOLDER / "coarse.s").read_text()
-    return Compiled(code, program, text, "one counter a photon", ram, chosen.matrix()[None, None], chip)
+    return Compiled(code, program, text, "one counter a photon", ram, chosen.matrix(chip=chip)[None, None], chip)
 
 
 def _matrix(code: IntegerCode, chip: ChipSpec) -> np.ndarray:

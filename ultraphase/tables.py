@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scenes.errors import require
+from scenes.errors import InputError, require
 
 INT8_SCALE = 127  # a coding tensor's 1.0
 
@@ -61,6 +61,26 @@ def wave_matrix(quarter: np.ndarray, harmonics: Sequence[int]) -> np.ndarray:
 def fourier_matrix(quarter: np.ndarray, codes: int) -> np.ndarray:
     """Return what `fourier.s` adds, (K, 4 Q): the `wave_matrix` of harmonics 1 .. K/2."""
     return wave_matrix(quarter, range(1, codes // 2 + 1))
+
+
+def require_waves(temporal: np.ndarray, harmonics: Sequence[int], where: str) -> None:
+    """Raise InputError, naming row and time bin, unless the quarter wave of a temporal tensor (2 H, Mt) gives its rows
+    back as cos and sin of the harmonics: exactly but for rounding, and for half a step of the table (pi / Mt)."""
+    try:
+        quarter = quarter_wave(temporal)
+    except InputError as reason:
+        raise InputError(f"{where}: {reason}") from None
+    held, bins = np.asarray(temporal, np.int64), temporal.shape[1]
+    found = wave_matrix(quarter, harmonics)
+    most = (int(np.abs(quarter).max()) + 0.5) / np.cos(np.pi / bins)  # the wave's amplitude, which no bin centre has
+    off = np.abs(found - held) > most * np.pi / bins + 1
+    if off.any():
+        row, t = np.argwhere(off)[0]
+        wave, harmonic = ("cos", "sin")[row % 2], harmonics[row // 2]
+        raise InputError(
+            f"{where}: row {row} is not {wave} of harmonic {harmonic}: {held[row, t]} in bin {t}, a quarter wave gives "
+            f"{found[row, t]}"
+        )
 
 
 def block_matrix(temporal: np.ndarray, timestamps: int) -> np.ndarray:

@@ -7,7 +7,7 @@ from scenes.errors import InputError
 from ultraphase import ChipSpec, CoreArray, verify
 from ultraphase.compiler import compile_code
 from ultraphase.integer_code import IntegerCode, folded_temporal
-from ultraphase.tables import block_sum
+from ultraphase.tables import block_sum, coarse_matrix
 
 
 def waves(harmonics: tuple[int, ...], bins: int) -> np.ndarray:
@@ -160,3 +160,66 @@ def test_codes_of_other_shapes_are_refused():
         IntegerCode("large", np.full((2, 16), 128))
     with pytest.raises(InputError, match="3 x 2 cores does not divide into blocks of 2 x 2"):
         compile_code(learned(2, 16, (2, 2))).tables((2, 3))
+
+
+@pytest.mark.parametrize(
+    ("harmonics", "message"),
+    [
+        ((1, 2), r"2 harmonics for codes of shape \(8, 1024\), expected one for each two rows"),
+        ((1, 2, 3, 4, 5), "5 harmonics for codes"),
+        ((1, 2, 5, 9), "row 4 is not cos of harmonic 5"),
+        ((1, 2, 4, 3), "row 4 is not cos of harmonic 4"),
+        ((1, -2, 3, 4), "harmonic -2, expected 1 or more"),
+        ((1, 0, 3, 4), "harmonic 0, expected 1 or more"),
+        ((1.5, 2, 3, 4), "harmonic 1.5, expected a whole number"),
+        (4, "harmonics 4, expected whole numbers in a row"),
+    ],
+)
+def test_harmonics_that_are_not_those_of_the_rows_are_refused(harmonics, message):
+    with pytest.raises(InputError, match=f"code waves: {message}"):
+        IntegerCode("waves", waves((1, 2, 3, 4), 1024), harmonics=harmonics)
+
+
+def test_rows_that_are_not_those_of_the_harmonics_are_refused():
+    late = waves((1, 2, 3, 4), 256)
+    late[7] = np.roll(late[7], 2)
+    with pytest.raises(InputError, match="row 7 is not sin of harmonic 4"):
+        IntegerCode("late", late, harmonics=(1, 2, 3, 4))
+    with pytest.raises(InputError, match="code table: quarter wave: the first row is no cosine"):
+        IntegerCode("table", np.arange(16).reshape(2, 8), harmonics=(1,))
+
+
+@pytest.mark.parametrize("bins", [8, 16, 64, 1024])
+@pytest.mark.parametrize("amplitude", [3, 31, 127])
+def test_waves_of_any_length_and_height_are_taken(bins, amplitude):
+    """What is rounded, and half a step of the table late for even harmonics, still is a Fourier code."""
+    harmonics = tuple(range(1, bins // 4))
+    angle = 2 * np.pi * np.array(harmonics)[:, None] * (np.arange(bins) + 0.5) / bins
+    rows = np.rint(amplitude * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(np.int8).reshape(-1, bins)
+    code = IntegerCode("waves", rows, harmonics=np.array(harmonics))
+    assert code.harmonics == harmonics and folded_temporal(code).shape == rows.shape
+
+
+@pytest.mark.parametrize("changed", [{"spatial": np.ones((32, 2, 2), int)}, {"temporal": np.eye(32, 1024, dtype=int)}])
+def test_counters_are_of_equal_gates_alone(changed):
+    given = {"temporal": coarse_matrix(32, 1024), "counters": True} | changed
+    with pytest.raises(InputError, match="code gates: counters "):
+        IntegerCode("gates", **given)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_counters_follow_the_timestamps_of_the_chip(bits):
+    chip = ChipSpec(timestamp_bits=bits)
+    compiled = compile_code(IntegerCode("gates", coarse_matrix(32, 1 << bits), counters=True), chip)
+    assert verify(compiled.program, compiled.matrix[0, 0], chip=chip).clocks.size == 1 << bits
+    assert compiled.program.timestamps == 1 << bits
+    shorter = IntegerCode("gates", coarse_matrix(32, 1 << bits - 1), counters=True)
+    with pytest.raises(InputError, match=f"counters over {1 << bits - 1} bins, expected all {1 << bits} timestamps"):
+        compile_code(shorter, chip)
+
+
+def test_what_is_no_array_of_bytes_is_refused():
+    with pytest.raises(InputError, match="temporal of type list, expected a NumPy array"):
+        IntegerCode("list", [[1, 2]])
+    with pytest.raises(InputError, match="value 128 is outside -127 to 127"):
+        IntegerCode("lowest", np.full((2, 16), -128, np.int8))

@@ -7,6 +7,7 @@ from scenes.errors import InputError
 from ultraphase import ChipSpec, Core, CoreArray, assemble, method, verify
 from ultraphase.catalog import PUBLISHED
 from ultraphase.power import Cost, Load, as_csv, cost_of, measured_cost, power, reference_bits, sweep, table
+from ultraphase.tables import int8_codes
 
 
 def test_speed_is_the_published_140_million_operations():
@@ -67,8 +68,9 @@ def tensor(name: str):
     chosen = method(name)
     if not chosen.temporal_bins:
         return None
-    wave = np.rint(127 * np.cos(2 * np.pi * (np.arange(chosen.temporal_bins) + 0.5) / chosen.temporal_bins))
-    return np.tile(wave.astype(int), (chosen.codes, 1))
+    centres = (np.arange(chosen.temporal_bins) + 0.5) / chosen.temporal_bins
+    angle = 2 * np.pi * np.arange(1, chosen.codes // 2 + 1)[:, None] * centres
+    return int8_codes(np.stack([np.cos(angle), np.sin(angle)], axis=1).reshape(chosen.codes, -1))
 
 
 def test_table_shows_residuals_of_the_emulation():

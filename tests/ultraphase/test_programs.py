@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scenes.errors import InputError
-from ultraphase import Core, CoreArray, assemble, method, verify
+from ultraphase import ChipSpec, Core, CoreArray, assemble, method, verify
 from ultraphase.array import ArrayRun
 from ultraphase.catalog import FOLDER, PUBLISHED
 from ultraphase.tables import block_matrix, fourier_matrix, int8_codes, quarter_wave, spatial_sum
@@ -326,6 +326,32 @@ def test_tensors_that_a_quarter_wave_does_not_give():
         chosen.tables(temporal(16, 1024))
     with pytest.raises(InputError, match="needs an int8 temporal tensor"):
         chosen.matrix(None)
+    with pytest.raises(InputError, match=r"of type list, expected integers of shape \(8, 1024\)"):
+        chosen.tables(temporal(8, 1024).tolist())
+
+
+@pytest.mark.parametrize("name", ["fourier-8", "separable-8", "addressed-8"])
+def test_tensors_that_a_program_does_not_compute_are_refused(name):
+    """Tables and matrix come from the first row alone: the others must be its harmonics."""
+    chosen, right = method(name), tensor(name)
+    gray, zeros = right[[0, 1, 2, 3, 6, 7, 4, 5]], right.copy()
+    zeros[1:] = 0
+    for wrong, row in ((gray, 4), (zeros, 1)):
+        for call in (chosen.tables, chosen.matrix):
+            with pytest.raises(InputError, match=f"program {name}: row {row} is not .* of harmonic"):
+                call(wrong)
+
+
+def test_programs_follow_the_timestamps_of_the_chip_or_refuse_it():
+    chip, chosen = ChipSpec(timestamp_bits=8), method("coarse-16")
+    found = verify(chosen.program(chip), chosen.matrix(chip=chip), chip=chip)
+    assert found.table.shape == (256, 16) and (found.table.sum(axis=0) == 16).all()
+    assert chosen.program(chip).timestamps == 256
+    with pytest.raises(InputError, match="program coarse-256: 256 bins of the chip's 256 timestamps"):
+        method("coarse-256").program(chip)
+    for call in (method("fourier-8").program, lambda chip: method("fourier-8").matrix(tensor("fourier-8"), chip)):
+        with pytest.raises(InputError, match="program fourier-8: is for 1,024 timestamps, the chip has 256"):
+            call(chip)
 
 
 def test_int8_codes_stay_within_127():

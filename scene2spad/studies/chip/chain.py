@@ -82,7 +82,8 @@ class FastCores:
             for column in range(columns):
                 core = (0, 0) if alike else (row, column)
                 if core not in found:
-                    found[core] = verify(compiled.program, compiled.matrix[core], core_tables(compiled, *core))
+                    tables = core_tables(compiled, *core)
+                    found[core] = verify(compiled.program, compiled.matrix[core], tables, chip=compiled.chip)
                 found[row, column] = found[core]
         return cls(compiled, tuple(tuple(found[r, c] for c in range(columns)) for r in range(rows)))
 

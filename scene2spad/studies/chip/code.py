@@ -24,7 +24,7 @@ from ultraphase.assembly.program import listing
 from ultraphase.catalog import TIMESTAMPS
 from ultraphase.compiler import Compiled, compile_code
 from ultraphase.integer_code import IntegerCode, folded_temporal
-from ultraphase.tables import block_sum, quarter_wave, wave_matrix
+from ultraphase.tables import block_sum, require_waves
 
 COUNTER_LIMIT = 255
 MAX_HEADROOM_BITS = 4
@@ -136,12 +136,10 @@ def harmonics_of(design: Design, temporal: np.ndarray, sensor: Sensor) -> tuple[
     gray = design.code == "gray"
     found = gray_frequencies(block_pulse(bins, sensor))[:count] if gray else list(range(1, count + 1))
     try:
-        folded = wave_matrix(quarter_wave(temporal), found)
+        require_waves(temporal, found, "code")
     except InputError:
         return ()
-    # even harmonics are half a step of the table late: pi / bins, and a rounding
-    near = bool((np.abs(folded - temporal) <= 127 * np.pi / bins + 1).all())
-    return tuple(found) if near else ()
+    return tuple(found)
 
 
 def codes_by_torch(counts: np.ndarray, compiled: Compiled) -> np.ndarray:
