@@ -6,12 +6,13 @@ from collections.abc import Iterable
 from dataclasses import fields
 from difflib import get_close_matches
 from numbers import Integral, Real
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 MAX_NAMES = 8
+_Item = TypeVar("_Item")
 
 
 class InputError(ValueError):
@@ -37,6 +38,25 @@ def require_kind(value: object, kind: type, where: str, hint: str = "") -> None:
     gives one."""
     article = "an" if kind.__name__[0] in "AEIOU" else "a"
     require(isinstance(value, kind), f"{where}: expected {article} {kind.__name__}{hint}, not {type(value).__name__}")
+
+
+def require_kinds(owner: object, where: str, **kinds: type) -> None:
+    """Raise InputError unless fields of an object, given by name, are of their classes; `where` comes first."""
+    for name, kind in kinds.items():
+        require_kind(getattr(owner, name), kind, f"{where}: {name}")
+
+
+def tuple_of(values: object, kind: type[_Item], what: str) -> tuple[_Item, ...]:
+    """Return several objects of one class as a tuple, or an InputError that names the first of another class.
+
+    One object alone, and a text, which would be a list of its letters, are no list.
+    """
+    if isinstance(values, (kind, str)) or not isinstance(values, Iterable):
+        raise InputError(f"{what}: expected a list of {kind.__name__}, not {type(values).__name__}")
+    found: tuple[_Item, ...] = tuple(values)
+    for place, value in enumerate(found):
+        require_kind(value, kind, f"{what}[{place}]")
+    return found
 
 
 def require_choice(value: object, known: Iterable[str], what: str) -> None:

@@ -14,8 +14,18 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from scenes.arrays import check_faces, checked_radiance, cross, finite_number, frozen_array, rigid_pose
-from scenes.errors import InputError, require
+from scenes.arrays import (
+    checked_radiance,
+    finite_number,
+    frozen_array,
+    looking_pose,
+    mesh_arrays,
+    number_array,
+    rigid_pose,
+    three_numbers,
+    whole_pixels,
+)
+from scenes.errors import require, require_choice, require_kind, require_kinds, tuple_of
 from scenes.notebook import html_card
 
 MaterialKind = Literal[
@@ -45,7 +55,8 @@ class Texture:
     name: str
 
     def __post_init__(self) -> None:
-        image = np.array(self.image, dtype=np.float32, order="C")
+        require_kinds(self, "texture", name=str)
+        image = number_array(self.image, np.float32, f"texture {self.name}")
         require(image.ndim == 2 and image.size > 0, f"texture {self.name}: shape {image.shape}, expected (h, w)")
         require(bool(np.isfinite(image).all()), f"texture {self.name}: holds NaN or infinite values")
         require(bool(image.min() >= 0), f"texture {self.name}: negative value {image.min():g}")
@@ -89,11 +100,10 @@ class Material:
     name: str = "material"
 
     def __post_init__(self) -> None:
+        require_kinds(self, "material", name=str)
         where = f"material {self.name}"
-        known = self.kind in MATERIAL_KINDS
-        require(known, f"{where}: kind {self.kind!r}, expected one of {', '.join(MATERIAL_KINDS)}")
-        known = self.distribution in DISTRIBUTIONS
-        require(known, f"{where}: distribution {self.distribution!r}, expected one of {', '.join(DISTRIBUTIONS)}")
+        require_choice(self.kind, MATERIAL_KINDS, f"{where}: kind")
+        require_choice(self.distribution, DISTRIBUTIONS, f"{where}: distribution")
         for label in ("albedo", "specular", "opacity"):
             object.__setattr__(self, label, _fraction(getattr(self, label), f"{where}: {label}"))
         for label in ("roughness", "ior", "eta", "k"):
@@ -133,17 +143,10 @@ class Surface:
     name: str = "surface"
 
     def __post_init__(self) -> None:
+        require_kinds(self, "mesh", name=str)
         where = f"mesh {self.name}"
-        vertices = frozen_array(self.vertices, np.float64, (3,), f"{where}: vertices")
-        faces = frozen_array(self.faces, np.int64, (3,), f"{where}: faces")
-        require(vertices.ndim == 2 and faces.ndim == 2, f"{where}: vertices and faces must be tables of three columns")
-        require(len(faces) > 0 and len(vertices) > 0, f"{where}: has no faces")
-        if not np.isfinite(vertices).all():
-            bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-            raise InputError(f"{where}: {bad} of {len(vertices)} vertices are NaN or infinite")
-        farthest = float(np.abs(vertices).max())
-        require(farthest <= MAX_COORDINATE_M, f"{where}: a vertex at {farthest:g} m is beyond {MAX_COORDINATE_M:g} m")
-        check_faces(faces, len(vertices), where)
+        require_kinds(self, where, material=Material)
+        vertices, faces = mesh_arrays(self.vertices, self.faces, MAX_COORDINATE_M, where)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
         for label, width in (("uv", 2), ("normals", 3)):
@@ -171,10 +174,7 @@ class Camera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", rigid_pose(self.pose, "camera pose"))
         for label, value in (("width", self.width), ("height", self.height)):
-            side = finite_number(value, f"camera {label}")
-            good = side == int(side) and 1 <= side <= MAX_IMAGE_SIDE
-            require(good, f"camera {label} {side:g} is outside 1 to {MAX_IMAGE_SIDE} whole pixels")
-            object.__setattr__(self, label, int(side))
+            object.__setattr__(self, label, whole_pixels(value, MAX_IMAGE_SIDE, f"camera {label}"))
         object.__setattr__(self, "fov_deg", finite_number(self.fov_deg, "camera fov"))
         require(0.01 <= self.fov_deg <= 170, f"camera fov {self.fov_deg:g} degrees is outside 0.01 to 170")
 
@@ -190,16 +190,7 @@ class Camera:
         up: Iterable[float] = (0.0, 1.0, 0.0),
     ) -> Camera:
         """Return a camera at `origin` [m] that looks at `target` [m], `up` upwards in the image, or an InputError."""
-        origin, target, up = (np.asarray(tuple(v), float) for v in (origin, target, up))
-        forward = target - origin
-        right = cross(forward, up)
-        far_enough = np.linalg.norm(forward) > 1e-9 and np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward)
-        require(bool(far_enough), f"camera at {origin.tolist()} cannot look at {target.tolist()} with up {up.tolist()}")
-        forward = forward / np.linalg.norm(forward)
-        right = right / np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.column_stack((right, cross(forward, right), forward, origin))
-        return cls(pose, fov_deg, width, height)
+        return cls(looking_pose(origin, target, up), fov_deg, width, height)
 
     @property
     def origin(self) -> np.ndarray:
@@ -221,8 +212,10 @@ class Camera:
         if width is None:
             if height is None:
                 return self
+            height = whole_pixels(height, MAX_IMAGE_SIDE, "camera height")
             width = max(1, round(self.width * height / self.height))
         elif height is None:
+            width = whole_pixels(width, MAX_IMAGE_SIDE, "camera width")
             height = max(1, round(self.height * width / self.width))
         return replace(self, width=width, height=height)
 
@@ -262,12 +255,11 @@ class Laser:
     cone_deg: float | None = None
 
     def __post_init__(self) -> None:
-        require(self.mode in LASER_MODES, f"laser mode {self.mode!r}, expected one of {', '.join(LASER_MODES)}")
-        baseline = tuple(float(v) for v in self.baseline_m)
-        require(len(baseline) == 3 and all(map(math.isfinite, baseline)), f"laser baseline {baseline} is not 3 numbers")
-        object.__setattr__(self, "baseline_m", baseline)
-        good = self.cone_deg is None or MIN_CONE_DEG <= self.cone_deg <= 360
-        require(good, f"laser cone {self.cone_deg} degrees is outside (0, 360], {MIN_CONE_DEG:g} at least")
+        require_choice(self.mode, LASER_MODES, "laser mode")
+        object.__setattr__(self, "baseline_m", three_numbers(self.baseline_m, "laser baseline [m]"))
+        if self.cone_deg is not None:
+            good = MIN_CONE_DEG <= finite_number(self.cone_deg, "laser cone") <= 360
+            require(good, f"laser cone {self.cone_deg} degrees is outside (0, 360], {MIN_CONE_DEG:g} at least")
         require(self.cone_deg is None or self.mode == "flood", f"laser mode {self.mode}: a cone is for flood only")
 
     @property
@@ -315,6 +307,7 @@ class Ambient:
     def __post_init__(self) -> None:
         object.__setattr__(self, "radiance", checked_radiance(self.radiance, "ambient radiance"))
         if self.environment is not None:
+            require_kind(self.environment, Texture, "ambient environment")
             checked_radiance(self.environment.image.max(), f"environment map {self.environment.name}: radiance")
         both = self.environment is not None and self.radiance > 0
         require(not both, "ambient light is either a constant radiance or an environment map, not both")
@@ -333,9 +326,13 @@ class Scene:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "surfaces", tuple(self.surfaces))
-        object.__setattr__(self, "notes", tuple(" ".join(note.split()) for note in self.notes))
-        require(len(self.surfaces) > 0, f"scene {self.name}: has no surfaces")
+        require_kinds(self, "scene", name=str)
+        where = f"scene {self.name}"
+        object.__setattr__(self, "surfaces", tuple_of(self.surfaces, Surface, f"{where}: surfaces"))
+        require(len(self.surfaces) > 0, f"{where}: has no surfaces")
+        require_kinds(self, where, camera=Camera, laser=Laser, ambient=Ambient)
+        notes = tuple_of(self.notes, str, f"{where}: notes")
+        object.__setattr__(self, "notes", tuple(" ".join(note.split()) for note in notes))
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the facts."""

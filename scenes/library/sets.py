@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from scenes.errors import InputError, did_you_mean, require
+from scenes.errors import InputError, did_you_mean, require, require_whole
 from scenes.io.inputs import file_sha256
 from scenes.model import Scene
 
@@ -40,6 +40,7 @@ class SceneSet:
     inputs: Callable[[int], Sequence[Path]] = lambda index: ()
 
     def view(self, index: int, *, seed: int = 0, width: int | None = None, height: int | None = None) -> Scene:
+        index, seed = require_whole(index, f"set {self.name}: view"), require_whole(seed, f"set {self.name}: seed")
         most = LARGEST if self.size is None else self.size
         require(0 <= index < most, f"set {self.name}: view {index} is outside 0 to {most - 1}")
         require(seed >= 0, f"set {self.name}: seed {seed} is not a whole number of 0 or more")
