@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TypedDict
 
 import numpy as np
 
-from scenes.errors import require
+from scenes.arrays import finite_number, three_numbers
+from scenes.errors import did_you_mean, normalise_fields, require, require_choice, require_kind
 from scenes.model import Camera, Scene
 
 AXES = ("x", "y", "z")
 Point = tuple[float, float, float]
+# Horizontal part of a view's direction, to its vertical one, below which it is straight down or up: what is left is
+# rounding, of vertices in single precision for instance, and says nothing of where up is in the image.
+VERTICAL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -34,22 +40,31 @@ class Placing:
     bare: bool = False
 
     def __post_init__(self) -> None:
-        require(self.up is None or self.up in AXES, f"up axis {self.up!r}, expected one of {', '.join(AXES)}")
+        if self.up is not None:
+            require_choice(self.up, AXES, "up axis")
         if self.scale is not None:
-            good = math.isfinite(self.scale) and 1e-9 <= self.scale <= 1e9
-            require(good, f"scale {self.scale:g} metres a unit is outside 1e-9 to 1e9")
-        for name, point in (("camera position", self.origin), ("point to look at", self.target)):
-            good = point is None or all(map(math.isfinite, point))
-            require(good, f"{name} {point} is not three finite numbers")
+            scale = finite_number(self.scale, "scale [metres a unit]")
+            require(1e-9 <= scale <= 1e9, f"scale {scale:g} metres a unit is outside 1e-9 to 1e9")
+        if self.fov_deg is not None:
+            finite_number(self.fov_deg, "camera fov")
+        for name, label in (("origin", "camera position"), ("target", "point to look at")):
+            point = getattr(self, name)
+            if point is not None:
+                object.__setattr__(self, name, three_numbers(point, label))
+        normalise_fields(self, "placing")
 
     @property
     def moves_camera(self) -> bool:
+        """Return whether position, direction or angle of the camera is stated."""
         return not (self.origin is None and self.target is None and self.fov_deg is None)
 
-    def camera(self, camera: Camera, target: np.ndarray) -> Camera:
-        """Return the camera as stated, upright; `target` is what it looks at where nothing is stated.
+    def camera(self, camera: Camera, target: np.ndarray, notes: list[str]) -> Camera:
+        """Return the camera as stated, upright; `target` (3,) [m] is what it looks at where nothing is stated.
 
-        A camera whose target alone is stated turns where it stands. Raises InputError as `Camera.look_at` does.
+        A camera whose target alone is stated turns where it stands. One that looks straight down or up keeps +x on the
+        right of the image, as a camera at the scene's front (+z) that goes over its top or under it: -z is up in the
+        image where it looks down, +z where it looks up, which `notes` are told. Raises InputError as `Camera.look_at`
+        does.
         """
         if not self.moves_camera:
             return camera
@@ -58,10 +73,40 @@ class Placing:
             return replace(camera, fov_deg=fov)
         origin = camera.origin if self.origin is None else self.origin
         aimed_at = target if self.target is None else self.target
-        return Camera.look_at(origin, aimed_at, fov_deg=fov, width=camera.width, height=camera.height)
+        up = (0.0, 1.0, 0.0)
+        across, upward, along = (float(end - start) for start, end in zip(origin, aimed_at, strict=True))
+        if math.hypot(across, along) < VERTICAL * abs(upward):
+            up = (0.0, 0.0, math.copysign(1.0, upward))
+            where, sign = ("up", "+") if upward > 0 else ("down", "-")
+            notes.append(f"the camera looks straight {where}: {sign}z is up in the image, +x on its right")
+        return Camera.look_at(origin, aimed_at, fov_deg=fov, width=camera.width, height=camera.height, up=up)
+
+
+class PlacingFields(TypedDict, total=False):
+    """Fields of `Placing` as keywords of a function."""
+
+    up: str | None
+    scale: float | None
+    origin: Point | None
+    target: Point | None
+    fov_deg: float | None
+    bare: bool
 
 
 AS_IT_IS = Placing()
+
+
+def stated(placing: Placing, values: Mapping[str, object], where: str) -> Placing:
+    """Return a placing with fields of it that were given to a function as keywords.
+
+    Raises InputError for other keywords, which comes with `where`, the call, and what it takes.
+    """
+    require_kind(placing, Placing, f"{where}: placing", " (scenes.placing)")
+    known = [item.name for item in fields(Placing)]
+    for name in values:
+        expected = f"expected fields of Placing: {', '.join(known)}"
+        require(name in known, f"{where}: {name!r} is unknown, {expected}{did_you_mean(name, known)}")
+    return replace(placing, **values)  # type: ignore[arg-type]
 
 
 def scaled(scene: Scene, factor: float) -> Scene:
@@ -83,4 +128,5 @@ def placed(scene: Scene, placing: Placing) -> Scene:
         return scene
     points = np.concatenate([surface.vertices for surface in scene.surfaces])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    return replace(scene, camera=placing.camera(scene.camera, middle))
+    notes = list(scene.notes)
+    return replace(scene, camera=placing.camera(scene.camera, middle, notes), notes=tuple(notes))

@@ -47,6 +47,7 @@ TURNS = {
     "y": np.eye(4),
     "z": np.array(((1.0, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))),
 }
+FLAT = 1e-6  # height of a level mesh to its largest extent, below which it would lie in the floor
 ZERO_AREA = 1e-12  # m^2; a face of no larger area is degenerate; in a model under 1 m its share of the extent squared
 
 
@@ -68,7 +69,7 @@ def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placin
     high = np.max([part.vertices.max(axis=0) for part in parts], axis=0)
     centre = (low + high) / 2
     radius = max(float(np.linalg.norm(part.vertices - centre, axis=1).max()) for part in parts)
-    camera = placing.camera(_camera(centre, radius, width, height), centre)
+    camera = placing.camera(_camera(centre, radius, width, height), centre, notes)
     wall_z = low[2] - WALL_GAP_M
     around = [] if placing.bare else _around(path, camera, wall_z)
     paint = Paint(path, notes)
@@ -206,7 +207,7 @@ def _stand(path: Path, parts: list[Part], notes: list[str], placing: Placing) ->
     notes += [f"largest extent {size}", *warning]
     pose = scale * turn
     pose[:, 3] = -scale * (low[0] + high[0]) / 2, -scale * low[1], -scale * (low[2] + high[2]) / 2, 1
-    if scale * (high[1] - low[1]) < 1e-6:
+    if not placing.bare and high[1] - low[1] < FLAT * extent:
         pose[1, 3] += 1e-3
         notes.append("flat and level: lifted by 1 mm off the floor")
     moved = [_moved(part, pose) for part in parts]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from scenes.library.living_room import living_room
 from scenes.library.things import shapes
 from scenes.library.washroom import washroom
 from scenes.model import Camera, Material, Scene, Surface
-from scenes.placing import AS_IT_IS, Placing, placed
+from scenes.placing import AS_IT_IS, Placing, PlacingFields, placed, stated
 
 SCENES: dict[str, str] = {
     "living-room": "a furnished room made from the seed, 0.8 to 6.2 m, with a window and a lamp as ambient light",
@@ -43,6 +44,7 @@ def load_scene(
     width: int | None = None,
     height: int | None = None,
     placing: Placing = AS_IT_IS,
+    **placing_fields: Unpack[PlacingFields],
 ) -> Scene:
     """Return the scene of that name, or in that file (.obj .ply .stl .glb, or Mitsuba .xml).
 
@@ -51,10 +53,13 @@ def load_scene(
     a Middlebury scene too.
 
     width, height: pixels; None is 128 x 96, or the film size of an .xml; one alone keeps the proportions. The seed
-    matters to procedural scenes only. `placing` states size, upward axis (meshes) and camera. Raises InputError in one
-    line for an unknown name or extension, or a bad file.
+    matters to procedural scenes only. `placing` states size, upward axis (meshes) and camera; its fields can be given
+    as keywords: `load_scene("part.stl", scale=0.001, up="y")`. Those are `up` (x, y or z), `scale` (metres per unit of
+    the file), `origin` and `target` of the camera [m], `fov_deg`, and `bare` (no floor and no wall). Raises InputError
+    in one line for an unknown name, extension or keyword, or a bad file.
     """
     spec = str(spec)
+    placing = stated(placing, placing_fields, "load_scene")
     if Path(spec).suffix.lower() in MESH_EXTENSIONS:
         size = _looking_ahead(WIDTH, HEIGHT).resized(width, height)
         return load_mesh(Path(spec), width=size.width, height=size.height, placing=placing)

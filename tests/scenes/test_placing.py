@@ -49,6 +49,63 @@ def test_bare_leaves_the_mesh_alone_and_a_camera_stands_where_it_is_put(tip):
         load_mesh(tip, placing=Placing(origin=(0.0, 1.0, -9.0), target=(0.0, 0.0, 0.0)))
 
 
+@pytest.mark.parametrize(("height_m", "up", "words"), [(5.0, -1, "down: -z"), (-5.0, 1, "up: +z")])
+def test_a_view_straight_down_or_up_keeps_right_and_front(tip, height_m, up, words):
+    """It is the limit of upright views from the front (+z) that go over the top, or under it: +x is on the right."""
+    placing = Placing(origin=(0.0, height_m, 0.0), target=(0.0, 0.0, 0.0), bare=True)
+    scene = load_mesh(tip, placing=placing)
+    right, down, forward = scene.camera.rotation.T
+    assert right == pytest.approx((1, 0, 0)) and down == pytest.approx((0, 0, -up))
+    assert forward == pytest.approx((0, -math.copysign(1, height_m), 0))
+    assert any(f"straight {words} is up in the image" in note for note in scene.notes)
+    near = load_mesh(tip, placing=Placing(origin=(0.0, height_m, 1e-4), target=(0.0, 0.0, 0.0), bare=True))
+    assert near.camera.rotation == pytest.approx(scene.camera.rotation, abs=1e-4)
+    assert not any("straight" in note for note in near.notes)
+
+
+def test_a_view_from_above_needs_no_target_and_may_have_a_floor(tip):
+    """The middle of a mesh in single precision lies beside its axis by some rounding, which turns no picture."""
+    for origin in ((0.0, 3.0, 0.0), (1e-7, 3.0, -1e-7)):
+        scene = load_mesh(tip, placing=Placing(origin=origin))
+        assert [surface.name for surface in scene.surfaces] == ["tip", "floor", "wall"]
+        assert scene.camera.rotation[:, 0] == pytest.approx((1, 0, 0), abs=1e-6)
+
+
+def test_a_scene_seen_from_above_keeps_its_notes():
+    scene = load_scene("tabletop/spikes", placing=Placing(origin=(0.0, 50.0, 0.0), target=(0.0, 0.0, 0.0)))
+    assert len(scene.notes) == len(load_scene("tabletop/spikes").notes) + 1
+    assert scene.notes[-1] == "the camera looks straight down: -z is up in the image, +x on its right"
+
+
+def test_fields_of_a_placing_are_keywords_too(tip):
+    """They come on top of those of a placing that is given."""
+    one = load_scene(str(tip), scale=0.01, up="z", bare=True)
+    other = load_scene(str(tip), placing=Placing(scale=0.01, bare=True), up="z")
+    assert one.digest() == other.digest() == load_scene(str(tip), placing=Placing("z", 0.01, bare=True)).digest()
+    assert load_scene("plane", fov_deg=20).camera.fov_deg == 20
+
+
+SHEET = "v 0 0 0\nv 0 0 1\nv 1 0 1\nv 1 0 0\nf 1 2 3 4\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "scale", "bare", "low_m"),
+    [
+        (SHEET, 1.0, True, 0.0),  # no floor that it would lie in
+        (SHEET, 1.0, False, 1e-3),
+        (SHEET.replace("v 0 0 0", "v 0 5e-7 0"), 1000.0, False, 1e-3),  # 0.5 mm in a kilometre
+        (TIP, 1e-7, False, 0.0),  # 0.1 micrometres tall and as wide
+        (TIP, 1e-7, True, 0.0),
+    ],
+)
+def test_what_is_level_for_its_size_is_lifted_where_there_is_a_floor(tmp_path, text, scale, bare, low_m):
+    path = tmp_path / "a.obj"
+    path.write_text(text)
+    scene = load_mesh(path, placing=Placing(scale=scale, bare=bare))
+    assert scene.surfaces[0].vertices[:, 1].min() == low_m
+    assert any("lifted" in note for note in scene.notes) == (low_m > 0)
+
+
 def test_a_larger_scene_looks_the_same(tmp_path):
     path = xml_files.write(
         tmp_path, '<shape type="rectangle"><transform name="toWorld"><translate z="4"/></transform></shape>'
