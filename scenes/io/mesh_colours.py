@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenes.errors import InputError, require
-from scenes.io.mesh_files import MaterialEntry, ply_texture, read_material_library
+from scenes.io.mesh_files import ply_texture, read_material_library
+from scenes.io.mesh_formats.mtl import MaterialEntry
 from scenes.io.textures import MAX_PIXELS, image_values, load_texture, luminance, opened_image, srgb_to_linear
 from scenes.model import Material, Texture
 
@@ -87,8 +88,11 @@ class Paint:
             self.notes.append(f"{part.name}: opacity {entry.opacity:g} is left out, its surface is opaque")
         image = entry.image
         if image is not None and self._is_mapped(part):
-            return image, lambda: load_texture(image)
-        return entry.colour
+            note = f"material {material}: {entry.tint_note}"
+            if entry.tint_note and note not in self.notes:
+                self.notes.append(note)
+            return (image, entry.tint), lambda: load_texture(image, tint=entry.tint)
+        return None if entry.colour is None else float(luminance(np.array(entry.colour)))
 
     def _ply_albedo(self, part: Part) -> Albedo | float | None:
         file = ply_texture(self.path)

@@ -6,20 +6,19 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scenes.errors import InputError, require
+from scenes.errors import InputError, listed, require
 from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb import check_glb, with_bare_materials
+from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library
 from scenes.io.mesh_formats.obj import obj_fault, plain_obj
 from scenes.io.mesh_formats.ply import plain_ply
 from scenes.io.mesh_formats.stl import check_stl
-from scenes.io.textures import luminance
 
 if TYPE_CHECKING:
     import trimesh
@@ -131,23 +130,14 @@ def check_vertices(vertices: np.ndarray, name: str) -> None:
     require(largest <= MAX_COORDINATE, message)
 
 
-@dataclass(frozen=True)
-class MaterialEntry:
-    """Entry of an .mtl file for one material: linear luminance of Kd, file of map_Kd, whether it names a map_d, d."""
-
-    colour: float | None = None
-    image: Path | None = None
-    cut_out: bool = False
-    opacity: float = 1.0
-
-
 def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEntry]:
     """Read the material library of an OBJ; InputError for a texture that it names and that is not there.
 
     trimesh reads the library too, but silently drops such textures and rounds Kd to 8 bits.
     """
     entries: dict[str, MaterialEntry] = {}
-    for name in _library_names(lenient_text(path), path.parent):
+    text = lenient_text(path)
+    for name in _library_names(text, path.parent):
         if not (path.parent / name.replace("\\", "/")).exists():
             notes.append(f"material file {name} not found")
             continue
@@ -155,8 +145,17 @@ def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEnt
             library = file_inside(path.parent, name, "material file")
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-        entries |= _read_library(library)
+        entries |= read_library(library, notes)
+    _note_undefined(text, entries, notes)
     return entries
+
+
+def _note_undefined(text: str, entries: dict[str, MaterialEntry], notes: list[str]) -> None:
+    """Note the names of an OBJ's usemtl lines that no material file defines: such faces have no material."""
+    used = re.findall(r"^ *usemtl +(.*?) *$", text.replace("\t", " ").replace("\r", ""), re.MULTILINE)
+    undefined = [name for name in dict.fromkeys(used) if name and name not in entries]
+    if undefined:
+        notes.append(f"usemtl names what no material file defines: {listed(undefined)}")
 
 
 def _library_names(text: str, folder: Path) -> list[str]:
@@ -172,9 +171,12 @@ def _library_names(text: str, folder: Path) -> list[str]:
 
 
 def _with_one_library(content: bytes, beside: _Beside) -> bytes:
-    """Return an OBJ that names one material file at most, as trimesh reads the first alone: of several all names."""
+    """Return an OBJ that names one material file at most, of the names of all its materials.
+
+    trimesh reads the first file alone, and drops all materials where one of its lines is unlike what it expects.
+    """
     names = _library_names(content.decode("utf-8", errors="replace"), beside.folder)
-    if len(names) < 2:
+    if not names:
         return content
     there = [name for name in names if (beside.folder / name.replace("\\", "/")).exists()]
     lines = [line.strip() for name in there for line in beside.get(name).splitlines()]
@@ -190,58 +192,3 @@ def ply_texture(path: Path) -> Path | None:
         return None if named is None else file_inside(path.parent, named[1], "texture")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def lenient_text(path: Path) -> str:
-    """Read a text file: names and comments in any encoding, numbers never."""
-    return read_bytes(path).decode("utf-8", errors="replace")
-
-
-def _read_library(library: Path) -> dict[str, MaterialEntry]:
-    entries: dict[str, MaterialEntry] = {}
-    stated: set[str] = set()  # by d
-    name = ""
-    for line in lenient_text(library).splitlines():
-        key, rest = (*line.split(maxsplit=1), "", "")[:2]
-        if key.lower() == "newmtl":
-            name = " ".join(rest.split())
-            entries[name] = MaterialEntry()
-        elif key.lower() == "kd" and name:
-            entries[name] = replace(entries[name], colour=_kd(library, rest))
-        elif key.lower() == "map_kd" and name:
-            entries[name] = replace(entries[name], image=_map_kd(library, name, rest))
-        elif key.lower() == "map_d" and name:
-            entries[name] = replace(entries[name], cut_out=True)
-        elif key.lower() in ("d", "tr") and name and not (key.lower() == "tr" and name in stated):
-            # where both are given, programs disagree on what Tr is
-            stated |= {name} if key.lower() == "d" else set()
-            entries[name] = replace(entries[name], opacity=_opacity(library, key.lower(), rest))
-    return entries
-
-
-def _opacity(library: Path, key: str, text: str) -> float:
-    """Return what d says, or 1 less what Tr says."""
-    try:
-        value = float(text.removeprefix("-halo").split()[0])
-    except (ValueError, IndexError):
-        raise InputError(f"{library}: {key} {text.strip()!r}, expected a number") from None
-    return value if key == "d" else 1 - value
-
-
-def _kd(library: Path, text: str) -> float:
-    """Return the luminance of Kd, which is a reflectance by the format's text, and in Blender's files: linear."""
-    try:
-        colour = [float(word) for word in text.split()[:3]]
-        return float(luminance(np.clip(colour * 3 if len(colour) == 1 else colour, 0, 1)))
-    except ValueError:
-        raise InputError(f"{library}: Kd {text.strip()!r}, expected three numbers") from None
-
-
-def _map_kd(library: Path, name: str, text: str) -> Path:
-    """Return the texture file of a map_Kd line, whose options (-s 1 1 1 ...) are left out."""
-    file = text.strip()
-    file = file.split()[-1] if file.startswith("-") else file
-    try:
-        return file_inside(library.parent, file, f"texture of material {name}")
-    except InputError as error:
-        raise InputError(f"{library}: {error}") from None

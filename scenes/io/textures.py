@@ -18,15 +18,23 @@ from scenes.model import Texture
 if TYPE_CHECKING:
     from PIL import Image
 
+Colour = tuple[float, float, float]  # linear RGB
+WHITE: Colour = (1.0, 1.0, 1.0)
 MAX_PIXELS = 1 << 26
 SHARP_PIXELS = 1024  # side up to which images without interpolation are enlarged
 MAX_EXR_VALUES = 1 << 27  # of all channels: 8192 x 4096 RGBA, 1 GiB as float64
 
 
-def luminance(rgb: np.ndarray) -> np.ndarray:
-    """Return Rec. 709 luminance of linear RGB (..., 3): the one number this project keeps of a colour."""
+def luminance(rgb: np.ndarray, tint: Colour = WHITE) -> np.ndarray:
+    """Return Rec. 709 luminance of linear RGB (..., 3), times `tint`: the one number this project keeps of it."""
     rgb = np.asarray(rgb)[..., :3]
-    return rgb @ np.array([0.2126, 0.7152, 0.0722], dtype=np.result_type(rgb, np.float32))
+    weights = np.array([0.2126, 0.7152, 0.0722]) * tint
+    return rgb @ weights.astype(np.result_type(rgb, np.float32))
+
+
+def _tinted(grey: np.ndarray, tint: Colour) -> np.ndarray:
+    """Multiply a grey image by a colour's luminance."""
+    return grey if tint == WHITE else grey * luminance(np.array(tint, np.float32))
 
 
 def srgb_to_linear(value: np.ndarray) -> np.ndarray:
@@ -35,17 +43,18 @@ def srgb_to_linear(value: np.ndarray) -> np.ndarray:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
-def load_texture(path: Path, *, linear: bool = False, channel: str = "luminance") -> Texture:
+def load_texture(path: Path, *, linear: bool = False, channel: str = "luminance", tint: Colour = WHITE) -> Texture:
     """Read an image file (.png .jpg .bmp .tga .tif through Pillow, .exr through OpenEXR) as a linear texture.
 
     `linear` says that the numbers of an 8- or 16-bit file are linear already, else they are taken as sRGB (.exr is
     always linear). `channel` is "luminance", or "alpha" for the alpha channel (luminance where there is none).
+    `tint` is a linear colour that the image is multiplied by.
     Raises InputError naming the file when it is missing, broken or of another type.
     """
     path = regular_file(path, "texture file")
     if path.suffix.lower() == ".exr":
-        return Texture(_exr_pixels(path, channel), path.name)
-    return Texture(_image_pixels(path, linear, channel), path.name)
+        return Texture(_exr_pixels(path, channel, tint), path.name)
+    return Texture(_image_pixels(path, linear, channel, tint), path.name)
 
 
 def with_sharp_texels(texture: Texture) -> Texture:
@@ -60,10 +69,10 @@ def with_sharp_texels(texture: Texture) -> Texture:
     return Texture(np.kron(texture.image, np.ones((factor, factor), np.float32)), texture.name)
 
 
-def _image_pixels(path: Path, linear: bool, channel: str) -> np.ndarray:
+def _image_pixels(path: Path, linear: bool, channel: str, tint: Colour) -> np.ndarray:
     with opened_image(path) as image:
         values = image_values(image, linear=linear, channel=channel)
-    return luminance(values) if values.shape[2] == 3 else values[..., 0]
+    return luminance(values, tint) if values.shape[2] == 3 else _tinted(values[..., 0], tint)
 
 
 def image_values(image: Image.Image, *, linear: bool = False, channel: str = "luminance") -> np.ndarray:
@@ -153,12 +162,12 @@ def read_flat_exr(path: Path, what: str = "image file") -> tuple[dict[str, np.nd
         raise InputError(f"{path}: broken EXR file ({(str(error).splitlines() or ['no reason given'])[0]})") from None
 
 
-def _exr_pixels(path: Path, channel: str) -> np.ndarray:
+def _exr_pixels(path: Path, channel: str, tint: Colour) -> np.ndarray:
     pixels = exr_channels(path, "texture file")
     if channel == "alpha" and "A" in pixels:
         return pixels["A"]
     if {"R", "G", "B"} <= pixels.keys():
-        return luminance(np.stack([pixels[name] for name in "RGB"], axis=-1))
+        return luminance(np.stack([pixels[name] for name in "RGB"], axis=-1), tint)
     if "Y" in pixels:
-        return pixels["Y"]
+        return _tinted(pixels["Y"], tint)
     raise InputError(f"{path}: channels {', '.join(sorted(pixels))}, expected R G B or Y")

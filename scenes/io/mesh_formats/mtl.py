@@ -1,0 +1,152 @@
+"""Material libraries (.mtl): what of each material becomes an albedo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from scenes.arrays import finite_number
+from scenes.errors import InputError, require
+from scenes.io.inputs import file_inside, read_bytes
+from scenes.io.textures import WHITE, Colour
+
+# Options of a map, and what they are where they change nothing: up to three numbers, of which those left out are as
+# stated here, or as many words; None is one word that matters to a cache or to other maps alone.
+POINT_OPTIONS = {"-s": (1.0, 1.0, 1.0), "-o": (0.0, 0.0, 0.0), "-t": (0.0, 0.0, 0.0)}
+WORD_OPTIONS = {
+    "-blendu": ("on",),
+    "-blendv": ("on",),
+    "-cc": ("off",),
+    "-clamp": ("off",),
+    "-mm": ("0", "1"),
+    "-texres": None,
+    "-imfchan": None,
+    "-boost": None,
+}
+
+
+@dataclass(frozen=True)
+class MaterialEntry:
+    """Entry of an .mtl file for one material: linear RGB of Kd, file of map_Kd, whether it names a map_d, d."""
+
+    colour: Colour | None = None
+    image: Path | None = None
+    cut_out: bool = False
+    opacity: float = 1.0
+
+    @property
+    def tint(self) -> Colour:
+        """Linear RGB that the image is multiplied by: Kd, as the format says, or 1 where there is none.
+
+        A black one would leave nothing of the image. Programs write it that let the image replace the colour.
+        """
+        return self.colour if self.colour is not None and any(self.colour) else WHITE
+
+    @property
+    def tint_note(self) -> str:
+        """What becomes of a Kd beside the image, where it is neither missing nor white."""
+        if self.colour is None or self.colour == WHITE:
+            return ""
+        if self.tint == WHITE:
+            return "map_Kd is taken alone, not multiplied by its black Kd"
+        return f"map_Kd is multiplied by its Kd, {' '.join(f'{value:g}' for value in self.colour)}"
+
+
+def lenient_text(path: Path) -> str:
+    """Read a text file: names and comments in any encoding, numbers never."""
+    return read_bytes(path).decode("utf-8", errors="replace")
+
+
+def read_library(library: Path, notes: list[str]) -> dict[str, MaterialEntry]:
+    """Read a material library: its materials by name, with notes on options of images that are left out.
+
+    Raises InputError for an image that is not there, and for options that move an image on its surface.
+    """
+    entries: dict[str, MaterialEntry] = {}
+    stated: set[str] = set()  # by d
+    name = ""
+    for line in lenient_text(library).splitlines():
+        key, rest = (*line.split(maxsplit=1), "", "")[:2]
+        if key.lower() == "newmtl":
+            name = " ".join(rest.split())
+            entries[name] = MaterialEntry()
+        elif key.lower() == "kd" and name:
+            entries[name] = replace(entries[name], colour=_kd(library, rest))
+        elif key.lower() == "map_kd" and name:
+            entries[name] = replace(entries[name], image=_map_kd(library, name, rest, notes))
+        elif key.lower() == "map_d" and name:
+            entries[name] = replace(entries[name], cut_out=True)
+        elif key.lower() in ("d", "tr") and name and not (key.lower() == "tr" and name in stated):
+            # where both are given, programs disagree on what Tr is
+            stated |= {name} if key.lower() == "d" else set()
+            entries[name] = replace(entries[name], opacity=_opacity(library, key.lower(), rest))
+    return entries
+
+
+def _opacity(library: Path, key: str, text: str) -> float:
+    """Return what d says, or 1 less what Tr says."""
+    try:
+        value = float(text.removeprefix("-halo").split()[0])
+    except (ValueError, IndexError):
+        raise InputError(f"{library}: {key} {text.strip()!r}, expected a number") from None
+    return value if key == "d" else 1 - value
+
+
+def _kd(library: Path, text: str) -> Colour:
+    """Return Kd, 0 to 1 each: a reflectance by the format's text, and in Blender's files: linear."""
+    try:
+        words = text.split()[:3]
+        given = [finite_number(float(word), "Kd") for word in (words * 3 if len(words) == 1 else words)]
+        red, green, blue = (min(max(value, 0.0), 1.0) for value in given)
+    except ValueError:  # of which InputError is one
+        raise InputError(f"{library}: Kd {text.strip()!r}, expected three numbers") from None
+    return red, green, blue
+
+
+def _map_kd(library: Path, name: str, text: str, notes: list[str]) -> Path:
+    """Return the texture file of a map_Kd line; options that would move or distort it are refused, others noted."""
+    where = f"{library}: map_Kd of material {name}"
+    rest = text.strip()
+    while rest.startswith("-") and len(rest.split(maxsplit=1)) == 2:
+        option, rest = rest.split(maxsplit=1)
+        option = option.lower()
+        if option in POINT_OPTIONS:
+            identity = POINT_OPTIONS[option]
+            values, rest = _leading_numbers(rest)
+            same = (*values, *identity[len(values) :]) == identity
+            shown = " ".join(f"{value:g}" for value in values)
+            require(same, f"{where}: option {option} {shown} is not read; write it into the texture coordinates")
+        elif option in WORD_OPTIONS:
+            usual = WORD_OPTIONS[option]
+            words = rest.split(maxsplit=1 if usual is None else len(usual))
+            given, rest = words[:-1], words[-1]
+            if usual is not None and not _equal(given, usual):
+                notes.append(f"material {name}: option {option} {' '.join(given)} of map_Kd is left out")
+        else:
+            notes.append(f"material {name}: option {option} of map_Kd is left out")
+            rest = rest.split()[-1]
+    try:
+        return file_inside(library.parent, rest, f"texture of material {name}")
+    except InputError as error:
+        raise InputError(f"{library}: {error}") from None
+
+
+def _leading_numbers(text: str) -> tuple[list[float], str]:
+    """Return up to three numbers that text begins with, and the text behind them, which is a file's name."""
+    values: list[float] = []
+    while len(values) < 3 and len(text.split(maxsplit=1)) == 2:
+        word, behind = text.split(maxsplit=1)
+        try:
+            values.append(float(word))
+        except ValueError:
+            break
+        text = behind
+    return values, text
+
+
+def _equal(given: list[str], usual: tuple[str, ...]) -> bool:
+    """Compare words of an option; numbers count by their value."""
+    try:
+        return [float(word) for word in given] == [float(word) for word in usual]
+    except ValueError:
+        return [word.lower() for word in given] == list(usual)
