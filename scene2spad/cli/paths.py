@@ -35,17 +35,20 @@ def input_file(path: Path) -> Path:
     return path
 
 
-def output_file(path: Path, suffix: str, kind: str, made: Path | None = None) -> Path:
+def output_file(path: Path, suffix: str, kind: str, made: Path | None = None, *, figure: bool = False) -> Path:
     """Return an output path that can be written later, with its picture: checked before the work, not after it.
 
     Results of the same kind may be written again; any other file is not overwritten.
-    made   folder that the command makes first: the output may lie in it, or in one above it, that is not there yet
+    made     folder that the command makes first: the output may lie in it, or in one above it, that is not there yet
+    figure   whether the picture is written, too: then one of another program is not overwritten either
     """
     if path.suffix.lower() not in (HDF5_SUFFIXES if suffix in HDF5_SUFFIXES else (suffix,)):
         raise InputError(f"{path}: the output must end in {suffix}")
     for target in (path, picture(path, kind)):
         check_target(target, made=made)
     keep_foreign(path, Mark(kind, lambda found: holds_kind(found, kind)))
+    if figure:
+        keep_foreign(picture(path, kind), PNG_FIGURE)
     return path
 
 

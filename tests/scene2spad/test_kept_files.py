@@ -105,6 +105,28 @@ def test_no_program_is_written_over_its_source(folder, capfd):
     )
 
 
+@pytest.mark.parametrize(
+    ("line", "out", "beside"),
+    [
+        ("render plane --bounces 1 --width 8 --height 6", "keep.exr", "keep.transient.png"),
+        ("render plane --bounces 1 --width 8 --height 6", None, "plane.transient.png"),
+        ("sense g.exr", "keep.h5", "keep.histogram.png"),
+        ("depth g.h5", "keep.exr", "keep.depth.png"),
+        ("depth g.h5", None, "g-log-matched.depth.png"),
+    ],
+)
+def test_pictures_of_other_programs_beside_a_result_are_kept(line, out, beside, folder, capfd):
+    """And no result is written beside them; without a picture of ours there is nothing to keep them from."""
+    before = {*Path().iterdir()}
+    argv = [*line.split(), *(["--out", out] if out else [])]
+    kept(capfd, argv, beside, foreign_png())
+    assert {path.name for path in {*Path().iterdir()} - before} <= {beside, "a.png"}
+    assert main([*argv, "--no-figure"]) == 0
+    Path(beside).unlink()
+    assert main(argv) == 0
+    assert main(argv) == 0  # our own is written again
+
+
 def test_a_comparison_keeps_the_users_picture(folder, capfd):
     Path("my.png").write_bytes(b"a picture")
     Path("my.csv").write_text(f"method,{','.join(FIGURES)},seconds\n")  # as every version wrote it

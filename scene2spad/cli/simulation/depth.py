@@ -92,7 +92,8 @@ def run(command: Depth, progress: Progress) -> dict:
     is_transient = source.suffix.lower() == ".exr" and holds_kind(source, "transient")
     # not the name of the map of `FILE.h5`, which other photons are in
     stem = f"{source.stem}-sensed" if is_transient else source.stem
-    out = output_file(command.out or source.with_name(f"{stem}-{label}.exr"), ".exr", "depth")
+    out = command.out or source.with_name(f"{stem}-{label}.exr")
+    output_file(out, ".exr", "depth", figure=command.figure)
     network = _network(command)
     if is_transient:
         histogram, sensed = _sensed(command, source, command.seed)
@@ -164,7 +165,8 @@ def _run_folder(command: Depth, label: str, progress: Progress) -> dict:
         histogram, words = _sensed(command, input_file(file), command.seed + number)
         sensed = sensed or f"{words} and more, one for each"
         out.mkdir(exist_ok=True)
-        found = _estimated(command, network, histogram, file, output_file(target, ".exr", "depth"))
+        output_file(target, ".exr", "depth", figure=command.figure)
+        found = _estimated(command, network, histogram, file, target)
         views.append({"file": str(file), **{key: found[key] for key in (*MEANS, *COUNTS, "out")}})
     log.info("%s: %d transients sensed %s", folder, len(files), sensed)
     means = {key: _mean([view[key] for view in views]) for key in MEANS}

@@ -126,9 +126,10 @@ def run(command: Render, progress: Progress) -> dict:
     check_offset(command.offset)
     _check_sunlight(command)
     if command.out is not None:
-        output_file(command.out, ".exr", "transient")
+        output_file(command.out, ".exr", "transient", figure=command.figure)
     scene = _load(command)
-    out = command.out or output_file(Path(f"{file_stem(scene.name)}.exr"), ".exr", "transient")
+    named = Path(f"{file_stem(scene.name)}.exr")
+    out = command.out or output_file(named, ".exr", "transient", figure=command.figure)
     scene = _lit(scene, command)
     start = time.perf_counter()
     if command.offset and command.offset_mode == "time":

@@ -170,7 +170,8 @@ def _files(command: Sense) -> tuple[Path, Path]:
     source = input_file(command.file)
     histogram_given = source.suffix.lower() in HDF5_SUFFIXES
     require(not histogram_given, f"{source}: is an HDF5 file, expected a transient (.exr) that `render` wrote")
-    return source, output_file(command.out or source.with_suffix(".h5"), ".h5", "histogram")
+    out = command.out or source.with_suffix(".h5")
+    return source, output_file(out, ".h5", "histogram", figure=command.figure)
 
 
 def _check_mat(path: Path, transient: Transient, sensor: Sensor) -> None:
