@@ -72,11 +72,12 @@ def _integrator_class(name: str, variant: str) -> type:
             self.bins = int(props.get("temporal_bins", TEMPORAL_BINS))
             self.width_m = float(props.get("bin_width_opl", BIN_WIDTH_OPL_M))
             self.start_m = float(props.get("start_opl", 0.0))
-            depth, error = int(props.get("max_depth", -1)), float(props.get("error", 0.0))
+            depth = int(props.get("max_depth", -1))
+            error = float(props["error"]) if "error" in props else None
             require(self.bins > 0, f"{name}: temporal_bins {self.bins} is not positive")
             require(0 < self.width_m < np.inf, f"{name}: bin_width_opl {self.width_m:g} m is not a positive length")
             require(depth == -1 or depth >= 2, f"{name}: max_depth {depth}, expected -1 or at least 2")
-            self.settings = RenderSettings(bounces=None if depth < 0 else depth - 1, error=error or None)
+            self.settings = RenderSettings(bounces=None if depth < 0 else depth - 1, error=error)
 
         def render(
             self,

@@ -73,6 +73,13 @@ def test_start_and_range_leave_light_out_and_keep_the_rest():
     assert none.sum() == 0
 
 
+@pytest.mark.parametrize("error", [0, 0.0, -1.0, 2.0])
+def test_an_error_that_is_no_target_is_refused(error):
+    with pytest.raises(RuntimeError, match=rf"error {float(error)} is outside 0.0001 to 1.0"):
+        mi.load_dict({"type": "scene2spad", "error": error})
+    assert mi.load_dict({"type": "scene2spad"}).settings.error is None
+
+
 def test_returns_are_spread_by_overlap():
     """By hand, bins of 1 m: a point, a return over two bins, one over the end, one before the start."""
     zeros = np.zeros((1, 1), np.float32)
