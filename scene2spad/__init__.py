@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from scenes import Ambient, Camera, InputError, Laser, Material, Scene, Surface, Texture
     from scenes.library.catalog import load_scene
+    from scenes.placing import Placing
     from spad.formats.histogram import Histogram, read_histogram, write_histogram
     from spad.formats.mat import read_mat, write_mat
     from spad.formats.rgbd import transient_from_rgbd
@@ -58,6 +59,7 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
     ),
     "scenes": ("Ambient", "Camera", "InputError", "Laser", "Material", "Scene", "Surface", "Texture"),
     "scenes.library.catalog": ("load_scene",),
+    "scenes.placing": ("Placing",),
     "render.mitsuba_integrator": ("register_integrator",),
     "render.settings": ("RenderSettings",),
     "render.transient": ("Transient", "read_transient", "write_transient"),
@@ -86,6 +88,7 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
 }
 __all__ = [  # noqa: RUF022 (in the order of the chain)
     "load_scene",
+    "Placing",
     "Scene",
     "Surface",
     "Material",

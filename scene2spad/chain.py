@@ -18,10 +18,14 @@ if TYPE_CHECKING:
     from csph.weights.cards import Card
     from render.transient import Transient
     from scenes.model import Scene
+    from scenes.placing import Placing
     from spad.formats.histogram import Histogram
     from spad.sensor.budget import Optics
     from spad.sensor.model import Sensor
 
+# What says how a scene stands, by the names of the command line and those of `Placing`, and the field of `Placing`.
+PLACING = {"up": "up", "scale": "scale", "bare": "bare", "from_": "origin", "look_at": "target", "fov": "fov_deg"}
+PLACING |= {field: field for field in PLACING.values()}
 Law = Literal["auto", "poisson", "first-photon", "free-running"]
 
 
@@ -31,6 +35,7 @@ def render(
     seed: int = 0,
     width: int | None = None,
     height: int | None = None,
+    placing: Placing | None = None,
     progress: Progress | None = None,
     **settings: Any,
 ) -> Transient:
@@ -45,6 +50,8 @@ def render(
         Seed of everything random. The same seed gives the same bytes.
     width, height : int, optional
         Image size in pixels of a scene that is loaded by name or from a file. One alone keeps the proportions.
+    placing : Placing, optional
+        How a scene that is loaded stands: its scale and camera, and of a mesh its upward axis and whether it is bare.
     progress : callable, optional
         Called with what is done and the share that is done, 0 to 1.
     **settings
@@ -75,18 +82,26 @@ def render(
     from render.settings import RenderSettings
     from scenes.library.catalog import load_scene
     from scenes.model import Scene
+    from scenes.placing import AS_IT_IS, Placing
 
     _check_settings(settings, [field.name for field in fields(RenderSettings)])
+    if placing is not None:
+        require_kind(placing, Placing, "render: placing")
+    called = "expected a function of what is done and the share that is done, 0 to 1"
+    require(progress is None or callable(progress), f"render: progress {progress!r}, {called}")
     if not isinstance(scene, Scene):
-        scene = load_scene(str(scene), seed=seed, width=width, height=height)
-    elif width is not None or height is not None:
-        raise InputError("render: a Scene has its own camera; width and height go with a name or a file")
+        scene = load_scene(str(scene), seed=seed, width=width, height=height, placing=placing or AS_IT_IS)
+    elif width is not None or height is not None or placing is not None:
+        raise InputError("render: a Scene has its own camera; width, height and placing go with a name or a file")
     return render_scene(scene, RenderSettings(**settings), seed=seed, progress=progress)
 
 
 def _check_settings(settings: dict[str, Any], known: list[str]) -> None:
     """Raise InputError for unknown settings, and for those that are no numbers and have to be."""
     for name, value in settings.items():
+        if name in PLACING:
+            field = PLACING[name]
+            raise InputError(f"render: {name!r} is no setting, give placing=scene2spad.Placing({field}={value!r})")
         require(name in known, f"render: setting {name!r} is unknown{did_you_mean(name, known)}")
         if value is not None and name not in ("refraction", "budget"):
             require(isinstance(value, Real | np.bool_), f"render: {name} {value!r}, expected a number")

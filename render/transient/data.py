@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from render.transient.exr_files import write_exr
-from scenes.errors import InputError, require, require_kind
+from scenes.errors import InputError, require, require_kind, require_number
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
 from scenes.json_types import JsonObject
 from scenes.notebook import html_card
@@ -159,9 +159,11 @@ class Transient:
     def delayed(self, offset_m: float) -> Transient:
         """Return the same scene `offset_m` farther in time alone (a `time` offset): paths + 2 offset, depth + offset.
 
-        A negative offset brings it nearer, at most until the nearest return begins at the laser. Raises InputError for
-        other offsets, and with a displaced laser, for which a delay is no distance.
+        offset_m: metres; a negative one brings it nearer, at most until the nearest return begins at the laser. Raises
+        InputError for other offsets, for what is no number, and with a displaced laser, for which a delay is no
+        distance.
         """
+        offset_m = require_number(offset_m, "time offset")
         check_delay(self.meta.get("laser", {}).get("baseline_m", ()))
         least = -float(self.path_near_m.min(initial=2 * LIMIT_M)) / 2
         require(least <= offset_m <= LIMIT_M, f"time offset {offset_m:g} m is outside {least:g} to {LIMIT_M:g}")
@@ -184,6 +186,7 @@ class Transient:
 def write_transient(transient: Transient, path: Path) -> None:
     """Write the multi-part EXR, whole or not at all. Raises InputError where the path cannot be written."""
     require_kind(transient, Transient, "write_transient")
+    require(isinstance(path, str | os.PathLike), f"write_transient: expected a path, not {type(path).__name__}")
     with whole_file(path) as beside:
         _write_exr(transient, beside)
 
@@ -253,6 +256,7 @@ def read_transient(path: Path) -> Transient:
     """
     import OpenEXR
 
+    require(isinstance(path, str | os.PathLike), f"read_transient: expected a path, not {type(path).__name__}")
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: file not found")

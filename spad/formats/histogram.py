@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from scenes.errors import InputError, require_kind
+from scenes.errors import InputError, require, require_kind
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.hdf5 import USER_BLOCK, add_checksum, describe, open_checked, read_dataset
 from scenes.json_types import JsonObject
@@ -176,6 +177,7 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
     import h5py
 
     require_kind(histogram, Histogram, "write_histogram")
+    require(isinstance(path, str | os.PathLike), f"write_histogram: expected a path, not {type(path).__name__}")
     meta = {**histogram.meta, "sensor": histogram.sensor.to_dict(), "budget": histogram.budget.to_dict()}
     packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     buffer = io.BytesIO()  # HDF5 itself does not survive a full disk
@@ -202,6 +204,7 @@ def read_histogram(path: Path) -> Histogram:
 
     Raises InputError in one line for a missing, foreign, truncated or altered file, or one of a newer schema.
     """
+    require(isinstance(path, str | os.PathLike), f"read_histogram: expected a path, not {type(path).__name__}")
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: file not found")

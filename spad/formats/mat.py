@@ -8,6 +8,7 @@ published `bin` is round(2 d / (c Delta)), with c = 3e8 m/s.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError, require, require_whole
+from scenes.errors import InputError, require, require_kind, require_whole
 from scenes.limits import require_memory
 from spad.detection.laws import LOW_FLUX
 from spad.estimators.depth import estimate_depth
@@ -49,6 +50,8 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     Where nothing is, and where nothing was detected, bins are 1: published loaders subtract 1 from unsigned numbers.
     Raises InputError as `check_mat` does, and where the file cannot be written.
     """
+    require_kind(histogram, Histogram, "write_mat")
+    require(isinstance(path, str | os.PathLike), f"write_mat: expected a path, not {type(path).__name__}")
     path, sensor = Path(path), histogram.sensor
     height, width = histogram.depth_m.shape
     check_mat(path, sensor, height, width, laser_baseline_m(histogram))
@@ -186,6 +189,7 @@ def read_mat(path: Path, frame: int = 0) -> Histogram:
 
     Raises InputError in one line for a file that is none of these, and a frame that is not there.
     """
+    require(isinstance(path, str | os.PathLike), f"read_mat: expected a path, not {type(path).__name__}")
     path = Path(path)
     frame = require_whole(frame, f"{path}: frame")
     contents = load_mat(path)

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from processes import run_process
 
 import scene2spad as s2s
+from scene2spad.cli import main
 from spad.estimators.depth import histogram_depth_m
 
 WALL = s2s.transient_from_rgbd(np.full((4, 4), 2.0), np.ones((4, 4)), np.ones((4, 4)))
@@ -66,6 +68,22 @@ def test_depth_is_that_of_the_parts(histogram):
     assert s2s.depth_errors(by_name, histogram)["mae_mm"] < 100
 
 
+def test_an_own_mesh_is_placed_as_on_the_command_line(tmp_path):
+    """A ball of radius 30 in a file of millimetres, bare: its nearest point is the camera's distance less 30 mm."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=30)
+    ball.export(tmp_path / "ball.stl")
+    placing = s2s.Placing(scale=1e-3, origin=(0, 0.03, 1), target=(0, 0.03, 0), fov_deg=5, bare=True)
+    transient = s2s.render(tmp_path / "ball.stl", width=9, height=9, bounces=1, placing=placing)
+    assert np.nanmin(transient.depth_m) == pytest.approx(0.97, abs=1e-3)
+    assert np.isnan(transient.depth_m[0, 0])  # neither a floor nor a wall
+    out = tmp_path / "ball.exr"
+    words = (
+        "--scale 0.001 --from 0 0.03 1 --look-at 0 0.03 0 --fov 5 --bare --width 9 --height 9 --bounces 1 --no-figure"
+    )
+    assert main(["render", str(tmp_path / "ball.stl"), *words.split(), "--out", str(out)]) == 0
+    assert s2s.read_transient(out).sha256() == transient.sha256()
+
+
 def test_optics_place_hot_pixels_by_the_seed_of_the_photons(monkeypatch):
     seeds = []
 
@@ -110,6 +128,21 @@ def test_optics_compute_the_photon_budget():
         (lambda h: s2s.RenderSettings(direct_tolerance_m="a"), "direct_tolerance_m 'a', expected a number"),
         (lambda h: s2s.CompressiveLayer(s2s.Design()), "a CodingTensor .*`CompressiveLayer.of` .* not Design"),
         (lambda h: s2s.render("galery"), "gallery"),
+        (lambda h: s2s.render("ball.stl", bare=True), r"'bare' is no setting, give placing=.*Placing\(bare=True\)"),
+        (lambda h: s2s.render("ball.stl", fov=30), r"'fov' is no setting, give placing=.*Placing\(fov_deg=30\)"),
+        (lambda h: s2s.render("plane", placing={"scale": 2}), "render: placing: expected a Placing, not dict"),
+        (lambda h: s2s.render(s2s.load_scene("plane"), placing=s2s.Placing(scale=2)), "placing go with a name"),
+        (lambda h: s2s.render("plane", placing=s2s.Placing(bare=True)), "`bare` are for mesh files"),
+        (lambda h: s2s.render("plane", width=2, height=2, bounces=1, progress=3), "progress 3, expected a function"),
+        (lambda h: WALL.delayed("x"), "time offset 'x', expected a number"),
+        (lambda h: WALL.delayed(float("nan")), "time offset nan m is outside"),
+        (lambda h: s2s.read_transient(3), "read_transient: expected a path, not int"),
+        (lambda h: s2s.write_transient(WALL, None), "write_transient: expected a path, not NoneType"),
+        (lambda h: s2s.read_histogram(3), "read_histogram: expected a path, not int"),
+        (lambda h: s2s.write_histogram(h, 3), "write_histogram: expected a path, not int"),
+        (lambda h: s2s.read_mat(3), "read_mat: expected a path, not int"),
+        (lambda h: s2s.write_mat(h, 3), "write_mat: expected a path, not int"),
+        (lambda h: s2s.write_mat(WALL, "x.mat"), "write_mat: expected a Histogram, not Transient"),
         (lambda h: s2s.estimate_depth(h, "log-machted"), "log-matched"),
         (lambda h: s2s.load_model("nosuch"), "nosuch"),
         (lambda h: s2s.coding_tensor("furier", 8), "furier"),
