@@ -80,20 +80,29 @@ def render(
     """
     from render.engine import render as render_scene
     from render.settings import RenderSettings
-    from scenes.library.catalog import load_scene
     from scenes.model import Scene
-    from scenes.placing import AS_IT_IS, Placing
 
     _check_settings(settings, [field.name for field in fields(RenderSettings)])
-    if placing is not None:
-        require_kind(placing, Placing, "render: placing")
-    called = "expected a function of what is done and the share that is done, 0 to 1"
-    require(progress is None or callable(progress), f"render: progress {progress!r}, {called}")
+    _check_progress(progress)
     if not isinstance(scene, Scene):
-        scene = load_scene(str(scene), seed=seed, width=width, height=height, placing=placing or AS_IT_IS)
+        scene = _loaded(str(scene), seed, width, height, placing)
     elif width is not None or height is not None or placing is not None:
         raise InputError("render: a Scene has its own camera; width, height and placing go with a name or a file")
     return render_scene(scene, RenderSettings(**settings), seed=seed, progress=progress)
+
+
+def _loaded(name: str, seed: int, width: int | None, height: int | None, placing: Placing | None) -> Scene:
+    from scenes.library.catalog import load_scene
+    from scenes.placing import AS_IT_IS, Placing
+
+    if placing is not None:
+        require_kind(placing, Placing, "render: placing")
+    return load_scene(name, seed=seed, width=width, height=height, placing=placing or AS_IT_IS)
+
+
+def _check_progress(progress: object) -> None:
+    expected = "expected a function of what is done and the share that is done, 0 to 1"
+    require(progress is None or callable(progress), f"render: progress {progress!r}, {expected}")
 
 
 def _check_settings(settings: dict[str, Any], known: list[str]) -> None:
