@@ -9,7 +9,6 @@ import numpy as np
 
 import scene2spad as s2s
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from spad.formats.dense import dense_radiance
 
 WIDTH, HEIGHT = 32, 24
 SENSOR = s2s.sensor_by_name("reference")
@@ -20,7 +19,7 @@ counts_per_radiance = 50 / light.total_radiance().mean()  # this laser brings 50
 
 def expected_counts(scene: s2s.Scene) -> np.ndarray:
     """Return the expected signal detections (H, W, T) of one exposure."""
-    return counts_per_radiance * dense_radiance(s2s.render(scene, bounces=1, seed=14), SENSOR)["data"]
+    return counts_per_radiance * s2s.dense(s2s.render(scene, bounces=1, seed=14), SENSOR)["data"]
 
 
 def with_albedo(albedo: float) -> s2s.Scene:

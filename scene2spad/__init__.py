@@ -39,8 +39,11 @@ if TYPE_CHECKING:
     from scenes import Ambient, Camera, InputError, Laser, Material, Scene, Surface, Texture
     from scenes.library.catalog import load_scene
     from scenes.placing import Placing
+    from spad.formats.dense import dense, write_dense
+    from spad.formats.dense_reader import read_dense
     from spad.formats.histogram import Histogram, read_histogram, write_histogram
     from spad.formats.mat import read_mat, write_mat
+    from spad.formats.ply import points, write_ply
     from spad.formats.rgbd import transient_from_rgbd
     from spad.sensor.budget import Optics
     from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
@@ -66,6 +69,9 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
     "spad.sensor.model": ("PhotonBudget", "Sensor", "sensor_by_name"),
     "spad.sensor.pulse": ("Pulse", "read_pulse"),
     "spad.sensor.budget": ("Optics",),
+    "spad.formats.dense": ("dense", "write_dense"),
+    "spad.formats.dense_reader": ("read_dense",),
+    "spad.formats.ply": ("points", "write_ply"),
     "spad.formats.histogram": ("Histogram", "read_histogram", "write_histogram"),
     "spad.formats.mat": ("read_mat", "write_mat"),
     "spad.formats.rgbd": ("transient_from_rgbd",),
@@ -115,6 +121,11 @@ __all__ = [  # noqa: RUF022 (in the order of the chain)
     "write_histogram",
     "read_mat",
     "write_mat",
+    "dense",
+    "write_dense",
+    "read_dense",
+    "points",
+    "write_ply",
     "estimate_depth",
     "depth_errors",
     "coding_tensor",

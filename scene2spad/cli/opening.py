@@ -104,15 +104,20 @@ def pixel_sensor(name: str | None, path: Path) -> Sensor:
 
 
 def open_histogram(path: Path, frame: int = 0) -> Histogram:
-    """Read a histogram of ours (.h5), or a frame or capture of the published family (.mat)."""
+    """Read a histogram of ours (.h5), counts that `export` wrote (.npz, .h5), or a frame or capture of the published
+    family (.mat)."""
     if path.suffix.lower() == ".mat":
         from spad.formats.mat import read_mat
 
         return read_mat(path, frame)
+    require(not frame, f"{path}: --frame {frame} is for captures (.mat)")
+    if _is_dense(path):
+        from spad.formats.dense_reader import read_dense
+
+        return read_dense(path)
     from spad.formats.histogram import read_histogram
 
     _check_no_other_kind(path)
-    require(not frame, f"{path}: --frame {frame} is for captures (.mat)")
     return read_histogram(path)
 
 
@@ -126,6 +131,16 @@ def open_for_depth(path: Path, frame: int = 0) -> Histogram:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return histogram
+
+
+def _is_dense(path: Path) -> bool:
+    """Tell whether a file is a dense export, and no histogram: every .npz, and HDF5 by the names of its arrays."""
+    suffix = path.suffix.lower()
+    if suffix not in HDF5_SUFFIXES or holds_kind(input_file(path), "histogram"):
+        return suffix == ".npz"
+    from scene2spad.viewer.exports import is_dense
+
+    return is_dense(path)
 
 
 def _is_cube(path: Path) -> bool:
@@ -145,9 +160,10 @@ def _check_no_other_kind(path: Path) -> None:
         kinds = tuple(kind for kind in kinds if holds_kind(path, kind)) or ("picture",)
     if kinds[0] == "codes" and _is_cube(path):
         kinds = ("dense",)
+    from spad.formats.dense_reader import BY_HAND
+
     cure = {
-        "dense": "; in Python scene2spad.Histogram.from_counts takes its counts (H, W, T) with their sensor, and "
-        "scene2spad.write_histogram makes the file",
+        "dense": BY_HAND,
         "transient": "; sense it first: `scene2spad sense`",
         "codes": "; `depth` takes them by --codes-file, `compare` by --methods",
         "network": "; `depth` takes it by --checkpoint, `compare` by --methods",

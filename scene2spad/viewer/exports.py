@@ -10,10 +10,11 @@ import numpy as np
 from scene2spad.viewer.content import Content, Cube, Layer, grey_layer
 from scene2spad.viewer.sources import depth_layer
 from scenes.errors import InputError, require
-from scenes.files import read_arrays
-from scenes.io.hdf5 import open_checked, read_dataset
+from scenes.io.hdf5 import open_checked
 from scenes.io.inputs import read_bytes
 from scenes.io.mesh_formats.ply import plain_ply
+from spad.formats.dense import AXES
+from spad.formats.dense_reader import read_dense_arrays
 
 MAPS = {"expected_signal": "photons", "expected_background": "photons", "albedo": ""}
 COLUMNS = [(name, "<f4") for name in ("x", "y", "z", "intensity", "confidence")]
@@ -77,16 +78,13 @@ def dense_content(path: Path) -> Content:
 
 
 def _dense_arrays(path: Path) -> dict[str, np.ndarray]:
-    if path.suffix.lower() == ".npz":
-        arrays = read_arrays(path, "dense array")
-        missing = [name for name in DENSE if name not in arrays]
-        require(not missing, f"{path}: holds no {', '.join(missing)}; expected a dense array that `export` wrote")
-        return arrays
-    try:
-        with open_checked(path) as file:
-            return {name: read_dataset(file, name) for name in (*DENSE, *MAPS) if name in DENSE or name in file}
-    except InputError as error:
-        raise InputError(f"{path}: no dense array that `export` wrote: {error}") from None
+    """Return the arrays of an export; time is the last axis of `data` where the file says which one it is."""
+    arrays, text = read_dense_arrays(path)
+    missing = [name for name in DENSE if name not in arrays]
+    require(not missing, f"{path}: no dense array that `export` wrote: holds no {', '.join(missing)}")
+    if text.get("axes") == AXES["thw"] and arrays["data"].ndim == 3:
+        arrays["data"] = np.moveaxis(arrays["data"], 0, 2)
+    return arrays
 
 
 def _map(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...]) -> Layer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +18,7 @@ from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
+log = logging.getLogger("scene2spad")
 DENSE = (".npz", *HDF5_SUFFIXES)
 CODES = (".txt", ".npy")
 # An array of codes (.npy) has no mark of ours: it is as any program writes it.
@@ -56,8 +58,8 @@ def run(command: Export, progress: Progress) -> dict:
     path, out, suffix = command.file, command.out, command.out.suffix.lower()
     kind = kind_of(path)
     codes, dense = kind in ("codes", "network"), suffix in DENSE
-    light = dense and kind in ("transient", "pack")
-    purposes = {"int8": (codes, "codes"), "sensor": (light, "a dense array (.npz, .h5) of a transient")}
+    binned = dense and kind in ("transient", "pack")
+    purposes = {"int8": (codes, "codes"), "sensor": (binned, "a dense array (.npz, .h5) of a transient")}
     purposes |= {"layout": (dense, "a dense array (.npz, .h5)"), "view": (kind == "pack", "a pack")}
     purposes |= {"frame": (kind == "histogram", "captures (.mat)"), "intensity": (kind == "depth", "a depth map")}
     only_for(command, str(path), purposes)
@@ -72,7 +74,8 @@ def run(command: Export, progress: Progress) -> dict:
         write_dense(arrays, out, layout=command.layout)
         rows, columns, times = arrays["data"].shape
         shape = [times, rows, columns] if command.layout == "thw" else [rows, columns, times]
-        return {"shape": shape, "layout": command.layout, "out": str(out)}
+        light = {name: float(arrays[name]) for name in ("wrapped", "unrecorded") if name in arrays}
+        return {"shape": shape, "layout": command.layout, **light, "out": str(out)}
     if suffix == ".ply" and kind in ("transient", "pack", "histogram", "depth"):
         return {"points": _points(command, kind), "out": str(out)}
     all_forms = (".npz", ".h5", ".ply")
@@ -106,38 +109,33 @@ def _codes(command: Export, kind: str) -> dict:
 
 
 def _dense(command: Export, kind: str) -> dict[str, np.ndarray]:
-    from spad.formats.dense import dense_counts, dense_radiance
+    """Return the arrays, and say which light they have at another time than its own."""
+    from spad.formats.dense import arrival_reasons, dense
 
     if kind == "histogram":
-        return dense_counts(open_histogram(command.file, command.frame))
-    sensor = pixel_sensor(command.sensor, command.file)
-    return dense_radiance(open_transient(command.file, kind, command.view), sensor)
+        histogram = open_histogram(command.file, command.frame)
+        arrays, sensor = dense(histogram), histogram.sensor
+    else:
+        sensor = pixel_sensor(command.sensor, command.file)
+        arrays = dense(open_transient(command.file, kind, command.view), sensor)
+    for reason in arrival_reasons(arrays, sensor):
+        log.log(logging.WARNING if reason.startswith("warning:") else logging.INFO, "%s", reason)
+    return arrays
 
 
 def _points(command: Export, kind: str) -> int:
     """Write the cloud, and return how many points it has."""
-    from spad.formats.bistatic import pixel_directions
-    from spad.formats.ply import write_ply
+    from spad.formats.ply import points_of, write_ply
 
     depth_m, intensity, confidence, pointing = _depth_of(command, kind)
-    directions = pixel_directions(pointing, depth_m.shape)
-    if directions is None:
-        why = _why_no_points(depth_m, pointing.get("camera"))
-        raise InputError(f"{command.file}: {why}, so there are no points")
-    points = directions * depth_m[..., None]
+    try:
+        points = points_of(depth_m, pointing)
+    except InputError as error:
+        raise InputError(f"{command.file}: {error}") from None
     known = np.isfinite(depth_m)
     top = float(np.quantile(intensity[known], 0.995)) if known.any() else 1.0
-    fraction = np.clip(intensity[known] / (top or 1.0), 0, 1)
-    write_ply(points[known], command.out, intensity=fraction, confidence=confidence[known])
+    write_ply(points, command.out, intensity=np.clip(intensity / (top or 1.0), 0, 1), confidence=confidence)
     return int(known.sum())
-
-
-def _why_no_points(depth_m: np.ndarray, camera: JsonObject | None) -> str:
-    if not camera:
-        return "does not say which camera it was seen with"
-    rows, columns = depth_m.shape
-    image = f"{camera.get('height')} x {camera.get('width')}"
-    return f"its {rows} x {columns} depths are not pixels of its camera's image of {image}"
 
 
 def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, JsonObject]:

@@ -38,8 +38,8 @@ class Depth(Common):
     sensed first, as `sense` does; of a folder, every one."""
 
     file: Positional[Path]
-    """A histogram written by `sense` (.h5), a frame or capture of the published family (.mat), a transient (.exr), or
-    the folder of a set or of transients."""
+    """A histogram written by `sense` (.h5), its counts as `export` wrote them (.npz, .h5), a frame or capture of the
+    published family (.mat), a transient (.exr), or the folder of a set or of transients."""
     out: File = None
     """The depth map (.exr) to write (default: the file's and the method's name, with "sensed" between them for a
     transient); of a folder, the folder for them."""
