@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from spad.sensor.budget import Optics
     from spad.sensor.model import Sensor
 
-# What says how a scene stands, by the names of the command line and those of `Placing`, and the field of `Placing`.
-PLACING = {"up": "up", "scale": "scale", "bare": "bare", "from_": "origin", "look_at": "target", "fov": "fov_deg"}
-PLACING |= {field: field for field in PLACING.values()}
 Law = Literal["auto", "poisson", "first-photon", "free-running"]
 
 
@@ -103,6 +100,11 @@ def _loaded(name: str, seed: int, width: int | None, height: int | None, placing
 def _check_progress(progress: object) -> None:
     expected = "expected a function of what is done and the share that is done, 0 to 1"
     require(progress is None or callable(progress), f"render: progress {progress!r}, {expected}")
+
+
+# What says how a scene stands, by the names of the command line and those of `Placing`, and the field of `Placing`.
+PLACING = {"up": "up", "scale": "scale", "bare": "bare", "from_": "origin", "look_at": "target", "fov": "fov_deg"}
+PLACING |= {field: field for field in PLACING.values()}
 
 
 def _check_settings(settings: dict[str, Any], known: list[str]) -> None:
