@@ -30,6 +30,8 @@ class Placing:
     target   what the camera's axis meets [m]
     fov_deg  full horizontal angle of the camera
     bare     a mesh without the floor and the wall that are put around it
+
+    Raises InputError that names a field of another kind, or beyond its limits, and its value.
     """
 
     up: str | None = None
@@ -55,7 +57,7 @@ class Placing:
 
     @property
     def moves_camera(self) -> bool:
-        """Return whether position, direction or angle of the camera is stated."""
+        """Return whether position, direction or angle of the camera is stated, a bool."""
         return not (self.origin is None and self.target is None and self.fov_deg is None)
 
     def camera(self, camera: Camera, target: np.ndarray, notes: list[str]) -> Camera:
