@@ -12,10 +12,9 @@ background as well, is detected less by this factor, and then the first photon i
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+MANY_TRIALS = 1e15  # above them a multinomial of 2^31 counts is Poisson to 2e-6
 PerZone = float | np.ndarray  # one number, or one of each zone (Z,)
 
 
@@ -40,15 +39,16 @@ def saturated(flux: np.ndarray, trials: np.ndarray, recovery: PerZone, compressi
 def draw_saturated(
     flux: np.ndarray, trials: np.ndarray, recovery: PerZone, rng: np.random.Generator, compression: PerZone = 0.0
 ) -> np.ndarray:
-    """Draw counts (Z, T) int64 of one exposure: Poisson without saturation, with it the multinomial of all trials.
+    """Draw counts (Z, T) int64 of one exposure: Poisson without saturation, with it the multinomial of all trials,
+    which is Poisson again above MANY_TRIALS.
 
     What the compression takes is thinned from the bins.
     """
     counts = np.empty(flux.shape, dtype=np.int64)
     expected = saturated(flux, trials, recovery)
     for zone, mean in enumerate(expected):
-        if not math.isfinite(trials[zone]):
-            counts[zone] = rng.poisson(flux[zone])
+        if trials[zone] > MANY_TRIALS:  # also where they are infinite: nothing is lost
+            counts[zone] = rng.poisson(mean)
             continue
         cycles = max(1, round(trials[zone]))
         masses = mean / trials[zone]

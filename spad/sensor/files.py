@@ -19,12 +19,12 @@ from scenes.files import whole_file
 from scenes.io.inputs import file_sha256
 from scenes.json_types import JsonObject
 from spad.sensor.budget import Optics
-from spad.sensor.model import PRESETS, Sensor
+from spad.sensor.model import HOT_RATE_HZ, PRESETS, Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse
 from spad.sensor.quantities import format_quantity, parse_quantity
 from spad.sensor.tdc import Tdc
 from spad.sensor.toml import format_toml, read_toml
-from spad.zones.sensor import ZoneArray, check_chirp
+from spad.zones.sensor import ZoneArray, check_times
 
 SCHEMA = "1.0"
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
@@ -140,7 +140,7 @@ class SensorFile:
 
     def __post_init__(self) -> None:
         if self.zones is not None:
-            check_chirp(self.sensor, self.zones)
+            check_times(self.sensor, self.zones)
             self._check_no_pixels()
 
     def _check_no_pixels(self) -> None:
@@ -222,6 +222,8 @@ def sensor_from_tables(contents: Mapping[str, object], folder: Path = Path()) ->
     values: dict[str, Any] = {"name": name}
     for table in ("histogram", "detector"):
         values.update(tables.get(table, {}))
+    if values.get("hot_share"):
+        values.setdefault("hot_rate_hz", HOT_RATE_HZ)
     for table in ("pulse", "jitter"):
         if table in tables:
             values[table] = _pulse(tables[table], table)

@@ -6,12 +6,12 @@ import math
 from dataclasses import asdict, dataclass, field
 from functools import reduce
 from numbers import Real
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError, did_you_mean, require, require_number, require_whole
+from scenes.errors import InputError, did_you_mean, require, require_choice, require_number, require_whole
 from scenes.json_types import JsonObject
 from scenes.random_streams import Stream
 from spad.sensor.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
@@ -19,6 +19,7 @@ from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_fr
 from spad.sensor.tdc import Tdc
 
 Reset = Literal["synchronous", "free-running"]
+HOT_RATE_HZ = 1e4  # of hot pixels in a sensor file that gives their share alone, as with `sense --hot-pixels`
 NUMBERS = (  # fields of a sensor that are one number each
     *("bin_width_s", "period_s", "exposure_s", "pde", "hot_share", "hot_rate_hz", "dead_share", "dead_time_s"),
     "crosstalk",
@@ -36,7 +37,7 @@ class Sensor:
     pde                   photon detection efficiency at the laser's wavelength: radiometric budgets count with it
     dark_count_rate_hz    dark counts per second and pixel, uniform in time: a number, or one for each image row, used
                           again from the first where the image has more rows
-    hot_share, hot_rate_hz   share of pixels, drawn at random, that have this dark count rate instead
+    hot_share, hot_rate_hz   share of pixels, drawn at random, that have this dark count rate instead, above 0
     dead_share            share of pixels, drawn at random, that never detect anything
     reset                 what the detector does after a detection. `synchronous`: it is armed at the start of every
                           laser cycle and detects the first photon; `free-running`: it is armed again after dead_time_s
@@ -113,9 +114,11 @@ class Sensor:
         for label in ("hot_share", "dead_share"):
             fraction = getattr(self, label)
             require(0 <= fraction <= 1, f"{where}: {label} {fraction:g} is outside 0 to 1")
+        dark = f"{where}: hot_rate_hz 0 with hot_share {self.hot_share:g}: hot pixels would be dark"
+        require(self.hot_rate_hz > 0 or not self.hot_share, f"{dark}, expected a rate above 0, such as {HOT_RATE_HZ:g}")
         require(0 < self.pde <= 1, f"{where}: PDE {self.pde:g} is outside (0, 1]")
         require(0 <= self.crosstalk < 0.25, f"{where}: crosstalk {self.crosstalk:g} is outside [0, 0.25)")
-        require(self.reset in ("synchronous", "free-running"), f"{where}: reset {self.reset!r} is unknown")
+        require_choice(self.reset, get_args(Reset), f"{where}: reset")
         dead = self.dead_time_s
         require(math.isfinite(dead) and 0 <= dead <= 1, f"{where}: dead time {dead:g} s is outside 0 to 1")
         self._check_tdc(where)

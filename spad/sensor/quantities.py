@@ -11,7 +11,7 @@ from scenes.errors import InputError, require
 # Powers of ten of each unit, the base unit first: SI, but for bandwidths of filters, which are nanometres everywhere.
 UNITS: dict[str, dict[str, int]] = {
     "time": {"s": 0, "ms": -3, "us": -6, "ns": -9, "ps": -12, "fs": -15},
-    "rate": {"Hz": 0, "kHz": 3, "MHz": 6},
+    "rate": {"Hz": 0, "kHz": 3, "MHz": 6, "mHz": -3},
     "length": {"m": 0, "mm": -3, "um": -6, "nm": -9},
     "area": {"m2": 0, "mm2": -6, "um2": -12},
     "bandwidth": {"nm": 0, "um": 3},
@@ -47,15 +47,21 @@ def parse_quantity(value: object, dimension: str, where: str, *, signed: bool = 
     if found is None:
         raise InputError(f"{where}: {value!r} is no number with a unit, expected {example}")
     digits, unit = found[1], found[2].translate(_MICRO)
-    close = _PER_SECOND.get(unit.lower(), unit)
-    meant = "".join(f"; did you mean '{known}'?" for known in units if known.lower() == close.lower())
     named = f"the unit {unit}" if unit else "no unit"
-    require(unit in units, f"{where}: {value!r} has {named}, expected {example}{meant}")
+    require(unit in units, f"{where}: {value!r} has {named}, expected {example}{_meant(unit, dimension)}")
     try:
         exact = Decimal(digits).scaleb(units[unit])
     except (InvalidOperation, Overflow):
         raise InputError(f"{where}: {value!r} is no number with a unit, expected {example}") from None
     return _checked(float(exact), value, where, signed, infinite)
+
+
+def _meant(unit: str, dimension: str) -> str:
+    """Return a hint at the units that differ in case alone; none where the case would make milli of mega."""
+    close = _PER_SECOND.get(unit.lower(), unit)
+    alike = [known for known in UNITS[dimension] if known.lower() == close.lower()]
+    other_prefix = len(alike) == 1 and len(close) > 1 and {close[0], alike[0][0]} == {"m", "M"}
+    return "" if not alike or other_prefix else f"; did you mean {' or '.join(map(repr, alike))}?"
 
 
 def _checked(number: float, value: object, where: str, signed: bool, infinite: bool) -> float:

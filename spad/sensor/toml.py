@@ -21,7 +21,7 @@ def read_toml(path: Path, what: str = "sensor file") -> dict[str, object]:
     Raises InputError naming the file, and the line where it is no TOML; and for whole numbers beyond the 64 bits that
     TOML has.
     """
-    text = read_text(path, what, most_bytes=MAX_BYTES)
+    text = read_text(path, what, most_bytes=MAX_BYTES).removeprefix("\ufeff")  # a mark of byte order
     try:
         tables = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:

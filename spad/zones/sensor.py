@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from scenes.random_streams import Stream
 from spad.detection.saturation import draw_saturated, saturated
 from spad.sensor.clock import chirped
 from spad.sensor.model import Sensor
+from spad.zones.limits import MAX_COUNTS, VIEW, checked_number, key_of, numbers_of
 
 # Switches that an ablation turns off one by one: name and what `without` puts in their place.
 EFFECTS = (
@@ -53,9 +55,6 @@ _OFF = {
 }
 
 
-_SIGNED = ("centre_x", "centre_y", "delay_s", "chirp_hz", "baseline_m", "illumination_x", "illumination_y")
-
-
 @dataclass(frozen=True)
 class ZoneArray:
     """Zones and the switches of what happens to their light.
@@ -79,6 +78,8 @@ class ZoneArray:
     curvature_x, curvature_y         of the emitter's intensity exp(-(k_x u^2 + k_y v^2) / 2); off 0, uniform
     baseline_m    emitter minus receiver (x right, y down, z forward): parallax in the near field; off 0
     aperture_m    diameter of the receiver's lens, which blurs the zones' edges by aperture / depth; off 0
+
+    Raises InputError that names the key as in a sensor file, the zone from 0, and the limit.
     """
 
     centre_x: tuple[float, ...]
@@ -105,28 +106,25 @@ class ZoneArray:
     aperture_m: float = 0.0
 
     def __post_init__(self) -> None:
-        count = len(self.centre_x)
+        count = len(numbers_of("centre_x", self.centre_x))
         require(1 <= count <= 4096, f"zones: {count} of them, expected 1 to 4096")
-        for name in ("centre_y", "width", "height", *_OFF):
-            values = getattr(self, name)
-            if isinstance(values, int | float):
-                values = (values,) * count
-            elif not values and name in _OFF:
-                values = (_OFF[name],) * count
-            require(len(values) == count, f"zones: {len(values)} numbers of {name} for {count} zones")
-            object.__setattr__(self, name, tuple(float(value) for value in values))
-        require(len(self.baseline_m) == 3, f"zones: baseline of {len(self.baseline_m)} numbers, expected 3")
         for spec in fields(self):
-            values = getattr(self, spec.name)
-            values = values if isinstance(values, tuple) else (values,)
-            good = all(math.isfinite(value) or spec.name == "trials" for value in values)
-            require(good, f"zones: {spec.name} is not finite")
-            positive = spec.name in ("width", "height", "clock", "trials")
-            free = spec.name in _SIGNED
-            low = min(values)
-            good = free or (low > 0 if positive else low >= 0)
-            require(good, f"zones: {spec.name} {low:g} is below 0" + (" or 0" if positive else ""))
-        require(self.crosstalk < 1, f"zones: crosstalk {self.crosstalk:g} is outside [0, 1)")
+            name, values = spec.name, getattr(self, spec.name)
+            many = name in (*VIEW, *_OFF)
+            if many and isinstance(values, Real):
+                values = (values,) * count
+            elif name in _OFF and isinstance(values, tuple | list) and not values:
+                values = (_OFF[name],) * count
+            if many or name == "baseline_m":
+                values = numbers_of(name, values)
+                expected = count if many else 3
+                kind = f"{count} zones" if many else "x, y and z"
+                require(len(values) == expected, f"{key_of(name)}: {len(values)} numbers for {kind}")
+                checked: Any = tuple(checked_number(name, value, f"[{at}]") for at, value in enumerate(values))
+            else:
+                checked = checked_number(name, values)
+            object.__setattr__(self, name, checked)
+        require(self.crosstalk < 1, f"zones.crosstalk: {self.crosstalk:g} is outside [0, 1)")
 
     @property
     def count(self) -> int:
@@ -244,8 +242,12 @@ def largest_chirp(bins: int) -> float:
     return 0.25 / bins
 
 
-def check_chirp(sensor: Sensor, zones: ZoneArray) -> None:
-    """Raise InputError for a clock whose rate changes by more than a half within the histogram: nobody means that."""
+def check_times(sensor: Sensor, zones: ZoneArray) -> None:
+    """Raise InputError for a clock whose rate changes by more than a half within the histogram, and for detectors of a
+    zone whose delays differ by more than the laser's period: nobody means that."""
+    worst = int(np.argmax(zones.skew_s))
+    late_s, period_s = zones.skew_s[worst], sensor.period_s
+    require(late_s <= period_s, f"zones.skew[{worst}]: {late_s:g} s is above the laser's period of {period_s:g} s")
     most = largest_chirp(sensor.bins) / sensor.bin_width_s
     message = f"zones: chirp {zones.chirp_hz:g} Hz, at most {most:.3g} Hz lets a clock of {sensor.bins} bins "
     require(abs(zones.chirp_hz) <= most, f"{message}of {sensor.bin_width_s * 1e12:.4g} ps keep half of its rate")
@@ -296,7 +298,7 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
     Time wraps at the laser's period; what arrives in a part of it without bins is not counted. `drift_s` delays all
     zones, as a laser that warms up does.
     """
-    check_chirp(sensor, zones)
+    check_times(sensor, zones)
     period_m = SPEED_OF_LIGHT_M_PER_S * sensor.period_s
     own = np.zeros((zones.count, sensor.bins))
     for zone, seen in enumerate(returns):
@@ -352,8 +354,21 @@ def expected_zone_counts(
 def draw_zone_counts(
     returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, *, seed: int = 0, drift_s: float = 0.0
 ) -> np.ndarray:
-    """Draw counts (Z, T) int64 of one exposure; the same seed gives the same counts."""
+    """Draw counts (Z, T) int64 of one exposure; the same seed gives the same counts.
+
+    Raises InputError for a zone of more than 2^31 - 1 counts, expected or drawn.
+    """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.ZONES, 0, 0)))
     flux = zone_flux(returns, sensor, zones, drift_s)
     trials, recovery, compression = zones.saturation
-    return draw_saturated(flux, trials, recovery, rng, compression)
+    _check_counts(saturated(flux, trials, recovery), "expected counts")
+    counts = draw_saturated(flux, trials, recovery, rng, compression)
+    _check_counts(counts, "counts")
+    return counts
+
+
+def _check_counts(counts: np.ndarray, what: str) -> None:
+    total = counts.sum(axis=1)
+    worst = int(total.argmax())
+    message = f"zones: zone {worst} (of 0 to {len(total) - 1}) has {float(total[worst]):.4g} {what} in one exposure"
+    require(bool(total[worst] <= MAX_COUNTS), f"{message}, the limit is {MAX_COUNTS}: lower its gain or its background")

@@ -25,7 +25,7 @@ from spad.zones.fit import fit, roughness
 from spad.zones.sensor import (
     ZoneArray,
     ZoneReturns,
-    check_chirp,
+    check_times,
     draw_zone_counts,
     expected_zone_counts,
     largest_chirp,
@@ -310,7 +310,7 @@ def test_a_fitted_chirp_is_one_that_a_sensor_file_takes():
     for start in (0.9 * limit, -0.9 * limit):
         found, _, _ = fit(model, shown, {**values, "chirp": np.array([start])}, ("pulse", "gain", "delay", "chirp"))
         assert abs(found["chirp"][0]) <= limit
-        check_chirp(*as_sensor(model, found, SENSOR, ZONES))
+        check_times(*as_sensor(model, found, SENSOR, ZONES))
 
 
 def test_a_chirp_beyond_its_limit_is_fitted_as_the_largest():
@@ -320,4 +320,4 @@ def test_a_chirp_beyond_its_limit_is_fitted_as_the_largest():
     shown = [ZoneCapture(one.returns, model.expected(wild, one)) for one in captures(model, values, 8, 7)]
     found, _, _ = fit(model, shown, {**values, "chirp": np.array([0.0])}, ("pulse", "gain", "chirp"), steps=80)
     assert found["chirp"][0] == pytest.approx(-limit, rel=1e-6)
-    check_chirp(*as_sensor(model, found, SENSOR, ZONES))
+    check_times(*as_sensor(model, found, SENSOR, ZONES))

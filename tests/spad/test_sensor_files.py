@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from scene2spad.cli.simulation import sensing
 from scenes.errors import InputError
 from spad.sensor.budget import Optics
 from spad.sensor.files import (
@@ -23,7 +24,7 @@ from spad.sensor.files import (
     write_sensor,
 )
 from spad.sensor.files import ZONES as ZONE_KEYS
-from spad.sensor.model import PRESETS, Sensor
+from spad.sensor.model import HOT_RATE_HZ, PRESETS, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
 from spad.sensor.quantities import UNITS, format_quantity, parse_quantity
 from spad.sensor.toml import read_toml
@@ -103,7 +104,8 @@ def test_zones_of_which_some_never_saturate_come_back_from_their_file(tmp_path):
 
 @pytest.mark.parametrize("key", ["hot_fraction", "hot_rate", "dead_fraction", "reset", "dead_time", "crosstalk"])
 def test_what_only_pixels_have_is_refused_beside_zones(key):
-    only = {DETECTOR[key].field: getattr(WIDE, DETECTOR[key].field)}
+    keys = ("hot_fraction", "hot_rate") if key == "hot_fraction" else (key,)
+    only = {DETECTOR[key].field: getattr(WIDE, DETECTOR[key].field) for key in keys}
     with pytest.raises(InputError, match=rf"zones and detector\.{key} do not go together: it is of pixels"):
         SensorFile(replace(WHOLE, **only), zones=ZONES)
 
@@ -139,6 +141,35 @@ def test_micro_has_two_characters_and_counts_per_second_are_hertz():
     for unit, meant in (("cps", "Hz"), ("kcps", "kHz")):
         with pytest.raises(InputError, match=f"did you mean '{meant}'"):
             parse_quantity(f"100 {unit}", "rate", "x")
+
+
+def test_a_hint_never_makes_mega_of_milli_and_both_are_read_as_rates():
+    assert parse_quantity("100 mHz", "rate", "x") == 0.1 and parse_quantity("100 MHz", "rate", "x") == 1e8
+    with pytest.raises(InputError, match="did you mean 'MHz' or 'mHz'"):
+        parse_quantity("100 mhz", "rate", "x")
+    for unit, dimension in (("MJ", "energy"), ("Ms", "time"), ("Mm", "length")):
+        with pytest.raises(InputError) as refused:
+            parse_quantity(f"1 {unit}", dimension, "x")
+        assert "did you mean" not in str(refused.value)
+
+
+def test_a_file_may_begin_with_a_mark_of_byte_order(tmp_path):
+    (tmp_path / "s.toml").write_bytes(b"\xef\xbb\xbf" + PLAIN.encode())
+    assert read_sensor(tmp_path / "s.toml").sensor.bins == 128
+
+
+def test_hot_pixels_of_a_file_that_gives_their_share_alone_have_the_rate_of_the_option(tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text(PLAIN + "[detector]\nhot_fraction = 0.1\n")
+    sensor = read_sensor(path).sensor
+    assert sensor.hot_rate_hz == HOT_RATE_HZ == sensing.HOT_RATE_HZ
+    assert sensor.dark_rate_map_hz(10, 10).mean() == pytest.approx(0.1 * HOT_RATE_HZ)
+    assert read_sensor(write_sensor(SensorFile(sensor), tmp_path / "again.toml")).sensor == sensor
+    path.write_text(PLAIN + '[detector]\nhot_fraction = 0.1\nhot_rate = "0 Hz"\n')
+    with pytest.raises(InputError, match=r"hot_rate_hz 0 with hot_share .*: hot pixels would be dark"):
+        read_sensor(path)
+    with pytest.raises(InputError, match="sensor reference: hot_rate_hz 0 with hot_share"):
+        replace(Sensor(), hot_share=0.1)
 
 
 def test_a_width_is_read_as_sigma_or_as_full_width_at_half_maximum(tmp_path):
@@ -207,15 +238,23 @@ def test_the_presets_that_were_there_keep_their_names_and_values():
         ('fwhm = "200 ps"', 'samples = [1, -2]\nstep = "9 ps"', "pulse.samples[1]: -2 is negative"),
         ('fwhm = "200 ps"', 'samples = 3\nstep = "9 ps"', "pulse.samples: expected a list"),
         ('"200 ps"', '"200 ps"\n[detector]\npde = 1.5', "PDE 1.5 is outside (0, 1]"),
-        ('"200 ps"', '"200 ps"\n[detector]\nreset = "never"', "reset 'never' is unknown"),
+        (
+            '"200 ps"',
+            '"200 ps"\n[detector]\nreset = "never"',
+            "reset 'never' is unknown, expected one of synchronous, free-running",
+        ),
         ('"200 ps"', '"200 ps"\n[optics]\nf_number = 2', "optics.pulse_energy, focal_length, pixel_pitch is missing"),
         ('"200 ps"', '"200 ps"\n[sources]\n"histogram.bin" = "x"', "did you mean 'histogram.bins'?"),
         ('name = "mine"', 'schema = "2.0"\nname = "mine"', "sensor file of schema 2.0, this program reads 1"),
         ('name = "mine"', "name = ", "is no TOML"),
         ('"200 ps"', '"200 ps"\n[zones]\nwidth = [1]', "zones.centre_x, centre_y, height is missing"),
-        ('"200 ps"', '"200 ps"\n' + TWO_ZONES, "zones: 1 numbers of height for 2 zones"),
+        ('"200 ps"', '"200 ps"\n' + TWO_ZONES, "zones.height: 1 numbers for 2 zones"),
         ('"200 ps"', '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, -1]"), "zones.height[1]: -1 is negative"),
-        ('"200 ps"', '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, 1]\ncrosstalk = 1.5"), "crosstalk 1.5 is outside"),
+        (
+            '"200 ps"',
+            '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, 1]\ncrosstalk = 1.5"),
+            "zones.crosstalk: 1.5 is outside",
+        ),
         ('"200 ps"', '"200 ps"\n' + TWO_ZONES.replace("[1]", "[1, 1]\nbaseline = [3, 0, 0]"), "3 has no unit"),
     ],
 )
