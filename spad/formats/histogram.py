@@ -10,16 +10,22 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.errors import InputError, require, require_kind
+from scenes.errors import InputError, require, require_kind, require_whole
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.hdf5 import USER_BLOCK, add_checksum, describe, open_checked, read_dataset
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.notebook import html_card
-from spad.formats.timestamps import counts_from_timestamps, timestamps_from_counts
+from spad.formats.metadata import check_meta
+from spad.formats.timestamps import checked_events, counts_from_timestamps, timestamps_from_counts
 from spad.sensor.files import pixel_sensor
 from spad.sensor.model import PhotonBudget, Sensor
 
+MAX_MEAN_COUNTS = 1e9  # of a pixel, as `PhotonBudget` has
+FOREIGN = (
+    "in Python scene2spad.Histogram.from_counts takes counts (H, W, T), and Histogram.from_timestamps a list of "
+    "detections, with their sensor"
+)
 TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
 NOTES = {  # unit and description of every dataset of the file
     "timestamps": ("bins", "time bin of every detection from 0, ascending in a pixel, pixel after pixel in rows"),
@@ -91,7 +97,8 @@ class Histogram:
 
         Raises
         ------
-        InputError for counts of another shape, below 0, above 2^31 - 1, or that are no whole numbers.
+        InputError for counts of another shape, without a pixel, masked, below 0, above 2^31 - 1, of more than 1e9 a
+        pixel on average, or that are no whole numbers; and for metadata as `check_meta`.
 
         Examples
         --------
@@ -100,25 +107,65 @@ class Histogram:
         >>> Histogram.from_counts(np.ones((2, 3, 8), int), Sensor(bins=8)).timestamps()[0].shape
         (48,)
         """
-        counts, sensor = np.asarray(counts), pixel_sensor(sensor)
-        if counts.ndim != 3 or counts.shape[2] != sensor.bins or counts.dtype.kind not in "iufb":
-            raise InputError(f"histogram: counts are {counts.dtype}{counts.shape}, expected (H, W, {sensor.bins})")
-        least, most = (float(f(counts)) if counts.size else 0.0 for f in (np.min, np.max))
-        if not (least >= 0 and most <= np.iinfo(np.int32).max and (counts.dtype.kind in "iub" or _are_whole(counts))):
-            raise InputError(f"histogram: counts from {least:g} to {most:g}, expected whole numbers from 0 to 2^31 - 1")
-        unknown = np.full(counts.shape[:2], np.nan, np.float32)
+        sensor = pixel_sensor(sensor)
+        checked = _checked_counts(counts, sensor.bins)
+        unknown = np.full(checked.shape[:2], np.nan, np.float32)
+        given = {} if meta is None else check_meta(meta, (checked.shape[0], checked.shape[1]))
         return cls(
-            counts=np.array(counts, np.int32, order="C"),  # a copy: buffers are used again
+            counts=np.array(checked, np.int32, order="C"),  # a copy: buffers are used again
             sensor=sensor,
-            budget=PhotonBudget(0.0, float(counts.sum(dtype=float) / max(unknown.size, 1))),
+            budget=PhotonBudget(0.0, float(checked.sum(dtype=float) / unknown.size)),
             depth_m=unknown,
             mixed=np.zeros(unknown.shape, bool),
             albedo=unknown.astype(np.float16),
             expected_signal=unknown.copy(),
             expected_background=unknown.copy(),
             meta={"model": "poisson", "plan": ["measured counts"], "pile_up": 0.0, "wrapped": 0.0, "dark_share": 0.0}
-            | (meta or {}),
+            | given,
         )
+
+    @classmethod
+    def from_timestamps(
+        cls,
+        stamps: np.ndarray,
+        offsets: np.ndarray,
+        shape: tuple[int, int],
+        sensor: Sensor | str | Path,
+        meta: JsonObject | None = None,
+    ) -> Histogram:
+        """Make a histogram of a list of measured detections, as `timestamps` returns one.
+
+        Parameters
+        ----------
+        stamps : (N,) whole numbers, the time bin of each detection from 0, pixel after pixel in rows, in any order in
+            a pixel
+        offsets : (H*W + 1,) whole numbers: the detections of pixel p are stamps[offsets[p]:offsets[p + 1]]
+        shape : rows and columns (H, W) of the image
+        sensor : what recorded them, or its name or file (.toml)
+        meta : what is to be kept beside them, anything JSON holds
+
+        Returns
+        -------
+        A histogram as `from_counts` makes.
+
+        Raises
+        ------
+        InputError for stamps outside the sensor's bins, offsets that do not rise from 0 to N, and as `from_counts`.
+
+        Examples
+        --------
+        >>> from spad.sensor.model import Sensor
+        >>> Histogram.from_timestamps([5, 1, 5], [0, 2, 3], (1, 2), Sensor(bins=8)).counts[0, 0].tolist()
+        [0, 1, 0, 0, 0, 1, 0, 0]
+        """
+        sensor = pixel_sensor(sensor)
+        sides = isinstance(shape, tuple | list) and len(shape) == 2
+        require(sides, f"timestamps: shape {shape!r}, expected rows and columns (H, W)")
+        rows, columns = (require_whole(side, "timestamps: side of the image") for side in shape)
+        require(rows > 0 and columns > 0, f"timestamps: image of {rows} x {columns} pixels, expected 1 x 1 or more")
+        require_memory(16 * rows * columns * sensor.bins, f"a histogram of {rows * columns} pixels")
+        flat = counts_from_timestamps(*checked_events(stamps, offsets, rows * columns, sensor.bins), sensor.bins)
+        return cls.from_counts(flat.reshape(rows, columns, sensor.bins), sensor, meta)
 
     @property
     def signal_known(self) -> bool:
@@ -165,8 +212,20 @@ class Histogram:
         return sha.hexdigest()
 
 
-def _are_whole(counts: np.ndarray) -> bool:
-    return bool((counts == np.floor(counts)).all())
+def _checked_counts(counts: np.ndarray, bins: int) -> np.ndarray:
+    """Return counts of so many bins as an array; InputError for what `Histogram.from_counts` says."""
+    require(not np.ma.is_masked(counts), "histogram: counts are masked, fill them first: `counts.filled(0)`")
+    array = np.asarray(counts)
+    if array.ndim != 3 or array.shape[2] != bins or array.dtype.kind not in "iufb":
+        raise InputError(f"histogram: counts are {array.dtype}{array.shape}, expected (H, W, {bins})")
+    require(array.size > 0, f"histogram: counts are of {array.shape[0]} x {array.shape[1]} pixels, expected 1 or more")
+    least, most = float(array.min()), float(array.max())
+    whole = array.dtype.kind in "iub" or bool((array == np.floor(array)).all())
+    if not (least >= 0 and most <= np.iinfo(np.int32).max and whole):
+        raise InputError(f"histogram: counts from {least:g} to {most:g}, expected whole numbers from 0 to 2^31 - 1")
+    mean = float(array.sum(dtype=float)) / (array.shape[0] * array.shape[1])
+    require(mean <= MAX_MEAN_COUNTS, f"histogram: counts of {mean:.4g} a pixel on average, the limit is 1e9")
+    return array
 
 
 def write_histogram(histogram: Histogram, path: Path) -> None:
@@ -211,7 +270,7 @@ def read_histogram(path: Path) -> Histogram:
     try:
         with open_checked(path) as file:
             if ATTRIBUTE not in file.attrs:
-                raise InputError("not a file of scene2spad")
+                raise InputError(f"not a file of scene2spad; {FOREIGN}")
             meta, sha256 = open_seal(file.attrs[ATTRIBUTE], "histogram")
             unknown = sorted(set(file) - {*TRUTH, "counts", "timestamps", "offsets"})
             if unknown:

@@ -22,7 +22,7 @@ from scenes.limits import require_memory
 from spad.detection.laws import LOW_FLUX
 from spad.estimators.depth import estimate_depth
 from spad.formats.bistatic import CO_LOCATED, laser_baseline_m
-from spad.formats.histogram import Histogram
+from spad.formats.histogram import FOREIGN, Histogram
 from spad.formats.linospad import COUNTS, capture_histogram, frame_of
 from spad.formats.matfile import Matrix, load_mat, save_mat
 from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_taps
@@ -47,6 +47,7 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     as published. `bin_hr` and the estimates are of the arrival, which is the pulse's centroid, moved by as much as
     that bin stands off it on average.
     The layout holds no exposure, dead time and law, so that pile-up in its counts cannot be undone (`pile_up_warning`).
+    Where nobody knows how many detections are signal, `photons`, `mean_signal_photons` and `SBR` are NaN.
     Where nothing is, and where nothing was detected, bins are 1: published loaders subtract 1 from unsigned numbers.
     Raises InputError as `check_mat` does, and where the file cannot be written.
     """
@@ -110,6 +111,7 @@ def _frame(histogram: Histogram) -> dict[str, Matrix | float | dict[str, np.ndar
         for name, method in ESTIMATES.items()
     }
     budget, albedo = histogram.budget, histogram.albedo.astype(np.float64)
+    known_split = histogram.signal_known
     return {
         "spad": _sparse(histogram.counts),
         "rates": rates,
@@ -121,9 +123,9 @@ def _frame(histogram: Histogram) -> dict[str, Matrix | float | dict[str, np.ndar
         **estimates,
         "intensity": albedo,
         "intensity_hr": albedo,
-        "SBR": budget.sbr,
-        "mean_signal_photons": budget.signal,
-        "photons": budget.signal,
+        "SBR": budget.sbr if known_split else np.nan,
+        "mean_signal_photons": budget.signal if known_split else np.nan,
+        "photons": budget.signal if known_split else np.nan,
         "mean_background_photons": budget.background,
         "bin_size": sensor.bin_width_s,
         "dist": depth,
@@ -147,7 +149,7 @@ def _peak_offset_bins(sensor: Sensor) -> float:
 def _normalised_rates(histogram: Histogram, pulses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normalise each pixel's rates to (rate - min) / (max - min + 1e-8); return these, min and 1 / (max - min +
     1e-8)."""
-    signal = np.where(np.isfinite(histogram.depth_m), histogram.expected_signal.astype(np.float64), 0)
+    signal = np.where(np.isfinite(histogram.depth_m), np.nan_to_num(histogram.expected_signal.astype(np.float64)), 0)
     rates = pulses * signal[..., None]
     low, high = rates.min(axis=-1), rates.max(axis=-1)
     scaling = 1 / (high - low + RATES_EPSILON)
@@ -201,7 +203,8 @@ def read_mat(path: Path, frame: int = 0) -> Histogram:
             raise InputError(f"{path}: {error}") from None
     require(frame == 0, f"{path}: is one frame and no capture of several, frame {frame} is not there")
     missing = {"spad", "SBR", "photons"} - {*contents} | (set() if {"bin", "range_bins"} & {*contents} else {"bin"})
-    require(not missing, f"{path}: {', '.join(sorted(missing))} are missing, there are {', '.join(sorted(contents))}")
+    there = f"{', '.join(sorted(missing))} are missing, there are {', '.join(sorted(contents))}"
+    require(not missing, f"{path}: {there}; {FOREIGN}")
     try:
         return _histogram(contents, path)
     except InputError as error:
@@ -257,6 +260,9 @@ def _histogram(contents: Mapping[str, Matrix], path: Path) -> Histogram:
         background = float(contents["mean_background_photons"].item())
     else:
         background = signal / sbr if sbr > 0 and math.isfinite(sbr) else 0.0
+    known_split = not (math.isnan(signal) and math.isnan(sbr))
+    if not known_split:  # all detections, as of measured counts
+        signal, background = 0.0, float(counts.sum(dtype=float) / max(1, index.size))
     if "dist" in contents:
         depth = contents["dist"].astype(np.float32)
     else:
@@ -269,8 +275,8 @@ def _histogram(contents: Mapping[str, Matrix], path: Path) -> Histogram:
         depth_m=depth,
         mixed=np.zeros((height, width), bool),
         albedo=albedo.astype(np.float16),
-        expected_signal=np.full((height, width), signal, np.float32),
-        expected_background=np.full((height, width), background, np.float32),
+        expected_signal=np.full((height, width), signal if known_split else np.nan, np.float32),
+        expected_background=np.full((height, width), background if known_split else np.nan, np.float32),
         meta={"model": "poisson", "plan": ["read from a .mat file"], "pile_up": 0.0, "wrapped": 0.0, "dark_share": 0.0}
         | {"layout": "mat"},  # which knows no exposure, dead time or law: those of the sensor are not the recording's
     )

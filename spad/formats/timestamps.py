@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.json_types import JsonObject
 
 
@@ -92,6 +92,33 @@ class Timestamps:
         digits = np.unpackbits(stream, count=count * self.bits).reshape(count, self.bits)
         stamps = digits @ (1 << np.arange(self.bits - 1, -1, -1, dtype=np.int64))
         return Timestamps(self.height, self.width, self.bins, stamps.astype(np.uint16), self.offsets, self.meta)
+
+
+def checked_events(stamps: np.ndarray, offsets: np.ndarray, pixels: int, bins: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps (N,) and offsets (pixels + 1,) of so many pixels and bins as int64, in the order that they had.
+
+    Raises InputError for what is masked, no whole number, of another shape, or outside 0 to the last bin.
+    """
+    events, ends = (_whole(values, what) for values, what in ((stamps, "stamps"), (offsets, "offsets")))
+    right = ends.shape == (pixels + 1,)
+    require(right, f"timestamps: offsets are {ends.shape}, expected ({pixels + 1},) for {pixels} pixels")
+    rises = ends[0] == 0 and ends[-1] == len(events) and bool((np.diff(ends) >= 0).all())
+    require(rises, f"timestamps: offsets from {ends[0]} to {ends[-1]} must rise from 0 to the {len(events)} stamps")
+    wrong = np.flatnonzero((events < 0) | (events >= bins))
+    if len(wrong):
+        raise InputError(f"timestamps: stamps[{wrong[0]}] is {events[wrong[0]]}, expected a bin from 0 to {bins - 1}")
+    return events, ends
+
+
+def _whole(values: np.ndarray, what: str) -> np.ndarray:
+    """Return an array of one dimension of whole numbers as int64; those beyond are taken to its ends."""
+    require(not np.ma.is_masked(values), f"timestamps: {what} are masked, leave the masked ones out")
+    array = np.asarray(values)
+    good = array.ndim == 1 and (array.dtype.kind in "iuf" or not array.size)
+    require(good, f"timestamps: {what} are {array.dtype}{array.shape}, expected whole numbers of one dimension")
+    if array.dtype.kind == "f" and (array != np.floor(array)).any():
+        raise InputError(f"timestamps: {what} are no whole numbers")
+    return array.clip(-(1 << 62), 1 << 62).astype(np.int64) if array.dtype.kind in "fu" else array.astype(np.int64)
 
 
 def counts_from_timestamps(stamps: np.ndarray, offsets: np.ndarray, bins: int) -> np.ndarray:
