@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.transient import Transient
-from scenes.errors import InputError, require
+from scenes.errors import InputError, require, require_number, require_whole
 from scenes.json_types import JsonObject
 from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
@@ -76,7 +76,10 @@ def from_rgbd(
 
 
 def _alike(*images: np.ndarray) -> list[np.ndarray]:
-    arrays = [np.asarray(image, dtype=np.float64) for image in images]
+    try:
+        arrays = [np.asarray(image, dtype=np.float64) for image in images]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"RGB-D images: not an array of numbers ({error})") from None
     shapes = {array.shape for array in arrays}
     if len(shapes) != 1 or arrays[0].ndim != 2 or not arrays[0].size:
         raise InputError(f"RGB-D images of shapes {sorted(shapes)}, expected one of (H, W) for all")
@@ -111,6 +114,7 @@ def transient_from_rgbd(
     that `block` does not divide, negative depth, and albedo or ambient light that is negative or not finite.
     """
     depth, albedo, ambient = _alike(depth_m, albedo, ambient)
+    block = require_whole(block, "RGB-D images: block")
     require(
         block >= 1 and all(side % block == 0 for side in depth.shape),
         f"RGB-D images of {depth.shape[0]} x {depth.shape[1]} are no whole number of blocks of {block}",
@@ -156,6 +160,7 @@ def cosine_of_incidence(depth_m: np.ndarray, fov_deg: float) -> np.ndarray:
 
     Tangents are the shorter of the differences to both neighbours, so that an edge does not count as a slope.
     """
+    fov_deg = require_number(fov_deg, "RGB-D images: fov_deg")
     require(0 < fov_deg < 180, f"field of view {fov_deg:g} degrees is outside 0 to 180")
     height, width = depth_m.shape
     focal = width / 2 / math.tan(math.radians(fov_deg) / 2)

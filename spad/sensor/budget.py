@@ -13,7 +13,7 @@ import numpy as np
 
 from render.transient import Transient
 from scenes.constants import DEFAULT_WAVELENGTH_M, SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import require
+from scenes.errors import normalise_fields, require
 from scenes.optics.blackbody import PLANCK_J_S
 from spad.detection.rates import detector_maps
 from spad.sensor.model import PhotonBudget, Sensor
@@ -48,6 +48,7 @@ class Optics:
     wavelength_m: float = DEFAULT_WAVELENGTH_M
 
     def __post_init__(self) -> None:
+        normalise_fields(self, "optics")
         for name in ("pulse_energy_j", "focal_length_m", "f_number", "pixel_pitch_m", "filter_nm", "wavelength_m"):
             value = getattr(self, name)
             off = name == "pulse_energy_j"  # which a laser may be: background alone

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scenes.constants import REFERENCE_PULSE_SIGMA_S
-from scenes.errors import InputError, require
+from scenes.errors import InputError, normalise_fields, require, require_number
 from scenes.files import read_array
 from scenes.json_types import JsonObject
 from spad.sensor.normal import erfc, erfcx_far, ndtr
@@ -40,6 +40,7 @@ class Pulse:
     tail_s: float = 0.0
 
     def __post_init__(self) -> None:
+        normalise_fields(self, "pulse")
         good = math.isfinite(self.sigma_s) and 0 < self.sigma_s < 1e-3
         require(good, f"pulse sigma {self.sigma_s:g} s is outside (0, 1e-3)")
         good = math.isfinite(self.tail_s) and 0 <= self.tail_s < 1e-3
@@ -107,6 +108,14 @@ class SampledPulse:
     sample_s: float
 
     def __post_init__(self) -> None:
+        normalise_fields(self, "measured pulse")
+        kind = isinstance(self.samples, tuple | list) or (
+            isinstance(self.samples, np.ndarray) and self.samples.ndim == 1
+        )
+        require(kind, f"measured pulse: samples {self.samples!r}, expected a list of numbers")
+        for at, value in enumerate(self.samples):
+            if type(value) is not float:  # a table has some ten thousand
+                require_number(value, f"measured pulse: samples[{at}]")
         object.__setattr__(self, "samples", tuple(float(value) for value in self.samples))
         count = len(self.samples)
         require(1 <= count <= MAX_SAMPLES, f"measured pulse: {count} samples, expected 1 to {MAX_SAMPLES}")
@@ -219,6 +228,7 @@ def read_pulse(path: Path, sample_s: float) -> SampledPulse:
     A peak in the first or last hundredth of the samples means that they were recorded around a laser period: they are
     rolled until their circular centroid is in the middle.
     """
+    sample_s = require_number(sample_s, f"{path}: sample_s")
     path = Path(path)
     samples = read_array(path)
     good = samples.ndim == 1 and samples.dtype.kind in "fiu"

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from scenes.errors import did_you_mean, require
+from scenes.errors import did_you_mean, normalise_fields, require, require_choice
 from scenes.files import read_arrays
 from scenes.io.inputs import file_sha256
 from scenes.random_streams import Stream
@@ -57,6 +57,7 @@ class Tdc:
     correction_bits: int = 8
 
     def __post_init__(self) -> None:
+        normalise_fields(self, "tdc")
         period = self.clock_period_s
         require(
             math.isfinite(period) and 1e-12 <= period <= 1e-3,
@@ -69,15 +70,13 @@ class Tdc:
                 plain, f"tdc: table {self.table} has its own nonlinearity, dnl and missing are for drawn converters"
             )
         else:
-            whole = int(self.codes) == self.codes and 1 <= self.codes <= MAX_CODES
-            require(whole, f"tdc: {self.codes} codes is outside 1 to {MAX_CODES}")
+            require(1 <= self.codes <= MAX_CODES, f"tdc: {self.codes} codes is outside 1 to {MAX_CODES}")
         require(0 <= self.missing < 1, f"tdc: missing {self.missing:g} is outside [0, 1)")
         require(math.isfinite(self.dnl) and self.dnl >= 0, f"tdc: dnl {self.dnl:g} codes is negative or not finite")
         require(0 <= self.jitter_s < 1e-3, f"tdc: jitter {self.jitter_s:g} s is outside [0, 1e-3)")
-        known = self.correction in CORRECTIONS
-        require(known, f"tdc: correction {self.correction!r} is unknown, expected {', '.join(CORRECTIONS)}")
+        require_choice(self.correction, CORRECTIONS, "tdc: correction")
         bits = self.correction_bits
-        require(int(bits) == bits and 1 <= bits <= MAX_BITS, f"tdc: {bits} correction bits, expected 1 to {MAX_BITS}")
+        require(1 <= bits <= MAX_BITS, f"tdc: {bits} correction bits, expected 1 to {MAX_BITS}")
         if self.is_at_hand:
             self.ends()
 

@@ -1,0 +1,48 @@
+"""Values of another kind than a number of its unit are refused in one line that names them."""
+
+import numpy as np
+import pytest
+
+from scenes.errors import InputError
+from spad.formats.rgbd import transient_from_rgbd
+from spad.sensor.budget import Optics
+from spad.sensor.pulse import Pulse, SampledPulse, read_pulse
+from spad.sensor.tdc import Tdc
+
+ONES = np.ones((2, 2))
+LENS = (1e-9, 1e-2, 2.0, 2e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "meant"),
+    [
+        (lambda: Pulse("300 ps"), "pulse: sigma_s '300 ps', expected a number"),
+        (lambda: Pulse(1e-10, None), "pulse: tail_s None, expected a number"),
+        (lambda: SampledPulse((1.0, 2.0), "50 ps"), "measured pulse: sample_s '50 ps', expected a number"),
+        (lambda: SampledPulse((1.0, "2"), 1e-11), "measured pulse: samples[1] '2', expected a number"),
+        (lambda: SampledPulse("12", 1e-11), "measured pulse: samples '12', expected a list of numbers"),
+        (lambda: SampledPulse(None, 1e-11), "measured pulse: samples None, expected a list of numbers"),
+        (lambda: read_pulse("p.npy", "50 ps"), "p.npy: sample_s '50 ps', expected a number"),
+        (lambda: Optics("1 nJ", 1, 1, 1), "optics: pulse_energy_j '1 nJ', expected a number"),
+        (lambda: Optics(*LENS, transmission="80%"), "optics: transmission '80%', expected a number"),
+        (lambda: Optics(*LENS, wavelength_m=None), "optics: wavelength_m None, expected a number"),
+        (lambda: Tdc("2.5 ns", codes=4), "tdc: clock_period_s '2.5 ns', expected a number"),
+        (lambda: Tdc(2.5e-9, codes=4.0), "tdc: codes 4.0, expected a whole number"),
+        (lambda: Tdc(2.5e-9, table=3), "tdc: table 3, expected text"),
+        (lambda: Tdc(2.5e-9, codes=4, correction_bits="7"), "tdc: correction_bits '7', expected a whole number"),
+        (lambda: transient_from_rgbd(ONES, ONES, ONES, fov_deg="3"), "RGB-D images: fov_deg '3', expected a number"),
+        (lambda: transient_from_rgbd(ONES, ONES, ONES, block=2.0), "RGB-D images: block 2.0, expected a whole number"),
+        (lambda: transient_from_rgbd("a", ONES, ONES), "RGB-D images: not an array of numbers"),
+        (lambda: transient_from_rgbd([[1], [1, 2]], ONES, ONES), "RGB-D images: not an array of numbers"),
+    ],
+)
+def test_a_value_of_another_kind_is_refused_in_one_line(make, meant):
+    with pytest.raises(InputError) as refused:
+        make()
+    assert str(refused.value).startswith(meant)
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert Pulse(np.float64(1e-10)) == Pulse(1e-10) and type(Pulse(np.float32(1e-10)).sigma_s) is float
+    assert SampledPulse(np.array([1, 2]), np.float64(1e-11)) == SampledPulse((1.0, 2.0), 1e-11)
+    assert Tdc(2.5e-9, codes=np.int64(4)) == Tdc(2.5e-9, codes=4) and Optics(*np.array(LENS)) == Optics(*LENS)
