@@ -46,6 +46,7 @@ _OFF = {
     "leak": 0.0,
     "echo": 0.0,
 }
+MIN_FITTED = 8  # captures
 TAIL_BINS = 48
 RISE_BINS, RISE_BINS_LIMIT = 2, 8
 RETURN_SIGMAS = 6.0  # of a bin's background: Poisson noise alone reaches it in 1 of 1,000 histograms at the most
@@ -255,7 +256,10 @@ def calibrate(
     return in most of them.
     """
     check_effects(free)
-    require(start is not None or len(captures) >= 8, f"calibrate: {len(captures)} captures, expected 8 or more")
+    require(
+        start is not None or len(captures) >= MIN_FITTED,
+        f"calibrate: {len(captures)} captures, expected {MIN_FITTED} or more",
+    )
     check_returns(np.array([capture.counts for capture in captures]))
     reference = zones.count // 2
     if start is not None:

@@ -119,6 +119,44 @@ def shipped_without(path, change):
     np.savez(path, **arrays)
 
 
+def no_work(*_):
+    raise AssertionError("the plane was rendered")
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "meant"),
+    [
+        (
+            {"counts": np.s_[:, :4]},
+            [],
+            "mine.npz: captures of 4 zones and 128 bins, sensor tmf8820 has 9 zones of 128",
+        ),
+        ({"counts": np.s_[:, :, :64]}, [], "mine.npz: captures of 9 zones and 64 bins, sensor tmf8820 has 9 zones"),
+        ({}, ["--every", "1000"], "--every 1000 fits 1 of {n} captures of mine.npz, 8 are needed: expected --every"),
+    ],
+)
+def test_captures_that_do_not_fit_are_refused_before_any_work(change, options, meant, capfd, tmp_path, monkeypatch):
+    monkeypatch.setattr("scene2spad.cli.simulation.calibrating.zone_captures", no_work)
+    monkeypatch.chdir(tmp_path)
+    with np.load(shipped_captures()) as held:
+        arrays = {name: held[name][change.get(name, np.s_[:])] for name in ("distance_m", "counts")}
+    np.savez("mine.npz", **arrays)
+    assert main(["calibrate", "mine.npz", *options]) == 2
+    number = int((arrays["distance_m"] >= 0.1).sum())
+    err = capfd.readouterr().err
+    assert meant.format(n=number) in err and len(err.splitlines()) == 1
+
+
+def test_the_largest_every_that_is_proposed_leaves_enough(capfd, tmp_path, monkeypatch):
+    monkeypatch.setattr("scene2spad.cli.simulation.calibrating.zone_captures", no_work)
+    monkeypatch.chdir(tmp_path)
+    assert main(["calibrate", "--every", "1000"]) == 2
+    most = int(capfd.readouterr().err.split("expected --every ")[1].split()[0])
+    assert main(["calibrate", "--every", str(most + 1)]) == 2
+    with pytest.raises(AssertionError, match="the plane was rendered"):
+        main(["calibrate", "--every", str(most)])
+
+
 @pytest.mark.parametrize("background", [0, 100])
 def test_a_zone_that_sees_nothing_is_named_with_its_file(background, capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

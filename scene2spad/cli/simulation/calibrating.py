@@ -20,9 +20,10 @@ from scene2spad.datasets.zone_captures import (
 from scene2spad.options.simulation import Calibrate
 from scenes.errors import InputError, require
 from scenes.progress import Progress
-from spad.sensor.files import load_sensor, read_sensor, write_sensor
+from spad.sensor.files import SensorFile, load_sensor, read_sensor, write_sensor
 from spad.sensor.model import Sensor
 from spad.zones.calibration import (
+    MIN_FITTED,
     Calibration,
     calibrate,
     calibrated_file,
@@ -59,10 +60,12 @@ def run(command: Calibrate, progress: Progress) -> dict:
     enough = number >= MIN_CAPTURES
     require(enough, f"{path}: {number} captures from {command.nearest:g} m on, expected {MIN_CAPTURES} or more")
     _check_distances(chosen, start.sensor, path)
+    _check_shape(chosen, start, path)
+    _check_every(number, command.every, path)
+    _check_zones(chosen, command.every, path)
     began = time.perf_counter()
     progress("render the plane", 0.0)
     captures = zone_captures(chosen, start.sensor, start.zones)
-    _check_zones(chosen, command.every, path)
     progress("fit", 0.3)
     used = captures[:: command.every]
     held = [one for at, one in enumerate(captures) if at % command.every]
@@ -101,6 +104,22 @@ def _check_distances(chosen: PlaneCaptures, sensor: Sensor, path: Path) -> None:
     farthest, record_m = chosen.distance_m[-1], sensor.recorded_range_m
     message = f"{path}: distance_m {farthest:g} m is beyond the record of {record_m:.3g} m"
     require(farthest <= record_m, f"{message}: are these millimetres?")
+
+
+def _check_shape(chosen: PlaneCaptures, start: SensorFile, path: Path) -> None:
+    """Raise InputError that names the file for captures of other zones or bins than the sensor has."""
+    _, zones, bins = chosen.counts.shape
+    count, sensor = 0 if start.zones is None else start.zones.count, start.sensor
+    expected = f"sensor {sensor.name} has {count} zones of {sensor.bins} bins (--sensor)"
+    require((zones, bins) == (count, sensor.bins), f"{path}: captures of {zones} zones and {bins} bins, {expected}")
+
+
+def _check_every(number: int, every: int, path: Path) -> None:
+    """Raise InputError that names the option where it leaves too few captures to fit."""
+    used = -(-number // every)
+    most = (number - 1) // (MIN_FITTED - 1)
+    message = f"--every {every} fits {used} of {number} captures of {path}, {MIN_FITTED} are needed"
+    require(used >= MIN_FITTED, f"{message}: expected --every {most} or less")
 
 
 def warn_of_unknown(fitted: Calibration) -> None:
