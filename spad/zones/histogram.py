@@ -15,6 +15,9 @@ from spad.sensor.model import PhotonBudget, Sensor
 from spad.zones.sensor import ZoneArray, ZoneReturns, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
 
 
+PULSE_ENDS = 1e-11  # share of a pulse beyond its reach: as much of the light in the record is none of it
+
+
 def zone_grid(zones: ZoneArray) -> tuple[int, int, np.ndarray]:
     """Return rows, columns, and the zone at each place from top left; one row where the centres form no grid."""
     x, y = np.asarray(zones.centre_x).round(9), np.asarray(zones.centre_y).round(9)
@@ -29,7 +32,10 @@ def with_budget(zones: ZoneArray, transient: Transient, sensor: Sensor, budget: 
 
     Raises InputError where no light reaches a zone.
     """
-    signal = zone_signal(zone_returns(transient, zones), sensor, zones).sum(axis=1).mean()
+    returns = zone_returns(transient, zones)
+    signal = zone_signal(returns, sensor, zones).sum(axis=1).mean()
+    every = np.mean([gain * seen.light.sum() for gain, seen in zip(zones.gain, returns, strict=True)])
+    signal = signal if signal > PULSE_ENDS * every else 0.0
     record = f"the {sensor.bins * sensor.bin_width_s * 1e9:.4g} ns that {sensor.name} records"
     message = f"no light reaches a zone within {record}: {budget.signal:g} photons cannot be had"
     require(signal > 0 or budget.signal == 0, message)

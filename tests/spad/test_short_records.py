@@ -1,4 +1,4 @@
-"""Free-running detectors whose bins cover a part of the laser's period: the rest of it blinds them, too."""
+"""Bins that cover a part of the laser's period: the rest of it blinds free-running detectors, and counts or not."""
 
 from dataclasses import replace
 
@@ -7,8 +7,12 @@ import pytest
 from test_laws import SMALL, same
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
+from scenes.errors import InputError
 from spad.detection.detect import sense, sense_timestamps
-from spad.sensor.model import PhotonBudget, Pulse
+from spad.formats.rgbd import transient_from_rgbd
+from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.zones.histogram import sense_zones, with_budget
+from spad.zones.sensor import ZoneArray
 
 
 @pytest.mark.parametrize("crosstalk", [0.0, 1e-9])
@@ -37,3 +41,20 @@ def test_light_after_the_record_blinds_the_start_of_the_next_cycle() -> None:
     # 50 were counted if only the record blinded; expected are 0.05 in the first cycles, and 0.1 where background after
     # 0.4 periods keeps the return from being detected
     assert counts.sum() <= 3
+
+
+def test_photons_asked_for_are_within_the_record_of_zones_and_over_the_whole_period_of_pixels() -> None:
+    """A wall's return lies in a record of half the period, the background in all of it."""
+    plane = np.full((16, 16), 0.3)
+    wall = transient_from_rgbd(plane, plane, plane, meta={"camera": {"fov_deg": 60.0}})
+    sensor = Sensor(name="s", bins=64, bin_width_s=1e-10, period_s=128e-10, pulse=Pulse(1e-10))
+    budget = PhotonBudget(200.0, 100.0)
+    two = ZoneArray((-0.2, 0.2), (0.0, 0.0), (0.3, 0.3), (0.5, 0.5))
+    zones = sense_zones(wall, sensor, with_budget(two, wall, sensor, budget))
+    assert zones.expected_background.mean() == pytest.approx(100) and zones.budget.background == pytest.approx(100)
+    pixels = sense(wall, sensor, budget, seed=1).counts.sum(axis=2)
+    assert pixels.mean() == pytest.approx(200 + 100 / 2, abs=5 * np.sqrt(250 / 256))
+    late = transient_from_rgbd(plane * 5, plane, plane, meta={"camera": {"fov_deg": 60.0}})  # after the record
+    assert sense(late, sensor, budget, seed=1).counts.sum(axis=2).mean() == pytest.approx(50, abs=5 * np.sqrt(50 / 256))
+    with pytest.raises(InputError, match=r"no light reaches a zone within the 6\.4 ns that s records"):
+        with_budget(two, late, sensor, budget)
