@@ -14,7 +14,6 @@ from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.zones.sensor import ZoneArray, ZoneReturns, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
 
-
 PULSE_ENDS = 1e-11  # share of a pulse beyond its reach: as much of the light in the record is none of it
 
 
