@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scene2spad.cli.simulation import sensing
 from scenes.errors import InputError
 from spad.sensor.budget import Optics
 from spad.sensor.files import (
@@ -162,7 +161,7 @@ def test_hot_pixels_of_a_file_that_gives_their_share_alone_have_the_rate_of_the_
     path = tmp_path / "s.toml"
     path.write_text(PLAIN + "[detector]\nhot_fraction = 0.1\n")
     sensor = read_sensor(path).sensor
-    assert sensor.hot_rate_hz == HOT_RATE_HZ == sensing.HOT_RATE_HZ
+    assert sensor.hot_rate_hz == HOT_RATE_HZ
     assert sensor.dark_rate_map_hz(10, 10).mean() == pytest.approx(0.1 * HOT_RATE_HZ)
     assert read_sensor(write_sensor(SensorFile(sensor), tmp_path / "again.toml")).sensor == sensor
     path.write_text(PLAIN + '[detector]\nhot_fraction = 0.1\nhot_rate = "0 Hz"\n')

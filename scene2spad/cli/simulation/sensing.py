@@ -28,14 +28,13 @@ from spad.formats.bistatic import baseline_of
 from spad.formats.histogram import Histogram, write_histogram
 from spad.sensor.budget import Optics
 from spad.sensor.files import FWHM_PER_SIGMA, load_sensor
-from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.model import HOT_RATE_HZ, PhotonBudget, Sensor
 from spad.sensor.pulse import AnyPulse, Pulse, read_pulse
 from spad.zones.sensor import ZoneArray
 
 log = logging.getLogger("scene2spad")
 
 DEFAULT_PHOTONS = 50.0
-HOT_RATE_HZ = 1e4
 OPTICS = {  # options, and the fields that they set
     "pulse_energy": "pulse_energy_j",
     "focal_length": "focal_length_m",
