@@ -1,4 +1,4 @@
-"""What comes to a core's port, checked: timestamps, and where each core's begin among those of an array."""
+"""Check what comes to a core's port: timestamps, and where each core's begin among those of an array."""
 
 from __future__ import annotations
 

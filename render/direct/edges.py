@@ -224,8 +224,7 @@ def _child_edges(
     leaf_x, leaf_y = (((2 * (to >> mi.Int32(below)) + 1) << mi.Int32(below + 1)) for to in there)
     half = 0.5 / Float(grid << (level + 1))
     narrow, wide = 2 * half, dr.select(cut, 2 * half, 4 * half * Float(UInt32(1) << below))
-    # marks are written one by one: a recording that first saw a small image would spread them over copies for each
-    # thread, and write beyond those of a larger one
+    # one by one: by its default mode Dr.Jit 1.5.0 wrote outside of `bits`, an input of the recording, on two threads
     marks = [dr.select((cell.flags & LARGE) != 0, CUT, UInt32(0)) for cell in here]
     for i in range(2):
         x = 4 * mi.Int32(column) + 1 + dr.select(upright, 2 * mi.Int32(beyond), 2 * i)

@@ -128,15 +128,20 @@ def render_plane(
 
 def zone_captures(captures: PlaneCaptures, sensor: Sensor, zones: ZoneArray) -> list[ZoneCapture]:
     """Render the plane at each capture's distance, and return its light beside the counts."""
-    _, count, bins = captures.counts.shape
-    fits = count == zones.count and bins == sensor.bins
-    expected = f"sensor {sensor.name} has {zones.count} zones of {sensor.bins} bins"
-    require(fits, f"captures of {count} zones and {bins} bins: {expected}")
+    require_same_zones(captures, sensor, zones)
     found = []
     for distance, counts, drift in zip(captures.distance_m, captures.counts, captures.drift_bins, strict=True):
         returns = zone_returns(render_plane(float(distance), zones), zones)
         found.append(ZoneCapture(returns, counts, float(drift) * sensor.bin_width_s))
     return found
+
+
+def require_same_zones(captures: PlaneCaptures, sensor: Sensor, zones: ZoneArray, where: str = "") -> None:
+    """Raise InputError, which begins with `where`, for captures of other zones or bins than the sensor has."""
+    _, count, bins = captures.counts.shape
+    expected = f"sensor {sensor.name} has {zones.count} zones of {sensor.bins} bins"
+    fits = count == zones.count and bins == sensor.bins
+    require(fits, f"{where}captures of {count} zones and {bins} bins, {expected}")
 
 
 def within(captures: PlaneCaptures, nearest_m: float, farthest_m: float = math.inf) -> PlaneCaptures:

@@ -70,7 +70,7 @@ def test_a_word_too_many_is_told_once(capsys):
     ],
 )
 def test_an_option_given_twice_is_refused(words, message, capsys):
-    """Of options with several values the first ones were lost without a word."""
+    """Refuse an option that is given twice: of one with several values the first ones were lost without a word."""
     status, out, err = run(capsys, *words)
     assert status == 2 and not out and err.startswith(f"scene2spad: {message}") and err.count("\n") == 1
 

@@ -1,4 +1,4 @@
-"""What is given to a scene's classes in place of what they take is refused in one line, never in a bare exception."""
+"""Refuse values of another kind in the classes of a scene in one line, never by a bare exception."""
 
 from __future__ import annotations
 

@@ -192,7 +192,7 @@ def test_rows_that_are_not_those_of_the_harmonics_are_refused():
 @pytest.mark.parametrize("bins", [8, 16, 64, 1024])
 @pytest.mark.parametrize("amplitude", [3, 31, 127])
 def test_waves_of_any_length_and_height_are_taken(bins, amplitude):
-    """What is rounded, and half a step of the table late for even harmonics, still is a Fourier code."""
+    """Take rounded codes, and even harmonics that are half a step of the table late, as Fourier codes."""
     harmonics = tuple(range(1, bins // 4))
     angle = 2 * np.pi * np.array(harmonics)[:, None] * (np.arange(bins) + 0.5) / bins
     rows = np.rint(amplitude * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(np.int8).reshape(-1, bins)

@@ -1,4 +1,4 @@
-"""What users give cores, chips and loads: refused in one line that names the value and the limit, or taken as it is."""
+"""Refuse what users give cores, chips and loads in one line that names value and limit, or take it as it is."""
 
 import re
 

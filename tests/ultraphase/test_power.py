@@ -137,7 +137,7 @@ end:  MOV r4, #0
 
 
 def test_what_comes_before_the_loop_is_paid_once_a_frame():
-    """Of proof, cost and frames alike: a photon's clocks are what one more photon takes."""
+    """Compare proof, cost and frames: a photon's clocks are what one more photon takes."""
     program = assemble(PROLOGUE)
     cost = cost_of(program, (1, 1), {}, {})
     assert (verify(program).clocks == cost.clocks_per_photon).all()

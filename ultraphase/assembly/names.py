@@ -1,4 +1,4 @@
-"""The names of a source, and its constant expressions: numbers, `.equ` names, RAM addresses and loop variables."""
+"""Resolve the names of a source, and constant expressions: numbers, `.equ` names, RAM addresses, loop variables."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def name_of(line: Line, token: Token) -> str:
 
 
 class Names:
-    """What the names of a source stand for, as far as its lines were read.
+    """Hold what the names of a source stand for, as far as its lines were read.
 
     given   constants of the caller; each wins over the source's `.equ`, and must be one that the source has
     """

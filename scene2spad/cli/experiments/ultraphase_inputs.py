@@ -1,4 +1,4 @@
-"""What `ultraphase` reads: a program, the contents of its tables, and the photons of a frame."""
+"""Read what `ultraphase` takes: a program, the contents of its tables, and the photons of a frame."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ from scene2spad.cli.paths import Mark, check_target, keep_foreign
 from scene2spad.datasets.zone_captures import (
     PlaneCaptures,
     read_plane_captures,
+    require_same_zones,
     shipped_captures,
     within,
     zone_captures,
@@ -20,7 +21,7 @@ from scene2spad.datasets.zone_captures import (
 from scene2spad.options.simulation import Calibrate
 from scenes.errors import InputError, require
 from scenes.progress import Progress
-from spad.sensor.files import SensorFile, load_sensor, read_sensor, write_sensor
+from spad.sensor.files import load_sensor, read_sensor, write_sensor
 from spad.sensor.model import Sensor
 from spad.zones.calibration import (
     MIN_FITTED,
@@ -60,7 +61,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
     enough = number >= MIN_CAPTURES
     require(enough, f"{path}: {number} captures from {command.nearest:g} m on, expected {MIN_CAPTURES} or more")
     _check_distances(chosen, start.sensor, path)
-    _check_shape(chosen, start, path)
+    require_same_zones(chosen, start.sensor, start.zones, f"{path}: ")
     _check_every(number, command.every, path)
     _check_zones(chosen, command.every, path)
     began = time.perf_counter()
@@ -104,14 +105,6 @@ def _check_distances(chosen: PlaneCaptures, sensor: Sensor, path: Path) -> None:
     farthest, record_m = chosen.distance_m[-1], sensor.recorded_range_m
     message = f"{path}: distance_m {farthest:g} m is beyond the record of {record_m:.3g} m"
     require(farthest <= record_m, f"{message}: are these millimetres?")
-
-
-def _check_shape(chosen: PlaneCaptures, start: SensorFile, path: Path) -> None:
-    """Raise InputError that names the file for captures of other zones or bins than the sensor has."""
-    _, zones, bins = chosen.counts.shape
-    count, sensor = 0 if start.zones is None else start.zones.count, start.sensor
-    expected = f"sensor {sensor.name} has {count} zones of {sensor.bins} bins (--sensor)"
-    require((zones, bins) == (count, sensor.bins), f"{path}: captures of {zones} zones and {bins} bins, {expected}")
 
 
 def _check_every(number: int, every: int, path: Path) -> None:

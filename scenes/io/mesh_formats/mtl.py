@@ -1,4 +1,4 @@
-"""Material libraries (.mtl): what of each material becomes an albedo."""
+"""Read material libraries (.mtl): what of each material becomes an albedo."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class MaterialEntry:
 
     @property
     def tint(self) -> Colour:
-        """Linear RGB that the image is multiplied by: Kd, as the format says, or 1 where there is none.
+        """Return the linear RGB that the image is multiplied by: Kd, as the format says, or 1 where there is none.
 
         A black one would leave nothing of the image. Programs write it that let the image replace the colour.
         """
@@ -44,7 +44,7 @@ class MaterialEntry:
 
     @property
     def tint_note(self) -> str:
-        """What becomes of a Kd beside the image, where it is neither missing nor white."""
+        """Say what becomes of a Kd beside the image, where it is neither missing nor white."""
         if self.colour is None or self.colour == WHITE:
             return ""
         if self.tint == WHITE:
