@@ -125,16 +125,21 @@ def mean_over_scenes(values: Mapping[str, ArrayLike]) -> Interval:
     kept = [v for v in kept if np.isfinite(v).any()]
     require(bool(kept), "mean over scenes: no finite value")
     require(len({len(v) for v in kept}) == 1, "mean over scenes: scenes with different numbers of seeds")
-    mean = float(np.mean([np.nanmean(v) for v in kept]))
-    if len(kept) < 2:
+    return _interval([float(np.nanmean(v)) for v in kept], _means_of_seeds(kept))
+
+
+def _means_of_seeds(scenes: Sequence[np.ndarray]) -> list[float]:
+    """Return each seed's mean over scenes; scenes are arrays (seeds, values), and NaN is left out."""
+    by_seed = ([np.nanmean(one) for one in seed if np.isfinite(one).any()] for seed in zip(*scenes, strict=True))
+    return [float(np.mean(means)) for means in by_seed if means]
+
+
+def _interval(by_scene: Sequence[float], *by_seed: Sequence[float]) -> Interval:
+    """Return the mean over scenes with its interval, in which the variances over each group of trainings are, too."""
+    mean = float(np.mean(by_scene))
+    if len(by_scene) < 2:
         return Interval(mean, math.nan, math.nan)
-    parts = [(_variance_of_mean([np.nanmean(v) for v in kept]), len(kept) - 1)]
-    seeds = len(kept[0])
-    if seeds > 1:
-        by_seed = [[np.nanmean(v[seed]) for v in kept if np.isfinite(v[seed]).any()] for seed in range(seeds)]
-        trained = [float(np.mean(one)) for one in by_seed if one]
-        if len(trained) > 1:
-            parts.append((_variance_of_mean(trained), len(trained) - 1))
+    parts = [(_variance_of_mean(values), len(values) - 1) for values in (by_scene, *by_seed) if len(values) > 1]
     variance = sum(part for part, _ in parts)
     if variance == 0:
         return Interval(mean, mean, mean)
@@ -156,16 +161,35 @@ def _student_quantile(freedom: float) -> float:
 def paired_difference(first: Mapping[str, ArrayLike], second: Mapping[str, ArrayLike]) -> Interval:
     """Return mean of first - second, value by value, with its interval; both as in `mean_over_scenes`.
 
-    What makes a scene or a level hard is in both and cancels. Other numbers of seeds: of the means over seeds. NaN
-    where no value of both is finite.
+    What makes a scene or a level hard is in both and cancels. With as many seeds in both, seeds are paired, too. With
+    other numbers of seeds the means over seeds are compared, and the variances over the seeds of either are added to
+    that over scenes (Welch 1947). NaN values are left out, and where no value of both is finite the mean is NaN.
     """
     scenes = [scene for scene in first if scene in second]
     require(bool(scenes), "paired difference: the two have no scene in common")
-    differences = {}
+    pairs = []
     for scene in scenes:
         a, b = (np.atleast_2d(np.asarray(v[scene], float)) for v in (first, second))
         require(a.shape[1] == b.shape[1], f"paired difference: scene {scene} has other levels in the two")
-        differences[scene] = a - b if len(a) == len(b) else a.mean(0) - b.mean(0)
-    if not any(np.isfinite(values).any() for values in differences.values()):
+        pairs.append((a, b))
+    if all(len(a) == len(b) for a, b in pairs):
+        differences = {scene: a - b for scene, (a, b) in zip(scenes, pairs, strict=True)}
+        nothing = not any(np.isfinite(values).any() for values in differences.values())
+        return Interval(math.nan, math.nan, math.nan) if nothing else mean_over_scenes(differences)
+    return _unpaired_seeds(pairs)
+
+
+def _unpaired_seeds(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Interval:
+    """Return the mean difference of scenes (seeds, values) that have other numbers of seeds in both, with its
+    interval."""
+    ours, theirs = [], []  # each seed against the mean of the other's seeds
+    for a, b in pairs:
+        known = np.isfinite(a).any(0) & np.isfinite(b).any(0)
+        if known.any():
+            a, b = a[:, known], b[:, known]
+            ours.append(a - np.nanmean(b, 0))
+            theirs.append(b - np.nanmean(a, 0))
+    if not ours:
         return Interval(math.nan, math.nan, math.nan)
-    return mean_over_scenes(differences)
+    gaps = [float(np.nanmean(np.nanmean(a, 0))) for a in ours]  # each level once, whatever seeds have a value there
+    return _interval(gaps, _means_of_seeds(ours), _means_of_seeds(theirs))

@@ -143,13 +143,42 @@ def test_intervals_over_scenes_and_seeds_cover_the_mean(seeds):
     assert 0.95 - 4 * (0.95 * 0.05 / trials) ** 0.5 < covered / trials < 0.995
 
 
+@pytest.mark.parametrize("seeds", [(3, 1), (3, 2), (2, 5)])
+def test_paired_differences_see_what_trainings_differ_by(seeds):
+    """Other numbers of seeds in both: no number of scenes tells which training is usual, and intervals cover it."""
+    scenes = {str(i): np.full((1, 4), float(i)) for i in range(50)}
+    trained = {scene: np.concatenate([values, values + 2]) for scene, values in scenes.items()}
+    reach = 12.706  # Student's, of one degree of freedom; the variance of the mean of 0 and 2 is 1
+    assert paired_difference(trained, scenes) == pytest.approx((1, 1 - reach, 1 + reach), abs=1e-3)
+    assert paired_difference(scenes, trained) == pytest.approx((-1, -1 - reach, -1 + reach), abs=1e-3)
+    rng, trials, covered = np.random.default_rng(seeds), 1000, 0
+    for _ in range(trials):
+        hard = rng.normal(0, 1, (8, 1))
+        both = []
+        for count in seeds:
+            apart = rng.normal(0, 1, (1, count)) if count > 1 else 0
+            values = hard + apart + rng.normal(0, 0.3, (8, count))
+            both.append({str(i): v[:, None] for i, v in enumerate(values)})
+        interval = paired_difference(*both)
+        covered += interval.low <= 0 <= interval.high
+    # Welch's degrees of freedom are estimates: where few trainings rule, intervals cover a little less often
+    assert 0.92 - 4 * (0.92 * 0.08 / trials) ** 0.5 < covered / trials < 0.995
+
+
+def test_paired_differences_leave_out_values_that_are_not_known():
+    second = {"a": np.array([[1.0, 2.0]]), "b": np.array([[3.0, 4.0]])}
+    first = {scene: np.repeat(values + 1, 3, axis=0) for scene, values in second.items()}
+    first["a"][0, 1] = np.nan  # of one training: the others' stand for it
+    assert paired_difference(first, second).mean == pytest.approx(1)
+    second["a"][0, 0] = np.nan
+    assert paired_difference(first, second).mean == pytest.approx(1)
+
+
 def test_paired_differences_cancel_what_scenes_share():
     rng = np.random.default_rng(0)
     second = {f"scene-{i}": rng.uniform(1, 100, 4) for i in range(8)}
     first = {scene: values + 1 for scene, values in second.items()}
     assert paired_difference(first, second) == pytest.approx((1, 1, 1))
-    trained = {scene: np.stack([values, values + 2]) for scene, values in second.items()}
-    assert paired_difference(trained, second) == pytest.approx((1, 1, 1))
     nothing = paired_difference({"a": [np.nan, 1.0], "b": [np.nan]}, {"a": [1.0, np.nan], "b": [2.0]})
     assert all(math.isnan(value) for value in nothing)  # no value of both: not known, and no mistake of the user's
     with pytest.raises(InputError, match="no scene in common"):
