@@ -106,8 +106,8 @@ class Frames(Dataset):
 
     def __getitem__(self, number: int) -> Request:
         scene, (signal, background) = self.chosen[number], self.levels[number]
-        # sets after the first have noise of their own
-        key = (self.config.seed, Stream.VALIDATE, number, *((self.source,) if self.source else ()))
+        # of four numbers: training has three, of which the second, the epoch, can be Stream.VALIDATE
+        key = (self.config.seed, Stream.VALIDATE, number, self.source + 1)
         return Request(self.source, Patch(scene, 0, 0, signal, background, key))
 
 

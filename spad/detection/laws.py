@@ -7,6 +7,7 @@ cycle, whose cost follows photons. A free-running detector goes event by event, 
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -70,6 +71,8 @@ def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.
 
     Events farther than `dead` from the one before are detected whatever came earlier. Chains of closer ones are
     followed from detection to detection, all chains side by side.
+
+    Pixels lie one behind the other on one axis of time, as many of them as float64 resolves to 2^-16 of the unit.
     """
     early = time < ready[pixel]
     order = np.flatnonzero(~early)
@@ -77,9 +80,18 @@ def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.
     if not len(order):
         return order
     where, when = pixel[order], time[order]
+    span = float(when.max()) + 2 * dead + 1  # more than a dead time between pixels
+    together = max(1, int(2.0**37 / span))
+    cuts = [0, *(np.flatnonzero(np.diff(where // together)) + 1), len(where)]
+    detected = np.concatenate([_live(where[a:b] % together, when[a:b], dead, span) for a, b in pairwise(cuts)])
+    last = np.flatnonzero(detected)
+    ready[where[last]] = np.maximum(ready[where[last]], when[last] + dead)  # ascending: the last one stays
+    return order[last]
+
+
+def _live(where: np.ndarray, when: np.ndarray, dead: float, span: float) -> np.ndarray:
+    """Return which of some pixels' events, ascending by pixel and time, are detected; a pixel's axis is `span` long."""
     new_pixel = np.concatenate(([True], where[1:] != where[:-1]))
-    # one increasing axis for all pixels, more than a dead time apart
-    span = float(when.max()) + 2 * dead + 1
     axis = when + where * span
     sure = new_pixel | np.concatenate(([True], np.diff(axis) >= dead))
     following = np.maximum(np.searchsorted(axis, axis + dead), np.arange(1, len(axis) + 1))  # also without dead time
@@ -91,9 +103,7 @@ def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.
         going = chain < ends
         chain, ends = chain[going], ends[going]
         detected[chain] = True
-    last = np.flatnonzero(detected)
-    ready[where[last]] = np.maximum(ready[where[last]], when[last] + dead)  # ascending: the last one stays
-    return order[last]
+    return detected
 
 
 NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))

@@ -37,6 +37,9 @@ def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
     every detection (Rapp 2019). mu_k = -ln(1 - n_k / (N - blind_k)) where the dead time is longer than a bin, as only
     one detection a cycle fits; n_k / (N - blind_k) below. (..., T) -> (..., T) float64. A sensor whose bins do not
     cover its period is refused by InputError.
+
+    Detections are taken for even within their bins. That holds for low flux: with half a detection a bin and cycle and
+    a dead time of 1 to 2.5 bins, bins are up to 3 % off and sums 1 % high.
     """
     if sensor.bins != sensor.bins_per_period:
         raise InputError(f"sensor {sensor.name}: the dead-time correction needs bins that cover the period")

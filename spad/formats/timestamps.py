@@ -62,6 +62,7 @@ class Timestamps:
     def merged(cls, parts: Iterable[Timestamps]) -> Timestamps:
         """Return one exposure of several: the detections of all, ascending again in every pixel."""
         parts = list(parts)
+        require(bool(parts), "no timestamps to merge")
         first = parts[0]
         if any((p.height, p.width, p.bins) != (first.height, first.width, first.bins) for p in parts):
             raise InputError("timestamps of different sizes cannot be merged")

@@ -20,8 +20,8 @@ from scenes.json_types import JsonObject
 from spad.sensor.normal import erfc, erfcx_far, ndtr
 
 MAX_SAMPLES = 1 << 16
-# Steps of a table that stands for two kernels in one, per standard deviation of the narrower: the table widens the
-# pulse's variance by 1 / (12 * 16^2) of that one's, 0.03 %.
+# Steps of a table that stands for two kernels in one, per standard deviation of the narrower. Both kernels and the
+# table are of steps: these widen the pulse's variance by 3 / (12 * 16^2) of that one's, 0.1 %.
 _STEPS_PER_STD = 16
 _TABLE_SIGMAS = 8.5
 

@@ -156,8 +156,8 @@ def measured_table(table: str, clock_period_s: float, sha256: str = "") -> np.nd
 
 @lru_cache(maxsize=8)
 def _drawn(codes: int, dnl: float, missing: float) -> np.ndarray:
-    """Draw widths: a fraction `missing` is 0, the others are gamma with such a mean and spread that of all codes the
-    mean is 1 and the standard deviation `dnl`."""
+    """Draw widths: a fraction `missing` is 0, the others share the clock period by a symmetric Dirichlet law whose
+    concentration gives all codes the standard deviation `dnl` about their mean of 1."""
     absent = round(missing * codes)
     there = codes - absent
     require(there > 0, f"tdc: missing {missing:g} of {codes} codes leaves none")
@@ -171,12 +171,25 @@ def _drawn(codes: int, dnl: float, missing: float) -> np.ndarray:
         f"tdc: dnl {dnl:g} is below {least:.3g} codes, what {absent} missing of {codes} make alone",
     )
     rng = np.random.default_rng(np.random.SeedSequence(0, spawn_key=(Stream.PIXELS, 3, 0)))
-    widths = np.ones((DRAWN, codes)) if spread < _ROUNDING else rng.gamma(1 / spread, spread, (DRAWN, codes))
-    widths[rng.permuted(np.tile(np.arange(codes) < absent, (DRAWN, 1)), axis=1)] = 0
+    comes = rng.permuted(np.tile(np.arange(codes) >= absent, (DRAWN, 1)), axis=1)
+    # n Dirichlet widths of concentration k each, with a mean of 1, have the variance (n - 1) / (n k + 1)
+    widths = comes * 1.0 if spread < _ROUNDING else _gamma(((there - 1) / spread - 1) / there, comes, rng)
     ends = np.cumsum(widths, axis=1)
     ends /= ends[:, -1:]
     ends.setflags(write=False)
     return ends
+
+
+def _gamma(shape: float, comes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw gamma variates where a code `comes`, and 0 elsewhere; each row is in units of its largest.
+
+    A shape near 0 has variates below the smallest number. They are drawn in logarithms, as G(k) = G(k + 1) U^(1 / k)
+    (Marsaglia, Tsang 2000).
+    """
+    shape = max(shape, 1e-9)
+    logs = np.log(rng.standard_gamma(shape + 1, comes.shape)) + np.log1p(-rng.random(comes.shape)) / shape
+    logs = np.where(comes, logs, -np.inf)
+    return np.exp(logs - logs.max(axis=1, keepdims=True))
 
 
 @lru_cache(maxsize=8)

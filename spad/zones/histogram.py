@@ -100,9 +100,10 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
 
 
 def _wrapped(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray) -> float:
-    """Return the share of the light that arrives later than one period after the laser's emission."""
+    """Return the share of the light that arrives later than one period after the laser's emission; echoes and the
+    module's own reflection are not counted."""
     period_m = SPEED_OF_LIGHT_M_PER_S * sensor.period_s
-    light = np.array([(seen.light.sum(), seen.light[seen.near_m >= period_m].sum()) for seen in returns])
+    light = np.array([(seen.light.sum(), seen.light @ seen.fraction_behind(period_m)) for seen in returns])
     every, late = np.asarray(zones.gain) @ light
     return float(late / every) if every > 0 else 0.0
 

@@ -165,6 +165,12 @@ class ZoneReturns(NamedTuple):
     far_m: np.ndarray
     light: np.ndarray
 
+    def fraction_behind(self, path_m: float) -> np.ndarray:
+        """Return which fraction of each path interval, evenly lit, lies behind a path."""
+        near, far, _ = self
+        behind = np.where(near >= path_m, 1.0, 0.0)  # intervals without length
+        return np.divide(far - np.maximum(near, path_m), far - near, out=behind, where=far > near).clip(0, 1)
+
 
 def zone_returns(transient: Transient, zones: ZoneArray) -> list[ZoneReturns]:
     """Gather the returns that each zone sees: radiance x share of the pixel in the zone x cos^4 of its direction.

@@ -196,6 +196,17 @@ def test_dead_time_photon_by_photon(dead: float) -> None:
     assert (np.sort(np.concatenate(parts)) == np.sort(kept)).all()
 
 
+def test_dead_time_is_the_same_in_the_last_pixel_of_a_large_image() -> None:
+    """Millions of pixels, each over hundreds of millions of bins: one float64 axis of all would resolve 0.2 bins."""
+    time = 3e8 + np.random.default_rng(3).uniform(0, 300, 600)
+    first = live_detections(np.zeros(600, int), time, 0.4, np.zeros(1))
+    for other in (1_000, 3_999_999):
+        there = live_detections(np.full(600, other), time, 0.4, np.zeros(4_000_000))
+        assert np.array_equal(there, first)
+    both = live_detections(np.repeat([5, 3_999_999], 600), np.tile(time, 2), 0.4, np.zeros(4_000_000))
+    assert np.array_equal(both, np.concatenate((first, first + 600)))
+
+
 @pytest.mark.parametrize("tau_periods", [0.05, 0.7, 2.5])
 def test_dead_time_rate(tau_periods: float) -> None:
     """m = r / (1 + r tau) within 0.5 % at homogeneous flux and 1e6 detections."""

@@ -206,9 +206,16 @@ def test_the_table_that_ships_is_as_unequal_as_its_source_says() -> None:
     assert "MIT License" in notice and "Sergei Kulkov" in notice
 
 
-def test_drawn_converters_have_the_nonlinearity_that_is_asked_for() -> None:
-    widths = np.diff(Tdc(2.5e-9, codes=140, dnl=0.8, missing=0.1).ends(), axis=1, prepend=0) * 140
-    assert (widths == 0).mean() == pytest.approx(0.1) and widths.std() == pytest.approx(0.8, abs=0.02)
+@pytest.mark.parametrize(
+    ("codes", "dnl", "missing"),
+    [(140, 0.8, 0.1), (140, 3.0, 0.0), (16, 2.0, 0.25), (4, 1.0, 0.0), (4, 1.5, 0.0), (4, 3**0.5, 0.25), (2, 0.5, 0.0)],
+)
+def test_drawn_converters_have_the_nonlinearity_that_is_asked_for(codes: int, dnl: float, missing: float) -> None:
+    widths = np.diff(Tdc(2.5e-9, codes=codes, dnl=dnl, missing=missing).ends(), axis=1, prepend=0) * codes
+    squares = ((widths - 1) ** 2).mean(axis=1)  # of each converter, whose codes fill one clock period
+    assert squares.mean() == pytest.approx(dnl**2, abs=5 * squares.std() / len(squares) ** 0.5 + 1e-9)
+    if dnl < 1:  # else widths below the smallest number come, too
+        assert (widths == 0).mean() == pytest.approx(missing)
     assert np.array_equal(Tdc(2.5e-9, codes=140).ends()[0], np.cumsum(np.full(140, 1.0)) / 140)
 
 

@@ -315,3 +315,6 @@ def test_zones_tell_how_much_of_their_light_wraps():
     late = sense_zones(view(1.2), sensor, TWO).meta
     assert late["wrapped"] == 1 and any(line.startswith("wrap: 100.000% of the light") for line in late["plan"])
     assert late["dark_share"] is None, "a zone's background is not told apart"
+    period_m = 1.9187  # of path: returns on both sides of the period's end count by what lies behind it
+    ends = ZoneReturns(np.array([0.9, 1.0, 1.2]) * period_m, np.array([1.4, 1.0, 1.5]) * period_m, np.array([5.0, 2, 1]))
+    assert ends.fraction_behind(period_m) == pytest.approx([0.8, 1, 1])
