@@ -130,7 +130,8 @@ class Evaluation:
                 found = {name: self.interval(methods, group, levels, name) for name in figures}
                 line: dict[str, Any] = {name: None if i is None else i.mean for name, i in found.items()}
                 mae = found["mae_mm"]
-                line["mae_interval_mm"] = None if mae is None else [mae.low, mae.high]
+                # Student's interval of few scenes can reach below 0, where no error is
+                line["mae_interval_mm"] = None if mae is None else [float(np.maximum(mae.low, 0)), mae.high]
                 table[levels][group] = line
         estimate, truth = (
             np.concatenate(parts) for parts in zip(*(pair for m in methods for pair in self.depths[m]), strict=True)

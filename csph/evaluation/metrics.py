@@ -105,8 +105,11 @@ def bias_by_depth(
     return found
 
 
+INTERVAL_LEVEL = 0.95
+
+
 class Interval(NamedTuple):
-    """A mean over scenes with its 95 % interval."""
+    """A mean over scenes with its interval of INTERVAL_LEVEL."""
 
     mean: float
     low: float
@@ -155,7 +158,7 @@ def _variance_of_mean(values: Sequence[float]) -> float:
 def _student_quantile(freedom: float) -> float:
     from scipy.special import stdtrit  # takes 0.3 s to import
 
-    return float(stdtrit(freedom, 0.975))
+    return float(stdtrit(freedom, 0.5 + INTERVAL_LEVEL / 2))
 
 
 def paired_difference(first: Mapping[str, ArrayLike], second: Mapping[str, ArrayLike]) -> Interval:

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, EvaluationPlan, Method, as_dicts, evaluate
-from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.evaluation.metrics import INTERVAL_LEVEL, PHOTON_LEVELS
 from csph.networks.model import DepthModel, load_model, tensors_sha256
 from csph.training.config import TrainConfig
 from csph.training.lineage import count_seen
@@ -28,6 +28,8 @@ from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
+
+FEW_SCENES = 6  # with fewer an interval is wider than the scenes are spread
 
 
 def photon_levels(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
@@ -133,7 +135,7 @@ def _counted(found: Evaluation, path: Path, range_m: float) -> dict[str, int]:
     return {"pixels_within_range": within, "beyond_range": beyond}
 
 
-def _scenes_counted(path: Path, views: Views) -> dict[str, int]:
+def _scenes_counted(path: Path, views: Views) -> dict[str, int | float]:
     """Count the scenes that intervals are over, and the views whose scene is known by a name alone, which a warning
     tells."""
     scenes, unsure = len(set(views.scenes)), unsure_scenes(path, views)
@@ -142,7 +144,9 @@ def _scenes_counted(path: Path, views: Views) -> dict[str, int]:
             "%s: scenes of %d of %d views are known by name alone: intervals count each name as one scene, %d in all"
         )
         log.warning(message, path, unsure, len(views.scenes), scenes)
-    return {"scenes": scenes, "unsure_scenes": unsure}
+    if scenes < FEW_SCENES:
+        log.info("95 %% intervals of %d scenes are wide, and trust their errors to be normal (Student)", scenes)
+    return {"scenes": scenes, "unsure_scenes": unsure, "interval_level": INTERVAL_LEVEL}
 
 
 def warn_of_seen(command: Evaluate, configs: Sequence[TrainConfig], views: Views, whole: Views) -> None:

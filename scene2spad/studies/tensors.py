@@ -14,8 +14,9 @@ from torch import Tensor
 from csph import CodingTensor, Design, make_coding
 from csph.codes.files import read_codes
 from csph.weights.cards import checkpoint_of, model_coding
-from csph.weights.shipped import checkpoint_name
+from csph.weights.shipped import checkpoint_name, shipped_file
 from csph.weights.torch_files import load_torch_file
+from scene2spad.networks.registry import ModelSpec
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import save
 from scenes.errors import InputError, require
@@ -23,7 +24,7 @@ from scenes.io.inputs import regular_file
 from scenes.progress import Progress
 
 CURVES = 4
-# Figure 1 is at a compression of 128, Figure 17 at 64; its learned tensors come from training (`--checkpoints`).
+# Figure 1 is at a compression of 128, Figure 17 at 64. Learned tensors are those of shipped models where there is one.
 PAPER = (
     ("fourier", (1024, 1, 1)),
     ("gray", (1024, 1, 1)),
@@ -44,8 +45,7 @@ def run(command: Study, progress: Progress) -> dict:
         sheets["tensors-design"] = [_start(design, command.seed)]
     if not sheets:
         for name, ratio in RATIOS.items():
-            designs = [Design.named(code, block, compression=ratio) for code, block in PAPER]
-            sheets[name] = [_start(design, command.seed) for design in designs]
+            sheets[name] = [_shipped_or_start(code, block, ratio, command.seed) for code, block in PAPER]
     command.out.mkdir(parents=True, exist_ok=True)
     drawn = []
     for number, (name, codings) in enumerate(sheets.items()):
@@ -53,6 +53,12 @@ def run(command: Study, progress: Progress) -> dict:
         drawn.append(str(draw(codings, command.out / f"{name}.png")))
     common = {name: [described(coding) for coding in codings] for name, codings in sheets.items()}
     return {"figures": drawn, "tensors": common}
+
+
+def _shipped_or_start(code: str, block: tuple[int, int, int], ratio: int, seed: int) -> CodingTensor:
+    """Return the codes of the shipped model of a learned design, of its first seed; else the design at its start."""
+    design, model = Design.named(code, block, compression=ratio), ModelSpec(code, block, ratio).name
+    return coding_of(Path(model)) if design.learned and shipped_file(model).is_file() else _start(design, seed)
 
 
 def _start(design: Design, seed: int) -> CodingTensor:

@@ -148,6 +148,10 @@ def test_study_tensors_draws_the_papers_designs_and_any_other(capfd, tmp_path, m
         (32, 8704),
         (128, 133120),
     ]
+    # learned codes are those of the models that ship
+    assert [t["name"] for t in drawn[2:]] == [
+        f"learned-{block}-128x-s0" for block in ("1024x1x1", "256x4x4", "1024x4x4")
+    ]
     assert drawn[1]["harmonics"] == [1, 1, 2, 2, 4, 4, 8, 8] and all(t["compression"] == 128 for t in drawn)
     assert (tmp_path / "tensors-128x.png").read_bytes()[:4] == b"\x89PNG"
     argv = ("--design", "hadamard+learned", "--block", "64", "2", "2", "--codes", "4", "--out", str(tmp_path))

@@ -316,5 +316,6 @@ def test_zones_tell_how_much_of_their_light_wraps():
     assert late["wrapped"] == 1 and any(line.startswith("wrap: 100.000% of the light") for line in late["plan"])
     assert late["dark_share"] is None, "a zone's background is not told apart"
     period_m = 1.9187  # of path: returns on both sides of the period's end count by what lies behind it
-    ends = ZoneReturns(np.array([0.9, 1.0, 1.2]) * period_m, np.array([1.4, 1.0, 1.5]) * period_m, np.array([5.0, 2, 1]))
+    near, far = (np.array(ends) * period_m for ends in ([0.9, 1.0, 1.2], [1.4, 1.0, 1.5]))
+    ends = ZoneReturns(near, far, np.ones(3))
     assert ends.fraction_behind(period_m) == pytest.approx([0.8, 1, 1])

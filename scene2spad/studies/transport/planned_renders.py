@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from csph.evaluation.metrics import image_errors
+from csph.evaluation.metrics import INTERVAL_LEVEL, image_errors
 from render.transient import Transient
 from scene2spad.studies.results import Store
 from scene2spad.studies.transport.plan import FAILS, HOLDS, LEVELS, LIMIT, OPEN
@@ -22,9 +22,6 @@ from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
 from spad.formats.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
-
-
-COVERAGE = 0.95  # of an interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +85,7 @@ def planned_rows(
     """
     found: list[JsonObject] = []
     draws = sorted(set(draws))
-    coverage = 1 - (1 - COVERAGE) / len(draws)
+    coverage = 1 - (1 - INTERVAL_LEVEL) / len(draws)
     for number, place in enumerate(places):
         progress(f"planned and full, {place.name}, {place.laser}", number / len(places))
         for count in draws:
@@ -134,7 +131,7 @@ def _both(
     return found
 
 
-def compared(full: np.ndarray, planned: np.ndarray, coverage: float = COVERAGE) -> tuple[float, float]:
+def compared(full: np.ndarray, planned: np.ndarray, coverage: float = INTERVAL_LEVEL) -> tuple[float, float]:
     """Return mean(planned) / mean(full) - 1 over draws of photons, and the half width of its interval by Student's
     t."""
     each = (planned - full) / full.mean()
