@@ -101,7 +101,7 @@ def render(
         ambient=ambient.radiance,
         mixed=traced.mixed.reshape(camera.height, camera.width),
         error=noise.reshape(camera.height, camera.width).astype(np.float32),
-        meta=_meta(scene, settings, plan, seed, error, traced) | _of_ambient(plan, settings, ambient),
+        meta=_meta(scene, plan, seed, error, traced) | _of_ambient(plan, settings, ambient),
     )
 
 
@@ -122,7 +122,7 @@ def _traced_to_target(
         if more is None:
             break
         extra = MoreSamples(more, derived_seed(seed, Stream.MORE, 0, number))
-        traced = add_samples(world, plan, settings, traced, extra, report)
+        traced = add_samples(world, plan, traced, extra, report)
         plan = replace(plan, spp=traced.spp, reasons=(*plan.reasons, traced.reasons[-1]))
         error = estimated_error(world, plan, traced)
     reasons = (*_bias_reasons(plan, traced, error), *clamp_reasons(plan, settings, traced, error))
@@ -180,7 +180,7 @@ def additional_schedule(
     rounds = np.ceil(traced.schedule.spp * factor / batches).astype(np.int64) * batches
     more = traced.schedule._replace(spp=rounds)
     if plan.filter:
-        filter_octaves = filter_octaves_of(world, plan, settings, traced.origin_m, traced.schedule.cost + more.cost)
+        filter_octaves = filter_octaves_of(world, plan, traced.origin_m, traced.schedule.cost + more.cost)
         return more._replace(filter_octaves=filter_octaves)
     return more
 
@@ -230,9 +230,7 @@ def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> 
     return paths | {"ambient_error": round(ambient.error, 6)}
 
 
-def _meta(
-    scene: Scene, settings: RenderSettings, plan: Plan, seed: int, error: ErrorEstimate, traced: LightSamples
-) -> JsonObject:
+def _meta(scene: Scene, plan: Plan, seed: int, error: ErrorEstimate, traced: LightSamples) -> JsonObject:
     camera, laser = scene.camera, scene.laser
     return {
         "scene": scene.name,

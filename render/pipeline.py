@@ -172,7 +172,7 @@ class MoreSamples(NamedTuple):
 
 
 def add_samples(
-    world: TracedScene, plan: Plan, settings: RenderSettings, traced: LightSamples, extra: MoreSamples, report: Progress
+    world: TracedScene, plan: Plan, traced: LightSamples, extra: MoreSamples, report: Progress
 ) -> LightSamples:
     """Return a render's light with further paths, weighted by their numbers.
 
@@ -238,7 +238,7 @@ def _allocated(
     if not plan.filter:
         return schedule, reasons
     spp = max(schedule.cost, FIRST_FILTERED_SPP)
-    from_m = float(filter_octaves_of(world, plan, settings, origin_m, spp).from_m[0])
+    from_m = float(filter_octaves_of(world, plan, origin_m, spp).from_m[0])
     (noise,) = pilot_noise(world, blocks, plan.bounces, pilot_seed, from_m, clamp)
     gain = gain_of_filter(blocks, (own, reused), noise, spp, least)
     if gain < FILTER_GAIN:
@@ -276,7 +276,7 @@ def _filtered(
 ) -> tuple[Schedule, tuple[str, ...]]:
     """Allocate paths of filtered light by the pilot's noise of every block, or without it evenly."""
     spp = FIRST_FILTERED_SPP if plan.spp is None else plan.spp
-    filter_octaves = filter_octaves_of(world, plan, settings, origin_m, spp)
+    filter_octaves = filter_octaves_of(world, plan, origin_m, spp)
     schedule = uniform(blocks, _in_batches(spp, FILTERED_BATCHES), reuses_paths=False)
     if noise is not None:
         schedule = allocate(blocks, noise, cost=spp, batches=FILTERED_BATCHES, min_spp=FILTERED_BATCHES)
@@ -324,9 +324,7 @@ def _unfiltered(
     return schedule, tuple(reasons)
 
 
-def filter_octaves_of(
-    world: TracedScene, plan: Plan, settings: RenderSettings, origin_m: np.ndarray, spp: float
-) -> Octaves:
+def filter_octaves_of(world: TracedScene, plan: Plan, origin_m: np.ndarray, spp: float) -> Octaves:
     """Return octaves of filtered light for so many paths a pixel in all."""
     distance_m = float(origin_m[origin_m > 0].mean()) / 2
     width_m, growth = plan.indirect_tolerance_m, plan.indirect_growth

@@ -160,7 +160,7 @@ class CellTree:
         places = Place(*(getattr(self, name) for name in Place._fields))
         cells = Cells(*(getattr(self, name) for name in Cells._fields))
         tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
-        bits = child_edges(tree, places, cells, parents, start, float(self.least))[: self.used]
+        bits = child_edges(tree, places, cells, parents, float(self.least))[: self.used]
         self.mixed[self.rank[_having(bits, MIXED)]] = True
         marked = _having(bits, CUT | GLINT)
         deepest = np.where(bits[marked] & GLINT, levels + GLINT_LEVELS, levels)

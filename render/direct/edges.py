@@ -106,9 +106,9 @@ def first_edges(
     return tuple(values.numpy() for values in found)
 
 
-def child_edges(tree: Tree, places: Place, cells: Cells, parents: np.ndarray, start: int, least: float) -> np.ndarray:
-    """Compare the children of cells that were just cut, numbered from `start`, with each other and with what lies
-    beyond the cut cells' sides: a child of a cell of the same size, or a leaf.
+def child_edges(tree: Tree, places: Place, cells: Cells, parents: np.ndarray, least: float) -> np.ndarray:
+    """Compare the children of cells that were just cut with each other and with what lies beyond the cut cells' sides:
+    a child of a cell of the same size, or a leaf.
 
     Returns CUT, MIXED and GLINT bits of every cell, children or what was met beside them, (N,) uint32. CUT is set of
     large children, too.

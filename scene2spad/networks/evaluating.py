@@ -122,7 +122,7 @@ def _report_plans(found: Evaluation, law: str | None) -> None:
         )
 
 
-def _counted(found: Evaluation, path: Path, range_m: float) -> dict[str, int]:
+def _counted(found: Evaluation, path: Path, range_m: float) -> JsonObject:
     """Count the pixels of all views that errors can be of, and those left out beyond the range, which a warning
     tells."""
     first = found.rows[0]
@@ -135,7 +135,7 @@ def _counted(found: Evaluation, path: Path, range_m: float) -> dict[str, int]:
     return {"pixels_within_range": within, "beyond_range": beyond}
 
 
-def _scenes_counted(path: Path, views: Views) -> dict[str, int | float]:
+def _scenes_counted(path: Path, views: Views) -> JsonObject:
     """Count the scenes that intervals are over, and the views whose scene is known by a name alone, which a warning
     tells."""
     scenes, unsure = len(set(views.scenes)), unsure_scenes(path, views)

@@ -138,7 +138,6 @@ _HARD = Section(
 )
 
 _OFFSET = "scene2spad study depth-offset"
-_FULL = f"{_OFFSET} --full"
 _FIGURES = Section(
     "figures",
     "Figures of the paper's supplement",

@@ -284,7 +284,6 @@ _KINDS: dict[str, Callable[[Materials, Plugin, Uv], Values]] = {
     "phong": _phong,
     "principled": _principled,
 }
-_WRAPPERS = ("twosided", "mask", "bumpmap", "normalmap")
 _WAYS_ROUND = {
     "roughdielectric": "no light is bent or scattered by glass here; write dielectric, or diffuse for frosted glass",
     "blendbsdf": "write the stronger of its two bsdfs alone",

@@ -33,7 +33,6 @@ MAX_LEVEL = 0.485
 MIDDLEBURY_FILES = ("view1.png", "disp1.png", "dmin.txt")
 DATA_VARIABLE = "SCENE2SPAD_DATA"
 DEPTH_EXTENSIONS = (".png", ".exr")
-IMAGE_EXTENSIONS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 MAX_DEPTH_M = 1e4
 
 

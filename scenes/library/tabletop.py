@@ -148,7 +148,7 @@ def tabletop(name: str, *, width: int = 88, height: int = 72) -> Scene:
             _stand(make(palette, rng), floor, rng)
     # dark: of a hidden lamp's light a trace would come round the table, and be all the ambient light there is
     hidden = [replace(surface, emission=0.0) for surface in one_of_each(palette)]
-    surfaces = _table(palette, rng) + [s for place in floor.places for s in place.surfaces] + hidden
+    surfaces = _table(palette) + [s for place in floor.places for s in place.surfaces] + hidden
     pitch = math.radians(PITCH_DEG)
     ahead = (0.0, EYE_M + math.sin(pitch), -math.cos(pitch))
     camera = Camera.look_at((0, EYE_M, 0), ahead, fov_deg=FOV_DEG, width=width, height=height)
@@ -177,7 +177,7 @@ def _stand(piece: Piece, floor: Floor, rng: Random, tries: int = 30) -> None:
             return
 
 
-def _table(palette: Palette, rng: Random) -> list[Surface]:
+def _table(palette: Palette) -> list[Surface]:
     """Table top and wall, larger than the image."""
     top = panel((0, 0, -1.5), (2.0, 0, 0), (0, 0, -1.2))
     back = panel((0, 0.8, -WALL_M), (2.0, 0, 0), (0, 1.2, 0))

@@ -165,7 +165,7 @@ def test_children_are_compared_with_all_that_lies_beside_them(cut_before: int, g
                 bits = bits_of_pair(cells, (number, beside), [places[number], places[beside]], grid)
                 expected[[number, beside]] |= bits
     columns = Place(*np.array(places, np.int32).T.copy())
-    bits = child_edges(Tree(grid, width, first, rank_of, child[:count]), columns, cells, parents, start, LEAST)
+    bits = child_edges(Tree(grid, width, first, rank_of, child[:count]), columns, cells, parents, LEAST)
     assert np.array_equal(bits, expected)
     assert all(20 < np.count_nonzero(bits & bit) < count - 20 for bit in (CUT, MIXED, GLINT)[: 2 + glossy])
 

@@ -182,7 +182,7 @@ def test_a_missed_target_is_made_good():
     error = estimated_error(world, plan, first)
     more = engine.additional_schedule(world, plan, settings, first, error, 3.0)
     assert error.total > 0.02 and more is not None
-    both = tracing.add_samples(world, plan, settings, first, tracing.MoreSamples(more, 1), lambda what, fraction: None)
+    both = tracing.add_samples(world, plan, first, tracing.MoreSamples(more, 1), lambda what, fraction: None)
     assert both.spp > first.spp
 
     def true(traced: tracing.LightSamples) -> float:
