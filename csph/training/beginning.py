@@ -67,7 +67,8 @@ def check_init(init: Beginning | None, config: TrainConfig) -> None:
     switches = [_switches(one) for one in (mine, other)]
     named = "" if switches[0] == switches[1] else f": --layer {switches[1]} and {switches[0]}"
     message = f"{other.name} on {other.sensor.name} cannot begin one of {mine.name} on {mine.sensor.name}{named}"
-    require(alike, f"init: a model of {message}")
+    cure = f"; with --network {other.network} it can" if not differ or held else ""  # the network alone hinders
+    require(alike, f"init: a model of {message}{cure}")
     less = not network_alone and other.layer.get("int8", False) and not mine.layer.get("int8", False)
     require(not less, f"init: a model of {other.name} in 8 bits cannot begin one without --layer int8")
     theirs = _options(other)

@@ -301,10 +301,23 @@ def test_a_dry_training_refuses_the_sets_that_the_run_refuses(capfd, tmp_path, m
 @pytest.mark.parametrize("option", ["--init", "--init-network"])
 def test_a_dry_training_refuses_the_beginnings_that_the_run_refuses(capfd, tmp_path, monkeypatch, option):
     monkeypatch.chdir(tmp_path)
-    expected = {"nowhere": "nowhere", "fourier-1024x1x1-128x-periodic-s1": "cannot begin one of"}
+    other = "fourier-1024x1x1-128x-periodic-s1"
+    expected = {"nowhere": "nowhere", other: f"{other}: network periodic: is for Fourier codes over all 1024 bins"}
     for name, words in expected.items():
         for dry in ((), ("--dry-run",)):
             assert words in refused(capfd, "train", *QUICK, "--set", "planes", "--out", "x", option, name, *dry)
+
+
+def test_a_model_to_begin_with_decides_the_network(capfd, tmp_path, monkeypatch):
+    """Compact by default with smoke; the model is refined. One that cannot be is answered with the one that can."""
+    monkeypatch.chdir(tmp_path)
+    name = "learned-256x4x4-128x-t8-mixed-s42"
+    begun = ("train", *QUICK, "--block", "256", "4", "4", "--compression", "128", "--init", name)
+    assert run(capfd, *begun, "--dry-run")["model"] == "learned 256x4x4 K32, refined"
+    assert "with --network refined it can" in refused(capfd, *begun, "--network", "compact", "--out", "x")
+    compact = replace(Train(), init="learned-256x4x4-128x-s0", preset="laptop")
+    assert config_of(compact).model.network == "compact"
+    assert config_of(replace(compact, network="refined")).model.network == "refined"
 
 
 def test_an_evaluation_counts_its_pixels_and_views(capfd, tmp_path, monkeypatch):
