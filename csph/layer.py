@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from csph.codes import blocks, rank
-from csph.codes.design import Design
+from csph.codes.design import OWN, Design
 from csph.codes.nested import nested
 from csph.codes.photons import encode_photons, photon_table
 from csph.codes.quantise import (
@@ -44,9 +44,10 @@ def make_coding(
     entries of one code of that part; a spatial part may begin orthogonal instead, with the same mean square. `sensor`
     (default: the reference) lends its pulse to Gray Fourier.
 
-    Raises InputError where K does not fit the code, and for what is no Design.
+    Raises InputError where K does not fit the code, for own codes, which are in a file, and for what is no Design.
     """
     require_kind(design, Design, "make_coding")
+    require(design.code != OWN, f"{design.name}: its codes are in a file, which `csph.codes.files.own_codes` reads")
     require_kind(sensor or Sensor(), Sensor, "make_coding: sensor")
     require_choice(spatial_start, STARTS, "spatial_start")
     seed = require_whole(seed, "make_coding: seed")
@@ -61,6 +62,16 @@ def make_coding(
     start = orthogonal_start if spatial_start == "orthogonal" else uniform_start
     spatial = start((codes, rows, columns), rows * columns, seed + (1 << 32)) if design.has_spatial else None
     return CodingTensor(design.name, temporal, spatial, computed=design.computed)
+
+
+def _own_coding(coding: CodingTensor, design: Design) -> CodingTensor:
+    """Return own codes. Raises InputError unless they are those of a design of own codes."""
+    require_kind(coding, CodingTensor, "own codes")
+    require(design.code == OWN, f"{design.name}: own codes {coding.name} are for a design of own codes")
+    shape = (design.codes, *(design.block if design.full else design.block[:1]))
+    found = tuple(coding.temporal.shape)
+    require(found == shape and coding.spatial is None, f"{design.name}: own codes are {found}, expected {shape}")
+    return coding
 
 
 def _as_int8(steps: Tensor, step: Tensor) -> tuple[np.ndarray, float]:
@@ -140,14 +151,17 @@ class CompressiveLayer(nn.Module):
         sensor: Sensor | None = None,
         seed: int = 0,
         spatial_start: SpatialStart = "uniform",
+        own: CodingTensor | None = None,
         **options: bool,
     ) -> CompressiveLayer:
         """Return the layer of a design at its start; `options` are switches of LayerOptions.
 
-        Raises InputError for switches that it has not.
+        own   the codes of a design of own codes (`csph.codes.files.own_codes`)
+
+        Raises InputError for switches that it has not, and own codes that are not the design's.
         """
         check_switches(options)
-        coding = make_coding(design, sensor, seed, spatial_start)
+        coding = make_coding(design, sensor, seed, spatial_start) if own is None else _own_coding(own, design)
         switches = replace(LayerOptions(zero_mean=bool(design.zero_mean)), **options)
         return cls(coding, learned=design.learned, options=switches, sensor=sensor)
 

@@ -14,18 +14,22 @@ from scenes.errors import InputError, did_you_mean, normalise_fields, require, r
 CODES = ("learned", "fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 _QUARTER_WAVE = ("fourier", "gray", "fourier-published", "gray-published")
 _COUNTED = ("coarse", "hadamard")  # an entry follows from its place: nothing is stored
+OWN = "own"  # fixed codes of a user's file (`csph.codes.files.own_codes`), which have no other name
+_FREE = ("learned", "random", OWN)  # K is limited by the block alone, and every entry may be a number of its own
 
 
 @dataclass(frozen=True)
 class Design:
     """K codes over blocks of Mt bins x Mr rows x Mc columns.
 
-    code             temporal part: learned, or fixed to one of the codes of `csph.codes.temporal`
+    code             temporal part: learned, or fixed to one of the codes of `csph.codes.temporal`, or to OWN codes
     block            (Mt, Mr, Mc)
     codes            K
-    full             every entry a number of its own, instead of temporal x spatial (learned and random alone)
+    full             every entry a number of its own, instead of temporal x spatial (learned, random and own alone)
     spatial_learned  the spatial part of a fixed temporal code is learned ("fourier+learned")
-    zero_mean        rows are held to sum to zero over Mt; None: all but coarse histograms, as published
+    zero_mean        rows are held to sum to zero over Mt; None: all but coarse histograms, as published, and own codes,
+                     which stay as their file has them
+    sha256           of the file of own codes; empty for others
 
     Raises InputError for an unknown code, fields of another kind, and a number of codes that is not whole or more than
     it has.
@@ -37,23 +41,29 @@ class Design:
     full: bool = False
     spatial_learned: bool = True
     zero_mean: bool | None = None
+    sha256: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "block", _block_of(self.block))
         meant = did_you_mean(str(self.code), CODES)
-        word = isinstance(self.code, str) and self.code in CODES
+        word = isinstance(self.code, str) and self.code in (*CODES, OWN)
         require(word, f"design {self.code!r} is unknown{meant}, expected one of {', '.join(CODES)}")
-        most = self.size if self.code in ("learned", "random") else self.block[0]
+        most = self.size if self.code in _FREE else self.block[0]
         expected = f"expected a whole number from 1 to {most} for {self.code} codes"
         whole = isinstance(self.codes, Integral) and not isinstance(self.codes, bool) and 1 <= self.codes <= most
         require(whole, f"{self.codes!r} codes over a block of {self.block_name}, {expected}")
         normalise_fields(self, "design")
         known = self.zero_mean is None or isinstance(self.zero_mean, bool)
         require(known, f"design: zero_mean {self.zero_mean!r}, expected True, False or None")
-        free = self.code in ("learned", "random")
-        require(free or not self.full, f"design {self.code}: full coding tensors are learned or random")
+        require(self.code in _FREE or not self.full, f"design {self.code}: full coding tensors are learned or random")
+        hashed = isinstance(self.sha256, str) and bool(self.sha256) == (self.code == OWN)
+        require(hashed, f"design {self.code}: sha256 {self.sha256!r}, expected that of a file of own codes alone")
+        several = self.full == (math.prod(self.block[1:]) > 1) and not self.spatial_learned
+        require(
+            self.code != OWN or several, f"design {OWN}: codes over several pixels are full, and nothing is learned"
+        )
         if self.zero_mean is None:
-            object.__setattr__(self, "zero_mean", self.code != "coarse")
+            object.__setattr__(self, "zero_mean", self.code not in ("coarse", OWN))
 
     @classmethod
     def named(
@@ -101,9 +111,11 @@ class Design:
 
     @property
     def name(self) -> str:
-        """Return the name of the design, as in "fourier+learned 256x4x4 K32"."""
+        """Return the name of the design, as in "fourier+learned 256x4x4 K32"; own codes have the beginning of their
+        file's hash in it."""
         plus = "+learned" if self.has_spatial and self.spatial_learned and self.code != "learned" else ""
-        return f"{'full ' if self.full else ''}{self.code}{plus} {'x'.join(map(str, self.block))} K{self.codes}"
+        code = f"{OWN}-{self.sha256[:8]}" if self.code == OWN else self.code
+        return f"{'full ' if self.full else ''}{code}{plus} {'x'.join(map(str, self.block))} K{self.codes}"
 
     @property
     def learned(self) -> tuple[str, ...]:

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from csph.codes.design import OWN, Design
 from csph.codes.quantise import quantised
 from csph.codes.tensor import CodingTensor
 from scenes.errors import InputError
 from scenes.files import read_array, whole_file
+from scenes.io.inputs import file_sha256
 
 
 def read_codes(path: Path) -> CodingTensor:
@@ -25,6 +27,19 @@ def read_codes(path: Path) -> CodingTensor:
         return CodingTensor(Path(path).stem, torch.from_numpy(values.astype(np.float64)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def own_codes(path: Path) -> tuple[Design, CodingTensor]:
+    """Return the fixed codes of a .npy file as a design and its tensor: `DepthModel` takes both.
+
+    Raises InputError in one line that names the file.
+    """
+    coding = read_codes(path)
+    several = coding.block[1:] != (1, 1)
+    sha256 = file_sha256(path)
+    design = Design(OWN, coding.block, coding.codes, full=several, spatial_learned=False, sha256=sha256)
+    # (K, Mt, 1, 1) are codes (K, Mt) of single pixels
+    return design, CodingTensor(design.name, coding.temporal if several else coding.temporal.flatten(1))
 
 
 def write_codes(coding: CodingTensor, path: Path, *, int8: bool = False) -> Path:

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from csph.codes.blocks import encode_blocks
+from csph.codes.design import OWN
 from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8
+from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer
 from csph.networks.blockwise import Blockwise, mixers_for
 from csph.networks.compact import Compact
@@ -66,17 +68,21 @@ def _network(config: ModelConfig) -> Compact | DeepBoosting:
 
 
 class DepthModel(nn.Module):
-    """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin."""
+    """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin.
 
-    def __init__(self, config: ModelConfig, seed: int = 0) -> None:
+    own   the codes of a design of own codes (`csph.codes.files.own_codes`)
+    """
+
+    def __init__(self, config: ModelConfig, seed: int = 0, *, own: CodingTensor | None = None) -> None:
         super().__init__()
         require_kind(config, ModelConfig, "DepthModel")
         seed = require_whole(seed, "DepthModel: seed")
         self.config = config
         self.layer: CompressiveLayer | None = None
         if config.design is not None:
+            start = config.spatial_start
             self.layer = CompressiveLayer.of(
-                config.design, sensor=config.sensor, seed=seed, spatial_start=config.spatial_start, **config.layer
+                config.design, sensor=config.sensor, seed=seed, spatial_start=start, own=own, **config.layer
             )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -118,6 +124,12 @@ class DepthModel(nn.Module):
         if self.layer is None:
             raise InputError(f"{self.config.name}: has no codes, its network sees all bins")
         return self.layer
+
+    @property
+    def own_codes(self) -> CodingTensor | None:
+        """The codes of a design of own codes, which another model of the design needs; None of other designs."""
+        own = self.config.design is not None and self.config.design.code == OWN
+        return self.codes_layer.raw_coding() if own else None
 
     @property
     def parameters_count(self) -> int:
@@ -329,7 +341,7 @@ def load_model(path: Path) -> tuple[DepthModel, TrainConfig, JsonObject]:
         config, state = TrainConfig.from_dict(meta["config"]), meta["state"]
         require(isinstance(state, dict), f"its state is a {type(state).__name__}, expected an object")
         _check_design(config.model, sum(value.numel() for value in weights.values()))
-        model = DepthModel(config.model, config.seed)
+        model = DepthModel(config.model, config.seed, own=_stored_codes(config.model, weights))
         _check_weights(weights, model)
         model.load_state_dict(weights)
     except InputError as error:
@@ -349,6 +361,14 @@ def _check_design(config: ModelConfig, stored: int) -> None:
     if config.layer.get("pulse_in_codes") or config.layer.get("pulse_in_decoder"):
         require_memory(24 * depth**2, f"the pulse at every one of {depth} bins")
     require(numbers <= stored, f"its design has {numbers} code entries, the file holds {stored} numbers")
+
+
+def _stored_codes(config: ModelConfig, weights: dict[str, Tensor]) -> CodingTensor | None:
+    """Return own codes, which a checkpoint holds as it does all fixed codes; None of other designs."""
+    if config.design is None or config.design.code != OWN:
+        return None
+    require("layer.temporal" in weights, f"its weights are of another design than {config.name}: it holds no codes")
+    return CodingTensor(config.design.name, weights["layer.temporal"])
 
 
 def _check_weights(weights: dict[str, Tensor], model: DepthModel) -> None:

@@ -179,7 +179,8 @@ class TrainConfig:
     validation_views           frames of the validation scenes
     precision     Lightning's name; bf16-mixed on GPUs that have it
     threads       of a CPU (0: as many as there are); the same number gives the same bytes
-    data          what it was trained on: path and SHA-256, filled in by `csph.training.loop.train`
+    data          what it was trained on: path and SHA-256, filled in by `csph.training.loop.train`; of own codes the
+                  path, `codes_file`, from which `train` reads them
 
     Raises InputError for numbers out of range.
     """
@@ -278,7 +279,12 @@ class TrainConfig:
 
     def to_dict(self) -> JsonObject:
         """Return every number as JSON holds it."""
-        return asdict(self)
+        values = asdict(self)
+        design = values["model"]["design"]
+        # files of before own codes stay what they were
+        if design is not None and not design["sha256"]:
+            del design["sha256"]
+        return values
 
     @classmethod
     def from_dict(cls, values: JsonObject) -> TrainConfig:

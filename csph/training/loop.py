@@ -10,6 +10,7 @@
     last.safetensors    weights after the last step
     training-views.txt  short hashes of the views that it is trained on, by which `evaluate` knows them again
     ancestor-views.txt  those of the models that it began with, where they are known
+    codes.npy           a copy of the file of own codes, where there is one
     resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
 
 Devices, precision and several GPUs are Lightning's; nothing here knows how many there are.
@@ -35,6 +36,7 @@ from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from csph.codes.rank import coherence, participation_rank
+from csph.codes.tensor import CodingTensor
 from csph.networks.grid import on_published_grid, published_target
 from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
 from csph.networks.posterior import DECODERS
@@ -44,6 +46,7 @@ from csph.training.config import TrainConfig
 from csph.training.data import SetData, TrainBatch
 from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.optimiser import make_optimiser
+from csph.training.own_codes import own_codes_of
 from csph.training.resume import WholeFileCheckpoints, check_resume, claim_run
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
@@ -76,10 +79,10 @@ class DepthTraining(pl.LightningModule):
     """KL divergence to the pulse at the label, plus total variation and coherence where asked; Adam or Muon, and an
     average of the weights where asked."""
 
-    def __init__(self, config: TrainConfig, init: Beginning | None = None) -> None:
+    def __init__(self, config: TrainConfig, init: Beginning | None = None, own: CodingTensor | None = None) -> None:
         super().__init__()
         self.config = config
-        self.model = DepthModel(config.model, config.seed)
+        self.model = DepthModel(config.model, config.seed, own=own)
         if isinstance(init, NetworkOf):
             self.model.begin_with_network(init.model)
         elif init is not None:
@@ -368,7 +371,7 @@ def train(
     record = Record(folder, progress or (lambda what, fraction: None))
     with _quiet():
         runner = _trainer(config, record, hardware)
-    module = DepthTraining(config, init)
+    module = DepthTraining(config, init, own_codes_of(config, folder))
     claim_run(folder, config)  # once the model is known to be possible
     write_seen(folder, given[0], frozenset() if init is None else what_is_known(init).seen)
     if config.threads:

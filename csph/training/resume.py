@@ -11,6 +11,7 @@ from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import nn
 
 from csph.training.config import TrainConfig
+from csph.training.own_codes import FILE, keep_codes
 from csph.weights.torch_files import load_torch_file
 from scenes.errors import InputError, require
 from scenes.files import is_unclaimed, whole_file
@@ -23,28 +24,35 @@ LONGEST_VALUE = 40  # characters of a value in a message
 
 
 def claim_run(folder: Path, config: TrainConfig) -> None:
-    """Write the configuration, or see that the folder holds the same one.
+    """Write the configuration, or see that the folder holds the same one; keep the codes of a file there.
 
     Raises InputError for another run's folder, with what differs, and one that holds other files.
     """
     path = folder / "config.json"
     if path.is_file():
-        known = read_json_object(path, "configuration")
-        refusal = f"{folder}: holds a run with other options or another set"
-        try:  # by what it says: a file of before an option was there means its default
-            there = TrainConfig.from_dict(known).to_dict()
-        except InputError:
-            raise InputError(f"{refusal}; choose another --out") from None
-        stood, asked = (json.loads(json.dumps(one)) for one in (there, config.to_dict()))
-        for one in (stood, asked):  # runs of before kept none; the hash of what a run began with decides
-            one["data"].pop("ancestors", None)
-        differing = _differences(stood, asked)
-        require(not differing, f"{refusal} ({'; '.join(differing[:3])}); choose another --out")
-        return
-    require(is_unclaimed(folder), f"{folder}: is not an empty folder and holds no run; choose another --out")
-    folder.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as beside:
-        beside.write_text(json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n")
+        _check_same(folder, config)
+    else:
+        require(is_unclaimed(folder), f"{folder}: is not an empty folder and holds no run; choose another --out")
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as beside:
+            beside.write_text(json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n")
+    keep_codes(config, folder)
+
+
+def _check_same(folder: Path, config: TrainConfig) -> None:
+    """Raise InputError where a run's folder was made by another configuration."""
+    known = read_json_object(folder / "config.json", "configuration")
+    refusal = f"{folder}: holds a run with other options or another set"
+    try:  # by what it says: a file of before an option was there means its default
+        there = TrainConfig.from_dict(known).to_dict()
+    except InputError:
+        raise InputError(f"{refusal}; choose another --out") from None
+    stood, asked = (json.loads(json.dumps(one)) for one in (there, config.to_dict()))
+    for one in (stood, asked):  # runs of before kept no ancestors; hashes decide, of own codes, too
+        for name in ("ancestors", FILE):
+            one["data"].pop(name, None)
+    differing = _differences(stood, asked)
+    require(not differing, f"{refusal} ({'; '.join(differing[:3])}); choose another --out")
 
 
 def _differences(there: JsonObject, asked: JsonObject, within: str = "") -> list[str]:

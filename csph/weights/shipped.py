@@ -64,7 +64,8 @@ def ship(run: Path, name: str, folder: Path = WEIGHTS, *, errors: dict[str, dict
     model, config, state = load_model(run)
     log = checkpoint_file(run).with_name("log.csv")
     require(log.is_file(), f"{log}: file not found, a shipped model needs its training log")
-    data = {key: file_names(v) if key in ("training", "validation") else v for key, v in config.data.items()}
+    paths = ("training", "validation", "codes_file")
+    data = {key: file_names(v) if key in paths else v for key, v in config.data.items()}
     config = replace(config, data=data)
     path = shipped_file(name, folder)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 import torch
 
+from csph.codes.tensor import CodingTensor
 from csph.networks.model import DepthModel
 from csph.training.config import COUNT_BYTES, TrainConfig
+from csph.training.own_codes import own_codes_of
 from csph.weights.shipped import TIMINGS
 from scene2spad.datasets.workers import check_workers
 from scene2spad.dry_runs.resources import Cost, memory, timed
@@ -43,16 +45,17 @@ def dry_run(command: Train) -> dict:
     for warning in level_warnings(config):
         log.warning("%s", warning)
     folder = folder_of(command)
-    done = recorded_epochs(folder)
+    done, own = recorded_epochs(folder), own_codes_of(config, folder)
     if done is None:
-        seconds, parameters = step_seconds(config)
+        seconds, parameters = step_seconds(config, own)
         steps = config.steps
         basis = (
             f"{PILOT_STEPS} steps of this network on random counts, after one that is not counted: without drawing "
             "patches, reading sets, and validation"
         )
     else:
-        seconds, parameters = done.seconds / config.steps_per_epoch, DepthModel(config.model).parameters_count
+        seconds = done.seconds / config.steps_per_epoch
+        parameters = DepthModel(config.model, own=own).parameters_count
         steps = max(config.epochs - done.epochs, 0) * config.steps_per_epoch
         basis = f"the recorded seconds of {done.epochs} epochs in this folder"
     return {
@@ -103,15 +106,16 @@ def recorded_epochs(folder: Path) -> Recorded | None:
     return Recorded(max(found), median(found.values())) if found else None
 
 
-def step_seconds(config: TrainConfig) -> tuple[float, int]:
-    """Return seconds of a training step on this machine, on random counts, and the number of parameters."""
+def step_seconds(config: TrainConfig, own: CodingTensor | None = None) -> tuple[float, int]:
+    """Return seconds of a training step on this machine, on random counts, and the number of parameters; `own` are the
+    codes of a design of own codes."""
     from csph.training.data import TrainBatch
     from csph.training.loop import DepthTraining  # and Lightning, which takes seconds to import
     from csph.training.optimiser import make_optimiser
 
     if config.threads:
         torch.set_num_threads(config.threads)
-    module, sensor = DepthTraining(config), config.model.sensor
+    module, sensor = DepthTraining(config, own=own), config.model.sensor
     bins, shape = config.window or sensor.bins, (config.batch, config.crop, config.crop)
     random = torch.Generator().manual_seed(0)
     counts = torch.poisson(torch.full((shape[0], 1, bins, *shape[1:]), 0.1), generator=random)

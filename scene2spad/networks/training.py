@@ -15,13 +15,15 @@ from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.codes.design import Design
+from csph.codes.files import own_codes
 from csph.evaluation.methods import DepthEstimator, Method
 from csph.layer import SpatialStart
-from csph.networks.model import DepthModel
+from csph.networks.model import DepthModel, load_model
 from csph.training.beginning import NetworkOf, WeightsOf, check_init
 from csph.training.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
 from csph.training.lineage import begin_with
 from csph.training.overlap import overlap
+from csph.training.own_codes import FILE, codes_path
 from csph.training.views import Views, is_seen, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
@@ -48,31 +50,23 @@ def config_of(command: Train) -> TrainConfig:
     described = load_sensor(command.sensor)
     require(described.zones is None, f"train: sensor {command.sensor} has zones, networks are for pixels")
     sensor = described.sensor
-    network = command.network or _default_network(command)
+    _check_numbers(command)
+    design = _design_of(command)
+    network = command.network or _default_network(command, design)
     # the published network finds the pulse in the counts by itself; ours, of few layers, is given them matched
     uncoded: dict[str, Front] = {"none": "matched" if network == "compact" else "counts", "peak": "peak"}
-    front = uncoded.get(command.design, "codes")
-    design = None
-    if front == "codes":
-        design = Design.named(
-            command.design, command.block, codes=command.codes, compression=_compression(command), full=command.full
-        )
-    _check_numbers(command)
+    front = "codes" if design is not None else uncoded[command.design]
     switches: tuple[str, ...] = command.layer
     layer = dict.fromkeys(switches, True)
     # the first models' and the published start, which their recipes reproduce
     start: SpatialStart = "uniform" if command.preset in ("paper", "laptop-v1") else "orthogonal"
     start = command.spatial_start or start
     start = start if design is not None and "spatial" in design.learned else "uniform"
-    model = ModelConfig(
-        front=front,
-        design=design,
-        layer=layer,
-        network=network,
-        sensor=sensor,
-        grid=command.grid,
-        spatial_start=start,
-    )
+    try:
+        model = ModelConfig(front, design, layer, network, sensor, command.grid, start)
+    except InputError as error:
+        chosen = command.codes_file or (None if command.network else _begun_name(command))  # by which file or model
+        raise InputError(f"{chosen}: {error}" if chosen else str(error)) from None
     config = preset(
         command.preset,
         model,
@@ -93,6 +87,7 @@ def config_of(command: Train) -> TrainConfig:
         init_share=command.init_share,
         sense_on=command.sense_on,
         decoded_weight=command.decoded,
+        data=None if command.codes_file is None else {FILE: str(command.codes_file)},
     )
     if command.steps is None:
         return config
@@ -103,6 +98,33 @@ def config_of(command: Train) -> TrainConfig:
     decay_steps = max(1, round(config.decay_steps * each / config.steps_per_epoch))
     warmup = min(config.warmup, command.steps // 10)
     return replace(config, epochs=epochs, steps_per_epoch=each, decay_steps=decay_steps, warmup=warmup)
+
+
+def _design_of(command: Train) -> Design | None:
+    """Return the codes that are asked for; None for designs without. Raises InputError for a file of own codes beside
+    another block or number."""
+    if command.codes_file is None:
+        if command.design in ("none", "peak"):
+            return None
+        compression = _compression(command)
+        return Design.named(
+            command.design, command.block, codes=command.codes, compression=compression, full=command.full
+        )
+    design, _ = own_codes(codes_path(command.codes_file, folder_of(command)))
+    asked = {
+        "--block": (command.block, (Train.block, design.block)),
+        "--codes": (command.codes, (None, design.codes)),
+        "--compression": (command.compression, (None, design.compression_ratio)),
+    }
+    holds = f"holds {design.codes} codes over blocks of {design.block_name}"
+    for name, (value, fitting) in asked.items():
+        words = " ".join(map(str, value)) if isinstance(value, tuple) else value
+        require(value in fitting, f"train: {name} {words}: {command.codes_file} {holds}; leave {name} out")
+    return design
+
+
+def _begun_name(command: Train) -> str | None:
+    return command.init or command.init_network
 
 
 def _compression(command: Train) -> float | None:
@@ -125,13 +147,15 @@ def _check_numbers(command: Train) -> None:
     require(weights in (0, sets), f"train: {weights} --set-weights for {sets} sets, expected one for each")
 
 
-def _default_network(command: Train) -> Network:
-    """Return the network of a preset: published with paper; refined for codes of several pixels, where training has the
-    time for it; else compact."""
+def _default_network(command: Train, design: Design | None) -> Network:
+    """Return the network of the model to begin with; else of a preset: published with paper; refined for codes of
+    several pixels, where training has the time for it; else compact."""
+    begun = _begun_name(command)
+    if begun is not None:
+        return load_model(checkpoint_of(begun))[1].model.network
     if command.preset == "paper":
         return "published"
-    bins, rows, columns = command.block
-    coded = command.design not in ("none", "peak") and rows * columns > 1 and bins % 16 == 0
+    coded = design is not None and math.prod(design.block[1:]) > 1 and design.block[0] % 16 == 0
     return "refined" if coded and command.preset in ON_CPU else "compact"
 
 
@@ -214,6 +238,7 @@ def run_train(command: Train, progress: Progress) -> dict:
     from csph.training.loop import Hardware, train  # and Lightning, which takes seconds to import
 
     training, validation, data = views_of(command)
+    data |= config.data
     warn_of_inherited(init, validation)
     first = training[0].transients[0]
     for warning in level_warnings(config, first.height, first.width):
@@ -236,7 +261,7 @@ def run_train(command: Train, progress: Progress) -> dict:
 
 def begun_with(command: Train, config: TrainConfig) -> WeightsOf | NetworkOf | None:
     """Return the model, or the model whose network alone, a training begins with; InputError for one that cannot."""
-    begun = command.init or command.init_network
+    begun = _begun_name(command)
     if begun is None:
         return None
     init = begin_with(checkpoint_of(begun), network_alone=command.init_network is not None)
@@ -257,8 +282,9 @@ def warn_of_inherited(init: WeightsOf | NetworkOf | None, validation: Sequence[V
 
 def folder_of(command: Train) -> Path:
     """Return the folder of a run: the one asked for, or one named after its options."""
-    name = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}-{command.preset}-{command.seed}"
-    return command.out or Path("out/train") / name
+    codes = f"{command.design.replace('+', '-')}-{'x'.join(map(str, command.block))}"
+    codes = codes if command.codes_file is None else command.codes_file.stem
+    return command.out or Path("out/train") / f"{codes}-{command.preset}-{command.seed}"
 
 
 def network_method(model: DepthEstimator, *, overflows: list[int] | None = None, **reading: Any) -> Method:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from scene2spad.options.common import Common, Count, Long, Number, Pixels, Positional, may_stay_open, only_for
+from scene2spad.options.common import Common, Count, File, Long, Number, Pixels, Positional, may_stay_open, only_for
+from scenes.errors import require
 
 TrainingPreset = Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"]
 
@@ -28,6 +29,9 @@ class Train(Long):
     """Number K of codes, instead of --compression."""
     full: bool = False
     """A full coding tensor instead of a separable one."""
+    codes_file: File = None
+    """Fixed codes of your own (.npy), (K, Mt) or (K, Mt, Mr, Mc), instead of --design, as they are: block and number
+    are the file's. The run keeps a copy, codes.npy."""
     layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes", "int8"], ...] = ()
     """Switches of the layer that differ from the published one; int8 trains codes for the in-pixel processor: 8 bits
     within ranges that are learned, sums of 16 bits that wrap (begin with --init)."""
@@ -47,8 +51,8 @@ class Train(Long):
     ] = None
     """Our own (compact; blockwise sees the codes, too; refined looks at them twice; periodic answers alike at every
     delay, for Fourier codes over all bins with --layer keep_mean), the published, or the published without its final
-    ReLU, which can die (default: published with paper; refined for blocks of several pixels with
-    laptop and workstation; else compact)."""
+    ReLU, which can die (default: that of --init or --init-network; without these published with paper; refined for
+    blocks of several pixels with laptop and workstation; else compact)."""
     sensor: str = "reference"
     """Sensor preset or sensor file (.toml), as in `sense`; with a time-to-digital converter patches are drawn through
     it."""
@@ -111,13 +115,21 @@ class Train(Long):
 
 def check_used(command: Train) -> None:
     """Raise InputError for options that a training of this design would ignore."""
+    own = command.codes_file is not None
     coded = command.design not in ("none", "peak")
-    learned = command.design == "learned" or command.design.endswith("+learned")
+    learned = not own and (command.design == "learned" or command.design.endswith("+learned"))
     spatial = learned and not command.full and math.prod(command.block[1:]) > 1
     varied = bool(command.tv) or (command.preset == "paper" and not coded)
-    options = dict.fromkeys(("block", "compression", "codes", "full"), (coded, "designs with codes"))
+    options = dict.fromkeys(("block", "compression", "codes"), (coded, "designs with codes"))
     options |= {"spatial_start": (spatial, "spatial codes that are learned"), "tv_start": (varied, "--tv above 0")}
-    only_for(command, f"train --design {command.design}", options)
+    where = f"train --codes-file {command.codes_file}" if own else f"train --design {command.design}"
+    options |= {"design": (not own, "codes of no file"), "full": (coded and not own, "designs with codes of no file")}
+    only_for(command, where, options)
+    for option in ("design", "init", "init_network"):
+        given = getattr(command, option)
+        array = given is not None and given.endswith(".npy")
+        cure = "is a file of codes, expected --codes-file"
+        require(not array, f"train: --{option.replace('_', '-')} {given}: {cure} {given}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -90,7 +90,7 @@ def with_headroom(model: DepthModel, bits: int) -> DepthModel:
     good = 0 <= bits <= MAX_HEADROOM_BITS
     require(good, f"headroom of {bits} bits, expected 0 to {MAX_HEADROOM_BITS} of the 7 that a code has")
     require(model.layer is not None, f"{model.config.name}: has no codes to give headroom to")
-    wide = DepthModel(replace(model.config, layer={**model.config.layer, "int8": True}))
+    wide = DepthModel(replace(model.config, layer={**model.config.layer, "int8": True}), own=model.own_codes)
     wide.begin_with(model)
     with torch.no_grad():
         logarithms = wide.codes_layer.temporal_range
