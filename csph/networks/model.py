@@ -19,12 +19,11 @@ from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_in
 from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer
 from csph.networks.blockwise import Blockwise, mixers_for
-from csph.networks.compact import Compact
+from csph.networks.choice import network_of, own_network
 from csph.networks.grid import published_position
 from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
-from csph.networks.periodic import Periodic
 from csph.networks.posterior import Decoder, confidence, decoded
-from csph.networks.published import DeepBoosting, parameters_of
+from csph.networks.published import parameters_of
 from csph.networks.refined import Refined
 from csph.training.config import ModelConfig, TrainConfig, grows
 from scenes.errors import InputError, require, require_kind, require_whole
@@ -57,23 +56,25 @@ def _inside(span: Span) -> slice:
     return slice(span.inner, span.inner + span.own.stop - span.own.start)
 
 
-def _network(config: ModelConfig) -> Compact | DeepBoosting:
-    if config.sees_codes:
-        kind = Refined if config.network == "refined" else Blockwise
-        design, keep_mean = config.codes_design, config.layer.get("keep_mean", False)
-        return kind(design.block, design.codes, keep_mean=keep_mean)
-    if config.network in ("compact", "periodic"):
-        return Compact() if config.network == "compact" else Periodic()
-    return DeepBoosting(final_relu=config.network == "published")
-
-
 class DepthModel(nn.Module):
     """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where the weights begin.
 
-    own   the codes of a design of own codes (`csph.codes.files.own_codes`)
+    own       the codes of a design of own codes (`csph.codes.files.own_codes`)
+    network   (B, 1, T, R, C) -> logits (B, T, R, C), in place of the one that the configuration names: a module whose
+              `reach` is how many pixels around one its answer depends on, and `coarsest` the side in pixels of the
+              cells that its layers pool. `save_model` knows no such network
+
+    Raises InputError for parts of another kind, and a network that lacks these numbers.
     """
 
-    def __init__(self, config: ModelConfig, seed: int = 0, *, own: CodingTensor | None = None) -> None:
+    def __init__(
+        self,
+        config: ModelConfig,
+        seed: int = 0,
+        *,
+        own: CodingTensor | None = None,
+        network: nn.Module | None = None,
+    ) -> None:
         super().__init__()
         require_kind(config, ModelConfig, "DepthModel")
         seed = require_whole(seed, "DepthModel: seed")
@@ -86,7 +87,8 @@ class DepthModel(nn.Module):
             )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.network = _network(config)
+            self.network = network_of(config) if network is None else own_network(network)
+        self.has_own_network = network is not None
 
     def begin_with(self, other: DepthModel) -> None:
         """Take the weights of a model of the same design, or of one that this design `holds`, and its network; clipping
@@ -304,10 +306,13 @@ def weights_sha256(model: nn.Module) -> str:
 def save_model(model: DepthModel, config: TrainConfig, state: JsonObject, path: Path, *, half: bool = False) -> None:
     """Write weights as safetensors, whole or not at all; configuration and `state` (step, validation) in its header.
 
-    `half` keeps them in float16, in half the space; `load_model` gives float32 again, 11 bits of each.
+    `half` keeps them in float16, in half the space; `load_model` gives float32 again, 11 bits of each. Raises
+    InputError for a network of a user's own, which no configuration names.
     """
     from safetensors.torch import save
 
+    nameless = "its network is no registered one: keep its state_dict, or register it as docs/extending.md says"
+    require(not model.has_own_network, f"{path}: {nameless}")
     weights = {name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()}
     weights = {name: value.half() for name, value in weights.items()} if half else weights
     header = seal({"config": config.to_dict(), "state": state}, KIND, tensors_sha256(weights))
