@@ -37,7 +37,7 @@ def changed(tmp_path_factory) -> Path:
     for package in PACKAGES:
         shutil.copytree(ROOT / package, tree / package, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
     diffs = re.findall(r"```diff\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(diffs) == 4
+    assert len(diffs) == 5
     for diff in diffs:
         done = subprocess.run(["git", "apply", "-"], input=diff, text=True, cwd=tree, capture_output=True, check=False)
         assert done.returncode == 0, done.stderr
@@ -51,12 +51,13 @@ def commands() -> list[list[str]]:
 
 def test_the_commands_of_the_page_run_on_the_changed_tree(changed, tmp_path):
     asked = commands()
-    assert len(asked) == 4
+    assert len(asked) == 6
     for words in asked:
-        small = ["--no-figure"] if words[0] != "study" else []
+        small = ["--no-figure"] if words[0] not in ("study", "train") else []
         done = run_process([sys.executable, "-m", "scene2spad", *words, *small], cwd=tmp_path, env=of(changed))
         assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "steps.exr").is_file() and list(tmp_path.rglob("counts.png"))
+    assert (tmp_path / "plain" / "model.safetensors").is_file() and list(tmp_path.glob("*network-plain*"))
 
 
 def test_the_law_of_the_page_counts_what_its_closed_form_says(changed, tmp_path):
@@ -65,6 +66,14 @@ def test_the_law_of_the_page_counts_what_its_closed_form_says(changed, tmp_path)
     # 400 photons in 64 us of which dead time takes 0.2 us each; the first photon of a pixel finds it armed
     expected = 400 * np.exp(-400 * 2e-7 / 6.4e-5)
     assert abs(mean - expected) < 5 * error + 1
+
+
+def test_the_loop_of_the_page_lowers_its_loss_without_a_change_to_the_package(tmp_path):
+    (block,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    done = run_process([sys.executable, "-c", block], cwd=tmp_path, env=of(ROOT))
+    assert done.returncode == 0, done.stderr
+    losses = [float(one) for one in re.findall(r": ([\d.]+) m", done.stdout)]
+    assert len(losses) == 4 and losses[-1] < losses[0] and (tmp_path / "gated.pt").is_file()
 
 
 def of(tree: Path) -> dict[str, str]:
