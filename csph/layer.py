@@ -90,7 +90,8 @@ class CompressiveLayer(nn.Module):
     With `int8` the logarithms of the clipping ranges are parameters as well, `temporal_range` and `spatial_range`; they
     begin at each factor's largest magnitude (`fit_ranges`).
 
-    Sums are in float32 whatever the counts' type and autocast, in float64 where the weights are.
+    Sums and results are in float32 whatever the counts' type and autocast, in float64 where the weights are. Weights of
+    16 bits (`bfloat16()`, `half()`) are taken to float32 first: only the weights themselves are rounded.
 
     `torch.func.functional_call` runs it with other weights, and `backward` and `torch.autograd.functional.jacobian`
     give its first derivatives. It has no batching rule and no second derivative: `vmap`, `grad` and `jacrev` of
@@ -188,17 +189,21 @@ class CompressiveLayer(nn.Module):
         flat = weights.reshape(*weights.shape[:2], -1)
         return (self.pulse.to(weights.dtype).T @ flat).view(weights.shape)
 
+    def _constrained_temporal(self) -> Tensor:
+        temporal = blocks.widened(self.temporal)
+        return blocks.centred(temporal, 1) if self.options.zero_mean else temporal
+
     def _exact_temporal(self) -> Tensor:
-        part = blocks.centred(self.temporal, 1) if self.options.zero_mean else self.temporal
+        part = self._constrained_temporal()
         return self._blurred(part) if self.options.pulse_in_codes else part
 
     def _temporal_steps(self) -> tuple[Tensor, Tensor]:
         assert self.temporal_range is not None
-        return clipped_steps(self._exact_temporal(), self.temporal_range)
+        return clipped_steps(self._exact_temporal(), blocks.widened(self.temporal_range))
 
     def _spatial_steps(self) -> tuple[Tensor, Tensor]:
         assert self.spatial is not None and self.spatial_range is not None
-        return clipped_steps(self.spatial, self.spatial_range)
+        return clipped_steps(blocks.widened(self.spatial), blocks.widened(self.spatial_range))
 
     def _temporal_part(self) -> Tensor:
         if not self.options.int8:
@@ -207,8 +212,10 @@ class CompressiveLayer(nn.Module):
         return steps * step
 
     def _spatial_part(self) -> Tensor | None:
-        if self.spatial is None or not self.options.int8:
-            return self.spatial
+        if self.spatial is None:
+            return None
+        if not self.options.int8:
+            return blocks.widened(self.spatial)
         steps, step = self._spatial_steps()
         return steps * step
 
@@ -250,8 +257,7 @@ class CompressiveLayer(nn.Module):
 
     def raw_coding(self) -> CodingTensor:
         """Return the weights as they are now with the constraint alone, before the pulse and without steps."""
-        temporal = blocks.centred(self.temporal, 1) if self.options.zero_mean else self.temporal
-        return CodingTensor(self.name, temporal, self.spatial, computed=self.computed)
+        return CodingTensor(self.name, self._constrained_temporal(), self.spatial, computed=self.computed)
 
     @torch.no_grad()
     def begin_within(self, coding: CodingTensor, design: Design) -> None:
@@ -299,7 +305,8 @@ class CompressiveLayer(nn.Module):
 
     def _encode_int8(self, counts: Tensor) -> Tensor:
         sums, step = self._core_sums(counts)
-        # the slope of a sum that wraps would narrow the range, which wraps more
+        # backward as if no sum wrapped: the slope of a wrapped sum has the wrong sign, and would narrow the clipping
+        # range, so that still more sums wrap
         held = straight_through(sums * step, wrapped_sums(sums) * step)
         spatial = self._spatial_part()
         if spatial is None:
@@ -340,7 +347,7 @@ class CompressiveLayer(nn.Module):
     def _checked(self, codes: Tensor) -> Tensor:
         good = codes.ndim == 5 and codes.shape[1] == self.codes
         require(good, f"codes of shape {tuple(codes.shape)}: expected (batch, {self.codes}, time, rows, columns)")
-        return codes.to(self.temporal.dtype)
+        return codes.to(blocks.widened(self.temporal).dtype)
 
     def forward(self, counts: Tensor) -> Tensor:
         """Return `decode(encode(counts))`, (B, 1, T, R, C), the input of the depth network. Raises as `encode`."""

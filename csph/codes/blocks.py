@@ -2,7 +2,7 @@
 
 Order of every tensor: batch, channel, time, row, column. A block is Mt bins x Mr rows x Mc columns; blocks tile the
 histogram without overlap, so that a strided convolution is one matrix product over rearranged counts, and a
-transposed convolution its transpose. Sums are in float32, or in float64 where the weights are.
+transposed convolution its transpose. Sums are in the type of the weights.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from csph.autograd import Context, applied
-from scenes.errors import require, require_kind
+from scenes.errors import InputError, require, require_kind
 
 EPSILON = 1e-5  # of zero-normalisation, as published
 FORMED = 4  # entries for each count, at most, of a separable coding tensor that is formed
@@ -29,7 +29,14 @@ def in_full(values: Tensor) -> torch.autocast:
     """Return the context in which sums over `values` keep their type, whatever autocast is on. Raises InputError for
     what is no tensor, as a numpy array."""
     require_kind(values, Tensor, "counts or codes", " (`torch.from_numpy` makes one)")
-    return torch.autocast(values.device.type, enabled=False)
+    # the meta device, which computes shapes alone, has no autocast
+    return torch.autocast("cpu" if values.is_meta else values.device.type, enabled=False)
+
+
+def widened(values: Tensor) -> Tensor:
+    """Return values of 16 bits in float32, in which sums over thousands of counts neither overflow nor lose photons;
+    others as they are."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def check_counts(counts: Tensor, block: tuple[int, int, int]) -> None:
@@ -44,14 +51,17 @@ def check_counts(counts: Tensor, block: tuple[int, int, int]) -> None:
 
 def check_tiling(size: tuple[int, ...], block: tuple[int, int, int]) -> None:
     """Raise InputError unless blocks of Mt x Mr x Mc tile a histogram of T x R x C."""
-    tiles = all(whole % part == 0 for whole, part in zip(size, block, strict=True))
-    given, asked = (" x ".join(map(str, numbers)) for numbers in (size, block))
-    require(tiles, f"histogram of {given} (time x rows x columns) is not tiled by blocks of {asked}")
+    if any(whole % part for whole, part in zip(size, block, strict=True)):
+        # not before: compiled layers of several sizes hold symbols, which have no text
+        given, asked = (" x ".join(map(str, numbers)) for numbers in (size, block))
+        raise InputError(f"histogram of {given} (time x rows x columns) is not tiled by blocks of {asked}")
 
 
 def _wide(values: Tensor, columns: int) -> Tensor:
     """View memory in the widest elements that a run of `columns` entries is made of: up to 16 bytes are then moved at a
     time, five times faster than one by one."""
+    if torch.compiler.is_compiling() or values.is_meta:  # neither knows where in memory the values begin
+        return values
     run = columns * values.element_size()
     for dtype, size in ((torch.complex128, 16), (torch.int64, 8), (torch.int32, 4)):
         if (

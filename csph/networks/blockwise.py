@@ -109,5 +109,5 @@ class Blockwise(Compact):
         self.late = BlockMixer(channels, block, codes)
 
     def forward(self, x: Tensor, codes: Tensor) -> Tensor:  # type: ignore[override]
-        block_codes = code_features(codes, centre=self.centre)
+        block_codes = code_features(codes, centre=self.centre).to(x.dtype)
         return self.logits(x, lambda f: self.early(f, block_codes), lambda f: self.late(f, block_codes))

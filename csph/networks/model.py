@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from csph.codes.blocks import encode_blocks
+from csph.codes.blocks import check_counts, encode_blocks
 from csph.codes.design import OWN
 from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8
 from csph.codes.tensor import CodingTensor
@@ -64,7 +64,8 @@ class DepthModel(nn.Module):
               `reach` is how many pixels around one its answer depends on, and `coarsest` the side in pixels of the
               cells that its layers pool. `save_model` knows no such network
 
-    Raises InputError for parts of another kind, and a network that lacks these numbers.
+    An empty batch has empty logits and depths. Raises InputError for parts of another kind, and a network that lacks
+    these numbers.
     """
 
     def __init__(
@@ -144,7 +145,7 @@ class DepthModel(nn.Module):
         if self.layer is not None:
             return self.layer(counts)
         require_kind(counts, Tensor, "counts", " (`torch.from_numpy` makes one)")
-        if self.config.front == "counts":
+        if self.config.front == "counts" or not len(counts):
             return counts.float()
         if self.config.front == "matched":
             return normalised_correlation(counts.float().flatten(3).squeeze(1), self.config.sensor).view(counts.shape)
@@ -155,20 +156,28 @@ class DepthModel(nn.Module):
         whole = counts if self.layer is not None else self.network_input(counts)
         firsts = first_bin.tolist()
         cut = torch.stack([one[:, first : first + window] for one, first in zip(whole, firsts, strict=True)])
-        return self(cut) if self.layer is not None else self.network(cut)
+        return self(cut) if self.layer is not None else self._logits(cut)
 
     def logits_of_codes(self, codes: Tensor) -> Tensor:
         """Return logits (B, T, R, C) of codes (B, K, T/Mt, R/Mr, C/Mc)."""
         x = self.codes_layer.decode(codes)
         if isinstance(self.network, Refined):
-            return self.network(x, codes.to(x.dtype), self.codes_layer)
-        return self.network(x, codes.to(x.dtype)) if isinstance(self.network, Blockwise) else self.network(x)
+            return self._logits(x, codes.to(x.dtype), self.codes_layer)
+        return self._logits(x, codes.to(x.dtype)) if isinstance(self.network, Blockwise) else self._logits(x)
+
+    def _logits(self, x: Tensor, *codes: object) -> Tensor:
+        """Compute logits (B, T, R, C) from what the network sees, (B, 1, T, R, C), in the type of its weights."""
+        x = x.to(next(self.network.parameters()).dtype)
+        if len(x):
+            return self.network(x, *codes)
+        check_counts(x, (1, 1, 1))
+        return x.squeeze(1)
 
     def forward(self, counts: Tensor) -> Tensor:
         """Return logits (B, T, R, C) of counts (B, 1, T, R, C) that blocks tile."""
         if self.config.sees_codes and self.layer is not None:
             return self.logits_of_codes(self.layer.encode(counts))
-        return self.network(self.network_input(counts))
+        return self._logits(self.network_input(counts))
 
     def position(self, logits: Tensor, decoder: Decoder | None = None) -> Tensor:
         """Return the answer in bins from the edge of bin 0, (B, T, R, C) -> (B, R, C); decoder None: the

@@ -135,10 +135,10 @@ def transposed_conv_x2(x: Tensor, weight: Tensor) -> Tensor:
 
 
 def check_input(x: Tensor, factor: int) -> None:
-    """Raise InputError unless x is (B, 1, T, R, C) with T a multiple of `factor`."""
+    """Raise InputError unless x is (B, 1, T, R, C), none of them 0, with T a multiple of `factor`."""
     shape = tuple(x.shape)
     good = len(shape) == 5 and shape[1] == 1 and 0 not in shape
-    require(good, f"network input of shape {shape}: expected (batch, 1, time, rows, columns)")
+    require(good, f"network input of shape {shape}: expected (batch, 1, time, rows, columns), each 1 or more")
     require(shape[2] % factor == 0, f"network input of {shape[2]} bins: expected a multiple of {factor}")
 
 

@@ -65,7 +65,7 @@ class Refined(Blockwise):
         channels_last(self)
 
     def forward(self, x: Tensor, codes: Tensor, layer: CompressiveLayer) -> Tensor:  # type: ignore[override]
-        block_codes = code_features(codes, centre=self.centre)
+        block_codes = code_features(codes, centre=self.centre).to(x.dtype)
         features, slices = self.features(x, lambda f: self.early(f, block_codes), lambda f: self.late(f, block_codes))
         first = logits_of(features, slices, self.fine, self.skip_gates, x)
         posterior = first.softmax(1).view(x.shape)
@@ -83,11 +83,11 @@ class Refined(Blockwise):
     def _correction(self, features: Tensor, residual: Tensor, posterior: Tensor, layer: CompressiveLayer) -> Tensor:
         """Compute what the second look adds to the logits, (B, T, R, C)."""
         batch, (rows, columns) = len(posterior), posterior.shape[-2:]
-        slices = layer.back_project(residual).reshape(-1, FOLD, rows, columns)
+        slices = layer.back_project(residual).to(posterior.dtype).reshape(-1, FOLD, rows, columns)
         both = torch.cat([time_to_channels(slices), time_to_channels(posterior.reshape(-1, FOLD, rows, columns))], 1)
         both = both.contiguous(memory_format=torch.channels_last)
         features = self.second(features + over_time(self.residual_stem, both, batch), batch)
         length = torch.linalg.vector_norm(residual, dim=1, keepdim=True)
-        left = torch.cat([residual, length], 1).permute(0, 2, 3, 4, 1)
+        left = torch.cat([residual, length], 1).to(posterior.dtype).permute(0, 2, 3, 4, 1)
         features = self.third(self.residual_mixer(features, left), batch)
         return logits_of(features, slices, self.correction, self.correction_gates, posterior)
