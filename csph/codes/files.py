@@ -1,32 +1,58 @@
-"""Coding tensors in files: .npy in, and text tables out, in decimal or rounded to 8-bit integers."""
+"""Coding tensors in files, as .npy arrays and as text tables: in decimal, or rounded to 8-bit integers."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from csph.codes.design import OWN, Design
 from csph.codes.quantise import quantised
 from csph.codes.tensor import CodingTensor
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.files import read_array, whole_file
-from scenes.io.inputs import file_sha256
+from scenes.io.inputs import file_sha256, read_text
+
+FACTOR = re.compile(
+    r"^# (temporal|spatial), shape (\d+(?: x \d+)*)(?:, int8, one step is (\S+))?\n((?:[^#\n][^\n]*\n)+)", re.MULTILINE
+)
 
 
 def read_codes(path: Path) -> CodingTensor:
-    """Read a coding tensor, (K, Mt) or (K, Mt, Mr, Mc), from a .npy file; the file's name is its name.
+    """Read a coding tensor from a .npy file, (K, Mt) or (K, Mt, Mr, Mc), or from a text table of `write_codes`; the
+    file's name is its name.
 
     Raises InputError in one line that names the file.
     """
+    path = Path(path)
+    parts = _text_parts(path) if path.suffix.lower() == ".txt" else {"temporal": _array_part(path)}
+    try:
+        return CodingTensor(path.stem, **parts)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _array_part(path: Path) -> Tensor:
     values = read_array(path)
     if values.ndim not in (2, 4):
         raise InputError(f"{path}: shape {values.shape}, expected codes (K, T) or (K, Mt, Mr, Mc)")
-    try:
-        return CodingTensor(Path(path).stem, torch.from_numpy(values.astype(np.float64)))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    return torch.from_numpy(values.astype(np.float64))
+
+
+def _text_parts(path: Path) -> dict[str, Tensor]:
+    """Read the factors of a text table by their names. Raises InputError that names the file."""
+    parts = {}
+    for name, shape, step, rows in FACTOR.findall(read_text(path, "table of codes")):
+        try:
+            values = np.array([row.split() for row in rows.splitlines()], np.float64) * float(step or 1)
+            parts[name] = torch.from_numpy(values.reshape([int(size) for size in shape.split(" x ")]))
+        except ValueError:
+            raise InputError(f"{path}: {name} part holds other than the {shape} numbers that it states") from None
+    require("temporal" in parts, f"{path}: is no table of codes as `export` writes it")
+    return parts
 
 
 def own_codes(path: Path) -> tuple[Design, CodingTensor]:
@@ -39,7 +65,7 @@ def own_codes(path: Path) -> tuple[Design, CodingTensor]:
     sha256 = file_sha256(path)
     design = Design(OWN, coding.block, coding.codes, full=several, spatial_learned=False, sha256=sha256)
     # (K, Mt, 1, 1) are codes (K, Mt) of single pixels
-    return design, CodingTensor(design.name, coding.temporal if several else coding.temporal.flatten(1))
+    return design, CodingTensor(design.name, coding.tensor if several else coding.tensor.flatten(1))
 
 
 def write_codes(coding: CodingTensor, path: Path, *, int8: bool = False) -> Path:
@@ -52,8 +78,9 @@ def write_codes(coding: CodingTensor, path: Path, *, int8: bool = False) -> Path
         exact = quantised(coding) if int8 else None
         whole = coding.tensor.numpy() if exact is None else exact.tensor
         flat = whole[..., 0, 0] if coding.block[1:] == (1, 1) else whole
-        with whole_file(path) as beside:
-            np.save(beside, np.ascontiguousarray(flat))
+        # to an open file: numpy would add .npy to a name that ends in .NPY
+        with whole_file(path) as beside, beside.open("wb") as file:
+            np.save(file, np.ascontiguousarray(flat))
         if exact is not None:
             with whole_file(step_file(path)) as beside:
                 beside.write_text(f"{_heading(coding)}\n# int8, one step is\n{exact.scale:.9g}\n")

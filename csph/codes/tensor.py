@@ -30,7 +30,8 @@ class CodingTensor:
     steps     weight of one step of the temporal and of the spatial part where both are whole steps within +-127
               already, as those of a layer trained with `int8`; None for others
 
-    Raises InputError for other shapes, values that are not finite, and more codes than counts.
+    Both parts are kept in float32, also those given in float64 or 16 bits. Raises InputError for other shapes, values
+    that are not finite, or not in float32, and more codes than counts.
     """
 
     name: str
@@ -99,7 +100,8 @@ class CodingTensor:
 
     @cached_property
     def table(self) -> Tensor:
-        """Return the tensor as `encode_photons` wants it, (Mt Mr Mc, K): a row for each place in the block."""
+        """Return the tensor as `encode_photons` wants it, (Mr Mc Mt, K): a row for each place in the block,
+        time fastest."""
         return photon_table(self.tensor)
 
     @property
