@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,10 @@ if TYPE_CHECKING:
     from spad.formats.histogram import Histogram
     from spad.sensor.model import Sensor
 
+log = logging.getLogger("scene2spad")
+
 CODES = ("fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
+CODES_FILES = (".npy", ".txt")
 Method = Callable[["Histogram"], np.ndarray]
 
 
@@ -24,20 +28,14 @@ def depth_method(name: str, sensor: Sensor, *, seed: int = 0) -> Method:
     """Return the depth method of a name: a function of a histogram that gives depth (H, W) [m].
 
     An estimator (argmax, matched, ...), a temporal code and its number (fourier-16) decoded by correlation, the name or
-    file of a network, or codes (K, T) of one's own in a .npy file. Raises InputError for anything else.
+    file of a network, or a file of one's own codes (`codes_method`). Raises InputError for anything else.
     """
     from spad.estimators.depth import METHODS, histogram_depth_m
 
     if name in METHODS:
         return lambda histogram: histogram_depth_m(histogram, name)
-    if name.endswith(".npy"):
-        from csph.codes.files import read_codes
-
-        coding = read_codes(Path(name))
-        bins, rows, columns = coding.block
-        alone = f"{name}: codes of blocks of {bins} bins x {rows} rows x {columns} columns, expected those of one pixel"
-        require((bins, rows, columns) == (sensor.bins, 1, 1), f"{alone} over the {sensor.bins} bins of {sensor.name}")
-        return decoded_by(coding)
+    if is_codes_file(name):
+        return codes_method(Path(name), sensor)
     found = re.fullmatch(r"([a-z-]+?)-(\d{1,4})", name)
     if found is not None and found[1] in CODES:
         from csph import CodingTensor, temporal_code
@@ -49,9 +47,38 @@ def depth_method(name: str, sensor: Sensor, *, seed: int = 0) -> Method:
     try:
         model = load_model(checkpoint_of(name))[0]
     except InputError as error:
-        kinds = f"{', '.join(METHODS)}, a code such as fourier-16, codes in a .npy file or a network"
+        kinds = f"{', '.join(METHODS)}, a code such as fourier-16, codes in a file (.npy, .txt) or a network"
         raise InputError(f"method {name!r} is none of {kinds}: {error}") from None
     return lambda histogram: model.estimate(histogram).depth_m
+
+
+def is_codes_file(name: str | Path) -> bool:
+    """Tell by its ending whether a method's name is that of a file of codes."""
+    return Path(name).suffix.lower() in CODES_FILES
+
+
+def codes_method(path: Path, sensor: Sensor) -> Method:
+    """Return the method of a file of one's own codes over one pixel: (K, T) as .npy, or a text table of `export`.
+
+    Warns of codes that depend on each other. Raises InputError that names the file for those of other blocks or bins,
+    and those that tell no depth.
+    """
+    from csph.codes.decode import check_decodable, decoded_rank
+    from csph.codes.files import read_codes
+
+    coding = read_codes(path)
+    bins, rows, columns = coding.block
+    alone = f"{path}: codes of blocks of {bins} bins x {rows} rows x {columns} columns, expected those of one pixel"
+    require((bins, rows, columns) == (sensor.bins, 1, 1), f"{alone} over the {sensor.bins} bins of {sensor.name}")
+    try:
+        check_decodable(coding)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    rank = decoded_rank(coding)
+    if rank < coding.codes:
+        told = "%s: its %d codes have rank %d where a uniform background is removed: so many numbers tell depth"
+        log.warning(told, path, coding.codes, rank)
+    return decoded_by(coding)
 
 
 def decoded_by(coding: CodingTensor) -> Method:

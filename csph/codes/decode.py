@@ -10,12 +10,48 @@ import torch
 from torch import Tensor
 
 from csph.codes.tensor import CodingTensor, as_tensor, encode
-from scenes.errors import InputError, require_kind
+from scenes.errors import InputError, require, require_kind
 from spad.estimators.depth import by_pixels, correlate, depth_in_range, grid_peak, noise_free_bias_m
 from spad.sensor.model import Sensor
 from spad.sensor.template import FINE_STEP, pulse_taps
 
 _TIE = 1e-6  # of the largest score: what float32 sums cannot tell apart
+
+
+def _matrix(coding: CodingTensor, device: str = "cpu") -> Tensor:
+    return coding.tensor.flatten(1).double().to(device)
+
+
+def _background(matrix: Tensor) -> Tensor:
+    """Compute C 1, (K,): what a uniform background adds to the codes; 0 where it is no more than rounding."""
+    uniform = matrix.sum(-1)
+    return torch.where(uniform.abs() > 1e-5 * matrix.abs().sum(-1), uniform, 0.0)
+
+
+@lru_cache(maxsize=32)
+def decoded_rank(coding: CodingTensor) -> int:
+    """Return the rank of P C, P as in `_templates`: how many directions of the codes depth is found from.
+
+    A direction counts if its singular value tells two scores apart, whose templates it turns by an angle a: a^2 / 2
+    must exceed a tie. It must exceed what the rounding of C to float32 leaves, too.
+    """
+    matrix = _matrix(coding)
+    uniform = _background(matrix)
+    left = matrix - torch.outer(uniform, uniform @ matrix) / (uniform @ uniform) if uniform.any() else matrix
+    values = torch.linalg.svdvals(left)
+    resolved = math.sqrt(2 * _TIE) * float(values[0])
+    return int((values > max(resolved, torch.finfo(torch.float32).eps * float(matrix.norm()))).sum())
+
+
+def check_decodable(coding: CodingTensor) -> None:
+    """Raise InputError for codes from which correlation finds no depth: one code, or `decoded_rank` below 2.
+
+    Two codes that do not sum to zero may have rank 1: more is not left of them, and its sign tells two gates apart.
+    """
+    require(coding.codes >= 2, f"{coding.name}: 1 code tells nothing but a sign, correlation over K needs 2 or more")
+    rank, least = decoded_rank(coding), min(2, coding.codes - bool(_background(_matrix(coding)).any()))
+    told = f"coding tensor {coding.name}: its {coding.codes} codes have rank {rank} where a uniform background is"
+    require(rank >= least, f"{told} removed, depth by correlation needs {least} or more")
 
 
 @lru_cache(maxsize=8)
@@ -28,11 +64,10 @@ def _templates(coding: CodingTensor, sensor: Sensor, device: str) -> Tensor:
     K = 2 codes only a sign would be left.
     """
     taps = pulse_taps(sensor, device)
-    matrix = coding.tensor.flatten(1).double().to(device)
+    matrix = _matrix(coding, device)
     first = int(taps.shifts[0])
     templates = torch.stack([correlate(matrix, step.unsqueeze(0), first, sensor).T for step in taps.fine], dim=1)
-    uniform = matrix.sum(-1)
-    uniform = torch.where(uniform.abs() > 1e-5 * matrix.abs().sum(-1), uniform, 0.0)
+    uniform = _background(matrix)
     if uniform.any():
         templates = templates - (templates @ uniform).unsqueeze(-1) * uniform / (uniform @ uniform)
     return templates / templates.norm(dim=-1, keepdim=True).clamp(min=1e-30)
@@ -74,15 +109,14 @@ def decode_depth(codes: Tensor | np.ndarray, coding: CodingTensor, sensor: Senso
     `codes` may be a numpy array. h(tau) is the binned pulse. Searched over the bin centres, then over a grid of
     eighths of a bin and a parabola; of equal scores the first, of neighbours that score alike their middle; the
     noise-free answer is subtracted as in `spad.estimators.depth`. NaN where all codes are zero. Raises InputError for
-    another number of codes or bins, and codes that are not finite.
+    another number of codes or bins, codes that are not finite, and a coding tensor of rank below 2.
     """
     require_kind(coding, CodingTensor, "decode_depth", " of `coding_tensor`")
     require_kind(sensor, Sensor, "decode_depth")
     codes = as_tensor(codes)
     if coding.bins != sensor.bins:
         raise InputError(f"coding tensor {coding.name} has {coding.bins} bins, sensor {sensor.name} has {sensor.bins}")
-    if coding.codes < 2:
-        raise InputError(f"{coding.name}: 1 code tells nothing but a sign, correlation over K needs 2 or more")
+    check_decodable(coding)
     if codes.ndim < 1 or codes.shape[-1] != coding.codes:
         raise InputError(
             f"codes of shape {tuple(codes.shape)}: the last axis must be the {coding.codes} of {coding.name}"

@@ -309,7 +309,7 @@ def classical(name: str) -> Callable[[Tensor, Sensor], Tensor]:
         return lambda counts, sensor: estimate_depth(counts, sensor, name)
     code, _, number = name.rpartition("-")
     numbered = code != "" and number.isascii() and number.isdigit()
-    require(numbered, f"baseline {name!r}: expected {', '.join(METHODS)}, or CODE-K")
+    require(numbered, f"baseline {name!r}: expected {', '.join(METHODS)}, CODE-K or codes in a file (.npy, .txt)")
 
     def compressive(counts: Tensor, sensor: Sensor) -> Tensor:
         coding = _coding(code, int(number), sensor)

@@ -148,7 +148,8 @@ class Evaluate(Common):
     paper's pairs, in its own simulation, read by both decoders (middlebury/NAME/ with view1.png, disp1.png and dmin.txt
     of half size, in $SCENE2SPAD_DATA)."""
     baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
-    """Estimators of `depth`, and CODE-K decoded without a network."""
+    """Estimators of `depth`, and codes decoded without a network: CODE-K, or your own (K, T) in a file (.npy, or .txt
+    as `export` writes it)."""
     levels: tuple[str, ...] = ()
     """Photon levels, mean signal + background a pixel, as in 1+100 3+3 (default: the paper's 16); each gets a line."""
     law: Annotated[

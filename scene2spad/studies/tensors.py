@@ -16,6 +16,7 @@ from csph.codes.files import read_codes
 from csph.weights.cards import checkpoint_of, model_coding
 from csph.weights.shipped import checkpoint_name, shipped_file
 from csph.weights.torch_files import load_torch_file
+from scene2spad.methods import is_codes_file
 from scene2spad.networks.registry import ModelSpec
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import save
@@ -74,13 +75,13 @@ def coding_of(path: Path) -> CodingTensor:
 
     A model is a name (`models`), a run's folder or its checkpoint (.safetensors), and lends its name; a file of another
     program is a checkpoint whose state holds `temporal` and maybe `spatial` (of one layer, under any prefix), or a .npy
-    array (K, Mt) or (K, Mt, Mr, Mc).
+    array (K, Mt) or (K, Mt, Mr, Mc); tables of codes (.txt) are those of `export`.
     """
     path = checkpoint_of(path)
     if path.is_dir() or path.suffix == ".safetensors":
         return replace(model_coding(path), name=checkpoint_name(path))
     regular_file(path)
-    if path.suffix == ".npy":
+    if is_codes_file(path):
         return read_codes(path)
     state = load_torch_file(path)
     state = state.get("state_dict", state) if isinstance(state, dict) else {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from scene2spad.cli.opening import open_for_depth, open_transient, pixel_sensor
 from scene2spad.cli.paths import beside_folder, holds_kind, input_file, output_file, picture
-from scene2spad.methods import depth_method
+from scene2spad.methods import codes_method, depth_method, is_codes_file
 from scene2spad.options.common import Common, Count, File, Number, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.progress import Progress
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from csph.networks.model import DepthModel
+    from scene2spad.methods import Method
     from spad.formats.histogram import Histogram
     from spad.sensor.model import Sensor
 
@@ -64,7 +66,8 @@ class Depth(Common):
     codes: Count = None
     """Number K of codes kept per pixel by `--method compressive` (default: 16)."""
     codes_file: File = None
-    """Codes of your own for `--method compressive`, (K, T) in a .npy file, instead of --code and --codes."""
+    """Codes of your own for `--method compressive`, (K, T) in a file (.npy, or .txt as `export` writes it), instead of
+    --code and --codes."""
     frame: int = 0
     """Frame of a capture (.mat) of several, from 0."""
     sensor: Annotated[str | None, may_stay_open("NAME")] = None
@@ -105,7 +108,7 @@ def run(command: Depth, progress: Progress) -> dict:
         require(not asked, message)
         histogram, sensed = open_for_depth(source, command.frame), ""
     progress(command.method, 0.1)
-    result = _estimated(command, network, histogram, source, out)
+    result = _estimated(command, network, partial(_chosen_method, command), histogram, source, out)
     result = ({"sensed": sensed} if sensed else {}) | result
     return result if command.json else readable(result)
 
@@ -160,13 +163,14 @@ def _run_folder(command: Depth, label: str, progress: Progress) -> dict:
     network = _network(command)
     targets = [out / f"{file.stem}-{label}.exr" for file in files]
     views, sensed = [], ""
+    choose = cache(partial(_chosen_method, command))  # a file of codes is read, and warned of, once
     for number, (file, target) in enumerate(zip(files, targets, strict=True)):
         progress(file.name, number / len(files))
         histogram, words = _sensed(command, input_file(file), command.seed + number)
         sensed = sensed or f"{words} and more, one for each"
         out.mkdir(exist_ok=True)
         output_file(target, ".exr", "depth", figure=command.figure)
-        found = _estimated(command, network, histogram, file, target)
+        found = _estimated(command, network, choose, histogram, file, target)
         views.append({"file": str(file), **{key: found[key] for key in (*MEANS, *COUNTS, "out")}})
     log.info("%s: %d transients sensed %s", folder, len(files), sensed)
     means = {key: _mean([view[key] for view in views]) for key in MEANS}
@@ -181,7 +185,14 @@ def _mean(values: Sequence[float] | np.ndarray) -> float:
     return float(known.mean()) if known.size else float("nan")
 
 
-def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram, source: Path, out: Path) -> dict:
+def _estimated(
+    command: Depth,
+    network: DepthModel | None,
+    choose: Callable[[Sensor], Method],
+    histogram: Histogram,
+    source: Path,
+    out: Path,
+) -> dict:
     """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
     from spad.estimators.depth import confidence_map, histogram_errors
     from spad.formats.bistatic import pointing_of
@@ -189,7 +200,7 @@ def _estimated(command: Depth, network: DepthModel | None, histogram: Histogram,
     label = depth_label(command)
     start = time.perf_counter()
     if network is None:
-        depth = _chosen_method(command, histogram.sensor)(histogram)
+        depth = choose(histogram.sensor)(histogram)
         seconds = time.perf_counter() - start
         sure = confidence_map(histogram, depth, command.method)
     else:
@@ -249,8 +260,8 @@ def _check_codes(command: Depth) -> None:
     """Raise InputError for options of codes that the method, or a file of codes, leaves without a meaning."""
     compressive, own = command.method == "compressive", command.codes_file is not None
     purpose = "--method compressive"
-    array = command.codes_file is None or command.codes_file.suffix == ".npy"
-    require(array, f"--codes-file {command.codes_file}: expected codes (K, T) in a .npy file")
+    known = command.codes_file is None or is_codes_file(command.codes_file)
+    require(known, f"--codes-file {command.codes_file}: expected codes (K, T) in a .npy file, or a .txt of `export`")
     only_for(command, "depth", dict.fromkeys(("code", "codes", "codes_file"), (compressive, purpose)))
     only_for(command, "depth", dict.fromkeys(("code", "codes"), (not own, f"{purpose} without --codes-file")))
 
@@ -275,10 +286,10 @@ def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "f
     )
 
 
-def _chosen_method(command: Depth, sensor: Sensor) -> Callable[[Histogram], np.ndarray]:
+def _chosen_method(command: Depth, sensor: Sensor) -> Method:
     """Return the method without a network that the options name."""
     if command.codes_file is not None:
-        return depth_method(str(input_file(command.codes_file)), sensor)
+        return codes_method(input_file(command.codes_file), sensor)
     name = _code_name(command) if command.method == "compressive" else command.method
     return depth_method(name, sensor, seed=command.seed)
 
