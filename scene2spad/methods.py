@@ -76,8 +76,8 @@ def codes_method(path: Path, sensor: Sensor) -> Method:
         raise InputError(f"{path}: {error}") from None
     rank = decoded_rank(coding)
     if rank < coding.codes:
-        told = "%s: its %d codes have rank %d where a uniform background is removed: so many numbers tell depth"
-        log.warning(told, path, coding.codes, rank)
+        message = "%s: its %d codes have rank %d where a uniform background is removed: so many numbers tell depth"
+        log.warning(message, path, coding.codes, rank)
     return decoded_by(coding)
 
 

@@ -50,8 +50,8 @@ def check_decodable(coding: CodingTensor) -> None:
     """
     require(coding.codes >= 2, f"{coding.name}: 1 code tells nothing but a sign, correlation over K needs 2 or more")
     rank, least = decoded_rank(coding), min(2, coding.codes - bool(_background(_matrix(coding)).any()))
-    told = f"coding tensor {coding.name}: its {coding.codes} codes have rank {rank} where a uniform background is"
-    require(rank >= least, f"{told} removed, depth by correlation needs {least} or more")
+    ranked = f"coding tensor {coding.name}: its {coding.codes} codes have rank {rank} where a uniform background is"
+    require(rank >= least, f"{ranked} removed, depth by correlation needs {least} or more")
 
 
 @lru_cache(maxsize=8)

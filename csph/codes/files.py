@@ -30,7 +30,7 @@ def read_codes(path: Path) -> CodingTensor:
     path = Path(path)
     parts = _text_parts(path) if path.suffix.lower() == ".txt" else {"temporal": _array_part(path)}
     try:
-        return CodingTensor(path.stem, **parts)
+        return CodingTensor(path.stem, parts["temporal"], parts.get("spatial"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
