@@ -32,9 +32,10 @@ def zero_normalised(values: Tensor, axis: int, epsilon: float) -> Tensor:
 
 
 def back_project(codes: Tensor, tensor: Tensor, epsilon: float) -> Tensor:
-    """Return back-project codes by a transposed strided convolution, codes and tensor zero-normalised over K.
+    """Project codes back onto time bins and pixels by a transposed strided convolution.
 
-    codes (B, K, T / Mt, R / Mr, C / Mc), tensor (K, Mt, Mr, Mc) -> (B, 1, T, R, C).
+    Codes and tensor are zero-normalised over K first: codes (B, K, T / Mt, R / Mr, C / Mc), tensor (K, Mt, Mr, Mc) ->
+    (B, 1, T, R, C).
     """
     kernel = zero_normalised(tensor.unsqueeze(1), 0, epsilon)
     return torch.nn.functional.conv_transpose3d(zero_normalised(codes, 1, epsilon), kernel, stride=tensor.shape[1:])

@@ -1,5 +1,4 @@
-"""Measure how many of a block's pixels codes tell apart: participation rank and coherence of a coding tensor's spatial
-part."""
+"""Measure how well codes tell the pixels of a block apart: participation rank and coherence of a coding tensor."""
 
 from __future__ import annotations
 
@@ -8,8 +7,10 @@ from torch import Tensor
 
 
 def pixel_gram(weights: Tensor) -> Tensor:
-    """Return inner products of what the codes of a tensor (K, Mt, Mr, Mc), or (K, Mt) of one pixel, are for each two
-    pixels, (Mr Mc, Mr Mc)."""
+    """Return the Gram matrix (Mr Mc, Mr Mc) of the pixels of a coding tensor (K, Mt, Mr, Mc), or (K, Mt) of one pixel.
+
+    Entry (p, q) is the inner product, over codes and time bins, of the weights of pixels p and q.
+    """
     rows = weights.reshape(weights.shape[0] * weights.shape[1], -1)
     return rows.T @ rows
 

@@ -29,12 +29,15 @@ def stored(counts: ArrayLike, compressive: ArrayLike, codes: ArrayLike, factor: 
 
 
 def data_compression(counts: ArrayLike, compressive: ArrayLike, codes: ArrayLike) -> np.ndarray:
-    """Return off-sensor: N / (B K)."""
+    """Return how many times less data leave the sensor than without compression: N / (B K)."""
     return np.asarray(counts, dtype=float) / transmitted(compressive, codes)
 
 
 def memory_compression(counts: ArrayLike, compressive: ArrayLike, codes: ArrayLike, factor: float = 1.0) -> np.ndarray:
-    """Return in-sensor: N / (K (B + M / factor)). Below 1 the codes and their tensor need more than the histogram."""
+    """Return how many times less memory the sensor needs than without compression: N / (K (B + M / factor)).
+
+    Below 1 the codes and their tensors need more memory than the histogram.
+    """
     return np.asarray(counts, dtype=float) / stored(counts, compressive, codes, factor)
 
 
@@ -45,5 +48,5 @@ def best_blocks(counts: ArrayLike, factor: float = 1.0) -> np.ndarray:
 
 
 def separable_factor(bins: int, rows: int, columns: int) -> float:
-    """Return mt Mr Mc / (Mt + Mr Mc): how much smaller a separable tensor of this block is than a full one."""
+    """Return Mt Mr Mc / (Mt + Mr Mc): how much smaller a separable tensor of this block is than a full one."""
     return bins * rows * columns / (bins + rows * columns)

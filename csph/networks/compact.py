@@ -62,8 +62,8 @@ class _ResidualConv3d(nn.Module):
         return x + self.whole(x).relu_()
 
 
-# What modules of `Compact` are called in checkpoints: files of before the modules had these names are read, and files
-# and their hashes stay what they were.
+# Names of the modules of `Compact` in checkpoints. They are those that older versions gave the modules, so that their
+# checkpoints are read and hashes of weights do not change.
 IN_FILES = {
     "full_resolution": "near",
     "half_resolution": "middle",

@@ -21,7 +21,10 @@ GRIDS: tuple[str, ...] = ("continuous", "published")
 
 
 def published_centroid_bins(sensor: Sensor) -> float:
-    """Return centroid of the published test pulse in bins after its fullest bin (-0.44 on the reference sensor)."""
+    """Return how far the centroid of the published test pulse lies behind its fullest bin, in bins.
+
+    It is -0.44 on the reference sensor, where the centroid comes before the fullest bin.
+    """
     taps = published_taps(sensor)
     return float(taps @ np.arange(len(taps)) - taps.argmax())
 

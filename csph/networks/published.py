@@ -79,28 +79,34 @@ class DeepBoosting(nn.Module):
         nn.init.normal_(_weight(self.up[-1]), std=_UP_INIT_STD)
 
     def multiscale(self, x: Tensor) -> Tensor:
-        """Return (B, 1, T, R, C) -> (B, 8, T, R, C), features at dilations 1, 2, 1 on 2, and 2 on 1."""
+        """Return features (B, 8, T, R, C) of a histogram (B, 1, T, R, C), two channels from each of four branches.
+
+        In order: a convolution of dilation 1, one of dilation 2, dilation 1 after dilation 2, and 2 after 1.
+        """
         first, second = self.a1(x).relu_(), self.a2(x).relu_()
         return torch.cat([first, second, self.a3(second).relu_(), self.a4(first).relu_()], 1)
 
     def contract(self, features: Tensor) -> Tensor:
-        """Return (B, 8, T, R, C) -> (B, 32, T/16, R, C)"""
+        """Return features (B, 32, T/16, R, C) of (B, 8, T, R, C): a 1x1x1 convolution to two channels, then four
+        convolutions that each halve the time axis."""
         x = self.c1(features).relu_()
         for step in self.ds:
             x = step(x).relu_()
         return x
 
     def boost(self, x: Tensor) -> Tensor:
-        """Return (B, 32, T/16, R, C) -> (B, 112, T/16, R, C)"""
+        """Return features (B, 112, T/16, R, C) of (B, 32, T/16, R, C): ten dense blocks add 8 channels each."""
         for block in self.blocks:
             x = block(x)
         return x
 
     def expand(self, x: Tensor) -> Tensor:
-        """Return (B, 112, T/16, R, C) -> logits (B, T, R, C).
+        """Return logits (B, T, R, C) of features (B, 112, T/16, R, C).
 
-        No ReLU stands between up4 and the 1x1x1 convolution: their product is one transposed convolution to a single
-        channel, a seventh of up4's work.
+        Four transposed convolutions each double the time axis, and a 1x1x1 convolution leaves one channel.
+
+        No ReLU stands between the last two of these. They are computed as one transposed convolution with the product
+        of their kernels, which has one output channel instead of seven, and takes a seventh of the work.
         """
         for step in self.up[:-1]:
             x = transposed_conv_x2(x, _weight(step)).relu_()

@@ -36,8 +36,8 @@ def _entry(name: str, model: DepthModel, config: TrainConfig) -> JsonObject:
 def ancestors_of(config: TrainConfig, folder: Path = WEIGHTS) -> tuple[JsonObject, ...]:
     """Return the models that a trained one goes back to, nearest first; of random weights none.
 
-    Runs of before kept the name and the hash of the first alone: shipped models are known by both, of others that hash
-    is all there is.
+    Runs written by older versions keep only the name of the model that they began with, and the hash of its weights. If
+    both are those of a shipped model, its own configuration tells its ancestors. Of other models no more is known.
     """
     data = config.data
     if isinstance(data.get("ancestors"), list):

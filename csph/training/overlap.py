@@ -20,8 +20,9 @@ class Overlap(NamedTuple):
 def overlap(training: Sequence[Views], validation: Sequence[Views]) -> Overlap:
     """Count the validation views that are among the training views, and those whose scenes are.
 
-    Sets of different seeds have scenes of the same names, and packs of before name no seed: scenes are the same where
-    both name and seed are, or a view of each shows the same surfaces by the same camera.
+    Sets of different seeds have scenes of the same names, so that a name alone tells nothing. Packs written by older
+    versions name no seed. Two scenes are the same if name and seed are known and equal, if their hashes of surfaces and
+    camera are, or if a view of one has the depth map of a view of the other.
     """
     trained_views = {view_key(view) for views in training for view in views.transients}
     trained_scenes = {key for views in training for keys in _keys_by_scene(views).values() for key in keys}

@@ -12,13 +12,17 @@ from scenes.errors import require
 from scenes.files import whole_file
 from scenes.io.inputs import read_bytes
 
-KEPT = "codes.npy"  # of a run: a copy of the file
+KEPT = "codes"  # of a run: a copy of the file, with its ending
 FILE = "codes_file"  # in a configuration's data: where the file lies
+
+
+def _kept(file: Path, folder: Path) -> Path:
+    return folder / f"{KEPT}{file.suffix.lower()}"
 
 
 def codes_path(file: Path, folder: Path) -> Path:
     """Return a file of own codes, or its copy in a run's folder where it is gone."""
-    kept = folder / KEPT
+    kept = _kept(file, folder)
     return kept if kept.is_file() and not file.exists() else file
 
 
@@ -40,8 +44,11 @@ def own_codes_of(config: TrainConfig, folder: Path) -> CodingTensor | None:
 
 def keep_codes(config: TrainConfig, folder: Path) -> None:
     """Copy a run's file of own codes into its folder, unless it is there."""
-    kept = folder / KEPT
-    if FILE in config.data and not kept.is_file():
-        contents = read_bytes(Path(str(config.data[FILE])))
+    if FILE not in config.data:
+        return
+    file = Path(str(config.data[FILE]))
+    kept = _kept(file, folder)
+    if not kept.is_file():
+        contents = read_bytes(file)
         with whole_file(kept) as beside:
             beside.write_bytes(contents)

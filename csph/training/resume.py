@@ -43,12 +43,13 @@ def _check_same(folder: Path, config: TrainConfig) -> None:
     """Raise InputError where a run's folder was made by another configuration."""
     known = read_json_object(folder / "config.json", "configuration")
     refusal = f"{folder}: holds a run with other options or another set"
-    try:  # by what it says: a file of before an option was there means its default
+    try:  # compared as configurations: options that a file of an older version lacks have their defaults
         there = TrainConfig.from_dict(known).to_dict()
     except InputError:
         raise InputError(f"{refusal}; choose another --out") from None
     stood, asked = (json.loads(json.dumps(one)) for one in (there, config.to_dict()))
-    for one in (stood, asked):  # runs of before kept no ancestors; hashes decide, of own codes, too
+    # hashes tell what a run began with, and own codes; older versions wrote no ancestors, and files may move
+    for one in (stood, asked):
         for name in ("ancestors", FILE):
             one["data"].pop(name, None)
     differing = _differences(stood, asked)

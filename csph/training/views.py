@@ -161,7 +161,7 @@ def _short_hash(content: bytes) -> str:
 
 
 def is_seen(view: Transient, keys: Set[str]) -> bool:
-    """Tell whether a view is among those of some keys, of runs of before, too, whose keys held the mixed pixels."""
+    """Tell whether one of the keys is that of a view. Keys written by older versions hash its mixed pixels, too."""
     shown = _shown(view)
     before = shown + view.mixed.astype(np.uint8).tobytes()
     return not keys.isdisjoint((_short_hash(shown), _short_hash(before)))
@@ -178,7 +178,10 @@ def write_seen(folder: Path, sets: Iterable[Views], inherited: Set[str] = frozen
 
 
 def read_seen(checkpoint: Path, name: str = SEEN) -> frozenset[str] | None:
-    """Return the keys of the views that a run's folder, or a checkpoint in one, was trained on (SEEN), or its ancestors
-    (ANCESTORS_SEEN); None where nobody kept them, as of runs of before."""
+    """Return the keys of the views that a run, given by its folder or a checkpoint in it, was trained on.
+
+    `name` = ANCESTORS_SEEN asks for the views of its ancestors instead. None where the folder holds no such file, as
+    those written by older versions.
+    """
     path = (checkpoint if checkpoint.is_dir() else checkpoint.parent) / name
     return frozenset(path.read_text(errors="replace").split()) if path.is_file() else None
