@@ -64,8 +64,7 @@ class DepthModel(nn.Module):
               `reach` is how many pixels around one its answer depends on, and `coarsest` the side in pixels of the
               cells that its layers pool. `save_model` knows no such network
 
-    An empty batch has empty logits and depths. Raises InputError for parts of another kind, and a network that lacks
-    these numbers.
+    An empty batch has empty logits. Raises InputError for parts of another kind, and a network without these numbers.
     """
 
     def __init__(
@@ -249,8 +248,7 @@ class DepthModel(nn.Module):
             part = histogram.counts
             if len(down.read) != rows or len(across.read) != columns:
                 part = part[down.read[:, None], across.read]
-            # time moves from the last axis to the first by transposing a matrix of pixels x bins, which torch copies in
-            # tiles: a third of the time of permuting the image's axes
+            # a transposed matrix of pixels x bins: torch copies it in a third of the time of permuted axes
             size = (1, 1, bins, len(down.read), len(across.read))
             counts = torch.from_numpy(part).reshape(-1, bins).T.contiguous().view(size)
             inside = _inside(down), _inside(across)

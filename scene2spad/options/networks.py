@@ -30,8 +30,8 @@ class Train(Long):
     full: bool = False
     """A full coding tensor instead of a separable one."""
     codes_file: File = None
-    """Fixed codes of your own (.npy), (K, Mt) or (K, Mt, Mr, Mc), instead of --design, as they are: block and number
-    are the file's. The run keeps a copy, codes.npy."""
+    """Fixed codes of your own instead of --design, as they are: an array (.npy), (K, Mt) or (K, Mt, Mr, Mc), or a table
+    as `export` writes it (.txt). Block and number are the file's. The run keeps a copy."""
     layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes", "int8"], ...] = ()
     """Switches of the layer that differ from the published one; int8 trains codes for the in-pixel processor: 8 bits
     within ranges that are learned, sums of 16 bits that wrap (begin with --init)."""
