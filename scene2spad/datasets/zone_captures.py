@@ -56,6 +56,7 @@ def read_plane_captures(path: Path) -> PlaneCaptures:
     Raises InputError in one line that names the file and what is missing, of another shape, negative or not finite.
     """
     path = Path(path)
+    require(path.suffix.lower() == ".npz", f"{path}: captures are a .npz file")
     held = read_arrays(path, "capture file")
     for name, dims in (("distance_m", 1), ("counts", 3), ("reference_counts", 2), ("chip_depth_1_mm", 2)):
         if dims == 2 and name not in held:

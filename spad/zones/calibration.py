@@ -195,7 +195,7 @@ def middle_capture(captures: Sequence[ZoneCapture]) -> ZoneCapture:
 
 
 def starting_values(
-    captures: Sequence[ZoneCapture], sensor: Sensor, zones: int, first_bin: int, basis: PulseBasis, reference: int
+    captures: Sequence[ZoneCapture], sensor: Sensor, zones: int, basis: PulseBasis, reference: int
 ) -> Values:
     """Find rough values from the captures: pulse from the middle capture, gains and delays from its zones."""
     middle = middle_capture(captures)
@@ -266,7 +266,7 @@ def calibrate(
         basis, values = start.basis, dict(start.values)
     else:
         basis = _basis_for(captures, sensor, reference)
-        values = starting_values(captures, sensor, zones.count, 0, basis, reference)
+        values = starting_values(captures, sensor, zones.count, basis, reference)
     for name, value in _OFF.items():
         if name not in free:
             values[name] = np.full_like(values[name], value)

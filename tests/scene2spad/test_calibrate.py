@@ -119,6 +119,39 @@ def shipped_without(path, change):
     np.savez(path, **arrays)
 
 
+@pytest.mark.parametrize(
+    ("distances", "words"),
+    [
+        (lambda held: held[::-1], "distance_m does not belong to counts: in 9 of 9 zones the return moves -"),
+        (lambda held: 2 * held, "distance_m does not belong to counts: in 9 of 9 zones the return moves 0.4"),
+        (lambda held: np.full_like(held, 0.3), "distinct distances in distance_m of the captures fitted: 1, which do"),
+        (lambda held: 0.25 + 0.1 * held, "distance_m spans"),
+    ],
+    ids=["reversed", "paths", "equal", "near"],
+)
+def test_distances_of_other_captures_are_refused_before_any_work(distances, words, capfd, tmp_path, monkeypatch):
+    monkeypatch.setattr("scene2spad.cli.simulation.calibrating.zone_captures", no_work)
+    monkeypatch.chdir(tmp_path)
+    with np.load(shipped_captures()) as held:
+        arrays = {"distance_m": distances(held["distance_m"]), "counts": held["counts"]}
+    np.savez("mine.npz", **arrays)
+    assert main(["calibrate", "mine.npz"]) == 2
+    err = capfd.readouterr().err
+    assert f"scene2spad: mine.npz: {words}" in err and not [*tmp_path.glob("*.toml")]
+
+
+@pytest.mark.parametrize("effects", [["delay", "background"], []])
+def test_captures_in_part_of_another_order_lead_to_no_file(effects, capfd, tmp_path, monkeypatch):
+    """Where 6 of 45 captures are others', returns still move with distance; the fit shows it, without numbers that
+    overflow."""
+    monkeypatch.chdir(tmp_path)
+    shipped_without("turned.npz", lambda counts: np.copyto(counts, np.roll(counts, -6, axis=0)))
+    options = ["--effects", *effects] if effects else []
+    assert main(["calibrate", "turned.npz", "--every", "6", *options]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("scene2spad: turned.npz: the fit ") and not [*tmp_path.glob("*.toml")]
+
+
 def no_work(*_):
     raise AssertionError("the plane was rendered")
 
@@ -190,6 +223,9 @@ def test_captures_that_a_zone_misses_are_told_and_used(capfd, tmp_path, monkeypa
         (["huge.npz"], "huge.npz: counts holds values that are not finite, negative or above"),
         (["mm.npz"], "mm.npz: distance_m 400 m is beyond the record of 1.75 m: are these millimetres?"),
         (["--sensor", "reference"], "has no zones"),
+        (["renamed.h5"], "renamed.h5: captures are a .npz file"),
+        (["--nearest", "-1"], "--nearest -1: expected a distance in m, 0 or more"),
+        (["--nearest", "nan"], "--nearest nan: expected a distance in m, 0 or more"),
         (["--every", "1"], "leaves no capture"),
         (["--nearest", "0.39"], "expected 16 or more"),
         (["--effects", "gravity"], "gravity cannot be fitted"),
@@ -203,6 +239,7 @@ def test_mistakes_end_in_one_line(arguments, words, capfd, tmp_path, monkeypatch
     np.savez(tmp_path / "thin.npz", distance_m=np.ones(3))
     distance_m, counts = np.linspace(0.1, 0.4, 20), np.ones((20, 2, 5))
     np.savez(tmp_path / "small.npz", distance_m=distance_m, counts=counts)
+    (tmp_path / "renamed.h5").write_bytes(shipped_captures().read_bytes())
     np.savez(tmp_path / "mm.npz", distance_m=1e3 * distance_m, counts=np.ones((20, 9, 128)))
     np.savez(tmp_path / "halves.npz", distance_m=distance_m, counts=0.5 * counts)
     np.savez(tmp_path / "endless.npz", distance_m=distance_m, counts=counts, reference_counts=np.full((20, 5), np.nan))

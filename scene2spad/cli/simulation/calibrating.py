@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +35,9 @@ from spad.zones.calibration import (
     poisson_deviance,
     sees_return,
 )
+from spad.zones.evidence import WRONG, check_distances, check_fit
 from spad.zones.expected_counts import ZoneCapture
-from spad.zones.sensor import expected_zone_counts
+from spad.zones.sensor import ZoneArray, expected_zone_counts
 
 log = logging.getLogger("scene2spad")
 
@@ -46,12 +49,7 @@ HOW = "calibrated from"  # first words of the sources that a written file names
 
 def run(command: Calibrate, progress: Progress) -> dict:
     """Render the plane at each distance, fit every N-th capture, score the others, write the file."""
-    require(command.out.suffix == ".toml", f"{command.out}: the output must end in .toml")
-    check_target(command.out)
-    keep_foreign(command.out, Mark("calibrated sensor", is_calibrated))
-    require(command.every >= 2, f"--every {command.every} leaves no capture to be held out, expected 2 or more")
-    require(0 <= command.model_error < 1, f"--model-error {command.model_error:g} is outside 0 to 1")
-    check_effects(command.effects)
+    _check_options(command)
     start = load_sensor(command.sensor)
     if start.zones is None:
         raise InputError(f"sensor {start.sensor.name} has no zones: its file needs a table [zones]")
@@ -64,13 +62,18 @@ def run(command: Calibrate, progress: Progress) -> dict:
     require_same_zones(chosen, start.sensor, start.zones, f"{path}: ")
     _check_every(number, command.every, path)
     _check_zones(chosen, command.every, path)
+    tried = chosen.chosen(np.arange(0, number, command.every))
+    with _told_of(path):
+        check_distances(tried.distance_m, tried.counts, start.sensor, start.zones, command.effects)
     began = time.perf_counter()
     progress("render the plane", 0.0)
     captures = zone_captures(chosen, start.sensor, start.zones)
     progress("fit", 0.3)
     used = captures[:: command.every]
     held = [one for at, one in enumerate(captures) if at % command.every]
-    fitted = calibrate(used, start.sensor, start.zones, free=command.effects, model_error=command.model_error)
+    with _told_of(path):
+        fitted = _fitted(used, start.sensor, start.zones, command)
+        check_fit(fitted, tried.counts, command.effects)
     warn_of_unknown(fitted)
     span = f"{chosen.distance_m[0]:g} to {chosen.distance_m[-1]:g} m"
     how = f"{HOW} {len(used)} captures of {path.name}, {span}"
@@ -90,6 +93,35 @@ def run(command: Calibrate, progress: Progress) -> dict:
         "standard_errors": {name: float(np.max(error)) for name, error in fitted.errors.items()},
         "out": str(command.out),
     }
+
+
+def _check_options(command: Calibrate) -> None:
+    """Raise InputError for an option that needs no file to be wrong."""
+    require(command.out.suffix == ".toml", f"{command.out}: the output must end in .toml")
+    check_target(command.out)
+    keep_foreign(command.out, Mark("calibrated sensor", is_calibrated))
+    require(command.every >= 2, f"--every {command.every} leaves no capture to be held out, expected 2 or more")
+    require(0 <= command.model_error < 1, f"--model-error {command.model_error:g} is outside 0 to 1")
+    nearest = command.nearest
+    require(math.isfinite(nearest) and nearest >= 0, f"--nearest {nearest:g}: expected a distance in m, 0 or more")
+    check_effects(command.effects)
+
+
+@contextmanager
+def _told_of(path: Path) -> Iterator[None]:
+    """Name the file in an InputError."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _fitted(captures: Sequence[ZoneCapture], sensor: Sensor, zones: ZoneArray, command: Calibrate) -> Calibration:
+    """Fit the sensor; numbers that no sensor file holds are the captures' fault, and told as such."""
+    try:
+        return calibrate(captures, sensor, zones, free=command.effects, model_error=command.model_error)
+    except InputError as error:
+        raise InputError(f"the fit ends at no sensor ({error}): {WRONG}") from None
 
 
 def is_calibrated(path: Path) -> bool:
@@ -130,10 +162,8 @@ def warn_of_unknown(fitted: Calibration) -> None:
 def _check_zones(chosen: PlaneCaptures, every: int, path: Path) -> None:
     """Raise InputError that names the file for a zone that the captures used say nothing of; warn of captures that some
     zone sees nothing in."""
-    try:
+    with _told_of(path):
         check_returns(chosen.counts[::every])
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     blind = np.argwhere(~sees_return(chosen.counts))
     if len(blind):
         number, (first, zone) = len(np.unique(blind[:, 0])), blind[0]
