@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Iterator
-from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 from weakref import WeakKeyDictionary
@@ -23,12 +21,12 @@ from spad.detection.photons import expected_signal, light_of
 from spad.detection.rates import rates_for
 from spad.formats.histogram import Histogram
 from spad.formats.timestamps import Timestamps
+from spad.sensor.arrival import record_line, wrap_line
 from spad.sensor.model import PhotonBudget, Sensor
 
 Model = Literal["auto", "poisson", "first-photon", "free-running"]
 MODELS: tuple[str, ...] = ("auto", *LAWS)
 _HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
-MISSED_MATTERS = 1e-3  # share of the signal that finds no bins, from which on it is told
 
 
 def sense(
@@ -79,29 +77,6 @@ def sense_timestamps(
     return timestamps_of(exposure, truth["meta"], progress)
 
 
-def stream_timestamps(
-    transient: Transient,
-    sensor: Sensor,
-    budget: PhotonBudget,
-    *,
-    parts: int,
-    seed: int = 0,
-    model: Model = "auto",
-    dark_map_hz: np.ndarray | None = None,
-) -> Iterator[Timestamps]:
-    """Yield one exposure in `parts` equal parts, one after the other, for exposures larger than memory.
-
-    `Timestamps.merged` of all is one draw of `sense_timestamps` (another one for each number of parts). A dead time
-    that lasts from one part into the next is carried over. Raises InputError for fewer cycles than parts.
-    """
-    if not 1 <= parts <= sensor.cycles:
-        raise InputError(f"{parts} parts of an exposure of {sensor.cycles:g} cycles, expected 1 to that many")
-    exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
-    ready = np.zeros(transient.height * transient.width)
-    for part in range(parts):
-        yield timestamps_of(replace(exposure, part=part, parts=parts), truth["meta"], None, ready)
-
-
 def expected_in_pixel(
     transient: Transient, sensor: Sensor, budget: PhotonBudget, row: int, column: int, *, seed: int = 0
 ) -> np.ndarray:
@@ -139,17 +114,16 @@ def _planned(
     reasons = [*rates.reasons, reason]
     if sensor.crosstalk:
         reasons.append(f"crosstalk: a detection fires each of its neighbours with probability {sensor.crosstalk:.3%}")
-    # dead pixels detect neither what wraps nor the rest
+    # where pixels are dead, less than the budget is detected: all light but theirs, which `wrapped` leaves out, too
     detected = float(all_light.sum()) if (rates.alive == 0).any() else budget.signal * signal.size
     fraction = wrapped / detected if wrapped > 0 else 0.0
     if wrapped > 0:
-        reasons.append(
-            f"wrap: {fraction:.3%} of the signal arrives after the period of {sensor.range_m:.3f} m and wraps"
-        )
+        reasons.append(wrap_line(fraction, sensor))
     fractions = signal_fractions(signal)
-    # of all light, recorded or not: a budget is of all
-    warnings = (_record_warning(sensor, detected, float(signal.sum())), glint_warning(signal_fractions(all_light)))
-    reasons += [warning for warning in warnings if warning is not None]
+    missed = 1 - float(signal.sum()) / detected if detected > 0 else 0.0
+    # the photon budget is of all light, whether there are bins for it or not, and so is the part that a glint takes
+    lines = (record_line(missed, sensor), glint_warning(signal_fractions(all_light)))
+    reasons += [line for line in lines if line is not None]
     meta = {
         "seed": int(seed),
         "model": chosen,
@@ -179,17 +153,6 @@ def _pile_up(model: str, sensor: Sensor, recorded: np.ndarray, over_period: np.n
     armed at every cycle, else of the whole period, as those outside the record blind it, too."""
     armed_by_dead_time = model == "free-running" or (model != "first-photon" and not sensor.armed_every_cycle)
     return float((over_period if armed_by_dead_time else recorded).max(initial=0) / sensor.cycles)
-
-
-def _record_warning(sensor: Sensor, detected: float, recorded: float) -> str | None:
-    """Return one line where the period is longer than the record and some of the signal arrives when there are no
-    bins; a warning where it is most of it."""
-    missed = 1 - recorded / detected if detected > 0 else 0.0
-    if sensor.bins == sensor.bins_per_period or missed < MISSED_MATTERS:
-        return None
-    record, period = (f"{1e9 * bins * sensor.bin_width_s:.4g} ns" for bins in (sensor.bins, sensor.bins_per_period))
-    words = f"record: {missed:.1%} of the signal arrives when there are no bins, {record} of a period of {period}"
-    return f"warning: {words}" if missed > 0.5 else words
 
 
 def _sha256(transient: Transient) -> str:

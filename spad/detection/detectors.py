@@ -23,29 +23,21 @@ MAX_EVENTS = 1 << 22  # held at once by the event-by-event laws, about 200 MB
 
 
 class BlockLight(NamedTuple):
-    """Light on a block of pixels during one part of an exposure.
-
-    cycles  the part's first laser cycle, and the one after its last
-    timed   whether detections are drawn at times, which a converter puts into bins, or in bins at once
-    """
+    """Light on a block of pixels during an exposure; `timed` says whether detections are drawn at times, which a
+    converter puts into bins, or in bins at once."""
 
     flux: PixelFlux
     sensor: Sensor
-    cycles: tuple[int, int]
     timed: bool
 
     @property
     def primaries(self) -> float:
         """Return the expected primary detections of the block, before dead time takes its share."""
-        first, last = self.cycles
-        expected = float(self.flux.signal.sum() + self.flux.background.sum())
-        return expected * ((last - first) / round(self.sensor.cycles))
+        return float(self.flux.signal.sum() + self.flux.background.sum())
 
     def drawn(self, rng: np.random.Generator) -> Detections:
-        """Draw the primary detections of the part, all in cycle 0."""
-        first, last = self.cycles
-        fraction = (last - first) / round(self.sensor.cycles)
-        events = draw_primaries(self.flux, self.sensor, rng, fraction=fraction, fractional=self.timed)
+        """Draw the primary detections, all in cycle 0."""
+        events = draw_primaries(self.flux, self.sensor, rng, fractional=self.timed)
         return Detections(events.pixel, np.zeros(len(events.pixel), np.int8), events.position)
 
 
@@ -65,6 +57,10 @@ class DetectionLaw(ABC):
         ready (P,) is when each pixel is armed first, in bins; it is moved on to when it is armed after the last one.
         """
 
+    def pieces(self, light: BlockLight) -> int:
+        """Return how many times `detect` yields."""
+        return 1
+
     @abstractmethod
     def keep(self, events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
         """Return those of given events, photons and crosstalk, that are detected."""
@@ -73,9 +69,8 @@ class DetectionLaw(ABC):
     def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
         """Return about how many of so many primary detections a pixel and exposure are detected, (P,) -> (P,)."""
 
-    def counts(self, rate: np.ndarray, cycles: int, fraction: float, rng: np.random.Generator) -> np.ndarray:
-        """Draw counts (P, T) from expected primary detections of a whole exposure of `cycles`, of which `fraction` is
-        drawn."""
+    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw counts (P, T) from expected primary detections of an exposure of `cycles`."""
         raise NotImplementedError(f"{self.name} is drawn photon by photon")
 
 
@@ -96,9 +91,9 @@ class Poisson(DetectionLaw):
         """Return all."""
         return primaries
 
-    def counts(self, rate: np.ndarray, cycles: int, fraction: float, rng: np.random.Generator) -> np.ndarray:
+    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
         """Draw n_i ~ Poisson(lambda_i) in every bin."""
-        return rng.poisson(rate * fraction)
+        return rng.poisson(rate)
 
 
 class FirstPhoton(DetectionLaw):
@@ -109,7 +104,7 @@ class FirstPhoton(DetectionLaw):
     def detect(self, light: BlockLight, rng: np.random.Generator, ready: np.ndarray) -> Iterator[Detections]:
         """Yield the first of the primary detections of each cycle."""
         events = light.drawn(rng)
-        events = events._replace(cycle=rng.integers(*light.cycles, len(events.pixel)))
+        events = events._replace(cycle=rng.integers(round(light.sensor.cycles), size=len(events.pixel)))
         yield first_of_each_cycle(events, light.sensor)
 
     def keep(self, events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
@@ -120,9 +115,9 @@ class FirstPhoton(DetectionLaw):
         """Return the number of cycles that hold a photon."""
         return -sensor.cycles * np.expm1(-primaries / sensor.cycles)
 
-    def counts(self, rate: np.ndarray, cycles: int, fraction: float, rng: np.random.Generator) -> np.ndarray:
+    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
         """Draw the multinomial of all cycles (`first_photon_counts`)."""
-        return first_photon_counts(rate / cycles, round(fraction * cycles), rng)
+        return first_photon_counts(rate / cycles, cycles, rng)
 
 
 class FreeRunning(DetectionLaw):
@@ -130,13 +125,16 @@ class FreeRunning(DetectionLaw):
 
     name, by_bins, whole_period = "free-running", False, True
 
+    def pieces(self, light: BlockLight) -> int:
+        """Return into how many stretches of cycles an exposure is cut, so that MAX_EVENTS are held at once."""
+        return min(max(1, math.ceil(light.primaries / MAX_EVENTS)), round(light.sensor.cycles))
+
     def detect(self, light: BlockLight, rng: np.random.Generator, ready: np.ndarray) -> Iterator[Detections]:
         """Yield the detections of as many cycles at a time as memory allows."""
-        sensor, (first, last) = light.sensor, light.cycles
-        pieces = min(max(1, math.ceil(light.primaries / MAX_EVENTS)), last - first)
-        edges = [first + (last - first) * piece // pieces for piece in range(pieces + 1)]
+        sensor, cycles, pieces = light.sensor, round(light.sensor.cycles), self.pieces(light)
+        edges = [cycles * piece // pieces for piece in range(pieces + 1)]
         for start, stop in pairwise(edges):
-            fraction = (stop - start) / round(sensor.cycles)
+            fraction = (stop - start) / cycles
             events = draw_primaries(light.flux, sensor, rng, fraction=fraction, fractional=True, whole_period=True)
             cycle = rng.integers(start, stop, len(events.pixel))
             yield self.keep(Detections(events.pixel, cycle, events.position), sensor, ready)

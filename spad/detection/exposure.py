@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Lock
 from typing import TypeVar
 
 import numpy as np
@@ -25,6 +27,7 @@ from spad.formats.timestamps import Timestamps
 from spad.sensor.model import Sensor
 from spad.sensor.tdc import time_codes
 
+log = logging.getLogger(__name__)
 Finished = TypeVar("Finished")
 # One random stream for this many pixels: the counts do not depend on threads, nor on how the work is cut.
 STREAM_PIXELS = 1024
@@ -33,11 +36,12 @@ DENSE_FROM = 4.0
 # Photons, or bins, that a thread holds at once: a block with more is drawn in parts. None of up to 4096 bins has more.
 MAX_HELD = 1 << 24
 MAX_CROSSTALK_EVENTS = 1 << 26
+MANY_EVENTS = 1e7  # drawn one by one, from which on it is said before: some seconds of work on a core
 
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """One exposure, or part `part` of `parts` equal ones in cycles, under one law."""
+    """One exposure under one law."""
 
     transient: Transient
     sensor: Sensor
@@ -45,19 +49,6 @@ class Exposure:
     whole: PixelFlux
     law: DetectionLaw
     seed: int
-    part: int = 0
-    parts: int = 1
-
-    @property
-    def cycles(self) -> tuple[int, int]:
-        """Return the first and last + 1 laser cycle of this part; an exposure has a whole number."""
-        total = round(self.sensor.cycles)
-        return total * self.part // self.parts, total * (self.part + 1) // self.parts
-
-    @property
-    def fraction(self) -> float:
-        first, last = self.cycles
-        return (last - first) / round(self.sensor.cycles)
 
     @property
     def blocks(self) -> list[slice]:
@@ -65,7 +56,7 @@ class Exposure:
         return [slice(first, min(first + STREAM_PIXELS, pixels)) for first in range(0, pixels, STREAM_PIXELS)]
 
     def rng(self, stage: int, block: slice) -> np.random.Generator:
-        seeds = np.random.SeedSequence(self.seed, spawn_key=(stage, self.part, block.start // STREAM_PIXELS))
+        seeds = np.random.SeedSequence(self.seed, spawn_key=(stage, 0, block.start // STREAM_PIXELS))
         return np.random.Generator(np.random.SFC64(seeds))
 
     @property
@@ -98,7 +89,7 @@ class Exposure:
         owner, start, length, signal, background = self.whole
         part = slice(first, last)
         flux = PixelFlux(owner[part] - block.start, start[part], length[part], signal[part], background[block])
-        return BlockLight(flux, self.sensor, self.cycles, self.timed)
+        return BlockLight(flux, self.sensor, self.timed)
 
 
 def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
@@ -111,10 +102,10 @@ def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
         if drawn.ndim == 2:
             _fill(counts[block], drawn)
         else:
-            # of other types than these it is thirty times slower
+            # NumPy is twice as fast with int64 indices, and a hundred times with a one of the counts' own type
             np.add.at(counts[block].reshape(-1), drawn.astype(np.int64), np.int32(1))
 
-    _draw(exposure, fill, progress, np.zeros(height * width))
+    _draw(exposure, fill, progress)
     counts = counts.reshape(height, width, bins)
     if exposure.adds_crosstalk:
         add_crosstalk(counts, exposure.sensor.crosstalk, exposure.rng(Stream.CROSSTALK, slice(0, 0)))
@@ -129,13 +120,10 @@ def _fill(counts: np.ndarray, drawn: np.ndarray) -> None:
     counts[:] = drawn
 
 
-def timestamps_of(
-    exposure: Exposure, meta: JsonObject, progress: Progress | None, ready: np.ndarray | None = None
-) -> Timestamps:
+def timestamps_of(exposure: Exposure, meta: JsonObject, progress: Progress | None) -> Timestamps:
     height, width, bins = exposure.transient.height, exposure.transient.width, exposure.sensor.bins
     if exposure.adds_crosstalk:
         return Timestamps.of_counts(counts_of(exposure, progress), meta)
-    ready = np.zeros(height * width) if ready is None else ready
 
     def sorted_stamps(block: slice, drawn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         places = np.repeat(np.arange(drawn.size, dtype=np.int32), drawn.ravel()) if drawn.ndim == 2 else np.sort(drawn)
@@ -143,7 +131,7 @@ def timestamps_of(
         number = np.diff(np.searchsorted(places, starts))
         return (places - np.repeat(starts[:-1], number)).astype(np.uint16), number
 
-    stamps, numbers = zip(*_draw(exposure, sorted_stamps, progress, ready), strict=True)
+    stamps, numbers = zip(*_draw(exposure, sorted_stamps, progress), strict=True)
     offsets = np.cumsum(np.concatenate(([0], *numbers)), dtype=np.int64)
     return Timestamps(height, width, bins, np.concatenate(stamps), offsets, meta)
 
@@ -157,32 +145,66 @@ def thread_count() -> int:
 
 
 def _draw(
-    exposure: Exposure, finish: Callable[[slice, np.ndarray], Finished], progress: Progress | None, ready: np.ndarray
+    exposure: Exposure, finish: Callable[[slice, np.ndarray], Finished], progress: Progress | None
 ) -> list[Finished]:
     """Call finish(pixels, detected) for every block or part of it, on `thread_count()` threads.
 
     What was detected: counts (P, T), or places pixel x T + bin (N,) int32 in no order, pixels counted from the block's.
     """
+    _forecast(exposure)
+    meter, ready = Meter(progress, exposure.whole.pixels), np.zeros(exposure.whole.pixels)
     if exposure.sensor.crosstalk and not exposure.adds_crosstalk:
-        return [finish(block, places) for block, places in _with_crosstalk(exposure, ready)]
+        return [finish(block, places) for block, places in _with_crosstalk(exposure, ready, meter)]
     blocks, workers = exposure.blocks, thread_count()
     finished: list[Finished] = []
     with ThreadPoolExecutor(workers) as pool:
         for start in range(0, len(blocks), 4 * workers):  # no more at once than a few
-            if progress is not None:
-                progress("sense", start / len(blocks))
             group = blocks[start : start + 4 * workers]
-            for drawn in pool.map(lambda block: _block(exposure, block, ready, finish), group):
+            for drawn in pool.map(lambda block: _block(exposure, block, ready, finish, meter), group):
                 finished += drawn
     return finished
 
 
+class Meter:
+    """Report how many of an exposure's pixels are drawn, from any thread."""
+
+    def __init__(self, progress: Progress | None, pixels: int) -> None:
+        self.progress, self.pixels, self.done, self.lock = progress, pixels, 0.0, Lock()
+        self.add(0.0)
+
+    def add(self, pixels: float) -> None:
+        """Add pixels that are drawn, or parts of them: of a pixel drawn over half of the exposure a half."""
+        with self.lock:
+            self.done += pixels
+            if self.progress is not None:
+                self.progress("sense", min(1.0, self.done / self.pixels))
+
+    def count(self, parts: Iterator[Detections], pieces: int, pixels: int) -> Iterator[Detections]:
+        """Pass detections on, and add the pixels by as many pieces as there are."""
+        for part in parts:
+            yield part
+            self.add(pixels / pieces)
+
+
+def _forecast(exposure: Exposure) -> None:
+    """Tell how many events a law that draws them one by one has before it, where they are many."""
+    events = float(exposure.whole.signal.sum() + exposure.whole.background.sum())
+    if exposure.law.by_bins or events < MANY_EVENTS:
+        return
+    message = "%s: %.3g photons are drawn one by one; fewer photons or a shorter exposure take less time"
+    log.info(message, exposure.law.name, events)
+
+
 def _block(
-    exposure: Exposure, block: slice, ready: np.ndarray, finish: Callable[[slice, np.ndarray], Finished]
+    exposure: Exposure,
+    block: slice,
+    ready: np.ndarray,
+    finish: Callable[[slice, np.ndarray], Finished],
+    meter: Meter,
 ) -> list[Finished]:
     """Draw the detections of a block, and call `finish` with as many of its pixels as can be held at once."""
     rng = exposure.rng(Stream.SENSE, block)
-    return [finish(part, draw_part(exposure, part, ready[part], rng)) for part in _parts(exposure, block)]
+    return [finish(part, draw_part(exposure, part, ready[part], rng, meter)) for part in _parts(exposure, block)]
 
 
 def _is_dense(exposure: Exposure, light: BlockLight) -> bool:
@@ -201,15 +223,18 @@ def _parts(exposure: Exposure, block: slice) -> Iterator[slice]:
     yield from _parts(exposure, slice(middle, block.stop))
 
 
-def draw_part(exposure: Exposure, block: slice, ready: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def draw_part(
+    exposure: Exposure, block: slice, ready: np.ndarray, rng: np.random.Generator, meter: Meter
+) -> np.ndarray:
     """Draw the detections of some pixels: places, or counts (P, T) where every bin is drawn at once."""
     law, light = exposure.law, exposure.light(block)
     if _is_dense(exposure, light):
         from spad.detection.flux import expected_counts  # with torch, whose import takes a second
 
         rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()
-        return law.counts(rate, round(exposure.sensor.cycles), exposure.fraction, rng)
-    parts = law.detect(light, rng, ready)
+        meter.add(light.flux.pixels)
+        return law.counts(rate, round(exposure.sensor.cycles), rng)
+    parts = meter.count(law.detect(light, rng, ready), law.pieces(light), light.flux.pixels)
     recorded = (exposure.coded(exposure.recorded(part), block.start) for part in parts)
     return np.concatenate([_places(part, exposure.sensor) for part in recorded])
 
@@ -227,7 +252,6 @@ def _check_crosstalk_events(exposure: Exposure) -> None:
     expected = float(exposure.law.expected(primaries, exposure.sensor).sum())
     if exposure.law.by_bins:
         expected = max(expected, *(float(primaries[block].sum()) for block in exposure.blocks))
-    expected *= exposure.fraction
     if expected > MAX_CROSSTALK_EVENTS:
         raise InputError(
             f"crosstalk event by event: {expected:.3g} events would be held at once, the limit is "
@@ -235,7 +259,7 @@ def _check_crosstalk_events(exposure: Exposure) -> None:
         )
 
 
-def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+def _with_crosstalk(exposure: Exposure, ready: np.ndarray, meter: Meter) -> Iterator[tuple[slice, np.ndarray]]:
     """Detect event by event over the whole image: detections fire neighbours, whose detector then decides between both.
 
     A detection that a neighbour's crosstalk makes impossible keeps what it fired itself, and crosstalk fires no
@@ -246,7 +270,8 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray) -> Iterator[tuple[sli
     everything, before = [], ready.copy()
     for block in exposure.blocks:
         rng, light = exposure.rng(Stream.SENSE, block), exposure.light(block)
-        parts = list(exposure.law.detect(light, rng, before[block]))
+        drawn, pieces = exposure.law.detect(light, rng, before[block]), exposure.law.pieces(light)
+        parts = list(meter.count(drawn, pieces, light.flux.pixels))
         everything += [part._replace(pixel=part.pixel + block.start) for part in parts]
     events = Detections(*(np.concatenate(columns) for columns in zip(*everything, strict=True)))
     rng = exposure.rng(Stream.CROSSTALK, slice(0, 0))

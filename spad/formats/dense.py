@@ -26,6 +26,7 @@ from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.formats.histogram import NOTES, Histogram
+from spad.sensor.arrival import record_line, warning_of_most, wrap_line
 from spad.sensor.files import pixel_sensor
 from spad.sensor.model import Sensor
 
@@ -45,7 +46,6 @@ UNITS = {
     "meta": ("text", "JSON of the photon budget, and of what made the counts"),
 }
 RADIANCE = ("1/(m^2 sr)", "radiance that arrives in the bin, per joule of the pulse")
-UNRECORDED_MATTERS = 1e-3  # fraction from which on it is told, as `sense` does
 
 
 def dense(seen: Transient | Histogram, sensor: Sensor | str | Path | None = None) -> dict[str, np.ndarray]:
@@ -150,16 +150,9 @@ def _json(values: JsonObject) -> np.ndarray:
 def arrival_reasons(arrays: dict[str, np.ndarray], sensor: Sensor) -> list[str]:
     """Return one line each, as `sense` has them, for light that wraps and for light that finds no bins; a warning
     where it is most of it."""
-    reasons = []
     wrapped, unrecorded = (float(arrays.get(name, 0.0)) for name in ("wrapped", "unrecorded"))
-    if wrapped > 0:
-        words = f"wrap: {wrapped:.3%} of the signal arrives after the period of {sensor.range_m:.3f} m and wraps"
-        reasons.append(f"warning: {words}" if wrapped > 0.5 else words)
-    if unrecorded >= UNRECORDED_MATTERS:
-        record, period = (f"{1e9 * n * sensor.bin_width_s:.4g} ns" for n in (sensor.bins, sensor.bins_per_period))
-        words = f"record: {unrecorded:.1%} of the signal arrives when there are no bins, {record} of a period of"
-        reasons.append(f"{'warning: ' if unrecorded > 0.5 else ''}{words} {period}")
-    return reasons
+    wrap = warning_of_most(wrap_line(wrapped, sensor), wrapped) if wrapped > 0 else None
+    return [line for line in (wrap, record_line(unrecorded, sensor)) if line is not None]
 
 
 def write_dense(arrays: dict[str, np.ndarray], path: Path, *, layout: Layout = "hwt") -> Path:

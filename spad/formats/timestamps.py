@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -58,28 +57,6 @@ class Timestamps:
         stamps, offsets = timestamps_from_counts(counts)
         return cls(height, width, bins, stamps, offsets, meta or {})
 
-    @classmethod
-    def merged(cls, parts: Iterable[Timestamps]) -> Timestamps:
-        """Return one exposure of several: the detections of all, ascending again in every pixel."""
-        parts = list(parts)
-        require(bool(parts), "no timestamps to merge")
-        first = parts[0]
-        if any((p.height, p.width, p.bins) != (first.height, first.width, first.bins) for p in parts):
-            raise InputError("timestamps of different sizes cannot be merged")
-        places = np.sort(np.concatenate([part.places() for part in parts]))
-        return cls.of_places(places, first.height, first.width, first.bins, first.meta)
-
-    def places(self) -> np.ndarray:
-        """Return pixel x T + bin of every detection, (N,) int64: its index in the flat dense form."""
-        pixel = np.repeat(np.arange(self.height * self.width), np.diff(self.offsets))
-        return pixel * self.bins + self.stamps
-
-    @classmethod
-    def of_places(cls, places: np.ndarray, height: int, width: int, bins: int, meta: JsonObject) -> Timestamps:
-        """Return from ascending indices in the flat dense form."""
-        offsets = np.searchsorted(places, np.arange(height * width + 1) * bins)
-        return cls(height, width, bins, (places % bins).astype(np.uint16), offsets.astype(np.int64), meta)
-
     def packed(self) -> np.ndarray:
         """Return all stamps as one stream of `bits` bits each, most significant first, (ceil(N bits / 8),) uint8."""
         shifts = np.arange(self.bits - 1, -1, -1, dtype=np.uint16)
@@ -112,7 +89,11 @@ def checked_events(stamps: np.ndarray, offsets: np.ndarray, pixels: int, bins: i
 
 
 def _whole(values: np.ndarray, what: str) -> np.ndarray:
-    """Return an array of one dimension of whole numbers as int64; those beyond are taken to its ends."""
+    """Return an array of one dimension of whole numbers as int64.
+
+    Floating-point and unsigned numbers beyond +-2^62 become +-2^62, as int64 would turn them to other numbers: a check
+    against bins still refuses them. Raises InputError for masked numbers, fractions and other shapes.
+    """
     require(not np.ma.is_masked(values), f"timestamps: {what} are masked, leave the masked ones out")
     array = np.asarray(values)
     good = array.ndim == 1 and (array.dtype.kind in "iuf" or not array.size)

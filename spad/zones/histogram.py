@@ -11,6 +11,7 @@ from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
 from spad.formats.histogram import Histogram
+from spad.sensor.arrival import wrap_line
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.zones.sensor import ZoneArray, ZoneReturns, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
 
@@ -61,8 +62,7 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
         reasons[0] += f", {lost:.1%} of the detections lost to saturation"
     wrapped = _wrapped(returns, sensor, zones)
     if wrapped > 0:
-        late = f"arrives after the period of {sensor.range_m:.3f} m and wraps"
-        reasons.append(f"wrap: {wrapped:.3%} of the light {late}")
+        reasons.append(wrap_line(wrapped, sensor, "light"))
     pixel = _centre_pixels(transient, zones)
 
     def laid(values: np.ndarray, kind: type) -> np.ndarray:

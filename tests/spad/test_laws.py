@@ -9,7 +9,7 @@ from scipy import stats
 from test_flux import transient_of
 
 from scenes import InputError
-from spad.detection.detect import expected_in_pixel, sense, sense_timestamps, stream_timestamps
+from spad.detection.detect import expected_in_pixel, sense, sense_timestamps
 from spad.detection.exposure import draw_part
 from spad.detection.laws import (
     Detections,
@@ -327,21 +327,47 @@ def test_timestamps_and_histogram_are_one_draw(model: str, signal: float, crosst
     assert len(stamps.packed()) == -(-len(stamps.stamps) * 10 // 8)
 
 
-@pytest.mark.parametrize("model", ["poisson", "first-photon", "free-running"])
-def test_parts_of_an_exposure_are_the_exposure(model: str) -> None:
+def test_pieces_of_an_exposure_are_the_exposure_and_report_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Event by event an exposure of many photons is drawn some cycles at a time: dead time lasts over the seams."""
     cycles = 400
     sensor = replace(SMALL, exposure_s=cycles * SMALL.period_s, dead_time_s=2.2 * SMALL.period_s)
-    if model == "first-photon":
-        sensor = replace(sensor, dead_time_s=0.0)
     scene, budget = same(400, (0.5, 0.6, 1.0)), PhotonBudget(0.5 * cycles, 0.3 * cycles)
-    parts = list(stream_timestamps(scene, sensor, budget, parts=40, seed=1, model=model))
-    assert len(parts) == 40 and len({part.stamps.tobytes() for part in parts}) == 40
-    merged = Timestamps.merged(parts).counts()[0]
-    whole = sense(scene, sensor, budget, seed=1, model=model).counts[0]
-    both = np.stack([merged.sum(axis=0), whole.sum(axis=0)])
+    whole = sense(scene, sensor, budget, seed=1, model="free-running").counts[0]
+    monkeypatch.setattr("spad.detection.detectors.MAX_EVENTS", 400 * 0.8 * cycles / 40)
+    done: list[float] = []
+    report = lambda what, fraction: done.append(fraction)  # noqa: E731
+    pieces = sense(scene, sensor, budget, seed=1, model="free-running", progress=report).counts[0]
+    # about 40 pieces, a report after each; the budget's mean is reached to rounding
+    assert len(done) in (41, 42) and done == sorted(done) and done[0] == 0 and done[-1] == pytest.approx(1)
+    both = np.stack([pieces.sum(axis=0), whole.sum(axis=0)])
     assert stats.chi2_contingency(both[:, both.sum(axis=0) > 20]).pvalue > 1e-3
     # forgetting the dead time at 40 seams would add 0.5 tau's worth of detections at each: 10 % here
     assert both.sum(axis=1)[0] == pytest.approx(both.sum(axis=1)[1], rel=5 * np.sqrt(2 / both[1].sum()))
+
+
+@pytest.mark.parametrize("crosstalk", [0.0, 0.01])
+@pytest.mark.parametrize("model", ["poisson", "first-photon", "free-running"])
+def test_progress_ends_at_one_whatever_the_law(model: str, crosstalk: float) -> None:
+    """Two blocks of pixels, on however many threads."""
+    done: list[float] = []
+    report = lambda what, fraction: done.append(fraction)  # noqa: E731
+    sensor = replace(SMALL, exposure_s=100 * SMALL.period_s, crosstalk=crosstalk)
+    scene = same(1100, (0.5, 0.6, 1.0))
+    sense(scene, sensor, PhotonBudget(30.0, 20.0), seed=1, model=model, progress=report)
+    assert done == sorted(done) and done[0] == 0 and done[-1] == pytest.approx(1) and len(done) >= 3
+
+
+@pytest.mark.parametrize(
+    ("model", "many", "lines"), [("free-running", 50, 1), ("free-running", 1e7, 0), ("poisson", 50, 0)]
+)
+def test_many_events_that_are_drawn_one_by_one_are_said_before(model, many, lines, monkeypatch, caplog) -> None:
+    monkeypatch.setattr("spad.detection.exposure.MANY_EVENTS", many)
+    said = lambda *_: pytest.fail("drawn before it was said") if len(caplog.records) < lines else None  # noqa: E731
+    with caplog.at_level("INFO", logger="spad"):
+        sense(same(4, (0.5, 0.6, 1.0)), SMALL, PhotonBudget(20.0, 10.0), seed=1, model=model, progress=said)
+    assert [record.message for record in caplog.records] == [
+        "free-running: 120 photons are drawn one by one; fewer photons or a shorter exposure take less time"
+    ] * lines
 
 
 def test_a_dead_time_of_seconds_takes_no_more_memory_than_one_of_nanoseconds():
