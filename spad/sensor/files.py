@@ -6,7 +6,6 @@ A file holds `name`, `description`, the tables `histogram`, `pulse`, `jitter`, `
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -20,14 +19,13 @@ from scenes.io.inputs import file_sha256
 from scenes.json_types import JsonObject
 from spad.sensor.budget import Optics
 from spad.sensor.model import HOT_RATE_HZ, PRESETS, Sensor
-from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse
+from spad.sensor.pulse import FWHM_PER_SIGMA, AnyPulse, Pulse, SampledPulse
 from spad.sensor.quantities import format_quantity, parse_quantity
 from spad.sensor.tdc import Tdc
 from spad.sensor.toml import format_toml, read_toml
 from spad.zones.sensor import ZoneArray, check_times
 
 SCHEMA = "1.0"
-FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 KINDS_OF_PULSE = "sigma, fwhm, or samples with step"
 
 

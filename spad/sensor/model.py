@@ -15,7 +15,7 @@ from scenes.errors import InputError, did_you_mean, require, require_choice, req
 from scenes.json_types import JsonObject
 from scenes.random_streams import Stream
 from spad.sensor.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
-from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse, convolved, pulse_from_dict
+from spad.sensor.pulse import FWHM_PER_SIGMA, AnyPulse, Pulse, SampledPulse, convolved, pulse_from_dict
 from spad.sensor.tdc import Tdc
 
 Reset = Literal["synchronous", "free-running"]
@@ -248,9 +248,7 @@ PRESETS: dict[str, Sensor] = {
         pulse=SampledPulse(TRAIN_PULSE, TRAIN_BIN_WIDTH_S),
         dark_count_rate_hz=tuple(30 * counts for counts in TRAIN_DARK_COUNTS),
     ),
-    "linospad": Sensor(
-        name="linospad", bins=1536, bin_width_s=26e-12, pulse=Pulse(LINOSPAD_FWHM_S / (2 * math.sqrt(2 * math.log(2))))
-    ),
+    "linospad": Sensor(name="linospad", bins=1536, bin_width_s=26e-12, pulse=Pulse(LINOSPAD_FWHM_S / FWHM_PER_SIGMA)),
 }
 
 

@@ -20,6 +20,7 @@ from scenes.json_types import JsonObject
 from spad.sensor.normal import erfc, erfcx_far, ndtr
 
 MAX_SAMPLES = 1 << 16
+FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))  # of a Gaussian
 # Steps of a table that stands for two kernels in one, per standard deviation of the narrower. Both kernels and the
 # table are of steps: these widen the pulse's variance by 3 / (12 * 16^2) of that one's, 0.1 %.
 _STEPS_PER_STD = 16
@@ -49,7 +50,7 @@ class Pulse:
     @property
     def fwhm_s(self) -> float:
         """Return the full width at half maximum of the Gaussian part [s]."""
-        return 2 * math.sqrt(2 * math.log(2)) * self.sigma_s
+        return FWHM_PER_SIGMA * self.sigma_s
 
     @property
     def reach_s(self) -> float:
