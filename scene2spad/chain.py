@@ -193,9 +193,9 @@ def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | Dep
     histogram : Histogram
         What `sense`, `read_histogram` or `read_mat` gives.
     method : str, Path, CodingTensor or DepthModel
-        A classical estimator (argmax, matched, log-matched, correlation, coates), the name or file of a trained
-        network (`models` lists those that come with the package), a network that `load_model` gave, or a temporal
-        coding tensor, whose codes are decoded by correlation.
+        A classical estimator (argmax, matched, log-matched, lmf-published, correlation, coates), the name or file of a
+        trained network (`models` lists those that come with the package), a network that `load_model` gave, or a
+        temporal coding tensor, whose codes are decoded by correlation.
 
     Returns
     -------

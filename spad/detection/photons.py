@@ -79,7 +79,8 @@ def draw_primaries(
 ) -> PhotonEvents:
     """Draw primary detections within the sensor's bins in a share of the exposure, or over the whole period.
 
-    Whole bins (int64), or positions within them (float64) where a dead time, or a converter, needs to know.
+    Whole bins (int32, above 2^31 bins a period int64), or positions within them (float64) where a dead time, or a
+    converter, needs to know.
     """
     period = sensor.bins_per_period
     number = rng.poisson(light.signal * fraction)
