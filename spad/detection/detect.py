@@ -112,6 +112,8 @@ def _planned(
     pile_up = _pile_up(model, sensor, signal + background, all_light + rates.background.ravel())
     chosen, reason = choose_model(model, pile_up, sensor)
     reasons = [*rates.reasons, reason]
+    if sensor.bins == 1:
+        reasons.append("warning: one bin: photons are counted, but not timed, so that there is no depth")
     if sensor.crosstalk:
         reasons.append(f"crosstalk: a detection fires each of its neighbours with probability {sensor.crosstalk:.3%}")
     # where pixels are dead, less than the budget is detected: all light but theirs, which `wrapped` leaves out, too

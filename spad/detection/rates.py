@@ -139,4 +139,6 @@ def _odd_pixels(sensor: Sensor, dead: np.ndarray, measured: bool) -> tuple[str, 
     """Return the plan's lines on hot and dead pixels; a measured map of dark counts holds its own hot pixels."""
     drawn = sensor.hot_share and not measured
     hot = (f"hot pixels: {sensor.hot_share:.2%} at {sensor.hot_rate_hz:g} Hz",) if drawn else ()
+    if sensor.hot_rate_hz > 0 and not sensor.hot_share and not measured:
+        hot = (f"hot pixels: none, their rate of {sensor.hot_rate_hz:g} Hz needs a hot_fraction (--hot-pixels)",)
     return (*hot, f"dead pixels: {int(dead.sum())} of {dead.size}") if dead.any() else hot

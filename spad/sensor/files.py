@@ -6,6 +6,7 @@ A file holds `name`, `description`, the tables `histogram`, `pulse`, `jitter`, `
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -229,7 +230,18 @@ def sensor_from_tables(contents: Mapping[str, object], folder: Path = Path()) ->
         values["tdc"] = _converters(Tdc(**tables["tdc"]), folder)
     optics = Optics(**tables["optics"]) if "optics" in tables else None
     zones = ZoneArray(**tables["zones"]) if "zones" in tables else None
-    return SensorFile(Sensor(**values), optics, zones, description, _sources(contents))
+    try:
+        sensor = Sensor(**values)
+    except InputError as error:
+        raise InputError(_by_keys(str(error))) from None
+    return SensorFile(sensor, optics, zones, description, _sources(contents))
+
+
+def _by_keys(message: str) -> str:
+    """Return a message of `Sensor` with the keys of a sensor file in place of its fields."""
+    for key, spec in (HISTOGRAM | DETECTOR).items():
+        message = re.sub(rf"\b{spec.field}\b", key, message)
+    return message
 
 
 def _converters(tdc: Tdc, folder: Path) -> Tdc:

@@ -98,6 +98,10 @@ def test_plan_names_what_there_is():
     third = np.nextafter(1 / 3, 1) * np.ones((1, 8))
     filled = fill_background(np.zeros((1, 8), np.float32), third, 1 / 3)
     assert "exceed" not in filled.reason and filled.dark_fraction == 1 and (filled.background == third).all()
+    idle = sense(wall, replace(dark, hot_share=0.0), PhotonBudget(10, 20)).meta["plan"]
+    assert "hot pixels: none, their rate of 600 Hz needs a hot_fraction (--hot-pixels)" in idle
+    single = sense(wall, Sensor(bins=1, bin_width_s=1e-7), PhotonBudget(10, 20)).meta["plan"]
+    assert "warning: one bin: photons are counted, but not timed, so that there is no depth" in single
     half_dead = sense(wall, replace(REFERENCE, dead_share=0.5), PhotonBudget(10, 20)).meta
     assert half_dead["wrapped"] == pytest.approx(1)
 

@@ -165,10 +165,18 @@ def test_hot_pixels_of_a_file_that_gives_their_share_alone_have_the_rate_of_the_
     assert sensor.dark_rate_map_hz(10, 10).mean() == pytest.approx(0.1 * HOT_RATE_HZ)
     assert read_sensor(write_sensor(SensorFile(sensor), tmp_path / "again.toml")).sensor == sensor
     path.write_text(PLAIN + '[detector]\nhot_fraction = 0.1\nhot_rate = "0 Hz"\n')
-    with pytest.raises(InputError, match=r"hot_rate_hz 0 with hot_share .*: hot pixels would be dark"):
+    with pytest.raises(InputError, match=r"sensor mine: hot_rate 0 with hot_fraction .*: hot pixels would be dark"):
         read_sensor(path)
     with pytest.raises(InputError, match="sensor reference: hot_rate_hz 0 with hot_share"):
         replace(Sensor(), hot_share=0.1)
+
+
+@pytest.mark.parametrize("key", ["hot_fraction", "dead_fraction"])
+def test_a_value_out_of_range_is_told_by_the_files_key(key, tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text(PLAIN + f"[detector]\n{key} = 2\n")
+    with pytest.raises(InputError, match=rf"s.toml: sensor mine: {key} 2 is outside 0 to 1$"):
+        read_sensor(path)
 
 
 def test_a_width_is_read_as_sigma_or_as_full_width_at_half_maximum(tmp_path):
