@@ -26,6 +26,7 @@ WRONG = "do distance_m and counts belong together, and the sensor to both?"
 # Relative error of a model that says something of the sensor. Of a TMF8820 all effects leave 2 %, the background alone,
 # without delays and saturation, 48 %; distances of other captures leave 110 % and more.
 MISFIT_LIMIT = 0.7
+POISSON_DEVIANCE = 2.0  # above what Poisson noise alone leaves a bin: 1 of many counts, at most 1.2 of few
 MAX_PAIRED = 256  # captures whose pairs are looked at
 
 
@@ -88,13 +89,17 @@ def check_fit(fitted: Calibration, counts: np.ndarray, free: Sequence[str]) -> N
     """Raise InputError for a calibration of counts (N, Z, T) that says nothing of the sensor.
 
     Gains have to be known better than to their own size in most zones. Where the background is fitted, the deviance of
-    n counts a bin has to be below 1 + (MISFIT_LIMIT)^2 n: without it every bin beside the return is wrong.
+    n counts a bin has to be below POISSON_DEVIANCE + MISFIT_LIMIT^2 n. Where it is not, bins beside the return are off
+    by all of their counts, and the deviance says nothing of the distances.
     """
     gain, error = np.asarray(fitted.zones.gain), fitted.errors["gain"]
     known = int((np.isfinite(gain) & np.isfinite(error) & (error < gain)).sum())
     message = f"the fit knows the gain of {known} of {len(gain)} zones, of the others not its order of magnitude"
     require(2 * known > len(gain), f"{message}: {WRONG}")
-    misfit = math.sqrt(max(0.0, fitted.deviance - 1) / float(counts.mean())) if fitted.deviance < math.inf else math.inf
+    beyond = (
+        fitted.deviance - POISSON_DEVIANCE if fitted.deviance < math.inf else math.inf
+    )  # also where it is no number
+    misfit = math.sqrt(max(0.0, beyond) / float(counts.mean()))
     message = f"the fit is wrong by {misfit:.0%} of a bin's counts, deviance {fitted.deviance:.3g} a bin"
-    good = "background" not in free or misfit < MISFIT_LIMIT  # not with a deviance that is no number, either
+    good = "background" not in free or misfit < MISFIT_LIMIT
     require(good, f"{message}, expected below {MISFIT_LIMIT:.0%}: {WRONG}")

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
 from spad.zones.calibration import Calibration
-from spad.zones.evidence import check_distances, check_fit, light_speeds, return_speeds
+from spad.zones.evidence import POISSON_DEVIANCE, check_distances, check_fit, light_speeds, return_speeds
 from spad.zones.expected_counts import PulseBasis
 from spad.zones.sensor import ZoneArray
 
@@ -100,8 +101,17 @@ def test_a_fit_that_says_nothing_is_refused():
     for unknown in ([9.0, 9.0, 0.03], [np.nan, np.inf, 0.03]):
         with pytest.raises(InputError, match="the fit knows the gain of 1 of 3 zones"):
             check_fit(fitted(errors={"gain": np.array(unknown)}), counts, TIMED)
-    check_fit(fitted(deviance=1 + 100 * 0.69**2), counts, TIMED)
-    for deviance, size in ((1 + 100 * 0.71**2, "71%"), (np.inf, "inf%"), (np.nan, "inf%")):
+    check_fit(fitted(deviance=2 + 100 * 0.69**2), counts, TIMED)
+    for deviance, size in ((2 + 100 * 0.71**2, "71%"), (np.inf, "inf%"), (np.nan, "inf%")):
         with pytest.raises(InputError, match=f"the fit is wrong by {size} of a bin's counts"):
             check_fit(fitted(deviance=deviance), counts, TIMED)
         check_fit(fitted(deviance=deviance), counts, ("delay",))  # without a background all bins beside it are wrong
+
+
+def test_poisson_noise_alone_is_no_misfit():
+    """The deviance of a bin of mean n from its own mean is 2 sum_k P(k) (k log(k / n) - k + n)."""
+    counts = np.arange(1, 200)
+    for mean in np.geomspace(0.01, 50, 60):
+        mass = stats.poisson.pmf(counts, mean)
+        deviance = 2 * (mass @ (counts * np.log(counts / mean) - counts + mean) + np.exp(-mean) * mean)
+        assert deviance < 1.2 < POISSON_DEVIANCE
