@@ -96,10 +96,8 @@ def check_fit(fitted: Calibration, counts: np.ndarray, free: Sequence[str]) -> N
     known = int((np.isfinite(gain) & np.isfinite(error) & (error < gain)).sum())
     message = f"the fit knows the gain of {known} of {len(gain)} zones, of the others not its order of magnitude"
     require(2 * known > len(gain), f"{message}: {WRONG}")
-    beyond = (
-        fitted.deviance - POISSON_DEVIANCE if fitted.deviance < math.inf else math.inf
-    )  # also where it is no number
-    misfit = math.sqrt(max(0.0, beyond) / float(counts.mean()))
+    deviance = fitted.deviance if fitted.deviance < math.inf else math.inf  # NaN is no fit, either
+    misfit = math.sqrt(max(0.0, deviance - POISSON_DEVIANCE) / float(counts.mean()))
     message = f"the fit is wrong by {misfit:.0%} of a bin's counts, deviance {fitted.deviance:.3g} a bin"
     good = "background" not in free or misfit < MISFIT_LIMIT
     require(good, f"{message}, expected below {MISFIT_LIMIT:.0%}: {WRONG}")
