@@ -59,7 +59,8 @@ def run(command: Study, progress: Progress) -> dict:
 def _shipped_or_start(code: str, block: tuple[int, int, int], ratio: int, seed: int) -> CodingTensor:
     """Return the codes of the shipped model of a learned design, of its first seed; else the design at its start."""
     design, model = Design.named(code, block, compression=ratio), ModelSpec(code, block, ratio).name
-    return coding_of(Path(model)) if design.learned and shipped_file(model).is_file() else _start(design, seed)
+    start = _start(design, seed)  # also where it is not drawn: a seed out of range is refused
+    return coding_of(Path(model)) if design.learned and shipped_file(model).is_file() else start
 
 
 def _start(design: Design, seed: int) -> CodingTensor:
