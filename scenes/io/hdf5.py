@@ -40,6 +40,7 @@ SLACK_BYTES = 1 << 16
 PROBE_SECONDS, PROBE_BYTES_PER_SECOND = 4, 20_000_000
 PROBE_BYTES = 4 << 30
 WAITING = 15  # times as long by the clock
+UNREADABLE, UNLIMITED = 1, 2  # how the probe ends: the library cannot read the file, or no limits could be set
 
 
 class Sink(io.RawIOBase):
@@ -154,6 +155,7 @@ def _probe(path: Path, *, contents: bool) -> None:
     status, words = in_child(lambda: _walk(path, contents), seconds)
     endless = f"the HDF5 library does not come to an end of it in {seconds} s: it is damaged"
     require(status not in (-signal.SIGXCPU, -signal.SIGKILL), endless)
+    require(status != UNLIMITED, f"cannot be checked: no limits could be set for the process that does it ({words})")
     require(status == 0, f"the HDF5 library cannot read it ({words[:120] or f'status {status}'})")
 
 
@@ -177,7 +179,7 @@ def _walk(path: Path, contents: bool) -> None:
 def in_child(work: Callable[[], None], cpu_seconds: int) -> tuple[int, str]:
     """Do something in a copy of this process that may be killed: its status as of `subprocess`, and its last words.
 
-    The copy has `cpu_seconds` of the processor and may allocate PROBE_BYTES. Nobody is inside HDF5 while it is made.
+    The copy has `cpu_seconds` of the processor and may allocate PROBE_BYTES, or less where this process may. Nobody is inside HDF5 while it is made.
     """
     import h5py
 
@@ -197,17 +199,27 @@ def _die_working(work: Callable[[], None], cpu_seconds: int, writing: int) -> No
     """In the copy: work within limits, write what went wrong, and end without a word to anybody else."""
     import resource  # not on Windows
 
-    status = 1
+    status = UNLIMITED
     try:
         own = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (own + PROBE_BYTES, own + PROBE_BYTES))
-        resource.setrlimit(resource.RLIMIT_CPU, (cpu_seconds, cpu_seconds))
+        _set_limit(resource.RLIMIT_AS, own + PROBE_BYTES)
+        _set_limit(resource.RLIMIT_CPU, cpu_seconds)
+        status = UNREADABLE
         work()
         status = 0
     except BaseException as error:
         os.write(writing, " ".join(str(error).split())[:1000].encode())
     finally:
         os._exit(status)
+
+
+def _set_limit(kind: int, wanted: int) -> None:
+    """Limit a resource of this process; a hard limit that is lower already, as of `ulimit -v`, stays."""
+    import resource
+
+    hard = resource.getrlimit(kind)[1]
+    most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    resource.setrlimit(kind, (most, most))
 
 
 def _wait_for(child: int, seconds: float) -> int:

@@ -130,6 +130,36 @@ def test_a_probe_that_never_ends_is_stopped_by_its_processor_time(tmp_path, monk
         pass
 
 
+READER = """
+import resource, sys
+from pathlib import Path
+from scenes.io.hdf5 import open_checked, read_dataset
+used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+for kind, most in ((resource.RLIMIT_AS, used + (1 << 30)), (resource.RLIMIT_CPU, 60)):
+    resource.setrlimit(kind, (most, most))
+with open_checked(Path(sys.argv[1])) as file:
+    print(read_dataset(file, "x").sum())
+"""
+
+
+def test_a_file_is_read_within_limits_that_are_lower_than_those_of_its_probe(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    path = hdf5(tmp_path / "a.h5", x=lambda file, name: file.create_dataset(name, data=np.ones(4)))
+    command = [sys.executable, "-c", READER, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "4.0\n"), done.stderr
+
+
+def test_limits_that_cannot_be_set_are_told_apart_from_damage(tmp_path, monkeypatch):
+    def refuse(*_) -> None:
+        raise ValueError("not allowed")
+
+    monkeypatch.setattr(hdf5_module, "_set_limit", refuse)
+    path = hdf5(tmp_path / "a.h5", x=lambda file, name: file.create_dataset(name, data=np.ones(4)))
+    with pytest.raises(InputError, match=r"no limits could be set .*\(not allowed\)"), open_checked(path):
+        pass
+
+
 def test_a_file_without_a_checksum_is_read_by_another_process_first(tmp_path):
     """As written before there were checksums; and damaged so that the library fails or never ends."""
     with h5py.File(tmp_path / "old.h5", "w") as file:
