@@ -37,12 +37,13 @@ OLDER = {"transient": (1,)}  # schemas that are still read; they differ in where
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` to write to; renamed to `path` at the end, removed if anything goes wrong.
 
-    What killed processes of this machine left in the folder is removed before the first file goes there. Raises
-    InputError in one line when the folder is missing, the disk is full, or writing is not allowed.
+    Where `path` is a link, the file that it leads to is written, and the link stays. What killed processes of this
+    machine left in the folder is removed before the first file goes there. Raises InputError in one line when the
+    folder is missing, the disk is full, or writing is not allowed.
     """
-    path = Path(path)
-    # the suffix stays last: some libraries choose the format by it
-    beside = path.with_name(f".{path.stem[:80]}.{_machine()}.{os.getpid()}.part{path.suffix}")
+    suffix = Path(path).suffix  # stays last, that of a link too: some libraries choose the format by it
+    path = link_target(Path(path))
+    beside = path.with_name(f".{path.stem[:80]}.{_machine()}.{os.getpid()}.part{suffix}")
     try:
         if not path.parent.is_dir():
             raise InputError(f"{path}: folder {path.parent} does not exist")
@@ -58,6 +59,15 @@ def whole_file(path: Path) -> Iterator[Path]:
             beside.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or str(error).splitlines()[0]})") from None
+
+
+def link_target(path: Path) -> Path:
+    """Return the file that a symbolic link leads to, there or not; another path as it is. InputError for a loop."""
+    if not path.is_symlink():
+        return path
+    target = Path(os.path.realpath(path))
+    require(not target.is_symlink(), f"{path}: is a link that leads back to itself")
+    return target
 
 
 def _machine() -> str:
@@ -132,7 +142,7 @@ def read_array(path: Path) -> np.ndarray:
         size = path.stat().st_size
         require_memory(2 * size, "its array")
         with path.open("rb") as file:
-            return _array(file, size)
+            return npy_array(file, size)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except _NPY_ERRORS as error:
@@ -152,7 +162,7 @@ def read_arrays(path: Path, what: str = "array file") -> dict[str, np.ndarray]:
             require_memory(2 * sum(entry.file_size for entry in entries), "its arrays")
             for entry in entries:
                 with archive.open(entry) as file:
-                    found[entry.filename.removesuffix(".npy")] = _array(file, entry.file_size)
+                    found[entry.filename.removesuffix(".npy")] = npy_array(file, entry.file_size)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # what zipfile raises for damaged directories is of many types
@@ -160,15 +170,20 @@ def read_arrays(path: Path, what: str = "array file") -> dict[str, np.ndarray]:
     return found
 
 
-def _array(file: IO[bytes], size: int) -> np.ndarray:
-    """Read one array from a file of .npy format with so many bytes; nothing is allocated before shapes are checked."""
+def npy_array(file: IO[bytes], size: int, kinds: str = "biuf", name: str = "") -> np.ndarray:
+    """Read one array from a file of .npy format with so many bytes; nothing is allocated before its shape is checked.
+
+    Raises InputError, which begins with the array's `name`, for another kind of values (NumPy's letters `kinds`; one
+    text alone is taken) and a shape that is not that of the bytes; ValueError and others of NumPy for a damaged header.
+    """
     version = np.lib.format.read_magic(file)
     header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, columns_first, dtype = header[version](file)
-    require(dtype.kind in "biuf", f"holds {dtype}, expected numbers")
+    require(dtype.kind in kinds, f"{name} holds {dtype}, expected {'text' if kinds == 'U' else 'numbers'}".strip())
+    require(kinds != "U" or shape == (), f"{name} holds texts of shape {shape}, expected one".strip())
     left = size - file.tell()
     fits = min(shape, default=0) >= 0 and math.prod(shape) * dtype.itemsize == left
-    require(fits, f"states shape {shape} of {dtype}, {left} bytes follow")
+    require(fits, f"{name} states shape {shape} of {dtype}, {left} bytes follow".strip())
     values = np.frombuffer(bytearray(file.read(left)), dtype)
     return values.reshape(shape, order="F" if columns_first else "C")
 
@@ -249,7 +264,7 @@ def silenced() -> Iterator[None]:
 
 
 def finite(value: object) -> object:
-    """Return JSON knows no NaN: null instead."""
+    """Return a value with None for every number that JSON does not know, NaN and infinities, in lists and dicts too."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

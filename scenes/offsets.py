@@ -36,9 +36,10 @@ def check_delay(baseline_m: Iterable[float]) -> None:
 
 
 def pushed_along_rays(scene: Scene, metres: float) -> Scene:
-    """Return every point p at distance d in direction r from the camera goes to p + metres r, d + metres.
+    """Return the scene with every point `metres` farther from the camera, along the ray on which the camera sees it.
 
-    A flat face does not stay flat, so faces are divided until pushed edges lie within 0.6 mm of their place. Shading
+    A point p in direction r and at distance d goes to p + metres r, at distance d + metres. A flat face does not stay
+    flat, so faces are divided until pushed edges lie within 0.6 mm of their place. Shading
     normals follow: n' is along r (r n) + (n - r (r n)) / (1 + metres / d), the inverse transpose of the map.
     Raises InputError for a surface through the camera's centre.
     """

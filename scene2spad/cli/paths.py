@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from scenes.errors import InputError
+from scenes.files import link_target
 from scenes.io.hdf5 import HDF5_SUFFIXES
 
 HEAD_BYTES = 4096  # of a file, by which its format is told
@@ -55,8 +56,10 @@ def output_file(path: Path, suffix: str, kind: str, made: Path | None = None, *,
 def check_target(path: Path, source: Path | None = None, made: Path | None = None) -> None:
     """Raise InputError for a file that cannot be written: no folder for it, a folder of its name, or the source.
 
-    Whether the folder `made`, and those above it, can be made is for `output_folder` to check.
+    A link is checked as the file that it leads to. Whether the folder `made`, and those above it, can be made is for
+    `output_folder` to check.
     """
+    path = link_target(path)
     if made is not None and not path.parent.exists():
         folder = made.resolve()
         if path.parent.resolve() in (folder, *folder.parents):

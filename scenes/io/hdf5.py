@@ -179,7 +179,8 @@ def _walk(path: Path, contents: bool) -> None:
 def in_child(work: Callable[[], None], cpu_seconds: int) -> tuple[int, str]:
     """Do something in a copy of this process that may be killed: its status as of `subprocess`, and its last words.
 
-    The copy has `cpu_seconds` of the processor and may allocate PROBE_BYTES, or less where this process may. Nobody is inside HDF5 while it is made.
+    The copy has `cpu_seconds` of the processor and may allocate PROBE_BYTES, or what limits of this process leave.
+    Nobody is inside HDF5 while it is made.
     """
     import h5py
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 from zipfile import ZipFile
 
 import numpy as np
 
 from scenes.errors import InputError, require
+from scenes.files import npy_array
 from scenes.io.hdf5 import open_checked, read_dataset
 from scenes.io.inputs import parse_json, regular_file
 from scenes.json_types import JsonObject
@@ -60,26 +61,12 @@ def _from_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         for entry in entries:
             name = entry.filename.removesuffix(".npy")
             with archive.open(entry) as file:
-                values = _array(file, entry.file_size, "U" if name in TEXT else "biuf", name)
+                values = npy_array(file, entry.file_size, "U" if name in TEXT else "biuf", name)
             if name in TEXT:
                 text[name] = str(values[()])
             else:
                 numbers[name] = values
     return numbers, text
-
-
-def _array(file: IO[bytes], size: int, kinds: str, name: str) -> np.ndarray:
-    """Read one array of .npy format with so many bytes; nothing is allocated before its shape is checked."""
-    version = np.lib.format.read_magic(file)
-    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    shape, columns_first, dtype = header[version](file)
-    require(dtype.kind in kinds, f"{name} holds {dtype}, expected {'text' if kinds == 'U' else 'numbers'}")
-    require(kinds != "U" or shape == (), f"{name} holds texts of shape {shape}, expected one")
-    left = size - file.tell()
-    fits = min(shape, default=0) >= 0 and math.prod(shape) * dtype.itemsize == left
-    require(fits, f"{name} states shape {shape} of {dtype}, {left} bytes follow")
-    values = np.frombuffer(bytearray(file.read(left)), dtype)
-    return values.reshape(shape, order="F" if columns_first else "C")
 
 
 def _text(dataset: h5py.Dataset, name: str) -> str:

@@ -37,6 +37,32 @@ def test_a_file_and_its_folder_are_flushed_before_and_after_the_rename(tmp_path,
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
+def test_a_link_stays_and_the_file_that_it_leads_to_is_written(tmp_path):
+    """The temporary file lies beside that file, which may be on another disk, and has the asked ending."""
+    there = tmp_path / "there"
+    there.mkdir()
+    (tmp_path / "to-old.txt").symlink_to(there / "old.dat")
+    (tmp_path / "to-new.txt").symlink_to("there/new.txt")  # dangles, and is relative
+    (tmp_path / "twice.txt").symlink_to("to-old.txt")
+    (there / "old.dat").write_text("old")
+    for name, target in (("to-old.txt", "old.dat"), ("to-new.txt", "new.txt"), ("twice.txt", "old.dat")):
+        with whole_file(tmp_path / name) as beside:
+            assert beside.parent == there and beside.suffix == ".txt"
+            beside.write_text(name)
+        assert (tmp_path / name).is_symlink() and (there / target).read_text() == name
+    assert {path.name for path in there.iterdir()} == {"old.dat", "new.txt"}
+
+
+def test_links_that_lead_nowhere_are_refused_in_one_line(tmp_path):
+    (tmp_path / "a.txt").symlink_to(tmp_path / "b.txt")
+    (tmp_path / "b.txt").symlink_to(tmp_path / "a.txt")
+    (tmp_path / "far.txt").symlink_to(tmp_path / "none/far.txt")
+    for name, words in (("a.txt", "a.txt: is a link that leads back to itself"), ("far.txt", "none does not exist")):
+        with pytest.raises(InputError, match=words), whole_file(tmp_path / name):
+            pytest.fail("begun")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", "b.txt", "far.txt"}
+
+
 def test_a_deeply_nested_seal_is_no_seal_of_ours():
     with pytest.raises(InputError, match="not one of ours"):
         open_seal('{"a":' * 100_000, "histogram")
