@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scene2spad.cli.paths import holds_kind, input_file
+from scene2spad.cli.paths import begins, holds_kind, input_file
 from scenes.errors import InputError, require
 from scenes.io.hdf5 import HDF5_SUFFIXES
+from scenes.io.hdf5 import MARK as HDF5_MARK
+from scenes.io.hdf5 import SIGNATURE as HDF5_SIGNATURE
 
 if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
@@ -31,6 +34,7 @@ BY_SUFFIX = {
     ".s": ("program",),
     ".txt": ("text",),
 }
+EXR_SIGNATURE = b"\x76\x2f\x31\x01"
 SEALED = ("transient", "depth", "histogram", "pack", "network")
 KNOWN = (
     "a transient or depth map (.exr), a histogram or pack (.h5), a frame (.mat), a checkpoint (.safetensors) or a "
@@ -160,6 +164,10 @@ def _check_no_other_kind(path: Path) -> None:
         kinds = tuple(kind for kind in kinds if holds_kind(path, kind)) or ("picture",)
     if kinds[0] == "codes" and _is_cube(path):
         kinds = ("dense",)
+    if kinds[0] == "picture":
+        raise InputError(
+            f"{path}: {_foreign_exr(path)}, expected a histogram (.h5) or a transient (.exr) of scene2spad"
+        )
     from spad.formats.dense_reader import BY_HAND
 
     cure = {
@@ -167,8 +175,22 @@ def _check_no_other_kind(path: Path) -> None:
         "transient": "; sense it first: `scene2spad sense`",
         "codes": "; `depth` takes them by --codes-file, `compare` by --methods",
         "network": "; `depth` takes it by --checkpoint, `compare` by --methods",
+        "depth": "; `show` draws it, `export` makes points of it",
+        "cloud": "; `show` draws it",
+        "table": " (.h5); a table holds no photon counts of pixels, `show` draws one that scene2spad wrote",
+        "sensor": "; `sense` and `depth` take it by --sensor",
+        "program": "; `ultraphase` runs it",
     }
     raise InputError(f"{path}: is of kind {kinds[0]}, expected a histogram{cure.get(kinds[0], '')}")
+
+
+def _foreign_exr(path: Path) -> str:
+    """Say what a file is that ends in .exr, and that we did not write."""
+    if begins(path, re.escape(HDF5_SIGNATURE)) or begins(path, re.escape(HDF5_MARK)):
+        return "is an HDF5 file under the name of an OpenEXR file; give it the ending .h5"
+    if begins(path, re.escape(EXR_SIGNATURE)):
+        return "is an OpenEXR picture of another program"
+    return "is no OpenEXR file, whatever its name says"
 
 
 def open_depth(path: Path) -> DepthMap:

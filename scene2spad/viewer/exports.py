@@ -51,18 +51,8 @@ def dense_content(path: Path) -> Content:
 
     Raises InputError for arrays that do not belong together.
     """
-    arrays = _dense_arrays(path)
+    arrays, _ = dense_arrays(path)
     data, time_s, depth_m = arrays["data"], arrays["tofs"], arrays["depth_m"]
-    shaped = data.ndim == 3 and depth_m.ndim == 2 and time_s.ndim == 1 and len(time_s) > 1
-    require(shaped, f"{path}: data {data.shape}, tofs {time_s.shape} and depth_m {depth_m.shape} are no dense export")
-    if data.shape == (len(time_s), *depth_m.shape) and data.shape != (*depth_m.shape, len(time_s)):
-        data = np.moveaxis(data, 0, 2)
-    fits = data.shape == (*depth_m.shape, len(time_s))
-    require(fits, f"{path}: data of shape {data.shape} for {depth_m.shape} pixels and {len(time_s)} times")
-    known = bool(np.isfinite(data).all()) and bool(np.isfinite(time_s).all()) and bool((np.diff(time_s) > 0).all())
-    require(
-        known and float(data.min(initial=0)) >= 0, f"{path}: holds negative or infinite numbers, or times that fall"
-    )
     counted = data.dtype.kind in "iu"
     unit = "detections" if counted else "1/(m² sr)"
     layers = [grey_layer("sum over time", unit, data.sum(axis=2, dtype=np.float64))]
@@ -77,14 +67,28 @@ def dense_content(path: Path) -> Content:
     return Content(path.name, facts, tuple(layers), (cube,))
 
 
-def _dense_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an export; time is the last axis of `data` where the file says which one it is."""
+def dense_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Return the arrays of an export, whose `data` has time last, and its texts, each by name.
+
+    Raises InputError for arrays that are missing or do not belong together.
+    """
     arrays, text = read_dense_arrays(path)
     missing = [name for name in DENSE if name not in arrays]
     require(not missing, f"{path}: no dense array that `export` wrote: holds no {', '.join(missing)}")
-    if text.get("axes") == AXES["thw"] and arrays["data"].ndim == 3:
-        arrays["data"] = np.moveaxis(arrays["data"], 0, 2)
-    return arrays
+    data, time_s, depth_m = arrays["data"], arrays["tofs"], arrays["depth_m"]
+    shaped = data.ndim == 3 and depth_m.ndim == 2 and time_s.ndim == 1 and len(time_s) > 1
+    if shaped and text.get("axes") == AXES["thw"]:
+        data = np.moveaxis(data, 0, 2)
+    require(shaped, f"{path}: data {data.shape}, tofs {time_s.shape} and depth_m {depth_m.shape} are no dense export")
+    if data.shape == (len(time_s), *depth_m.shape) and data.shape != (*depth_m.shape, len(time_s)):
+        data = np.moveaxis(data, 0, 2)
+    fits = data.shape == (*depth_m.shape, len(time_s))
+    require(fits, f"{path}: data of shape {data.shape} for {depth_m.shape} pixels and {len(time_s)} times")
+    known = bool(np.isfinite(data).all()) and bool(np.isfinite(time_s).all()) and bool((np.diff(time_s) > 0).all())
+    require(
+        known and float(data.min(initial=0)) >= 0, f"{path}: holds negative or infinite numbers, or times that fall"
+    )
+    return arrays | {"data": data}, text
 
 
 def _map(path: Path, name: str, values: np.ndarray, shape: tuple[int, ...]) -> Layer:

@@ -9,6 +9,7 @@ import pytest
 from render.transient import read_transient
 from scene2spad.cli import main
 from scene2spad.cli.results.inspect import BARS, WIDTH, drawn
+from spad.formats.dense import dense, write_dense
 from spad.formats.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor.model import Sensor
 
@@ -64,6 +65,39 @@ def test_a_pack_shows_the_view_asked_for(files, capfd):
     assert message(capfd, files / "set.h5", "--view", 2)["views"] == 3
     assert main(["inspect", str(files / "set.h5"), "--view", "3"]) == 2
     assert "no view 3, there are 0 to 2" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["counts.npz", "counts.h5"])
+def test_dense_counts_are_those_of_their_histogram(files, capfd, tmp_path, name):
+    histogram = read_histogram(files / "gallery.h5")
+    layout = "hwt" if name == "counts.npz" else "thw"
+    write_dense(dense(histogram), tmp_path / name, layout=layout)
+    found = message(capfd, tmp_path / name, "--pixel", 5, 7)
+    assert (found["kind"], found["data"], found["unit"]) == ("dense", "counts", "detections per bin")
+    axes = {"hwt": ([12, 16, 1024], "row, column, time"), "thw": ([1024, 12, 16], "time, row, column")}
+    assert (found["shape"], found["axes"]) == axes[layout] and (found["rows"], found["columns"]) == (12, 16)
+    assert found["sensor"] == "reference" and found["bin_width_s"] == histogram.sensor.bin_width_s
+    assert found["wrapped"] == histogram.meta["wrapped"] and {"meta", "mixed"} <= {*found["arrays"]}
+    counts = np.zeros(1024, int)
+    for one in found["pixel"]["counts"]:
+        counts[one["bin"]] = one["counts"]
+    assert np.array_equal(counts, histogram.counts[5, 7]) and found["pixel"]["sum"] == counts.sum()
+
+
+def test_dense_light_has_its_unit_and_may_have_no_sensor(files, capfd, tmp_path):
+    arrays = dense(read_transient(files / "gallery.exr"), "reference")
+    write_dense(arrays, tmp_path / "light.npz")
+    found = message(capfd, tmp_path / "light.npz", "--pixel", 5, 7)
+    assert (found["data"], found["unit"]) == ("radiance", "1/(m^2 sr)")
+    bins = [one["bin"] for one in found["pixel"]["counts"]]
+    assert bins == np.flatnonzero(arrays["data"][5, 7]).tolist()
+    write_dense({name: arrays[name] for name in ("data", "tofs", "depth_m")}, tmp_path / "bare.npz")
+    assert message(capfd, tmp_path / "bare.npz")["sensor"] is None
+    assert main(["inspect", str(tmp_path / "bare.npz"), "--pixel", "12", "0"]) == 2
+    assert "no pixel in row 12, column 0" in capfd.readouterr().err
+    np.savez(tmp_path / "other.npz", data=np.ones((2, 3, 8)))
+    assert main(["inspect", str(tmp_path / "other.npz")]) == 2
+    assert "or dense arrays (.npz, .h5)" in capfd.readouterr().err
 
 
 def test_text_is_short_and_readable(files, capfd):

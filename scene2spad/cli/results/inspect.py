@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("scene2spad")
 KINDS = {".exr": ("transient",), **dict.fromkeys(HDF5_SUFFIXES, ("histogram", "pack"))}
+DENSE_SUFFIXES = (".npz", *HDF5_SUFFIXES)
 RANGES = {"path_m", "depth_m", "ambient_W_per_m2_sr_nm"}
 MAX_LINES = 40  # of a pixel's table
 BARS = " ▁▂▃▄▅▆▇█"
@@ -32,7 +33,8 @@ WIDTH = 64  # characters of a drawn histogram
 @dataclass(frozen=True, kw_only=True)
 class Inspect(Common):
     """Say what is in a file: kind, shape, units, sensor, seed, plan and ranges; with --pixel also that pixel's returns
-    or counts. FILE is a transient (.exr of render), a histogram (.h5 of sense) or a pack of a set (.h5 of dataset)."""
+    or counts. FILE is a transient (.exr of render), a histogram (.h5 of sense), a pack of a set (.h5 of dataset) or
+    dense arrays (.npz, .h5 of export)."""
 
     file: Positional[Path]
     """The file."""
@@ -45,10 +47,7 @@ class Inspect(Common):
 def run(command: Inspect, progress: Progress) -> dict:
     """Describe a file, and one pixel of it."""
     path = input_file(command.file)
-    known = KINDS.get(path.suffix.lower(), ())
-    kind = next((kind for kind in known if holds_kind(path, kind)), None)
-    if kind is None:
-        raise InputError(f"{path}: expected a transient (.exr), a histogram (.h5) or a pack (.h5) of scene2spad")
+    kind = _kind(path)
     only_for(command, str(path), {"view": (kind == "pack", "a pack")})
     if kind == "histogram":
         from spad.formats.histogram import read_histogram
@@ -56,6 +55,8 @@ def run(command: Inspect, progress: Progress) -> dict:
         histogram = read_histogram(path)
         found: JsonObject = {"kind": kind, **_of_histogram(histogram)}
         pixel = None if command.pixel is None else _counts_of(histogram, _checked(command, histogram.depth_m.shape))
+    elif kind == "dense":
+        found, pixel = _dense(command, path)
     else:
         found, transient = _transient(command, path, kind)
         shape = (transient.height, transient.width)
@@ -65,6 +66,33 @@ def run(command: Inspect, progress: Progress) -> dict:
     for name in RANGES & found.keys():
         found[name] = " to ".join(f"{value:.4g}" for value in found[name]) or "none"
     return found | ({} if pixel is None else {"pixel": _as_text(pixel)})
+
+
+def _kind(path: Path) -> str:
+    known = KINDS.get(path.suffix.lower(), ())
+    kind = next((kind for kind in known if holds_kind(path, kind)), None)
+    if kind is not None:
+        return kind
+    if path.suffix.lower() in DENSE_SUFFIXES:
+        from scene2spad.viewer.exports import is_dense
+
+        if is_dense(path):
+            return "dense"
+    expected = "a transient (.exr), a histogram (.h5), a pack (.h5) or dense arrays (.npz, .h5) of scene2spad"
+    raise InputError(f"{path}: expected {expected}")
+
+
+def _dense(command: Inspect, path: Path) -> tuple[JsonObject, JsonObject | None]:
+    """Describe a dense export, and the pixel asked for."""
+    from scene2spad.cli.results.dense_facts import of_dense, pixel_of_dense
+    from scene2spad.viewer.exports import dense_arrays
+
+    arrays, text = dense_arrays(path)
+    found: JsonObject = {"kind": "dense", **of_dense(arrays, text)}
+    if command.pixel is None:
+        return found, None
+    pixel = _checked(command, arrays["depth_m"].shape)
+    return found, pixel_of_dense(arrays, pixel) | {"drawn": drawn(arrays["data"][pixel])}
 
 
 def _transient(command: Inspect, path: Path, kind: str) -> tuple[JsonObject, Transient]:
