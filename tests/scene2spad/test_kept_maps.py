@@ -20,7 +20,8 @@ def test_every_map_has_the_errors_of_its_row(capfd, tmp_path, monkeypatch):
     write_pack([(wall(distance, 4), {"scene": f"walls/{distance:g}"}) for distance in (2.0, 3.0)], Path("walls.h5"))
     command = ["evaluate", "none-s0", "--set", "walls.h5", "--levels", "50+1", "2+0.5", "--baselines", "argmax"]
     assert main([*command, "--out", "out", "--json", "--maps"]) == 0
-    assert json.loads(capfd.readouterr().out)["maps"] == "out/maps"
+    told = capfd.readouterr()
+    assert json.loads(told.out)["maps"] == "out/maps" and "earlier evaluation" not in told.err
     with Path("out/evaluation.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["group"] == "all"]
     assert len(rows) == len([*Path("out/maps").rglob("*.exr")]) == 8
@@ -31,6 +32,18 @@ def test_every_map_has_the_errors_of_its_row(capfd, tmp_path, monkeypatch):
         truth = wall(distance, 4).depth_m
         assert meta["method"] == row["method"] and depth.shape == (4, 4) and confidence is None
         assert 1e3 * np.nanmean(np.abs(depth - truth)) == pytest.approx(float(row["mae_mm"]), rel=1e-3)
+
+
+def test_maps_of_an_earlier_evaluation_are_told(capfd, tmp_path, monkeypatch):
+    """They stay beside a table without maps of its own; an empty folder is nothing to tell."""
+    monkeypatch.chdir(tmp_path)
+    write_pack([(wall(2.0, 4), {"scene": "wall"})], Path("wall.h5"))
+    command = ["evaluate", "none-s0", "--set", "wall.h5", "--levels", "50+1", "--out", "out"]
+    Path("out/maps").mkdir(parents=True)
+    assert main(command) == 0 and "earlier evaluation" not in capfd.readouterr().err
+    Path("out/maps/old.exr").write_bytes(b"map")
+    assert main(command) == 0 and "warning: out/maps holds depth maps of an earlier" in capfd.readouterr().err
+    assert Path("out/maps/old.exr").read_bytes() == b"map"
 
 
 def test_maps_of_two_evaluations_do_not_mix(capfd, tmp_path):

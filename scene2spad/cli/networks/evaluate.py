@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from scene2spad.options.networks import Evaluate
 from scenes.errors import require
 from scenes.progress import Progress
 
+log = logging.getLogger("scene2spad")
 PUBLISHED_SET = Path("published")
 
 
@@ -22,10 +24,20 @@ def run(command: Evaluate, progress: Progress) -> dict:
     if command.set == PUBLISHED_SET:
         from scene2spad.datasets import published
 
-        return published.run_evaluate(command, progress)
-    from scene2spad.networks import evaluating
+        result = published.run_evaluate(command, progress)
+    else:
+        from scene2spad.networks import evaluating
 
-    return evaluating.run_evaluate(command, progress)
+        result = evaluating.run_evaluate(command, progress)
+    _warn_of_old_maps(command)
+    return result
+
+
+def _warn_of_old_maps(command: Evaluate) -> None:
+    """Warn of depth maps that an earlier evaluation left beside the new table: they are kept, and are not of it."""
+    folder = command.out / "maps"
+    if not command.maps and folder.is_dir() and any(folder.iterdir()):
+        log.warning("warning: %s holds depth maps of an earlier evaluation, not of the table just written", folder)
 
 
 def _check_checkpoints(paths: Sequence[Path]) -> None:
