@@ -1,8 +1,10 @@
-"""Entry point of the console script: it imports next to nothing, so that Ctrl-C is answered from the first moment."""
+"""Entry point of the console script: it imports next to nothing, so that Ctrl-C is answered some milliseconds after
+Python itself has started."""
 
 from __future__ import annotations
 
 import gc
+import io
 import os
 import sys
 
@@ -12,6 +14,7 @@ from scene2spad.interrupts import STOPPED, comes_of_interrupt, interrupt_again
 def script() -> None:
     """Run the command line and exit with its status; 130 for Ctrl-C, also while libraries are being imported."""
     _open_standard_streams()
+    _check_folder()
     # Libraries make a million objects that stay: searching them for garbage is a tenth of the time of their import.
     gc.set_threshold(50_000)
     # Threads of OpenMP (torch) that wait for each other sleep instead of spinning: a small depth map takes a quarter
@@ -43,7 +46,10 @@ def script() -> None:
 
 
 def _open_standard_streams() -> None:
-    """Give closed streams (>&-) somewhere to write to, or the next file opened would take their number."""
+    """Give closed streams (>&-) somewhere to write to, or the next file opened would take their number.
+
+    What the encoding of an output lacks, as bars of a histogram in ASCII, is written as question marks.
+    """
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
@@ -51,3 +57,15 @@ def _open_standard_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number: this one
     sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
     sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors != "backslashreplace":  # which stderr has
+            stream.reconfigure(errors="replace")
+
+
+def _check_folder() -> None:
+    """Exit with 2 where the current folder has been deleted: libraries fail in it, each by words of its own."""
+    try:
+        os.getcwd()  # noqa: PTH109 (pathlib is not imported yet)
+    except OSError as error:
+        print(f"scene2spad: the current folder is gone ({error.strerror}); change to another", file=sys.stderr)
+        sys.exit(2)

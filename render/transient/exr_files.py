@@ -18,11 +18,13 @@ DEEP = b"deepscanline"
 
 
 def write_exr(file: OpenEXR.File, path: Path) -> None:
-    """Write a file; OSError where that fails, or ends early."""
+    """Write a file; OSError where that fails, or ends early, and for a name that OpenEXR cannot take."""
     try:
         file.write(str(path))
     except RuntimeError as error:
         raise OSError(str(error)) from None
+    except UnicodeEncodeError:
+        raise OSError("its name is no UTF-8 text") from None
     if not is_complete(path):
         raise OSError("its last bytes were lost: is the disk full?")
 

@@ -7,7 +7,9 @@ import importlib
 import io
 import json
 import logging
+import os
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +31,7 @@ from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
 DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."
+NARROWEST = 20  # columns; the parser's help does not come to an end in fewer than five or so
 PIPED_S = 30.0  # between lines of progress where stderr is no terminal
 # In the order of --help: every command and its room. `scene2spad.cli.ROOM.NAME` has the options, a class `Name`, and
 # `run`; only what runs is imported.
@@ -62,6 +65,7 @@ def main(argv: list[str]) -> int:
             return 0
         if argv[:1] == ["--completion"]:
             return _print_completion(argv[1:])
+        _check_text(argv)
         command = parse_command(argv or ["--help"])
     except InputError as error:
         return _refuse(str(error))
@@ -109,6 +113,14 @@ def runner_of(name: str) -> Callable[[Common, Progress], dict]:
 
 def _module_of(name: str) -> ModuleType:
     return importlib.import_module(f"scene2spad.cli.{COMMANDS[name]}.{name}")
+
+
+def _check_text(argv: list[str]) -> None:
+    """Raise InputError for a word that is no text in this locale, as names of files may be: not every library takes
+    such names."""
+    for word in argv:
+        cure = f"is no {sys.getfilesystemencoding()} text; rename the file, or set a locale that has its letters"
+        require(word.encode("utf-8", "ignore").decode() == word, f"{word}: {cure}")
 
 
 def _check_words(argv: list[str]) -> None:
@@ -168,6 +180,8 @@ def parse_command(argv: list[str]) -> Common:
     Raises SystemExit: 2 after one line on stderr for words that are none, 0 after `--help`.
     """
     _check_words(argv)
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)
     usage = io.StringIO()
     try:
         with contextlib.redirect_stderr(usage):
@@ -200,7 +214,7 @@ def _one_line(box: str) -> str:
         text = text.replace(choice[0], f"{expected}{did_you_mean(choice[1], known)}", 1)
     text = _unparsed(text) or text
     text = re.sub(r" no type matching .*?could be instantiated from (\[.*?\])\. Got errors.*", r" cannot be \1", text)
-    return re.sub(r"For full helptext, run (.*)$", r"(see \1)", text) or "bad command line; see scene2spad --help"
+    return re.sub(r"For full helptext, run:? (.*)$", r"(see \1)", text) or "bad command line; see scene2spad --help"
 
 
 def _unparsed(text: str) -> str:
