@@ -26,10 +26,11 @@ from render.indirect.reuse import (
 from render.indirect.schedule import Schedule
 from render.probe import Probe, ProbePixels, make_probe, probe_splats, read_probe
 from render.scene.traced_scene import TracedScene, dr
-from render.transient.samples import Samples, concatenate, no_samples, packed
+from render.transient.samples import Samples, concatenate, no_samples, packed, select
 
 MAX_CELLS = 700_000  # of one launch: 17 MB of accumulators
 OVER = 0.3  # of a launch
+COMBINED = 1 << 21  # samples of two estimates that are merged at a time
 
 
 class PathGrid(NamedTuple):
@@ -88,12 +89,21 @@ def combined(one: IndirectLight, other: IndirectLight, fraction: np.ndarray) -> 
 
 def combined_samples(one: Samples, other: Samples, fraction: np.ndarray, cells: Cells, origin_m: np.ndarray) -> Samples:
     """Return the weighted mean of two estimates' samples in the same `cells`; `fraction` of the first, for every
-    pixel."""
-    parts = [
-        samples._replace(radiance=samples.radiance * weight[samples.pixel])
-        for samples, weight in ((one, fraction), (other, 1 - fraction))
-    ]
-    return coarsened(concatenate(parts), cells, origin_m)
+    pixel.
+
+    Pixels are merged some at a time: all at once, 17 million samples in each took 4 GB.
+    """
+    held = np.bincount(one.pixel, minlength=len(fraction)) + np.bincount(other.pixel, minlength=len(fraction))
+    part_of = np.cumsum(held) // COMBINED
+    merged = []
+    for part in np.unique(part_of[held > 0]):
+        first, end = np.searchsorted(part_of, (part, part + 1))
+        weighed = []
+        for samples, weight in ((one, fraction), (other, 1 - fraction)):
+            some = select(samples, np.flatnonzero((samples.pixel >= first) & (samples.pixel < end)))
+            weighed.append(some._replace(radiance=some.radiance * weight[some.pixel]))
+        merged.append(coarsened(concatenate(weighed), cells, origin_m))
+    return concatenate(merged) if merged else no_samples()
 
 
 def image_cells(world: TracedScene, width_m: float, growth: float, origin_m: np.ndarray, bounces: int) -> Cells:

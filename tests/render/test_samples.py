@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from render.indirect import integrator
+from render.indirect.path_cells import make_cells
 from render.transient.samples import Samples, merge, packed, to_returns
 
 
@@ -83,3 +85,18 @@ def test_far_paths_in_narrow_cells_stay_apart():
         assert merge(both, 1e-4).path_m.tolist() == [near, far]
     pixels = packed(np.array([2**31 - 1, 2**31 - 2]), np.full(2, 1e5), np.zeros(2), np.ones(2), np.full(2, 2))
     assert sorted(merge(pixels, 1e-4).pixel.tolist()) == [2**31 - 2, 2**31 - 1]
+
+
+@pytest.mark.parametrize("at_a_time", [1, 100])
+def test_two_estimates_merge_alike_in_parts_and_at_once(monkeypatch, at_a_time):
+    """To the last bit: each pixel's samples are in one part, in their order."""
+    rng = np.random.default_rng(0)
+    one, other = (packed(*random_samples(seed, 2000, 50)) for seed in (1, 2))
+    fraction, origin_m = rng.random(50), rng.random(50)
+    cells = make_cells(0.03, 0.05, -1.0, 20.0)
+    whole = integrator.combined_samples(one, other, fraction, cells, origin_m)
+    monkeypatch.setattr(integrator, "COMBINED", at_a_time)
+    parts = integrator.combined_samples(one, other, fraction, cells, origin_m)
+    assert 50 < len(whole.pixel) < 4000
+    for first, second in zip(whole, parts, strict=True):
+        assert first.dtype == second.dtype and np.array_equal(first, second)
