@@ -6,6 +6,15 @@ from pathlib import Path
 import pytest
 
 from scene2spad.cli import main
+from scene2spad.dry_runs.rendering import (
+    LIBRARY_BYTES,
+    MEMORY_MARGIN,
+    PIXEL_BYTES,
+    Trial,
+    estimated,
+    peak_of_render,
+    trial_sizes,
+)
 from scene2spad.options.experiments import STUDIES, Study
 from scene2spad.studies import every
 from scenes.errors import InputError
@@ -33,12 +42,67 @@ def test_a_dry_render_states_its_plan_and_writes_nothing(capfd, folder):
     assert files(folder) == []
     assert said["dry_run"] and said["out"] == "plane.exr" and said["pixels"] == [96, 64]
     assert said["plan"]["bounces"] == 1 and "trial" in said["basis"]
-    assert said["memory"]["work_bytes_at_least"] == 650 * 96 * 64 < said["memory"]["limit_bytes"]
+    least = LIBRARY_BYTES + PIXEL_BYTES * 96 * 64
+    assert MEMORY_MARGIN * least < said["memory"]["peak_bytes"] < said["memory"]["limit_bytes"]
     # the plane's rays are as many in every pixel, so that the trial tells the render's
     made = answer(capfd, "render", "plane", "--width", "96", "--height", "64", "--bounces", "1", "--no-figure")
     assert said["plan"]["grid"] == made["plan"]["grid"]
     assert said["estimate"]["rays"] == pytest.approx(made["rays"], rel=0.3)
     assert said["estimate"]["file_bytes"] == pytest.approx((folder / "plane.exr").stat().st_size, rel=0.5)
+
+
+def test_two_trials_are_extended_by_edges_and_area():
+    """Numbers that are a sqrt(p) + b p of p pixels come out as they are, and times as a constant and a slope."""
+
+    def trial(side: int) -> Trial:
+        edges_and_area = 300 * side + 2 * side**2
+        return Trial(side, side, 1 + 1e-4 * side**2, 2.0, edges_and_area, 5 * side, 7 * side**2, 0)
+
+    found = estimated([trial(48), trial(96)], 0.5, 640 * 480)
+    side = (640 * 480) ** 0.5
+    assert found["rays"] == pytest.approx(300 * side + 2 * side**2)
+    assert found["returns"] == pytest.approx(5 * side, abs=1) and found["file_bytes"] == pytest.approx(7 * side**2)
+    assert found["seconds"] == pytest.approx(0.5 + 1 + 1e-4 * side**2) and found["cpu_seconds"] == 2
+    whole = estimated([trial(48)], 0.5, 48 * 48)
+    assert whole["rays"] == 300 * 48 + 2 * 48**2 and whole["seconds"] == pytest.approx(1.5 + 1e-4 * 48**2)
+
+
+def test_estimates_never_fall_with_the_size_of_the_image():
+    """Noise of trials may say that the larger one took less, or that all is edges: no figure shrinks from there."""
+    some = [Trial(48, 48, 2.0, 2.0, 900, 500, 800, 0), Trial(96, 96, 1.0, 1.0, 800, 900, 4000, 0)]
+    found = estimated(some, 0.0, 640 * 480)
+    assert found["seconds"] == 1 and found["cpu_seconds"] == 1
+    times = 640 * 480 / 96**2  # as many pixels: all is edges, or all is area
+    for name, other in (("rays", 800), ("returns", 900), ("file_bytes", 4000)):
+        assert 0.999 * times**0.5 < found[name] / other < 1.001 * times
+
+
+@pytest.mark.parametrize(
+    ("pixels", "sizes"), [(100, [100]), (2304, [2304]), (6144, [576, 2304]), (10**6, [2304, 9216])]
+)
+def test_trials_are_no_larger_than_the_request(pixels, sizes):
+    assert trial_sizes(pixels) == sizes
+
+
+# scene, pixels, bounces, returns, and the peak of its process as the system counted it [MB]
+PEAKS = [
+    ("gallery", 64 * 64, 1, 57_343, 229),
+    ("gallery", 256 * 256, 1, 250_374, 316),
+    ("gallery", 640 * 480, 1, 837_719, 578),
+    ("gallery", 256 * 256, 24, 4_620_740, 479),
+    ("gallery", 640 * 480, 24, 19_310_597, 1211),
+    ("living-room", 256 * 256, 1, 333_104, 407),
+    ("living-room", 640 * 480, 1, 682_754, 662),
+    ("living-room", 320 * 240, 24, 4_871_989, 512),
+    ("living-room", 640 * 480, 24, 17_017_431, 1639),
+]
+
+
+@pytest.mark.parametrize(("scene", "pixels", "bounces", "returns", "peak"), PEAKS)
+def test_memory_is_promised_near_measured_peaks(scene, pixels, bounces, returns, peak):
+    """What the trials took, 220 MB of one bounce and 364 or more of 24, is their own peak."""
+    promised = peak_of_render(pixels, returns, 220e6 if bounces == 1 else 364e6)
+    assert 0.98 * peak < promised / 1e6 < 1.5 * peak, scene
 
 
 def test_a_dry_render_refuses_what_the_render_refuses(capfd, folder):
