@@ -23,7 +23,7 @@ from scenes.model import Scene
 TRIAL_PIXELS = 9216  # of the larger trial; a quarter of it where the request has no more
 SMALLER = 4  # times fewer pixels has the other trial
 FIRST_PIXELS = 64  # compiles, so that the trials' times are those of tracing
-# Fitted to the peaks of 13 renders of 64 x 64 to 640 x 480 pixels, of one bounce and of 24, with their pictures: either
+# Fitted to the peaks of 14 renders of 64 x 64 to 640 x 480 pixels, of one bounce and of 24, with their pictures: either
 # the launches' memory, as a trial's, or libraries, layers and all returns while they are merged and written.
 LIBRARY_BYTES, PIXEL_BYTES, RETURN_BYTES = 265e6, 1400, 46
 MEMORY_MARGIN = 1.1
