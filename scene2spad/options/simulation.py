@@ -20,8 +20,8 @@ class Sense(Common):
     out: File = None
     """The .h5 file (default: the transient's name)."""
     sensor: str = "reference"
-    """Sensor preset (reference, iccv2023-train, linospad, linospad2, pf32, swissspad3, tmf8820, tmf8828, vl53l1x,
-    vl53l8ch, ads6311) or a sensor file (.toml)."""
+    """Sensor preset (reference, reference-tdc, iccv2023-train, linospad, linospad2, pf32, swissspad3, tmf8820, tmf8828,
+    vl53l1x, vl53l8ch, ads6311) or a sensor file (.toml)."""
     bins: Count = None
     """Time bins of the histogram (default: the preset's)."""
     bin_width: Number = None
