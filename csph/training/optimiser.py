@@ -3,7 +3,7 @@
 Adam scales each weight's step alone. Muon (Jordan et al. 2024, https://kellerjordan.github.io/posts/muon) takes the
 weights of a layer as a matrix from inputs to outputs and makes all singular values of its step alike, so that rare
 directions are learned as fast as common ones. From random weights, learned 256x4x4 codes with the compact network have
-after 500 steps the validation error that Adam reaches after 1,500 (docs/networks-beside-print.md).
+after 500 steps the validation error that Adam reaches after 1,500 (docs/training-notebook.md).
 
     M <- 0.95 M + 0.05 G                    G: the gradient, a matrix (outputs, inputs x taps)
     W <- W - rate sqrt(max(1, outputs / inputs)) orthogonalised(0.95 M + 0.05 G)
