@@ -61,6 +61,7 @@ def own_codes(path: Path) -> tuple[Design, CodingTensor]:
     Raises InputError in one line that names the file.
     """
     coding = read_codes(path)
+    require(bool(coding.tensor.any()), f"{path}: all codes are zero")
     several = coding.block[1:] != (1, 1)
     sha256 = file_sha256(path)
     design = Design(OWN, coding.block, coding.codes, full=several, spatial_learned=False, sha256=sha256)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
@@ -247,6 +248,8 @@ def run_train(command: Train, progress: Progress) -> dict:
         if begun is not None:
             data[name] = Path(begun).name
     folder = folder_of(command)
+    if command.codes_file is not None:
+        _warn_of_dependent(codes_path(command.codes_file, folder))
     result = train(
         replace(config, data=data),
         training,
@@ -257,6 +260,14 @@ def run_train(command: Train, progress: Progress) -> dict:
         progress=progress,
     )
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}
+
+
+def _warn_of_dependent(path: Path) -> None:
+    """Warn of own codes that follow from each other: they tell a network nothing more."""
+    _, coding = own_codes(path)
+    rank = int(torch.linalg.matrix_rank(coding.tensor.flatten(1)))
+    if rank < coding.codes:
+        log.warning("%s: its %d codes have rank %d: the others follow from so many", path, coding.codes, rank)
 
 
 def begun_with(command: Train, config: TrainConfig) -> WeightsOf | NetworkOf | None:
