@@ -30,7 +30,7 @@ MEMORY_MARGIN = 1.1
 
 
 class Trial(NamedTuple):
-    """What one smaller image took."""
+    """Hold what the render of one smaller image took."""
 
     width: int
     height: int

@@ -93,7 +93,7 @@ def test_codes_that_tell_no_depth_are_refused(rows, message):
 
 @pytest.mark.parametrize("name", FIXED_CODES)
 def test_codes_by_name_are_decoded(name):
-    """What a uniform background adds is one direction of gates and of random codes."""
+    """Take what a uniform background adds for one direction of gates and of random codes."""
     sensor, lost = Sensor(), int(name in ("coarse", "random"))
     for codes in (2, 4, 8, 16, 64):
         coding = CodingTensor(name, temporal_code(name, codes, sensor.bins, sensor))

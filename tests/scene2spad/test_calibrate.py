@@ -142,8 +142,8 @@ def test_distances_of_other_captures_are_refused_before_any_work(distances, word
 
 @pytest.mark.parametrize("effects", [["delay", "background"], []])
 def test_captures_in_part_of_another_order_lead_to_no_file(effects, capfd, tmp_path, monkeypatch):
-    """Where 6 of 45 captures are others', returns still move with distance; the fit shows it, without numbers that
-    overflow."""
+    """Refuse 6 of 45 captures that are others': returns still move with distance, so that the fit shows it, without
+    numbers that overflow."""
     monkeypatch.chdir(tmp_path)
     shipped_without("turned.npz", lambda counts: np.copyto(counts, np.roll(counts, -6, axis=0)))
     options = ["--effects", *effects] if effects else []

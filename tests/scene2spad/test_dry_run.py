@@ -100,7 +100,7 @@ PEAKS = [
 
 @pytest.mark.parametrize(("scene", "pixels", "bounces", "returns", "peak"), PEAKS)
 def test_memory_is_promised_near_measured_peaks(scene, pixels, bounces, returns, peak):
-    """What the trials took, 220 MB of one bounce and 364 or more of 24, is their own peak."""
+    """Promise at most half more than was measured; trials themselves took 220 MB of one bounce, 364 or more of 24."""
     promised = peak_of_render(pixels, returns, 220e6 if bounces == 1 else 364e6)
     assert 0.98 * peak < promised / 1e6 < 1.5 * peak, scene
 

@@ -1,4 +1,4 @@
-"""What captures say of a sensor: distances that are not theirs, too few of them, and fits that say nothing."""
+"""Refuse captures that say nothing of a sensor: other distances, too few of them, and fits without a result."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What `inspect` says of a dense export, and of one pixel of it."""
+"""Describe a dense export for `inspect`, and one pixel of it."""
 
 from __future__ import annotations
 
