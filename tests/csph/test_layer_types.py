@@ -17,6 +17,12 @@ DESIGNS = (
     Design("fourier", (32, 1, 1), 6),
 )
 SWITCHES = ({}, {"int8": True}, {"pulse_in_codes": True, "pulse_in_decoder": True})
+CASES = [  # int8 is for factors
+    pytest.param(design, switches, id="-".join([design.name, *switches]))
+    for design in DESIGNS
+    for switches in SWITCHES
+    if not (design.full and switches.get("int8"))
+]
 MODELS = {
     "compact": ModelConfig(design=Design("learned", (64, 2, 2), 8)),
     "blockwise": ModelConfig(design=Design("learned", (64, 2, 2), 8), network="blockwise"),
@@ -42,12 +48,9 @@ def outcome(layer: CompressiveLayer, x: torch.Tensor) -> tuple[torch.Tensor, ...
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("switches", SWITCHES)
-@pytest.mark.parametrize("design", DESIGNS, ids=lambda design: design.name)
+@pytest.mark.parametrize(("design", "switches"), CASES)
 def test_weights_of_16_bits_compute_as_the_same_weights_in_float32(design, switches, dtype):
     """1003 counts were 1004 in bfloat16, and 1e5 counts in a bin infinite in float16."""
-    if design.full and switches.get("int8"):
-        pytest.skip("int8 is for factors")
     half = CompressiveLayer.of(design, **switches).to(dtype)
     whole = copy.deepcopy(half).float()
     x = counts()
@@ -82,12 +85,9 @@ def test_a_layer_gives_shapes_on_the_meta_device(design):
     assert layer.decode(codes.to("meta")).shape == x.shape
 
 
-@pytest.mark.parametrize("switches", SWITCHES[:2])
 @pytest.mark.parametrize("columns", [8, 6])  # pixels of a row are moved 2 and 4 at a time, where not compiled
-@pytest.mark.parametrize("design", DESIGNS, ids=lambda design: design.name)
+@pytest.mark.parametrize(("design", "switches"), CASES)
 def test_a_compiled_layer_computes_the_same(design, columns, switches):
-    if design.full and switches.get("int8"):
-        pytest.skip("int8 is for factors")
     layer, x = CompressiveLayer.of(design, **switches).double(), counts(columns)
     torch.compiler.reset()  # of what other cases compiled of the same code
     compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")

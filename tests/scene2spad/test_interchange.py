@@ -1,6 +1,5 @@
 """Files, codes and networks of the published family at the command line."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 import scipy.io
 import scipy.sparse
 import torch
+from commands import run
 
 from csph.codes.design import Design
 from csph.networks.model import DepthModel, load_model, save_model
@@ -23,13 +23,6 @@ from spad.formats.histogram import Histogram, write_histogram
 from spad.formats.linospad import Capture, write_linospad
 from spad.formats.mat import read_mat, write_mat
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
-
-
-def run(capfd, *argv: str) -> dict:
-    status = main([*argv, "--json"])
-    out, err = capfd.readouterr()
-    assert status == 0, err
-    return json.loads(out)
 
 
 def refused(capfd, *argv: str) -> str:

@@ -7,6 +7,7 @@ import matplotlib
 import numpy as np
 import pytest
 import scipy.io
+from commands import refused
 from PIL import Image
 
 from scene2spad.cli import main
@@ -35,14 +36,6 @@ def folder(made, tmp_path, monkeypatch) -> Path:
     (tmp_path / "own.s").write_text((FOLDER / "coarse.s").read_text())
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def refused(capfd, *argv: str) -> str:
-    capfd.readouterr()
-    status = main(list(argv))
-    err = capfd.readouterr().err
-    assert status == 2 and len(err.splitlines()) == 1, err
-    return err
 
 
 def kept(capfd, argv: list[str], path: str, contents: bytes) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from commands import refused, run
 from small_runs import QUICK
 
 from csph.codes.design import OWN, Design
@@ -33,21 +34,6 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.save("mine.npy", ROWS)
     np.save("block.npy", np.random.default_rng(0).normal(size=(4, 256, 2, 2)))
-
-
-def run(capfd, *argv: str) -> dict:
-    status = main([*argv, "--json"])
-    out, err = capfd.readouterr()
-    assert status == 0, err
-    return json.loads(out)
-
-
-def refused(capfd, *argv: str) -> str:
-    capfd.readouterr()
-    status = main(list(argv))
-    err = capfd.readouterr().err
-    assert status == 2 and len(err.splitlines()) == 1, err
-    return err
 
 
 def test_a_run_with_own_codes_needs_their_file_no_more(capfd):
