@@ -56,7 +56,7 @@ def _text_parts(path: Path) -> dict[str, Tensor]:
 
 
 def own_codes(path: Path) -> tuple[Design, CodingTensor]:
-    """Return the fixed codes of a .npy file as a design and its tensor: `DepthModel` takes both.
+    """Return the fixed codes of a file (.npy, .txt) as a design and its tensor: `DepthModel` takes both.
 
     Raises InputError in one line that names the file.
     """
