@@ -1,6 +1,6 @@
 """Depth labels on the published grid: arrivals on whole bins, the label the pulse's fullest bin, decoded by i/(T - 1).
 
-Ours are continuous and centred on the pulse. A model that is to be compared with print is trained on print's grid: the
+Ours are continuous and centred on the pulse. A model that is to be compared with the paper is trained on its grid: the
 published label stands 0.44 bins (6.5 mm) behind the pulse's centroid, and bin i of T is decoded as i/(T - 1) of the
 range, k/(T - 1) bins too far at bin k. Neither is an error of a network.
 """

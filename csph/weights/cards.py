@@ -105,7 +105,7 @@ def limits(config: TrainConfig) -> tuple[str, ...]:
     if long and reach and not config.time_offset_m:
         found.append(f"depths beyond those of its training set, {reach:g} m, or such as it rarely shows")
     if model.grid == "published":
-        found.append("absolute depth: its labels are the published ones, for comparison with print")
+        found.append("absolute depth: its labels are the published ones, for comparison with the paper")
     return tuple(found)
 
 

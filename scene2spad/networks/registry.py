@@ -38,7 +38,7 @@ class ModelSpec:
     time_offset_m  random delays in training, 0 as published
     trained_on     rooms: direct light in rooms, the recipe of the offset study; mixed: rooms and clutter with indirect
                    light as well, levels over their whole range; published: rooms and clutter on the published grid, for
-                   comparison with print
+                   comparison with the paper
     int8           trained for the chip (`--layer int8`), beginning with `plain`
     tdc            trained further behind the real converters of `TDC_SENSOR`, beginning with `plain`
     """
@@ -188,7 +188,7 @@ def check(config: TrainConfig, wanted: ModelSpec, path: Path) -> None:
     """Raise InputError in one line for a checkpoint that is not what is wanted: other design, seed, sensor, time
     offsets.
 
-    Models to compare with print are each trained by a recipe of its own: some were begun with a run of another seed,
+    Models to compare with the paper are each trained by a recipe of its own: some were begun with a run of another seed,
     and some keep the mean over their codes.
     """
     expected = config_of(wanted.command("laptop", Path("planes"), Path()))

@@ -83,7 +83,7 @@ class Train(Long):
     """Train on so many bins around a label but for the last tenth of the run; 0: all (default: the preset's, where the
     codes allow it)."""
     grid: Literal["continuous", "published"] = "continuous"
-    """Labels: continuous, or on whole bins and decoded as published, for comparison with print."""
+    """Labels: continuous, or on whole bins and decoded as published, for comparison with the paper."""
     spatial_start: Annotated[Literal["uniform", "orthogonal"] | None, may_stay_open("{uniform,orthogonal}")] = None
     """Start of learned spatial codes (default: orthogonal; uniform with paper and laptop-v1)."""
     sense_on: Annotated[Literal["host", "device"] | None, may_stay_open("{host,device}")] = None

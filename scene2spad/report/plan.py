@@ -350,6 +350,6 @@ _BEYOND = Section(
 SECTIONS = (_SPEED, _HARD, _FIGURES, _BEYOND)
 NEVER = (
     "Real captures of the LinoSPAD prototype (S.4): they cannot be had; Figures 13 and 14 stand on rendered ones.",
-    "Three of the eight Middlebury scenes of the published test set: our numbers beside print are of the other five.",
+    "Three of the eight Middlebury scenes of the published test set: our numbers beside its own are of the other five.",
     "Power of a chip: the published table is recomputed, its programs are emulated, no silicon was measured.",
 )

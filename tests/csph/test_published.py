@@ -101,7 +101,7 @@ def test_an_imported_model_finds_the_depths_of_the_one_that_was_trained(design, 
     np.testing.assert_allclose(loaded.depth_of(histogram)[0], expected, atol=TRAIN.bin_depth_m / 100)
     ours = soft_argmax(logits)[0] * TRAIN.bin_depth_m
     assert (torch.from_numpy(loaded.depth_of(histogram)[0]) - ours).abs().max() < TRAIN.bin_depth_m
-    assert "absolute depth: its labels are the published ones, for comparison with print" in limits(config)
+    assert "absolute depth: its labels are the published ones, for comparison with the paper" in limits(config)
 
 
 def test_recorded_outputs_of_the_published_network_come_back_through_an_import(shared_data, tmp_path):

@@ -174,7 +174,7 @@ def test_a_published_checkpoint_is_imported_and_used(capfd, folder):
     direct = load_model(Path("imported"))[0].depth_of(histogram)[0]
     known = np.isfinite(histogram.depth_m)
     assert found["mae_mm"] == pytest.approx(1e3 * np.abs(direct - histogram.depth_m)[known].mean(), rel=1e-4)
-    # print trains on the one and tests on the other: what was learned of pulses was in bins
+    # the paper trains on the one and tests on the other: what was learned of pulses was in bins
     run(capfd, "models", "import", "epoch=6.ckpt", "--sensor", "reference", "--out", "for-tests")
     write_histogram(planes(8), Path("reference.h5"))
     run(capfd, "depth", "reference.h5", "--method", "network", "--no-figure", "--checkpoint", "for-tests")

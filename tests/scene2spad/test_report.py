@@ -344,7 +344,7 @@ def test_published_numbers_stand_beside_ours():
     one, other = ModelSpec("fourier", (1024, 1, 1)), ModelSpec("gray", (1024, 1, 1))
     rows = report_published.error_rows([one, other], [{"model": one.name, "near_mae_mm_label": 80.68}], far=False)
     assert rows[0]["near published"] == 40.34 and rows[0]["near ours / published"] == "2.00 worse"
-    assert len(rows) == 1  # print stands beside what was measured, alone beside nothing
+    assert len(rows) == 1  # the paper stands beside what was measured, alone beside nothing
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ class Models(Common):
     """Checkpoint of the published code to import (.ckpt, written by Lightning)."""
     sensor: Annotated[str | None, may_stay_open("NAME")] = None
     """Sensor whose histograms an imported model is to take, a preset or a file (default: iccv2023-train, that of the
-    published training set; print tests on reference)."""
+    published training set; the paper tests on reference)."""
     out: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder for an imported model (default: out/models and the checkpoint's name)."""
 

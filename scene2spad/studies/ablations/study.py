@@ -49,7 +49,7 @@ def run(command: Study, progress: Progress) -> dict:
     rows = evaluated(store, [*subjects.values()], test, levels, maps=shown, seed=seed, progress=progress)
     others = [model.subject for model in again.values()]
     repeated = evaluated(store, others, test, levels, seed=seed, progress=progress)
-    # with print, models of print's grid are compared as well; published numbers are means of all test levels
+    # with the paper, models of its grid are compared as well; published numbers are means of all test levels
     twins = where_trained([replace(one, trained_on="published") for one in models.found], command)
     beside = {one: model.subject for one, model in twins.items()}
     pairs, pair_levels = (SMOKE.pairs, SMOKE.pair_levels) if smoke else (None, PHOTON_LEVELS)

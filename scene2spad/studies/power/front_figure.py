@@ -71,7 +71,7 @@ def _points(
     for row, (x, y) in zip(rows, places, strict=True):
         axes.plot(x, y, markersize=9, label=row["name"], **styles[row["name"]] | {"ls": ""})
     for row in printed:
-        label = "print: its clocks, MAE of 8 pairs at 16 levels" if row is printed[0] else None
+        label = "paper: its clocks, MAE of 8 pairs at 16 levels" if row is printed[0] else None
         axes.plot(measure(row), row["mae_mm"], "k*", markerfacecolor="none", markersize=11, label=label)
         axes.annotate(row["name"], (measure(row), row["mae_mm"]), (4, 4), textcoords="offset points", fontsize=7)
     axes.set(xscale="log", yscale="log", ylabel="MAE [mm]")
