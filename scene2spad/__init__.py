@@ -19,8 +19,8 @@ from scenes.lazy import lazy_names
 if TYPE_CHECKING:
     from csph import CodingTensor, CompressiveLayer, Design, decode_depth, encode, encode_timestamps, make_coding
     from csph.codes.physics import deepinv_physics
+    from csph.networks.config import ModelConfig, TrainConfig
     from csph.networks.model import DepthModel
-    from csph.training.config import ModelConfig, TrainConfig
     from csph.training.loop import train
     from csph.training.views import Views, read_views
     from csph.weights.cards import Card
@@ -86,7 +86,7 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
     ),
     "csph.codes.physics": ("deepinv_physics",),
     "csph.weights.cards": ("Card",),
-    "csph.training.config": ("ModelConfig", "TrainConfig"),
+    "csph.networks.config": ("ModelConfig", "TrainConfig"),
     "csph.networks.model": ("DepthModel",),
     "csph.training.loop": ("train",),
     "csph.training.views": ("Views", "read_views"),

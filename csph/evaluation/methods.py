@@ -16,7 +16,6 @@ import numpy as np
 
 from csph.evaluation.exposures import Plans, asked_law
 from csph.evaluation.metrics import (
-    PHOTON_LEVELS,
     TOLERANCES_MM,
     Interval,
     bias_by_depth,
@@ -25,6 +24,7 @@ from csph.evaluation.metrics import (
     mean_over_scenes,
     paired_difference,
 )
+from csph.levels import PHOTON_LEVELS
 from csph.networks.posterior import Decoder
 from csph.training.views import Views
 from render.backend.malloc import retain_freed_memory

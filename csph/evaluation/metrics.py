@@ -1,4 +1,4 @@
-"""Figures of merit of depth maps, the paper's photon levels and groups, and intervals over scenes."""
+"""Figures of merit of depth maps, the paper's groups of photon levels, and intervals over scenes."""
 
 from __future__ import annotations
 
@@ -13,13 +13,6 @@ from numpy.typing import ArrayLike
 from scenes.errors import require
 from spad.estimators.depth import depth_errors
 
-# mean signal and background photons of the 16 test levels; training draws from the first nine
-PHOTON_LEVELS: tuple[tuple[float, float], ...] = (
-    *((signal, background) for signal in (10.0, 5.0, 2.0) for background in (2.0, 10.0, 50.0)),
-    *((10.0, background) for background in (200.0, 500.0, 1000.0)),
-    *((50.0, background) for background in (50.0, 200.0, 500.0, 1000.0)),
-)
-TRAIN_LEVELS = PHOTON_LEVELS[:9]
 LOW_SBR = 0.1  # the paper's two groups of levels: at most, and above
 TOLERANCES_MM = (1, 5, 10, 20)
 _SSIM_SIDE = 7  # pixels of scikit-image's window

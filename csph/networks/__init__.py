@@ -1,1 +1,1 @@
-"""Depth networks, the model that joins code, back-projection and network, and its posterior."""
+"""Depth networks, the model that joins code, back-projection and network, its configuration and its posterior."""

@@ -8,10 +8,10 @@ from torch import nn
 
 from csph.networks.blockwise import Blockwise
 from csph.networks.compact import Compact
+from csph.networks.config import ModelConfig
 from csph.networks.periodic import Periodic
 from csph.networks.published import DeepBoosting
 from csph.networks.refined import Refined
-from csph.training.config import ModelConfig
 from scenes.errors import require, require_kind
 
 

@@ -20,12 +20,12 @@ from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer
 from csph.networks.blockwise import Blockwise, mixers_for
 from csph.networks.choice import network_of, own_network
+from csph.networks.config import ModelConfig, TrainConfig, grows
 from csph.networks.grid import published_position
 from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
 from csph.networks.posterior import Decoder, confidence, decoded
 from csph.networks.published import parameters_of
 from csph.networks.refined import Refined
-from csph.training.config import ModelConfig, TrainConfig, grows
 from scenes.errors import InputError, require, require_kind, require_whole
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.inputs import regular_file
@@ -109,7 +109,7 @@ class DepthModel(nn.Module):
     def begin_with_network(self, other: DepthModel) -> None:
         """Take the weights of another model's network alone.
 
-        What a larger network has beyond a smaller one (`training.config.HELD`) keeps its start, which adds nothing;
+        What a larger network has beyond a smaller one (`networks.config.HELD`) keeps its start, which adds nothing;
         so do the steps that mix a block's pixels where blocks differ in pixels. Where they differ in bins, these are
         repeated along time.
         """

@@ -1,1 +1,1 @@
-"""Train depth networks: configuration, patches sensed on the fly, loss, schedule, resume."""
+"""Train depth networks: patches sensed on the fly, loss, schedule, resume."""

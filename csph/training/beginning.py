@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from csph.codes.nested import holds
 from csph.layer_options import LayerOptions
+from csph.networks.config import ModelConfig, TrainConfig, grows
 from csph.networks.model import DepthModel
-from csph.training.config import ModelConfig, TrainConfig, grows
 from scenes.errors import require, require_kind
 from scenes.json_types import JsonObject
 

@@ -17,9 +17,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from csph.evaluation.metrics import PHOTON_LEVELS
-from csph.training.config import WINDOW_STEP, TrainConfig
-from csph.training.levels import dealt_levels, draw_level
+from csph.levels import PHOTON_LEVELS, dealt_levels, draw_level
+from csph.networks.config import WINDOW_STEP, TrainConfig
 from scenes.errors import require
 from scenes.random_streams import Stream
 from spad.detection.device_patches import DevicePatches

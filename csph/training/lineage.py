@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from csph.networks.config import TrainConfig
 from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.training.beginning import NetworkOf, WeightsOf
-from csph.training.config import TrainConfig
 from csph.training.views import ANCESTORS_SEEN, SEEN, Views, is_seen, read_seen
 from csph.weights.shipped import WEIGHTS, checkpoint_name, shipped_file
 from scenes.errors import InputError

@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from csph.networks.config import TrainConfig
 from csph.networks.model import DepthModel
-from csph.training.config import TrainConfig
 
 RANGE_RATE = 0.02  # of the logarithms of int8 clipping ranges: a bit more headroom in some 40 steps
 MOMENTUM = 0.95

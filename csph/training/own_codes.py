@@ -7,7 +7,7 @@ from pathlib import Path
 from csph.codes.design import OWN
 from csph.codes.files import own_codes
 from csph.codes.tensor import CodingTensor
-from csph.training.config import TrainConfig
+from csph.networks.config import TrainConfig
 from scenes.errors import require
 from scenes.files import whole_file
 from scenes.io.inputs import read_bytes

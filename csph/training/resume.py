@@ -10,7 +10,7 @@ import torch
 from lightning_fabric.plugins.io.torch_io import TorchCheckpointIO
 from torch import nn
 
-from csph.training.config import TrainConfig
+from csph.networks.config import TrainConfig
 from csph.training.own_codes import FILE, keep_codes
 from csph.weights.torch_files import load_torch_file
 from scenes.errors import InputError, require

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from csph.training.config import TrainConfig
+from csph.networks.config import TrainConfig
 
 
 def rate_factor(step: int, config: TrainConfig) -> float:

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from csph.codes.design import Design
 from csph.codes.temporal import FIXED_CODES, temporal_code
+from csph.networks.config import ModelConfig, TrainConfig, preset
 from csph.networks.model import DepthModel, save_model
-from csph.training.config import ModelConfig, TrainConfig, preset
 from csph.weights.torch_files import load_torch_file
 from scenes.errors import InputError, require
 from spad.sensor.model import Sensor, sensor_by_name

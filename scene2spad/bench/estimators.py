@@ -11,7 +11,7 @@ import torch
 from matplotlib import pyplot as plt
 from PIL import Image
 
-from csph.evaluation.metrics import PHOTON_LEVELS as LEVELS
+from csph.levels import PHOTON_LEVELS as LEVELS
 from csph.training.views import read_views
 from render.transient import Transient
 from scene2spad.options.experiments import Bench

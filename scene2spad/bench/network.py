@@ -17,9 +17,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from csph.codes.design import Design
 from csph.evaluation.methods import EvaluationPlan, evaluate
+from csph.networks.config import NETWORKS, ModelConfig, Network, preset
 from csph.networks.model import DepthModel
 from csph.networks.published import DeepBoosting, parameters_of
-from csph.training.config import NETWORKS, ModelConfig, Network, preset
 from csph.training.loss import kl_divergence
 from csph.training.views import split_views
 from render.backend.malloc import retain_freed_memory

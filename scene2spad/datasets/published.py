@@ -21,7 +21,8 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from csph.evaluation.methods import DepthEstimator
-from csph.evaluation.metrics import PHOTON_LEVELS, image_errors
+from csph.evaluation.metrics import image_errors
+from csph.levels import PHOTON_LEVELS
 from csph.networks.grid import published_centroid_bins
 from csph.networks.model import DepthModel, load_model
 from csph.networks.posterior import DECODERS, Decoder

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from csph.evaluation.methods import EvaluationPlan, Method, Row, as_dicts, evaluate
-from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.levels import PHOTON_LEVELS
 from csph.training.views import Views, read_views
 from scene2spad.datasets.packing import pack_set
 from scene2spad.datasets.rendering import Job, make_set

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import torch
 
 from csph.codes.tensor import CodingTensor
+from csph.networks.config import COUNT_BYTES, TrainConfig
 from csph.networks.model import DepthModel
-from csph.training.config import COUNT_BYTES, TrainConfig
 from csph.training.own_codes import own_codes_of
 from csph.weights.shipped import TIMINGS
 from scene2spad.datasets.workers import check_workers

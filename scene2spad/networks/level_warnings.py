@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from csph.training.config import TrainConfig
-from csph.training.levels import BACKGROUND, SIGNAL, Level, Levels
+from csph.levels import BACKGROUND, SIGNAL, Level, Levels
+from csph.networks.config import TrainConfig
 from spad.detection.detect import mean_pixel_law
 from spad.sensor.model import PhotonBudget
 

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from csph import CodingTensor, decode_depth, encode, temporal_code
 from csph.evaluation.metrics import LOW_SBR
-from csph.evaluation.metrics import PHOTON_LEVELS as LEVELS
+from csph.levels import PHOTON_LEVELS as LEVELS
 from render.engine import render
 from render.settings import RenderSettings
 from render.transient import Transient

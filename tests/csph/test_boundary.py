@@ -9,9 +9,9 @@ import torch
 
 from csph.codes.design import Design
 from csph.layer import CompressiveLayer, LayerOptions, make_coding
+from csph.networks.config import ModelConfig, TrainConfig, preset
 from csph.networks.model import DepthModel, save_model
 from csph.training.beginning import WeightsOf
-from csph.training.config import ModelConfig, TrainConfig, preset
 from csph.training.loop import train
 from csph.training.views import Views
 from scene2spad.datasets.planes import random_planes

@@ -8,7 +8,7 @@ import sys
 import pytest
 from test_training import FEW, MODEL, near_planes
 
-from csph.training.config import preset
+from csph.networks.config import preset
 from csph.training.loop import train
 from csph.training.views import split_views
 from csph.weights.cards import cards, checkpoint_of, read_card, shipped_model

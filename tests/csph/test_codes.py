@@ -21,7 +21,7 @@ from csph.codes.temporal import (
 )
 from csph.codes.tensor import CodingTensor, encode
 from csph.layer import CompressiveLayer
-from csph.training.config import ModelConfig
+from csph.networks.config import ModelConfig
 from scenes.errors import InputError
 from spad.formats.rgbd import published_taps
 from spad.sensor.model import Pulse, Sensor, sensor_by_name

@@ -5,7 +5,7 @@ import csv
 import pytest
 from test_training import FEW, MODEL, near_planes
 
-from csph.training.config import preset
+from csph.networks.config import preset
 from csph.training.loop import train
 from csph.training.views import split_views
 

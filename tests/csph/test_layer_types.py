@@ -7,8 +7,8 @@ import torch
 
 from csph.codes.design import Design
 from csph.layer import CompressiveLayer
+from csph.networks.config import ModelConfig
 from csph.networks.model import DepthModel
-from csph.training.config import ModelConfig
 from scenes.errors import InputError
 
 DESIGNS = (

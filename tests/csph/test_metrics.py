@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from csph.evaluation.metrics import (
-    PHOTON_LEVELS,
-    TRAIN_LEVELS,
     bias_by_depth,
     grouped_errors,
     image_errors,
@@ -16,6 +14,7 @@ from csph.evaluation.metrics import (
     paired_difference,
     ssim,
 )
+from csph.levels import PHOTON_LEVELS, TRAIN_LEVELS
 from scenes import InputError
 
 

@@ -10,9 +10,9 @@ from csph.codes.design import Design
 from csph.codes.nested import block_parts, holds, nested
 from csph.layer import CompressiveLayer
 from csph.networks.blockwise import BlockMixer, mixers_for
+from csph.networks.config import ModelConfig, preset
 from csph.networks.model import DepthModel
 from csph.training.beginning import NetworkOf, check_init
-from csph.training.config import ModelConfig, preset
 from csph.training.loop import DepthTraining
 from scenes.errors import InputError
 from spad.sensor.model import Sensor

@@ -6,8 +6,8 @@ import torch
 from torch import nn
 
 from csph.codes.design import Design
+from csph.networks.config import ModelConfig, TrainConfig
 from csph.networks.model import DepthModel, save_model
-from csph.training.config import ModelConfig, TrainConfig
 from scenes import InputError
 from spad.formats.histogram import Histogram
 from spad.sensor.model import Sensor

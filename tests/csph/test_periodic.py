@@ -10,9 +10,9 @@ from torch.nn import functional as F
 
 from csph.codes.design import Design
 from csph.networks.compact import Compact
+from csph.networks.config import ModelConfig, TrainConfig
 from csph.networks.model import DepthModel, load_model, save_model
 from csph.networks.periodic import PERIOD, STEP, CircularInTime, Periodic
-from csph.training.config import ModelConfig, TrainConfig
 from scenes.errors import InputError
 from spad.sensor.model import Sensor
 

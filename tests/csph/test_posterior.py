@@ -11,10 +11,10 @@ from csph.codes.design import Design
 from csph.codes.rank import coherence, participation_rank, pixel_gram, separable_gram
 from csph.codes.temporal import orthogonal_start, uniform_start
 from csph.layer import CompressiveLayer
+from csph.networks.config import ModelConfig
 from csph.networks.images import mirrored, spans
 from csph.networks.model import DepthModel
 from csph.networks.posterior import confidence, decoded, posterior_median
-from csph.training.config import ModelConfig
 from scene2spad.datasets.planes import random_planes
 from scenes.errors import InputError
 from spad.detection.detect import sense

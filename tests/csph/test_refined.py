@@ -11,9 +11,9 @@ from csph.codes.design import Design
 from csph.codes.quantise import HALF_RANGE
 from csph.networks.blockwise import code_features
 from csph.networks.compact import FOLD, averages
+from csph.networks.config import ModelConfig, TrainConfig
 from csph.networks.model import DepthModel, load_model, save_model
 from csph.networks.refined import MAX_LOG_AMPLITUDE, unexplained
-from csph.training.config import ModelConfig, TrainConfig
 from scenes.errors import InputError
 from spad.sensor.model import Sensor
 

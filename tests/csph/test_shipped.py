@@ -10,8 +10,8 @@ import torch
 from csph.codes.design import Design
 from csph.codes.temporal import bin_energy, grouped_energy, truncated_fourier
 from csph.layer import make_coding
+from csph.networks.config import ModelConfig, preset
 from csph.networks.model import load_model
-from csph.training.config import ModelConfig, preset
 from csph.training.loop import train
 from csph.training.views import split_views
 from csph.weights.shipped import checkpoint_name, is_shipped, ship, shipped_file, shipped_names

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from test_training import FEW, MODEL, SMALL, near_planes
 
-from csph.evaluation.metrics import PHOTON_LEVELS
-from csph.training.config import preset
+from csph.levels import PHOTON_LEVELS, dealt_levels
+from csph.networks.config import preset
 from csph.training.data import Frames, SetData
-from csph.training.levels import dealt_levels
 from scenes import InputError
 from spad.detection.training_patches import PackedViews, pack_views
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.levels import PHOTON_LEVELS
 from scene2spad.cli import main
 from scene2spad.studies.chip.plan import MAIN, Plan
 from scene2spad.studies.chip.study import compared_rows, in_words

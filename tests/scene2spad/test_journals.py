@@ -13,7 +13,7 @@ from processes import ended_process
 from set_folders import begun, finished
 
 from csph.codes.design import Design
-from csph.training.config import ModelConfig, TrainConfig
+from csph.networks.config import ModelConfig, TrainConfig
 from csph.training.resume import claim_run
 from csph.weights.shipped import cpu_minutes
 from render.transient.packs import read_pack, write_pack

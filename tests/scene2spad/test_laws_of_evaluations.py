@@ -11,7 +11,7 @@ import torch
 
 from csph.evaluation.exposures import PlanLine, Plans, asked_law
 from csph.evaluation.methods import EvaluationPlan, evaluate
-from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.levels import PHOTON_LEVELS
 from csph.training.views import Views
 from render.transient.packs import write_pack
 from scene2spad.cli import main

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 from small_runs import QUICK
 
-from csph.training.config import ModelConfig, preset
-from csph.training.levels import CONTINUOUS
+from csph.levels import CONTINUOUS
+from csph.networks.config import ModelConfig, preset
 from scene2spad.cli import main
 from scene2spad.networks.level_warnings import level_warnings
 from spad.sensor.files import SensorFile, write_sensor

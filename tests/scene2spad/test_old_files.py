@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import scene2spad as s2s
-from csph.training.config import TrainConfig
+from csph.networks.config import TrainConfig
 from csph.training.views import read_views
 from render.transient.packs import read_pack
 from scene2spad.cli import main

@@ -9,8 +9,8 @@ import scipy.sparse
 import torch
 
 from csph import Design
+from csph.networks.config import ModelConfig, preset
 from csph.networks.model import DepthModel, save_model
-from csph.training.config import ModelConfig, preset
 from scene2spad.cli import main
 from scene2spad.studies.real_data import study as real_data
 from scene2spad.studies.real_data.figures import View, directions, projected, raw_cloud

@@ -132,8 +132,8 @@ def _read_capture(path: Path) -> Numbers:
 
 def _write_weights(path: Path) -> None:
     from csph.codes.design import Design
+    from csph.networks.config import ModelConfig, TrainConfig
     from csph.networks.model import DepthModel, save_model
-    from csph.training.config import ModelConfig, TrainConfig
     from spad.sensor.model import Sensor
 
     design = Design.named("learned", (16, 2, 2), codes=8)

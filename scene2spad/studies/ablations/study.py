@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from csph.evaluation.methods import Evaluation, Row, as_dicts
-from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.levels import PHOTON_LEVELS
 from scene2spad.datasets import published
 from scene2spad.datasets.test_sets import TestSet, depth_map, evaluated, rendered
 from scene2spad.networks.lookup import obtain, other_seeds, where_trained

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from csph.evaluation.metrics import PHOTON_LEVELS
+from csph.levels import PHOTON_LEVELS
 from scene2spad.networks.registry import ModelSpec
 
 Level = tuple[float, float]

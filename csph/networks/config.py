@@ -8,11 +8,10 @@ from typing import Any, Literal
 
 from csph.codes.design import Design
 from csph.codes.temporal import MAX_SEED
-from csph.evaluation.metrics import TRAIN_LEVELS
 from csph.layer_options import STARTS, SpatialStart, check_switches
+from csph.levels import CONTINUOUS, TRAIN_LEVELS, Levels, checked_levels
 from csph.networks.grid import GRIDS, Grid
 from csph.networks.posterior import Decoder
-from csph.training.levels import CONTINUOUS, Levels, checked_levels
 from scenes.errors import InputError, normalise_fields, require, require_choice, require_number
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
@@ -174,7 +173,7 @@ class TrainConfig:
     decoded_weight   of the mean absolute error, in bins, of the posterior's mean: for models that are read by the
                   soft-argmax, as published; it takes mass from far bins that the divergence hardly sees
     tv_weight, tv_start        weight of the mean total variation of depth / range, and the step it comes in at
-    levels        mean (signal, background) photons, one drawn for each patch; or "continuous" (`csph.training.levels`)
+    levels        mean (signal, background) photons, one drawn for each patch; or "continuous" (`csph.levels`)
     time_offset_m random delay, uniform from 0 to this, of every patch: 0 is off, as published
     validation_views           frames of the validation scenes
     precision     Lightning's name; bf16-mixed on GPUs that have it

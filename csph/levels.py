@@ -1,4 +1,4 @@
-"""Photon levels that a patch is trained at: a list, as published, or drawn from a continuous range."""
+"""Photon levels: the paper's 16, and those that a patch is trained at, a list or drawn from a continuous range."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ import numpy as np
 
 from scenes.errors import require
 from scenes.random_streams import Stream
+
+# mean signal and background photons of the 16 test levels; training draws from the first nine
+PHOTON_LEVELS: tuple[tuple[float, float], ...] = (
+    *((signal, background) for signal in (10.0, 5.0, 2.0) for background in (2.0, 10.0, 50.0)),
+    *((10.0, background) for background in (200.0, 500.0, 1000.0)),
+    *((50.0, background) for background in (50.0, 200.0, 500.0, 1000.0)),
+)
+TRAIN_LEVELS = PHOTON_LEVELS[:9]
 
 CONTINUOUS = "continuous"
 SIGNAL = (1.0, 100.0)  # mean signal photons, log-uniform
