@@ -61,7 +61,8 @@ class ModelConfig:
              that looks at the codes a second time; periodic, the compact one on a circle of time, for Fourier codes of
              the whole range; published; or published with logits of any sign, which cannot die
     sensor   whose histograms it takes
-    grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with the paper
+    grid     continuous labels on the pulse's centroid, or the published ones (`networks.grid`), to compare with the
+             paper
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
 
     Raises InputError for parts of another kind, and those that do not go together.

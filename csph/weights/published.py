@@ -45,8 +45,8 @@ def import_checkpoint(path: Path, folder: Path, sensor: Sensor | None = None) ->
     """Write a published checkpoint as `folder`/model.safetensors, which `csph.networks.model.load_model` reads.
 
     `sensor` (default: that of the published training set) is the one whose histograms the model is to take: what it
-    learned of pulses was in bins, and the paper tests it on the reference sensor. Nothing but tensors and plain values is
-    unpickled. Raises InputError in one line for a file that is no such checkpoint, another design's, damaged or not
+    learned of pulses was in bins, and the paper tests it on the reference sensor. Nothing but tensors and plain values
+    is unpickled. Raises InputError in one line for a file that is no such checkpoint, another design's, damaged or not
     finite, a sensor whose bins its blocks do not divide, and a folder that holds a model already.
     """
     path, target = Path(path), Path(folder) / "model.safetensors"

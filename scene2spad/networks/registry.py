@@ -188,8 +188,8 @@ def check(config: TrainConfig, wanted: ModelSpec, path: Path) -> None:
     """Raise InputError in one line for a checkpoint that is not what is wanted: other design, seed, sensor, time
     offsets.
 
-    Models to compare with the paper are each trained by a recipe of its own: some were begun with a run of another seed,
-    and some keep the mean over their codes.
+    Models to compare with the paper are each trained by a recipe of its own: some were begun with a run of another
+    seed, and some keep the mean over their codes.
     """
     expected = config_of(wanted.command("laptop", Path("planes"), Path()))
     pairs = {
