@@ -6,7 +6,7 @@
 from scene2spad.datasets.zone_captures import read_plane_captures, shipped_captures, within, zone_captures
 from spad.sensor.files import load_sensor
 from spad.zones.calibration import calibrate, poisson_deviance
-from spad.zones.sensor import expected_zone_counts
+from spad.zones.simulation import expected_zone_counts
 
 EVERY = 3  # fit every third capture
 captures = within(read_plane_captures(shipped_captures()), 0.25)

@@ -41,10 +41,10 @@ if TYPE_CHECKING:
     from scenes.placing import Placing
     from spad.formats.dense import dense, write_dense
     from spad.formats.dense_reader import read_dense
-    from spad.formats.histogram import Histogram, read_histogram, write_histogram
     from spad.formats.mat import read_mat, write_mat
     from spad.formats.ply import points, write_ply
     from spad.formats.rgbd import transient_from_rgbd
+    from spad.measurements.histogram import Histogram, read_histogram, write_histogram
     from spad.sensor.budget import Optics
     from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
     from spad.sensor.pulse import Pulse, read_pulse
@@ -72,7 +72,7 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
     "spad.formats.dense": ("dense", "write_dense"),
     "spad.formats.dense_reader": ("read_dense",),
     "spad.formats.ply": ("points", "write_ply"),
-    "spad.formats.histogram": ("Histogram", "read_histogram", "write_histogram"),
+    "spad.measurements.histogram": ("Histogram", "read_histogram", "write_histogram"),
     "spad.formats.mat": ("read_mat", "write_mat"),
     "spad.formats.rgbd": ("transient_from_rgbd",),
     "csph": (

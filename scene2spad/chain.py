@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from render.transient import Transient
     from scenes.model import Scene
     from scenes.placing import Placing
-    from spad.formats.histogram import Histogram
+    from spad.measurements.histogram import Histogram
     from spad.sensor.budget import Optics
     from spad.sensor.model import Sensor
 
@@ -221,7 +221,7 @@ def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | Dep
     (8, 8)
     """
     from spad.estimators.depth import METHODS, histogram_depth_m
-    from spad.formats.histogram import Histogram
+    from spad.measurements.histogram import Histogram
 
     require_kind(histogram, Histogram, "estimate_depth", " of `sense`, `read_histogram` or `read_mat`")
     if isinstance(method, str) and method in METHODS:
@@ -311,7 +311,7 @@ def depth_errors(depth_m: np.ndarray, histogram: Histogram, *, unmixed: bool = F
     0.0
     """
     from spad.estimators.depth import histogram_errors
-    from spad.formats.histogram import Histogram
+    from spad.measurements.histogram import Histogram
 
     require_kind(histogram, Histogram, "depth_errors", " as the truth")
     exclude = histogram.mixed if unmixed else None

@@ -14,7 +14,7 @@ from scenes.errors import InputError, require
 
 if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
-    from spad.formats.histogram import Histogram
+    from spad.measurements.histogram import Histogram
     from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")

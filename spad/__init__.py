@@ -12,7 +12,7 @@ from scenes.lazy import lazy_names
 if TYPE_CHECKING:
     from spad.detection.detect import sense
     from spad.estimators.depth import estimate_depth
-    from spad.formats.histogram import Histogram, read_histogram, write_histogram
+    from spad.measurements.histogram import Histogram, read_histogram, write_histogram
     from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
     from spad.sensor.pulse import Pulse
 
@@ -33,7 +33,7 @@ __getattr__, __dir__ = lazy_names(
     {
         "spad.detection.detect": ("sense",),
         "spad.estimators.depth": ("estimate_depth",),
-        "spad.formats.histogram": ("Histogram", "read_histogram", "write_histogram"),
+        "spad.measurements.histogram": ("Histogram", "read_histogram", "write_histogram"),
         "spad.sensor.model": ("PhotonBudget", "Sensor", "sensor_by_name"),
         "spad.sensor.pulse": ("Pulse",),
     },

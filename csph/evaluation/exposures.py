@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from spad.detection.detect import Model, choose_model, mean_pixel_law
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 BY_DEFAULT = "model: poisson as asked"  # begins the line that says nothing where nobody asked

@@ -33,8 +33,8 @@ from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.detect import Model, sense
-from spad.formats.bistatic import recorded_range_m
-from spad.formats.histogram import TRUTH, Histogram
+from spad.estimators.bistatic import recorded_range_m
+from spad.measurements.histogram import TRUTH, Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 PIXELS = ("all", "unmixed", "mixed")

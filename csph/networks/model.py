@@ -31,9 +31,9 @@ from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
 from scenes.io.inputs import regular_file
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
+from spad.estimators.bistatic import radial_depth_of
 from spad.estimators.matching import normalised_correlation
-from spad.formats.bistatic import radial_depth_of
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 
 KIND = "network"
 

@@ -29,7 +29,7 @@ from scene2spad.options.experiments import Bench
 from scenes.errors import require
 from scenes.files import whole_file
 from scenes.progress import Progress
-from spad.formats.histogram import counts_from_timestamps
+from spad.measurements.histogram import counts_from_timestamps
 
 BATCH, SIZE, PHOTONS = 4, (1024, 32, 32), 60
 DESIGNS = (
@@ -108,7 +108,7 @@ def dense(stamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor
 
 
 def dense_of_sensor(stamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
-    """Return the same by `formats.histogram`, as a histogram file is read: integer counts pixel by pixel, then time
+    """Return the same by `spad.measurements`, as a histogram file is read: integer counts pixel by pixel, then time
     first."""
     counts = counts_from_timestamps(stamps.numpy(), offsets.numpy(), size[0])
     return torch.from_numpy(counts).view(-1, 1, *size[1:], size[0]).permute(0, 1, 4, 2, 3).float().contiguous()

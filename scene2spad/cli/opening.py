@@ -18,7 +18,7 @@ from scenes.io.hdf5 import SIGNATURE as HDF5_SIGNATURE
 if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
     from render.transient import Transient
-    from spad.formats.histogram import Histogram
+    from spad.measurements.histogram import Histogram
     from spad.sensor.model import Sensor
 
 BY_SUFFIX = {
@@ -119,7 +119,7 @@ def open_histogram(path: Path, frame: int = 0) -> Histogram:
         from spad.formats.dense_reader import read_dense
 
         return read_dense(path)
-    from spad.formats.histogram import read_histogram
+    from spad.measurements.histogram import read_histogram
 
     _check_no_other_kind(path)
     return read_histogram(path)
@@ -127,7 +127,7 @@ def open_histogram(path: Path, frame: int = 0) -> Histogram:
 
 def open_for_depth(path: Path, frame: int = 0) -> Histogram:
     """Read a histogram as `open_histogram` does; InputError, naming the file, for one that cannot tell depth."""
-    from spad.formats.bistatic import check_pointing
+    from spad.estimators.bistatic import check_pointing
 
     histogram = open_histogram(path, frame)
     try:

@@ -43,8 +43,8 @@ from scenes.io.relief import (
 from scenes.io.textures import opened_image
 from scenes.progress import Progress
 from scenes.random_streams import Stream
-from spad.formats.histogram import Histogram
 from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_from_rgbd
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 log = logging.getLogger("scene2spad")

@@ -23,7 +23,7 @@ from scenes.files import read_array
 from scenes.library.sets import scene_set
 from scenes.offsets import OffsetMode
 from scenes.progress import Progress
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 
 TILE = (4, 4)  # pixels that images are cut to whole numbers of, for every model alike

@@ -17,8 +17,9 @@ from scenes.errors import require
 from scenes.files import read_arrays
 from scenes.model import Camera, Laser, Material, Scene, Surface
 from spad.sensor.model import Sensor
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.expected_counts import ZoneCapture
-from spad.zones.sensor import ZoneArray, zone_returns
+from spad.zones.simulation import zone_returns
 
 PIXELS = 28  # side of the image that the zones' fields of view are cut from
 CONE_DEG = 80.0

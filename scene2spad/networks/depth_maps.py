@@ -10,9 +10,9 @@ import numpy as np
 
 from csph.evaluation.methods import KeepMap, Row
 from scenes.errors import require
-from spad.formats.bistatic import pointing_of
+from spad.estimators.bistatic import pointing_of
 from spad.formats.depth_map import write_depth
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 
 
 def check_free(folder: Path) -> None:

@@ -34,7 +34,7 @@ from scene2spad.options.networks import Train, check_used
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.files import load_sensor
 from spad.sensor.model import Sensor
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from render.transient import Transient
 from scene2spad.plots.style import plt, save
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 
 DEPTH_COLOURS = matplotlib.colormaps["viridis_r"].with_extremes(bad="lightgrey")

@@ -13,8 +13,8 @@ from scene2spad.plots.figures import DEPTH_COLOURS, ERROR_COLOURS, depth_limits,
 from scene2spad.plots.style import COLOURS, plt, save
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel
-from spad.formats.bistatic import time_tells_depth, true_arrival_s
-from spad.formats.histogram import Histogram
+from spad.estimators.bistatic import time_tells_depth, true_arrival_s
+from spad.measurements.histogram import Histogram
 
 SHOWN_RANKS = {"dark": 0.1, "median": 0.5, "bright": 0.9}  # among pixels of one known surface, where there are any
 WINDOW_NS = (4.0, 12.0)  # before and after the true arrival

@@ -36,9 +36,9 @@ from scenes.files import whole_file
 from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 from spad.detection.detect import sense
+from spad.estimators.bistatic import recorded_range_m
 from spad.estimators.depth import cramer_rao_m, depth_errors, estimate_depth
-from spad.formats.bistatic import recorded_range_m
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 log = logging.getLogger("scene2spad")

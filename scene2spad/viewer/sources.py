@@ -13,7 +13,7 @@ from scene2spad.viewer.content import METRES_PER_NS, NS_PER_M, Content, Cube, La
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.json_types import JsonObject
 from spad.detection.rates import Rates, rates_for
-from spad.formats.bistatic import (
+from spad.estimators.bistatic import (
     baseline_of,
     pixel_directions,
     pointing_of,
@@ -21,7 +21,7 @@ from spad.formats.bistatic import (
     true_arrival_s,
     true_path_m,
 )
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 
 FRAMES = 256  # bins of path length of a transient that no sensor has seen
@@ -115,7 +115,7 @@ def depth_layer(name: str, depth_m: np.ndarray) -> Layer:
 
 def surface(depth_m: np.ndarray, pointing: JsonObject, value: np.ndarray | None) -> JsonObject:
     """Return points (N, 3) in the camera's frame and their brightness; nothing where it is not known where the pixels
-    look (`spad.formats.bistatic.pixel_directions`)."""
+    look (`spad.estimators.bistatic.pixel_directions`)."""
     directions = pixel_directions(pointing, depth_m.shape)
     if directions is None:
         return {}

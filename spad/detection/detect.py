@@ -19,8 +19,8 @@ from spad.detection.glints import glint_warning, signal_fractions
 from spad.detection.laws import LOW_FLUX
 from spad.detection.photons import expected_signal, light_of
 from spad.detection.rates import rates_for
-from spad.formats.histogram import Histogram
-from spad.formats.timestamps import Timestamps
+from spad.measurements.histogram import Histogram
+from spad.measurements.timestamps import Timestamps
 from spad.sensor.arrival import record_line, wrap_line
 from spad.sensor.model import PhotonBudget, Sensor
 

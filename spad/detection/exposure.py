@@ -23,7 +23,7 @@ from spad.detection.detectors import BlockLight, DetectionLaw
 from spad.detection.laws import Detections, add_crosstalk, crosstalk_events
 from spad.detection.photons import PixelFlux
 from spad.detection.rates import Rates
-from spad.formats.timestamps import Timestamps
+from spad.measurements.timestamps import Timestamps
 from spad.sensor.model import Sensor
 from spad.sensor.tdc import time_codes
 

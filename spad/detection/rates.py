@@ -8,7 +8,7 @@ import numpy as np
 
 from render.transient import Transient
 from scenes.errors import InputError
-from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.model import PhotonBudget, Sensor, detector_maps
 
 
 class Rates(NamedTuple):
@@ -64,33 +64,6 @@ def default_background(
     """
     dark_hz, _ = detector_maps(sensor, (transient.height, transient.width), dark_map_hz, seed)
     return max(PhotonBudget().background, float((dark_hz * sensor.exposure_s).mean()))
-
-
-def detector_maps(
-    sensor: Sensor, shape: tuple[int, int], dark_map_hz: np.ndarray | None, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return dark counts per second (H, W) and dead pixels (H, W) bool: the sensor's, or a measured map's and the
-    sensor's dead pixels besides."""
-    dead = sensor.dead_pixels(*shape, seed)
-    if dark_map_hz is None:
-        return sensor.dark_rate_map_hz(*shape, seed), dead
-    measured_hz, silent = check_dark_map(dark_map_hz, shape)
-    return measured_hz, dead | silent
-
-
-def check_dark_map(measured_hz: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a measured map's dark counts per second (H, W), 0 in dead pixels, and which are dead (NaN).
-
-    Raises InputError for another shape, and for rates that are negative or infinite.
-    """
-    measured = np.asarray(measured_hz, dtype=np.float64)
-    if measured.shape != shape:
-        raise InputError(f"dark count map is {measured.shape}, the image {shape}")
-    dead = np.isnan(measured)
-    measured = np.where(dead, 0.0, measured)
-    if not (np.isfinite(measured).all() and measured.min(initial=0) >= 0):
-        raise InputError("dark count map: rates must be finite and 0 or more, NaN for a dead pixel")
-    return measured, dead
 
 
 class Filled(NamedTuple):

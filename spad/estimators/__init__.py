@@ -1,1 +1,1 @@
-"""Estimate depth from counts without a network."""
+"""Estimate depth from counts without a network, and turn recorded times into depth."""

@@ -27,6 +27,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, did_you_mean, require
 from spad.detection.detectors import LAWS
 from spad.detection.laws import LOW_FLUX
+from spad.estimators.bistatic import radial_depth_of, recorded_range_m, time_tells_depth
 from spad.estimators.matching import (
     argmax_bins,
     correlate,
@@ -39,8 +40,7 @@ from spad.estimators.matching import (
     published_log_matched_bins,
 )
 from spad.estimators.pile_up import linearised
-from spad.formats.bistatic import radial_depth_of, recorded_range_m, time_tells_depth
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse, binned_pulse_slope, pulse_taps
 

@@ -1,1 +1,1 @@
-"""Hold and read histograms, timestamps, `.mat` files, captures and RGB-D simulations."""
+"""Read and write what others use: `.mat` files, captures, dense counts, point clouds and RGB-D simulations."""

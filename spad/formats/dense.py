@@ -25,7 +25,7 @@ from scenes.files import whole_file
 from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
-from spad.formats.histogram import NOTES, Histogram
+from spad.measurements.histogram import NOTES, Histogram
 from spad.sensor.arrival import record_line, warning_of_most, wrap_line
 from spad.sensor.files import pixel_sensor
 from spad.sensor.model import Sensor

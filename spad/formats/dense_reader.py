@@ -17,7 +17,7 @@ from scenes.io.inputs import parse_json, regular_file
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.formats.dense import AXES, UNITS
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ import scipy.sparse
 
 from scenes.errors import require
 from scenes.limits import require_memory
-from spad.formats.histogram import Histogram
 from spad.formats.matfile import Matrix, load_mat, save_mat
-from spad.formats.timestamps import Timestamps
+from spad.measurements.histogram import Histogram
+from spad.measurements.timestamps import Timestamps
 from spad.sensor.model import Sensor, sensor_by_name
 
 BINS = 1536

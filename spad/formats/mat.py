@@ -20,12 +20,12 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require, require_kind, require_whole
 from scenes.limits import require_memory
 from spad.detection.laws import LOW_FLUX
+from spad.estimators.bistatic import CO_LOCATED, laser_baseline_m
 from spad.estimators.depth import estimate_depth
-from spad.formats.bistatic import CO_LOCATED, laser_baseline_m
-from spad.formats.histogram import FOREIGN, Histogram
 from spad.formats.linospad import COUNTS, capture_histogram, frame_of
 from spad.formats.matfile import Matrix, load_mat, save_mat
 from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_taps
+from spad.measurements.histogram import FOREIGN, Histogram
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 from spad.sensor.pulse import SampledPulse
 from spad.sensor.template import binned_pulse

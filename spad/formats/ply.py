@@ -11,8 +11,8 @@ from render.transient import Transient
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.json_types import JsonObject
-from spad.formats.bistatic import pixel_directions, pointing_of
-from spad.formats.histogram import Histogram
+from spad.estimators.bistatic import pixel_directions, pointing_of
+from spad.measurements.histogram import Histogram
 
 
 def points(seen: Transient | Histogram, depth_m: np.ndarray | None = None) -> np.ndarray:

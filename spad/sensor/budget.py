@@ -15,8 +15,7 @@ from render.transient import Transient
 from scenes.constants import DEFAULT_WAVELENGTH_M, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import normalise_fields, require
 from scenes.optics.blackbody import PLANCK_J_S
-from spad.detection.rates import detector_maps
-from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.model import PhotonBudget, Sensor, detector_maps
 
 # Mean ambient radiance [W/(m^2 sr nm)] above which it is no radiance of daylight. White paper facing the sun: 100 klux
 # are 0.82 W/(m^2 nm) at 850 nm as a black body (`sunlight_w_per_m2_nm`), the direct sun of the reference spectrum ASTM

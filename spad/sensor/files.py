@@ -24,7 +24,7 @@ from spad.sensor.pulse import FWHM_PER_SIGMA, AnyPulse, Pulse, SampledPulse
 from spad.sensor.quantities import format_quantity, parse_quantity
 from spad.sensor.tdc import Tdc
 from spad.sensor.toml import format_toml, read_toml
-from spad.zones.sensor import ZoneArray, check_times
+from spad.sensor.zone_array import ZoneArray, check_times
 
 SCHEMA = "1.0"
 KINDS_OF_PULSE = "sigma, fwhm, or samples with step"

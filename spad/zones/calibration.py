@@ -14,9 +14,9 @@ from scenes.errors import did_you_mean, require
 from spad.sensor.files import SensorFile
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import SampledPulse
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.expected_counts import FINE, PulseBasis, Values, ZoneCapture, ZoneModel
 from spad.zones.fit import covariance_of, fit
-from spad.zones.sensor import ZoneArray
 
 # What can be fitted; the pulse and the gains always are.
 OPTIONAL = (

@@ -10,8 +10,8 @@ import numpy as np
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
 from spad.sensor.model import Sensor
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.calibration import Calibration, sees_return
-from spad.zones.sensor import ZoneArray
 
 # Effects that show in how a return moves with distance: one distance cannot tell a late zone from a slow clock.
 OF_TIME = ("delay", "clock", "bin_width", "chirp")

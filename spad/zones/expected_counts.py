@@ -15,7 +15,7 @@ import numpy as np
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.saturation import saturated, saturated_jacobian
 from spad.sensor.clock import chirped
-from spad.zones.sensor import ZoneReturns, since_emission, stray_returns, with_skew
+from spad.zones.simulation import ZoneReturns, since_emission, stray_returns, with_skew
 
 FINE = 6  # steps of the pulse in a bin
 TAIL = 2  # the same in the tail

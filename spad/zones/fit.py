@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from spad.sensor.zone_array import largest_chirp
 from spad.zones.expected_counts import Values, ZoneCapture, ZoneModel
-from spad.zones.sensor import largest_chirp
 
 _RIDGE = 1e-11
 _HALVINGS = 8

@@ -10,10 +10,11 @@ import numpy as np
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.arrival import wrap_line
 from spad.sensor.model import PhotonBudget, Sensor
-from spad.zones.sensor import ZoneArray, ZoneReturns, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
+from spad.sensor.zone_array import ZoneArray
+from spad.zones.simulation import ZoneReturns, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
 
 PULSE_ENDS = 1e-11  # share of a pulse beyond its reach: as much of the light in the record is none of it
 
@@ -89,7 +90,7 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
             "brightest_thousandth": brightest,
             "median_signal": float(np.median(signal)),
             "transient": {**transient.meta, "sha256": transient.sha256()},
-            # as the zones are laid out: what tells depth from a recorded time (`spad.formats.bistatic`)
+            # as the zones are laid out: what tells depth from a recorded time (`spad.estimators.bistatic`)
             "zones": {
                 name: laid(np.asarray(getattr(zones, name)), float).tolist()
                 for name in ("centre_x", "centre_y", "delay_s", "clock")

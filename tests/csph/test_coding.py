@@ -13,7 +13,7 @@ from csph import CodingTensor, decode_depth, encode, encode_timestamps, truncate
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from spad.estimators.depth import cramer_rao_m, grid_peak
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse
 

@@ -9,7 +9,7 @@ from csph.codes.design import Design
 from csph.networks.config import ModelConfig, TrainConfig
 from csph.networks.model import DepthModel, save_model
 from scenes import InputError
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 
 SMALL = Sensor(bins=64, bin_width_s=1e-9)

@@ -18,7 +18,7 @@ from csph.networks.posterior import confidence, decoded, posterior_median
 from scene2spad.datasets.planes import random_planes
 from scenes.errors import InputError
 from spad.detection.detect import sense
-from spad.formats.histogram import TRUTH
+from spad.measurements.histogram import TRUTH
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse
 

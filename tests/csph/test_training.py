@@ -339,7 +339,7 @@ def test_freed_memory_is_kept():
 
 def test_a_networks_depth_knows_where_the_laser_is():
     """A half path beside a displaced laser becomes a distance, for networks as for the filters."""
-    from spad.formats.bistatic import radial_depth_m
+    from spad.estimators.bistatic import radial_depth_m
 
     camera = {"pose": np.eye(4).tolist(), "fov_deg": 60.0, "width": 16, "height": 16}
     views, baseline = near_planes(1), (0.1, 0.0, 0.02)

@@ -12,13 +12,13 @@ from render.transient import write_transient
 from scene2spad.cli import main
 from scene2spad.cli.simulation.calibrating import is_calibrated, warn_of_unknown
 from scene2spad.datasets.zone_captures import read_plane_captures, render_plane, shipped_captures, zone_captures
-from spad.formats.histogram import read_histogram
+from spad.measurements.histogram import read_histogram
 from spad.sensor.files import load_sensor, read_sensor, sensor_tables, write_sensor
 from spad.sensor.model import Sensor
 from spad.sensor.toml import format_toml
 from spad.zones.calibration import Calibration
 from spad.zones.expected_counts import PulseBasis
-from spad.zones.sensor import draw_zone_counts, zone_returns
+from spad.zones.simulation import draw_zone_counts, zone_returns
 
 
 def test_shipped_captures_are_a_tmf8820s():

@@ -17,7 +17,7 @@ from spad.detection.detect import sense
 from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
 from spad.estimators.depth import depth_errors, estimate_depth
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 SENSOR, BUDGET = Sensor(), PhotonBudget(50, 50)

@@ -16,7 +16,7 @@ from scene2spad.cli import main
 from scene2spad.studies.chip.chain import ChipDepth, FastCores, interpret, network_depth
 from scene2spad.studies.chip.code import codes_by_torch, compile_model, harmonics_of, headroom_of, with_headroom
 from scenes.errors import InputError
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 FITS = {

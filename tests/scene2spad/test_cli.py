@@ -9,7 +9,7 @@ from processes import run_process
 
 from render.transient import read_transient
 from scene2spad.cli import main
-from spad.formats.histogram import read_histogram
+from spad.measurements.histogram import read_histogram
 
 SMALL = ["--width", "16", "--height", "12"]
 

@@ -18,7 +18,7 @@ from csph import CodingTensor, encode, temporal_code
 from scene2spad.cli import main
 from scene2spad.cli.main import progress_lines
 from scenes.library.catalog import load_scene
-from spad.formats.histogram import read_histogram
+from spad.measurements.histogram import read_histogram
 from spad.sensor.model import Sensor
 
 

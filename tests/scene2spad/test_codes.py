@@ -24,7 +24,7 @@ from scenes.errors import InputError
 from scenes.library.catalog import load_scene
 from spad.detection.detect import sense
 from spad.estimators.depth import cramer_rao_m, depth_errors
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.template import binned_pulse
 

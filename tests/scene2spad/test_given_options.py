@@ -17,8 +17,8 @@ from scene2spad.options.networks import Train
 from scenes.errors import InputError
 from spad.detection.detect import sense
 from spad.formats.depth_map import write_depth
-from spad.formats.histogram import write_histogram
 from spad.formats.rgbd import transient_from_rgbd
+from spad.measurements.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, sensor_by_name
 
 MODEL = "learned-256x4x4-128x-s0"

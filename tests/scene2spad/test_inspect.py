@@ -10,7 +10,7 @@ from render.transient import read_transient
 from scene2spad.cli import main
 from scene2spad.cli.results.inspect import BARS, WIDTH, drawn
 from spad.formats.dense import dense, write_dense
-from spad.formats.histogram import Histogram, read_histogram, write_histogram
+from spad.measurements.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor.model import Sensor
 
 

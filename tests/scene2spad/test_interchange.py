@@ -19,9 +19,9 @@ from scene2spad.networks.training import config_of
 from scene2spad.options.networks import Train
 from scenes.errors import InputError
 from spad.detection.detect import sense
-from spad.formats.histogram import Histogram, write_histogram
 from spad.formats.linospad import Capture, write_linospad
 from spad.formats.mat import read_mat, write_mat
+from spad.measurements.histogram import Histogram, write_histogram
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 
 

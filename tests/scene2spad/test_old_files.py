@@ -18,7 +18,7 @@ from csph.training.views import read_views
 from render.transient.packs import read_pack
 from scene2spad.cli import main
 from spad.formats.depth_map import read_depth
-from spad.formats.histogram import TRUTH, read_histogram
+from spad.measurements.histogram import TRUTH, read_histogram
 
 OLD = Path(__file__).parent / "old_files"
 

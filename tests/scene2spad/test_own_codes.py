@@ -21,7 +21,7 @@ from scene2spad.datasets.planes import wall
 from scene2spad.studies.chip.code import with_headroom
 from scenes import InputError
 from spad.detection.detect import sense
-from spad.formats.histogram import write_histogram
+from spad.measurements.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 TIME = (np.arange(1024) + 0.5) / 1024

@@ -19,11 +19,11 @@ from scene2spad.plots import pixels
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel, sense
 from spad.detection.laws import first_photon_counts
-from spad.formats.bistatic import true_arrival_s
+from spad.estimators.bistatic import true_arrival_s
 from spad.formats.depth_map import read_depth
-from spad.formats.histogram import Histogram, read_histogram, write_histogram
 from spad.formats.mat import read_mat
 from spad.formats.rgbd import transient_from_rgbd
+from spad.measurements.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor.budget import Optics
 from spad.sensor.files import SensorFile, write_sensor
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name

@@ -23,7 +23,7 @@ from scene2spad.viewer.sources import expected_cube, light_over_path, merged_ret
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.detect import expected_in_pixel, rates_for
 from spad.formats.depth_map import read_depth
-from spad.formats.histogram import read_histogram
+from spad.measurements.histogram import read_histogram
 
 MODEL = "learned-256x4x4-128x-s0"
 

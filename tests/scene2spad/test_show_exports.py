@@ -15,10 +15,10 @@ from scene2spad.cli import main
 from scene2spad.cli.results.show import page_of
 from scene2spad.viewer.exports import cloud_content, dense_content
 from scenes.errors import InputError
-from spad.formats.histogram import read_histogram
 from spad.formats.linospad import capture_of, write_linospad
 from spad.formats.mat import read_mat
-from spad.formats.timestamps import Timestamps
+from spad.measurements.histogram import read_histogram
+from spad.measurements.timestamps import Timestamps
 
 MODEL = "fourier-1024x1x1-128x-s0"
 EXPORTS = ("counts.npz", "counts.h5", "counts-thw.h5", "light.npz", "cloud.ply")

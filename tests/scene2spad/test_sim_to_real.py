@@ -12,7 +12,7 @@ from scene2spad.studies.sim_to_real.measures import centroid, compare, randomise
 from scene2spad.studies.sim_to_real.pose import Pose, find_pose, model_covariance, nearest_start, render_counts
 from scenes.errors import InputError
 from spad.sensor.files import load_sensor
-from spad.zones.sensor import ZoneArray
+from spad.sensor.zone_array import ZoneArray
 
 
 def histograms(captures: int = 100, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from processes import run_process
 
-from spad.formats.histogram import Histogram, write_histogram
+from spad.measurements.histogram import Histogram, write_histogram
 from spad.sensor.model import Sensor
 
 COMMAND = [sys.executable, "-m", "scene2spad"]

@@ -32,7 +32,7 @@ from scene2spad.networks.training import config_of
 from scene2spad.options.networks import Train
 from scenes import InputError
 from spad.detection.detect import sense
-from spad.formats.histogram import write_histogram
+from spad.measurements.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 

@@ -8,7 +8,7 @@ import pytest
 from scene2spad.cli import main
 from scene2spad.studies.power.emulated_chain import emulate
 from scene2spad.studies.power.program_tables import int8_temporal
-from spad.formats.histogram import Histogram, write_histogram
+from spad.measurements.histogram import Histogram, write_histogram
 from spad.sensor.model import Sensor
 from ultraphase import method
 from ultraphase.catalog import FOLDER

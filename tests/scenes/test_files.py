@@ -239,7 +239,7 @@ import h5py, json
 import readers
 from scenes import InputError
 from scenes.io.hdf5 import add_checksum
-from spad.formats.histogram import read_histogram
+from spad.measurements.histogram import read_histogram
 path = Path({str(tmp_path / "h.h5")!r})
 for extra in ("unknown", "counts"):
     readers.READERS["histogram"].make(path)

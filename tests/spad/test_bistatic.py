@@ -10,8 +10,7 @@ from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from scenes.model import Camera
-from spad.estimators.depth import confidence_map, histogram_depth_m, histogram_errors
-from spad.formats.bistatic import (
+from spad.estimators.bistatic import (
     optical_path_m,
     radial_depth_m,
     recorded_range_m,
@@ -19,13 +18,14 @@ from spad.formats.bistatic import (
     true_arrival_s,
     true_path_m,
 )
-from spad.formats.histogram import Histogram
+from spad.estimators.depth import confidence_map, histogram_depth_m, histogram_errors
 from spad.formats.rgbd import transient_from_rgbd
+from spad.measurements.histogram import Histogram
 from spad.sensor.clock import chirped, unchirped
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.histogram import sense_zones
-from spad.zones.sensor import ZoneArray
 
 GATED = Sensor(name="gated", bins=64, bin_width_s=1e-10, period_s=2e-8)
 BASELINE = (0.4, -0.2, 0.1)

@@ -10,6 +10,7 @@ from scenes.errors import InputError
 from spad.detection.saturation import draw_saturated
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
+from spad.sensor.zone_array import ZoneArray, check_times, largest_chirp
 from spad.zones.calibration import (
     as_sensor,
     calibrate,
@@ -22,15 +23,7 @@ from spad.zones.calibration import (
 )
 from spad.zones.expected_counts import PulseBasis, ZoneCapture, ZoneModel
 from spad.zones.fit import fit, roughness
-from spad.zones.sensor import (
-    ZoneArray,
-    ZoneReturns,
-    check_times,
-    draw_zone_counts,
-    expected_zone_counts,
-    largest_chirp,
-    zone_flux,
-)
+from spad.zones.simulation import ZoneReturns, draw_zone_counts, expected_zone_counts, zone_flux
 
 ZONES = ZoneArray((-0.2, 0.0, 0.2), (0.0, 0.0, 0.0), (0.1,) * 3, (0.1,) * 3)
 SENSOR = Sensor(name="s", bins=40, bin_width_s=1e-10, pulse=Pulse(1e-10))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scenes import Camera
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
+from spad.estimators.bistatic import radial_depth_m
 from spad.estimators.depth import (
     ESTIMATORS,
     METHODS,
@@ -24,8 +25,7 @@ from spad.estimators.depth import (
     noise_free_bias_m,
 )
 from spad.estimators.matching import correlation, normalised_correlation
-from spad.formats.bistatic import radial_depth_m
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 from spad.sensor.template import binned_pulse, pulse_taps
 

@@ -16,8 +16,8 @@ from scenes.io.hdf5 import add_checksum
 from spad.detection.detect import expected_in_pixel, sense
 from spad.detection.flux import expected_counts
 from spad.detection.rates import fill_background, rates_for
-from spad.formats.histogram import Histogram, read_histogram, write_histogram
-from spad.formats.timestamps import counts_from_timestamps
+from spad.measurements.histogram import Histogram, read_histogram, write_histogram
+from spad.measurements.timestamps import counts_from_timestamps
 from spad.sensor.model import PhotonBudget, Sensor
 
 REFERENCE = Sensor()

@@ -10,10 +10,10 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.calibration import Calibration
 from spad.zones.evidence import POISSON_DEVIANCE, check_distances, check_fit, light_speeds, return_speeds
 from spad.zones.expected_counts import PulseBasis
-from spad.zones.sensor import ZoneArray
 
 ZONES = ZoneArray((-0.3, 0.0, 0.3), (0.0, 0.0, 0.0), (0.1,) * 3, (0.1,) * 3)
 SENSOR = Sensor(name="s", bins=64, bin_width_s=1e-10, pulse=Pulse(1e-10))

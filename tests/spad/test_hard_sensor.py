@@ -14,7 +14,7 @@ from scenes.errors import InputError
 from spad.detection.detect import sense, sense_timestamps
 from spad.detection.rates import default_background
 from spad.estimators.depth import METHODS, estimate_depth
-from spad.formats.histogram import Histogram, read_histogram, write_histogram
+from spad.measurements.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor.files import pixel_sensor
 from spad.sensor.model import PRESETS, PhotonBudget, Pulse, Sensor
 

@@ -21,7 +21,7 @@ from spad.detection.laws import (
     live_detections,
 )
 from spad.estimators.pile_up import coates, free_running_flux, linearised
-from spad.formats.timestamps import Timestamps
+from spad.measurements.timestamps import Timestamps
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 from spad.sensor.tdc import Tdc
 

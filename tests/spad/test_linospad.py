@@ -23,7 +23,7 @@ from spad.formats.linospad import (
     resampled_sensor,
     write_linospad,
 )
-from spad.formats.timestamps import Timestamps
+from spad.measurements.timestamps import Timestamps
 from spad.sensor.model import PhotonBudget, sensor_by_name
 
 LINOSPAD = sensor_by_name("linospad")

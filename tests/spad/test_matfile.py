@@ -15,11 +15,11 @@ from test_rgbd import made
 from scenes import InputError
 from spad.detection.detect import sense
 from spad.estimators.depth import histogram_depth_m
-from spad.formats.histogram import Histogram
 from spad.formats.linospad import read_linospad
 from spad.formats.mat import pile_up_warning, read_mat, write_mat
 from spad.formats.matfile import checked_contents, load_mat, save_mat
 from spad.formats.rgbd import published_taps, transient_from_rgbd
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 from spad.sensor.pulse import Pulse, SampledPulse
 

@@ -7,8 +7,8 @@ import scipy.io
 
 from scenes.errors import InputError
 from spad.estimators.depth import histogram_depth_m
-from spad.formats.histogram import Histogram, read_histogram, write_histogram
 from spad.formats.mat import read_mat, write_mat
+from spad.measurements.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
 

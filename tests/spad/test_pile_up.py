@@ -11,7 +11,7 @@ from scenes.errors import InputError
 from spad.detection.detect import choose_model, sense
 from spad.estimators.depth import confidence_map, detection_law, estimate_depth, histogram_depth_m
 from spad.estimators.pile_up import coates, free_running_flux, linearised
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 CYCLES, PIXELS, PER_CYCLE = 2000, 200, 3.5

@@ -7,7 +7,7 @@ from test_flux import transient_of
 
 from spad.detection.detect import sense
 from spad.detection.laws import first_photon_masses
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.reference import arrivals, detect_free_running, detect_synchronous
 from spad.sensor.model import PhotonBudget, Sensor
 

@@ -27,7 +27,7 @@ from spad.sensor.model import HOT_RATE_HZ, PRESETS, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
 from spad.sensor.quantities import UNITS, format_quantity, parse_quantity
 from spad.sensor.toml import read_toml
-from spad.zones.sensor import ZoneArray
+from spad.sensor.zone_array import ZoneArray
 
 PLAIN = """name = "mine"
 [histogram]

@@ -11,8 +11,8 @@ from scenes.errors import InputError
 from spad.detection.detect import sense, sense_timestamps
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.histogram import sense_zones, with_budget
-from spad.zones.sensor import ZoneArray
 
 
 @pytest.mark.parametrize("crosstalk", [0.0, 1e-9])

@@ -19,7 +19,7 @@ from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
 from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.estimators.depth import histogram_depth_m
-from spad.formats.histogram import read_histogram, write_histogram
+from spad.measurements.histogram import read_histogram, write_histogram
 from spad.reference import arrivals, code_overlap, detect_free_running, detect_synchronous, time_bin
 from spad.sensor import tdc as converters
 from spad.sensor.files import SensorFile, load_sensor, read_sensor, write_sensor

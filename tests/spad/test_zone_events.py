@@ -8,7 +8,8 @@ from scipy.stats import chi2
 
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
-from spad.zones.sensor import ZoneArray, ZoneReturns, expected_zone_counts
+from spad.sensor.zone_array import ZoneArray
+from spad.zones.simulation import ZoneReturns, expected_zone_counts
 
 SENSOR = Sensor(name="s", bins=48, bin_width_s=1e-10, pulse=Pulse(1.2e-10))
 ZONES = {"centre_x": (-0.2, 0.2), "centre_y": (0.0, 0.0), "width": (0.1, 0.1), "height": (0.1, 0.1)}

@@ -11,8 +11,9 @@ from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.files import SensorFile, sensor_from_tables
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.histogram import sense_zones
-from spad.zones.sensor import ZoneArray, ZoneReturns, draw_zone_counts, zone_signal
+from spad.zones.simulation import ZoneReturns, draw_zone_counts, zone_signal
 
 SENSOR = Sensor(name="s", bins=64, bin_width_s=1e-10, pulse=Pulse(1e-10))
 TWO = ZoneArray((-0.1, 0.1), (0.0, 0.0), (0.2, 0.2), (0.2, 0.2))

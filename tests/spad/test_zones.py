@@ -15,15 +15,9 @@ from spad.sensor.clock import chirped
 from spad.sensor.files import SensorFile
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse
+from spad.sensor.zone_array import EFFECTS, ZoneArray
 from spad.zones.histogram import sense_zones, with_budget, zone_grid
-from spad.zones.sensor import (
-    EFFECTS,
-    ZoneArray,
-    ZoneReturns,
-    expected_zone_counts,
-    zone_returns,
-    zone_signal,
-)
+from spad.zones.simulation import ZoneReturns, expected_zone_counts, zone_returns, zone_signal
 
 SENSOR = Sensor(name="s", bins=64, bin_width_s=1e-10, pulse=Pulse(1e-10))
 TWO = ZoneArray((-0.2, 0.2), (0.0, 0.0), (0.3, 0.3), (0.5, 0.5))

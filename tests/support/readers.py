@@ -63,13 +63,13 @@ def _of_transient(transient) -> Numbers:
 
 
 def _write_histogram(path: Path) -> None:
-    from spad.formats.histogram import write_histogram
+    from spad.measurements.histogram import write_histogram
 
     write_histogram(_histogram(), path)
 
 
 def _read_histogram(path: Path) -> Numbers:
-    from spad.formats.histogram import read_histogram
+    from spad.measurements.histogram import read_histogram
 
     return _of_histogram(read_histogram(path))
 

@@ -149,7 +149,7 @@ def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.nd
             require(bright.shape == found.depth_m.shape, f"{command.intensity}: is of another size than {command.file}")
         return found.depth_m, bright, sure, found.meta
     if kind == "histogram":
-        from spad.formats.bistatic import pointing_of
+        from spad.estimators.bistatic import pointing_of
 
         histogram = open_histogram(command.file, command.frame)
         bright = histogram.counts.sum(axis=2, dtype=np.int64).astype(np.float32)

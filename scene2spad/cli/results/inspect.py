@@ -19,7 +19,7 @@ from scenes.progress import Progress
 
 if TYPE_CHECKING:
     from render.transient import Transient
-    from spad.formats.histogram import Histogram
+    from spad.measurements.histogram import Histogram
 
 log = logging.getLogger("scene2spad")
 KINDS = {".exr": ("transient",), **dict.fromkeys(HDF5_SUFFIXES, ("histogram", "pack"))}
@@ -50,7 +50,7 @@ def run(command: Inspect, progress: Progress) -> dict:
     kind = _kind(path)
     only_for(command, str(path), {"view": (kind == "pack", "a pack")})
     if kind == "histogram":
-        from spad.formats.histogram import read_histogram
+        from spad.measurements.histogram import read_histogram
 
         histogram = read_histogram(path)
         found: JsonObject = {"kind": kind, **_of_histogram(histogram)}

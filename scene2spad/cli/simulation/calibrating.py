@@ -25,6 +25,7 @@ from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.sensor.files import load_sensor, read_sensor, write_sensor
 from spad.sensor.model import Sensor
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.calibration import (
     MIN_FITTED,
     Calibration,
@@ -37,7 +38,7 @@ from spad.zones.calibration import (
 )
 from spad.zones.evidence import WRONG, check_distances, check_fit
 from spad.zones.expected_counts import ZoneCapture
-from spad.zones.sensor import ZoneArray, expected_zone_counts
+from spad.zones.simulation import expected_zone_counts
 
 log = logging.getLogger("scene2spad")
 

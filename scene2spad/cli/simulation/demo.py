@@ -50,7 +50,7 @@ def run(command: Demo, progress: Progress) -> dict:
     from scene2spad.plots.pixels import draw_demo
     from spad.detection.detect import sense
     from spad.estimators.depth import histogram_errors
-    from spad.formats.histogram import write_histogram
+    from spad.measurements.histogram import write_histogram
     from spad.sensor.model import PhotonBudget, sensor_by_name
 
     budget = PhotonBudget(command.signal, command.background)

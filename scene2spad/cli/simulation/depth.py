@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from csph.networks.model import DepthModel
     from scene2spad.methods import Method
-    from spad.formats.histogram import Histogram
+    from spad.measurements.histogram import Histogram
     from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")
@@ -194,8 +194,8 @@ def _estimated(
     out: Path,
 ) -> dict:
     """Estimate depth from a histogram; write the map and its picture, and return errors and files."""
+    from spad.estimators.bistatic import pointing_of
     from spad.estimators.depth import confidence_map, histogram_errors
-    from spad.formats.bistatic import pointing_of
 
     label = depth_label(command)
     start = time.perf_counter()

@@ -23,14 +23,14 @@ from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.detection.one_pixel import quadrature_in_pixel
-from spad.detection.rates import check_dark_map, default_background
-from spad.formats.bistatic import baseline_of
-from spad.formats.histogram import Histogram, write_histogram
+from spad.detection.rates import default_background
+from spad.estimators.bistatic import baseline_of
+from spad.measurements.histogram import Histogram, write_histogram
 from spad.sensor.budget import Optics
 from spad.sensor.files import FWHM_PER_SIGMA, load_sensor
-from spad.sensor.model import HOT_RATE_HZ, PhotonBudget, Sensor
+from spad.sensor.model import HOT_RATE_HZ, PhotonBudget, Sensor, check_dark_map
 from spad.sensor.pulse import AnyPulse, Pulse, read_pulse
-from spad.zones.sensor import ZoneArray
+from spad.sensor.zone_array import ZoneArray
 
 log = logging.getLogger("scene2spad")
 

@@ -14,8 +14,8 @@ from csph.networks.posterior import Decoder
 from scene2spad.studies.chip.code import ChipModel, codes_by_torch, leave_sensor
 from scene2spad.studies.power.emulated_chain import timestamps_of
 from scenes.errors import require
-from spad.formats.bistatic import radial_depth_of
-from spad.formats.histogram import Histogram
+from spad.estimators.bistatic import radial_depth_of
+from spad.measurements.histogram import Histogram
 from ultraphase import CoreArray
 from ultraphase.catalog import TIMESTAMPS
 from ultraphase.compiler import Compiled

@@ -27,7 +27,7 @@ from scene2spad.studies.depth_offset.tables import by_design, mean_error
 from scene2spad.studies.results import Store
 from scenes.json_types import JsonObject
 from spad.detection.detect import sense
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 WALL_PIXELS = 32  # on a side

@@ -15,7 +15,7 @@ import torch
 from csph import CodingTensor, decode_depth, encode
 from scene2spad.studies.power.program_tables import fixed_spatial, int8_temporal
 from scenes.errors import require
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 from ultraphase import CoreArray, Method
 from ultraphase.catalog import TIMESTAMPS

@@ -25,7 +25,7 @@ from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.estimators.depth import histogram_errors
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 from ultraphase import ChipSpec, Method, Program, method
 from ultraphase.arrivals import TimedCore, lost_fraction, poisson_arrivals

@@ -25,7 +25,7 @@ from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.estimators.depth import histogram_errors
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, sensor_by_name
 from ultraphase import Method, method
 from ultraphase.assembly.isa import encode

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from spad.zones.sensor import EFFECTS
+from spad.sensor.zone_array import EFFECTS
 
 SENSOR = "tmf8820"
 # What is calibrated. Crosstalk is not: a plane that fills all zones hardly tells it from the zones' own light.

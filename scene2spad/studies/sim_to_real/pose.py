@@ -12,8 +12,9 @@ from scipy.special import stdtrit
 from scene2spad.datasets.zone_captures import render_plane
 from scenes.errors import require
 from spad.sensor.model import Sensor
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.fit import covariance_of
-from spad.zones.sensor import ZoneArray, ZoneReturns, expected_zone_counts, zone_returns
+from spad.zones.simulation import ZoneReturns, expected_zone_counts, zone_returns
 
 # Rigid motions that the derivative is taken over: metres, and radians about the sensor's y and x axes.
 STEPS = (5e-4, 0.01, 0.01)

@@ -34,10 +34,11 @@ from scenes.files import finite, whole_file, write_csv
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.sensor.files import SensorFile, load_sensor, write_sensor
+from spad.sensor.zone_array import ZoneArray
 from spad.zones.calibration import Calibration, calibrate, calibrated_file
 from spad.zones.expected_counts import ZoneCapture
 from spad.zones.histogram import zone_grid
-from spad.zones.sensor import ZoneArray, expected_zone_counts
+from spad.zones.simulation import expected_zone_counts
 
 FORMAT = 1  # of results kept from run to run: another number forgets them
 SPANS = ((0.0, 0.05), (0.05, 0.1), (0.1, 0.2), (0.2, 0.4), (0.1, 0.4))  # metres: what is told apart

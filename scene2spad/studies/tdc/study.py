@@ -50,7 +50,7 @@ from scenes.files import finite, whole_file, write_csv
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.tdc import clock_error, recalibrated
 

@@ -20,7 +20,7 @@ from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 

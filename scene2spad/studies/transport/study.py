@@ -44,8 +44,8 @@ from scenes.json_types import JsonObject
 from scenes.library.sets import scene_set
 from scenes.model import Ambient, Laser, Scene
 from scenes.progress import Progress
-from spad.formats.histogram import Histogram
 from spad.formats.rgbd import transient_from_rgbd
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")

@@ -16,8 +16,8 @@ from scenes.io.hdf5 import USER_BLOCK, add_checksum, describe, open_checked, rea
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.notebook import html_card
-from spad.formats.metadata import check_meta
-from spad.formats.timestamps import checked_events, counts_from_timestamps, timestamps_from_counts
+from spad.measurements.metadata import check_meta
+from spad.measurements.timestamps import checked_events, counts_from_timestamps, timestamps_from_counts
 from spad.sensor.files import pixel_sensor
 from spad.sensor.model import PhotonBudget, Sensor
 

@@ -16,7 +16,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError
 from scenes.json_types import JsonObject
 from scenes.model import Camera
-from spad.formats.histogram import Histogram
+from spad.measurements.histogram import Histogram
 from spad.sensor.clock import chirped, unchirped
 from spad.sensor.model import Sensor
 

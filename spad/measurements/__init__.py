@@ -1,0 +1,1 @@
+"""Hold what an exposure leaves: counts, timestamps, and the metadata beside them."""
