@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from scenes.errors import InputError, require
+from scenes.geometry.shapes import grid_faces
 from scenes.io.inputs import read_text
 from scenes.io.textures import exr_channels, load_texture, opened_image
-from scenes.library.things.parts import grid_faces
 from scenes.model import Camera, Material, Scene, Surface, Texture
 
 # Middlebury 2006: focal length [px] of the full-size images, baseline [m]; the files are half-size, and hold

@@ -10,12 +10,12 @@ from typing import Unpack
 import numpy as np
 
 from scenes.errors import InputError, did_you_mean
+from scenes.geometry import shapes
 from scenes.io.meshes import EXTENSIONS as MESH_EXTENSIONS
 from scenes.io.meshes import load_mesh
 from scenes.library.gallery import gallery
 from scenes.library.hall import hall
 from scenes.library.living_room import living_room
-from scenes.library.things import shapes
 from scenes.library.washroom import washroom
 from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing, PlacingFields, placed, stated

@@ -11,10 +11,9 @@ import math
 
 import numpy as np
 
-from scenes.library.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
 from scenes.library.rooms import one_of_each
 from scenes.library.things.edge_shapes import MAKERS, random_rotation, rotated
-from scenes.library.things.palette import make_palette, pick
+from scenes.library.things.palette import LAMP_RADIANCE, WINDOW_RADIANCE, make_palette, pick
 from scenes.library.things.parts import Palette, Random, joined, panel, with_normals
 from scenes.library.things.patterns import on_one_sheet
 from scenes.model import Camera, Material, Scene, Surface

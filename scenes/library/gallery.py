@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from scenes.library.things import shapes
+from scenes.geometry import shapes
 from scenes.model import Camera, Material, Scene, Surface
 
 ROOM_M = (6.0, 3.0, 9.0)  # width, height, depth

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from scenes.library.things import shapes
+from scenes.geometry import shapes
 from scenes.model import Ambient, Camera, Laser, Material, Scene, Surface, Texture
 
 ALBEDO = 0.5

@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scenes.geometry.shapes import Shape
 from scenes.library.layout import Boxes, Floor, Place, in_each_other, set_down, to_shell
-from scenes.library.living_room import LAMP_RADIANCE, WINDOW_RADIANCE
 from scenes.library.things import clutter, fittings, furniture
-from scenes.library.things.palette import make_palette, pick
+from scenes.library.things.palette import LAMP_RADIANCE, WINDOW_RADIANCE, make_palette, pick
 from scenes.library.things.parts import Palette, Piece, Random, box, joined, panel, sheet, with_normals
 from scenes.library.things.patterns import on_one_sheet
-from scenes.library.things.shapes import Shape
 from scenes.model import Camera, Scene, Surface
 
 SPLITS = ("train", "val", "test")

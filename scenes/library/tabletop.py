@@ -13,9 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from scenes.errors import require
+from scenes.geometry import shapes
 from scenes.library.layout import Floor, set_down
 from scenes.library.rooms import one_of_each
-from scenes.library.things import clutter, shapes
+from scenes.library.things import clutter
 from scenes.library.things.blobs import branching, stone, toy
 from scenes.library.things.palette import make_palette, pick
 from scenes.library.things.parts import (

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.library.things import shapes
+from scenes.geometry import shapes
 from scenes.library.things.parts import (
     Palette,
     box,

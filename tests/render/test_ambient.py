@@ -12,7 +12,7 @@ from render.ambient.integrator import ambient_light
 from render.direct.integrator import Layers, centre_layers
 from render.scene.traced_scene import TracedScene, mi
 from scene2spad.bench.hard import oracles
-from scenes.library.things.shapes import box, sphere
+from scenes.geometry.shapes import box, sphere
 from scenes.model import Ambient, Material, Scene, Surface
 
 GLASS = Material("thindielectric", ior=1.5)

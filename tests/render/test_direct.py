@@ -9,7 +9,7 @@ import pytest
 from render.direct.integrator import DirectLight, direct_light
 from render.scene.traced_scene import TracedScene, dr
 from scenes import Camera, Laser, Material, Scene, Surface
-from scenes.library.things.shapes import sphere
+from scenes.geometry.shapes import sphere
 
 
 class Moments(NamedTuple):

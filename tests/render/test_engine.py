@@ -30,8 +30,8 @@ from render.settings import RenderSettings
 from render.transient.samples import Samples
 from scene2spad.bench.hard import oracles
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
+from scenes.geometry.shapes import box, sphere
 from scenes.library.hard_cases import hard_case
-from scenes.library.things.shapes import box, sphere
 
 
 def room(mode: str = "flood", width: int = 24, height: int = 18) -> Scene:

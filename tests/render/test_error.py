@@ -15,7 +15,7 @@ from render.transient import Transient
 from render.transient.samples import Samples
 from scene2spad.bench.hard import oracles
 from scenes import Material, Scene, Surface
-from scenes.library.things.shapes import box
+from scenes.geometry.shapes import box
 
 WIDTH, HEIGHT = 40, 30
 

@@ -34,8 +34,8 @@ from render.scene.rays import camera_rays, first_opaque, sample_bsdf, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 from render.settings import Plan, RenderSettings
 from scenes import Camera, Laser, Material, Scene, Surface
+from scenes.geometry.shapes import box, sphere
 from scenes.library.hard_cases import hard_case
-from scenes.library.things.shapes import box, sphere
 
 WIDTH, HEIGHT, BATCHES = 16, 12, 16
 METAL = Material("roughconductor", roughness=0.1, eta=2.9, k=3.1)

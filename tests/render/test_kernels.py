@@ -13,7 +13,7 @@ from render.scene.traced_scene import TracedScene, dr
 from render.settings import RenderSettings
 from render.specular.image_method import specular_light
 from scenes import Camera, Laser, Material, Scene, Surface
-from scenes.library.things.shapes import box, rectangle, sphere
+from scenes.geometry.shapes import box, rectangle, sphere
 
 SETTINGS = RenderSettings(bounces=3, spp=16, grid=2)
 

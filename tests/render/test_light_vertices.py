@@ -14,7 +14,7 @@ from render.scene.rays import laser_light
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr
 from scene2spad.bench.hard import oracles
 from scenes import Laser, Material, Scene, Surface
-from scenes.library.things.shapes import box, sphere
+from scenes.geometry.shapes import box, sphere
 
 LAMP = Laser("flood", cone_deg=360)
 KINDS = ("diffuse", "plastic", "roughplastic", "roughconductor", "dielectric")

@@ -10,7 +10,7 @@ import pytest
 from render.scene.traced_scene import TracedScene
 from render.specular.image_method import specular_light
 from scenes import Camera, Laser, Material, Scene, Surface
-from scenes.library.things.shapes import box, sphere
+from scenes.geometry.shapes import box, sphere
 
 METAL = Material("roughconductor", roughness=0.02, eta=2.9, k=3.1)
 

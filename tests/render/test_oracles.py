@@ -16,7 +16,7 @@ from render.transient import Transient
 from render.transient.samples import SampleBuffer, Samples
 from scene2spad.bench.hard import oracles
 from scenes import Ambient, Camera, Laser, Material, Scene, Surface, Texture
-from scenes.library.things.shapes import box, sphere
+from scenes.geometry.shapes import box, sphere
 
 DIRECT = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
 

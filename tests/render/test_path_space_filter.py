@@ -21,10 +21,10 @@ from scene2spad.bench.hard.oracles_optics import integrating_sphere
 from scene2spad.bench.rendering import settings
 from scene2spad.bench.rendering.binning import binned
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
+from scenes.geometry.shapes import box, sphere
 from scenes.library import hard_cases
 from scenes.library.catalog import load_scene
 from scenes.library.hard_cases import hard_case
-from scenes.library.things.shapes import box, sphere
 
 SLOW = pytest.mark.slow
 

@@ -9,7 +9,7 @@ import torch
 from render.engine import render
 from render.settings import RenderSettings
 from scenes import Ambient, Camera, InputError, Laser, Material, Scene, Surface, Texture
-from scenes.library.things import shapes
+from scenes.geometry import shapes
 from scenes.model import LASER_MODES, MATERIAL_KINDS
 from spad.detection.detect import sense
 from spad.estimators.depth import estimate_depth

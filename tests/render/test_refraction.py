@@ -12,7 +12,7 @@ from render.engine import render
 from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
-from scenes.library.things.shapes import box, sphere
+from scenes.geometry.shapes import box, sphere
 
 N = 1.5
 GLASS = Material("dielectric", ior=N, name="glass")

@@ -12,7 +12,7 @@ from render.scene.traced_scene import TracedScene
 from render.specular.image_method import specular_light
 from render.specular.mirrors import check_slabs, find_mirrors, slab_error_m
 from scenes import Camera, InputError, Laser, Material, Scene, Surface, Texture
-from scenes.library.things.shapes import axis_frame, box, sphere
+from scenes.geometry.shapes import axis_frame, box, sphere
 
 GOOD_MIRROR = Material("conductor", eta=0.0, k=1.0, specular=0.8, name="mirror")
 SILVER = Material("conductor", eta=0.2, k=3.0, name="silver")

@@ -18,7 +18,7 @@ from render.transient.samples import Samples
 from scene2spad.bench.hard import oracles
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, REFERENCE_PULSE_SIGMA_S, SPEED_OF_LIGHT_M_PER_S
-from scenes.library.things.shapes import box
+from scenes.geometry.shapes import box
 
 WALLS = Material(albedo=0.7)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])

@@ -8,7 +8,8 @@ import pytest
 from triangles import hit_distances
 
 from scenes import InputError, Scene, Texture
-from scenes.library.living_room import HIGH, LOW, RUG_M, living_room
+from scenes.library.living_room import HIGH, LOW, living_room
+from scenes.library.things.basic_furniture import RUG_M
 
 SEEDS = (0, 1, 2, 3)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from xml_files import GREY, LUMINANCE, OBJ, PLY, first_hit, image, load, meshes, refusal, texel, write
 
+from scenes.geometry import shapes
 from scenes.io.mitsuba_xml import load_mitsuba_xml
-from scenes.library.things import shapes
 
 DOWN = [((0.3, 0.2, 5), (0, 0, -1)), ((0.2, 0.35, 5), (0, 0, -1)), ((0.6, 0.3, 5), (0, 0, -1))]
 SIDES = [((-0.3, 0.2, 5), (0, 0, -1)), ((5, 0.3, 0.4), (-1, 0, 0)), ((-0.3, -5, 0.4), (0, 1, 0))]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes import Camera, InputError, Material, Scene, Surface
-from scenes.library.things.shapes import box, rectangle, sphere
+from scenes.geometry.shapes import box, rectangle, sphere
 from scenes.offsets import moved_away, pushed_along_rays
 
 

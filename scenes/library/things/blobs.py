@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.library.things import shapes
+from scenes.geometry import shapes
 from scenes.library.things.parts import Random
 
 CELLS = 26  # marching-cubes cells along the longest edge

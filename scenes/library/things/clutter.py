@@ -6,11 +6,10 @@ import math
 
 import numpy as np
 
-from scenes.library.living_room import LAMP_RADIANCE
-from scenes.library.things import shapes
+from scenes.geometry import shapes
 from scenes.library.things.blobs import bag, blend
 from scenes.library.things.ornaments import candles, flowers, plant, root, sculpture, soft_toy, vase, vase_profile
-from scenes.library.things.palette import pick
+from scenes.library.things.palette import LAMP_RADIANCE, pick
 from scenes.library.things.parts import Palette, Piece, Random, box, joined, lathe, moved, panel, placed, tube, turned
 
 

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from scenes.library.things import shapes
-from scenes.library.things.parts import Random, box, grid_faces, moved, sheet, tube
+from scenes.geometry import shapes
+from scenes.library.things.parts import Random, box, moved, sheet, tube
 
 Maker = Callable[[Random], shapes.Shape]
 
@@ -150,7 +150,7 @@ def drapery(rng: Random) -> shapes.Shape:
     )
     ragged = 1 + rng.uniform(0, 0.3) * np.cos(rng.uniform(2, 12) * y + rng.uniform(0, 6.3))
     points = np.stack((x * ragged, y, folds), axis=-1) * 0.85
-    return points.reshape(-1, 3), grid_faces(33, 33), np.column_stack(((x.ravel() + 1) / 2, (y.ravel() + 1) / 2))
+    return points.reshape(-1, 3), shapes.grid_faces(33, 33), np.column_stack(((x.ravel() + 1) / 2, (y.ravel() + 1) / 2))
 
 
 def steps(rng: Random) -> shapes.Shape:

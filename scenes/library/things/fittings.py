@@ -7,10 +7,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.library import living_room as living
-from scenes.library.things import shapes
-from scenes.library.things.palette import pick, repainted
-from scenes.library.things.parts import Palette, Piece, Random, box, joined, lathe, moved, panel, sheet, tube, turned
+from scenes.geometry import shapes
+from scenes.library.things import basic_furniture as basic
+from scenes.library.things.palette import LAMP_RADIANCE, WINDOW_RADIANCE, pick, repainted
+from scenes.library.things.parts import (
+    Palette,
+    Piece,
+    Random,
+    box,
+    joined,
+    lathe,
+    moved,
+    panel,
+    placed,
+    sheet,
+    tube,
+    turned,
+)
 
 
 def radiator(palette: Palette, rng: Random) -> Piece:
@@ -40,7 +53,7 @@ def wall_window(palette: Palette, rng: Random) -> Piece:
     glass = panel((0, sill + tall / 2, 0.03), (x, 0, 0), (0, tall / 2, 0))
     surfaces = [
         joined("window: frame", pick(palette, rng, "paint"), *bars),
-        joined("window: sky", palette["sky"], sky, emission=living.WINDOW_RADIANCE),
+        joined("window: sky", palette["sky"], sky, emission=WINDOW_RADIANCE),
         joined("window: glass", palette["glass"], glass),
     ]
     kind = rng.random()
@@ -121,8 +134,8 @@ def hanging_picture(palette: Palette, rng: Random) -> Piece:
     wide, tall = rng.uniform((0.3, 0.3), (1.1, 0.8))
     own = repainted(palette, rng) | {"painting": pick(palette, rng, "print" if rng.random() < 0.4 else "painting")}
     y = rng.uniform(1.55, 1.7) - tall / 2
-    surfaces = living.picture(own, wide, tall, bar=rng.uniform(0.015, 0.05))
-    return Piece(tuple(living.placed(surfaces, 0, 0, y=y)))
+    surfaces = basic.picture(own, wide, tall, bar=rng.uniform(0.015, 0.05))
+    return Piece(tuple(placed(surfaces, 0, 0, y=y)))
 
 
 def shelf(palette: Palette, rng: Random) -> Piece:
@@ -163,7 +176,7 @@ def pendant(palette: Palette, rng: Random, height: float) -> Piece:
     surfaces = (
         joined("pendant: shade", pick(palette, rng, "paint" if rng.random() < 0.5 else "satin"), lathe(profile, 28)),
         joined("pendant: wire", pick(palette, rng, "dark"), wire),
-        joined("pendant: bulb", palette["sky"], bulb, emission=living.LAMP_RADIANCE),
+        joined("pendant: bulb", palette["sky"], bulb, emission=LAMP_RADIANCE),
     )
     return Piece(surfaces)
 

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from scenes.library import living_room as living
-from scenes.library.things import shapes
+from scenes.geometry import shapes
+from scenes.library.things import basic_furniture as basic
 from scenes.library.things.blobs import bag, rounded_box
 from scenes.library.things.fittings import coats, radiator
 from scenes.library.things.palette import pick, repainted
@@ -25,7 +25,7 @@ def sofa(palette: Palette, rng: Random) -> Piece:
     """Return a sofa for two or three, sometimes with a cushion, a blanket or a bag on it."""
     width = rng.uniform(1.4, 2.3)
     own = repainted(palette, rng)
-    surfaces = living.sofa(own, width, own["sofa cloth"], depth=rng.uniform(0.75, 0.95))
+    surfaces = basic.sofa(own, width, own["sofa cloth"], depth=rng.uniform(0.75, 0.95))
     for x in rng.uniform(0.35 - width / 2, width / 2 - 0.35, int(rng.integers(0, 4))):
         pillow = turned(rounded_box((0.42, 0.36, 0.14), 3.0), "x", -18, (x, 0.46, 0.26))
         surfaces.append(joined("cushion: cloth", pick(palette, rng, "cloth"), turned(pillow, "y", rng.uniform(-8, 8))))
@@ -34,12 +34,12 @@ def sofa(palette: Palette, rng: Random) -> Piece:
 
 def armchair(palette: Palette, rng: Random) -> Piece:
     own = repainted(palette, rng)
-    return Piece(tuple(living.sofa(own, rng.uniform(0.8, 1.0), own["sofa cloth"])))
+    return Piece(tuple(basic.sofa(own, rng.uniform(0.8, 1.0), own["sofa cloth"])))
 
 
 def bookshelf(palette: Palette, rng: Random) -> Piece:
     width, height = rng.uniform(0.6, 1.8), rng.uniform(0.9, 2.2)
-    surfaces = living.bookshelf(repainted(palette, rng), rng, width, height)
+    surfaces = basic.bookshelf(repainted(palette, rng), rng, width, height)
     return Piece(tuple(surfaces), ((0, 0.14, width / 2 - 0.05, 0.12, height),))
 
 
@@ -162,14 +162,14 @@ def dining_table(palette: Palette, rng: Random) -> Piece:
         )
         return Piece(round_one, ((0, 0, 0.65 * radius, 0.65 * radius, top),))
     return Piece(
-        tuple(living.table(repainted(palette, rng), top, width, depth)),
+        tuple(basic.table(repainted(palette, rng), top, width, depth)),
         ((0, 0, width / 2 - 0.08, depth / 2 - 0.08, top),),
     )
 
 
 def coffee_table(palette: Palette, rng: Random) -> Piece:
     width, depth, top = rng.uniform((0.6, 0.45, 0.35), (1.2, 0.7, 0.48))
-    surfaces = living.table(repainted(palette, rng), top, width, depth)
+    surfaces = basic.table(repainted(palette, rng), top, width, depth)
     if rng.random() < 0.5:
         lower = box((-width / 2 + 0.08, 0.12, -depth / 2 + 0.08), (width / 2 - 0.08, 0.135, depth / 2 - 0.08))
         surfaces.append(joined("table: shelf", pick(palette, rng, "wood"), lower))
@@ -177,7 +177,7 @@ def coffee_table(palette: Palette, rng: Random) -> Piece:
 
 
 def chair(palette: Palette, rng: Random) -> Piece:
-    return Piece(tuple(living.chair(repainted(palette, rng), rng.uniform(0.42, 0.48), rng.uniform(0.82, 1.1))))
+    return Piece(tuple(basic.chair(repainted(palette, rng), rng.uniform(0.42, 0.48), rng.uniform(0.82, 1.1))))
 
 
 def office_chair(palette: Palette, rng: Random) -> Piece:
@@ -230,7 +230,7 @@ def stool(palette: Palette, rng: Random) -> Piece:
 
 
 def floor_lamp(palette: Palette, rng: Random) -> Piece:
-    return Piece(tuple(living.floor_lamp(repainted(palette, rng) | {"brushed steel": palette["steel"]})))
+    return Piece(tuple(basic.floor_lamp(repainted(palette, rng) | {"brushed steel": palette["steel"]})))
 
 
 def clothes_horse(palette: Palette, rng: Random) -> Piece:
@@ -262,7 +262,7 @@ def heap(palette: Palette, rng: Random) -> Piece:
 
 
 def rug(palette: Palette, rng: Random) -> Piece:
-    return Piece(tuple(living.rug(palette, *rng.uniform((0.8, 1.2), (1.6, 2.4)))))
+    return Piece(tuple(basic.rug(palette, *rng.uniform((0.8, 1.2), (1.6, 2.4)))))
 
 
 AT_WALL = {

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.library.things import shapes
+from scenes.geometry import shapes
 from scenes.library.things.blobs import branching, stone, toy
 from scenes.library.things.palette import pick
 from scenes.library.things.parts import Palette, Piece, Random, joined, lathe, moved, sheet, tube, turned

@@ -1,4 +1,4 @@
-"""The paints, woods, cloths and metals that one procedural scene is made of, albedos 0.03 to 0.95."""
+"""The paints, woods, cloths and metals that one procedural scene is made of, albedos 0.03 to 0.95, and its lights."""
 
 from __future__ import annotations
 
@@ -19,6 +19,12 @@ from scenes.library.things.patterns import (
 from scenes.model import Material, Texture
 
 DARKEST, BRIGHTEST = 0.03, 0.95
+
+# Steady light near 550 to 700 nm [W/(m^2 sr nm)]. Full sun is 1e5 lx and about 1.5 W/(m^2 nm), so an overcast sky of
+# 3,300 cd/m^2 seen through the window is 3.3e3 / 1e5 * 1.5 = 0.05; an 800 to 1,500 lm bulb whose light leaves through
+# 0.25 m^2 of cloth is 600 to 1,200 cd/m^2, about 0.01 to 0.02.
+WINDOW_RADIANCE = 0.05
+LAMP_RADIANCE = 0.02
 
 
 def make_palette(rng: Random) -> Palette:

@@ -13,7 +13,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from scenes.library.things import shapes
+from scenes.geometry import shapes
+from scenes.geometry.shapes import grid_faces
 from scenes.model import Material, Surface
 
 Random = np.random.Generator
@@ -190,15 +191,11 @@ def sheet(points: np.ndarray) -> shapes.Shape:
     """Return a grid of points (rows, columns, 3) as triangles, seen from where columns run right and rows run up."""
     rows, columns = points.shape[:2]
     v, u = np.meshgrid(np.linspace(0, 1, rows), np.linspace(0, 1, columns), indexing="ij")
-    return points.reshape(-1, 3).astype(float), grid_faces(rows, columns), np.column_stack((u.ravel(), v.ravel()))
-
-
-def grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Return two triangles a cell of a grid of rows x columns vertices, counterclockwise with columns right and rows
-    up."""
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    right, up = corner + 1, corner + columns
-    return np.stack((corner, right, up + 1, corner, up + 1, up), axis=-1).reshape(-1, 3)
+    return (
+        points.reshape(-1, 3).astype(float),
+        grid_faces(rows, columns),
+        np.column_stack((u.ravel(), v.ravel())),
+    )
 
 
 def turned(shape: shapes.Shape, axis: str, degrees: float, by: Vector = (0.0, 0.0, 0.0)) -> shapes.Shape:

@@ -132,6 +132,14 @@ def axis_frame(direction: np.ndarray) -> np.ndarray:
     return np.array([(1 + sign * x * x * a, b, x), (sign * b, sign + y * y * a, y), (-sign * x, -y, z)])
 
 
+def grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Return two triangles a cell of a grid of rows x columns vertices, counterclockwise with columns right and rows
+    up."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, up = corner + 1, corner + columns
+    return np.stack((corner, right, up + 1, corner, up + 1, up), axis=-1).reshape(-1, 3)
+
+
 def transform(vertices: np.ndarray, matrix4: np.ndarray) -> np.ndarray:
     """Return points moved by an affine 4x4 matrix."""
     matrix4 = np.asarray(matrix4, dtype=np.float64)
