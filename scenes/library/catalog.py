@@ -11,8 +11,8 @@ import numpy as np
 
 from scenes.errors import InputError, did_you_mean
 from scenes.geometry import shapes
-from scenes.io.meshes import EXTENSIONS as MESH_EXTENSIONS
-from scenes.io.meshes import load_mesh
+from scenes.io.mesh_formats.meshes import EXTENSIONS as MESH_EXTENSIONS
+from scenes.io.mesh_formats.meshes import load_mesh
 from scenes.library.gallery import gallery
 from scenes.library.hall import hall
 from scenes.library.living_room import living_room
@@ -86,7 +86,7 @@ def _loaded(spec: str, seed: int, width: int | None, height: int | None) -> Scen
             f"or a file with extension {' '.join(EXTENSIONS)}{did_you_mean(spec, SCENES)}"
         )
     if kind == ".xml":
-        from scenes.io.mitsuba_xml import load_mitsuba_xml
+        from scenes.io.mitsuba.scene_file import load_mitsuba_xml
 
         return load_mitsuba_xml(Path(spec), width=width, height=height)
     size = _looking_ahead(WIDTH, HEIGHT).resized(width, height)

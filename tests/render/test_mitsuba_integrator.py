@@ -12,7 +12,7 @@ from render.mitsuba_integrator import dense_path_histogram, register_integrator
 from render.settings import RenderSettings
 from render.transient import Transient
 from scenes.errors import InputError
-from scenes.io.mitsuba_xml import load_mitsuba_xml
+from scenes.io.mitsuba.scene_file import load_mitsuba_xml
 
 mi = start_mitsuba()
 register_integrator()

@@ -11,7 +11,7 @@ import trimesh
 
 from scene2spad.cli import main
 from scenes import InputError
-from scenes.io.meshes import load_mesh
+from scenes.io.mesh_formats.meshes import load_mesh
 from scenes.io.relief import RgbdFiles, middlebury, rgbd
 from scenes.library.catalog import load_scene
 from scenes.library.hard_cases import million_triangles

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from scenes import InputError, Scene
-from scenes.io.meshes import load_mesh
+from scenes.io.mesh_formats.meshes import load_mesh
 from scenes.io.textures import luminance, srgb_to_linear
 from scenes.placing import Placing
 

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from scenes import InputError, Scene, Surface
-from scenes.io import mesh_colours
-from scenes.io.meshes import load_mesh
+from scenes.io.mesh_formats import mesh_colours
+from scenes.io.mesh_formats.meshes import load_mesh
 from scenes.io.textures import luminance, srgb_to_linear
 from scenes.placing import Placing
 

@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 from scenes import InputError, Scene, Surface, Texture
-from scenes.io.meshes import load_mesh
+from scenes.io.mesh_formats.meshes import load_mesh
 
 DATA = Path(os.environ.get("SCENE2SPAD_DATA", Path(__file__).parents[2].parent / "shared/data"))
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"

@@ -11,7 +11,7 @@ import pytest
 from xml_files import LUMINANCE, RECTANGLE, SENSOR, load, refusal, texel, write
 
 from scenes import Ambient, InputError, Texture
-from scenes.io.mitsuba_xml import load_mitsuba_xml
+from scenes.io.mitsuba.scene_file import load_mitsuba_xml
 
 DATA = Path(os.environ.get("SCENE2SPAD_DATA") or Path(__file__).parents[2].parent / "shared" / "data")
 LIVING_ROOM = DATA / "scenes" / "living-room" / "scene.xml"

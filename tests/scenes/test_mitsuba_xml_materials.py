@@ -1,4 +1,4 @@
-"""scenes.io.mitsuba_bsdf: the materials of a Mitsuba scene file, against Mitsuba itself and against closed forms."""
+"""scenes.io.mitsuba.bsdf: the materials of a Mitsuba scene file, against Mitsuba itself and against closed forms."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from xml_files import GREY, LUMINANCE, first_hit, image, load, material, meshes, refusal, texel, write
 
-from scenes.io.mitsuba_xml import load_mitsuba_xml
+from scenes.io.mitsuba.scene_file import load_mitsuba_xml
 from scenes.io.textures import luminance, srgb_to_linear
 
 AIR = 1.000277

@@ -1,4 +1,4 @@
-"""scenes.io.mitsuba_shapes: the shapes of a Mitsuba scene file, against Mitsuba itself and against closed forms."""
+"""scenes.io.mitsuba.shapes: the shapes of a Mitsuba scene file, against Mitsuba itself and against closed forms."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from xml_files import GREY, LUMINANCE, OBJ, PLY, first_hit, image, load, meshes, refusal, texel, write
 
 from scenes.geometry import shapes
-from scenes.io.mitsuba_xml import load_mitsuba_xml
+from scenes.io.mitsuba.scene_file import load_mitsuba_xml
 
 DOWN = [((0.3, 0.2, 5), (0, 0, -1)), ((0.2, 0.35, 5), (0, 0, -1)), ((0.6, 0.3, 5), (0, 0, -1))]
 SIDES = [((-0.3, 0.2, 5), (0, 0, -1)), ((5, 0.3, 0.4), (-1, 0, 0)), ((-0.3, -5, 0.4), (0, 1, 0))]

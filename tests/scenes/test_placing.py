@@ -8,7 +8,7 @@ import pytest
 import xml_files
 
 from scenes import InputError
-from scenes.io.meshes import load_mesh
+from scenes.io.mesh_formats.meshes import load_mesh
 from scenes.library.catalog import load_scene
 from scenes.optics.blackbody import planck_w_per_m2_nm, seen_radiance_w_per_m2_sr_nm, sunlit_sky_w_per_m2_sr_nm
 from scenes.placing import Placing, scaled

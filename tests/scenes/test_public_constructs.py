@@ -12,8 +12,8 @@ import pytest
 from xml_files import RECTANGLE, SENSOR, load, meshes, refusal, write
 
 from scene2spad.cli import main
-from scenes.io import mitsuba_shapes
-from scenes.io.mitsuba_xml import load_mitsuba_xml
+from scenes.io.mitsuba import shapes as mitsuba_shapes
+from scenes.io.mitsuba.scene_file import load_mitsuba_xml
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "own-scenes.md"
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scenes import InputError, Scene, Surface, Texture
-from scenes.io.mitsuba_xml import load_mitsuba_xml
+from scenes.io.mitsuba.scene_file import load_mitsuba_xml
 
 SENSOR = (
     '<sensor type="perspective"><float name="fov" value="60"/>'

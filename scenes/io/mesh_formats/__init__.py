@@ -1,4 +1,4 @@
-"""Check what mesh files declare of themselves against what is in them: what each format needs beside trimesh.
+"""Read mesh files; check what they declare against what is in them: what each format needs beside trimesh.
 
 trimesh reads a text file that was cut, drops a texture that it cannot find, and takes negative indices as Python does.
 It passes over what it has no model for: what would then be seen as something else is refused, or put as it reads it.

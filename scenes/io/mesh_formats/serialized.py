@@ -16,7 +16,7 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from scenes.io.inputs import read_bytes
-from scenes.io.mesh_files import MAX_TRIANGLES
+from scenes.io.mesh_formats.mesh_files import MAX_TRIANGLES
 from scenes.limits import require_memory
 
 MAGIC = 0x041C

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenes.errors import InputError, require
-from scenes.io.mesh_files import ply_texture, read_material_library
+from scenes.io.mesh_formats.mesh_files import ply_texture, read_material_library
 from scenes.io.mesh_formats.mtl import MaterialEntry
 from scenes.io.textures import MAX_PIXELS, image_values, load_texture, luminance, opened_image, srgb_to_linear
 from scenes.model import Material, Texture

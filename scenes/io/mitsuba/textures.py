@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from scenes.errors import InputError
-from scenes.io.mitsuba_nodes import Document
-from scenes.io.mitsuba_plugin import Plugin
+from scenes.io.mitsuba.nodes import Document
+from scenes.io.mitsuba.plugin import Plugin
 from scenes.io.textures import load_texture, with_sharp_texels
 from scenes.model import Texture
 

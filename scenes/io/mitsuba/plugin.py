@@ -12,7 +12,7 @@ import numpy as np
 from scenes.errors import InputError
 from scenes.geometry.shapes import axis_frame
 from scenes.io.inputs import read_text
-from scenes.io.mitsuba_nodes import Document
+from scenes.io.mitsuba.nodes import Document
 from scenes.io.textures import luminance, srgb_to_linear
 from scenes.optics.blackbody import seen_radiance_w_per_m2_sr_nm
 

@@ -17,13 +17,13 @@ from scenes.arrays import check_faces
 from scenes.errors import InputError
 from scenes.geometry import shapes
 from scenes.io.inputs import read_bytes
-from scenes.io.mesh_colours import Paint, Part
-from scenes.io.mesh_files import (
+from scenes.io.mesh_formats.glb import glb_notes
+from scenes.io.mesh_formats.mesh_colours import Paint, Part
+from scenes.io.mesh_formats.mesh_files import (
     MAX_COORDINATE,
     check_vertices,
     load_trimesh,
 )
-from scenes.io.mesh_formats.glb import glb_notes
 from scenes.io.mesh_formats.ply import ply_colours
 from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing

@@ -13,11 +13,11 @@ from scenes.arrays import check_faces
 from scenes.errors import InputError
 from scenes.geometry import shapes
 from scenes.io.inputs import read_bytes
-from scenes.io.mesh_files import check_vertices, load_trimesh
+from scenes.io.mesh_formats.mesh_files import check_vertices, load_trimesh
 from scenes.io.mesh_formats.serialized import read_serialized
-from scenes.io.mitsuba_bsdf import Look, Materials
-from scenes.io.mitsuba_nodes import Document
-from scenes.io.mitsuba_plugin import Plugin
+from scenes.io.mitsuba.bsdf import Look, Materials
+from scenes.io.mitsuba.nodes import Document
+from scenes.io.mitsuba.plugin import Plugin
 from scenes.model import Camera, Surface
 
 # At 128 segments a disk's area is 4e-4 too small, at 5 subdivisions a sphere's 3e-4: under the 1e-3 that is promised.

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from scenes.errors import InputError
-from scenes.io.mitsuba_bsdf import Materials
-from scenes.io.mitsuba_nodes import Document, LocatedError
-from scenes.io.mitsuba_plugin import VALUE_TAGS, Plugin
-from scenes.io.mitsuba_shapes import Shapes, shows_open_back
+from scenes.io.mitsuba.bsdf import Materials
+from scenes.io.mitsuba.nodes import Document, LocatedError
+from scenes.io.mitsuba.plugin import VALUE_TAGS, Plugin
+from scenes.io.mitsuba.shapes import Shapes, shows_open_back
 from scenes.model import Ambient, Camera, Scene, Surface, Texture
 
 # How far a matrix may be from a rotation and still be one that was written with few digits.

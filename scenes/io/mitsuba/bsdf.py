@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from scenes.errors import InputError
-from scenes.io.mitsuba_nodes import Document
-from scenes.io.mitsuba_plugin import Plugin
-from scenes.io.mitsuba_textures import Textures, Uv, clipped
+from scenes.io.mitsuba.nodes import Document
+from scenes.io.mitsuba.plugin import Plugin
+from scenes.io.mitsuba.textures import Textures, Uv, clipped
 from scenes.model import DISTRIBUTIONS, Material, Texture
 from scenes.optics.refractive_indices import CONDUCTORS, INDICES
 
