@@ -10,9 +10,9 @@ from typing import TypeVar
 
 import numpy as np
 
+from scene2spad.emulation.emulated_chain import timestamps_of
+from scene2spad.emulation.program_tables import int8_temporal
 from scene2spad.options.experiments import Bench
-from scene2spad.studies.power.emulated_chain import timestamps_of
-from scene2spad.studies.power.program_tables import int8_temporal
 from scenes.errors import require
 from scenes.files import whole_file
 from scenes.progress import Progress

@@ -1,1 +1,1 @@
-"""Render scene sets, in processes or on a cluster; test sets, planes, captures."""
+"""Render scene sets, in processes or on a cluster; planes, captures."""

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from csph.weights.shipped import WEIGHTS
-from scene2spad.datasets.test_sets import rooms
 from scene2spad.networks.registry import ModelRegistry, ModelSpec, Trained
+from scene2spad.networks.test_sets import rooms
 from scene2spad.networks.training import PLANES
 from scene2spad.options.experiments import Study
 from scenes.errors import InputError

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 
-from scene2spad.datasets.published import printed
+from scene2spad.networks.published import printed
 from scene2spad.networks.registry import ModelSpec
 from scene2spad.report import html
 from scene2spad.studies.ablations.plan import sheets_of

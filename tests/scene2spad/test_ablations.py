@@ -11,7 +11,7 @@ import pytest
 from csph.evaluation.methods import Row
 from csph.training.loop import train
 from scene2spad.cli import main
-from scene2spad.datasets.published import printed
+from scene2spad.networks.published import printed
 from scene2spad.networks.registry import ModelSpec
 from scene2spad.networks.training import config_of
 from scene2spad.studies.ablations import figures
@@ -109,7 +109,7 @@ def test_a_study_runs_to_the_end_and_again_without_work(study, capfd, tmp_path, 
     first = json.loads(capfd.readouterr().out)
     assert all(Path(path).is_file() for path in (*first["figures"], *first["csv"], first["numbers"]))
     assert len(first["models"]) == 2 and len(first["conclusions"]) == len(plans.CLAIMS[study])
-    monkeypatch.setattr("scene2spad.datasets.test_sets.evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    monkeypatch.setattr("scene2spad.networks.test_sets.evaluate", lambda *_, **__: pytest.fail("evaluated again"))
     monkeypatch.setattr(train.__module__ + ".train", lambda *_, **__: pytest.fail("trained again"))
     assert main(command) == 0
     assert json.loads(capfd.readouterr().out) == first

@@ -7,7 +7,7 @@ import pytest
 from set_folders import begun, finished
 
 from scene2spad.cli import main
-from scene2spad.studies.results import Store
+from scene2spad.networks.results import Store
 from scenes.errors import InputError
 
 MADE = {"set": "planes", "seed": 0}

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scene2spad.datasets import published
 from scene2spad.datasets.rendering import Job, make_set
 from scene2spad.datasets.zone_captures import read_plane_captures
 from scene2spad.dry_runs.sets import dry_run
+from scene2spad.networks import published
 from scenes import InputError
 
 

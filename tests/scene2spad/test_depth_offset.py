@@ -15,14 +15,14 @@ from csph.networks.model import load_model
 from csph.weights.cards import shipped_model
 from render.transient.packs import write_pack
 from scene2spad.cli import main
-from scene2spad.datasets import published
 from scene2spad.datasets.planes import random_planes
-from scene2spad.datasets.test_sets import TestSet, evaluated
+from scene2spad.networks import published
 from scene2spad.networks.registry import EvaluatedModel, ModelRegistry, ModelSpec
+from scene2spad.networks.results import Store
+from scene2spad.networks.test_sets import TestSet, evaluated
 from scene2spad.studies.depth_offset import plan as plans
 from scene2spad.studies.depth_offset import study as depth_offset
 from scene2spad.studies.depth_offset import tables
-from scene2spad.studies.results import Store
 from spad.detection.detect import sense
 from spad.formats.rgbd import published_from_rgbd, published_taps
 from spad.sensor.model import PhotonBudget, Sensor

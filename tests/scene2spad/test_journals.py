@@ -18,7 +18,7 @@ from csph.training.resume import claim_run
 from csph.weights.shipped import cpu_minutes
 from render.transient.packs import read_pack, write_pack
 from scene2spad.datasets.planes import random_planes
-from scene2spad.studies.results import Store
+from scene2spad.networks.results import Store
 from scenes import InputError
 from scenes.files import append_line, is_unclaimed, whole_file
 from scenes.io.inputs import read_whole_lines

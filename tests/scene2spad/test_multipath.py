@@ -61,6 +61,6 @@ def test_a_small_run_ends_and_again_without_work(capfd, tmp_path, monkeypatch):
     assert {line["light"] for line in first["summary"]} == {*LIGHTS}
     assert {line["method"] for line in first["summary"]} == {"log-matched", "argmax", *(one.name for one in MODELS)}
     assert first["scenes"][0]["indirect_share"] > 0.01 and Path(first["figures"][0]).is_file()
-    monkeypatch.setattr("scene2spad.datasets.test_sets.evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    monkeypatch.setattr("scene2spad.networks.test_sets.evaluate", lambda *_, **__: pytest.fail("evaluated again"))
     assert main(command) == 0
     assert json.loads(capfd.readouterr().out) == first

@@ -8,8 +8,8 @@ import pytest
 from csph.codes.design import Design
 from scene2spad.cli.main import main
 from scene2spad.datasets.planes import random_planes
-from scene2spad.datasets.test_sets import TestSet
 from scene2spad.networks.registry import TDC_SENSOR, ModelSpec
+from scene2spad.networks.test_sets import TestSet
 from scene2spad.studies.tdc import study
 from scene2spad.studies.tdc.plan import CLOCKS, DELAY, FOLDED, PERFECT, REAL, TABLE, TRAINED, sensor_of
 

@@ -1,6 +1,6 @@
 """Test sets of studies: rendered once, in folders that studies of different extent share."""
 
-from scene2spad.datasets.test_sets import rendered
+from scene2spad.networks.test_sets import rendered
 
 
 def test_studies_of_different_size_and_count_share_a_folder(tmp_path):

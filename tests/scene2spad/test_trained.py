@@ -16,8 +16,8 @@ from csph.weights.shipped import shipped_file, shipped_names
 from scene2spad.cli.main import parse_command
 from scene2spad.datasets.planes import random_planes
 from scene2spad.networks.registry import ModelRegistry, ModelSpec, check, ship_all
+from scene2spad.networks.results import Store
 from scene2spad.networks.training import config_of, training_reach_m
-from scene2spad.studies.results import Store
 from scenes import InputError
 
 LEARNED = ModelSpec("learned", (256, 4, 4), 128, 1)

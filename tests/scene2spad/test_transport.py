@@ -285,7 +285,7 @@ def test_a_small_run_ends_and_again_without_work(capfd, tmp_path, monkeypatch):
     assert "seconds" not in written and (tmp_path / "out/smoke/timings.jsonl").read_text().count("\n") == 8
 
     monkeypatch.setattr("scene2spad.studies.transport.study.render", lambda *_, **__: pytest.fail("rendered again"))
-    monkeypatch.setattr("scene2spad.datasets.test_sets.evaluate", lambda *_, **__: pytest.fail("evaluated again"))
+    monkeypatch.setattr("scene2spad.networks.test_sets.evaluate", lambda *_, **__: pytest.fail("evaluated again"))
     monkeypatch.setattr(
         "scene2spad.studies.transport.planned_renders.coupled", lambda *_, **__: pytest.fail("drawn again")
     )

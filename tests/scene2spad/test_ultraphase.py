@@ -7,8 +7,8 @@ import pytest
 
 from scene2spad.bench import emulate as bench
 from scene2spad.cli import main
-from scene2spad.studies.power.emulated_chain import by_torch, decode, emulate
-from scene2spad.studies.power.program_tables import int8_temporal
+from scene2spad.emulation.emulated_chain import by_torch, decode, emulate
+from scene2spad.emulation.program_tables import int8_temporal
 from scenes.errors import InputError
 from spad.sensor.model import sensor_by_name
 from ultraphase import method

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from scene2spad.cli import main
-from scene2spad.studies.power.emulated_chain import emulate
-from scene2spad.studies.power.program_tables import int8_temporal
+from scene2spad.emulation.emulated_chain import emulate
+from scene2spad.emulation.program_tables import int8_temporal
 from spad.measurements.histogram import Histogram, write_histogram
 from spad.sensor.model import Sensor
 from ultraphase import method

@@ -9,9 +9,9 @@ from pathlib import Path
 from scene2spad.cli.experiments.ultraphase_inputs import program_of, tables_of
 from scene2spad.cli.experiments.ultraphase_run import run_frame
 from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
+from scene2spad.emulation.program_tables import all_costs, verified
 from scene2spad.options.common import only_for
 from scene2spad.options.experiments import Ultraphase
-from scene2spad.studies.power.program_tables import all_costs, verified
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.json_types import JsonObject

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scene2spad.emulation.program_tables import fixed_spatial, int8_temporal
 from scene2spad.options.common import only_for
 from scene2spad.options.experiments import Ultraphase
-from scene2spad.studies.power.program_tables import fixed_spatial, int8_temporal
 from scenes.errors import InputError, require
 from scenes.files import read_array
 from ultraphase import Method, Program, assemble_file, method

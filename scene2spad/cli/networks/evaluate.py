@@ -22,7 +22,7 @@ def run(command: Evaluate, progress: Progress) -> dict:
     require(not twice, f"evaluate: baseline {' '.join(twice[:1])} is named twice")
     _check_checkpoints(command.checkpoints)
     if command.set == PUBLISHED_SET:
-        from scene2spad.datasets import published
+        from scene2spad.networks import published
 
         result = published.run_evaluate(command, progress)
     else:

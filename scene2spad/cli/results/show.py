@@ -84,7 +84,7 @@ def run(command: Show, progress: Progress) -> dict:
     if out.suffix.lower() in (".png", ".pdf"):
         drawn = _picture(command, kind, out)
     elif out.suffix.lower() in ANIMATIONS:
-        from scene2spad.plots.animation import write_gif, write_mp4
+        from scene2spad.viewer.animation import write_gif, write_mp4
 
         write = write_gif if out.suffix.lower() == ".gif" else write_mp4
         drawn = write(_cube(command, kind), out)

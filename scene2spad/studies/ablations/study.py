@@ -16,16 +16,16 @@ import numpy as np
 
 from csph.evaluation.methods import Evaluation, Row, as_dicts
 from csph.levels import PHOTON_LEVELS
-from scene2spad.datasets import published
-from scene2spad.datasets.test_sets import TestSet, depth_map, evaluated, rendered
+from scene2spad.networks import published
 from scene2spad.networks.lookup import obtain, other_seeds, where_trained
 from scene2spad.networks.registry import ModelSpec, Trained, ship_all
+from scene2spad.networks.results import Store
+from scene2spad.networks.test_sets import TestSet, depth_map, evaluated, rendered
 from scene2spad.options.experiments import Study
 from scene2spad.studies.ablations import figures
 from scene2spad.studies.ablations.plan import ALIKE_WITHIN, BETTER, CLAIMS, LEVELS, Claim, Sheet, sheets_of
 from scene2spad.studies.depth_offset.plan import SHOWN_VIEWS, SMOKE, TEST_SET
 from scene2spad.studies.depth_offset.tables import summary_rows
-from scene2spad.studies.results import Store
 from scenes.files import finite, whole_file, write_csv
 from scenes.json_types import JsonObject
 from scenes.progress import Progress

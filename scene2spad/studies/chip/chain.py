@@ -11,8 +11,8 @@ import torch
 
 from csph.codes.quantise import Int8Rule
 from csph.networks.posterior import Decoder
+from scene2spad.emulation.emulated_chain import timestamps_of
 from scene2spad.studies.chip.code import ChipModel, codes_by_torch, leave_sensor
-from scene2spad.studies.power.emulated_chain import timestamps_of
 from scenes.errors import require
 from spad.estimators.bistatic import radial_depth_of
 from spad.measurements.histogram import Histogram

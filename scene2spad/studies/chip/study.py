@@ -16,15 +16,15 @@ import numpy as np
 
 from csph.evaluation.methods import Evaluation, Row, as_dicts
 from csph.evaluation.metrics import paired_difference
-from scene2spad.datasets import published
-from scene2spad.datasets.test_sets import TestSet, evaluated, rendered
+from scene2spad.networks import published
 from scene2spad.networks.lookup import obtain
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained
+from scene2spad.networks.results import Store
+from scene2spad.networks.test_sets import TestSet, evaluated, rendered
 from scene2spad.options.experiments import Study
 from scene2spad.studies.chip.chain import ChipDepth, interpret
 from scene2spad.studies.chip.code import codes_by_torch, compile_model, with_headroom
 from scene2spad.studies.chip.plan import HEADROOM_BITS, ROOM_SIZE, TEST_SET, WITHIN, Plan, plan_of
-from scene2spad.studies.results import Store
 from scenes.errors import InputError
 from scenes.files import finite, whole_file, write_csv
 from scenes.json_types import JsonObject

@@ -23,8 +23,8 @@ from csph.networks.model import DepthModel
 from csph.networks.posterior import Decoder
 from scene2spad.datasets.planes import wall
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained
+from scene2spad.networks.results import Store
 from scene2spad.studies.depth_offset.tables import by_design, mean_error
-from scene2spad.studies.results import Store
 from scenes.json_types import JsonObject
 from spad.detection.detect import sense
 from spad.measurements.histogram import Histogram

@@ -18,10 +18,11 @@ from pathlib import Path
 from csph.evaluation.methods import Row, as_dicts
 from csph.networks.model import DepthModel, weights_sha256
 from csph.training.views import read_views, split_views
-from scene2spad.datasets import published
-from scene2spad.datasets.test_sets import TestSet, depth_map, evaluated, rendered
+from scene2spad.networks import published
 from scene2spad.networks.lookup import obtain
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained, ship_all
+from scene2spad.networks.results import Store
+from scene2spad.networks.test_sets import TestSet, depth_map, evaluated, rendered
 from scene2spad.networks.training import PLANES, training_reach_m
 from scene2spad.options.experiments import Study
 from scene2spad.studies.depth_offset import figures, range_end, tables
@@ -35,7 +36,6 @@ from scene2spad.studies.depth_offset.plan import (
     Plan,
     plan_of,
 )
-from scene2spad.studies.results import Store
 from scenes.errors import InputError, require
 from scenes.files import finite, whole_file, write_csv
 from scenes.json_types import JsonObject

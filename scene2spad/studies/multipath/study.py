@@ -18,14 +18,14 @@ import numpy as np
 from csph.evaluation.methods import Row, as_dicts
 from csph.training.views import Views
 from render.transient import Transient
-from scene2spad.datasets.test_sets import TestSet, evaluated
 from scene2spad.networks.lookup import ModelLookup, obtain, where_trained
 from scene2spad.networks.registry import EvaluatedModel
+from scene2spad.networks.results import Store
+from scene2spad.networks.test_sets import TestSet, evaluated
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import plain_log, plt, save
 from scene2spad.plots.style import COLOURS, look
 from scene2spad.studies.multipath.plan import DELAYED, FILTER, HEADLINE, LIGHTS, MIXED, MODELS, PEAK, PLANS, Plan
-from scene2spad.studies.results import Store
 from scene2spad.studies.transport.study import direct_alone, rendered_once, without_network
 from scenes.files import finite, whole_file, write_csv
 from scenes.json_types import JsonObject

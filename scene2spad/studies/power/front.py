@@ -15,12 +15,12 @@ import numpy as np
 
 from csph.weights.shipped import WEIGHTS
 from render.transient import Transient
-from scene2spad.datasets.published import PUBLISHED as PUBLISHED_ERRORS
+from scene2spad.emulation.emulated_chain import by_torch, decode
+from scene2spad.networks.published import PUBLISHED as PUBLISHED_ERRORS
 from scene2spad.networks.registry import ModelRegistry
 from scene2spad.studies.chip.chain import ChipDepth, core_tables, measured
 from scene2spad.studies.chip.code import compile_model
 from scene2spad.studies.chip.plan import MAIN, OTHERS, TRAINED_FOR_CHIP
-from scene2spad.studies.power.emulated_chain import by_torch, decode
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense

@@ -12,13 +12,13 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from render.engine import render
+from scene2spad.emulation.emulated_chain import Emulated, by_torch, decode, emulate, shared_core_depths
+from scene2spad.emulation.program_tables import all_costs, int8_temporal
 from scene2spad.options.experiments import Study
 from scene2spad.plots import figures
 from scene2spad.plots.figures import DEPTH_COLOURS, plt
-from scene2spad.studies.power.emulated_chain import Emulated, by_torch, decode, emulate, shared_core_depths
 from scene2spad.studies.power.front import designs, front_rows, loss_rows, printed_rows
 from scene2spad.studies.power.front_figure import draw_front
-from scene2spad.studies.power.program_tables import all_costs, int8_temporal
 from scenes.errors import InputError, require
 from scenes.files import read_arrays, whole_file, write_csv
 from scenes.library.catalog import load_scene

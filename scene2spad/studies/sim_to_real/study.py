@@ -23,8 +23,8 @@ from scene2spad.datasets.zone_captures import (
     within,
     zone_captures,
 )
+from scene2spad.networks.results import Store
 from scene2spad.options.experiments import Study
-from scene2spad.studies.results import Store
 from scene2spad.studies.sim_to_real import figures
 from scene2spad.studies.sim_to_real.measures import Comparison, compare, summary
 from scene2spad.studies.sim_to_real.pile_up import HIGH, best_of, draw_pile_up, pile_up_rows

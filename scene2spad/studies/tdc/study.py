@@ -22,16 +22,16 @@ import torch
 from csph.codes.design import Design
 from csph.evaluation.metrics import image_errors, paired_difference
 from csph.networks.model import DepthModel
-from scene2spad.datasets.test_sets import TestSet, rendered
 from scene2spad.networks.lookup import obtain
 from scene2spad.networks.registry import ModelSpec, Trained
+from scene2spad.networks.results import Store
+from scene2spad.networks.test_sets import TestSet, rendered
 from scene2spad.networks.training import classical
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import plain_log, plt, save
 from scene2spad.plots.style import look
 from scene2spad.studies.chip.chain import ChipDepth
 from scene2spad.studies.chip.code import compile_model
-from scene2spad.studies.results import Store
 from scene2spad.studies.tdc.plan import (
     CLOCKS,
     DELAY,

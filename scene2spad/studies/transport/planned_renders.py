@@ -12,7 +12,7 @@ from scipy import stats
 
 from csph.evaluation.metrics import INTERVAL_LEVEL, image_errors
 from render.transient import Transient
-from scene2spad.studies.results import Store
+from scene2spad.networks.results import Store
 from scene2spad.studies.transport.plan import FAILS, HOLDS, LEVELS, LIMIT, OPEN
 from scene2spad.studies.transport.tables import Contender
 from scenes.json_types import JsonObject

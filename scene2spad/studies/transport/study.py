@@ -26,13 +26,13 @@ from render.engine import render
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
 from scene2spad.bench.rendering.references import key_of
-from scene2spad.datasets.test_sets import TestSet, evaluated
 from scene2spad.networks.lookup import ModelLookup, obtain
 from scene2spad.networks.registry import EvaluatedModel, ModelRegistry
+from scene2spad.networks.results import Store
+from scene2spad.networks.test_sets import TestSet, evaluated
 from scene2spad.networks.training import baseline
 from scene2spad.options.experiments import Study
 from scene2spad.studies.real_data.study import sun_and_sky
-from scene2spad.studies.results import Store
 from scene2spad.studies.transport import figures
 from scene2spad.studies.transport.plan import CHECKED, LASERS, LEVELS, LIMIT, MODELS, PLANS, STEPS, UNCOMPRESSED, Plan
 from scene2spad.studies.transport.planned_renders import Place, planned_conclusions, planned_rows

@@ -28,8 +28,8 @@ from csph.networks.model import DepthModel, load_model
 from csph.networks.posterior import DECODERS, Decoder
 from csph.weights.cards import checkpoint_of
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec
+from scene2spad.networks.results import Store
 from scene2spad.options.networks import Evaluate
-from scene2spad.studies.results import Store
 from scenes.errors import InputError, require
 from scenes.files import write_csv
 from scenes.io.relief import (

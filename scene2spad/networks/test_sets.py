@@ -16,8 +16,8 @@ from csph.training.views import Views, read_views
 from scene2spad.datasets.packing import pack_set
 from scene2spad.datasets.rendering import Job, make_set
 from scene2spad.networks.registry import EvaluatedModel
+from scene2spad.networks.results import Store
 from scene2spad.networks.training import network_method
-from scene2spad.studies.results import Store
 from scenes.errors import InputError, require
 from scenes.files import read_array
 from scenes.library.sets import scene_set

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from csph import CodingTensor, decode_depth, encode
-from scene2spad.studies.power.program_tables import fixed_spatial, int8_temporal
+from scene2spad.emulation.program_tables import fixed_spatial, int8_temporal
 from scenes.errors import require
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor

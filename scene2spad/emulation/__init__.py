@@ -1,0 +1,1 @@
+"""Run recorded photons through emulated cores, and take depth from what they put out."""
