@@ -15,7 +15,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from spad.detection.laws import Detections, first_of_each_cycle, first_photon_counts, live_detections
+from spad.detection.laws import Detections, Moved, first_of_each_cycle, first_photon_counts, live_detections
 from spad.detection.photons import PixelFlux, draw_primaries
 from spad.sensor.model import Sensor
 
@@ -23,8 +23,11 @@ MAX_EVENTS = 1 << 22  # held at once by the event-by-event laws, about 200 MB
 
 
 class BlockLight(NamedTuple):
-    """Light on a block of pixels during an exposure; `timed` says whether detections are drawn at times, which a
-    converter puts into bins, or in bins at once."""
+    """Light on a block of pixels during an exposure, and the sensor as light reaches it.
+
+    `timed` says whether detections are drawn at times, over the whole period, which jitter delays or a converter puts
+    into bins; else they are drawn in bins at once.
+    """
 
     flux: PixelFlux
     sensor: Sensor
@@ -37,7 +40,7 @@ class BlockLight(NamedTuple):
 
     def drawn(self, rng: np.random.Generator) -> Detections:
         """Draw the primary detections, all in cycle 0."""
-        events = draw_primaries(self.flux, self.sensor, rng, fractional=self.timed)
+        events = draw_primaries(self.flux, self.sensor, rng, fractional=self.timed, whole_period=self.timed)
         return Detections(events.pixel, np.zeros(len(events.pixel), np.int8), events.position)
 
 
@@ -69,8 +72,11 @@ class DetectionLaw(ABC):
     def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
         """Return about how many of so many primary detections a pixel and exposure are detected, (P,) -> (P,)."""
 
-    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw counts (P, T) from expected primary detections of an exposure of `cycles`."""
+    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator, moved: Moved | None = None) -> np.ndarray:
+        """Draw counts (P, T) from expected primary detections of an exposure of `cycles`.
+
+        `moved` turns shares of detections in the bins of the period into those after jitter, in the sensor's bins.
+        """
         raise NotImplementedError(f"{self.name} is drawn photon by photon")
 
 
@@ -91,8 +97,8 @@ class Poisson(DetectionLaw):
         """Return all."""
         return primaries
 
-    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw n_i ~ Poisson(lambda_i) in every bin."""
+    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator, moved: Moved | None = None) -> np.ndarray:
+        """Draw n_i ~ Poisson(lambda_i) in every bin; the rates hold all jitter."""
         return rng.poisson(rate)
 
 
@@ -115,9 +121,9 @@ class FirstPhoton(DetectionLaw):
         """Return the number of cycles that hold a photon."""
         return -sensor.cycles * np.expm1(-primaries / sensor.cycles)
 
-    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
+    def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator, moved: Moved | None = None) -> np.ndarray:
         """Draw the multinomial of all cycles (`first_photon_counts`)."""
-        return first_photon_counts(rate / cycles, cycles, rng)
+        return first_photon_counts(rate / cycles, cycles, rng, moved)
 
 
 class FreeRunning(DetectionLaw):

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from threading import Lock
 from typing import TypeVar
 
@@ -20,7 +21,8 @@ from scenes.limits import require_memory
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.detectors import BlockLight, DetectionLaw
-from spad.detection.laws import Detections, add_crosstalk, crosstalk_events
+from spad.detection.jitter import before_detection, blurred, delayed, over_the_period
+from spad.detection.laws import Detections, Moved, add_crosstalk, crosstalk_events
 from spad.detection.photons import PixelFlux
 from spad.detection.rates import Rates
 from spad.measurements.timestamps import Timestamps
@@ -60,9 +62,15 @@ class Exposure:
         return np.random.Generator(np.random.SFC64(seeds))
 
     @property
+    def jitters(self) -> bool:
+        """Return whether jitter delays what the law has chosen; else it is drawn with the pulse (`jitter`)."""
+        return bool(self.sensor.jitters) and not self.law.independent
+
+    @property
     def timed(self) -> bool:
-        """Return whether detections are drawn at times, which a converter then puts into bins, or in bins at once."""
-        return self.sensor.tdc is not None
+        """Return whether detections are drawn at times, which jitter and a converter then put into bins, or in bins at
+        once."""
+        return self.sensor.tdc is not None or self.jitters
 
     def coded(self, events: Detections, first: int) -> Detections:
         """Return detections with the bins that their pixels' converters give them; pixels are counted from `first`."""
@@ -74,22 +82,34 @@ class Exposure:
 
     def recorded(self, events: Detections) -> Detections:
         """Return the detections that find a bin: a detector blinds itself also in the part of the period without."""
-        if not self.law.whole_period or self.sensor.bins == self.sensor.bins_per_period:
+        anywhere = self.law.whole_period or self.jitters
+        if not anywhere or self.sensor.bins == self.sensor.bins_per_period:
             return events
         seen = events.position < self.sensor.bins
         return Detections(*(column[seen] for column in events))
+
+    def finished(self, events: Detections, first: int, rng: np.random.Generator) -> Detections:
+        """Return what the law detected as it is recorded: with jitter, in bins; pixels are counted from `first`."""
+        return self.coded(self.recorded(delayed(events, self.sensor, rng) if self.jitters else events), first)
 
     @property
     def adds_crosstalk(self) -> bool:
         """Return whether crosstalk only adds to counts: no detection keeps another one from being made."""
         return bool(self.sensor.crosstalk) and self.law.independent and not self.timed
 
+    def moved(self, block: slice) -> Moved | None:
+        """Return what turns shares of detections in bins of the period into those with jitter; None without any."""
+        if not self.jitters:
+            return None
+        converter = None if self.rates.converter is None else self.rates.converter.reshape(-1)[block]
+        return partial(blurred, sensor=self.sensor, converter=converter)
+
     def light(self, block: slice) -> BlockLight:
         first, last = self.transient.offsets[block.start], self.transient.offsets[block.stop]
         owner, start, length, signal, background = self.whole
         part = slice(first, last)
         flux = PixelFlux(owner[part] - block.start, start[part], length[part], signal[part], background[block])
-        return BlockLight(flux, self.sensor, self.timed)
+        return BlockLight(flux, before_detection(self.sensor) if self.jitters else self.sensor, self.timed)
 
 
 def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
@@ -231,12 +251,12 @@ def draw_part(
     if _is_dense(exposure, light):
         from spad.detection.flux import expected_counts  # with torch, whose import takes a second
 
-        rate = expected_counts(exposure.transient, exposure.sensor, exposure.rates, block)[0].numpy()
+        sensor = over_the_period(exposure.sensor) if exposure.jitters else exposure.sensor
+        rate = expected_counts(exposure.transient, sensor, exposure.rates, block)[0].numpy()
         meter.add(light.flux.pixels)
-        return law.counts(rate, round(exposure.sensor.cycles), rng)
+        return law.counts(rate, round(sensor.cycles), rng, exposure.moved(block))
     parts = meter.count(law.detect(light, rng, ready), law.pieces(light), light.flux.pixels)
-    recorded = (exposure.coded(exposure.recorded(part), block.start) for part in parts)
-    return np.concatenate([_places(part, exposure.sensor) for part in recorded])
+    return np.concatenate([_places(exposure.finished(part, block.start, rng), exposure.sensor) for part in parts])
 
 
 def _places(detected: Detections, sensor: Sensor) -> np.ndarray:
@@ -280,7 +300,7 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray, meter: Meter) -> Iter
     cause, pixel = cause[seen], pixel[seen]
     fired = Detections(pixel, events.cycle[cause], events.position[cause])
     both = Detections(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
-    detected = exposure.coded(exposure.recorded(exposure.law.keep(both, sensor, ready)), 0)
+    detected = exposure.finished(exposure.law.keep(both, sensor, ready), 0, rng)
     places = np.sort(detected.pixel * np.int64(sensor.bins) + detected.position.astype(np.int64))
     edges = [block.start * sensor.bins for block in exposure.blocks]
     edges.append(exposure.rates.alive.size * sensor.bins)

@@ -7,6 +7,7 @@ cycle, whose cost follows photons. A free-running detector goes event by event, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from spad.sensor.model import Sensor
 
 # Below 1 % detections per cycle dead time and pile-up change nothing that counts could show.
 LOW_FLUX = 0.01
+Moved = Callable[[np.ndarray], np.ndarray]
 
 
 def first_photon_masses(flux: np.ndarray) -> np.ndarray:
@@ -32,9 +34,19 @@ def first_photon_masses(flux: np.ndarray) -> np.ndarray:
     return fractions / fractions.sum(axis=-1, keepdims=True)  # a multinomial refuses a sum 1e-12 above 1
 
 
-def first_photon_counts(flux: np.ndarray, cycles: int, rng: np.random.Generator) -> np.ndarray:
-    """Return counts of a synchronous detector, (n_1 .. n_T, none) ~ Multinomial(cycles, p): (P, T) int64."""
-    return rng.multinomial(cycles, first_photon_masses(flux))[:, :-1]
+def first_photon_counts(
+    flux: np.ndarray, cycles: int, rng: np.random.Generator, moved: Moved | None = None
+) -> np.ndarray:
+    """Return counts of a synchronous detector, (n_1 .. n_T, none) ~ Multinomial(cycles, p): (P, T) int64.
+
+    `moved`, if given, maps the shares of the bins to those after jitter, which moves detections and makes none.
+    """
+    masses = first_photon_masses(flux)
+    if moved is not None:
+        seen = moved(masses[:, :-1])
+        masses = np.append(seen, np.clip(1 - seen.sum(axis=1, keepdims=True), 0, None), axis=1)
+        masses /= masses.sum(axis=1, keepdims=True)
+    return rng.multinomial(cycles, masses)[:, :-1]
 
 
 class Detections(NamedTuple):

@@ -77,6 +77,9 @@ def linearised(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor
 
     Pixels with at most 1 % detections per cycle (or dead time, if longer) keep their counts: what would change is a
     hundredth of one, which does nothing but decide between equal maxima.
+
+    The law is undone as if timestamps had no jitter. What jitter moved to before the first arrival then takes from what
+    follows: with a jitter of 85 ps (sigma) and a pulse of 42 ps a depth is 2 mm too large at one photon a cycle.
     """
     counts = counts.double()
     if law is None:

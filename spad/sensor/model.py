@@ -142,11 +142,15 @@ class Sensor:
         return rate if isinstance(rate, tuple) else (rate,)
 
     @property
-    def kernels(self) -> tuple[AnyPulse, ...]:
-        """Return what delays a detection, independently: the pulse, the detector's jitter, the clock's."""
+    def jitters(self) -> tuple[AnyPulse, ...]:
+        """Return what delays the timestamp of a photon that was detected: the detector's jitter, the clock's."""
         clock = None if self.tdc is None or self.tdc.jitter_s == 0 else Pulse(self.tdc.jitter_s)
-        kernels = (self.pulse, self.jitter, clock)
-        return tuple(kernel for kernel in kernels if kernel is not None)
+        return tuple(kernel for kernel in (self.jitter, clock) if kernel is not None)
+
+    @property
+    def kernels(self) -> tuple[AnyPulse, ...]:
+        """Return what delays a detection, independently: the laser's pulse, and the `jitters`."""
+        return (self.pulse, *self.jitters)
 
     @property
     def response(self) -> AnyPulse:

@@ -1,0 +1,77 @@
+"""Jitter of detections: what delays a timestamp after a detector that may be blind has chosen among the photons.
+
+Which photon a detector with a dead time detects is decided as photons arrive, blurred by the laser's pulse alone. The
+avalanche's build-up, the read-out and the clock delay the timestamp of the detection afterwards. Where no detection
+keeps another one from being made, the order does not matter, and all kernels are drawn at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import reduce
+
+import numpy as np
+
+from spad.detection.laws import Detections
+from spad.sensor.model import Sensor
+from spad.sensor.pulse import AnyPulse, convolved
+
+WINDOW_SIGMAS = 8.5
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+
+
+def before_detection(sensor: Sensor) -> Sensor:
+    """Return the sensor as photons reach it: without the jitter of the detector and of the clock."""
+    clock = None if sensor.tdc is None else replace(sensor.tdc, jitter_s=0.0)
+    return replace(sensor, jitter=None, tdc=clock)
+
+
+def over_the_period(sensor: Sensor) -> Sensor:
+    """Return a sensor `before_detection` with equal bins that cover the whole period: jitter moves detections into
+    the record from outside."""
+    return replace(before_detection(sensor), bins=sensor.bins_per_period, tdc=None)
+
+
+def delayed(events: Detections, sensor: Sensor, rng: np.random.Generator) -> Detections:
+    """Return detections, at times in bins, with the sensor's jitter; times are folded into the period."""
+    position = events.position.astype(np.float64)
+    for kernel in sensor.jitters:
+        position += kernel.draw(rng, len(position)) / sensor.bin_width_s
+    position %= sensor.bins_per_period
+    position[position >= sensor.bins_per_period] = 0  # a tiny negative one rounds up to the period itself
+    return events._replace(position=position)
+
+
+def blurred(masses: np.ndarray, sensor: Sensor, converter: np.ndarray | None) -> np.ndarray:
+    """Return the fractions of detections in the sensor's bins, (P, bins), of those at equal bins of the period, (P, T).
+
+    Detections are uniform within a bin before jitter, and after it where converters have unequal bins. `converter`
+    (P,) is a row of `Sensor.code_edges`, or None.
+    """
+    kernel = _folded(reduce(convolved, sensor.jitters), sensor)
+    spectrum = np.fft.rfft(masses) * np.fft.rfft(kernel)
+    moved = np.clip(np.fft.irfft(spectrum, n=masses.shape[-1]), 0, None)
+    edges = sensor.code_edges
+    if edges is None or converter is None:
+        return moved[:, : sensor.bins]
+    arrived = np.concatenate((np.zeros((len(moved), 1)), np.cumsum(moved, axis=1)), axis=1)
+    whole = np.arange(arrived.shape[1])
+    at_edges = (
+        np.interp(edges[row] % sensor.bins_per_period, whole, mine) + mine[-1] * (edges[row] // sensor.bins_per_period)
+        for row, mine in zip(converter, arrived, strict=True)
+    )
+    return np.clip(np.diff(np.stack(list(at_edges)), axis=1), 0, None)
+
+
+def _folded(jitter: AnyPulse, sensor: Sensor) -> np.ndarray:
+    """Return fractions of detections that jitter moves by 0, 1, ... bins around the period, (bins_per_period,)."""
+    period, width = sensor.bins_per_period, sensor.bin_width_s
+    before, after = jitter.window_s(WINDOW_SIGMAS)
+    moves = np.arange(-int(np.ceil(abs(before) / width)) - 1, int(np.ceil(abs(after) / width)) + 2)
+    edges = np.append(moves, moves[-1] + 1)
+    fractions = sum(
+        w / 2 * jitter.bin_masses((edges - (1 + u) / 2) * width) for u, w in zip(_NODES, _WEIGHTS, strict=True)
+    )
+    kernel = np.zeros(period)
+    np.add.at(kernel, moves % period, fractions)
+    return kernel / kernel.sum()
