@@ -15,6 +15,7 @@ from scenes.io.mitsuba.plugin import Plugin
 from scenes.io.mitsuba.textures import Textures, Uv, clipped
 from scenes.model import DISTRIBUTIONS, Material, Texture
 from scenes.optics.refractive_indices import CONDUCTORS, INDICES
+from scenes.optics.rough_coats import uncoated, with_inner_scattering
 
 MAX_NESTING = 16
 MIN_ALPHA = 1e-3
@@ -143,8 +144,11 @@ def _microfacets(materials: Materials, plugin: Plugin, default: float) -> Values
     elif distribution not in DISTRIBUTIONS:
         raise plugin.fail(f"distribution {distribution!r}, expected one of {', '.join(DISTRIBUTIONS)}")
     if plugin.has("alpha_u") or plugin.has("alpha_v"):
-        plugin.note("alpha_u and alpha_v are replaced by their mean")
-        alpha = (plugin.number("alpha_u", default) + plugin.number("alpha_v", default)) / 2
+        plugin.note("alpha_u and alpha_v are replaced by their geometric mean, which keeps the highlight's peak")
+        across, along = plugin.number("alpha_u", default), plugin.number("alpha_v", default)
+        if min(across, along) < 0:
+            raise plugin.fail(f"alpha_u {across:g} and alpha_v {along:g}, expected neither below 0")
+        alpha = math.sqrt(across * along)
     else:
         alpha = materials.mean(plugin, "alpha", default)
     return {"roughness": alpha, "distribution": distribution}
@@ -170,8 +174,6 @@ def _plastic(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     index = _relative_index(plugin, "polypropylene")
     if index < 1:
         raise plugin.fail(f"int_ior / ext_ior is {index:g}, and a coat is denser than what is around it; write diffuse")
-    if plugin.boolean("nonlinear", False):
-        plugin.note("the colour shift of internal scattering (nonlinear) is left out")
     return {
         "albedo": materials.fraction(plugin, "diffuse_reflectance", 0.5, uv),
         "specular": clipped(plugin, "specular_reflectance", materials.mean(plugin, "specular_reflectance", 1.0)),
@@ -179,8 +181,28 @@ def _plastic(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     }
 
 
+def _smooth_plastic(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
+    return _nonlinear(plugin, _plastic(materials, plugin, uv))
+
+
 def _rough_plastic(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
-    return _rough(_plastic(materials, plugin, uv), "plastic", _microfacets(materials, plugin, 0.1))
+    rough = _microfacets(materials, plugin, 0.1)
+    return _nonlinear(plugin, _rough(_plastic(materials, plugin, uv), "plastic", rough))
+
+
+def _nonlinear(plugin: Plugin, values: Values) -> Values:
+    """Return a plastic's values with the albedo that internal scattering leaves, where the plugin asks for it."""
+    if not plugin.boolean("nonlinear", False):
+        return values
+    coat = values["ior"], values.get("roughness", 0.0), values.get("distribution", "beckmann")
+    return values | {"albedo": _changed(values["albedo"], lambda albedo: with_inner_scattering(albedo, *coat))}
+
+
+def _changed(albedo: float | Texture, change: Callable[[np.ndarray], np.ndarray]) -> float | Texture:
+    """Return an albedo, or a texture's every one, after a change, from 0 to 1."""
+    if isinstance(albedo, Texture):
+        return Texture(np.clip(change(albedo.image), 0, 1), albedo.name)
+    return float(np.clip(change(np.array(albedo)), 0, 1))
 
 
 def _conductor(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
@@ -234,7 +256,8 @@ def _phong(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
 
 
 def _principled(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
-    """Return the principled bsdf (Burley 2012) as rough plastic, or a rough conductor where it is mostly metal.
+    """Return the principled bsdf (Burley 2012) as rough plastic, or as diffuse where that is nearer; as a rough
+    conductor where it is mostly metal.
 
     alpha = roughness^2; a metal reflects its base colour at every angle; the index of a coat without one is that of
     normal reflectance 0.08 specular.
@@ -248,16 +271,34 @@ def _principled(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
     alpha = max(materials.mean(plugin, "roughness", 0.5) ** 2, MIN_ALPHA)
     values: Values = {"roughness": alpha, "distribution": "ggx"}
     left_out = "tints, sheen and clear coat are left out"
+    if 0 < metallic < 1:
+        plugin.note(f"metallic {metallic:g} is taken as {int(metallic > 0.5)}: a surface is all metal, or none")
     if metallic > 0.5:
         plugin.note(f"principled is taken as a rough conductor of its base colour: {left_out}")
         eta, k = CONDUCTORS["none"]
         colour = min(materials.mean(plugin, "base_color", 0.5), 1.0)
         return values | {"kind": "roughconductor", "eta": eta, "k": k, "specular": colour}
-    plugin.note(f"principled is taken as rough plastic: {left_out}")
     root = math.sqrt(0.08 * max(materials.mean(plugin, "specular", 0.5), MIN_ALPHA))
     index = plugin.number("eta") if plugin.has("eta") else (1 + root) / (1 - root)
-    values["albedo"] = materials.fraction(plugin, "base_color", 0.5, uv)
-    return values | {"kind": "roughplastic", "ior": index}
+    base = materials.fraction(plugin, "base_color", 0.5, uv)
+    return _principled_base(plugin, base, values | {"kind": "roughplastic", "ior": index}, left_out)
+
+
+def _principled_base(plugin: Plugin, base: float | Texture, coat: Values, left_out: str) -> Values:
+    """Return rough plastic as bright as the principled bsdf, whose coat takes no light from its base; or diffuse."""
+    mean = float(base.image.mean(dtype=np.float64)) if isinstance(base, Texture) else base
+    if coat["ior"] <= 1 or mean == 0:
+        plugin.note(f"principled is taken as rough plastic: {left_out}")
+        return coat | {"albedo": base}
+    coated, albedo = uncoated(mean, coat["ior"], coat["roughness"])
+    if not coated:
+        plugin.note(f"principled is taken as diffuse, as rough plastic would be too dark: {left_out}")
+        return {"kind": "diffuse", "albedo": _changed(base, lambda own: own + (albedo - mean))}
+    plugin.note(f"principled is taken as rough plastic: {left_out}")
+    brightest = float(base.image.max()) if isinstance(base, Texture) else base
+    if brightest * albedo / mean > 1:
+        plugin.note("base_color below its coat is clipped to 1, the surface is a little too dark")
+    return coat | {"albedo": _changed(base, lambda own: own * (albedo / mean))}
 
 
 def _dielectric(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
@@ -275,7 +316,7 @@ def _dielectric(materials: Materials, plugin: Plugin, uv: Uv) -> Values:
 _KINDS: dict[str, Callable[[Materials, Plugin, Uv], Values]] = {
     "diffuse": _diffuse,
     "roughdiffuse": _rough_diffuse,
-    "plastic": _plastic,
+    "plastic": _smooth_plastic,
     "roughplastic": _rough_plastic,
     "conductor": _conductor,
     "roughconductor": _rough_conductor,
