@@ -19,6 +19,7 @@ from scenes.optics.blackbody import seen_radiance_w_per_m2_sr_nm
 COLOUR_TAGS = ("float", "integer", "rgb", "srgb", "spectrum")
 # Of a matrix: what is beyond leaves the range of numbers when matrices are multiplied, inverted or decomposed.
 MAX_ENTRY = 1e15
+AXIS_TOLERANCE = 1e-3  # of the length of an axis of rotation
 MAX_SPECTRUM_BYTES = 1 << 20
 VALUE_TAGS = (*COLOUR_TAGS, "boolean", "string", "vector", "point", "blackbody", "transform")
 PLUGIN_TAGS = (
@@ -296,6 +297,8 @@ class Plugin:
         length = np.linalg.norm(axis)
         if length == 0:
             raise self.fail("<rotate> has no axis, expected x, y or z")
+        if abs(length - 1) > AXIS_TOLERANCE and not self.document.legacy:
+            self.note("the axis of a <rotate> is taken at unit length, which Mitsuba 3 does not do")
         x, y, z = axis / length
         cross = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
         return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross

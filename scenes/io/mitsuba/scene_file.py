@@ -10,6 +10,7 @@ import numpy as np
 
 from scenes.errors import InputError
 from scenes.io.mitsuba.bsdf import Materials
+from scenes.io.mitsuba.clipping import is_cut
 from scenes.io.mitsuba.nodes import Document, LocatedError
 from scenes.io.mitsuba.plugin import VALUE_TAGS, Plugin
 from scenes.io.mitsuba.shapes import Shapes, shows_open_back
@@ -17,6 +18,7 @@ from scenes.model import Ambient, Camera, Scene, Surface, Texture
 
 # How far a matrix may be from a rotation and still be one that was written with few digits.
 ORTHONORMAL_TOLERANCE = 1e-3
+CLIPS_M = {"near_clip": 1e-2, "far_clip": 1e4}  # and where they are by default
 # Named in the notes and left out: no triangle carries them, and the scene's own lights are ambient light only.
 _LEFT_OUT_EMITTERS = (
     *("point", "spot", "directional", "directionalarea", "projector", "collimated"),
@@ -67,6 +69,7 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
     for surface in surfaces:
         if materials.is_one_sided(surface.material) and shows_open_back(surface, camera):
             document.notes.add("reflects from both sides, in Mitsuba the back without twosided is black", surface.name)
+    _note_cut(document, found["sensor"][0], camera, surfaces)
     stem = document.path.stem
     name = document.path.resolve().parent.name if stem == "scene" else stem
     return Scene(name or stem, tuple(surfaces), camera, ambient=ambient, notes=document.notes.lines())
@@ -92,12 +95,23 @@ def _camera(document: Document, sensors: list[Plugin]) -> Camera:
     if any(sensor.number(f"principal_point_offset_{axis}", 0.0) for axis in "xy"):
         sensor.note("principal_point_offset is left out, the axis stays in the image centre")
     lens = ("aperture_radius", "focus_distance")
-    sensor.ignore(("near_clip", "far_clip", "shutter_open", "shutter_close", *lens))
+    sensor.ignore((*CLIPS_M, "shutter_open", "shutter_close", *lens))
     sensor.note_unused()
     try:
         return Camera(pose, fov, width, height)
     except InputError as error:
         raise sensor.fail(str(error)) from None
+
+
+def _note_cut(document: Document, sensor: Plugin, camera: Camera, surfaces: list[Surface]) -> None:
+    """Name what Mitsuba's camera cuts off: what is nearer than one plane, and beyond another."""
+    near_m, far_m = (sensor.number(name, default) for name, default in CLIPS_M.items())
+    for surface in surfaces:
+        if is_cut(surface, camera, near_m, far_m):
+            text = (
+                f"is seen nearer than near_clip {near_m:g} or beyond far_clip {far_m:g}, in Mitsuba it is cut off there"
+            )
+            document.notes.add(text, surface.name)
 
 
 def _film_size(sensor: Plugin) -> tuple[int, int]:
