@@ -116,3 +116,14 @@ def test_materials_that_are_defined_nowhere_are_noted_by_name(tmp_path: Path) ->
 
 def test_materials_that_are_defined_are_not_noted(tmp_path: Path) -> None:
     assert load(tmp_path, "newmtl oak\nKd 0.5 0.5 0.5\n").notes == (SIZE_KEPT,)
+
+
+def test_metal_glow_and_clipped_colours_are_noted_in_a_line_each(tmp_path: Path) -> None:
+    glowing = "".join(f"newmtl {name}\nKd 0.5 0.5 2\nKe 0 3 0\nPm 1\n" for name in ("oak", "elm"))
+    dark = "newmtl ash\nKd 0.5 0.5 0.5\nKe 0 0 0\nPm 0\n"
+    assert load(tmp_path, glowing + dark).notes[-3:] == (
+        "Kd outside 0 to 1 is clipped: oak, elm",
+        "Ke is left out, its surfaces give no light: oak, elm",
+        "Pm is left out, its surfaces are diffuse: oak, elm",
+    )
+    assert not any(word in note for note in load(tmp_path, dark).notes for word in ("Kd", "Ke", "Pm"))

@@ -385,3 +385,13 @@ def test_extensions_that_a_glb_only_uses_are_noted(tmp_path: Path) -> None:
         "KHR_materials_transmission left out: its surfaces are opaque",
         "KHR_materials_sheen left out: its surfaces are diffuse",
     )
+
+
+def test_metal_and_glow_of_a_glb_are_noted(tmp_path: Path) -> None:
+    def notes(**material: object) -> list[str]:
+        path = glb(tmp_path / "a.glb", {"POSITION": CORNERS}, {"name": "brass", **material})
+        return [note for note in load_mesh(path, placing=AS_FILE).notes if note.endswith(": brass")]
+
+    metal, glow = notes(pbrMetallicRoughness={}, emissiveFactor=[0, 1, 0])
+    assert metal.startswith("metallicFactor") and glow.startswith("emissiveFactor")
+    assert notes(pbrMetallicRoughness={"metallicFactor": 0}, emissiveFactor=[0, 0, 0]) == []

@@ -8,7 +8,7 @@ import struct
 import warnings
 from collections.abc import Callable, Iterator
 
-from scenes.errors import InputError, require
+from scenes.errors import InputError, listed, require
 from scenes.io.inputs import parse_json
 from scenes.io.mesh_formats import NotReadError
 from scenes.io.textures import check_checksums
@@ -68,7 +68,8 @@ def _check_extensions(header: JsonObject) -> None:
 
 
 def glb_notes(content: bytes) -> list[str]:
-    """Return what is left out of a sound GLB by its extensions: instances, clear surfaces, and other looks."""
+    """Return what is left out of a sound GLB: by its extensions instances, clear surfaces, and other looks; metal and
+    glow."""
     header, _ = _glb_chunks(content)
     notes = []
     several = sum(_INSTANCES in node.get("extensions", {}) for node in header.get("nodes", []))
@@ -83,7 +84,32 @@ def glb_notes(content: bytes) -> list[str]:
     ):
         if names:
             notes.append(f"{', '.join(sorted(names))} left out: {words}")
-    return notes
+    return [*notes, *_metal_and_glow(used)]
+
+
+def _metal_and_glow(materials: list[JsonObject]) -> list[str]:
+    """Name the materials that are metal, as they are where metallicFactor is not given, and those that glow."""
+    looks = [(str(one.get("name", "without a name"))[:80], one.get("pbrMetallicRoughness"), one) for one in materials]
+    metal = [
+        name for name, pbr, one in looks if pbr is not None and _is_lit(one) and _is_some(pbr, "metallicFactor", 1)
+    ]
+    glow = [name for name, _, one in looks if _is_some(one, "emissiveFactor", 0)]
+    lines = (
+        ("metallicFactor (1 unless given) is left out, their surfaces are diffuse", metal),
+        ("emissiveFactor is left out, their surfaces give no light", glow),
+    )
+    return [f"{words}: {listed(list(dict.fromkeys(names)))}" for words, names in lines if names]
+
+
+def _is_some(look: JsonObject, key: str, default: float) -> bool:
+    """Return whether a factor, a number or several, is above 0 anywhere."""
+    value = look.get(key, default)
+    numbers = value if isinstance(value, list) else [value]
+    return any(isinstance(one, (int, float)) and one > 0 for one in numbers)
+
+
+def _is_lit(material: JsonObject) -> bool:
+    return "KHR_materials_unlit" not in material.get("extensions", {})
 
 
 def _glb_chunks(content: bytes) -> tuple[JsonObject, bytes]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from scenes.arrays import finite_number
-from scenes.errors import InputError, require
+from scenes.errors import InputError, listed, require
 from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.textures import WHITE, Colour
 
@@ -22,6 +22,13 @@ WORD_OPTIONS = {
     "-texres": None,
     "-imfchan": None,
     "-boost": None,
+}
+
+_LOOKS = {
+    "ke": "its surfaces give no light",
+    "map_ke": "its surfaces give no light",
+    "pm": "its surfaces are diffuse",
+    "map_pm": "its surfaces are diffuse",
 }
 
 
@@ -63,6 +70,7 @@ def read_library(library: Path, notes: list[str]) -> dict[str, MaterialEntry]:
     Raises InputError for an image that is not there, and for options that move an image on its surface.
     """
     entries: dict[str, MaterialEntry] = {}
+    changed: dict[str, list[str]] = {}  # materials by what is changed
     stated: set[str] = set()  # by d
     name = ""
     for line in lenient_text(library).splitlines():
@@ -71,7 +79,12 @@ def read_library(library: Path, notes: list[str]) -> dict[str, MaterialEntry]:
             name = " ".join(rest.split())
             entries[name] = MaterialEntry()
         elif key.lower() == "kd" and name:
-            entries[name] = replace(entries[name], colour=_kd(library, rest))
+            given, colour = _kd(library, rest)
+            entries[name] = replace(entries[name], colour=colour)
+            if given != colour:
+                changed.setdefault("Kd outside 0 to 1 is clipped", []).append(name)
+        elif key.lower() in _LOOKS and name and _is_some(rest):
+            changed.setdefault(f"{key} is left out, {_LOOKS[key.lower()]}", []).append(name)
         elif key.lower() == "map_kd" and name:
             entries[name] = replace(entries[name], image=_map_kd(library, name, rest, notes))
         elif key.lower() == "map_d" and name:
@@ -80,7 +93,16 @@ def read_library(library: Path, notes: list[str]) -> dict[str, MaterialEntry]:
             # where both are given, programs disagree on what Tr is
             stated |= {name} if key.lower() == "d" else set()
             entries[name] = replace(entries[name], opacity=_opacity(library, key.lower(), rest))
+    notes += [f"{words}: {listed(list(dict.fromkeys(names)))}" for words, names in changed.items()]
     return entries
+
+
+def _is_some(text: str) -> bool:
+    """Return whether numbers, or a map's name, say that there is any of it."""
+    try:
+        return any(float(word) > 0 for word in text.split())
+    except ValueError:
+        return bool(text.strip())
 
 
 def _opacity(library: Path, key: str, text: str) -> float:
@@ -92,15 +114,16 @@ def _opacity(library: Path, key: str, text: str) -> float:
     return value if key == "d" else 1 - value
 
 
-def _kd(library: Path, text: str) -> Colour:
-    """Return Kd, 0 to 1 each: a reflectance by the format's text, and in Blender's files: linear."""
+def _kd(library: Path, text: str) -> tuple[Colour, Colour]:
+    """Return Kd as given and 0 to 1 each: a reflectance by the format's text, and in Blender's files: linear."""
     try:
         words = text.split()[:3]
         given = [finite_number(float(word), "Kd") for word in (words * 3 if len(words) == 1 else words)]
-        red, green, blue = (min(max(value, 0.0), 1.0) for value in given)
+        red, green, blue = given
     except ValueError:  # of which InputError is one
         raise InputError(f"{library}: Kd {text.strip()!r}, expected three numbers") from None
-    return red, green, blue
+    clipped = [min(max(value, 0.0), 1.0) for value in given]
+    return (red, green, blue), (clipped[0], clipped[1], clipped[2])
 
 
 def _map_kd(library: Path, name: str, text: str, notes: list[str]) -> Path:
