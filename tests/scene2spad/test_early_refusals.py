@@ -71,6 +71,8 @@ def test_a_set_of_a_million_views_is_listed_as_it_is_rendered(tmp_path, monkeypa
         ("wall@2 --baseline 0.1 0 0 --offset 1", "a time offset needs a co-located laser"),
         ("wall@2 --baseline 0.1 0 0 --offset 1 --dry-run", "a time offset needs a co-located laser"),
         ("wall@2 --sunlight 100 --ambient off", "--sunlight 100 lux and --ambient off contradict each other"),
+        ("wall@2 --ambient-spp 4 --ambient off", "--ambient-spp 4 and --ambient off contradict each other"),
+        ("wall@2 --offset-mode ray", "--offset-mode ray is for a scene that is moved (--offset)"),
         ("wall@2 --sunlight 1e9", "--sunlight 1e+09 lux is outside 0 to 1e+06"),
     ],
 )

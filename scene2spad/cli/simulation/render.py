@@ -25,6 +25,7 @@ from scene2spad.options.common import (
     Positional,
     check_indirect,
     may_stay_open,
+    only_for,
 )
 from scenes import Ambient, InputError, Laser, Scene
 from scenes.constants import DEFAULT_WAVELENGTH_M
@@ -96,7 +97,8 @@ class Render(Long):
     ambient: Literal["auto", "on", "off"] = "auto"
     """Steady ambient light; auto renders it if the scene has any and the budget has background."""
     ambient_spp: Count = None
-    """Ambient light paths per pixel (default: until their noise is what --error or --budget asks for)."""
+    """Ambient light paths per pixel (default: until its noise, in shares of its mean, is some seven times --error, or
+    what the photons of --budget can show; 0.02 at least)."""
     offset: float = 0.0
     """Move the scene this many metres away."""
     offset_mode: Offset = "time"
@@ -124,7 +126,8 @@ def run(command: Render, progress: Progress) -> dict:
     check_indirect(command, "render", command.bounces, ("spp", "filter", "clamp"))
     settings = _settings(command)
     check_offset(command.offset)
-    _check_sunlight(command)
+    only_for(command, "render", {"offset_mode": (command.offset != 0, "a scene that is moved (--offset)")})
+    _check_ambient(command)
     if command.out is not None:
         output_file(command.out, ".exr", "transient", figure=command.figure)
     scene = _load(command)
@@ -207,8 +210,11 @@ def _lit(scene: Scene, command: Render) -> Scene:
     return replace(scene.without_lights(), laser=laser, ambient=sky)
 
 
-def _check_sunlight(command: Render) -> None:
-    lux = command.sunlight
+def _check_ambient(command: Render) -> None:
+    """Refuse light and paths that are asked for where ambient light is turned off."""
+    lux, spp = command.sunlight, command.ambient_spp
+    message = f"--ambient-spp {spp} and --ambient off contradict each other; leave one of them out"
+    require(spp is None or command.ambient != "off", message)
     if lux is None:
         return
     require(0 <= lux <= MAX_LUX, f"--sunlight {lux:g} lux is outside 0 to {MAX_LUX:g}")
