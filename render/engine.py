@@ -40,7 +40,8 @@ from scenes.random_streams import Stream
 
 log = logging.getLogger(__name__)
 
-AMBIENT_BOUNCES = 16  # most paths end long before, by chance
+AMBIENT_BOUNCES = 256  # most paths end long before, by chance
+MENTIONED = 1e-3  # share of ambient light left out beyond, above which the plan says so
 # Paths traced on top are at most so many times those traced before, pass by pass; filtered light has no pilot. The last
 # pass is for targets that are missed, not for the margin below, and by no more than twice as many paths may gain.
 MAX_MORE, MAX_MORE_FILTERED, MAX_MORE_HOPELESS = (3.0, 1.0, 1.0), (15.0, 15.0, 15.0), 1.0
@@ -84,6 +85,8 @@ def render(
         ambient_seed = derived_seed(seed, Stream.AMBIENT)
         ambient = ambient_light(world, spp, AMBIENT_BOUNCES, ambient_seed, by, noise=plan.ambient_noise)
         message = f"ambient light: {ambient.spp} paths a pixel, noise {ambient.error:.2g} of its mean"
+        if ambient.left_out >= MENTIONED:
+            message += f"; {ambient.left_out:.2%} of it is left out beyond {AMBIENT_BOUNCES} surfaces"
         plan = replace(plan, reasons=(*plan.reasons, message))
         log.info("%s", message)
     verdict = target_verdict(error, plan.target, len(noise))
@@ -227,7 +230,7 @@ def _of_ambient(plan: Plan, settings: RenderSettings, ambient: AmbientLight) -> 
     if not plan.ambient:
         return {}
     paths = {"ambient_spp": ambient.spp, "ambient_filtered": settings.ambient_filtered}
-    return paths | {"ambient_error": round(ambient.error, 6)}
+    return paths | {"ambient_error": round(math.hypot(ambient.error, ambient.left_out), 6)}
 
 
 def _meta(scene: Scene, plan: Plan, seed: int, error: ErrorEstimate, traced: LightSamples) -> JsonObject:

@@ -17,12 +17,15 @@ SETS = 8  # of a pixel's paths: positions in the pixel are even within each, and
 # Surfaces that every path may meet; from then on it goes on by chance where its weight has fallen below MIN_WEIGHT
 # (in rooms a tenth to a quarter of the noise's square, at 1.4 times the cost, of going on with the weight itself).
 CERTAIN, MIN_WEIGHT, MAX_LIKELY = 3, 1 / 6, 0.95
+# After so many a path that still carries much is between white walls, where the weight of what goes on would grow.
+MANY, MAX_LIKELY_LATE = 16, 0.995
 
 
 def camera_paths(
     world: TracedScene, pixel: UInts, sample: UInts, seed: UInts, key: UInts, bounces: UInts
-) -> tuple[Array, Array]:
-    """Light of camera rays of pixels, each with its number in its pixel: seen where emitted; reflected.
+) -> tuple[Array, Array, Array]:
+    """Light of camera rays of pixels, each with its number in its pixel: seen where emitted; reflected; and the weight
+    that each path still has where `bounces` end it.
 
     Sample s belongs to set s modulo SETS. Positions in a pixel are a randomised (0, 2)-sequence in each set, as lamps
     may be smaller than a pixel. `key` tells a launch's other random numbers apart.
@@ -38,11 +41,13 @@ def camera_paths(
 
 
 @dr.syntax
-def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple[Array, Array]:
-    """Light that comes back along each ray: what the ray itself meets, and what surfaces reflect."""
+def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple[Array, Array, Array]:
+    """Light that comes back along each ray: what the ray itself meets, and what surfaces reflect; and its weight where
+    `most` surfaces end it."""
     scene, context = world.mi_scene, mi.BSDFContext()
     lanes = dr.width(ray.d)
     seen, light, weight = dr.zeros(Float, lanes), dr.zeros(Float, lanes), dr.full(Float, 1, lanes)
+    cut = dr.zeros(Float, lanes)
     before = dr.zeros(mi.Interaction3f, lanes)  # the surface that the ray left, past all that it went straight through
     density = dr.full(Float, 1, lanes)  # of the ray's direction there; 0: no light could be sampled that way
     density = dr.select(weight > 0, 0, density)
@@ -82,6 +87,7 @@ def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple
         onward = si.to_world(bounce.wo)
         direction = dr.select(passing, ray.d, dr.select(by_pane, mirrored_direction(ray, si), onward))
         weight = dr.select(surface, weight * reflected[0], weight)
+        cut += dr.select(hit & ~passing & ~going_on, weight, 0)
         smooth = surface & ~mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
         mirrored = dr.select(passing, mirrored, ~smooth)
         mirrored_first |= (met == 0) & hit & ~passing & ~smooth
@@ -95,9 +101,10 @@ def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple
         weight /= dr.maximum(likely, 1e-9)
         active &= weight > 0
         ray = spawn(si, direction)
-    return seen, light
+    return seen, light, cut
 
 
 def survival(weight: Floats, met: UInts, passing: Masks) -> Array:
     """Return the probability with which a path goes on, of its weight and the number of surfaces that it has met."""
-    return dr.select((met >= CERTAIN) & ~passing, dr.minimum(weight / MIN_WEIGHT, MAX_LIKELY), 1)
+    most = dr.select(met < MANY, Float(MAX_LIKELY), Float(MAX_LIKELY_LATE))
+    return dr.select((met >= CERTAIN) & ~passing, dr.minimum(weight / MIN_WEIGHT, most), 1)

@@ -30,6 +30,8 @@ class AmbientLight(NamedTuple):
     """Radiance of each pixel [W/(m^2 sr nm)], (H, W) float32, its noise (rms over pixels by the image's mean), and the
     mean number of paths a pixel.
 
+    `left_out` is about the share of it that met more surfaces than were followed: the weight that paths still had at
+    the last one, beyond which the scene is taken to be as bright as the image.
     Where pixels share their light (`bilateral_filter`) the noise is what is left of it; how far it is blurred is not in
     it.
     """
@@ -37,6 +39,7 @@ class AmbientLight(NamedTuple):
     radiance: np.ndarray
     error: float
     spp: int
+    left_out: float = 0.0
 
 
 def ambient_light(
@@ -80,6 +83,7 @@ class _Sums:
         self.shape = world.scene.camera.height, world.scene.camera.width
         pixels = self.shape[0] * self.shape[1]
         self.sets, self.number = np.zeros((2, SETS, pixels)), np.zeros((SETS, pixels), np.int64)
+        self.cut = np.zeros(pixels)  # weight of paths that had to end
         self.caustic, self.caustic_number = np.zeros((SETS, pixels)), np.zeros((SETS, 1), np.int64)
         self.passes = 0  # of uneven numbers
 
@@ -115,10 +119,11 @@ class _Sums:
         """Trace paths of pixels with these numbers; `key` tells a launch's random numbers apart."""
         columns = [upload(UInt32, column) for column in (pixel, sample)]
         numbers = [dr.opaque(UInt32, number) for number in (self.seed, key, self.bounces)]
-        lights = self.world.recordings.call(self.world, "ambient", camera_paths, *columns, *numbers)
+        *lights, cut = self.world.recordings.call(self.world, "ambient", camera_paths, *columns, *numbers)
         row = sample % SETS * self.number.shape[1] + pixel
         for sums, light in zip(self.sets, lights, strict=True):
             sums += np.bincount(row, np.array(light, np.float64), self.number.size).reshape(sums.shape)
+        self.cut += np.bincount(pixel, np.array(cut, np.float64), len(self.cut))
         self.number += np.bincount(row, minlength=self.number.size).reshape(self.number.shape)
 
     def _trace_from_lamps(self, wanted: int) -> None:
@@ -160,7 +165,8 @@ class _Sums:
         # numbers below the least normal one are 0 in some threads and not in others, whose files would differ
         mean = np.where(mean < np.finfo(np.float32).tiny, 0, mean)
         error = float(np.sqrt(noise2) / mean.mean()) if mean.any() else 0.0
-        return AmbientLight(mean.reshape(self.shape).astype(np.float32), error, self.spp)
+        left_out = float((self.cut / self.number.sum(axis=0)).mean())
+        return AmbientLight(mean.reshape(self.shape).astype(np.float32), error, self.spp, left_out)
 
     def _shared(self, guide_layers: Layers) -> tuple[np.ndarray, float]:
         """Return light whose reflected part neighbours share, and its squared noise, told by two halves of the paths;

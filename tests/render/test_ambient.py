@@ -10,7 +10,9 @@ from render.ambient.bilateral_filter import bilateral_filter
 from render.ambient.camera_paths import SETS
 from render.ambient.integrator import ambient_light
 from render.direct.integrator import Layers, centre_layers
+from render.engine import render
 from render.scene.traced_scene import TracedScene, mi
+from render.settings import RenderSettings
 from scene2spad.bench.hard import oracles
 from scenes.geometry.shapes import box, sphere
 from scenes.model import Ambient, Material, Scene, Surface
@@ -246,3 +248,17 @@ def test_one_path_a_pixel_states_its_noise(shared):
     one, eight = (ambient_light(world, spp, 4, 1, layers) for spp in (1, 8))
     assert one.spp == 2 and 0.5 * eight.error < one.error
     assert one.radiance.mean() == pytest.approx(eight.radiance.mean(), rel=4 * np.hypot(one.error, eight.error))
+
+
+@pytest.mark.parametrize(("albedo", "left_out"), [(0.9, 0), (0.98, 0.98**256), (0.99, 0.99**256)])
+def test_light_between_white_walls_is_all_there_or_stated(albedo: float, left_out: float):
+    """In a closed box whose walls emit 1 and reflect albedo a, every pixel sees 1 / (1 - a)."""
+    vertices, faces, uv = box((4, 4, 4))
+    walls = Surface(vertices, faces[:, ::-1], Material(albedo=albedo), uv=uv, emission=1.0)
+    scene = Scene("furnace", (walls,), oracles.camera(16, 12, 60))
+    transient = render(scene, RenderSettings(bounces=1, ambient_spp=256))
+    assert transient.ambient.mean() * (1 - albedo) == pytest.approx(1 - left_out, abs=0.02)
+    noise = transient.ambient.std() / transient.ambient.mean()
+    assert transient.meta["ambient_error"] == pytest.approx(np.hypot(noise, left_out), rel=0.3)
+    said = any("left out beyond 256 surfaces" in line for line in transient.meta["plan"]["reasons"])
+    assert said == (left_out > 1e-3)

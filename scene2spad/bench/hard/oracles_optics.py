@@ -91,11 +91,6 @@ def slab_moments(
     return moments(radiance, 2 * (air / cosine + ior * thickness_m / inside), weight)
 
 
-def geometric_sum(albedo: float, first: int, last: int) -> float:
-    """Return albedo^first + ... + albedo^last."""
-    return math.fsum(albedo**k for k in range(first, last + 1))
-
-
 class SphereLight(NamedTuple):
     """Indirect light of 2 to B surfaces in an integrating sphere: radiance everywhere; per pixel the mean path [m] and
     the path's variance over the light of one pixel [m^2]."""
