@@ -42,12 +42,10 @@ def camera_paths(
 
 @dr.syntax
 def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple[Array, Array, Array]:
-    """Light that comes back along each ray: what the ray itself meets, and what surfaces reflect; and its weight where
-    `most` surfaces end it."""
+    """Light back along each ray: what it meets, what surfaces reflect; and its weight where `most` surfaces end it."""
     scene, context = world.mi_scene, mi.BSDFContext()
     lanes = dr.width(ray.d)
-    seen, light, weight = dr.zeros(Float, lanes), dr.zeros(Float, lanes), dr.full(Float, 1, lanes)
-    cut = dr.zeros(Float, lanes)
+    (seen, light, cut), weight = (dr.zeros(Float, lanes) for _ in range(3)), dr.full(Float, 1, lanes)
     before = dr.zeros(mi.Interaction3f, lanes)  # the surface that the ray left, past all that it went straight through
     density = dr.full(Float, 1, lanes)  # of the ray's direction there; 0: no light could be sampled that way
     density = dr.select(weight > 0, 0, density)

@@ -40,8 +40,8 @@ def _base_shares(index: float, alpha: float, distribution: str) -> tuple[float, 
 def _shares(cosine: float, index: float, alpha: float, distribution: str) -> tuple[float, float]:
     """Compute the reflectance and transmittance at an angle of incidence."""
     if alpha < SMOOTH:
-        fresnel = float(fresnel_reflectance(np.array(cosine), index))
-        return fresnel, 1 - fresnel
+        smooth = float(fresnel_reflectance(np.array(cosine), index))
+        return smooth, 1 - smooth
     level = (np.arange(RADII) + 0.5) / RADII  # of equal shares of projected microfacets
     tan2 = alpha**2 * (level / (1 - level) if distribution == "ggx" else -np.log1p(-level))
     height = 1 / np.sqrt(1 + tan2)[:, None]
