@@ -12,7 +12,7 @@ import numpy as np
 
 from render.ambient.integrator import AmbientLight, ambient_light
 from render.direct.integrator import centre_layers
-from render.error import ErrorEstimate, is_met, is_ruled_by_few, target_verdict
+from render.error import ErrorEstimate, is_met, is_ruled_by_bounces, is_ruled_by_few, target_verdict
 from render.image_error import estimated_error
 from render.indirect.schedule import Schedule, reallocated
 from render.pipeline import (
@@ -164,7 +164,7 @@ def additional_schedule(
         return None
     batches = traced.schedule.batches
     allowed = settings.target_fraction * plan.target**2
-    allowed -= error.direct**2 + error.merging**2 + error.bias**2 + error.clamped**2
+    allowed -= error.direct**2 + error.merging**2 + error.bias**2 + error.clamped**2 + error.truncated**2
     if plan.filter and error.bias < plan.target:
         # what merging and the filter seem to cost after few paths falls with more
         allowed = max(allowed, MIN_ALLOWED * settings.target_fraction * plan.target**2)
@@ -191,7 +191,8 @@ def additional_schedule(
 def remedy_reasons(plan: Plan, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:
     """State what to do where fewer paths than the pilot asked for missed the target: its estimate may be far off."""
     remedy = "" if traced.schedule is None else traced.schedule.remedy
-    return () if not remedy or is_met(error, plan.target) else (f"indirect light: too few paths; {remedy}",)
+    helps = bool(remedy) and not is_met(error, plan.target) and not is_ruled_by_bounces(error)
+    return () if not helps else (f"indirect light: too few paths; {remedy}",)
 
 
 def clamp_reasons(plan: Plan, settings: RenderSettings, traced: LightSamples, error: ErrorEstimate) -> tuple[str, ...]:

@@ -28,6 +28,8 @@ WORST_FRACTION, MIN_WORST = 1e-3, 16
 # The brightest pixels are checked one by one where they hold more than this part of the image's squared radiance.
 BRIGHTEST, BRIGHT_FRACTION = 32, 0.25
 UNEVEN = 2.0  # times the error above which the median pixel's is said beside it
+# Of light that met very many surfaces, in that of even light: its returns lie over a large part of the period.
+LATE_POWER = 2.0
 RULED = 0.5  # share of the squared error in these pixels above which they rule it
 FEW = 1 / 16  # of an image's pixels: the worst ones are no more where they are spoken of
 
@@ -36,7 +38,7 @@ FEW = 1 / 16  # of an image's pixels: the worst ones are no more where they are 
 class ErrorEstimate:
     """Relative errors: overall (nRMSE) and its parts; median and 95th percentile of pixels.
 
-    `bias` is the filter's, `clamped` what a clamp removes.
+    `bias` is the filter's, `clamped` what a clamp removes, `truncated` what would have met more surfaces than planned.
     `worst_share` is the share of the squared overall error in the worst pixels (`worst_fraction_of`). The overall error
     is a sum of squares: one firefly can rule it, while the median pixel is fine, and being in both of its sums holds it
     below 1. It is the error all the same, so that a target it exceeds is missed; the share says what to do about it.
@@ -51,9 +53,12 @@ class ErrorEstimate:
     pixel_p95: float
     worst_share: float = 0.0
     clamped: float = 0.0
+    truncated: float = 0.0
 
     def to_dict(self) -> dict:
-        return asdict(self)
+        """Return all parts by name; of light beyond the last bounce only where there is some that matters."""
+        parts = asdict(self)
+        return parts if self.truncated else {name: part for name, part in parts.items() if name != "truncated"}
 
 
 # Of a render whose checked pixels hold no light, though others do: nothing is known of its error.
@@ -170,7 +175,8 @@ def checked_pixels(pilot: np.ndarray, radiance: np.ndarray) -> CheckedPixels:
 class IndirectErrors(NamedTuple):
     """Squared errors of indirect light after the pulse, (pixels,) or one for all: noise, merging of returns, a filter's
     bias, what a clamp removed. The pixels are some of an image's: the scales say how many times as much noise, and
-    clamped error, the whole image has for its squared power."""
+    clamped error, the whole image has for its squared power. `left_out` is the share of all light that met more
+    surfaces than were followed."""
 
     noise: np.ndarray | float = 0.0
     merging: np.ndarray | float = 0.0
@@ -178,6 +184,7 @@ class IndirectErrors(NamedTuple):
     clamped: np.ndarray | float = 0.0
     noise_scale: float = 1.0
     clamped_scale: float = 1.0
+    left_out: float = 0.0
 
 
 def estimate(
@@ -202,15 +209,18 @@ def estimate(
         return ErrorEstimate(*(0.0,) * 7)
     of_image = direct, merging, noise * errors.noise_scale, bias, clamped * errors.clamped_scale
     *parts, lost = (max((weight * part).sum() / whole, 0.0) for part in of_image)
-    squared = np.maximum(direct + merging + noise + bias + clamped, 0)
+    late = LATE_POWER / REFERENCE_BINS * ((fine + indirect).sum(axis=1) * errors.left_out / (1 - errors.left_out)) ** 2
+    truncated = float((weight * late).sum() / whole)
+    squared = np.maximum(direct + merging + noise + bias + clamped + late, 0)
     typical = (power > 0) & (weight == weight.max())
     per_pixel = np.sqrt(squared[typical] / power[typical]) if typical.any() else np.zeros(1)
     return ErrorEstimate(
-        math.sqrt(sum(parts) + lost),
+        math.sqrt(sum(parts) + lost + truncated),
         *(math.sqrt(part) for part in parts),  # type: ignore[misc]  # mypy cannot count them
         pixel_median=float(np.median(per_pixel)),
         pixel_p95=float(np.quantile(per_pixel, 0.95)),
         clamped=math.sqrt(lost),
+        truncated=math.sqrt(truncated),
     )
 
 
@@ -222,6 +232,11 @@ def worst_pixels(pixels: int) -> int:
 def is_ruled_by_few(error: ErrorEstimate, pixels: int) -> bool:
     """Return whether a few of an image's pixels rule its error; False where the worst are no small part of it."""
     return error.worst_share > RULED and worst_pixels(pixels) <= FEW * pixels
+
+
+def is_ruled_by_bounces(error: ErrorEstimate) -> bool:
+    """Return whether light of more surfaces than are followed rules an error, which no number of paths lowers."""
+    return error.truncated**2 > RULED * error.total**2
 
 
 def worst_fraction_of(standard_error: np.ndarray, error: ErrorEstimate) -> float:
@@ -252,6 +267,8 @@ def target_verdict(error: ErrorEstimate, target: float, pixels: int) -> str:
         return message
     message = f"warning: the stated error of {stated} MISSES the target of {limit}"
     message += f"; the median pixel's is {error.pixel_median:.2g}"
+    if is_ruled_by_bounces(error):
+        message += f"; {error.truncated:.2g} is light beyond the last bounce"
     if is_ruled_by_few(error, pixels):
         rest = error.total * math.sqrt(1 - error.worst_share)
         message += (

@@ -68,7 +68,7 @@ def estimated_error(world: TracedScene, plan: Plan, traced: LightSamples) -> Err
     brightness = _over_checked(np.maximum(total**2 - variance, 0), checked) or 1.0
     clamped = _lost_to_clamp(traced.indirect.removed, checked)
     errors = IndirectErrors(
-        noise, merging, bias, clamped, _over_checked(variance, checked) / brightness, 1 / brightness
+        noise, merging, bias, clamped, _over_checked(variance, checked) / brightness, 1 / brightness, plan.left_out
     )
     error = estimate(coarse, fine, indirect, errors, checked.weight)
     return replace(error, worst_share=worst_fraction_of(traced.indirect.noise, error))

@@ -39,6 +39,8 @@ AMBIENT_FRACTION, MIN_AMBIENT_NOISE, MAX_AMBIENT_NOISE = 0.5, 0.02, 0.5
 # Energy left out by fewer bounces is bias, which no number of photons averages away. It lies in few pixels, inside a
 # lampshade or a pot: 0.2 % of an artist's room was 10 to 20 % of some pixels. More bounces cost a few per cent of time.
 LEFT_OUT, MAX_LEFT_OUT = 1 / 256, 0.02  # of the target; at most
+# More than that share of all light adds to the stated error; the pilot is then repeated with all the bounces there are.
+MATTERS, LATE_SPP = 1e-3, 64  # and that many paths in each of PILOT_PIXELS pixels
 # The pilot's pixels miss such places: there, light that met more than 11 surfaces was a tenth. Paths that carry little
 # end early: this costs up to 3 % of the time in rooms where 8 to 11 would do.
 MIN_BOUNCES = 24
@@ -141,7 +143,7 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
         fine = pilot_response(world, pixels, max(PILOT_GRID, _grid_for_cone(world)))
     target, why = _target(settings, fine)
     reasons.append(why)
-    bounces, spp, paths, more_reasons = _indirect(world, settings, pixels, fine, target, seed)
+    bounces, left_out, spp, paths, more_reasons = _indirect(world, settings, pixels, fine, target, seed)
     fraction = direct_fraction_of(settings, direct_alone)
     aim, paths = _aim(settings, target, paths)
     if aim < target:
@@ -180,6 +182,7 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
         ambient_noise=ambient_noise,
         clamp=settings.clamp,
         refraction="bent" if world.refracts else "straight",
+        left_out=left_out,
     )
 
 
@@ -277,25 +280,30 @@ def _grid(
 
 def _indirect(
     world: TracedScene, settings: RenderSettings, pixels: np.ndarray, fine: np.ndarray | None, target: float, seed: int
-) -> tuple[int, int | None, float, list[str]]:
-    """Choose bounces and paths a pixel; return both (None paths: left to the schedule), about how many paths meet the
-    target if every pixel has its own, and why."""
+) -> tuple[int, float, int | None, float, list[str]]:
+    """Choose bounces and paths a pixel; return the bounces, the share of light left out beyond where it matters, the
+    paths (None: left to the schedule), about how many meet the target if every pixel has its own, and why."""
     mode = world.scene.laser.mode
     if settings.bounces == 1:
-        return 1, 0, 0.0, ["indirect light: none, forced by 1 bounce"]
+        return 1, 0.0, 0, 0.0, ["indirect light: none, forced by 1 bounce"]
     if settings.bounces is None and mode == "scan":
         why = "indirect light: left out, also of the error, under a scanning laser unless bounces ask for it"
-        return 1, 0, 0.0, [why]
+        return 1, 0.0, 0, 0.0, [why]
     most = PILOT_BOUNCES if settings.bounces is None else settings.bounces
     energy, noise = energy_by_bounces(world, pixels, MIN_SPP, most, seed)
     assert fine is not None
     energy[1] = fine.sum()
-    lines, bounces = list[str](), settings.bounces
+    lines, bounces, left_out = list[str](), settings.bounces, 0.0
     if energy.sum() <= 0:  # what the laser lights may lie between the pilot's rays
         most = bounces or MIN_BOUNCES
-        return most, settings.spp, 0.0, [f"bounces: {most}; indirect light: the pilot's paths found no light"]
+        return most, 0.0, settings.spp, 0.0, [f"bounces: {most}; indirect light: the pilot's paths found no light"]
     if bounces is None:
         bounces, left_out = bounces_for(energy, min(LEFT_OUT * target, MAX_LEFT_OUT), MIN_BOUNCES)
+        if bounces == MAX_BOUNCES and left_out > MATTERS:
+            spp = LATE_SPP * PILOT_PIXELS // len(pixels)
+            energy = energy_by_bounces(world, pixels, spp, bounces, seed)[0]
+            energy[1] = fine.sum()
+            left_out = share_beyond(energy)
         fraction = energy[2:].sum() / energy.sum()
         lines.append(
             f"bounces: {bounces}; indirect light is {fraction:.2%} of the energy, {left_out:.2%} is left out beyond"
@@ -303,12 +311,12 @@ def _indirect(
     else:
         lines.append(f"bounces: {bounces}, forced")
     if bounces == 1:
-        return 1, 0, 0.0, [*lines, "indirect light: none, what it adds is less than may be left out"]
+        return 1, 0.0, 0, 0.0, [*lines, "indirect light: none, what it adds is less than may be left out"]
     power = float((fine**2).sum())
     paths = noise * PULSE_POWER / (PLANNED * settings.target_fraction * target**2 * power) if power > 0 else 0.0
     if settings.spp is not None:
         lines.append(f"indirect light: the work of {settings.spp} paths a pixel, forced")
-    return bounces, settings.spp, 0.0 if settings.filter else paths, lines
+    return bounces, left_out if left_out > MATTERS else 0.0, settings.spp, 0.0 if settings.filter else paths, lines
 
 
 def _aim(settings: RenderSettings, target: float, paths: float) -> tuple[float, float]:
@@ -338,3 +346,13 @@ def bounces_for(energy: np.ndarray, allowed: float, least: int = 1) -> tuple[int
     bounces = int(np.argmax(left_out[1:] <= allowed)) + 1 if (left_out[1:] <= allowed).any() else MAX_BOUNCES
     bounces = max(bounces, least) if bounces > 1 else 1
     return bounces, max(float(left_out[bounces]), 0.0)
+
+
+def share_beyond(energy: np.ndarray) -> float:
+    """Estimate the share of all energy beyond the last of many bounces: a geometric series goes on as its last two
+    thirds do, one to the other."""
+    third = len(energy) // 3
+    before, last = energy[-2 * third : -third].sum(), energy[-third:].sum()
+    ratio = min(last / before, 0.99) if before > 0 else 0.0
+    beyond = last * ratio / (1 - ratio)
+    return float(beyond / (energy.sum() + beyond)) if beyond > 0 else 0.0

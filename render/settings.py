@@ -142,6 +142,7 @@ class Plan:
     noise       target of the Monte-Carlo part of the error where spp is open
     target      that of the whole error
     refraction  of solid glass: direct light by Snell's law, or everything in a straight line
+    left_out    share of all laser light that meets more surfaces than planned, where it is enough to matter
     ambient_noise  where the paths of ambient light are open: the noise at which they end
     """
 
@@ -161,6 +162,9 @@ class Plan:
     ambient_noise: float = 0.0
     clamp: float | None = None
     refraction: Refraction = "straight"
+    left_out: float = 0.0
 
     def to_dict(self) -> JsonObject:
-        return asdict(self)
+        """Return all of it by name; light that is left out only where there is some that matters."""
+        parts = asdict(self)
+        return parts if self.left_out else {name: part for name, part in parts.items() if name != "left_out"}

@@ -24,7 +24,7 @@ from render.error import (
 from render.image_error import estimated_error
 from render.indirect.launch_layout import BLOCK
 from render.indirect.schedule import Schedule, reallocated
-from render.planning import bounces_for, make_plan
+from render.planning import bounces_for, make_plan, share_beyond
 from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
 from render.transient.samples import Samples
@@ -65,6 +65,8 @@ def test_bounces_follow_a_geometric_series_and_not_one_bright_path():
     assert bounces_for(energy, 0.011, least=5) == (bounces, left_out)
     assert bounces_for(energy, 0.011, least=12) == (12, pytest.approx(0.5**12, rel=1e-6))
     assert bounces_for(energy, 0.6, least=12)[0] == 1
+    assert share_beyond(0.98 ** np.arange(64)) == pytest.approx(0.98**64)
+    assert share_beyond(np.zeros(64)) == 0
     energy[-1] *= 2
     assert bounces_for(energy, 0.011)[0] in (7, 8, 9)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from render.engine import remedy_reasons, render
-from render.error import PULSE_POWER, IndirectErrors, checked_pixels, estimate, response
+from render.error import PULSE_POWER, IndirectErrors, checked_pixels, estimate, response, target_verdict
 from render.indirect.schedule import Schedule
 from render.planning import PILOT_PIXELS, cell_narrowing
 from render.settings import WIDEST_GROWTH, WIDEST_INDIRECT_M, RenderSettings
@@ -15,6 +15,7 @@ from render.transient import Transient
 from render.transient.samples import Samples
 from scene2spad.bench.hard import oracles
 from scenes import Material, Scene, Surface
+from scenes.constants import REFERENCE_BINS
 from scenes.geometry.shapes import box
 
 WIDTH, HEIGHT = 40, 30
@@ -116,8 +117,31 @@ def test_plans_say_how_wide_cells_are_and_settings_rule():
 @pytest.mark.parametrize(("total", "words"), [(0.03, ("indirect light: too few paths; ask",)), (0.01, ())])
 def test_more_paths_are_asked_for_only_where_the_target_is_missed(total, words):
     """The pilot's own estimate may be 40 times too large: a remedy beside a target that is met contradicts it."""
-    plan, error = SimpleNamespace(target=0.02), SimpleNamespace(total=total)
+    plan, error = SimpleNamespace(target=0.02), SimpleNamespace(total=total, truncated=0.0)
     empty = np.zeros(0, np.int64)
     schedule = Schedule(empty, empty, empty, remedy="ask")
     assert remedy_reasons(plan, SimpleNamespace(schedule=schedule), error) == words
     assert remedy_reasons(plan, SimpleNamespace(schedule=None), error) == ()
+
+
+def test_light_beyond_the_last_bounce_is_part_of_the_error():
+    """Its share of the energy, twice as uneven as if spread over the whole period; none where nothing is left out."""
+    even = np.full((4, REFERENCE_BINS), 1.0)
+    stated = estimate(even, even, errors=IndirectErrors(left_out=0.1))
+    assert stated.truncated == pytest.approx(0.1 / 0.9 * np.sqrt(2)) == stated.total == stated.pixel_median
+    assert stated.to_dict()["truncated"] == stated.truncated
+    assert "light beyond the last bounce" in target_verdict(stated, 0.02, 4)
+    whole = estimate(even, even)
+    assert whole.total == 0 and "truncated" not in whole.to_dict()
+
+
+@pytest.mark.parametrize(("albedo", "beyond"), [(0.6, False), (0.98, True)])
+def test_a_white_room_states_what_its_bounces_leave_out(albedo: float, beyond: bool):
+    vertices, faces, uv = box((6, 6, 6))
+    walls = Surface(vertices, faces[:, ::-1], Material(albedo=albedo), uv=uv)
+    meta = render(Scene("white", (walls,), oracles.camera(8, 8, 50)), RenderSettings(error=0.1), seed=1).meta
+    left_out = meta["plan"].get("left_out", 0.0)
+    assert (left_out > 0.05) == beyond and ("truncated" in meta["relative_error"]) == beyond
+    # of light that is even; what is first lit, and seen, is brighter
+    assert not beyond or 0.4 * 0.98**63 < left_out < 1.2 * 0.98**63
+    assert meta["relative_error"]["total"] > meta["relative_error"].get("truncated", 0.0)
