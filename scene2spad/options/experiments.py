@@ -187,17 +187,19 @@ class Ultraphase(Common):
     """File for the words (asm: one hexadecimal word a line), the listing (list; compile: with the tables) or the rows
     (table, sweep: .csv)."""
     photons: tuple[float, ...] = (550.0,)
-    """Photons a pixel and frame, background included; `run` takes one number, `sweep` several."""
+    """Photons a pixel and frame, background included; `run` takes one whole number, `sweep` several numbers."""
     signal: Number = None
-    """Photons of one laser return among --photons, the rest spread evenly over time (run; default: 50, or all where
-    these are fewer)."""
+    """Photons of one laser return among --photons, a whole number, the rest spread evenly over time (run; default: 50,
+    or all where these are fewer)."""
     timestamps: File = None
     """Photons of the frame instead of a made-up return (run): timestamps of every core, a .npy of shape (N,) from 0 to
-    1023; or a histogram of `sense` (.h5), whose pixels have a core each and give their photons in the order of time."""
+    1023; or a histogram of `sense` (.h5) of 1,024 bins, whose pixels have a core each and give their photons in the order
+    of time."""
     fps: tuple[float, ...] = (30.0,)
     """Frames a second (sweep)."""
     codes: tuple[int, ...] = ()
-    """K of the Fourier and separable programs (sweep; default: the seven of the paper)."""
+    """K of the Fourier and separable programs (sweep; default: the seven of the paper); those that are no program are
+    listed with the reason."""
     pixels: tuple[int, ...] = (4, 1048576)
     """Pixels of the sensor (sweep)."""
     trace: int = 0

@@ -148,11 +148,12 @@ def test_sweep_refuses_what_does_not_fit_and_goes_on(capfd, folder):
         (["run", "fourier-8", "--signal", "nan"], "--signal nan is outside 0 to 550"),
         (["run", "fourier-8", "--photons", "1", "2"], "2 photon counts"),
         (["run", "fourier-8", "--photons", "1e9"], "--photons 1e+09 is outside 0 to 20000"),
+        (["run", "fourier-8", "--photons", "1.5"], "--photons 1.5: expected a whole number"),
+        (["run", "fourier-8", "--photons", "2", "--signal", "0.6"], "--signal 0.6: expected a whole number"),
         (["run", "fourier-8", "--trace", "-1"], "--trace -1 is outside 0 to 100000"),
         (["run", "fourier-8", "--watch", "nothing"], "nothing"),
         (["sweep", "--fps", "0"], "load: 0 frames a second, expected more than 0, at most 1e9"),
         (["sweep", "--pixels", "0"], "0 pixels"),
-        (["sweep", "--codes", "7"], "7 codes"),
         (["table", "--out", "nowhere/t.csv"], "nowhere"),
     ],
 )

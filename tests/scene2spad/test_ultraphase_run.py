@@ -93,7 +93,9 @@ def test_each_core_may_have_a_table_of_its_own(capfd, folder):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["fourier-8", "--timestamps", "wide.h5"], "wide.h5: 1536 time bins, expected at most 1024"),
+        (["fourier-8", "--timestamps", "wide.h5"], "wide.h5: 1536 time bins, expected the chip's 1024 timestamps"),
+        (["fourier-8", "--timestamps", "half.h5"], "half.h5: 512 time bins, expected the chip's 1024 timestamps"),
+        (["coarse-16", "--timestamps", "half.h5"], "(`sense --bins 1024` gives such bins)"),
         (
             ["separable-8", "--timestamps", "odd.h5"],
             "odd.h5: 3 x 2 pixels do not divide into the blocks of 2 x 2 cores",
@@ -116,6 +118,7 @@ def test_each_core_may_have_a_table_of_its_own(capfd, folder):
 )
 def test_files_that_do_not_fit_are_refused(capfd, folder, argv, message):
     histogram(folder / "wide.h5", 2, 2, bins=1536)
+    histogram(folder / "half.h5", 2, 2, bins=512)
     histogram(folder / "odd.h5", 3, 2)
     histogram(folder / "row.h5", 1, 2)
     np.save(folder / "float.npy", np.ones(2))

@@ -101,6 +101,8 @@ def photons_of(command: Ultraphase, program: Program, block: tuple[int, int]) ->
     require(
         0 <= signal <= photons, f"--signal {signal:g} is outside 0 to {photons:g}, all photons of a pixel (--photons)"
     )
+    for option, count in (("photons", photons), ("signal", signal)):
+        require(float(count).is_integer(), f"--{option} {count:g}: expected a whole number, as one frame is run")
     return _in_order((2, 2), [_made_up(photons, signal, command.seed, core) for core in range(4)])
 
 
@@ -113,10 +115,10 @@ def _alike(stream: np.ndarray) -> Photons:
 
 
 def _made_up(photons: float, signal: float, seed: int, core: int) -> np.ndarray:
-    """Timestamps of one core in the order of detection: round(signal) around bin 300 + 100 core, the rest uniform."""
+    """Timestamps of one core in the order of detection: `signal` around bin 300 + 100 core, the rest uniform."""
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(8, core)))
-    near = np.rint(random.normal(300 + 100 * core, 1.4, round(signal))).astype(np.int64)
-    rest = random.integers(0, TIMESTAMPS, round(photons) - round(signal))
+    near = np.rint(random.normal(300 + 100 * core, 1.4, int(signal))).astype(np.int64)
+    rest = random.integers(0, TIMESTAMPS, int(photons) - int(signal))
     return random.permutation(np.concatenate([near, rest]) % TIMESTAMPS)
 
 
@@ -139,7 +141,8 @@ def _of_histogram(path: Path, program: Program, block: tuple[int, int]) -> Photo
     histogram = open_histogram(path)
     rows, columns, bins = histogram.counts.shape
     size = f"{path}: {rows} x {columns} pixels"
-    require(bins <= TIMESTAMPS, f"{path}: {bins} time bins, expected at most {TIMESTAMPS}, the chip's timestamps")
+    around = "its period spans them all (`sense --bins 1024` gives such bins)"
+    require(bins == TIMESTAMPS, f"{path}: {bins} time bins, expected the chip's {TIMESTAMPS} timestamps: {around}")
     require(rows * columns <= MAX_CORES, f"{size}, expected at most {MAX_CORES}, a core behind each")
     if block != (1, 1):
         whole = rows % block[0] == 0 and columns % block[1] == 0
