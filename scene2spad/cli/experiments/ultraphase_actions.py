@@ -177,12 +177,12 @@ def _sweep(command: Ultraphase, progress: Progress) -> dict:
         methods = [one for one in methods if one.family == "coarse"]
         for codes in dict.fromkeys(command.codes):
             for family in ("fourier", "separable"):
-                one = Method(family, codes)
                 try:
+                    one = Method(family, codes)
                     one.program()
                     methods.append(one)
                 except InputError as reason:
-                    refused[one.name] = str(reason)
+                    refused[f"{family}-{codes}"] = str(reason)
     for text, values in (("photons", command.photons), ("fps", command.fps), ("pixels", command.pixels)):
         require(len(values) > 0, f"ultraphase sweep: --{text} needs a number")
     for photons, frames_per_s, pixels in product(command.photons, command.fps, command.pixels):
