@@ -33,6 +33,8 @@ READINGS = {
     "published": "E x instructions x duty, as Supplementary Figure 5 prints it (Joules x duty, called Watts)",
     "energy": "E x instructions a second, with E = 1 / 94.6 GOPS/W in Joules (inferred, see ultraphase.power)",
 }
+# Columns of `sweep` that are of so many frames a second: no core draws or sends them that has no time for its frames
+NEEDS_TIME = ("rate_kb_per_s", "processing_uw", "processing_uw_energy", "readout_uw", "frame_end_uw_energy")
 
 
 @dataclass(frozen=True)
@@ -218,7 +220,8 @@ def sweep(
     them.
 
     processing_uw, processing_uw_energy   of the photons alone, as published; the frame's end stands beside them
-    busy, keeps_up                        share of the time that the slowest core of a block works: photons and end
+    busy, keeps_up                        share of the time that the slowest core of a block works: photons and end.
+                                          Above 1 no core keeps up: the columns of NEEDS_TIME are then None
     """
     chip, rates, sizes, rows = chip or ChipSpec(), tuple(frame_rates), tuple(pixels), []
     for count in photons:
@@ -233,6 +236,7 @@ def sweep(
                         {"name": name, **asdict(load), "busy": busy, "keeps_up": busy <= 1}
                         | _columns(cost.clocks_per_photon, cost.bits_per_pixel / 8, found)
                         | _end_columns(cost, found)
+                        | (dict.fromkeys(NEEDS_TIME) if busy > 1 else {})
                     )
     return rows
 

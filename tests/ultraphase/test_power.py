@@ -6,7 +6,7 @@ import pytest
 from scenes.errors import InputError
 from ultraphase import ChipSpec, Core, CoreArray, assemble, method, verify
 from ultraphase.catalog import PUBLISHED
-from ultraphase.power import Cost, Load, as_csv, cost_of, measured_cost, power, reference_bits, sweep, table
+from ultraphase.power import NEEDS_TIME, Cost, Load, as_csv, cost_of, measured_cost, power, reference_bits, sweep, table
 from ultraphase.tables import int8_codes
 
 
@@ -97,6 +97,16 @@ def test_sweep_has_every_combination_and_says_what_is_too_fast():
     assert not one["keeps_up"] and one["busy"] == pytest.approx((1e6 * 255 + 258) * 2.38e-9 * 1000)
     assert all(r["keeps_up"] for r in rows if r["photons"] == 550)
     assert next(r for r in rows if r["name"] == "raw timestamps")["bytes_per_pixel"] == 550 * 10 / 8
+
+
+def test_sweep_states_no_power_that_no_core_can_draw():
+    """A million photons in each of 1,000 frames a second take 607 times the time there is; it said 0.9 MW."""
+    rows = sweep({"fourier-16": Cost(255, 258, 256)}, (550, 1e6), (1000,), (1 << 20,))
+    for row in rows:
+        assert all((row[name] is None) != row["keeps_up"] for name in NEEDS_TIME), row
+    late = next(row for row in rows if not row["keeps_up"])
+    assert late["busy"] > 1 and late["frame_time_s"] == pytest.approx(1e6 * 255 * 2.38e-9)
+    assert "nan" not in as_csv(rows).lower() and ",," in as_csv(rows)
 
 
 def test_sweep_and_table_price_the_end_of_the_frame_alike():
