@@ -15,9 +15,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from scenes.errors import require
+from scenes.errors import require, require_kind
 
-_EXACT_IN_FLOAT32 = 1 << 24
+_EXACT_IN_FLOAT32, _EXACT_IN_FLOAT64, _EXACT_IN_INT64 = 1 << 24, 1 << 53, 1 << 63
 _CHUNK_BYTES = 1 << 19  # of histograms in bytes at a time: their floats, and all else, stay in a cache
 _LARGEST_BYTE = 127
 _ONE_THREAD = 1 << 18  # multiplications of a product that OpenBLAS does without threads, at most
@@ -27,9 +27,13 @@ def photon_sums(histograms: np.ndarray, table: np.ndarray, *, in_bytes: bool = T
     """Multiply counts (pixels, timestamps) of any integer type with a table (timestamps, numbers) of integers.
 
     `in_bytes` False keeps to products of floating point. Returns (pixels, numbers) int64, exact. Raises InputError for
-    negative counts, and for counts that are no integers.
+    negative counts, for counts that are no integers, for another shape, and for so many photons of a pixel that they
+    times the table's largest entry reach 2^63.
     """
+    require_kind(histograms, np.ndarray, "photon_sums")
     require(histograms.dtype.kind in "iub", f"histograms of {histograms.dtype}, expected whole numbers")
+    fits = histograms.ndim == 2 and histograms.shape[1] == len(table)
+    require(fits, f"histograms of shape {histograms.shape}, expected (pixels, {len(table)}) as the table's timestamps")
     (count, bins), numbers = histograms.shape, table.shape[1]
     blocks = equal_blocks(table)
     if blocks > 1:
@@ -46,10 +50,16 @@ def photon_sums(histograms: np.ndarray, table: np.ndarray, *, in_bytes: bool = T
         fullest = _fullest_bin(part)
         if bytes_product and fullest <= _LARGEST_BYTE:
             result[first : first + chunk] = bytes_product.of_histograms(part)
-        elif largest * _most_photons(part, fullest) < _EXACT_IN_FLOAT32:
+            continue
+        most = largest * _most_photons(part, fullest)
+        if most < _EXACT_IN_FLOAT32:
             result[first : first + chunk] = product.of_histograms(part)
-        else:  # exact to 2^53
+        elif most < _EXACT_IN_FLOAT64:
             result[first : first + chunk] = part.astype(np.float64) @ table.astype(np.float64)
+        else:
+            over = f"histogram holds {fullest} counts in a bin: with entries to {largest}, sums reach 2^63"
+            require(most < _EXACT_IN_INT64, over)
+            result[first : first + chunk] = part.astype(np.int64) @ table.astype(np.int64)
     return result
 
 
@@ -78,7 +88,10 @@ def _fullest_bin(histograms: np.ndarray) -> int:
 def _most_photons(histograms: np.ndarray, fullest: int) -> int:
     """Bound on the photons of a pixel: from the fullest bin where that is enough to be small, else counted."""
     bound = fullest * histograms.shape[1]
-    return bound if bound < 1 << 16 else int(histograms.sum(axis=1, dtype=np.int64).max(initial=0))
+    if bound < 1 << 16:
+        return bound
+    kind = np.int64 if bound < _EXACT_IN_INT64 else object  # Python's own whole numbers have no limit
+    return int(histograms.sum(axis=1, dtype=kind).max(initial=0))
 
 
 class _Product:

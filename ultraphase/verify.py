@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.errors import InputError, require
+from scenes.errors import InputError, require, require_kind
 from ultraphase.array import CoreArray, Frame
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.chip import ChipSpec
@@ -47,9 +47,13 @@ class Tabulated:
 
     def sums(self, histograms: np.ndarray) -> np.ndarray:
         """Add the photons of every pixel without a limit: counts (pixels, timestamps) of any integer type -> (pixels,
-        numbers) int64, exact. Raises InputError for other bins, and negative counts."""
-        bins = histograms.shape[1]
-        require(bins == len(self.table), f"histograms of {bins} bins, {self.program} has {len(self.table)} timestamps")
+        numbers) int64, exact. Raises InputError as `photon_sums` does: for other bins, negative counts, and sums that
+        reach 2^63."""
+        require_kind(histograms, np.ndarray, f"sums of {self.program}")
+        held, count = histograms.shape, len(self.table)
+        wide = len(held) == 2
+        require(wide, f"histograms of shape {held}, expected (pixels, {count}), the timestamps of {self.program}")
+        require(held[1] == count, f"histograms of {held[1]} bins, {self.program} has {count} timestamps")
         return photon_sums(histograms, self.table)
 
     def frame(self, histograms: np.ndarray) -> np.ndarray:

@@ -82,3 +82,27 @@ def test_negative_counts_are_refused():
     with pytest.raises(InputError, match="float32, expected whole numbers"):
         photon_sums(np.full((2, 1024), np.nan, np.float32), TABLES["fourier-8"])
     assert photon_sums(np.zeros((0, 1024), np.uint8), TABLES["fourier-8"]).shape == (0, 8)
+
+
+@pytest.mark.parametrize("counts", [1 << 44, (1 << 44) + 1, (1 << 55) + 3])
+def test_sums_beyond_doubles_are_exact(counts):
+    """Two bins of 2^44 + 1 photons with entries of 127 were off: doubles are exact to 2^53 alone."""
+    histograms, table = np.zeros((2, 1024), np.uint64), TABLES["fourier-8"]
+    histograms[1, [3, 700]] = counts, counts + 2
+    expected = [sum(int(n) * int(row[k]) for n, row in zip(histograms[1], table, strict=True)) for k in range(8)]
+    assert photon_sums(histograms, table).tolist() == [[0] * 8, expected]
+
+
+@pytest.mark.parametrize(
+    ("histograms", "message"),
+    [
+        (np.full((1, 1024), 1 << 63, np.uint64), "9223372036854775808 counts in a bin: with entries to 127, sums reach"),
+        (np.full((1, 1024), 1 << 50), "1125899906842624 counts in a bin"),
+        (np.zeros((2, 1000), np.uint8), r"histograms of shape \(2, 1000\), expected \(pixels, 1024\)"),
+        (np.zeros(1024, np.uint8), r"histograms of shape \(1024,\)"),
+        ([[0] * 1024], "expected a ndarray, not list"),
+    ],
+)
+def test_histograms_without_exact_sums_are_refused_in_one_line(histograms, message):
+    with pytest.raises(InputError, match=message):
+        photon_sums(histograms, TABLES["fourier-8"])

@@ -146,6 +146,8 @@ def test_tabulated_form_takes_any_integers_and_stays_exact():
     assert found.frame(np.zeros((0, 1024), np.uint8)).shape == (0, 8)
     with pytest.raises(InputError, match="512 bins"):
         found.sums(np.zeros((1, 512), np.uint8))
+    with pytest.raises(InputError, match=r"histograms of shape \(1024,\), expected \(pixels, 1024\)"):
+        found.sums(np.zeros(1024, np.uint8))
     with pytest.raises(InputError, match="-3 counts"):
         found.sums(np.full((1, 1024), -3))
 
