@@ -30,7 +30,7 @@ class CodingTensor:
     steps     weight of one step of the temporal and of the spatial part where both are whole steps within +-127
               already, as those of a layer trained with `int8`; None for others
 
-    Both parts are kept in float32, also those given in float64 or 16 bits. Raises InputError for other shapes, values
+    Both parts are copied, and kept in float32, also those given in float64 or 16 bits. Raises InputError for other shapes, values
     that are not finite, or not in float32, and more codes than counts.
     """
 
@@ -48,7 +48,8 @@ class CodingTensor:
             part = getattr(self, label)
             if part is None and label == "spatial":
                 continue
-            part = as_tensor(part).detach().float()  # which may end in infinity
+            # a copy, as decoders keep what they make of a tensor; in float32 it may end in infinity
+            part = as_tensor(part).detach().to(torch.float32, copy=True)
             shape = tuple(part.shape)
             if part.ndim not in ranks or 0 in shape or not bool(part.isfinite().all()):
                 raise InputError(
@@ -138,12 +139,14 @@ def _per_pixel(coding: CodingTensor) -> None:
 
 
 def as_tensor(values: Tensor | np.ndarray) -> Tensor:
-    """Return a tensor as it is, and a numpy array as one, copied where it is read-only, as arrays of files are.
+    """Return a tensor as it is, and a numpy array as one, copied where it is read-only, as arrays of files are, and
+    where its bytes are in another order than this computer's.
 
     Raises InputError for anything else.
     """
     if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":
-        return torch.from_numpy(np.require(values, requirements=["C", "W"]))
+        native = values.astype(values.dtype.newbyteorder("="), copy=False)
+        return torch.from_numpy(np.require(native, requirements=["C", "W"]))
     if not isinstance(values, Tensor):
         got = f"an array of {values.dtype}" if isinstance(values, np.ndarray) else type(values).__name__
         raise InputError(f"expected a tensor or an array of numbers, got {got}")

@@ -251,3 +251,27 @@ def test_complex_codes_and_counts_are_refused() -> None:
     for call in (lambda: CodingTensor("waves", waves), lambda: encode(waves, fourier(4, 64))):
         with pytest.raises(InputError, match="real and imaginary part are two rows"):
             call()
+
+
+def test_a_coding_tensor_keeps_its_own_copy() -> None:
+    """Change the caller's array: codes changed with it, and the decoder's templates, kept by object, did not."""
+    rows = truncated_fourier(8, 64).numpy().copy()
+    coding, codes = CodingTensor("mine", rows), encode(torch.eye(64)[:3], fourier(8, 64))
+    depth = decode_depth(codes, coding, SMALL)
+    rows *= -1
+    assert torch.equal(encode(torch.eye(64)[:3], coding), codes)
+    assert torch.equal(decode_depth(codes, coding, SMALL), depth)
+    spatial = torch.ones(8, 2, 2)
+    separable = CodingTensor("block", torch.ones(8, 64), spatial)
+    spatial.zero_()
+    assert bool((separable.tensor == 1).all())
+
+
+@pytest.mark.parametrize("kind", [">f4", ">f8", ">i2"])
+def test_arrays_of_the_other_byte_order_are_taken(kind: str) -> None:
+    rows = (100 * truncated_fourier(8, 64).numpy()).round().astype(kind)
+    coding = CodingTensor("mine", rows)
+    assert torch.equal(coding.temporal, torch.tensor(rows.tolist()))
+    counts = np.eye(64, dtype=kind)
+    assert torch.equal(encode(counts, coding), coding.temporal.T)
+    assert decode_depth(encode(counts, coding).numpy().astype(">f4"), coding, SMALL).isfinite().all()
