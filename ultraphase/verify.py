@@ -11,6 +11,7 @@ from scenes.errors import InputError, require, require_kind
 from ultraphase.array import CoreArray, Frame
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.chip import ChipSpec
+from ultraphase.core import require_loadable
 from ultraphase.products import photon_sums
 
 # What a photon finds in the registers, in the order of the states (see `verify`); from then on what the one before left
@@ -96,6 +97,7 @@ def verify(
     if the program changes a table, lets words out, or writes other than zeros before the first photon; and where it
     differs from the matrix, saying at which timestamp and number.
     """
+    require_loadable(program, tables, "verify")
     chip = chip or ChipSpec()
     count = timestamps or ((program.timestamps or chip.timestamps) if matrix is None else matrix.shape[1])
     require(bool(program.state), f"program {program.name}: declares no .space, there is nothing to verify")

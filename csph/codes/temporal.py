@@ -52,7 +52,7 @@ def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 
         "fourier-published": lambda: truncated_fourier(codes, bins, "published"),
         "gray-published": lambda: gray_fourier(codes, bins, published_pulse(bins, sensor), "published"),
     }
-    meant = did_you_mean(name, FIXED_CODES)
+    meant = did_you_mean(name, FIXED_CODES) if isinstance(name, str) else ""
     require(name in makers, f"temporal code {name!r} is unknown{meant}, expected one of {', '.join(FIXED_CODES)}")
     whole = isinstance(codes, Integral) and not isinstance(codes, bool) and codes >= 1
     require(whole, f"{name} code: {codes!r} codes, expected a whole number, 1 or more")

@@ -121,7 +121,10 @@ def shipped_model(name: str, folder: Path = WEIGHTS) -> Path:
 
 
 def checkpoint_of(name_or_path: Path | str, folder: Path = WEIGHTS) -> Path:
-    """Return a checkpoint's path as it is if something lies there, else the shipped model of that name. InputError."""
+    """Return a checkpoint's path as it is if something lies there, else the shipped model of that name. InputError,
+    also for what is neither text nor a path."""
+    named = isinstance(name_or_path, str | Path)
+    require(named, f"model {name_or_path!r}: expected a name of `models`, or the path of a checkpoint")
     path = Path(name_or_path)
     if path.exists() or path.suffix or len(path.parts) > 1:
         require(path.exists(), f"{path}: file not found")

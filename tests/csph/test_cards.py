@@ -75,3 +75,9 @@ def test_training_needs_no_renderer_and_no_command_line():
     message = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert message.returncode == 0, message.stderr
     assert int(message.stdout) > 100_000
+
+
+@pytest.mark.parametrize("name", [None, 8, b"none-s0"])
+def test_what_names_no_model_is_refused_in_one_line(name):
+    with pytest.raises(InputError, match=r"^model .*: expected a name of `models`, or the path of a checkpoint$"):
+        checkpoint_of(name)

@@ -198,3 +198,9 @@ def test_one_code_tells_no_depth():
     with pytest.raises(InputError, match="nothing but a sign"):
         decode_depth(torch.ones(4, 1), coding, Sensor())
     assert ModelConfig(design=Design("learned", (256, 1, 1), 1), layer={"keep_mean": True}).design.codes == 1
+
+
+@pytest.mark.parametrize("name", [None, 8])
+def test_what_names_no_code_is_refused_in_one_line(name):
+    with pytest.raises(InputError, match=rf"^temporal code {name} is unknown, expected one of fourier, gray"):
+        temporal_code(name, 8, 64, Sensor())

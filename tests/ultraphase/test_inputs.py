@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes.errors import InputError
-from ultraphase import ChipSpec, Core, CoreArray, assemble, method
+from ultraphase import ChipSpec, Core, CoreArray, assemble, assemble_file, method, verify
 from ultraphase.arrivals import TimedCore, periodic_arrivals
 from ultraphase.power import Cost, Load, power
 
@@ -132,3 +132,17 @@ def test_cores_that_put_out_different_numbers_of_words_are_named():
     code = assemble("ID r1\nBBC r1, #0, one\nOUTH r1\none: OUTH r1\nHALT", name="p")
     message = refused(lambda: CoreArray(code, (1, 2)).frame(np.zeros(0, int), np.zeros(3, int)))
     assert re.fullmatch(r"program p: cores put out .* words: core \(0, 0\) 1, core \(0, 1\) 2", message)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: assemble(None), "assemble: expected a str of source"),
+        (lambda: assemble_file(None), "assemble_file: expected the path of a source, not NoneType"),
+        (lambda: verify(None), "verify: expected a Program of"),
+        (lambda: verify(method("fourier-8").program(), tables=[1]), "verify: tables of type list"),
+    ],
+)
+def test_what_is_no_program_is_refused_in_one_line(call, message):
+    with pytest.raises(InputError, match=message):
+        call()

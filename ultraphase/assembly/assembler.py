@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.errors import InputError, did_you_mean
+from scenes.errors import InputError, did_you_mean, require, require_kind
 from scenes.io.inputs import file_inside, read_text
 from ultraphase.assembly.isa import BY_NAME, DIRECTIONS, REGISTERS, VALUE_BITS, Instruction
 from ultraphase.assembly.names import Names, name_of
@@ -62,6 +62,7 @@ def assemble(
     Raises InputError with file, line and column for a mistake in the source, and with what is over for a program that
     does not fit the chip.
     """
+    require_kind(text, str, "assemble", " of source (`assemble_file` takes a path)")
     assembly = _Assembly(chip or ChipSpec(), dict(constants or {}), read)
     assembly.take(source_lines(name, text))
     return assembly.program(name)
@@ -75,6 +76,7 @@ def assemble_file(
 ) -> Program:
     """Return `assemble` of a file, called by its own name or by `name`; files that it includes are looked for beside
     it."""
+    require(isinstance(path, str | Path), f"assemble_file: expected the path of a source, not {type(path).__name__}")
     path = Path(path)
 
     def read(name: str) -> str:
