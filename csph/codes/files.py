@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,9 +17,16 @@ from scenes.errors import InputError, require
 from scenes.files import read_array, whole_file
 from scenes.io.inputs import file_sha256, read_text
 
-FACTOR = re.compile(
-    r"^# (temporal|spatial), shape (\d+(?: x \d+)*)(?:, int8, one step is (\S+))?\n((?:[^#\n][^\n]*\n)+)", re.MULTILINE
-)
+# The line above a factor's rows
+FACTOR = re.compile(r"# (temporal|spatial), shape (\d+(?: x \d+)*)(?:, int8, one step is (\S+))?")
+
+
+class _Part(NamedTuple):
+    """A factor as a text table states it, and its rows."""
+
+    shape: str
+    step: str | None
+    rows: list[list[str]]
 
 
 def read_codes(path: Path) -> CodingTensor:
@@ -43,15 +51,36 @@ def _array_part(path: Path) -> Tensor:
 
 
 def _text_parts(path: Path) -> dict[str, Tensor]:
-    """Read the factors of a text table by their names. Raises InputError that names the file."""
+    """Read the factors of a text table by their names; other comments and blank lines are passed over. Raises
+    InputError that names the file."""
+    stated = _stated_parts(path)
+    require("temporal" in stated, f"{path}: is no table of codes as `export` writes it")
     parts = {}
-    for name, shape, step, rows in FACTOR.findall(read_text(path, "table of codes")):
+    for name, part in stated.items():
         try:
-            values = np.array([row.split() for row in rows.splitlines()], np.float64) * float(step or 1)
-            parts[name] = torch.from_numpy(values.reshape([int(size) for size in shape.split(" x ")]))
+            shape = [int(size) for size in part.shape.split(" x ")]
+            if len(part.rows) != shape[0]:
+                raise ValueError
+            values = np.array(part.rows, np.float64) * float(part.step or 1)
+            parts[name] = torch.from_numpy(values.reshape(shape))
         except ValueError:
-            raise InputError(f"{path}: {name} part holds other than the {shape} numbers that it states") from None
-    require("temporal" in parts, f"{path}: is no table of codes as `export` writes it")
+            raise InputError(f"{path}: {name} part holds other than the {part.shape} numbers that it states") from None
+    return parts
+
+
+def _stated_parts(path: Path) -> dict[str, _Part]:
+    parts: dict[str, _Part] = {}
+    rows: list[list[str]] | None = None
+    for line in read_text(path, "table of codes").splitlines():
+        found = FACTOR.fullmatch(line.strip())
+        if found:
+            require(found[1] not in parts, f"{path}: states its {found[1]} part twice")
+            rows = []
+            parts[found[1]] = _Part(found[2], found[3], rows)
+        elif line.strip() and not line.lstrip().startswith("#"):
+            if rows is None:
+                raise InputError(f"{path}: is no table of codes as `export` writes it")
+            rows.append(line.split())
     return parts
 
 
