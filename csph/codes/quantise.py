@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -11,10 +13,14 @@ from torch import Tensor
 
 from csph.codes.blocks import encode_blocks
 from csph.codes.tensor import CodingTensor
+from scenes.errors import listed
+
+log = logging.getLogger("csph")
 
 Int8Rule = Literal["calibrated", "published"]
 INT8_RULES: tuple[str, ...] = get_args(Int8Rule)
 LEVELS = 127  # +-: symmetric, -128 is left out so that a sign can always be turned
+FEW_STEPS = 4  # a code whose largest magnitude is fewer tells 8-bit sums next to nothing
 PRODUCT_SHIFT = 7  # bits that the product of two 8-bit factors is shifted by, back into 8 bits
 ACCUMULATOR_BITS = 16
 HALF_RANGE = 1 << ACCUMULATOR_BITS - 1
@@ -77,11 +83,28 @@ def quantised(coding: CodingTensor) -> Quantised:
     """Round every factor to the nearest of 255 steps between plus and minus its largest magnitude.
 
     The result is one 8-bit tensor, of separable factors their product in integers. A tensor that is in steps already
-    keeps them. Programs of a core have tables of their own (`ultraphase.compiler`).
+    keeps them. Programs of a core have tables of their own (`ultraphase.compiler`). All codes share a step: a warning
+    names those of which fewer than FEW_STEPS are left.
     """
     steps = coding.steps or (None, None)
     spatial = (None, 1.0) if coding.spatial is None else _to_int8(coding.spatial, steps[1])
-    return from_factors(coding.name, _to_int8(coding.temporal, steps[0]), spatial)
+    found = from_factors(coding.name, _to_int8(coding.temporal, steps[0]), spatial)
+    _warn_of_weak(coding, found.tensor)
+    return found
+
+
+def _warn_of_weak(coding: CodingTensor, steps: np.ndarray, least: int = FEW_STEPS) -> None:
+    """Warn, once of the same codes, of rows that 8 bits lose, since all rows share a step: of fewer than `least`."""
+    left = np.abs(steps.astype(np.int16)).reshape(len(steps), -1).max(1)
+    weak = np.flatnonzero((left < least) & (coding.tensor.flatten(1) != 0).any(1).cpu().numpy())
+    if weak.size:
+        _log_weak(coding.name, coding.codes, listed(f"{row} ({left[row]})" for row in weak))
+
+
+@lru_cache(maxsize=256)
+def _log_weak(name: str, codes: int, rows: str) -> None:
+    message = "%s: of its %d codes 8 bits leave few of 127 steps of row %s, as all share one step: scale rows alike"
+    log.warning(message, name, codes, rows)
 
 
 def from_factors(
@@ -102,7 +125,8 @@ def published_int8(coding: CodingTensor) -> CodingTensor:
 
     Each factor (temporal, spatial, or the full tensor) has steps of 2/255 whatever its largest value, and factors are
     multiplied in floating point: an emulation, not what one 8-bit tensor holds (`quantised`). Weights beyond +-1 are
-    clamped, where the published code wraps around. It also casts counts to 8 bits; here they stay as they are.
+    clamped, where the published code wraps around. It also casts counts to 8 bits; here they stay as they are. Warns of
+    rows that become 0.
     """
 
     def rounded(part: Tensor) -> Tensor:
@@ -111,7 +135,9 @@ def published_int8(coding: CodingTensor) -> CodingTensor:
 
     spatial = None if coding.spatial is None else rounded(coding.spatial)
     name, temporal = f"{coding.name} int8 as published", rounded(coding.temporal)
-    return replace(coding, name=name, temporal=temporal, spatial=spatial, steps=None)
+    found = replace(coding, name=name, temporal=temporal, spatial=spatial, steps=None)
+    _warn_of_weak(coding, (found.tensor != 0).cpu().numpy(), least=1)
+    return found
 
 
 class IntegerCodes(NamedTuple):

@@ -119,3 +119,24 @@ def test_depth_layers_decode_integer_codes():
 def test_codes_of_zeros_stay_zero():
     zero = CodingTensor("zero", torch.zeros(2, 4))
     assert (quantised(zero).tensor == 0).all() and (published_int8(zero).tensor == 0).all()
+
+
+def test_a_row_that_8_bits_lose_is_named_once(caplog):
+    """All rows share one step: a thousandth of the largest was all zeros without a word."""
+    wave = torch.cos(torch.arange(64) / 5)
+    rows = torch.stack([wave, 1e-3 * wave, 0.02 * wave, 0 * wave, wave.roll(9)])
+    for _ in range(2):
+        quantised(CodingTensor("weak rows", rows))
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert "weak rows: of its 5 codes" in told and "row 1 (0), 2 (3)," in told and "\n" not in told
+    caplog.clear()
+    quantised(CodingTensor("even rows", rows[[0, 4]]))
+    for design in DESIGNS:
+        quantised(make_coding(design))
+    assert not caplog.records
+
+
+def test_published_int8_names_the_rows_that_it_loses(caplog):
+    published_int8(CodingTensor("weak as published", torch.tensor([[1.0, -1.0], [1e-3, 0.0]])))
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert "weak as published: of its 2 codes" in told and "row 1 (0)," in told
