@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
     from spad.measurements.histogram import Histogram
     from spad.sensor.model import Sensor
-
-log = logging.getLogger("scene2spad")
 
 CODES = ("fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 CODES_FILES = (".npy", ".txt")
@@ -63,7 +60,7 @@ def codes_method(path: Path, sensor: Sensor) -> Method:
     Warns of codes that depend on each other. Raises InputError that names the file for those of other blocks or bins,
     and those that tell no depth.
     """
-    from csph.codes.decode import check_decodable, decoded_rank
+    from csph.codes.decode import check_decodable, warn_of_rank
     from csph.codes.files import read_codes
 
     coding = read_codes(path)
@@ -74,10 +71,7 @@ def codes_method(path: Path, sensor: Sensor) -> Method:
         check_decodable(coding)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    rank = decoded_rank(coding)
-    if rank < coding.codes:
-        message = "%s: its %d codes have rank %d where a uniform background is removed: so many numbers tell depth"
-        log.warning(message, path, coding.codes, rank)
+    warn_of_rank(coding, str(path))
     return decoded_by(coding)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from functools import lru_cache
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -15,6 +17,9 @@ from spad.estimators.depth import by_pixels, correlate, depth_in_range, grid_pea
 from spad.sensor.model import Sensor
 from spad.sensor.template import FINE_STEP, pulse_taps
 
+log = logging.getLogger("csph")
+
+_TOLD: WeakSet[CodingTensor] = WeakSet()  # whose rank was warned of
 _TIE = 1e-6  # of the largest score: what float32 sums cannot tell apart
 
 
@@ -52,6 +57,16 @@ def check_decodable(coding: CodingTensor) -> None:
     rank, least = decoded_rank(coding), min(2, coding.codes - bool(_background(_matrix(coding)).any()))
     ranked = f"coding tensor {coding.name}: its {coding.codes} codes have rank {rank} where a uniform background is"
     require(rank >= least, f"{ranked} removed, depth by correlation needs {least} or more")
+
+
+def warn_of_rank(coding: CodingTensor, name: str, *, lost: int = 0) -> None:
+    """Warn, once of a coding tensor, where fewer of its codes than all but `lost` tell depth, as they depend on each
+    other; `name` comes first."""
+    rank = decoded_rank(coding)
+    if rank < coding.codes - lost and coding not in _TOLD:
+        _TOLD.add(coding)
+        message = "%s: its %d codes have rank %d where a uniform background is removed: so many numbers tell depth"
+        log.warning(message, name, coding.codes, rank)
 
 
 @lru_cache(maxsize=8)
@@ -108,7 +123,8 @@ def decode_depth(codes: Tensor | np.ndarray, coding: CodingTensor, sensor: Senso
 
     `codes` may be a numpy array. h(tau) is the binned pulse. Searched over the bin centres, then over a grid of
     eighths of a bin and a parabola; of equal scores the first, of neighbours that score alike their middle; the
-    noise-free answer is subtracted as in `spad.estimators.depth`. NaN where all codes are zero. Raises InputError for
+    noise-free answer is subtracted as in `spad.estimators.depth`. NaN where all codes are zero. Codes that depend on
+    each other are warned of, once; the number that goes with a background is none of those. Raises InputError for
     another number of codes or bins, codes that are not finite, and a coding tensor of rank below 2.
     """
     require_kind(coding, CodingTensor, "decode_depth", " of `coding_tensor`")
@@ -125,5 +141,6 @@ def decode_depth(codes: Tensor | np.ndarray, coding: CodingTensor, sensor: Senso
         return torch.empty(codes.shape[:-1], device=codes.device)
     if not bool(codes.isfinite().all()):
         raise InputError(f"codes of {coding.name} are not all finite")
+    warn_of_rank(coding, f"coding tensor {coding.name}", lost=int(_background(_matrix(coding)).any()))
     depth = _raw_depth(codes.reshape(-1, coding.codes), coding, sensor) - _bias_m(coding, sensor)
     return depth_in_range(depth, sensor).reshape(codes.shape[:-1])

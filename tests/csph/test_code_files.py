@@ -122,6 +122,21 @@ def test_codes_by_name_are_decoded(name):
         assert decoded_rank(coding) == codes - lost
 
 
+def test_codes_that_depend_on_each_other_are_told_once(caplog):
+    """Warned of where they came from a file, and not where a program made the coding tensor."""
+    sensor = Sensor(name="64 bins", bins=BINS, period_s=BINS * Sensor().bin_width_s)
+    waves = temporal_code("fourier", 6, BINS, sensor)
+    twice = CodingTensor("mine", torch.cat([waves, waves[:3]]))
+    for _ in range(2):
+        decode_depth(torch.ones(3, 9), twice, sensor)
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert told.startswith("coding tensor mine: its 9 codes have rank 6 where a uniform background is removed")
+    caplog.clear()
+    for name in FIXED_CODES:  # a background takes one number of gates and of random codes: no fault of theirs
+        decode_depth(torch.ones(3, 8), CodingTensor(name, temporal_code(name, 8, BINS, sensor)), sensor)
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
 def test_the_rank_is_that_of_the_codes_in_any_unit_and_above_a_background(scale):
     waves = temporal_code("fourier", 6, BINS, Sensor())
