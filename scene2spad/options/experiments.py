@@ -193,8 +193,8 @@ class Ultraphase(Common):
     or all where these are fewer)."""
     timestamps: File = None
     """Photons of the frame instead of a made-up return (run): timestamps of every core, a .npy of shape (N,) from 0 to
-    1023; or a histogram of `sense` (.h5) of 1,024 bins, whose pixels have a core each and give their photons in the order
-    of time."""
+    1023; or a histogram of `sense` (.h5) of 1024 bins, whose pixels have a core each and give their photons in the
+    order of time."""
     fps: tuple[float, ...] = (30.0,)
     """Frames a second (sweep)."""
     codes: tuple[int, ...] = ()

@@ -132,7 +132,9 @@ def test_sweep_lists_numbers_that_no_program_has_beside_those_that_do_not_fit(ca
     """An odd number ended the command without a row, where 34 was listed."""
     result = run(capfd, "ultraphase", "sweep", "--codes", "3", "9999", "34", "8", "--pixels", "4")
     assert {"fourier-8", "separable-8"} <= {row["name"] for row in result["rows"]}
-    assert list(result["refused"]) == [f"{kind}-{codes}" for codes in (3, 9999, 34) for kind in ("fourier", "separable")]
+    assert list(result["refused"]) == [
+        f"{kind}-{codes}" for codes in (3, 9999, 34) for kind in ("fourier", "separable")
+    ]
     assert "3 codes, expected an even number" in result["refused"]["fourier-3"]
 
 
