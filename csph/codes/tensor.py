@@ -30,8 +30,8 @@ class CodingTensor:
     steps     weight of one step of the temporal and of the spatial part where both are whole steps within +-127
               already, as those of a layer trained with `int8`; None for others
 
-    Both parts are copied, and kept in float32, also those given in float64 or 16 bits. Raises InputError for other shapes, values
-    that are not finite, or not in float32, and more codes than counts.
+    Both parts are copied, and kept in float32, also those given in float64 or 16 bits. Raises InputError for other
+    shapes, values that are not finite, or not in float32, and more codes than counts.
     """
 
     name: str
