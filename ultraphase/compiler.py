@@ -21,7 +21,7 @@ from ultraphase.assembly.program import Program
 from ultraphase.catalog import FOLDER, Method
 from ultraphase.chip import ChipSpec
 from ultraphase.integer_code import IntegerCode, folded_temporal
-from ultraphase.tables import block_matrix, quarter_wave
+from ultraphase.tables import block_matrix, int8_codes, quarter_wave, wave_matrix
 
 _EAST, _WEST, _SOUTH, _NORTH = 1, 2, 4, 8  # bits of a core's `ways`, as `sumblock.s` reads them
 
@@ -132,7 +132,7 @@ def _ways(block: tuple[int, int]) -> np.ndarray:
 
 def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
     """Return program and tables of a code. Raises InputError in one line that names the bytes needed and there, and
-    what would fit: fewer codes, a shorter block, or a table that the cores of a block share."""
+    what would fit: fewer codes, a shorter or longer block, or a table that the cores of a block share."""
     chip = chip or ChipSpec()
     known = chip.timestamps % code.bins == 0 and code.bins & (code.bins - 1) == 0
     require(known, f"code {code.name}: blocks of {code.bins} bins, expected a power of two up to {chip.timestamps}")
@@ -150,33 +150,66 @@ def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
 
 
 def _what_fits(code: IntegerCode, chip: ChipSpec) -> str:
-    """Say which change of one thing would make the code fit into the RAM."""
+    """Say which change of one thing would make the code fit into the core: its RAM, and its program store too."""
     cores, folded = code.block[0] * code.block[1], bool(code.harmonics)
 
     def fits(codes: int, bins: int, shared: int = 1) -> bool:
         weighted = code.spatial is not None
         found = layout(codes, bins, cores, chip, folded=folded, weighted=weighted, shared=shared)
-        return found.total <= chip.ram_bytes
+        if found.total > chip.ram_bytes or codes > bins * cores:
+            return False
+        return shared > 1 or _assembles(_sized(code, codes, bins), chip)
 
     found = []
-    fewer = max((k for k in range(1, code.codes) if fits(k, code.bins)), default=0)
+    fewer = next((k for k in range(code.codes - 1, 0, -1) if not (folded and k % 2) and fits(k, code.bins)), 0)
     if fewer:
         found.append(f"{fewer} code{'s' if fewer > 1 else ''} of {code.bins} bins")
-    shorter = [1 << n for n in range(2, code.bins.bit_length() - 1) if fits(code.codes, 1 << n)]
-    if shorter:
-        found.append(f"{code.codes} codes of blocks of {shorter[-1]} bins")
+    lengths = [1 << n for n in range(2, chip.timestamps.bit_length())]
+    shorter = [bins for bins in lengths if bins < code.bins and fits(code.codes, bins)]
+    longer = [bins for bins in lengths if bins > code.bins and fits(code.codes, bins)]
+    for bins in (*shorter[-1:], *longer[:1]):
+        found.append(f"{code.codes} code{'s' if code.codes > 1 else ''} of blocks of {bins} bins")
     if cores > 1 and not folded and fits(code.codes, code.bins, cores):
         found.append(f"its table shared by the {cores} cores of a block")
     if not folded and code.codes % 2 == 0 and _fourier_fits(code, cores, chip):
         found.append("a Fourier code of the same size")
     if found:
         return "would fit: " + ", or ".join(found)
-    return "neither fewer codes nor a shorter block nor a shared table nor a Fourier code of its size would fit"
+    return "neither fewer codes nor another block nor a shared table nor a Fourier code of its size would fit"
+
+
+def _sized(code: IntegerCode, codes: int, bins: int) -> IntegerCode | None:
+    """Make a code of another size and of any values, as the sizes alone decide about its program; None where so few
+    bins do not hold its harmonics."""
+    spatial = None if code.spatial is None else np.ones((codes, *code.block), np.int64)
+    if code.harmonics:
+        harmonics = code.harmonics[: codes // 2]
+        return _waves(code.name, harmonics, bins, spatial) if max(harmonics) < bins // 2 else None
+    own = () if code.temporal.ndim == 2 else code.block
+    return IntegerCode(code.name, np.ones((codes, bins, *own), np.int64), spatial)
+
+
+def _waves(name: str, harmonics: tuple[int, ...], bins: int, spatial: np.ndarray | None) -> IntegerCode:
+    quarter = int8_codes(np.cos(2 * np.pi * (np.arange(bins // 4) + 0.5) / bins))
+    return IntegerCode(name, wave_matrix(quarter, harmonics), spatial, harmonics)
 
 
 def _fourier_fits(code: IntegerCode, cores: int, chip: ChipSpec) -> bool:
     found = layout(code.codes, code.bins, cores, chip, folded=True, weighted=True)
-    return code.codes <= code.bins - 2 and found.total <= chip.ram_bytes
+    if code.codes > code.bins - 2 or found.total > chip.ram_bytes:
+        return False
+    spatial = None if cores == 1 else np.ones((code.codes, *code.block), np.int64)
+    return _assembles(_waves(code.name, tuple(range(1, code.codes // 2 + 1)), code.bins, spatial), chip)
+
+
+def _assembles(code: IntegerCode | None, chip: ChipSpec) -> bool:
+    if code is None:
+        return False
+    try:
+        _fastest(code, chip)
+    except InputError:
+        return False
+    return True
 
 
 def _counters(code: IntegerCode, chip: ChipSpec) -> Compiled:
@@ -201,6 +234,14 @@ def _matrix(code: IntegerCode, chip: ChipSpec) -> np.ndarray:
 
 
 def _program(code: IntegerCode, chip: ChipSpec) -> tuple[str, str, Program]:
+    """Assemble a code's text. Raises InputError that says how many codes the program store would hold."""
+    try:
+        return _fastest(code, chip)
+    except InputError as refused:
+        raise InputError(f"{refused}; would fit: {_fewer_codes(code, chip)} codes") from None
+
+
+def _fastest(code: IntegerCode, chip: ChipSpec) -> tuple[str, str, Program]:
     """Assemble the fastest text that the program store holds: all harmonics one after the other, else in a loop."""
     refused: InputError | None = None
     for turns in turns_of(code):
@@ -209,7 +250,8 @@ def _program(code: IntegerCode, chip: ChipSpec) -> tuple[str, str, Program]:
             return source, loop_order(code, turns), _assembled(source, code.name, chip)
         except InputError as error:
             refused = refused or error
-    raise InputError(f"{refused}; would fit: {_fewer_codes(code, chip)} codes")
+    assert refused is not None, "a code without a text"
+    raise refused
 
 
 def _assembled(source: str, name: str, chip: ChipSpec) -> Program:
@@ -221,9 +263,6 @@ def _fewer_codes(code: IntegerCode, chip: ChipSpec) -> int:
     for codes in range(code.codes - 2, 0, -2):
         spatial = None if code.spatial is None else code.spatial[:codes]
         less = replace(code, temporal=code.temporal[:codes], spatial=spatial, harmonics=code.harmonics[: codes // 2])
-        try:
-            _assembled(source_of(less, chip, 1), code.name, chip)
-        except InputError:
-            continue
-        return codes
+        if _assembles(less, chip):
+            return codes
     return 0

@@ -127,8 +127,12 @@ def test_the_fastest_loop_that_the_store_holds_is_taken():
         (learned(8, 256, (2, 2)), r"would fit: 1 code of 256 bins, or a Fourier code"),
         (learned(8, 64, (4, 4)), r"777 bytes .* would fit: 5 codes of 64 bins, or its table shared by the 16 cores"),
         (learned(2, 256), r"528 bytes .* would fit: 1 code of 256 bins, or 2 codes of blocks of 128 bins"),
-        (learned(127, 1024), r"neither fewer codes nor a shorter block nor a shared table nor a Fourier code"),
+        (learned(127, 1024), r"neither fewer codes nor another block nor a shared table nor a Fourier code"),
         (fourier((1, 2, 4, 8, 16, 32, 64, 128, 3, 5, 6, 7), 1024), r"over the 256 of the core; would fit: 22 codes"),
+        (learned(2, 4), r"sums 1,024\), 512 are there; would fit: 2 codes of blocks of 16 bins$"),
+        (fourier((1, 2, 3), 8), r"sums 1,536\), 512 are there; would fit: 6 codes of blocks of 32 bins$"),
+        (fourier(tuple(range(1, 16)), 32), r"would fit: 6 codes of 32 bins$"),
+        (fourier(tuple(range(1, 32)), 512), r"over the 256 of the core; would fit: 60 codes$"),
         (learned(2, 48), r"blocks of 48 bins, expected a power of two"),
     ],
 )
@@ -141,7 +145,24 @@ def test_what_does_not_fit_is_refused_with_what_would(code, message):
 def test_what_would_fit_does():
     for fewer in (learned(1, 256, (2, 2)), learned(5, 64, (4, 4)), learned(1, 256), learned(2, 128)):
         compile_code(fewer)
+    for longer in (learned(2, 16), fourier((1, 2, 3), 32), fourier(tuple(range(1, 31)), 512)):
+        compile_code(longer)
     compile_code(fourier((1, 2, 4, 8, 16, 32, 64, 128, 3, 5, 6), 1024))
+
+
+@pytest.mark.parametrize(("codes", "bins"), [(62, 512), (58, 512), (34, 1024), (38, 1024), (46, 1024), (32, 1024)])
+def test_a_fourier_code_is_suggested_where_its_program_fits(codes, bins):
+    """RAM alone was looked at: of 31 harmonics the program store holds no loop."""
+    with pytest.raises(InputError) as refusal:
+        compile_code(learned(codes, bins))
+    suggested = "a Fourier code of the same size" in str(refusal.value)
+    try:
+        compile_code(fourier(tuple(range(1, codes // 2 + 1)), bins))
+    except InputError:
+        assert not suggested
+    else:
+        assert suggested
+    assert suggested == (codes == 32)
 
 
 def test_a_larger_chip_takes_more():
