@@ -181,8 +181,8 @@ class Ultraphase(Common):
     define: tuple[str, ...] = ()
     """Constants of a source file, as NAME=VALUE; all behind one --define: --define K=8 SHIFT=7."""
     table: tuple[str, ...] = ()
-    """Contents of the tables of a source file, as NAME=FILE.npy with whole numbers of shape (count,), or (rows,
-    columns, count) for each core its own (run, verify)."""
+    """Contents of the tables of a source file, as NAME=FILE.npy with whole numbers of shape (count,) (run,
+    verify), or (rows, columns, count) for each core its own (run)."""
     out: File = None
     """File for the words (asm: one hexadecimal word a line), the listing (list; compile: with the tables) or the rows
     (table, sweep: .csv)."""

@@ -52,10 +52,11 @@ def program_of(command: Ultraphase) -> tuple[Program, Method | None]:
 
 
 def tables_of(
-    command: Ultraphase, program: Program, chosen: Method | None, shape: tuple[int, int]
+    command: Ultraphase, program: Program, chosen: Method | None, shape: tuple[int, int] | None
 ) -> dict[str, np.ndarray]:
-    """Return the contents of a program's tables for an array of cores: of a program of the package its own."""
-    if chosen is not None:
+    """Return the contents of a program's tables for an array of cores, or for one core alone (None): of a program of
+    the package its own."""
+    if chosen is not None and shape is not None:
         require(not command.table, f"{chosen.name} has its tables; contents by --table are for source files")
         weights = fixed_spatial(chosen)
         if weights is not None:
@@ -71,13 +72,14 @@ def tables_of(
     return tables
 
 
-def _table(program: Program, name: str, path: Path, shape: tuple[int, int]) -> np.ndarray:
+def _table(program: Program, name: str, path: Path, shape: tuple[int, int] | None) -> np.ndarray:
     region = program.region(name)
     require(region.table, f"--table {name}: {name} is RAM that {program.name} writes (.space), expected a .table")
     values = read_array(path)
-    shapes = ((region.count,), (*shape, region.count))
+    shapes = [(region.count,), *([] if shape is None else [(*shape, region.count)])]
     good = values.dtype.kind in "iu" and values.shape in shapes
-    what = f"whole numbers of shape ({region.count},), or {shapes[1]} for each core its own"
+    more = ": one core is verified" if shape is None else f", or {shapes[1]} for each core its own"
+    what = f"whole numbers of shape ({region.count},){more}"
     require(good, f"{path}: {values.dtype} {values.shape} for table {name} of {program.name}, expected {what}")
     limits = np.iinfo(KINDS[region.kind])
     low, high = int(values.min()), int(values.max())
