@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.errors import InputError, require, require_kind
+from scenes.errors import InputError, listed, require, require_kind
 from ultraphase.array import CoreArray, Frame
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.chip import ChipSpec
 from ultraphase.core import require_loadable
+from ultraphase.frame_end import words_put_out
 from ultraphase.products import photon_sums
 
 # What a photon finds in the registers, in the order of the states (see `verify`); from then on what the one before left
@@ -25,6 +26,7 @@ _WORDS = {
     "random": ", with random registers where photons change them",
 }
 _LONG_FRAME = 300  # photons
+_CORES_TO_END = 1024  # at the most, of the frames that are run to their end
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,9 @@ class Tabulated:
     saturates  (numbers,) bool: stays at `high` (then nothing is ever subtracted); otherwise wraps around
     clocks     (timestamps,) int64: clocks that the photon takes
     states     from how many different contents of RAM and registers each timestamp was run
+    puts_out   number in RAM, as `sum[0]`, that each word is which leaves a core at the frame's end, "" for any other;
+               None where cores send to their neighbours then, which no core alone can run
+    numbers    names of all numbers in RAM
     """
 
     program: str
@@ -45,6 +50,8 @@ class Tabulated:
     saturates: np.ndarray
     clocks: np.ndarray
     states: int
+    puts_out: tuple[str, ...] | None = None
+    numbers: tuple[str, ...] = ()
 
     def sums(self, histograms: np.ndarray) -> np.ndarray:
         """Add the photons of every pixel without a limit: counts (pixels, timestamps) of any integer type -> (pixels,
@@ -91,13 +98,18 @@ def verify(
     States: RAM all zero, all at the top, all at the bottom, random; of 8-bit counters every uniform value. Registers as
     a new frame has them up to its first photon, with zeros and with random numbers before it; as another photon left
     them; and 0 or random where any photon so far changed them. A photon goes on where the core waits for it, so that
-    what comes before the loop runs once a frame, and its clocks are none of the photon's. Last, whole frames.
+    what comes before the loop runs once a frame, and its clocks are none of the photon's. Last, whole frames, and
+    frames to their end (`Tabulated.puts_out`).
 
     Raises InputError if what a photon adds, or how long it takes, depends on the state; if the frame ends at a photon;
-    if the program changes a table, lets words out, or writes other than zeros before the first photon; and where it
-    differs from the matrix, saying at which timestamp and number.
+    if the program changes a table, lets words out, or writes other than zeros before the first photon; if a frame puts
+    out other words after another frame than at first; and where it differs from the matrix, saying at which timestamp
+    and number, or puts out other than the matrix' numbers in their order.
     """
     require_loadable(program, tables, "verify")
+    for name, values in (tables or {}).items():
+        alone = np.ndim(values) == 1
+        require(alone, f"verify: table {name} of shape {np.shape(values)}, expected (count,): one core is verified")
     chip = chip or ChipSpec()
     count = timestamps or ((program.timestamps or chip.timestamps) if matrix is None else matrix.shape[1])
     require(bool(program.state), f"program {program.name}: declares no .space, there is nothing to verify")
@@ -121,10 +133,15 @@ def verify(
             raise InputError(bench.not_additive(bad, before, after, added, slow) + _WORDS[registers])
         states += 1
     assert added is not None and clocks is not None, "a program that was run on no state"
-    found = Tabulated(program.name, added, low, high, saturates & ~wraps, clocks, states)
+    found = Tabulated(program.name, added, low, high, saturates & ~wraps, clocks, states, numbers=bench.names)
     bench.whole_frames(found)
     if matrix is not None:
         _compare(program, added, np.asarray(matrix))
+    array = CoreArray(program, (1, min(count, _CORES_TO_END)), tables, chip=chip)
+    found = replace(found, puts_out=words_put_out(program, array, found, bench.random))
+    if matrix is not None and found.puts_out not in (None, found.numbers):
+        words = listed(f"{word or 'no number'} as word {n}" for n, word in enumerate(found.puts_out or ())) or "nothing"
+        raise InputError(f"program {program.name}: its frame puts out {words}, expected {listed(found.numbers)}")
     return found
 
 
@@ -151,6 +168,7 @@ class _Bench:
         self.low, self.high = (
             np.array([getattr(np.iinfo(KINDS[kind]), end) for kind in kinds], np.int64) for end in ("min", "max")
         )
+        self.names = tuple(f"{region.name}[{n}]" for region in program.state for n in range(region.count))
         self.changed = np.zeros(len(array.registers), bool)
         self.tables = self._table_bytes()
 
@@ -190,7 +208,7 @@ class _Bench:
             core, number = np.argwhere(held != right)[0]
             raise InputError(
                 f"program {self.program.name} is not additive: {_LONG_FRAME} photons leave {held[core, number]} in "
-                f"{self._name(number)}, what each adds alone is {right[core, number]}"
+                f"{self.names[number]}, what each adds alone is {right[core, number]}"
             )
 
     def _begin(self, *, random: bool) -> None:
@@ -206,7 +224,7 @@ class _Bench:
         if held.any():
             core, number = np.argwhere(held)[0]
             raise InputError(
-                f"program {self.program.name}: {self._name(number)} is {held[core, number]} before the first photon of "
+                f"program {self.program.name}: {self.names[number]} is {held[core, number]} before the first photon of "
                 "a frame that begins with zeros"
             )
 
@@ -233,9 +251,6 @@ class _Bench:
         parts = [self.array.ram[:, region.address : region.end] for region in self.program.regions if region.table]
         return np.concatenate([self.array.ram[:, :0], *parts], axis=1)
 
-    def _name(self, number: int) -> str:
-        return [f"{region.name}[{n}]" for region in self.program.state for n in range(region.count)][number]
-
     def not_additive(
         self, bad: np.ndarray, before: np.ndarray, after: np.ndarray, added: np.ndarray, slow: np.ndarray
     ) -> str:
@@ -251,7 +266,7 @@ class _Bench:
         neither &= after[:, number] != (exact - low) % (high - low + 1) + low
         t = int(np.argmax(neither if neither.any() else wrong))
         return (
-            f"program {self.program.name} is not additive: timestamp {t} takes {self._name(number)} from "
+            f"program {self.program.name} is not additive: timestamp {t} takes {self.names[number]} from "
             f"{before[number]} to {after[t, number]}, from 0 to {added[t, number]}"
         )
 

@@ -83,6 +83,30 @@ def test_verify_takes_tables(capfd, folder, own_copy):
     assert run(capfd, "verify", *own_copy)["adds"] == {"least": -127, "most": 127}
 
 
+def test_verify_takes_the_table_of_one_core(capfd, folder, own_copy):
+    """The message asked for (1, 1, 256), and the next one for a row for each of 1024 cores."""
+    np.save(folder / "q.npy", np.tile(np.load(folder / "q.npy"), (2, 2, 1)))
+    (line,) = refused(capfd, "verify", *own_copy)
+    assert line.endswith("expected whole numbers of shape (256,): one core is verified")
+    (line,) = refused(capfd, "verify", "fourier-8", "--table", "quarter=q.npy")
+    assert "fourier-8 has its tables" in line
+
+
+def test_verify_says_what_it_knows_of_the_frames_end(capfd, folder, own_copy):
+    proof = run(capfd, "verify", *own_copy)
+    assert proof["verified"] and proof["puts_out"] == [f"codes[{n}]" for n in range(8)]
+    (folder / "a.s").write_text(SHORT + DRAIN)
+    (line,) = refused(capfd, "verify", "a.s")
+    assert "a.s: the same photons put out" in line and "its end leaves other than it found" in line
+    (folder / "a.s").write_text(SHORT + DRAIN.replace("HALT", "MOV r1, #0\nSTH [sum], r1\nHALT"))
+    assert main(["ultraphase", "verify", "a.s", "--json"]) == 0
+    out, err = capfd.readouterr()
+    assert err == "warning: a.s: photons are verified, the frame's end is not: no word is sum[1]\n"
+    assert json.loads(out)["verified"] is False and json.loads(out)["frame_end"] == "no word is sum[1]"
+    shipped = run(capfd, "verify", "separable-8")
+    assert shipped["verified"] and shipped["frame_end"] == "puts out all numbers, in every frame anew"
+
+
 def test_each_core_may_have_a_table_of_its_own(capfd, folder):
     (folder / "a.s").write_text(".table t, u8, 2\nLDB r1, [t + 1]\nOUTB r1\nHALT\n")
     np.save(folder / "t.npy", np.arange(8).reshape(2, 2, 2))

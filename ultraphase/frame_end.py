@@ -1,0 +1,100 @@
+"""What leaves the sensor at a frame's end: frames run to it one after the other, beside the sums of their photons."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scenes.errors import InputError, require
+from ultraphase.array import CoreArray, Frame
+from ultraphase.assembly.program import KINDS, Program
+from ultraphase.catalog import Method
+from ultraphase.tables import INT8_SCALE, spatial_sum
+
+if TYPE_CHECKING:
+    from ultraphase.verify import Tabulated
+
+LINKS = ("SEND", "RECV")
+_BRIGHT, _PHOTONS = 4, 300  # cores with so many photons; all others have one
+
+
+def words_put_out(
+    program: Program, array: CoreArray, found: Tabulated, random: np.random.Generator
+) -> tuple[str, ...] | None:
+    """Return the number in RAM that each word is which leaves a core at a frame's end, "" for another; None where cores
+    send to their neighbours.
+
+    Four frames run, of the same photons but for the third. Raises InputError where a frame puts out other words after
+    others than at first.
+    """
+    if any(one.name in LINKS for one in program.instructions):
+        return None
+    array.registers[:] = random.integers(-(1 << 31), 1 << 31, array.registers.shape)
+    one, other = (_photons(array.shape[1], found, random) for _ in range(2))
+    frames = [array.frame(stamps, offsets) for stamps, offsets, _ in (one, one, other, one)]
+    for later in (frames[1], frames[3]):
+        _require_same(program, frames[0], later)
+    cores = frames[0].out_cores[:, 1]
+    if not (frames[0].out.size and np.array_equal(cores, frames[2].out_cores[:, 1])):
+        return ()
+    words = np.concatenate([frames[0].out, frames[2].out])
+    numbers = np.concatenate([held[cores] for _, _, held in (one, other)])
+    return _named(program, words, numbers, found.numbers, int(frames[0].out_bits[0, cores[0]]))
+
+
+def _photons(cores: int, found: Tabulated, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Make photons of a row of cores: timestamps, offsets, and the numbers that each core then holds."""
+    count = len(found.table)
+    bright = min(cores, _BRIGHT)
+    lengths = np.where(np.arange(cores) < bright, _PHOTONS, 1)
+    single = random.permutation(count)[: cores - bright]
+    stamps = np.concatenate([random.integers(0, count, bright * _PHOTONS), single])
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    sums = np.add.reduceat(found.table[stamps], offsets[:-1], axis=0)
+    return stamps, offsets, found.limited(sums)
+
+
+def _require_same(program: Program, first: Frame, later: Frame) -> None:
+    where = f"program {program.name}: the same photons put out"
+    alike = first.out.shape == later.out.shape and np.array_equal(first.out_cores, later.out_cores)
+    require(alike, f"{where} {first.out.size} words, and {later.out.size} after another frame")
+    different = np.argwhere(first.out != later.out)
+    if len(different):
+        core, word = different[0]
+        values = f"{first.out[core, word]} as word {word}, and {later.out[core, word]} after another frame"
+        raise InputError(f"{where} {values}: its end leaves other than it found")
+
+
+def _named(
+    program: Program, words: np.ndarray, numbers: np.ndarray, names: tuple[str, ...], bits: int
+) -> tuple[str, ...]:
+    """Name the number that each word always is: words and numbers (frames x cores, ...); each number once, as far as
+    two are ever different."""
+    sizes = np.concatenate([np.full(part.count, 8 * KINDS[part.kind].itemsize) for part in program.state])
+    left, found = list(range(len(names))), []
+    for word in words.T:
+        off = (word[:, None] - numbers) % (1 << sizes)
+        same = np.flatnonzero(~off.any(axis=0)).tolist()
+        found.append(next((number for number in same if number in left), same[0] if same else -1))
+        left = [number for number in left if number != found[-1]]
+    narrow = bits < sum(int(sizes[number]) if number >= 0 else 8 for number in found)  # a word that lost its upper byte
+    return tuple("" if number < 0 or (narrow and sizes[number] > 8) else names[number] for number in found)
+
+
+def require_block_end(method: Method, temporal: np.ndarray, seed: int = 0) -> None:
+    """Raise InputError unless a block of the catalogue's cores puts out the weighted sum of its photons, for random
+    weights, and again after another frame. A method of single cores `verify` has run to the end."""
+    if method.block == (1, 1):
+        return
+    random, program = np.random.default_rng(seed), method.program()
+    cores, matrix = method.block[0] * method.block[1], method.matrix(temporal)
+    weights = random.integers(-INT8_SCALE, INT8_SCALE + 1, (*method.block, method.codes))
+    array = CoreArray(program, method.block, method.tables(temporal, weights))
+    one, other = (random.integers(0, matrix.shape[1], (cores, _PHOTONS)) for _ in range(2))
+    for stamps in (one, one, other, one):
+        frame = array.frame(stamps.reshape(-1), np.arange(cores + 1) * _PHOTONS)
+        sums = matrix[:, stamps].sum(axis=-1).T.reshape(cores, -1, method.codes)
+        right = spatial_sum(sums, weights.reshape(cores, method.codes)).reshape(1, -1)
+        same = np.array_equal(frame.out, right)
+        require(same, f"program {program.name}: a block of cores puts out other than the weighted sum of its photons")
