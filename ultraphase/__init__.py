@@ -11,7 +11,8 @@ from ultraphase.chip import ChipSpec
 from ultraphase.compiler import compile_code
 from ultraphase.core import Core
 from ultraphase.integer_code import IntegerCode
-from ultraphase.verify import Tabulated, verify
+from ultraphase.products import Tabulated
+from ultraphase.verify import verify
 
 __all__ = [
     "ChipSpec",

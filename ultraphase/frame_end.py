@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from scenes.errors import InputError, require
 from ultraphase.array import CoreArray, Frame
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.catalog import Method
+from ultraphase.products import Tabulated
 from ultraphase.tables import INT8_SCALE, spatial_sum
-
-if TYPE_CHECKING:
-    from ultraphase.verify import Tabulated
 
 LINKS = ("SEND", "RECV")
 _BRIGHT, _PHOTONS = 4, 300  # cores with so many photons; all others have one

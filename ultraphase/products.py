@@ -11,6 +11,7 @@ The plain form is `ultraphase.reference.add_photons`.
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -21,6 +22,58 @@ _EXACT_IN_FLOAT32, _EXACT_IN_FLOAT64, _EXACT_IN_INT64 = 1 << 24, 1 << 53, 1 << 6
 _CHUNK_BYTES = 1 << 19  # of histograms in bytes at a time: their floats, and all else, stay in a cache
 _LARGEST_BYTE = 127
 _ONE_THREAD = 1 << 18  # multiplications of a product that OpenBLAS does without threads, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Tabulated:
+    """A program whose photons each add a row of `table` to the numbers in its RAM, whatever these are.
+
+    table      (timestamps, numbers) int64: what a photon of that timestamp adds
+    low, high  range of the numbers, (numbers,)
+    saturates  (numbers,) bool: stays at `high` (then nothing is ever subtracted); otherwise wraps around
+    clocks     (timestamps,) int64: clocks that the photon takes
+    states     from how many different contents of RAM and registers each timestamp was run
+    puts_out   number in RAM, as `sum[0]`, that each word is which leaves a core at the frame's end, "" for any other;
+               None where cores send to their neighbours then, which no core alone can run
+    numbers    names of all numbers in RAM
+    """
+
+    program: str
+    table: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    saturates: np.ndarray
+    clocks: np.ndarray
+    states: int
+    puts_out: tuple[str, ...] | None = None
+    numbers: tuple[str, ...] = ()
+
+    def sums(self, histograms: np.ndarray) -> np.ndarray:
+        """Add the photons of every pixel without a limit: counts (pixels, timestamps) of any integer type -> (pixels,
+        numbers) int64, exact. Raises InputError as `photon_sums` does: for other bins, negative counts, and sums that
+        reach 2^63."""
+        require_kind(histograms, np.ndarray, f"sums of {self.program}")
+        held, count = histograms.shape, len(self.table)
+        wide = len(held) == 2
+        require(wide, f"histograms of shape {held}, expected (pixels, {count}), the timestamps of {self.program}")
+        require(held[1] == count, f"histograms of {held[1]} bins, {self.program} has {count} timestamps")
+        return photon_sums(histograms, self.table)
+
+    def frame(self, histograms: np.ndarray) -> np.ndarray:
+        """Return numbers in RAM at the end of a frame that began with zeros, (pixels, timestamps) -> (pixels, numbers)
+        int64: what the core holds after the same photons in any order."""
+        return self.limited(self.sums(histograms))
+
+    def limited(self, sums: np.ndarray) -> np.ndarray:
+        """Return sums as the RAM holds them: saturated or wrapped."""
+        if not self.overflowed(sums):
+            return sums
+        wrapped = (sums - self.low) % (self.high - self.low + 1) + self.low
+        return np.where(self.saturates, np.minimum(sums, self.high), wrapped)
+
+    def overflowed(self, sums: np.ndarray) -> int:
+        """Return how many sums the RAM cannot hold."""
+        return int(np.count_nonzero((sums < self.low) | (sums > self.high)))
 
 
 def photon_sums(histograms: np.ndarray, table: np.ndarray, *, in_bytes: bool = True) -> np.ndarray:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from scenes.errors import InputError, listed, require, require_kind
+from scenes.errors import InputError, listed, require
 from ultraphase.array import CoreArray, Frame
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.chip import ChipSpec
 from ultraphase.core import require_loadable
 from ultraphase.frame_end import words_put_out
-from ultraphase.products import photon_sums
+from ultraphase.products import Tabulated
 
 # What a photon finds in the registers, in the order of the states (see `verify`); from then on what the one before left
 _REGISTERS = ("new", "left", "uninitialised", "left", "zero", "random", "left")
@@ -27,58 +27,6 @@ _WORDS = {
 }
 _LONG_FRAME = 300  # photons
 _CORES_TO_END = 1024  # at the most, of the frames that are run to their end
-
-
-@dataclass(frozen=True, eq=False)
-class Tabulated:
-    """A program whose photons each add a row of `table` to the numbers in its RAM, whatever these are.
-
-    table      (timestamps, numbers) int64: what a photon of that timestamp adds
-    low, high  range of the numbers, (numbers,)
-    saturates  (numbers,) bool: stays at `high` (then nothing is ever subtracted); otherwise wraps around
-    clocks     (timestamps,) int64: clocks that the photon takes
-    states     from how many different contents of RAM and registers each timestamp was run
-    puts_out   number in RAM, as `sum[0]`, that each word is which leaves a core at the frame's end, "" for any other;
-               None where cores send to their neighbours then, which no core alone can run
-    numbers    names of all numbers in RAM
-    """
-
-    program: str
-    table: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    saturates: np.ndarray
-    clocks: np.ndarray
-    states: int
-    puts_out: tuple[str, ...] | None = None
-    numbers: tuple[str, ...] = ()
-
-    def sums(self, histograms: np.ndarray) -> np.ndarray:
-        """Add the photons of every pixel without a limit: counts (pixels, timestamps) of any integer type -> (pixels,
-        numbers) int64, exact. Raises InputError as `photon_sums` does: for other bins, negative counts, and sums that
-        reach 2^63."""
-        require_kind(histograms, np.ndarray, f"sums of {self.program}")
-        held, count = histograms.shape, len(self.table)
-        wide = len(held) == 2
-        require(wide, f"histograms of shape {held}, expected (pixels, {count}), the timestamps of {self.program}")
-        require(held[1] == count, f"histograms of {held[1]} bins, {self.program} has {count} timestamps")
-        return photon_sums(histograms, self.table)
-
-    def frame(self, histograms: np.ndarray) -> np.ndarray:
-        """Return numbers in RAM at the end of a frame that began with zeros, (pixels, timestamps) -> (pixels, numbers)
-        int64: what the core holds after the same photons in any order."""
-        return self.limited(self.sums(histograms))
-
-    def limited(self, sums: np.ndarray) -> np.ndarray:
-        """Return sums as the RAM holds them: saturated or wrapped."""
-        if not self.overflowed(sums):
-            return sums
-        wrapped = (sums - self.low) % (self.high - self.low + 1) + self.low
-        return np.where(self.saturates, np.minimum(sums, self.high), wrapped)
-
-    def overflowed(self, sums: np.ndarray) -> int:
-        """Return how many sums the RAM cannot hold."""
-        return int(np.count_nonzero((sums < self.low) | (sums > self.high)))
 
 
 def verify(
@@ -107,9 +55,7 @@ def verify(
     and number, or puts out other than the matrix' numbers in their order.
     """
     require_loadable(program, tables, "verify")
-    for name, values in (tables or {}).items():
-        alone = np.ndim(values) == 1
-        require(alone, f"verify: table {name} of shape {np.shape(values)}, expected (count,): one core is verified")
+    _require_one_core(tables)
     chip = chip or ChipSpec()
     count = timestamps or ((program.timestamps or chip.timestamps) if matrix is None else matrix.shape[1])
     require(bool(program.state), f"program {program.name}: declares no .space, there is nothing to verify")
@@ -140,9 +86,19 @@ def verify(
     array = CoreArray(program, (1, min(count, _CORES_TO_END)), tables, chip=chip)
     found = replace(found, puts_out=words_put_out(program, array, found, bench.random))
     if matrix is not None and found.puts_out not in (None, found.numbers):
-        words = listed(f"{word or 'no number'} as word {n}" for n, word in enumerate(found.puts_out or ())) or "nothing"
-        raise InputError(f"program {program.name}: its frame puts out {words}, expected {listed(found.numbers)}")
+        raise InputError(_other_words(found))
     return found
+
+
+def _require_one_core(tables: Mapping[str, np.ndarray] | None) -> None:
+    for name, values in (tables or {}).items():
+        alone = np.ndim(values) == 1
+        require(alone, f"verify: table {name} of shape {np.shape(values)}, expected (count,): one core is verified")
+
+
+def _other_words(found: Tabulated) -> str:
+    words = listed(f"{word or 'no number'} as word {n}" for n, word in enumerate(found.puts_out or ())) or "nothing"
+    return f"program {found.program}: its frame puts out {words}, expected {listed(found.numbers)}"
 
 
 def _states(low: np.ndarray, high: np.ndarray, random: np.random.Generator) -> Iterator[np.ndarray]:
