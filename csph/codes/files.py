@@ -71,7 +71,10 @@ def _text_parts(path: Path) -> dict[str, Tensor]:
 def _stated_parts(path: Path) -> dict[str, _Part]:
     parts: dict[str, _Part] = {}
     rows: list[list[str]] | None = None
-    for line in read_text(path, "table of codes").splitlines():
+    text = read_text(path, "table of codes")
+    cut = f"{path}: ends within a line, so that its last number may be cut short; end the last line, or write it again"
+    require(not text or text.endswith(("\n", "\r")), cut)
+    for line in text.splitlines():
         found = FACTOR.fullmatch(line.strip())
         if found:
             require(found[1] not in parts, f"{path}: states its {found[1]} part twice")
