@@ -59,6 +59,25 @@ def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> M
     return ModelLookup(found, absent)
 
 
+def found_only(wanted: Sequence[ModelSpec], command: Study) -> ModelLookup:
+    """Return models of --models (else of --out), then of the package, for a study that trains none and can do without
+    them.
+
+    Absent ones are named in one line. Raises InputError for a model of another configuration under a wanted name.
+    """
+    found = ModelRegistry(models_folder(command)).gather(wanted)
+    absent = [one for one in wanted if one not in found]
+    if absent:
+        log.warning("no trained %s: left out", ", ".join(one.name for one in absent))
+    _warn_if_unlike(found.values())
+    return ModelLookup(found, absent)
+
+
+def models_folder(command: Study) -> Path:
+    """Return the folder of runs that a study looks in before the package."""
+    return command.models or command.out / command.preset / "models"
+
+
 def other_seeds(wanted: Iterable[ModelSpec], command: Study) -> dict[ModelSpec, Trained]:
     """Look up the same models trained with OTHER_SEEDS. Missing ones are skipped, not trained or reported."""
     return where_trained([replace(one, seed=seed) for one in wanted for seed in OTHER_SEEDS], command)
@@ -71,7 +90,7 @@ def where_trained(wanted: Sequence[ModelSpec], command: Study) -> dict[ModelSpec
 
 def _library(command: Study) -> ModelRegistry:
     retrain = command.retrain or command.preset == "smoke"
-    return ModelRegistry(command.models or command.out / command.preset / "models", None if retrain else WEIGHTS)
+    return ModelRegistry(models_folder(command), None if retrain else WEIGHTS)
 
 
 def _warn_if_unlike(found: Iterable[Trained]) -> None:

@@ -41,6 +41,8 @@ WIDEST_OF_COLUMN = 6.5  # drawn wider than this [inches], a figure takes both co
 MIN_POINTS = 5  # of text in a column, the least that journals print
 MAX_GROWTH = 1.4
 _PDF_TOO: ContextVar[bool] = ContextVar("pdf too", default=False)
+_MARK: ContextVar[str] = ContextVar("mark", default="")
+MARK_FILLS = 0.9  # of the figure's width and height
 
 plt.rcParams["axes.prop_cycle"] = plt.cycler(color=[*COLOURS.values()])
 plt.rcParams["pdf.fonttype"] = 42  # text in a PDF stays text
@@ -126,9 +128,12 @@ def _fit_legends(figure: Figure, scale: float) -> None:
 
 def save(figure: Figure, path: Path) -> Path:
     """Letter a figure's panels and write it as PNG, or as PDF of a column's width where the path ends so, whole or not
-    at all. Within `with_pdf` a PNG has its PDF beside it. The same figure has the same bytes.
+    at all. Within `with_pdf` a PNG has its PDF beside it, and within `marked` words lie across it. The same figure has
+    the same bytes.
     """
     letter_panels(figure)
+    if _MARK.get():
+        _write_across(figure, _MARK.get())
     pdf = path.suffix.lower() == ".pdf"
     if not pdf:
         with whole_file(path) as beside:
@@ -149,3 +154,24 @@ def with_pdf(wanted: bool = True) -> Iterator[None]:
         yield
     finally:
         _PDF_TOO.reset(before)
+
+
+@contextmanager
+def marked(words: str) -> Iterator[None]:
+    """Write words across every figure that is saved within; none where they are empty."""
+    before = _MARK.set(words)
+    try:
+        yield
+    finally:
+        _MARK.reset(before)
+
+
+def _write_across(figure: Figure, words: str) -> None:
+    """Write words from a figure's lower left to its upper right, so that all of it is marked."""
+    angle = float(np.degrees(np.arctan2(*reversed(figure.get_size_inches()))))
+    text = figure.text(0.5, 0.5, words, ha="center", va="center", rotation=angle, zorder=1000)
+    text.set(color=COLOURS["vermilion"], alpha=0.3)
+    for _ in range(2):  # letters do not grow quite as their size does
+        box = text.get_window_extent()
+        room = min(figure.bbox.width / box.width, figure.bbox.height / box.height)
+        text.set_fontsize(MARK_FILLS * room * text.get_fontsize())

@@ -23,6 +23,8 @@ log = logging.getLogger("scene2spad")
 TIMINGS = "timings.jsonl"
 ALL = "all"
 JOURNAL = "study-all.jsonl"
+NO_PRESET = ("tensors", "memory", "codes")  # studies whose results are the same with every preset
+SMOKE_MARK = "smoke run: toy size or trained for seconds"
 
 
 def run(command: Study, progress: Progress) -> dict:
@@ -39,10 +41,19 @@ def run_one(command: Study, progress: Progress) -> dict:
     spec = find_spec(room)
     module = room if spec is None or spec.submodule_search_locations is None else f"{room}.study"
     start = time.perf_counter()
-    result = importlib.import_module(module).run(command, progress)
+    from scene2spad.plots.style import marked  # with matplotlib, which a dry run does without
+
+    with marked(mark_of(command)):
+        result = importlib.import_module(module).run(command, progress)
     took = {"study": command.name, "preset": command.preset, "seconds": round(time.perf_counter() - start, 3)}
     append_line(command.out / TIMINGS, json.dumps(took))
     return result
+
+
+def mark_of(command: Study) -> str:
+    """Return what is written across figures of a smoke run; nothing on those that the preset does not change."""
+    toy = command.preset == "smoke" and command.name not in NO_PRESET and not command.capture
+    return SMOKE_MARK if toy else ""
 
 
 def run_all(command: Study, progress: Progress) -> dict:

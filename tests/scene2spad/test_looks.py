@@ -12,7 +12,7 @@ from PIL import Image
 
 import scene2spad as s2s
 from scene2spad.plots.figures import save
-from scene2spad.plots.style import COLOURS, MIN_POINTS, fit_column, look, plt, with_pdf
+from scene2spad.plots.style import COLOURS, MIN_POINTS, fit_column, look, marked, plt, with_pdf
 from scenes.notebook import html_card
 
 
@@ -54,6 +54,22 @@ def test_several_panels_are_lettered_and_colour_bars_are_not(tmp_path):
         figure.colorbar(panels[0, 0].imshow(np.zeros((2, 2))), ax=panels[0, 0])
         save(figure, tmp_path / "figure.png")
         assert [text.get_text() for panel in figure.axes for text in panel.texts] == letters
+
+
+def test_a_mark_lies_across_what_is_saved_within(tmp_path):
+    """And within the figure, whatever its shape."""
+    for size in ((3, 5), (12, 4)):
+        figure = plt.figure(figsize=size)
+        with marked("smoke run"):
+            save(figure, tmp_path / "figure.png")
+        figure.canvas.draw()
+        (mark,) = figure.texts
+        box = mark.get_window_extent()
+        assert mark.get_text() == "smoke run"
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
+    figure = plt.figure()
+    save(figure, tmp_path / "figure.png")
+    assert not figure.texts
 
 
 @pytest.mark.parametrize(("drawn", "inches"), [((6, 4), 3.5), ((14, 7), 7.16)])

@@ -8,19 +8,17 @@ and by emulation with arrival times at S.2's.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 
-from csph.weights.shipped import WEIGHTS
 from render.transient import Transient
 from scene2spad.emulation.emulated_chain import by_torch, decode
 from scene2spad.networks.published import PUBLISHED as PUBLISHED_ERRORS
-from scene2spad.networks.registry import ModelRegistry
+from scene2spad.networks.registry import ModelSpec, Trained
 from scene2spad.studies.chip.chain import ChipDepth, core_tables, measured
 from scene2spad.studies.chip.code import compile_model
-from scene2spad.studies.chip.plan import MAIN, OTHERS, TRAINED_FOR_CHIP
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense
@@ -68,15 +66,10 @@ class Design:
         return decode(by_torch(histogram.counts, self.coarse), self.coarse, histogram.sensor)
 
 
-def designs(folder: Path) -> tuple[list[Design], list[str]]:
-    """Return trained designs of a folder of runs, else of the package, and coarse histograms; and the names of absent
-    ones."""
-    library, found, absent = ModelRegistry(folder, WEIGHTS), [], []
-    for wanted in (*MAIN, *TRAINED_FOR_CHIP, *OTHERS):
-        trained = library.find(wanted)
-        if trained is None:
-            absent.append(wanted.name)
-            continue
+def designs(models: Mapping[ModelSpec, Trained]) -> list[Design]:
+    """Return trained designs, compiled for the chip, and coarse histograms."""
+    found = []
+    for wanted, trained in models.items():
         chip = ChipDepth.of(compile_model(trained.model, wanted.name))
         compiled, clocks = chip.chip.compiled, chip.fast.proofs[0][0].clocks
         codes, parts = compiled.code.codes, (compiled.program, core_tables(compiled))
@@ -87,7 +80,7 @@ def designs(folder: Path) -> tuple[list[Design], list[str]]:
         clocks = np.array([cost.clocks_per_photon])
         title = f"coarse histogram, K = {one.codes}"
         found.append(Design(title, one.codes, cost, clocks, one.program(), {}, coarse=one))
-    return found, absent
+    return found
 
 
 def front_rows(found: list[Design], transient: Transient, seed: int, progress: Progress) -> list[dict[str, object]]:

@@ -14,11 +14,13 @@ from matplotlib.axes import Axes
 from render.engine import render
 from scene2spad.emulation.emulated_chain import Emulated, by_torch, decode, emulate, shared_core_depths
 from scene2spad.emulation.program_tables import all_costs, int8_temporal
+from scene2spad.networks.lookup import found_only
 from scene2spad.options.experiments import Study
 from scene2spad.plots import figures
 from scene2spad.plots.figures import DEPTH_COLOURS, plt
 from scene2spad.studies.power.front import designs, front_rows, loss_rows, printed_rows
 from scene2spad.studies.power.front_figure import draw_front
+from scene2spad.studies.power.plan import WANTED
 from scenes.errors import InputError, require
 from scenes.files import read_arrays, whole_file, write_csv
 from scenes.library.catalog import load_scene
@@ -60,7 +62,8 @@ def run(command: Study, progress: Progress) -> dict:
     with whole_file(out / "ultraphase.csv") as beside:
         beside.write_text(as_csv(printed))
     errors = {name: _errors(depth, dim) for name, depth in shared.items()}
-    found, absent = designs(command.models or out / command.preset / "models")
+    models = found_only(WANTED, command)
+    found = designs(models.found)
     front = front_rows(found, transient, command.seed, progress)
     losses, print_points = loss_rows(found, command.seed, progress), printed_rows()
     write_csv(front, out / "ultraphase-front.csv")
@@ -78,7 +81,7 @@ def run(command: Study, progress: Progress) -> dict:
         "front": front,
         "lost_photons": losses,
         "front_published": print_points,
-        "front_absent": absent,
+        "front_absent": [one.name for one in models.absent],
         "spatial_weights": SPATIAL,
         "readings": READINGS,
         "figures": [str(path) for path in drawn],

@@ -26,8 +26,8 @@ from render.engine import render
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
 from scene2spad.bench.rendering.references import key_of
-from scene2spad.networks.lookup import ModelLookup, obtain
-from scene2spad.networks.registry import EvaluatedModel, ModelRegistry
+from scene2spad.networks.lookup import ModelLookup, found_only, obtain
+from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.networks.results import Store
 from scene2spad.networks.test_sets import TestSet, evaluated
 from scene2spad.networks.training import baseline
@@ -113,12 +113,7 @@ def _models(command: Study, progress: Progress) -> ModelLookup:
     """Trained models, where there are any: this study has something to say without them."""
     if command.retrain:
         return obtain(MODELS, command, progress)
-    library = ModelRegistry(command.models or command.out / command.preset / "models")
-    found = library.gather(MODELS)
-    absent = [one for one in MODELS if one not in found]
-    if absent:
-        log.warning("no trained %s: left out", ", ".join(one.name for one in absent))
-    return ModelLookup(found, absent)
+    return found_only(MODELS, command)
 
 
 def contenders_of(plan: Plan, models: ModelLookup) -> list[Contender]:
