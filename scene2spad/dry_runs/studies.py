@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
+from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import shipped_file
 from scene2spad.dry_runs.resources import memory
 from scene2spad.dry_runs.training import step_seconds
+from scene2spad.networks.lookup import OTHER_SEEDS, models_folder
 from scene2spad.networks.registry import ModelSpec
 from scene2spad.networks.training import PLANES, config_of
 from scene2spad.options.experiments import ABLATIONS, Study
@@ -17,13 +21,14 @@ from scenes.io.inputs import read_whole_lines
 
 
 def dry_run(command: Study) -> dict:
-    """Return models, kept results, memory and seconds of one study, as far as they are known."""
+    """Return models, kept results, memory and seconds of one study, as far as they are known. InputError for a network
+    that is given and is not there."""
     wanted = wanted_models(command)
     folder = command.out / command.preset
-    library = command.models or folder / "models"
-    trains = command.retrain or command.preset == "smoke"
-    there = [one.name for one in wanted if _is_there(one, library, shipped=not trains)]
-    missing = [one for one in wanted if one.name not in there]
+    trains = trains_models(command)
+    there, missing = _found(wanted, command, shipped=not trains)
+    beside, _ = _found(models_beside(command), command, shipped=not trains)
+    given = given_networks(command)
     to_train = missing if trains else []
     training_s = sum(_training_seconds(one, command.preset) for one in to_train)
     earlier = recorded_seconds(command)
@@ -38,7 +43,7 @@ def dry_run(command: Study) -> dict:
         "study": command.name,
         "preset": command.preset,
         "models": {
-            "there": there,
+            "there": [*(one.name for one in (*there, *beside)), *given],
             "to_train": [one.name for one in to_train],
             "left_out": [one.name for one in missing if one not in to_train],
         },
@@ -50,8 +55,39 @@ def dry_run(command: Study) -> dict:
     }
 
 
+def trains_models(command: Study) -> bool:
+    """Return whether a study trains what it does not find: with --retrain, and where `smoke` has models of its own."""
+    if command.name in ("transport", "power"):
+        return command.name == "transport" and command.retrain
+    return command.retrain or command.preset == "smoke"
+
+
+def given_networks(command: Study) -> list[str]:
+    """Return the networks that a study of given ones is given. Raises InputError for one that is not there."""
+    if command.name not in ("real-data", "render-error"):
+        return []
+    for one in command.checkpoints:
+        checkpoint_of(one)
+    return [str(one) for one in command.checkpoints]
+
+
+def models_beside(command: Study) -> list[ModelSpec]:
+    """Return the models that a study puts beside those that it asks for, where they are there."""
+    if command.name == "multipath":
+        from scene2spad.studies.multipath.plan import DELAYED, MIXED
+
+        return [*MIXED, *DELAYED]
+    if command.name not in ABLATIONS:
+        return []
+    from scene2spad.studies.ablations.plan import CLAIMS
+
+    claimed = dict.fromkeys(one for claim in CLAIMS[command.name] for one in (claim.first, claim.second))
+    again = [replace(one, seed=seed) for one in claimed for seed in OTHER_SEEDS]
+    return [*again, *(replace(one, trained_on="published") for one in wanted_models(command))]
+
+
 def wanted_models(command: Study) -> list[ModelSpec]:
-    """Return the trained models that a study asks for; none of those that need none."""
+    """Return the trained models that a study asks for; none of those that need none, or are given them."""
     found: tuple[ModelSpec, ...] = ()
     if command.name in ABLATIONS:
         from scene2spad.studies.ablations.plan import sheets_of
@@ -72,8 +108,10 @@ def wanted_models(command: Study) -> list[ModelSpec]:
         found = tdc_plan(command.preset).wanted
     elif command.name == "multipath":
         from scene2spad.studies.multipath.plan import MODELS as found
-    elif command.name == "transport" and command.retrain:
+    elif command.name == "transport":
         from scene2spad.studies.transport.plan import MODELS as found
+    elif command.name == "power":
+        from scene2spad.studies.power.plan import WANTED as found
     return list(dict.fromkeys(found))
 
 
@@ -88,8 +126,14 @@ def recorded_seconds(command: Study) -> list[float]:
     return found
 
 
-def _is_there(one: ModelSpec, library: Path, *, shipped: bool) -> bool:
-    return (library / one.name / "model.safetensors").is_file() or (shipped and shipped_file(one.name).is_file())
+def _found(wanted: Sequence[ModelSpec], command: Study, *, shipped: bool) -> tuple[list[ModelSpec], list[ModelSpec]]:
+    """Those that are there, in the folder of runs or (`shipped`) in the package, and those that are not."""
+
+    def is_there(one: ModelSpec) -> bool:
+        run = models_folder(command) / one.name / "model.safetensors"
+        return run.is_file() or (shipped and shipped_file(one.name).is_file())
+
+    return [one for one in wanted if is_there(one)], [one for one in wanted if not is_there(one)]
 
 
 def _training_seconds(one: ModelSpec, preset: TrainingPreset) -> float:

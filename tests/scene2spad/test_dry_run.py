@@ -149,6 +149,20 @@ def test_a_dry_study_tells_models_and_recorded_runs(capfd, folder):
     assert [one["study"] for one in said["studies"]] == list(STUDIES)
 
 
+def test_a_dry_study_lists_what_it_would_find_and_what_it_is_given(capfd, folder):
+    """Also of studies that train nothing, of models put beside those asked for, and of networks that are given."""
+    for name, one in (("transport", "gray-1024x1x1-128x-s0"), ("power", "fourier-1024x1x1-64x-s0"),
+                      ("multipath", "none-mixed-s0"), ("fourier", "learned-256x4x4-128x-s1")):  # fmt: skip
+        said = answer(capfd, "study", name, "--dry-run")["models"]
+        assert one in said["there"] and said["to_train"] == []
+    said = answer(capfd, "study", "transport", "--dry-run", "--retrain")["models"]
+    assert said["there"] == [] and "gray-1024x1x1-128x-s0" in said["to_train"]
+    for name in ("real-data", "render-error"):
+        assert answer(capfd, "study", name, "--checkpoints", "none-s0", "--dry-run")["models"]["there"] == ["none-s0"]
+        assert main(["study", name, "--checkpoints", "nowhere", "--dry-run"]) == 2
+    assert files(folder) == []
+
+
 @pytest.fixture
 def studies(monkeypatch, tmp_path):
     """Studies that only note that they were run; one lacks its data."""
