@@ -2,6 +2,7 @@
 
 import ast
 import re
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -161,3 +162,66 @@ def test_random_streams_have_numbers_of_their_own():
     assert twice == {"VIEW", "ZONES", "COUPLED"}
     stages = [node for tree in FILES.values() for node in ast.walk(tree) if isinstance(node, ast.Name)]
     assert not [node.id for node in stages if node.id.startswith("STAGE_")]
+
+
+def imported(tree: ast.Module) -> set[str]:
+    """Dotted names of all that a module imports, wherever in it; of `from a import b` both a and a.b."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {one.name for one in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
+    return names
+
+
+def imports_between_folders(trees: dict[str, ast.Module]) -> dict[str, set[str]]:
+    """Which folders each folder imports from; not what `__init__` gathers, nor of a folder and one that holds it.
+
+    `trees` by the modules' dotted names, those of `__init__` too (`scenes.io.inputs`, `scenes.io.__init__`).
+    """
+    folders = {name: name.rpartition(".")[0] for name in trees}
+    folders |= {folder: folder for folder in folders.values()}
+    graph: dict[str, set[str]] = {}
+    for name, tree in trees.items():
+        if not name.endswith(".__init__"):
+            here = folders[name]
+            there = {folders[one] for one in imported(tree) if one in folders}
+            apart = {one for one in there if not f"{one}.".startswith(f"{here}.") and not here.startswith(f"{one}.")}
+            graph[here] = graph.get(here, set()) | apart
+    return graph
+
+
+def import_cycle(graph: dict[str, set[str]]) -> list[str]:
+    """Folders that import each other round about, the first of them at the end again; empty where none do."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_folders_import_each_other_in_one_direction():
+    graph = imports_between_folders(
+        {of(path).removesuffix(".py").replace("/", "."): tree for path, tree in FILES.items()}
+    )
+    assert len(graph) > 30 and "scenes" in graph["render"]
+    assert not import_cycle(graph)
+
+
+def test_the_rule_of_directions_knows_a_cycle():
+    """Also where an import stands in a function; a folder's own parts, and what `__init__` gathers, are none."""
+    sources = {
+        "p.__init__": "from p.a import one\nfrom p.b.two import two",
+        "p.a.one": "from p import b\nimport p.top",
+        "p.a.deep.three": "from p.a.one import one",
+        "p.b.two": "import math",
+        "p.top": "from p.a.one import one",
+    }
+    trees = {name: ast.parse(text) for name, text in sources.items()}
+    assert imports_between_folders(trees) == {"p.a": {"p.b"}, "p.a.deep": set(), "p.b": set(), "p": set()}
+    assert not import_cycle(imports_between_folders(trees))
+    trees["p.b.two"] = ast.parse("def f():\n    from p.a.deep.three import three")
+    assert not import_cycle(imports_between_folders(trees))  # p.a.deep imports p.a, which holds it
+    trees["p.b.two"] = ast.parse("def f():\n    from p.a import one")
+    assert {*import_cycle(imports_between_folders(trees))} == {"p.a", "p.b"}
