@@ -13,7 +13,7 @@ from csph.networks.config import ModelConfig, preset
 from csph.networks.model import DepthModel, save_model
 from scene2spad.cli import main
 from scene2spad.studies.real_data import study as real_data
-from scene2spad.studies.real_data.figures import View, directions, projected, raw_cloud
+from scene2spad.studies.real_data.figures import View, directions, error_words, projected, raw_cloud
 from scenes.library.catalog import load_scene
 from spad.formats.linospad import read_linospad, resampled_sensor
 from spad.sensor.model import Sensor
@@ -111,6 +111,14 @@ def test_networks_see_bins_and_tiles(folder):
         whole = model.depth_m(counts.permute(2, 0, 1)[None, None])[0] * (sensor.bin_depth_m / Sensor().bin_depth_m)
     assert torch.allclose(real_data.network(model)(counts, sensor), whole, atol=1e-5)
     assert torch.allclose(real_data.network(model, tile=8)(counts, sensor), whole, atol=1e-4)
+
+
+def test_a_caption_says_over_how_many_pixels_its_error_is():
+    found = {"mae_mm": 12.3, "within_10mm": 0.5, "pixels": 17}
+    expected = "MAE 12 mm, 50% < 10 mm\nover 17 of 256 pixels"
+    assert error_words(found, 256, mixed=True) == f"{expected}\n(mixed ones left out)"
+    assert error_words(found, 256, mixed=False) == expected
+    assert error_words({**found, "pixels": 0}, 256, mixed=True) == ""
 
 
 def test_clouds_lie_where_the_camera_looks():

@@ -148,7 +148,15 @@ def _error(view: View, depth: np.ndarray | None, label: str) -> str:
     if view.depth_m is None or depth is None or label == "truth":
         return ""
     found = depth_errors(depth, view.depth_m, range_m=view.sensor.recorded_range_m, exclude=view.mixed)
-    return f"MAE {found['mae_mm']:.0f} mm,\n{found['within_10mm']:.0%} < 10 mm" if found["pixels"] else ""
+    return error_words(found, depth.size, mixed=view.mixed is not None)
+
+
+def error_words(found: dict, size: int, *, mixed: bool) -> str:
+    """Write the errors of a map of `size` pixels, and over how many of them; nothing where there is none."""
+    if not found["pixels"]:
+        return ""
+    over = f"over {found['pixels']:,} of {size:,} pixels" + ("\n(mixed ones left out)" if mixed else "")
+    return f"MAE {found['mae_mm']:.0f} mm, {found['within_10mm']:.0%} < 10 mm\n{over}"
 
 
 def _wrapped(label: str) -> str:
