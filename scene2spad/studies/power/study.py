@@ -18,7 +18,7 @@ from scene2spad.networks.lookup import found_only
 from scene2spad.options.experiments import Study
 from scene2spad.plots import figures
 from scene2spad.plots.figures import DEPTH_COLOURS, plt
-from scene2spad.studies.power.front import designs, front_rows, loss_rows, printed_rows
+from scene2spad.studies.power.front import absolute_errors, designs, front_rows, loss_rows, printed_rows
 from scene2spad.studies.power.front_figure import draw_front
 from scene2spad.studies.power.plan import WANTED
 from scenes.errors import InputError, require
@@ -26,7 +26,6 @@ from scenes.files import read_arrays, whole_file, write_csv
 from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 from spad.detection.detect import sense
-from spad.estimators.depth import histogram_errors
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, sensor_by_name
 from ultraphase import Method, method
@@ -90,10 +89,8 @@ def run(command: Study, progress: Progress) -> dict:
 
 
 def _errors(depth: np.ndarray, histogram: Histogram) -> dict:
-    found = histogram_errors(depth, histogram)
-    return {name: found[name] for name in ("mae_mm", "within_10mm")} | {
-        "median_mm": float(1e3 * np.nanmedian(np.abs(depth - histogram.depth_m)))
-    }
+    found = absolute_errors(depth, histogram)
+    return {name: found[name] for name in ("mae_mm", "within_10mm", "median_abs_mm")}
 
 
 def _depths(histogram: Histogram, out: Path, progress: Progress) -> tuple[dict[str, np.ndarray], list[dict]]:
@@ -187,7 +184,7 @@ def draw_depths(histogram: Histogram, depths: dict[str, np.ndarray], rows: list[
     errors = {row["name"]: row for row in rows}
     titles = {
         name: f"{name}: {errors[name]['bytes_per_pixel']:.0f} B a pixel\n"
-        f"MAE {errors[name]['mae_mm']:.0f} mm, median {errors[name]['median_mm']:.0f} mm\n"
+        f"MAE {errors[name]['mae_mm']:.0f} mm, median of |error| {errors[name]['median_abs_mm']:.0f} mm\n"
         f"{errors[name]['wraps']:,} wraps, {errors[name]['saturations']:,} saturations"
         for name in depths
     }
@@ -197,7 +194,7 @@ def draw_depths(histogram: Histogram, depths: dict[str, np.ndarray], rows: list[
 
 def _draw_shared(histogram: Histogram, depths: dict, errors: dict, path: Path) -> Path:
     titles = {
-        name: f"{name}\nMAE {errors[name]['mae_mm']:.0f} mm, median {errors[name]['median_mm']:.0f} mm"
+        name: f"{name}\nMAE {errors[name]['mae_mm']:.0f} mm, median of |error| {errors[name]['median_abs_mm']:.0f} mm"
         for name in depths
     }
     level = f"{histogram.budget.signal:g} signal and {histogram.budget.background:g} background photons a SPAD"
