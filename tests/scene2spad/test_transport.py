@@ -243,6 +243,23 @@ def test_the_table_has_the_change_by_each_step():
     assert change["ambient", "fourier-8"] == 0
 
 
+def test_an_interval_of_an_error_ends_at_0():
+    """Student's of two scenes, one hard and one easy, reaches below."""
+    rows = [Row("gray-8", f"s{i}", i, *LEVELS[0], "all", mae, mae, 0, 0, 0, 0, 1, 9, 0, 0)
+            for i, mae in enumerate((5.0, 600.0))]  # fmt: skip
+    (one,) = [c for c in contenders() if c.name == "gray-8"]
+    every = {(laser, step): rows for laser in LASERS for step in STEPS}
+    for line in transport_tables.summary(every, [one]):
+        assert line["mae_low"] == 0 and line["mae_high"] > 4000 and line["mae_mm"] == 302.5
+
+
+@pytest.mark.parametrize(
+    ("part", "words"), [(0.5, "50.0%"), (0.996, "99.6%"), (0.9998, "99.98%"), (1.0, "100%"), (-0.2, "-20.0%")]
+)
+def test_nearly_all_is_not_called_all(part, words):
+    assert transport_tables.part_saved(part) == words
+
+
 def test_codes_are_ranked_among_their_own():
     plan, models = PLANS["laptop"], ModelLookup({}, [])
     kinds = {one.name: (one.decoder, one.compression) for one in transport.contenders_of(plan, models)}

@@ -10,9 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import PercentFormatter, SymmetricalLogLocator
 
 from csph.evaluation.methods import Evaluation, Row
+from scene2spad.networks.intervals import interval_of
 from scene2spad.plots.figures import plain_log, plt, save
 from scene2spad.plots.style import COLOURS, look
 from scene2spad.studies.transport.plan import KEPT, LASERS, LATER, LEVELS, LIMIT, OPEN, REVERSED, STEPS
+from scene2spad.studies.transport.tables import part_saved
 from scenes.json_types import JsonObject
 
 LABELS = [label.replace(", ", ",\n") for label in STEPS.values()]
@@ -48,7 +50,7 @@ def draw_steps(summary: Sequence[JsonObject], rows: Mapping[tuple[str, str], Seq
 
 def _at_level(rows: Sequence[Row], design: str, signal: float, background: float) -> tuple[float, float, float] | None:
     chosen = [row for row in rows if (row.signal, row.background) == (signal, background)]
-    return Evaluation(chosen).interval([design])
+    return interval_of(Evaluation(chosen), [design])
 
 
 def _curve(axes: Axes, intervals: Sequence[tuple[float, float, float]], number: int, label: str, of: int) -> None:
@@ -120,18 +122,17 @@ def draw_planned(planned: Sequence[JsonObject], scenes: Sequence[JsonObject], pa
     left.invert_yaxis()
     left.set_xlabel("MAE on the planned render over that on the full one, - 1")
     left.set_title("error: bars are 95 % over draws of photons, most of which both renders share", fontsize=9)
-    left.legend(fontsize=8)
     place = np.arange(len(names))
-    right.barh(place - 0.18, [one["full_rays"] for one in scenes], 0.34, color="0.7", label="full")
+    right.barh(place - 0.18, [one["full_rays"] for one in scenes], 0.34, color="0.7", label="rays of the full render")
     bars = right.barh(
-        place + 0.18, [one["planned_rays"] for one in scenes], 0.34, color=COLOURS["blue"], label="planned"
+        place + 0.18, [one["planned_rays"] for one in scenes], 0.34, color=COLOURS["blue"], label="of the planned one"
     )
-    right.bar_label(bars, [f"{one['rays_saved']:.0%} saved" for one in scenes], fontsize=7, padding=2)
+    right.bar_label(bars, [f"{part_saved(one['rays_saved'])} saved" for one in scenes], fontsize=7, padding=2)
     right.set_xscale("log")
     right.set_xlim(0.3 * min(one["planned_rays"] for one in scenes), 4 * max(one["full_rays"] for one in scenes))
     right.set_xlabel("rays of laser light (ambient light apart)")
     right.set_title("work", fontsize=9)
-    right.legend(fontsize=8, loc="lower right")
+    figure.legend(loc="outside lower center", ncols=6, fontsize=8)
     left.xaxis.set_major_formatter(PercentFormatter(1.0))
     for axes in (left, right):
         axes.grid(alpha=0.3, axis="x")

@@ -36,7 +36,7 @@ from scene2spad.studies.real_data.study import sun_and_sky
 from scene2spad.studies.transport import figures
 from scene2spad.studies.transport.plan import CHECKED, LASERS, LEVELS, LIMIT, MODELS, PLANS, STEPS, UNCOMPRESSED, Plan
 from scene2spad.studies.transport.planned_renders import Place, planned_conclusions, planned_rows
-from scene2spad.studies.transport.tables import Contender, Rows, conclusions, ranking, summary
+from scene2spad.studies.transport.tables import Contender, Rows, conclusions, part_saved, ranking, summary
 from scenes.errors import InputError, require
 from scenes.files import append_line, finite, whole_file, write_csv
 from scenes.io.inputs import read_whole_lines
@@ -254,7 +254,7 @@ def _log_saved(scenes: Sequence[dict], seconds: Mapping[tuple[str, str], Mapping
     for one in scenes:
         taken = seconds.get((one["scene"], one["laser"]), {})
         message = "{planned:.1f} s instead of {full:.1f} s".format(**taken) if len(taken) == 2 else "seconds not known"
-        rays = f"{one['rays_saved']:.1%} of {one['full_rays']:.3g} rays saved"
+        rays = f"{part_saved(one['rays_saved'])} of {one['full_rays']:.3g} rays saved"
         log.info("%s, %s: the plan: %s; %s", one["scene"], one["laser"], rays, message)
 
 
@@ -274,7 +274,7 @@ def _summary(numbers: JsonObject) -> dict[str, list[str]]:
     ]
     saved = {(s["scene"], s["laser"]): s["rays_saved"] for s in numbers["scenes"]}
     plans = [
-        f"{c['scene']}, {c['laser']}: {saved[c['scene'], c['laser']]:.1%} of the rays saved; MAE off by "
+        f"{c['scene']}, {c['laser']}: {part_saved(saved[c['scene'], c['laser']])} of the rays saved; MAE off by "
         f"{c['difference']:+.2%} +- {c['uncertain']:.2%} at most ({c['design']}), under {LIMIT:.0%}: {c['verdict']}"
         for c in numbers["planned_conclusions"]
     ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from csph.evaluation.methods import LEVEL_GROUPS, PIXELS, Evaluation, Row
 from csph.evaluation.metrics import Interval, paired_difference
+from scene2spad.networks.intervals import interval_of
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.studies.transport.plan import FIRST, KEPT, LASERS, LATER, OPEN, REVERSED, STEPS
 from scenes.json_types import JsonObject
@@ -29,6 +30,14 @@ class Contender:
     @property
     def name(self) -> str:
         return self.subject.name
+
+
+def part_saved(part: float) -> str:
+    """Return a part as a percentage, with as many decimals, up to four, as tell it from all."""
+    for decimals in range(1, 5):
+        if (words := f"{part:.{decimals}%}") != f"{1:.{decimals}%}":
+            return words
+    return "100%"
 
 
 def order(interval: Interval) -> int | None:
@@ -132,7 +141,7 @@ def _lines(here: Sequence[Row], before: Sequence[Row] | None, name: str) -> Iter
     for levels in LEVEL_GROUPS:
         for pixels in PIXELS:
             values = Evaluation(list(here))
-            interval = values.interval([name], pixels, levels)
+            interval = interval_of(values, [name], pixels=pixels, levels=levels)
             if interval is None:
                 continue
             line = {"levels": levels, "pixels": pixels, "mae_mm": interval.mean, "mae_low": interval.low,
