@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,9 +21,9 @@ from scene2spad.networks import published
 from scene2spad.networks.registry import EvaluatedModel, ModelRegistry, ModelSpec
 from scene2spad.networks.results import Store
 from scene2spad.networks.test_sets import TestSet, evaluated
+from scene2spad.studies.depth_offset import figures, tables
 from scene2spad.studies.depth_offset import plan as plans
 from scene2spad.studies.depth_offset import study as depth_offset
-from scene2spad.studies.depth_offset import tables
 from spad.detection.detect import sense
 from spad.formats.rgbd import published_from_rgbd, published_taps
 from spad.sensor.model import PhotonBudget, Sensor
@@ -96,6 +97,31 @@ def test_no_return_from_the_reach_falls_beyond_the_boundary():
     boundary = tables.boundary_bin(7.0, SENSOR)
     after_m = 3 * 135e-12 * 299792458 / 2
     assert boundary == math.ceil((7.0 + after_m) / SENSOR.bin_depth_m)
+
+
+def test_intervals_of_errors_and_shares_end_at_0_and_shares_at_1():
+    """Student's of two scenes, one hard and one easy, reaches beyond."""
+    one = ModelSpec()
+    for hard, easy, ends in (((600.0, 0.0), (5.0, 0.1), 0), ((600.0, 1.0), (5.0, 0.8), 1)):
+        rows = [
+            replace(row(one.name, mae, scene=scene), within_10mm=within)
+            for scene, (mae, within) in (("a", hard), ("b", easy))
+        ]
+        found = tables.summary_rows(rows, [one], {})[0]
+        assert found["mae_mm_low"] == 0 and found["mae_mm_high"] > 4000
+        assert found["within_10mm_low" if ends == 0 else "within_10mm_high"] == ends
+
+
+@pytest.mark.parametrize(("reach_m", "named"), [(7.0, 2), (9.5, 1), (20.0, 0)])
+def test_the_legend_of_the_sweep_names_what_is_on_its_axis(monkeypatch, tmp_path, reach_m, named):
+    """Depths of 1 to 4 m leave 7 m at 3 to 6 m; half of them leave 9.5 m beyond an axis of 6 m; none leaves 20 m."""
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure) or path)
+    curves = [{"label": "learned 1024x1x1", "mae_mm": [10.0, 20.0, 30.0]}]
+    found = {"offsets_m": [0.0, 3.0, 6.0], "curves": curves, "training_reach_m": reach_m, "levels": [[10, 10]]}
+    figures.sweep({**found, "test_depths_m": [1.0, 2.0, 4.0], "scenes": 2}, tmp_path / "sweep.png")
+    (legend,) = drawn[0].legends
+    assert sum("test depths" in text.get_text() for text in legend.get_texts()) == named
 
 
 def test_a_break_lies_where_the_error_doubles():

@@ -166,13 +166,17 @@ def sweep(found: dict, path: Path) -> Path:
         options |= {"marker": mark_of(curve["label"]), "mfc": "white" if cured else colour_of(curve["label"])}
         panel.plot(found["offsets_m"], curve["mae_mm"], label=curve["label"], **options)
     reach, (low, middle, high) = found["training_reach_m"], found["test_depths_m"]
-    if reach is not None:
-        panel.axvspan(reach - high, reach - low, color="0.9", zorder=0)
-        panel.axvline(reach - middle, color="0.5", lw=1, zorder=0)
-        message = f"test depths leave the training's 99.9 % ({reach:.1f} m):\nband all pixels, line their median"
-        panel.plot([], [], color="0.5", lw=1, label=message)
+    first, last = found["offsets_m"][0] - 0.2, found["offsets_m"][-1] + 0.2
+    if reach is not None:  # only what lies on the axis has its line in the legend
+        leave = f"leave the training's 99.9 % ({reach:.1f} m)"
+        if reach - high < last and reach - low > first:
+            label = f"test depths {leave}"
+            panel.axvspan(reach - high, reach - low, color="0.9", zorder=0, label=label)
+        if first < reach - middle < last:
+            label = f"half of the test depths {leave}"
+            panel.axvline(reach - middle, color="0.5", lw=1, zorder=0, label=label)
     plain_log(panel)
-    panel.set_xlim(found["offsets_m"][0] - 0.2, found["offsets_m"][-1] + 0.2)
+    panel.set_xlim(first, last)
     levels = _levels([found])
     panel.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
     scenes = f"{found['scenes']} scene{'s' if found['scenes'] != 1 else ''}"
