@@ -52,6 +52,19 @@ def test_a_difference_from_the_perfect_clock_is_told_with_its_interval() -> None
     assert table["holds"] and (table["clock_bits"], table["code_bits"]) == (980, 8)
 
 
+@pytest.mark.parametrize(("reach", "last"), [(8.0, "5"), (80.0, "50"), (3000.0, "1,000")])
+def test_ticks_of_differences_reach_as_far_to_both_sides_as_they_do(monkeypatch, tmp_path, reach, last) -> None:
+    drawn = []
+    monkeypatch.setattr(study, "save", lambda figure, path: drawn.append(figure) or path)
+    common = {"method": "m", "mae_mm": 5.0}
+    rows = [{**common, "clock": clock, "difference": 0.0, "low": -reach / 100, "high": reach / 100} for clock in CLOCKS]
+    study.draw(rows, tmp_path / "tdc.png")
+    panel = drawn[0].axes[1]
+    ticks = [text.get_text() for text in panel.get_xticklabels()]
+    assert (ticks[0], ticks[-1]) == (f"-{last}", last) and len(ticks) < 12
+    assert "linear to ±10 %" in panel.get_xlabel() and "perfect and real" in panel.get_title()
+
+
 def test_the_mean_delay_is_that_of_codes_before_the_first_that_comes() -> None:
     """Codes that never come stand before all others: the first 18 or so of 140, 0.32 ns, whose effect falls to none."""
     assert 0.020 < study.mean_delay_m() < 0.030

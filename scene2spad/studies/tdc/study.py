@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 
 from csph.codes.design import Design
 from csph.evaluation.metrics import image_errors, paired_difference
@@ -55,6 +56,8 @@ from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.tdc import clock_error, recalibrated
 
 SENSED = tuple(clock for clock in CLOCKS if clock not in (DELAY, FOLDED, TRAINED))
+ALONE = (PERFECT, REAL)  # drawn by their errors, not by their difference from the perfect clock
+LINEAR = 10  # differences [%] up to here are drawn on a linear scale, larger ones on a logarithmic one
 CHIP = ", int8 on the chip"
 FIGURES = ("mae_mm", "within_10mm")
 CODE_BITS = 8  # of an entry of C
@@ -283,30 +286,46 @@ def draw(compared: Sequence[JsonObject], path: Path) -> Path:
     """Draw MAE of every method behind every clock, and the difference from the perfect clock where codes are
     corrected."""
     methods = [*dict.fromkeys(row["method"] for row in compared)]
-    figure, panels = plt.subplots(1, 2, figsize=(13, 1.5 + 0.55 * len(methods)), layout="constrained", sharey=True)
+    figure, panels = plt.subplots(1, 2, figsize=(13, 1.7 + 0.55 * len(methods)), layout="constrained", sharey=True)
+    beyond = 100 * WITHIN
     for number, clock in enumerate(CLOCKS):
         mine = [row for row in compared if row["clock"] == clock]
         place = np.array([methods.index(row["method"]) for row in mine]) + (number - 3) * 0.12
         panels[0].plot([row["mae_mm"] for row in mine], place, ms=5, label=clock, **look(number) | {"ls": ""})
-        if clock in (PERFECT, REAL):
+        if clock in ALONE:
             continue
         middle = np.array([100 * row["difference"] for row in mine])
         ends = np.array([[100 * row[end] for row in mine] for end in ("low", "high")])
         bars = np.abs(ends - middle) if len(mine) else np.zeros((2, 0))
         panels[1].errorbar(middle, place, xerr=bars, ms=4, lw=1, **look(number) | {"ls": ""})
+        beyond = max(beyond, np.nanmax(np.abs([*ends, middle]), initial=0.0))
     plain_log(panels[0], "x")
     panels[0].set(xlabel="mean absolute depth error [mm]", yticks=range(len(methods)), yticklabels=methods)
     panels[0].invert_yaxis()
     panels[1].axvline(100 * WITHIN, color="k", lw=1, ls=":")
     panels[1].axvline(0, color="k", lw=0.8)
-    panels[1].set_xscale("symlog", linthresh=10)
-    panels[1].set_xticks([-10, -5, 0, 5, 10, 20, 50, 100], ["-10", "-5", "0", "5", "10", "20", "50", "100"])
-    panels[1].set_xlabel("error more than behind a perfect clock [%], 95 % interval (dotted: 5 %)")
+    _symmetric(panels[1], beyond)
+    panels[1].set_title(f"without {' and '.join(ALONE)}, which stand in the left panel alone", fontsize=9)
     for axes in panels:
         axes.grid(alpha=0.3, axis="x")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=9)
     return save(figure, path)
+
+
+def _symmetric(axes: Axes, beyond: float) -> None:
+    """Make the axis of differences [%] linear within LINEAR and logarithmic beyond, with a tick wherever it reaches."""
+    axes.set_xscale("symlog", linthresh=LINEAR)
+    low, high = axes.get_xlim()
+    half = [0, 5, *(digit * 10**power for power in range(1, 9) for digit in (1, 2, 5))]
+    ticks = sorted({sign * tick for tick in half for sign in (-1, 1) if low <= sign * tick <= high})
+    if beyond > 100 * LINEAR:  # 2 and 5 of each decade would lie on one another
+        ticks = [tick for tick in ticks if abs(tick) < LINEAR or str(abs(tick))[0] == "1"]
+    axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+    axes.set_xlabel(
+        f"error more than behind a perfect clock [%], 95 % interval (dotted: {WITHIN:.0%})\n"
+        f"linear to ±{LINEAR} %, logarithmic beyond"
+    )
 
 
 def _in_words(numbers: JsonObject) -> JsonObject:
