@@ -40,6 +40,12 @@ def test_conclusions_count_scenes_and_find_the_least_background():
     assert (message["network"], message["mae_mm"], message["filter_mae_mm"]) == ("net", 15, 20)
     assert (message["filter_better_in"], message["scenes"]) == (1, 2)
     assert (message["least_background"], message["mae_mm_at_least_background"]) == (1.0, 50)
+    assert multipath.in_words(message).endswith("in 1 of 2 scenes; at 50 + 1 50 and 10 mm")
+    # of one level alone nothing is told twice
+    (message,) = multipath.conclusions(multipath.summary({"flood": rows}, subjects, LEVELS[:1]), scenes)
+    assert multipath.in_words(message).endswith(
+        "15 mm at 50 + 50 photons, log-matched 20 mm, the filter better in 1 of 2 scenes"
+    )
 
 
 def test_direct_light_alone_of_direct_light_is_the_same():

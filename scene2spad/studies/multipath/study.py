@@ -1,6 +1,6 @@
 """`study multipath`: networks beside the filter on all bins, where light takes several paths.
 
-Every room is rendered once under a flood laser, with indirect and ambient light. The same render without its indirect
+Every scene is rendered once under a flood laser, with indirect and ambient light. The same render without its indirect
 light stands beside it, scaled to the same mean counts: what differs between the two is multipath alone. The background
 falls from that of the training levels to nearly none.
 """
@@ -50,7 +50,7 @@ def run(command: Study, progress: Progress) -> dict:
     models = obtain(MODELS, command, progress)
     trained = models.found | where_trained((*MIXED, *DELAYED), command)
     subjects = [without_network(name) for name in (FILTER, PEAK)] + [one.subject for one in trained.values()]
-    full = rendered_rooms(plan, folder, progress)
+    full = rendered_scenes(plan, folder, progress)
     names = tuple(name for name, _ in plan.scenes)
     lights = dict(zip(LIGHTS, (full, tuple(direct_alone(one) for one in full)), strict=True))
     rows = {
@@ -80,7 +80,7 @@ def run(command: Study, progress: Progress) -> dict:
     return {**shown, "figures": [str(figure)], "csv": [str(table)], "numbers": str(path)}
 
 
-def rendered_rooms(plan: Plan, folder: Path, progress: Progress) -> tuple[Transient, ...]:
+def rendered_scenes(plan: Plan, folder: Path, progress: Progress) -> tuple[Transient, ...]:
     """Return every scene under a flood laser at the camera, rendered into the folder where it is not there."""
     found = []
     for number, (name, seed) in enumerate(plan.scenes):
@@ -154,15 +154,25 @@ def conclusions(means: Sequence[Mapping], scenes: Sequence[Mapping]) -> list[dic
 
 def _summary(numbers: JsonObject) -> dict[str, list[str]]:
     """Summarise the study for the terminal: conclusions, indirect light of every scene, absent models."""
-    lines = [
-        f"{LIGHTS[c['light']]}, {c['network']}: {c['mae_mm']:.0f} mm at 50 + 50 photons, {FILTER} "
-        f"{c['filter_mae_mm']:.0f} mm, the filter better in {c['filter_better_in']} of {c['scenes']} scenes; at 50 + "
-        f"{c['least_background']:g} {c['mae_mm_at_least_background']:.0f} and "
-        f"{c['filter_mae_mm_at_least_background']:.0f} mm"
-        for c in numbers["conclusions"]
-    ]
+    lines = [in_words(one) for one in numbers["conclusions"]]
     scenes = [f"{s['scene']}: {s['indirect_share']:.0%} of the light is indirect" for s in numbers["scenes"]]
     return {"conclusions": lines, "scenes": scenes, "absent": numbers["absent"] or ["none"]}
+
+
+def _counted(scenes: int) -> str:
+    return f"{scenes} scene{'s' if scenes != 1 else ''}"
+
+
+def in_words(c: Mapping) -> str:
+    """Write a conclusion as a line, its errors at the least background where that is not HEADLINE's."""
+    words = (
+        f"{LIGHTS[c['light']]}, {c['network']}: {c['mae_mm']:.0f} mm at 50 + 50 photons, {FILTER} "
+        f"{c['filter_mae_mm']:.0f} mm, the filter better in {c['filter_better_in']} of {_counted(c['scenes'])}"
+    )
+    if c["least_background"] == HEADLINE[1]:
+        return words
+    errors = f"{c['mae_mm_at_least_background']:.0f} and {c['filter_mae_mm_at_least_background']:.0f} mm"
+    return f"{words}; at 50 + {c['least_background']:g} {errors}"
 
 
 def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
@@ -191,7 +201,7 @@ def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
     panels[0, 0].set_ylabel("mean absolute depth error [mm]")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
-    rooms = f"{scenes} room{'s' if scenes != 1 else ''}"
+    mean = "mean of " if scenes > 1 else ""
     dashed = ". Dashed: trained on direct light alone" if set(MIXED_NAMES.values()) & set(methods) else ""
-    figure.suptitle(f"Multipath: {rooms} under a flood laser, mean of scenes{dashed}", fontsize=11)
+    figure.suptitle(f"Multipath under a flood laser: {mean}{_counted(scenes)}{dashed}", fontsize=11)
     return save(figure, path)
