@@ -75,7 +75,8 @@ def test_a_conclusion_is_decided_scene_by_scene_and_says_what_is_absent():
     found = decided(claim, rows, dict.fromkeys((claim.first, claim.second)))
     assert found["verdict"] == "holds" and found["difference_mm"][0] == pytest.approx(-4.5)
     found = decided(claim, rows, {claim.first: None})
-    assert found["verdict"] == "not decided" and claim.second.name in found["why"]
+    # the other may be there, but of another preset or compression: it is not called absent
+    assert found["verdict"] == "not decided" and found["why"] == f"not in this run: {claim.second.name}"
 
     # other seeds count: one that is better on average leaves open what the means' interval would decide
     again = replace(claim.second, seed=1)

@@ -30,6 +30,8 @@ from scenes.files import finite, whole_file, write_csv
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
+NOT_IN_RUN = "not in this run"  # absent, or of another preset or compression
+
 
 def run(command: Study, progress: Progress) -> dict:
     """Find or train the models, measure, decide the paper's conclusions, draw; tables and JSON in `command.out`."""
@@ -88,7 +90,12 @@ def decided(claim: Claim, rows: Sequence[Row], models: Mapping[ModelSpec, Traine
     seeds = [[one.name for one in models if replace(one, seed=of.seed) == of] for of in (claim.first, claim.second)]
     missing = [one.name for one, names in zip((claim.first, claim.second), seeds, strict=True) if not names]
     if missing:
-        return {**common, "levels": claim.levels, "verdict": "not decided", "why": f"absent: {', '.join(missing)}"}
+        return {
+            **common,
+            "levels": claim.levels,
+            "verdict": "not decided",
+            "why": f"{NOT_IN_RUN}: {', '.join(missing)}",
+        }
     evaluation = Evaluation(list(rows))
     first, second = (_mean_mm(evaluation, names, claim.levels) for names in seeds)
     apart = evaluation.difference(seeds[0], seeds[1], claim.levels)
