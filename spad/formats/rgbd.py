@@ -22,6 +22,7 @@ from spad.sensor.pulse import Pulse, SampledPulse
 
 PUBLISHED_SPEED_OF_LIGHT_M_PER_S = 3e8
 MIXED_M = 0.05
+ONE_SURFACE = 0.01  # samples whose depths differ by at most this share of their mean lie on one surface
 
 
 class Expected(NamedTuple):
@@ -106,10 +107,12 @@ def transient_from_rgbd(
     camera.
 
     With `block` b the images are b times finer than the sensor: a pixel sees the returns of its b x b samples, each
-    1 / b^2 of its footprint, so that an edge gives two returns and no depth in between; labels are those of the sample
-    at the pixel's centre, ambient light is the mean. `fov_deg` is the full horizontal angle that the cosine of
-    incidence is taken with, from the depth image itself; None for surfaces that face the camera. Samples without
-    depth (not finite, or 0) return nothing; a pixel with samples more than 50 mm apart, or partly nowhere, is mixed.
+    1 / b^2 of its footprint, so that an edge gives two returns and no depth in between. Labels (depth and albedo) are
+    those at the pixel's centre: of its sample where b is odd. Where b is even the centre is the corner of four samples,
+    and labels are their mean where their depths differ by at most 1 % of it, else those of the lower right one. Ambient
+    light is the mean. `fov_deg` is the full horizontal angle that the cosine of incidence is taken with, from the depth
+    image itself; None for surfaces that face the camera. Samples without depth (not finite, or 0) return nothing; a
+    pixel with samples more than 50 mm apart, or partly nowhere, is mixed.
     `depth_m` [m], `albedo` and `ambient` [W/(m2 sr nm)] are (H, W). Raises InputError for images of other shapes, sides
     that `block` does not divide, negative depth, and albedo or ambient light that is negative or not finite.
     """
@@ -136,7 +139,8 @@ def transient_from_rgbd(
     number = kept.sum(axis=1)
     extent = np.where(number > 0, np.nan_to_num(samples).max(axis=1) - np.nan_to_num(samples[:, 0]), 0)
     path = (2 * samples[kept]).astype(np.float32)
-    shape, centre = (height, width), (slice(block // 2, None, block),) * 2
+    shape = (height, width)
+    depth_label, albedo_label = _at_centres(depth, albedo, block)
     return Transient(
         height,
         width,
@@ -145,14 +149,27 @@ def transient_from_rgbd(
         path,
         energy[kept].astype(np.float32),
         np.ones(len(path), np.uint8),
-        depth_m=depth[centre].astype(np.float32),
+        depth_m=depth_label.astype(np.float32),
         normal=np.zeros((*shape, 3), np.float16),
-        albedo=albedo[centre].astype(np.float16),
+        albedo=albedo_label.astype(np.float16),
         ambient=blocks(ambient).mean(axis=1).reshape(shape).astype(np.float32),
         mixed=((extent > MIXED_M) | (number % block**2 > 0)).reshape(shape),
         error=np.zeros(shape, np.float32),
         meta={"scene": "RGB-D", **(meta or {})},
     )
+
+
+def _at_centres(depth: np.ndarray, albedo: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return depth and albedo at the centres of pixels of b x b samples, (H b, W b) -> (H, W) each."""
+    middle = block // 2
+    lower_right = depth[middle::block, middle::block], albedo[middle::block, middle::block]
+    if block % 2:
+        return lower_right
+    starts = [(down, right) for down in (middle - 1, middle) for right in (middle - 1, middle)]
+    depths, albedos = (np.stack([one[down::block, right::block] for down, right in starts]) for one in (depth, albedo))
+    mean = depths.mean(axis=0)  # NaN where one has no depth, and then not alike
+    alike = depths.max(axis=0) - depths.min(axis=0) <= ONE_SURFACE * mean
+    return np.where(alike, mean, lower_right[0]), np.where(alike, albedos.mean(axis=0), lower_right[1])
 
 
 def cosine_of_incidence(depth_m: np.ndarray, fov_deg: float) -> np.ndarray:

@@ -93,6 +93,23 @@ def test_blocks_give_an_edge_two_returns() -> None:
         transient_from_rgbd(depth, depth, depth, block=3)
 
 
+@pytest.mark.parametrize("block", [2, 3, 4])
+def test_labels_of_blocks_are_those_at_the_pixel_centre(block: int) -> None:
+    """A wall that slants by 2 mm a sample, sampled at the samples' centres, and its linear albedo."""
+    side = 6 * block
+    column = np.arange(side) + 0.5
+    depth, albedo = np.tile(2 + 2e-3 * column, (side, 1)), np.tile(0.2 + 2e-2 * column, (side, 1))
+    transient = transient_from_rgbd(depth, albedo, albedo, block=block)
+    centre = (np.arange(6) + 0.5) * block
+    assert np.allclose(transient.depth_m, 2 + 2e-3 * centre, atol=1e-6)
+    assert np.allclose(transient.albedo, 0.2 + 2e-2 * centre, atol=1e-3)
+    # no depth in between where the four samples at the centre lie on two surfaces: 1 % is the bound
+    for step, label in ((0.009, 1.0045), (0.02, 1.02)):
+        edge = np.tile([1.0, 1.0 + step], (2, 1))
+        assert transient_from_rgbd(edge, edge, edge, block=2).depth_m == pytest.approx(label)
+    assert transient_from_rgbd(np.array([[1, np.nan], [1, 1]]), *np.ones((2, 2, 2)), block=2).depth_m == 1
+
+
 def test_cosine_of_a_tilted_plane() -> None:
     """z = 2 + x tan 40 deg: the angle between its normal and each pixel's ray."""
     width, fov, slope = 60, 50.0, math.tan(math.radians(40))
