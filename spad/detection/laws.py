@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scenes.errors import require
 from spad.sensor.model import Sensor
 
 # Below 1 % detections per cycle dead time and pile-up change nothing that counts could show.
@@ -141,11 +142,16 @@ def crosstalk_events(
 
 def add_crosstalk(counts: np.ndarray, fraction: float, rng: np.random.Generator) -> None:
     """Add crosstalk to counts (H, W, T), in place: Binomial(n, fraction) detections in the same bin of each
-    neighbour."""
+    neighbour. Raises InputError for more counts in a bin than the counts' type holds."""
+    limit = np.iinfo(counts.dtype).max
     rows, columns, bins = np.nonzero(counts)
     number = counts[rows, columns, bins]
     for down, right in NEIGHBOURS:
         fired = rng.binomial(number, fraction)
         row, column = rows + down, columns + right
         inside = (fired > 0) & (row >= 0) & (row < counts.shape[0]) & (column >= 0) & (column < counts.shape[1])
-        counts[row[inside], column[inside], bins[inside]] += fired[inside].astype(counts.dtype)
+        place = row[inside], column[inside], bins[inside]
+        both = counts[place].astype(np.int64) + fired[inside]
+        most = both.max(initial=0)
+        require(most <= limit, f"a bin holds {most} counts, the limit is {limit}")
+        counts[place] = both

@@ -8,9 +8,11 @@ import pytest
 from scipy import stats
 from test_training_patches import SENSOR, scenes
 
+from scenes.errors import InputError
 from spad.detection.detect import sense, sense_timestamps
 from spad.detection.device_patches import DevicePatches
 from spad.detection.flux import expected_counts
+from spad.detection.laws import add_crosstalk
 from spad.detection.rates import rates_for
 from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.sensor.model import PhotonBudget, Sensor
@@ -33,6 +35,12 @@ def test_dead_pixels_detect_no_crosstalk(model: str) -> None:
     # crosstalk between pixels that are alive stays: a twentieth of what their live neighbours detect
     primaries = histogram.expected_signal + histogram.expected_background
     assert histogram.counts.sum() > primaries.sum() + 4 * np.sqrt(primaries.sum())
+
+
+def test_crosstalk_beyond_the_limit_of_a_bin_is_refused() -> None:
+    counts = np.full((2, 2, 1), 2**31 - 1000, np.int32)
+    with pytest.raises(InputError, match=r"^a bin holds 2\d+ counts, the limit is 2147483647$"):
+        add_crosstalk(counts, 0.05, np.random.default_rng(0))
 
 
 def expected_with_crosstalk(sensor: Sensor, budget: PhotonBudget) -> np.ndarray:
