@@ -39,7 +39,7 @@ from spad.estimators.matching import (
     matched_bins,
     published_log_matched_bins,
 )
-from spad.estimators.pile_up import linearised
+from spad.estimators.pile_up import warn_of_saturation, without_pile_up
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse, binned_pulse_slope, pulse_taps
@@ -161,7 +161,8 @@ def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched", 
     if not len(rows):
         return torch.empty(counts.shape[:-1], dtype=torch.float32, device=counts.device)
     if method == "coates":
-        rows = by_pixels(lambda part: linearised(part, sensor, law), rows)
+        warn_of_saturation(rows, sensor, law)
+        rows = by_pixels(lambda part: without_pile_up(part, sensor, law), rows)
     depth = _raw_depth(rows, sensor, method) - noise_free_bias_m(method, sensor)
     return depth_in_range(depth, sensor).reshape(counts.shape[:-1])
 
@@ -188,7 +189,7 @@ def confidence(
 
     def near(part: Tensor, place: Tensor) -> Tensor:
         if method == "coates":
-            part = linearised(part, sensor, law)
+            part = without_pile_up(part, sensor, law)
         part = part if part.dtype == torch.float64 else part.float()  # which counts bins to 16 million
         posterior, index = likelihood(part, sensor).softmax(-1), place + reach
         inside = (
@@ -280,7 +281,8 @@ def depth_errors(
 
     mae_mm, rmse_mm, median_mm (signed) and within_10mm (share strictly under 10 mm) over `pixels` pixels; left out and
     counted: empty (truth NaN), beyond_range (truth at the range, one for all or (H, W), or beyond), missing (estimate
-    NaN or infinite).
+    NaN or infinite). What a masked array masks is NaN. Raises InputError for maps of other shapes, of what is no number,
+    and of depths below 0.
     """
     estimate, truth = map(_metres, (estimate, truth))
     keep = (
@@ -307,10 +309,14 @@ def depth_errors(
 
 
 def _metres(depth: Tensor | np.ndarray) -> np.ndarray:
-    array = np.asarray(depth.cpu() if isinstance(depth, Tensor) else depth)
-    if array.dtype.kind not in "biuf":
-        raise InputError(f"depth map: values are {array.dtype}, expected real numbers")
-    return array.astype(np.float64)
+    """Return a depth map as float64, NaN where it is masked."""
+    array = np.ma.asarray(depth.cpu().numpy() if isinstance(depth, Tensor) else depth)
+    require(array.dtype.kind in "iuf", f"depth map: values are {array.dtype}, expected real numbers")
+    metres: np.ndarray = array.astype(np.float64).filled(np.nan)
+    negative = np.isfinite(metres) & (metres < 0)
+    least = float(metres.min(initial=0.0, where=negative))
+    require(not negative.any(), f"depth map: a depth of {least:g} m, expected 0 or more, or none (NaN)")
+    return metres
 
 
 def no_error_reason(errors: Mapping[str, float | int]) -> str | None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+
 import torch
 from torch import Tensor
 
 from scenes.errors import InputError
 from spad.detection.laws import LOW_FLUX
 from spad.sensor.model import Sensor
+
+log = logging.getLogger(__name__)
+# A pixel may end an exposure blind, half a dead time on average: a tenth of the live time of one that was live for 5.
+SATURATED_DEAD_TIMES = 5.0
 
 
 def coates(counts: Tensor, cycles: float) -> Tensor:
@@ -67,6 +73,35 @@ def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
     return -torch.log1p(-ratio.clamp(max=1 - 0.5 / cycles))
 
 
+def warn_of_saturation(counts: Tensor, sensor: Sensor, law: str | None = None) -> None:
+    """Log a warning where a free-running detector's pixels were live for less than 5 dead times in all, counts
+    (..., T); `law` as in `linearised`.
+
+    The flux is detections over the live time, which is the exposure less a dead time a detection. Near saturation it is
+    a small difference of large numbers: the blind part at the exposure's end alone makes 10 % of it.
+    """
+    if _law(sensor, law) != "free-running" or sensor.dead_time_s == 0:
+        return
+    detections = counts.double().sum(-1)
+    live = sensor.exposure_s / sensor.dead_time_s - detections
+    saturated = int(((live < SATURATED_DEAD_TIMES) & ~_too_few(detections, sensor)).sum())
+    if saturated:
+        log.warning(
+            "pile-up: %d of %d pixels are saturated, live for less than %g dead times of the exposure: their counts "
+            "without pile-up are more than 10 %% off, and may be many times too many",
+            *(saturated, detections.numel(), SATURATED_DEAD_TIMES),
+        )
+
+
+def _law(sensor: Sensor, law: str | None) -> str:
+    return law or ("first-photon" if sensor.armed_every_cycle else "free-running")
+
+
+def _too_few(detections: Tensor, sensor: Sensor) -> Tensor:
+    """Tell where pile-up changes nothing that counts could show."""
+    return detections * max(1.0, sensor.dead_time_s / sensor.period_s) <= LOW_FLUX * sensor.cycles
+
+
 def linearised(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor:
     """Return counts as they would be without pile-up, (..., T) float64: `coates`, or `free_running_flux`, times the
     cycles.
@@ -76,20 +111,23 @@ def linearised(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor
     A synchronous detector whose dead time is longer than the period is not armed at every cycle.
 
     Pixels with at most 1 % detections per cycle (or dead time, if longer) keep their counts: what would change is a
-    hundredth of one, which does nothing but decide between equal maxima.
+    hundredth of one, which does nothing but decide between equal maxima. Saturated pixels are told by
+    `warn_of_saturation`.
 
     The law is undone as if timestamps had no jitter. What jitter moved to before the first arrival then takes from what
     follows: with a jitter of 85 ps (sigma) and a pulse of 42 ps a depth is 2 mm too large at one photon a cycle.
     """
-    counts = counts.double()
-    if law is None:
-        law = "first-photon" if sensor.armed_every_cycle else "free-running"
+    warn_of_saturation(counts, sensor, law)
+    return without_pile_up(counts, sensor, law)
+
+
+def without_pile_up(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor:
+    """Return `linearised` of some of an image's pixels, without its warning."""
+    counts, law = counts.double(), _law(sensor, law)
     if law == "poisson":
         return counts
     if law == "first-photon":
         corrected = coates(counts, sensor.cycles) * sensor.cycles
     else:
         corrected = free_running_flux(counts, sensor.cycles, sensor) * sensor.cycles
-    blind = max(1.0, sensor.dead_time_s / sensor.period_s)
-    few = counts.sum(-1, keepdim=True) * blind <= LOW_FLUX * sensor.cycles
-    return torch.where(few, counts, corrected)
+    return torch.where(_too_few(counts.sum(-1, keepdim=True), sensor), counts, corrected)
