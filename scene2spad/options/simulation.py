@@ -42,7 +42,8 @@ class Sense(Common):
     reset: Annotated[Literal["synchronous", "free-running"] | None, may_stay_open("{synchronous,free-running}")] = None
     """Armed at every laser cycle, or again after the dead time (default: the preset's)."""
     dead_time: Number = None
-    """Dead time after a detection [s] (default: the preset's)."""
+    """Dead time after a detection [s] (default: the preset's). Up to one laser period it has no effect on a synchronous
+    detector, which is armed at every cycle."""
     exposure: Number = None
     """Exposure of the frame [s] (default: the preset's)."""
     jitter: Number = None

@@ -26,6 +26,7 @@ from spad.sensor.model import PhotonBudget, Sensor
 
 Model = Literal["auto", "poisson", "first-photon", "free-running"]
 MODELS: tuple[str, ...] = ("auto", *LAWS)
+IDLE = "the dead time of {:g} s has no effect, as the detector is armed at every cycle"
 _HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
 
 
@@ -181,7 +182,8 @@ def mean_pixel_law(sensor: Sensor, budget: PhotonBudget) -> tuple[str, float]:
 def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
     """Choose the detection law for `pile_up` primary detections per cycle in the brightest pixel, and say why.
 
-    Raises InputError for the first-photon law where the dead time outlasts the period.
+    A dead time that has no effect, as the detector is armed at every cycle all the same, is told. Raises InputError for
+    the first-photon law where the dead time outlasts the period.
     """
     outlasts = sensor.dead_time_s > sensor.period_s
     if asked == "first-photon" and outlasts:
@@ -193,16 +195,19 @@ def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
     blind = pile_up * max(1.0, sensor.dead_time_s / sensor.period_s)
     if outlasts:
         message += f", {blind:.2%} a dead time"
+    no_effect = sensor.armed_every_cycle and sensor.dead_time_s > 0
+    idle = f"; {IDLE.format(sensor.dead_time_s)}" if no_effect else ""
     if asked != "auto":
         left_out = ": pile-up and dead time, which matter from 1 %, are left out"
         return (
             asked,
-            f"model: {asked} as asked, at {message}{left_out if asked == 'poisson' and blind > LOW_FLUX else ''}",
+            f"model: {asked} as asked, at {message}{left_out if asked == 'poisson' and blind > LOW_FLUX else ''}"
+            f"{idle if asked == 'first-photon' else ''}",
         )
     if blind <= LOW_FLUX:
-        return "poisson", f"model: independent Poisson, {message}"
+        return "poisson", f"model: independent Poisson, {message}{idle}"
     if sensor.armed_every_cycle:
-        return "first-photon", f"model: first photon of each cycle (pile-up), {message}, armed at every cycle"
+        return "first-photon", f"model: first photon of each cycle (pile-up), {message}{idle or ', armed at every cycle'}"
     if sensor.dead_time_s == 0:
         return (
             "poisson",

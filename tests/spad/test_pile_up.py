@@ -86,6 +86,19 @@ def test_pile_up_of_zones_is_not_undone() -> None:
             refused()
 
 
+def test_a_saturated_free_running_detector_is_told_of_in_one_line(caplog) -> None:
+    """Live for 2 dead times of 2000, where the rate is 1000 a dead time; and for 200, where it is 9."""
+    sensor = replace(SENSOR, reset="free-running", dead_time_s=SENSOR.period_s)
+    for detections, lines in ((1800, 0), (1998, 1)):
+        caplog.clear()
+        counts = torch.full((2, 3, sensor.bins), detections / sensor.bins)
+        linearised(counts, sensor)
+        assert len(caplog.messages) == lines
+        estimate_depth(counts, sensor, "coates")
+        assert len(caplog.messages) == 2 * lines
+    assert caplog.messages[0].startswith("pile-up: 6 of 6 pixels are saturated, live for less than 5 dead times")
+
+
 @pytest.mark.parametrize("reset", ["synchronous", "free-running"])
 @pytest.mark.parametrize("dead_s", [0.0, 50e-9, 100e-9, 101e-9])
 def test_the_law_that_is_chosen_and_the_inverse_agree(reset: str, dead_s: float) -> None:
@@ -93,6 +106,17 @@ def test_the_law_that_is_chosen_and_the_inverse_agree(reset: str, dead_s: float)
     chosen, _ = choose_model("auto", PER_CYCLE, sensor)
     counts = torch.from_numpy(sense(WALL, sensor, PhotonBudget(1000, 1000), seed=4).counts[:, :4])
     assert torch.equal(linearised(counts, sensor), linearised(counts, sensor, chosen))
+
+
+def test_a_dead_time_without_effect_is_told_in_the_plan() -> None:
+    told = "the dead time of 5e-08 s has no effect, as the detector is armed at every cycle"
+    short = replace(SENSOR, dead_time_s=50e-9)
+    for asked, pile_up in (("auto", PER_CYCLE), ("auto", 1e-4), ("first-photon", PER_CYCLE)):
+        assert told in choose_model(asked, pile_up, short)[1]
+        for other in (SENSOR, replace(short, reset="free-running")):
+            assert "no effect" not in choose_model(asked, pile_up, other)[1]
+    assert "no effect" not in choose_model("free-running", PER_CYCLE, short)[1]
+    assert "no effect" not in choose_model("auto", PER_CYCLE, replace(SENSOR, dead_time_s=101e-9))[1]
 
 
 def test_confidence_of_corrected_depth_is_that_of_corrected_counts() -> None:
