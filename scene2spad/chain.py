@@ -144,7 +144,7 @@ def sense(
     law : str
         Detection law: auto, poisson, first-photon or free-running. ``meta["plan"]`` says why auto chose one.
     seed : int
-        Seed of the photons.
+        Seed of the photons, and of where hot and dead pixels are and which converter a pixel has.
 
     Returns
     -------
