@@ -207,7 +207,10 @@ def choose_model(asked: str, pile_up: float, sensor: Sensor) -> tuple[str, str]:
     if blind <= LOW_FLUX:
         return "poisson", f"model: independent Poisson, {message}{idle}"
     if sensor.armed_every_cycle:
-        return "first-photon", f"model: first photon of each cycle (pile-up), {message}{idle or ', armed at every cycle'}"
+        return (
+            "first-photon",
+            f"model: first photon of each cycle (pile-up), {message}{idle or ', armed at every cycle'}",
+        )
     if sensor.dead_time_s == 0:
         return (
             "poisson",

@@ -312,7 +312,7 @@ def _metres(depth: Tensor | np.ndarray) -> np.ndarray:
     """Return a depth map as float64, NaN where it is masked."""
     array = np.ma.asarray(depth.cpu().numpy() if isinstance(depth, Tensor) else depth)
     require(array.dtype.kind in "iuf", f"depth map: values are {array.dtype}, expected real numbers")
-    metres: np.ndarray = array.astype(np.float64).filled(np.nan)
+    metres: np.ndarray = np.ma.filled(array.astype(np.float64), np.nan)
     negative = np.isfinite(metres) & (metres < 0)
     least = float(metres.min(initial=0.0, where=negative))
     require(not negative.any(), f"depth map: a depth of {least:g} m, expected 0 or more, or none (NaN)")

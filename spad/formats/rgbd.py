@@ -129,17 +129,12 @@ def transient_from_rgbd(
     radiance = np.where(seen, albedo * cosine / (np.pi * np.where(seen, depth, 1) ** 2), 0) / block**2
     height, width = depth.shape[0] // block, depth.shape[1] // block
 
-    def blocks(image: np.ndarray) -> np.ndarray:
-        """(H b, W b) -> (H W, b b)"""
-        return image.reshape(height, block, width, block).swapaxes(1, 2).reshape(height * width, block * block)
-
-    order = np.argsort(blocks(depth), axis=1)  # NaN last
-    samples, energy = (np.take_along_axis(blocks(image), order, axis=1) for image in (depth, radiance))
+    order = np.argsort(_blocks(depth, block), axis=1)  # NaN last
+    samples, energy = (np.take_along_axis(_blocks(image, block), order, axis=1) for image in (depth, radiance))
     kept = np.isfinite(samples)
     number = kept.sum(axis=1)
     extent = np.where(number > 0, np.nan_to_num(samples).max(axis=1) - np.nan_to_num(samples[:, 0]), 0)
-    path = (2 * samples[kept]).astype(np.float32)
-    shape = (height, width)
+    path, shape = (2 * samples[kept]).astype(np.float32), (height, width)
     depth_label, albedo_label = _at_centres(depth, albedo, block)
     return Transient(
         height,
@@ -152,11 +147,17 @@ def transient_from_rgbd(
         depth_m=depth_label.astype(np.float32),
         normal=np.zeros((*shape, 3), np.float16),
         albedo=albedo_label.astype(np.float16),
-        ambient=blocks(ambient).mean(axis=1).reshape(shape).astype(np.float32),
+        ambient=_blocks(ambient, block).mean(axis=1).reshape(shape).astype(np.float32),
         mixed=((extent > MIXED_M) | (number % block**2 > 0)).reshape(shape),
         error=np.zeros(shape, np.float32),
         meta={"scene": "RGB-D", **(meta or {})},
     )
+
+
+def _blocks(image: np.ndarray, block: int) -> np.ndarray:
+    """Return the samples of every pixel, (H b, W b) -> (H W, b b)."""
+    height, width = (side // block for side in image.shape)
+    return image.reshape(height, block, width, block).swapaxes(1, 2).reshape(height * width, block * block)
 
 
 def _at_centres(depth: np.ndarray, albedo: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
