@@ -281,7 +281,7 @@ def depth_errors(
 
     mae_mm, rmse_mm, median_mm (signed) and within_10mm (share strictly under 10 mm) over `pixels` pixels; left out and
     counted: empty (truth NaN), beyond_range (truth at the range, one for all or (H, W), or beyond), missing (estimate
-    NaN or infinite). What a masked array masks is NaN. Raises InputError for maps of other shapes, of what is no number,
+    NaN or infinite). What a masked array masks is NaN. Raises InputError for maps of other shapes, of no numbers,
     and of depths below 0.
     """
     estimate, truth = map(_metres, (estimate, truth))
