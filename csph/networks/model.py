@@ -203,6 +203,7 @@ class DepthModel(nn.Module):
 
     def check_histogram(self, histogram: Histogram) -> None:
         """Raise InputError unless the histogram is of the sensor that the model was trained for."""
+        require_kind(histogram, Histogram, "DepthModel", " of `sense`, `read_histogram` or `read_mat`")
         mine, other = self.config.sensor, histogram.sensor
         alike = (mine.bins, mine.bin_width_s, mine.response) == (other.bins, other.bin_width_s, other.response)
         message = ", ".join(f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps)" for s in (mine, other))
@@ -242,8 +243,7 @@ class DepthModel(nn.Module):
         device = next(self.parameters()).device
         rows, columns, bins = histogram.counts.shape
         tile = tile or (TILE if rows * columns > WHOLE_PIXELS else None)
-        depth, sure = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
-        overflows = 0
+        depth, sure, overflows = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32), 0
         for down, across in self._tiles(rows, columns, tile):
             part = histogram.counts
             if len(down.read) != rows or len(across.read) != columns:

@@ -50,7 +50,7 @@ from csph.training.own_codes import own_codes_of
 from csph.training.resume import WholeFileCheckpoints, check_resume, claim_run
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
-from csph.training.views import Views, check_direct, check_light, packed_sha256, write_seen
+from csph.training.views import Views, check_direct, check_light, check_names, packed_sha256, path_of, write_seen
 from csph.weights.shipped import RESUME, TIMINGS
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import require, require_kind
@@ -271,6 +271,7 @@ def _listed(views: Views | Sequence[Views], which: str) -> list[Views]:
     require(good, f"train: {which} {several!r}, expected Views of one set or a list of several (`read_views`)")
     for one in several:
         require_kind(one, Views, f"train: {which}", " of `read_views`")
+        check_names(one, f"train: {which}")
         require(len(one.transients) > 0, f"train: {which}: a set has no view")
     return list(several)
 
@@ -358,7 +359,7 @@ def train(
     """
     require_kind(config, TrainConfig, "train", " of `preset`")
     given = [_listed(training, "training"), _listed(validation, "validation")]
-    folder = Path(folder)
+    folder = path_of(folder, "train: folder")
     config.check_memory()
     check_init(init, config)
     sets = [[pack_views(one.transients) for one in some] for some in given]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Iterable, Sequence, Set
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 
 from render.transient import Transient, read_transient
 from render.transient.packs import depth_steps, read_pack
-from scenes.errors import require
+from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.io.set_index import read_set_index
 from scenes.json_types import JsonObject
@@ -37,7 +38,7 @@ def read_views(path: Path) -> Views:
 
     Raises InputError in one line for anything else, an empty set, and a laser that is not at the camera.
     """
-    path = Path(path)
+    path = path_of(path, "read_views")
     if path.is_dir():
         transients, scenes = _from_folder(path)
     else:
@@ -49,6 +50,19 @@ def read_views(path: Path) -> Views:
         displaced = any(transient.meta.get("laser", {}).get("baseline_m", (0, 0, 0)))
         require(not displaced, f"{path}: the laser of {scene} is not at the camera, its path is not twice the depth")
     return Views(tuple(transients), tuple(scenes))
+
+
+def path_of(given: object, where: str) -> Path:
+    """Return a path that is given as a path or as text; InputError for anything else, `where` comes first."""
+    if not isinstance(given, str | os.PathLike):
+        raise InputError(f"{where}: expected a path, not {type(given).__name__}")
+    return Path(given)
+
+
+def check_names(views: Views, where: str) -> None:
+    """Raise InputError for views that have another number of names than transients; `where` comes first."""
+    number, names = len(views.transients), len(views.scenes)
+    require(number == names, f"{where}: Views of {number} transients and {names} names of scenes, expected as many")
 
 
 def _from_folder(path: Path) -> tuple[list[Transient], list[str]]:
@@ -85,6 +99,7 @@ def scenes_by_seed(scenes: Sequence[str], transients: Sequence[Transient]) -> li
 def split_views(views: Views, fraction: float = VALIDATION_FRACTION) -> tuple[Views, Views]:
     """Return training and validation views of different scenes: the last scenes are validation's. InputError for one
     scene."""
+    check_names(views, "split_views")
     names = list(dict.fromkeys(views.scenes))
     require(len(names) >= 2, f"a set of one scene ({names[0]}) has none left to validate on; give a validation set")
     held = set(names[-max(1, round(fraction * len(names))) :])

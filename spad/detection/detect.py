@@ -26,8 +26,8 @@ from spad.sensor.model import PhotonBudget, Sensor
 
 Model = Literal["auto", "poisson", "first-photon", "free-running"]
 MODELS: tuple[str, ...] = ("auto", *LAWS)
-IDLE = "the dead time of {:g} s has no effect, as the detector is armed at every cycle"
 _HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
+IDLE = "the dead time of {:g} s has no effect, as the detector is armed at every cycle"
 
 
 def sense(

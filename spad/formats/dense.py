@@ -65,7 +65,8 @@ def dense(seen: Transient | Histogram, sensor: Sensor | str | Path | None = None
         (T,), bin centres [s], ``depth_m`` (H, W), ``bin_width_s``, ``period_s`` and what else is known. ``wrapped`` is
         the fraction of the light that arrives later than one period after its emission, and is in the bins of its
         time less whole periods. ``ambient`` (H, W) is there where a transient has some [W/(m^2 sr nm)]. ``sensor`` and
-        ``meta`` are JSON.
+        ``meta`` are JSON. Of a histogram ``data`` and the images are its own arrays, which cannot be written to: change
+        a copy.
 
     Raises
     ------
@@ -88,20 +89,26 @@ def dense(seen: Transient | Histogram, sensor: Sensor | str | Path | None = None
 
 
 def dense_counts(histogram: Histogram) -> dict[str, np.ndarray]:
-    """Return the arrays that a dense export of counts holds, by name."""
+    """Return the arrays that a dense export of counts holds, by name; the histogram's own as views to read from."""
     arrays = {
-        "data": histogram.counts,
+        "data": _read_only(histogram.counts),
         **_times(histogram.sensor),
-        "depth_m": histogram.depth_m,
+        "depth_m": _read_only(histogram.depth_m),
         "albedo": histogram.albedo.astype(np.float32),
-        "mixed": histogram.mixed,
-        "expected_signal": histogram.expected_signal,
-        "expected_background": histogram.expected_background,
+        "mixed": _read_only(histogram.mixed),
+        "expected_signal": _read_only(histogram.expected_signal),
+        "expected_background": _read_only(histogram.expected_background),
         "meta": _json({**histogram.meta, "budget": histogram.budget.to_dict()}),
     }
     if histogram.signal_known and "wrapped" in histogram.meta:
         arrays["wrapped"] = np.array(float(histogram.meta["wrapped"]))
     return arrays
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def dense_radiance(transient: Transient, sensor: Sensor) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from render.transient import Transient
 from scenes.constants import DEFAULT_WAVELENGTH_M, SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import normalise_fields, require
+from scenes.errors import normalise_fields, require, require_kind
 from scenes.optics.blackbody import PLANCK_J_S
 from spad.sensor.model import PhotonBudget, Sensor, detector_maps
 
@@ -86,9 +86,11 @@ class Optics:
         """Return mean signal and mean background of a scene: the budget by means that gives these very expected counts.
 
         Background is ambient light through the filter and dark counts, the sensor's or a measured map's (H, W). Raises
-        InputError where the mean ambient radiance is above a bright sky's: then a scene file's lights are in units of
-        their own, as those made for pictures are.
+        InputError for a sensor's name in place of the sensor (`sensor_by_name`), and where the mean ambient radiance is
+        above a bright sky's: then a scene file's lights are in units of their own, as those made for pictures are.
         """
+        require_kind(transient, Transient, "budget", " of `render` or `read_transient`")
+        require_kind(sensor, Sensor, "budget: sensor", " (`sensor_by_name` gives a preset)")
         pixels = transient.height * transient.width
         radiance = float(transient.ambient.mean(dtype=np.float64))
         require(

@@ -13,7 +13,7 @@ from csph.networks.config import ModelConfig, TrainConfig, preset
 from csph.networks.model import DepthModel, save_model
 from csph.training.beginning import WeightsOf
 from csph.training.loop import train
-from csph.training.views import Views
+from csph.training.views import Views, read_views
 from scene2spad.datasets.planes import random_planes
 from scenes import InputError
 
@@ -139,12 +139,23 @@ def test_numbers_of_numpy_become_those_that_json_holds(tmp_path):
         ("rooms", PLANES, "train: training 'rooms', expected Views"),
         (["rooms"], PLANES, "train: training: expected a Views of `read_views`, not str"),
         (PLANES, Views((), ()), "train: validation: a set has no view"),
+        (PLANES._replace(scenes=()), PLANES, r"train: training: Views of \d+ transients and 0 names of scenes"),
     ],
 )
 def test_trainings_without_sets_are_refused(training, validation, message, tmp_path):
     with pytest.raises(InputError, match=message):
         train(TrainConfig(model=MODEL), training, validation, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_what_is_no_path_and_no_histogram_is_refused_in_one_line():
+    with pytest.raises(InputError, match=r"^train: folder: expected a path, not NoneType$"):
+        train(TrainConfig(model=MODEL), PLANES, PLANES, None)
+    with pytest.raises(InputError, match=r"^read_views: expected a path, not NoneType$"):
+        read_views(None)
+    for refused in (DepthModel(MODEL).estimate, DepthModel(MODEL).check_histogram):
+        with pytest.raises(InputError, match=r"^DepthModel: expected a Histogram of `sense`.*, not ndarray$"):
+            refused(COUNTS)
 
 
 @pytest.mark.parametrize("init", ["none-mixed-s0", WeightsOf("none-mixed-s0")])

@@ -137,6 +137,7 @@ def test_measured_counts_come_back():
     counts = np.random.default_rng(1).integers(0, 5, (2, 3, 1024))
     histogram = s2s.Histogram.from_counts(counts, SENSOR)
     arrays = s2s.dense(histogram)
+    assert not any(arrays[name].flags.writeable for name in ("data", "depth_m", "mixed", "expected_signal"))
     assert "wrapped" not in arrays  # nobody knows it
     back = s2s.read_dense(s2s.write_dense(arrays, "measured.npz"))
     assert back.sha256() == histogram.sha256() and not back.signal_known

@@ -6,10 +6,12 @@ import pytest
 from scenes.errors import InputError
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.budget import Optics
+from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse, SampledPulse, read_pulse
 from spad.sensor.tdc import Tdc
 
 ONES = np.ones((2, 2))
+WALL = transient_from_rgbd(ONES, ONES, ONES)
 LENS = (1e-9, 1e-2, 2.0, 2e-5)
 
 
@@ -26,6 +28,8 @@ LENS = (1e-9, 1e-2, 2.0, 2e-5)
         (lambda: Optics("1 nJ", 1, 1, 1), "optics: pulse_energy_j '1 nJ', expected a number"),
         (lambda: Optics(*LENS, transmission="80%"), "optics: transmission '80%', expected a number"),
         (lambda: Optics(*LENS, wavelength_m=None), "optics: wavelength_m None, expected a number"),
+        (lambda: Optics(*LENS).budget(WALL, "reference"), "budget: sensor: expected a Sensor (`sensor_by_name` gives"),
+        (lambda: Optics(*LENS).budget(ONES, Sensor()), "budget: expected a Transient of `render`"),
         (lambda: Tdc("2.5 ns", codes=4), "tdc: clock_period_s '2.5 ns', expected a number"),
         (lambda: Tdc(2.5e-9, codes=4.0), "tdc: codes 4.0, expected a whole number"),
         (lambda: Tdc(2.5e-9, table=3), "tdc: table 3, expected text"),
