@@ -21,7 +21,7 @@ from scenes.limits import require_memory
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.detectors import BlockLight, DetectionLaw
-from spad.detection.jitter import before_detection, blurred, delayed, over_the_period
+from spad.detection.jitter import before_detection, blurred, delayed, over_the_period, steps_per_bin
 from spad.detection.laws import Detections, Moved, add_crosstalk, crosstalk_events
 from spad.detection.photons import PixelFlux
 from spad.detection.rates import Rates
@@ -228,13 +228,20 @@ def _block(
 
 
 def _is_dense(exposure: Exposure, light: BlockLight) -> bool:
-    return exposure.law.by_bins and light.primaries > DENSE_FROM * exposure.sensor.bins * light.flux.pixels
+    by_bins = exposure.law.by_bins and not (exposure.jitters and steps_per_bin(exposure.sensor) == 0)
+    return by_bins and light.primaries > DENSE_FROM * exposure.sensor.bins * light.flux.pixels
+
+
+def _held_per_pixel(exposure: Exposure) -> int:
+    """Return how many numbers drawing every bin of a pixel at once holds."""
+    sensor = exposure.sensor
+    return sensor.bins_per_period * steps_per_bin(sensor) if exposure.jitters else sensor.bins
 
 
 def _parts(exposure: Exposure, block: slice) -> Iterator[slice]:
     """Yield a block's pixels in parts that hold at most MAX_HELD photons or bins each."""
     light, pixels = exposure.light(block), block.stop - block.start
-    held = exposure.sensor.bins * pixels if _is_dense(exposure, light) else light.primaries
+    held = _held_per_pixel(exposure) * pixels if _is_dense(exposure, light) else light.primaries
     if held <= MAX_HELD or pixels == 1 or not exposure.law.by_bins:  # event by event it is cut into cycles
         yield block
         return

@@ -7,6 +7,7 @@ keeps another one from being made, the order does not matter, and all kernels ar
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import reduce
 
@@ -17,6 +18,9 @@ from spad.sensor.model import Sensor
 from spad.sensor.pulse import AnyPulse, convolved
 
 WINDOW_SIGMAS = 8.5
+STEPS_PER_STD = 4  # of the pulse
+MAX_STEPS = 16  # per bin
+MAX_BINS, FINEST_S = 65536, 1e-15  # of a sensor
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 
@@ -26,10 +30,20 @@ def before_detection(sensor: Sensor) -> Sensor:
     return replace(sensor, jitter=None, tdc=clock)
 
 
+def steps_per_bin(sensor: Sensor) -> int:
+    """Return into how many steps a bin is divided before jitter, 1 to MAX_STEPS: finer than the pulse, as the first
+    photons of a cycle are not uniform within a bin. 0 where not even the bins of a period fit a sensor."""
+    wanted = math.ceil(min(STEPS_PER_STD * sensor.bin_width_s / sensor.pulse.std_s, MAX_STEPS))
+    fit = MAX_BINS // sensor.bins_per_period
+    return min(max(1, min(wanted, int(sensor.bin_width_s / FINEST_S))), fit)
+
+
 def over_the_period(sensor: Sensor) -> Sensor:
-    """Return a sensor `before_detection` with equal bins that cover the whole period: jitter moves detections into
-    the record from outside."""
-    return replace(before_detection(sensor), bins=sensor.bins_per_period, tdc=None)
+    """Return a sensor `before_detection` whose bins, equal ones, are the steps of the whole period: jitter moves
+    detections into the record from outside."""
+    steps = steps_per_bin(sensor)
+    bins, width = sensor.bins_per_period * steps, sensor.bin_width_s / steps
+    return replace(before_detection(sensor), bins=bins, bin_width_s=width, period_s=bins * width, tdc=None)
 
 
 def delayed(events: Detections, sensor: Sensor, rng: np.random.Generator) -> Detections:
@@ -43,19 +57,20 @@ def delayed(events: Detections, sensor: Sensor, rng: np.random.Generator) -> Det
 
 
 def blurred(masses: np.ndarray, sensor: Sensor, converter: np.ndarray | None) -> np.ndarray:
-    """Return the fractions of detections in the sensor's bins, (P, bins), of those at equal bins of the period, (P, T).
+    """Return the fractions of detections in the sensor's bins, (P, bins), of those in the steps of the period, (P, T).
 
-    Detections are uniform within a bin before jitter, and after it where converters have unequal bins. `converter`
+    Detections are uniform within a step before jitter, and after it where converters have unequal bins. `converter`
     (P,) is a row of `Sensor.code_edges`, or None.
     """
+    steps = steps_per_bin(sensor)
     kernel = _folded(reduce(convolved, sensor.jitters), sensor)
     spectrum = np.fft.rfft(masses) * np.fft.rfft(kernel)
     moved = np.clip(np.fft.irfft(spectrum, n=masses.shape[-1]), 0, None)
     edges = sensor.code_edges
     if edges is None or converter is None:
-        return moved[:, : sensor.bins]
+        return moved.reshape(len(moved), -1, steps).sum(axis=2)[:, : sensor.bins]
     arrived = np.concatenate((np.zeros((len(moved), 1)), np.cumsum(moved, axis=1)), axis=1)
-    whole = np.arange(arrived.shape[1])
+    whole = np.arange(arrived.shape[1]) / steps
     at_edges = (
         np.interp(edges[row] % sensor.bins_per_period, whole, mine) + mine[-1] * (edges[row] // sensor.bins_per_period)
         for row, mine in zip(converter, arrived, strict=True)
@@ -64,8 +79,9 @@ def blurred(masses: np.ndarray, sensor: Sensor, converter: np.ndarray | None) ->
 
 
 def _folded(jitter: AnyPulse, sensor: Sensor) -> np.ndarray:
-    """Return fractions of detections that jitter moves by 0, 1, ... bins around the period, (bins_per_period,)."""
-    period, width = sensor.bins_per_period, sensor.bin_width_s
+    """Return fractions of detections that jitter moves by 0, 1, ... steps around the period, (T,)."""
+    steps = steps_per_bin(sensor)
+    period, width = sensor.bins_per_period * steps, sensor.bin_width_s / steps
     before, after = jitter.window_s(WINDOW_SIGMAS)
     moves = np.arange(-int(np.ceil(abs(before) / width)) - 1, int(np.ceil(abs(after) / width)) + 2)
     edges = np.append(moves, moves[-1] + 1)
