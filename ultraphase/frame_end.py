@@ -1,4 +1,4 @@
-"""What leaves the sensor at a frame's end: frames run to it one after the other, beside the sums of their photons."""
+"""Run frames to their end, one after the other, and compare what leaves the sensor with the sums of their photons."""
 
 from __future__ import annotations
 

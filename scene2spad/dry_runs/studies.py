@@ -127,7 +127,7 @@ def recorded_seconds(command: Study) -> list[float]:
 
 
 def _found(wanted: Sequence[ModelSpec], command: Study, *, shipped: bool) -> tuple[list[ModelSpec], list[ModelSpec]]:
-    """Those that are there, in the folder of runs or (`shipped`) in the package, and those that are not."""
+    """Return the models that are in the folder of runs or (`shipped`) in the package, and those that are in neither."""
 
     def is_there(one: ModelSpec) -> bool:
         run = models_folder(command) / one.name / "model.safetensors"

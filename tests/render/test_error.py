@@ -125,7 +125,7 @@ def test_more_paths_are_asked_for_only_where_the_target_is_missed(total, words):
 
 
 def test_light_beyond_the_last_bounce_is_part_of_the_error():
-    """Its share of the energy, twice as uneven as if spread over the whole period; none where nothing is left out."""
+    """Take the share left out for twice as uneven as light spread over the whole period."""
     even = np.full((4, REFERENCE_BINS), 1.0)
     stated = estimate(even, even, errors=IndirectErrors(left_out=0.1))
     assert stated.truncated == pytest.approx(0.1 / 0.9 * np.sqrt(2)) == stated.total == stated.pixel_median

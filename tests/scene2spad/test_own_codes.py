@@ -128,7 +128,7 @@ def test_options_that_agree_with_the_file_are_taken(capfd):
 
 def test_codes_that_tell_nothing_are_refused_and_dependent_ones_told(capfd):
     np.save("zero.npy", np.zeros((4, 1024)))
-    assert refused(capfd, *TRAIN, "zero.npy", "--out", "zero") == "scene2spad: zero.npy: all codes are zero\n"
+    assert refused(capfd, *TRAIN, "zero.npy", "--out", "zero") == "scene2spad: zero.npy: all codes are zero"
     np.save("twice.npy", np.concatenate([ROWS, ROWS]))
     assert main([*TRAIN, "twice.npy", "--out", "twice"]) == 0
     assert "twice.npy: its 16 codes have rank 8: the others follow from so many" in capfd.readouterr().err

@@ -14,6 +14,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
+from commands import refused, run
 from small_runs import QUICK
 
 from csph.codes.design import Design
@@ -34,22 +35,6 @@ from scenes import InputError
 from spad.detection.detect import sense
 from spad.measurements.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, Sensor
-
-
-def run(capfd, *argv: str) -> dict:
-    status = main([*argv, "--json"])
-    out, err = capfd.readouterr()
-    assert status == 0, err
-    assert len(out.splitlines()) == 1
-    return json.loads(out)
-
-
-def refused(capfd, *argv: str) -> str:
-    status = main(list(argv))
-    out, err = capfd.readouterr()
-    lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
-    assert status == 2 and out == "" and len(lines) == 1 and "Traceback" not in err
-    return lines[0]
 
 
 def test_planes_of_few_pixels_return_no_light_from_behind_the_camera():

@@ -1,4 +1,4 @@
-"""What a camera of a Mitsuba file leaves out is named in the notes."""
+"""Check that notes name what a camera of a Mitsuba file leaves out."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_what_the_clipping_planes_cut_is_named_in_one_line(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(("height", "noted"), [(-1.0, 0), (-0.005, 1)])
 def test_a_floor_below_the_camera_is_cut_only_where_it_is_seen(tmp_path: Path, height: float, noted: int) -> None:
-    """Its triangles go past the camera: what counts is where they are in view."""
+    """Judge a floor whose triangles go past the camera by its part in view."""
     turn = '<rotate x="1" angle="-90"/><scale value="20"/>'
     floor = f'<shape type="rectangle"><transform name="to_world">{turn}<translate y="{height}"/></transform></shape>'
     assert len(clipped(tmp_path, 0.1, 100, floor)) == noted

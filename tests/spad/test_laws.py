@@ -8,9 +8,7 @@ import torch
 from scipy import stats
 from test_flux import transient_of
 
-from scenes import InputError
-from spad.detection.detect import expected_in_pixel, sense, sense_timestamps
-from spad.detection.exposure import draw_part
+from spad.detection.detect import expected_in_pixel, sense
 from spad.detection.laws import (
     Detections,
     add_crosstalk,
@@ -21,9 +19,7 @@ from spad.detection.laws import (
     live_detections,
 )
 from spad.estimators.pile_up import coates, free_running_flux, linearised
-from spad.measurements.timestamps import Timestamps
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
-from spad.sensor.tdc import Tdc
 
 REFERENCE = Sensor()
 SMALL = Sensor(name="small", bins=64)
@@ -245,6 +241,25 @@ def test_free_running_correction_recovers_the_flux(tau_periods: float) -> None:
         assert np.abs(raw / flux[fullest] - 1).max() > 0.2, "there was something to correct"
 
 
+def test_a_dead_time_of_seconds_takes_no_more_memory_than_one_of_nanoseconds():
+    """1 s is 1e10 bins: the kernel of whole periods is a number per bin, not an entry per bin of the dead time."""
+    sensor = Sensor(reset="free-running", dead_time_s=1.0, exposure_s=1000.0)
+    flux = free_running_flux(torch.full((1, sensor.bins), 0.5), sensor.cycles, sensor)
+    # each of 512 detections blinds 1e7 of the 1e10 cycles
+    live = sensor.cycles - 512 * sensor.dead_time_s / sensor.period_s
+    assert torch.allclose(flux, torch.full_like(flux, 0.5 / live), rtol=1e-6)
+    short = Sensor(reset="free-running", dead_time_s=250e-9)
+    counts = torch.arange(short.bins).double()[None] % 7
+    dead = short.dead_time_s / short.bin_width_s
+    far = torch.arange(1, int(dead) + 2).double()
+    within = torch.where(
+        far <= dead - 1, 1.0, torch.where(far <= dead, 1 - (1 - dead + far) ** 2 / 2, (1 + dead - far) ** 2 / 2)
+    )
+    blind = sum(fraction * counts.roll(int(d), -1) for fraction, d in zip(within, far, strict=True))
+    plain = -torch.log1p(-counts / (short.cycles - blind))
+    assert torch.allclose(free_running_flux(counts, short.cycles, short), plain, rtol=1e-9)
+
+
 # Crosstalk
 
 
@@ -306,132 +321,3 @@ def test_first_of_each_cycle_keeps_the_earliest() -> None:
     events = Detections(np.array([1, 0, 1, 1, 0]), np.array([3, 0, 3, 4, 0]), np.array([9, 5, 2, 7, 5]))
     first = first_of_each_cycle(events, SMALL)
     assert [tuple(map(int, event)) for event in zip(*first, strict=True)] == [(0, 0, 5), (1, 3, 2), (1, 4, 7)]
-
-
-# Forms
-
-
-@pytest.mark.parametrize(
-    ("model", "signal"), [("poisson", 30), ("poisson", 1e4), ("first-photon", 30), ("free-running", 30)]
-)
-@pytest.mark.parametrize("crosstalk", [0.0, 0.01])
-def test_timestamps_and_histogram_are_one_draw(model: str, signal: float, crosstalk: float) -> None:
-    sensor = replace(REFERENCE, crosstalk=crosstalk, dead_time_s=2e-8)
-    scene, budget = same(1500 if signal < 100 else 20, (4.0, 4.1, 1.0)), PhotonBudget(signal, 20)
-    stamps = sense_timestamps(scene, sensor, budget, seed=2, model=model)
-    counts = sense(scene, sensor, budget, seed=2, model=model).counts
-    assert (stamps.counts() == counts).all() and stamps.bits == 10 == sensor.timestamp_bits
-    again = Timestamps.of_counts(counts)
-    assert (again.stamps == stamps.stamps).all() and (again.offsets == stamps.offsets).all()
-    assert (stamps.unpacked(stamps.packed()).stamps == stamps.stamps).all()
-    assert len(stamps.packed()) == -(-len(stamps.stamps) * 10 // 8)
-
-
-def test_pieces_of_an_exposure_are_the_exposure_and_report_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Event by event an exposure of many photons is drawn some cycles at a time: dead time lasts over the seams."""
-    cycles = 400
-    sensor = replace(SMALL, exposure_s=cycles * SMALL.period_s, dead_time_s=2.2 * SMALL.period_s)
-    scene, budget = same(400, (0.5, 0.6, 1.0)), PhotonBudget(0.5 * cycles, 0.3 * cycles)
-    whole = sense(scene, sensor, budget, seed=1, model="free-running").counts[0]
-    monkeypatch.setattr("spad.detection.detectors.MAX_EVENTS", 400 * 0.8 * cycles / 40)
-    done: list[float] = []
-    report = lambda what, fraction: done.append(fraction)  # noqa: E731
-    pieces = sense(scene, sensor, budget, seed=1, model="free-running", progress=report).counts[0]
-    # about 40 pieces, a report after each; the budget's mean is reached to rounding
-    assert len(done) in (41, 42) and done == sorted(done) and done[0] == 0 and done[-1] == pytest.approx(1)
-    both = np.stack([pieces.sum(axis=0), whole.sum(axis=0)])
-    assert stats.chi2_contingency(both[:, both.sum(axis=0) > 20]).pvalue > 1e-3
-    # forgetting the dead time at 40 seams would add 0.5 tau's worth of detections at each: 10 % here
-    assert both.sum(axis=1)[0] == pytest.approx(both.sum(axis=1)[1], rel=5 * np.sqrt(2 / both[1].sum()))
-
-
-@pytest.mark.parametrize("crosstalk", [0.0, 0.01])
-@pytest.mark.parametrize("model", ["poisson", "first-photon", "free-running"])
-def test_progress_ends_at_one_whatever_the_law(model: str, crosstalk: float) -> None:
-    """Two blocks of pixels, on however many threads."""
-    done: list[float] = []
-    report = lambda what, fraction: done.append(fraction)  # noqa: E731
-    sensor = replace(SMALL, exposure_s=100 * SMALL.period_s, crosstalk=crosstalk)
-    scene = same(1100, (0.5, 0.6, 1.0))
-    sense(scene, sensor, PhotonBudget(30.0, 20.0), seed=1, model=model, progress=report)
-    assert done == sorted(done) and done[0] == 0 and done[-1] == pytest.approx(1) and len(done) >= 3
-
-
-@pytest.mark.parametrize(
-    ("model", "many", "lines"), [("free-running", 50, 1), ("free-running", 1e7, 0), ("poisson", 50, 0)]
-)
-def test_many_events_that_are_drawn_one_by_one_are_said_before(model, many, lines, monkeypatch, caplog) -> None:
-    monkeypatch.setattr("spad.detection.exposure.MANY_EVENTS", many)
-    said = lambda *_: pytest.fail("drawn before it was said") if len(caplog.records) < lines else None  # noqa: E731
-    with caplog.at_level("INFO", logger="spad"):
-        sense(same(4, (0.5, 0.6, 1.0)), SMALL, PhotonBudget(20.0, 10.0), seed=1, model=model, progress=said)
-    assert [record.message for record in caplog.records] == [
-        "free-running: 120 photons are drawn one by one; fewer photons or a shorter exposure take less time"
-    ] * lines
-
-
-def test_a_dead_time_of_seconds_takes_no_more_memory_than_one_of_nanoseconds():
-    """1 s is 1e10 bins: the kernel of whole periods is a number per bin, not an entry per bin of the dead time."""
-    sensor = Sensor(reset="free-running", dead_time_s=1.0, exposure_s=1000.0)
-    flux = free_running_flux(torch.full((1, sensor.bins), 0.5), sensor.cycles, sensor)
-    # each of 512 detections blinds 1e7 of the 1e10 cycles
-    live = sensor.cycles - 512 * sensor.dead_time_s / sensor.period_s
-    assert torch.allclose(flux, torch.full_like(flux, 0.5 / live), rtol=1e-6)
-    short = Sensor(reset="free-running", dead_time_s=250e-9)
-    counts = torch.arange(short.bins).double()[None] % 7
-    dead = short.dead_time_s / short.bin_width_s
-    far = torch.arange(1, int(dead) + 2).double()
-    within = torch.where(
-        far <= dead - 1, 1.0, torch.where(far <= dead, 1 - (1 - dead + far) ** 2 / 2, (1 + dead - far) ** 2 / 2)
-    )
-    blind = sum(fraction * counts.roll(int(d), -1) for fraction, d in zip(within, far, strict=True))
-    plain = -torch.log1p(-counts / (short.cycles - blind))
-    assert torch.allclose(free_running_flux(counts, short.cycles, short), plain, rtol=1e-9)
-
-
-@pytest.mark.parametrize("model", ["poisson", "first-photon"])
-def test_blocks_of_very_many_photons_are_drawn_in_parts(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One pixel of 40 is far brighter: its bins are drawn at once, those around it photon by photon, all by one law."""
-    returns = [[(0.5, 0.9, 1.0)] for _ in range(40)]
-    returns[17] = [(0.5, 0.9, 400.0)]
-    scene, budget = transient_of(*returns), PhotonBudget(100.0, 20.0)
-    scene = replace(scene, ambient=np.ones((1, 40), np.float32))
-    sensor = replace(SMALL, exposure_s=1e5 * SMALL.period_s)
-    usual = sense(scene, sensor, budget, seed=1, model=model).counts
-    shapes = []
-    monkeypatch.setattr("spad.detection.exposure.MAX_HELD", 200)
-    recording = lambda *given: shapes.append(draw_part(*given)) or shapes[-1]  # noqa: E731
-    monkeypatch.setattr("spad.detection.exposure.draw_part", recording)
-    drawn = sense(scene, sensor, budget, seed=2, model=model).counts
-    assert max(array.size for array in shapes) < 200 + 5 * np.sqrt(200) and any(array.ndim == 2 for array in shapes)
-    assert np.array_equal(sense_timestamps(scene, sensor, budget, seed=2, model=model).counts(), drawn)
-    both = np.stack([usual[0].sum(axis=0), drawn[0].sum(axis=0)])
-    assert stats.chi2_contingency(both[:, both.sum(axis=0) > 20]).pvalue > 1e-3
-    pixels = np.stack([usual.sum(axis=2)[0], drawn.sum(axis=2)[0]])
-    assert (np.abs(pixels[0] - pixels[1]) < 5 * np.sqrt(pixels.sum(axis=0)) + 1).all()
-
-
-def test_a_histogram_larger_than_memory_is_refused_before_it_is_allocated(monkeypatch):
-    monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "1e-6")
-    with pytest.raises(InputError, match=r"a histogram of 1 x 1 pixels and 1024 bins: needs .* GB of memory"):
-        sense(transient_of([(4.0, 4.02, 1.0)]), Sensor(), PhotonBudget(40, 60))
-
-
-@pytest.mark.parametrize(
-    ("law", "expected", "exposure"),
-    [("first-photon", "6e+09", 1e-3), ("free-running", "8.57e+08", 1.0), ("poisson", "6e+09", 1e-3)],
-)
-def test_crosstalk_of_too_many_detections_is_refused_before_any_is_drawn(law, expected, exposure, monkeypatch):
-    """First photons of 10,000 cycles would be few, but all photons of a block are drawn for them."""
-
-    def draw(*_, **__):
-        raise AssertionError("photons were drawn")
-
-    monkeypatch.setattr("spad.detection.detectors.draw_primaries", draw)
-    sensor = Sensor(crosstalk=0.01, dead_time_s=1e-8, exposure_s=exposure, tdc=Tdc(Sensor().period_s / 8, codes=128))
-    light = same(10, (3.0, 3.0, 1.0))
-    with pytest.raises(
-        InputError, match=r"crosstalk event by event: .* would be held at once, the limit is 67108864"
-    ) as caught:
-        sense(light, sensor, PhotonBudget(3e8, 3e8), model=law)
-    assert expected in str(caught.value)

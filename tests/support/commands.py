@@ -14,9 +14,10 @@ def run(capfd, *argv: str) -> dict:
 
 
 def refused(capfd, *argv: str) -> str:
-    """Return the one line of a command that is refused."""
+    """Return the one line of a command that is refused; warnings may stand before it, and stdout is empty."""
     capfd.readouterr()
     status = main(list(argv))
-    err = capfd.readouterr().err
-    assert status == 2 and len(err.splitlines()) == 1, err
-    return err
+    out, err = capfd.readouterr()
+    lines = [line for line in err.splitlines() if line.startswith("scene2spad: ")]
+    assert status == 2 and out == "" and len(lines) == 1 and "Traceback" not in err, err
+    return lines[0]
