@@ -39,6 +39,7 @@ from spad.sensor.model import PhotonBudget, Sensor
 
 PIXELS = ("all", "unmixed", "mixed")
 FIGURES = ("mae_mm", "rmse_mm", *(f"within_{t}mm" for t in TOLERANCES_MM))
+RANGES = {name: (0.0, 1.0 if name.startswith("within_") else math.inf) for name in FIGURES}  # of their values
 LEVEL_GROUPS: dict[str, Callable[[float, float], bool]] = {
     "all": lambda signal, background: True,
     "low_sbr": is_low_sbr,
@@ -111,9 +112,16 @@ class Evaluation:
     def interval(
         self, methods: Sequence[str], group: str = "all", levels: str = "all", figure: str = "mae_mm"
     ) -> Interval | None:
-        """Return mean over scenes with its interval; None where there is no finite value."""
+        """Return mean over scenes with its interval; None where there is no finite value.
+
+        Student's interval of few scenes can reach where no figure is: those of errors end at 0, of shares at 0 and 1.
+        """
         found = self.values(methods, group, levels, figure)
-        return mean_over_scenes(found) if any(np.isfinite(v).any() for v in found.values()) else None
+        if not any(np.isfinite(v).any() for v in found.values()):
+            return None
+        mean, *ends = mean_over_scenes(found)
+        least, most = RANGES.get(figure, (-math.inf, math.inf))
+        return Interval(mean, *(float(np.clip(end, least, most)) for end in ends))
 
     def difference(self, first: Sequence[str], second: Sequence[str], levels: str = "all") -> Interval:
         """Return paired difference of MAE [mm], first - second, over scenes and levels."""
@@ -130,8 +138,7 @@ class Evaluation:
                 found = {name: self.interval(methods, group, levels, name) for name in figures}
                 line: dict[str, Any] = {name: None if i is None else i.mean for name, i in found.items()}
                 mae = found["mae_mm"]
-                # Student's interval of few scenes can reach below 0, where no error is
-                line["mae_interval_mm"] = None if mae is None else [float(np.maximum(mae.low, 0)), mae.high]
+                line["mae_interval_mm"] = None if mae is None else [mae.low, mae.high]
                 table[levels][group] = line
         estimate, truth = (
             np.concatenate(parts) for parts in zip(*(pair for m in methods for pair in self.depths[m]), strict=True)

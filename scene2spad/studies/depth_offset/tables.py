@@ -11,7 +11,6 @@ import numpy as np
 from csph.codes.temporal import bin_energy, grouped_energy
 from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, Row
 from csph.layer import make_coding
-from scene2spad.networks.intervals import interval_of
 from scene2spad.networks.registry import ModelSpec, Trained
 from spad.sensor.model import Sensor
 
@@ -95,7 +94,7 @@ def summary_rows(rows: Sequence[Row], wanted: Iterable[ModelSpec], common: Mappi
         for levels in LEVEL_GROUPS:
             line = {"design": label, "compression": ratio, "seeds": len(names), **common, "levels": levels}
             for figure in ("mae_mm", "rmse_mm", "within_10mm"):
-                interval = interval_of(evaluation, names, levels=levels, figure=figure)
+                interval = evaluation.interval(names, levels=levels, figure=figure)
                 mean, low, high = interval or (math.nan,) * 3
                 line |= {figure: mean, f"{figure}_low": low, f"{figure}_high": high}
             found.append(line)

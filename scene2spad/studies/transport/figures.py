@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import PercentFormatter, SymmetricalLogLocator
 
 from csph.evaluation.methods import Evaluation, Row
-from scene2spad.networks.intervals import interval_of
 from scene2spad.plots.figures import plain_log, plt, save
 from scene2spad.plots.style import COLOURS, look
 from scene2spad.studies.transport.plan import KEPT, LASERS, LATER, LEVELS, LIMIT, OPEN, REVERSED, STEPS
@@ -50,7 +49,7 @@ def draw_steps(summary: Sequence[JsonObject], rows: Mapping[tuple[str, str], Seq
 
 def _at_level(rows: Sequence[Row], design: str, signal: float, background: float) -> tuple[float, float, float] | None:
     chosen = [row for row in rows if (row.signal, row.background) == (signal, background)]
-    return interval_of(Evaluation(chosen), [design])
+    return Evaluation(chosen).interval([design])
 
 
 def _curve(axes: Axes, intervals: Sequence[tuple[float, float, float]], number: int, label: str, of: int) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 
 from csph.evaluation.methods import LEVEL_GROUPS, PIXELS, Evaluation, Row
 from csph.evaluation.metrics import Interval, paired_difference
-from scene2spad.networks.intervals import interval_of
 from scene2spad.networks.registry import EvaluatedModel
 from scene2spad.studies.transport.plan import FIRST, KEPT, LASERS, LATER, OPEN, REVERSED, STEPS
 from scenes.json_types import JsonObject
@@ -141,7 +140,7 @@ def _lines(here: Sequence[Row], before: Sequence[Row] | None, name: str) -> Iter
     for levels in LEVEL_GROUPS:
         for pixels in PIXELS:
             values = Evaluation(list(here))
-            interval = interval_of(values, [name], pixels=pixels, levels=levels)
+            interval = values.interval([name], pixels, levels)
             if interval is None:
                 continue
             line = {"levels": levels, "pixels": pixels, "mae_mm": interval.mean, "mae_low": interval.low,
