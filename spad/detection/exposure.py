@@ -62,7 +62,7 @@ class Exposure:
         return np.random.Generator(np.random.SFC64(seeds))
 
     @property
-    def jitters(self) -> bool:
+    def delays_detected(self) -> bool:
         """Return whether jitter delays what the law has chosen; else it is drawn with the pulse (`jitter`)."""
         return bool(self.sensor.jitters) and not self.law.independent
 
@@ -70,7 +70,7 @@ class Exposure:
     def timed(self) -> bool:
         """Return whether detections are drawn at times, which jitter and a converter then put into bins, or in bins at
         once."""
-        return self.sensor.tdc is not None or self.jitters
+        return self.sensor.tdc is not None or self.delays_detected
 
     def coded(self, events: Detections, first: int) -> Detections:
         """Return detections with the bins that their pixels' converters give them; pixels are counted from `first`."""
@@ -82,7 +82,7 @@ class Exposure:
 
     def recorded(self, events: Detections) -> Detections:
         """Return the detections that find a bin: a detector blinds itself also in the part of the period without."""
-        anywhere = self.law.whole_period or self.jitters
+        anywhere = self.law.whole_period or self.delays_detected
         if not anywhere or self.sensor.bins == self.sensor.bins_per_period:
             return events
         seen = events.position < self.sensor.bins
@@ -90,7 +90,7 @@ class Exposure:
 
     def finished(self, events: Detections, first: int, rng: np.random.Generator) -> Detections:
         """Return what the law detected as it is recorded: with jitter, in bins; pixels are counted from `first`."""
-        return self.coded(self.recorded(delayed(events, self.sensor, rng) if self.jitters else events), first)
+        return self.coded(self.recorded(delayed(events, self.sensor, rng) if self.delays_detected else events), first)
 
     @property
     def adds_crosstalk(self) -> bool:
@@ -99,7 +99,7 @@ class Exposure:
 
     def moved(self, block: slice) -> Moved | None:
         """Return what turns shares of detections in bins of the period into those with jitter; None without any."""
-        if not self.jitters:
+        if not self.delays_detected:
             return None
         converter = None if self.rates.converter is None else self.rates.converter.reshape(-1)[block]
         return partial(blurred, sensor=self.sensor, converter=converter)
@@ -109,7 +109,7 @@ class Exposure:
         owner, start, length, signal, background = self.whole
         part = slice(first, last)
         flux = PixelFlux(owner[part] - block.start, start[part], length[part], signal[part], background[block])
-        return BlockLight(flux, before_detection(self.sensor) if self.jitters else self.sensor, self.timed)
+        return BlockLight(flux, before_detection(self.sensor) if self.delays_detected else self.sensor, self.timed)
 
 
 def counts_of(exposure: Exposure, progress: Progress | None) -> np.ndarray:
@@ -228,14 +228,14 @@ def _block(
 
 
 def _is_dense(exposure: Exposure, light: BlockLight) -> bool:
-    by_bins = exposure.law.by_bins and not (exposure.jitters and steps_per_bin(exposure.sensor) == 0)
+    by_bins = exposure.law.by_bins and not (exposure.delays_detected and steps_per_bin(exposure.sensor) == 0)
     return by_bins and light.primaries > DENSE_FROM * exposure.sensor.bins * light.flux.pixels
 
 
 def _held_per_pixel(exposure: Exposure) -> int:
     """Return how many numbers drawing every bin of a pixel at once holds."""
     sensor = exposure.sensor
-    return sensor.bins_per_period * steps_per_bin(sensor) if exposure.jitters else sensor.bins
+    return sensor.bins_per_period * steps_per_bin(sensor) if exposure.delays_detected else sensor.bins
 
 
 def _parts(exposure: Exposure, block: slice) -> Iterator[slice]:
@@ -258,7 +258,7 @@ def draw_part(
     if _is_dense(exposure, light):
         from spad.detection.flux import expected_counts  # with torch, whose import takes a second
 
-        sensor = over_the_period(exposure.sensor) if exposure.jitters else exposure.sensor
+        sensor = over_the_period(exposure.sensor) if exposure.delays_detected else exposure.sensor
         rate = expected_counts(exposure.transient, sensor, exposure.rates, block)[0].numpy()
         meter.add(light.flux.pixels)
         return law.counts(rate, round(sensor.cycles), rng, exposure.moved(block))
