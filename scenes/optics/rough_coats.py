@@ -10,11 +10,8 @@ from functools import lru_cache
 
 import numpy as np
 
-RADII, TURNS, COSINES = (
-    64,
-    32,
-    256,
-)  # of quadrature: heights of microfacets, turns about the normal, angles of incidence
+# Points of quadrature: heights of microfacets, turns about the normal, angles of incidence
+RADII, TURNS, COSINES = 64, 32, 256
 SMOOTH = 1e-3  # alpha below which an interface is taken as smooth
 
 

@@ -279,10 +279,10 @@ def depth_errors(
 ) -> dict[str, float | int]:
     """Return error figures of a depth map against the truth [m], both of one shape, over the pixels not in `exclude`.
 
-    mae_mm, rmse_mm, median_mm (signed) and within_10mm (share strictly under 10 mm) over `pixels` pixels; left out and
-    counted: empty (truth NaN), beyond_range (truth at the range, one for all or (H, W), or beyond), missing (estimate
-    NaN or infinite). What a masked array masks is NaN. Raises InputError for maps of other shapes, of no numbers,
-    and of depths below 0.
+    mae_mm, rmse_mm, median_mm (signed), median_abs_mm (of |error|) and within_10mm (share strictly under 10 mm) over
+    `pixels` of them; left out and counted: empty (truth NaN), beyond_range (truth at the range, one for all or (H, W),
+    or beyond), missing (estimate NaN or infinite). What a masked array masks is NaN. Raises InputError for maps of
+    other shapes, of no numbers, and of depths below 0.
     """
     estimate, truth = map(_metres, (estimate, truth))
     keep = (
@@ -296,13 +296,15 @@ def depth_errors(
     beyond = keep & (truth >= range_m)
     missing = keep & ~empty & ~beyond & ~np.isfinite(estimate)
     error = (estimate - truth)[keep & ~empty & ~beyond & ~missing] * 1e3
-    figures = {"mae_mm": math.nan, "rmse_mm": math.nan, "median_mm": math.nan, "within_10mm": math.nan}
+    figures = dict.fromkeys(("mae_mm", "rmse_mm", "median_mm", "median_abs_mm", "within_10mm"), math.nan)
     if error.size:
+        absolute = np.abs(error)
         figures = {
-            "mae_mm": float(np.abs(error).mean()),
+            "mae_mm": float(absolute.mean()),
             "rmse_mm": float(np.sqrt((error**2).mean())),
             "median_mm": float(np.median(error)),
-            "within_10mm": float((np.abs(error) < 10).mean()),
+            "median_abs_mm": float(np.median(absolute)),
+            "within_10mm": float((absolute < 10).mean()),
         }
     counted = {"empty": int(empty.sum()), "beyond_range": int(beyond.sum()), "missing": int(missing.sum())}
     return {**figures, "pixels": int(error.size), **counted}

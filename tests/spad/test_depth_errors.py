@@ -29,3 +29,11 @@ def test_what_is_no_depth_is_refused_in_one_line(depth, meant) -> None:
         with pytest.raises(InputError) as refused:
             depth_errors(estimate, truth, range_m=15.0)
         assert str(refused.value) == meant
+
+
+def test_the_median_of_the_absolute_error_is_over_the_pixels_of_the_mean() -> None:
+    """A pixel beyond the range is in neither; of signed errors of 1, -3 and 5 mm the absolute median is 3."""
+    truth = np.array([[1.0, 2.0], [3.0, 99.0]])
+    found = depth_errors(truth + np.array([[0.001, -0.003], [0.005, 50.0]]), truth, range_m=15.0)
+    assert found["pixels"] == 3 and found["mae_mm"] == pytest.approx(3)
+    assert found["median_abs_mm"] == pytest.approx(3) and found["median_mm"] == pytest.approx(1)

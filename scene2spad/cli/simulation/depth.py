@@ -120,7 +120,7 @@ def readable(result: dict) -> dict:
     why = no_error_reason(result)
     kept = dict(result)
     if why is not None:
-        unknown = (*MEANS, "median_mm", "unmixed")
+        unknown = (*MEANS, "median_mm", "median_abs_mm", "unmixed")
         items = (("errors", why) if key == "mae_mm" else (key, value) for key, value in result.items())
         kept = {key: value for key, value in items if key not in unknown}
     if isinstance(kept.get("unmixed"), dict):

@@ -8,7 +8,6 @@ and by emulation with arrival times at S.2's.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
@@ -23,7 +22,6 @@ from scene2spad.studies.chip.code import compile_model
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detect import sense
-from spad.estimators.bistatic import recorded_range_m
 from spad.estimators.depth import histogram_errors
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -97,20 +95,11 @@ def front_rows(found: list[Design], transient: Transient, seed: int, progress: P
         for one in found:
             progress(f"{one.name}, {photons:g} photons", number / len(PHOTONS))
             depth = one.depth_m(histogram)
-            errors = absolute_errors(depth, histogram)
-            common = {"name": one.name, "photons": photons, **{key: errors[key] for key in ("mae_mm", "median_abs_mm")}}
+            errors = histogram_errors(depth, histogram)
+            figures = {key: errors[key] for key in ("mae_mm", "median_abs_mm")}
+            common: dict[str, object] = {"name": one.name, "photons": photons, **figures}
             rows += [{**common, **_costs(one, photons, rate)} for rate in FRAME_RATES]
     return rows
-
-
-def absolute_errors(depth_m: np.ndarray, histogram: Histogram) -> dict[str, float]:
-    """Return `spad.estimators.depth.histogram_errors` with `median_abs_mm`, the median of |error| over the pixels of
-    `mae_mm`."""
-    truth = histogram.depth_m
-    left_out = ~np.isfinite(depth_m) | ~(truth < recorded_range_m(histogram))
-    error_mm = 1e3 * np.abs(depth_m - truth)[~left_out]
-    median = float(np.median(error_mm)) if error_mm.size else math.nan
-    return {**histogram_errors(depth_m, histogram), "median_abs_mm": median}
 
 
 def _costs(one: Design, photons: float, frames_per_s: float) -> dict[str, float]:

@@ -18,7 +18,7 @@ from scene2spad.networks.lookup import found_only
 from scene2spad.options.experiments import Study
 from scene2spad.plots import figures
 from scene2spad.plots.figures import DEPTH_COLOURS, plt
-from scene2spad.studies.power.front import absolute_errors, designs, front_rows, loss_rows, printed_rows
+from scene2spad.studies.power.front import designs, front_rows, loss_rows, printed_rows
 from scene2spad.studies.power.front_figure import draw_front
 from scene2spad.studies.power.plan import WANTED
 from scenes.errors import InputError, require
@@ -26,6 +26,7 @@ from scenes.files import read_arrays, whole_file, write_csv
 from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 from spad.detection.detect import sense
+from spad.estimators.depth import histogram_errors
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, sensor_by_name
 from ultraphase import Method, method
@@ -89,7 +90,7 @@ def run(command: Study, progress: Progress) -> dict:
 
 
 def _errors(depth: np.ndarray, histogram: Histogram) -> dict:
-    found = absolute_errors(depth, histogram)
+    found = histogram_errors(depth, histogram)
     return {name: found[name] for name in ("mae_mm", "within_10mm", "median_abs_mm")}
 
 
