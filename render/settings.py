@@ -124,7 +124,8 @@ class RenderSettings:
             object.__setattr__(self, "budget", (signal, background))
             if not (math.isfinite(signal) and math.isfinite(background) and signal > 0 and background >= 0):
                 raise InputError(
-                    f"render: budget of {signal:g} signal, {background:g} background photons is not positive"
+                    f"render: budget of {signal:g} signal, {background:g} background photons a pixel, expected signal "
+                    "above 0 and background of 0 or more"
                 )
         if self.budget is not None and self.error is not None:
             raise InputError("render: give an error target or a photon budget, not both")

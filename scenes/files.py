@@ -11,7 +11,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import lru_cache
 from pathlib import Path
@@ -149,8 +149,9 @@ def read_array(path: Path) -> np.ndarray:
         raise InputError(f"{path}: not a readable .npy file ({' '.join(str(error).split())[:80]})") from None
 
 
-def read_arrays(path: Path, what: str = "array file") -> dict[str, np.ndarray]:
-    """Read arrays of numbers from a .npz file, by name. `what` the file is called where it is not found.
+def read_arrays(path: Path, what: str = "array file", names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Read arrays of numbers from a .npz file, by name: all of them, or those of `names` that it holds. `what` the file
+    is called where it is not found.
 
     Raises InputError in one line that names the file: as `read_array` does, and where a checksum does not fit.
     """
@@ -161,8 +162,10 @@ def read_arrays(path: Path, what: str = "array file") -> dict[str, np.ndarray]:
             entries = archive.infolist()
             require_memory(2 * sum(entry.file_size for entry in entries), "its arrays")
             for entry in entries:
-                with archive.open(entry) as file:
-                    found[entry.filename.removesuffix(".npy")] = npy_array(file, entry.file_size)
+                name = entry.filename.removesuffix(".npy")
+                if names is None or name in names:
+                    with archive.open(entry) as file:
+                        found[name] = npy_array(file, entry.file_size)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # what zipfile raises for damaged directories is of many types

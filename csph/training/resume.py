@@ -32,11 +32,17 @@ def claim_run(folder: Path, config: TrainConfig) -> None:
     if path.is_file():
         _check_same(folder, config)
     else:
-        require(is_unclaimed(folder), f"{folder}: is not an empty folder and holds no run; choose another --out")
+        require_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as beside:
             beside.write_text(json.dumps(config.to_dict(), indent=1, sort_keys=True) + "\n")
     keep_codes(config, folder)
+
+
+def require_free(folder: Path) -> None:
+    """Raise InputError for a path that can hold no run: a file, or a folder with something else in it."""
+    there = (folder / "config.json").is_file() or is_unclaimed(folder)
+    require(there, f"{folder}: is not an empty folder and holds no run; choose another --out")
 
 
 def _check_same(folder: Path, config: TrainConfig) -> None:

@@ -30,7 +30,10 @@ from scenes.files import finite
 from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
-DESCRIPTION = "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth."
+DESCRIPTION = (
+    "From a 3D mesh scene to what a single-photon (SPAD) camera records of it, and on to depth. `--version` tells the "
+    "version, `--completion bash` (or zsh) prints completions for a shell: eval it in its start-up file."
+)
 NARROWEST = 20  # columns; the parser's help does not come to an end in fewer than five or so
 PIPED_S = 30.0  # between lines of progress where stderr is no terminal
 # In the order of --help: every command and its room. `scene2spad.cli.ROOM.NAME` has the options, a class `Name`, and

@@ -220,7 +220,9 @@ def transient_of(histogram: Histogram, path: Path, given: Path | None) -> Transi
     source = given or path.with_suffix(".exr")
     if given is None and not (source.is_file() and holds_kind(source, "transient")):
         return None
-    transient = open_transient(input_file(source), "transient", 0)
+    kind = kind_of(source)
+    require(kind == "transient", f"{source}: is of kind {kind}, expected the transient that {path} was sensed from")
+    transient = open_transient(source, kind, 0)
     if transient.sha256() == wanted:
         return transient
     require(given is None, f"{given}: is not the transient that {path} was sensed from")

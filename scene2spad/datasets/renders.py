@@ -31,7 +31,7 @@ def transient_files(folder: Path) -> list[Path]:
         found = [folder / record["file"] for record in read_set_index(folder)]
     else:
         found = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr" and is_transient(path))
-    require(bool(found), f"{folder}: no transient (.exr) in this folder, and it is none of a set")
+    require(bool(found), f"{folder}: no transient (.exr) in this folder, and it is not the folder of a set")
     return found
 
 

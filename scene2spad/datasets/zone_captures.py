@@ -58,11 +58,14 @@ def read_plane_captures(path: Path) -> PlaneCaptures:
     """
     path = Path(path)
     require(path.suffix.lower() == ".npz", f"{path}: captures are a .npz file")
-    held = read_arrays(path, "capture file")
-    for name, dims in (("distance_m", 1), ("counts", 3), ("reference_counts", 2), ("chip_depth_1_mm", 2)):
+    dimensions = {"distance_m": 1, "counts": 3, "reference_counts": 2, "chip_depth_1_mm": 2}
+    held = read_arrays(path, "capture file", dimensions)
+    for name, dims in dimensions.items():
         if dims == 2 and name not in held:
             continue
-        require(name in held, f"{path}: holds no {name}, there are {', '.join(held) or 'none'}")
+        require(
+            name in held, f"{path}: holds no {name}, expected captures: distance_m (N,) and counts (N, zones, bins)"
+        )
         good = held[name].ndim == dims and held[name].dtype.kind in "iuf" and held[name].size > 0
         require(good, f"{path}: {name} is {held[name].dtype}{held[name].shape}, expected {dims} dimensions of numbers")
         known = np.nan_to_num(held[name], nan=0.0) if name == "chip_depth_1_mm" else held[name]

@@ -25,6 +25,7 @@ from csph.training.beginning import NetworkOf, WeightsOf, check_init
 from csph.training.lineage import begin_with
 from csph.training.overlap import overlap
 from csph.training.own_codes import FILE, codes_path
+from csph.training.resume import require_free
 from csph.training.views import Views, is_seen, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
@@ -235,6 +236,8 @@ def run_train(command: Train, progress: Progress) -> dict:
     config.check_memory()
     require(bool(command.set), "train: --set without a set")
     check_workers(command.workers, least=0)
+    folder = folder_of(command)
+    require_free(folder)
     init = begun_with(command, config)
     from csph.training.loop import Hardware, train  # and Lightning, which takes seconds to import
 
@@ -247,7 +250,6 @@ def run_train(command: Train, progress: Progress) -> dict:
     for name, begun in (("init", command.init), ("init_network", command.init_network)):
         if begun is not None:
             data[name] = Path(begun).name
-    folder = folder_of(command)
     if command.codes_file is not None:
         _warn_of_dependent(codes_path(command.codes_file, folder))
     result = train(

@@ -18,6 +18,11 @@ def may_stay_open(metavar: str) -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
+def word(metavar: str) -> object:
+    """Return a positional argument with the name that its help calls it by."""
+    return tyro.conf.arg(metavar=metavar)
+
+
 Metres = tuple[float, float, float] | None
 Pixels = Annotated[int | None, may_stay_open("PIXELS")]
 Count = Annotated[int | None, may_stay_open("N")]
@@ -25,6 +30,7 @@ Number = Annotated[float | None, may_stay_open("X")]
 Mode = Annotated[Literal["flood", "line", "scan"] | None, may_stay_open("{flood,line,scan}")]
 Offset = Literal["time", "ray", "rigid"]
 File = Annotated[Path | None, may_stay_open("FILE")]
+GivenFile = Annotated[Path, word("FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)

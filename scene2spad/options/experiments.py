@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from scene2spad.options.common import Common, Count, File, Long, Number, Positional, may_stay_open
+from scene2spad.options.common import Common, Count, File, Long, Number, Positional, may_stay_open, word
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +172,7 @@ class Ultraphase(Common):
 
     action: Positional[Literal["table", "compile", "run", "asm", "list", "verify", "sweep"]] = "table"
     """Action: tabulate or sweep the chip's power, or compile, run, assemble, list or verify a program."""
-    program: Positional[str] = ""
+    program: Positional[Annotated[str, word("[PROGRAM]")]] = ""
     """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s); of compile, a
     shipped model's name or a checkpoint."""
     headroom: Count = None

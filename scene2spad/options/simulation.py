@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from scene2spad.options.common import Common, Count, File, Number, Positional, may_stay_open
+from scene2spad.options.common import Common, Count, File, GivenFile, Number, Positional, may_stay_open, word
 
 FITTED = ("delay", "skew", "clock", "bin_width", "chirp", "background", "leak", "echo", "trials", "recovery")
 
@@ -15,7 +15,7 @@ FITTED = ("delay", "skew", "clock", "bin_width", "chirp", "background", "leak", 
 class Sense(Common):
     """Record a transient with a single-photon sensor: photon counts to HDF5, with a picture beside it."""
 
-    file: Positional[Path]
+    file: Positional[GivenFile]
     """A transient written by `render` (.exr)."""
     out: File = None
     """The .h5 file (default: the transient's name)."""
@@ -94,7 +94,7 @@ class Sense(Common):
 class Calibrate(Common):
     """Calibrate a multi-zone sensor from captures of a plane at known distances, and write its sensor file."""
 
-    captures: Positional[Path] = Path("shipped")
+    captures: Positional[Annotated[Path, word("[CAPTURES]")]] = Path("shipped")
     """Captures (.npz: distance_m, counts by zone and bin, and reference_counts if any); shipped: a TMF8820's that come
     with the package."""
     sensor: str = "tmf8820"

@@ -217,6 +217,7 @@ def test_captures_that_a_zone_misses_are_told_and_used(capfd, tmp_path, monkeypa
         (["none.npz"], "capture file not found"),
         (["bad.npz"], "not a readable .npz file"),
         (["thin.npz"], "holds no counts"),
+        (["foreign.npz"], "holds no distance_m, expected captures: distance_m (N,) and counts (N, zones, bins)"),
         (["small.npz"], "captures of 2 zones and 5 bins"),
         (["halves.npz"], "counts are no whole numbers"),
         (["endless.npz"], "endless.npz: reference_counts holds values that are not finite"),
@@ -237,6 +238,7 @@ def test_mistakes_end_in_one_line(arguments, words, capfd, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bad.npz").write_text("no")
     np.savez(tmp_path / "thin.npz", distance_m=np.ones(3))
+    np.savez(tmp_path / "foreign.npz", meta="text", data=np.ones(3))
     distance_m, counts = np.linspace(0.1, 0.4, 20), np.ones((20, 2, 5))
     np.savez(tmp_path / "small.npz", distance_m=distance_m, counts=counts)
     (tmp_path / "renamed.h5").write_bytes(shipped_captures().read_bytes())

@@ -16,7 +16,7 @@ from readers import READERS
 
 from csph import CodingTensor, encode, temporal_code
 from scene2spad.cli import main
-from scene2spad.cli.main import progress_lines
+from scene2spad.cli.main import COMMANDS, progress_lines
 from scenes.library.catalog import load_scene
 from spad.measurements.histogram import read_histogram
 from spad.sensor.model import Sensor
@@ -255,3 +255,11 @@ def test_a_card_says_what_was_not_recorded(capfd):
     assert "cpu_minutes: not recorded\n" in out and "7 m farther: 31, as it is: 31" in out
     assert main(["models", name, "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["errors"] == {}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_names_what_a_command_takes(name, capsys):
+    """No argument is called by its type: the texts of the help speak of files, scenes and models."""
+    assert main([name, "--help"]) == 0
+    usage = capsys.readouterr().out.split("\n\n")[0]
+    assert not {"STR", "[STR]", "PATH", "[PATH]"} & set(usage.split()), usage

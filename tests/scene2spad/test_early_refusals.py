@@ -45,6 +45,14 @@ def test_absurd_sizes_are_refused_before_any_work(tmp_path, capsys, monkeypatch,
     assert why in message and message.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
+def test_a_run_that_has_no_place_is_refused_before_its_sets_are_read(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("scene2spad.networks.training.views_of", None)
+    (tmp_path / "notes.txt").write_text("mine")
+    for place in (tmp_path, tmp_path / "notes.txt"):
+        assert main([*TRAIN, "--out", str(place)]) == 2
+        assert "is not an empty folder and holds no run" in capsys.readouterr().err
+
+
 def test_a_set_of_a_million_views_is_listed_as_it_is_rendered(tmp_path, monkeypatch):
     """The first run is taken before the second is known; so are the views of an endless list."""
     first = next(dataset.views_by_place(Job("rooms"), itertools.count()))

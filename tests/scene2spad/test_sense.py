@@ -165,6 +165,19 @@ def test_export_by_command(scene, capfd, tmp_path):
     assert "unmixed" not in run(capfd, "depth", "s.mat")[1] and "unmixed" in run(capfd, "depth", "s.h5")[1]
 
 
+def test_an_efficiency_that_changes_nothing_is_told(scene, capfd):
+    status, _, err = run(capfd, "sense", "s.exr", "--pde", "0.5")
+    assert status == 0 and "--pde 0.5 changes nothing" in err
+    assert "--pde" not in run(capfd, "sense", "s.exr", "--pde", "0.5", "--radiometric")[2]
+
+
+def test_a_bad_input_is_told_before_a_bad_output(scene, capfd, tmp_path):
+    for name in ("text.exr", "text.h5"):
+        (tmp_path / name).write_text("no")
+    status, _, err = run(capfd, "sense", "text.exr")
+    assert status == 2 and "text.exr: not a readable EXR file" in err and "text.h5" not in err
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -182,6 +195,7 @@ def test_export_by_command(scene, capfd, tmp_path):
         (["--sensor", "tmf8820", "--exposure", "1"], "--exposure does not go with a sensor of zones"),
         (["--radiometric", "--signal", "3"], "leave out --signal"),
         (["--pde", "2"], "PDE 2"),
+        (["--hot-pixels", "2"], "share of hot pixels 2 is outside 0 to 1"),
         (["--dead-time", "1e-6", "--model", "first-photon"], "use free-running"),
         (["--exposure", "1e-12"], "shorter than the period"),
         (["--sensor", "retina"], "retina"),

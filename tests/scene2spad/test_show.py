@@ -331,3 +331,10 @@ def test_mistakes_are_one_line(argv, message, capfd):
     assert main(argv) == 2
     error = capfd.readouterr().err
     assert message in error and len(error.splitlines()) == 1
+
+
+def test_a_depth_map_is_no_transient_of_a_histogram(capfd):
+    assert main(["show", "gallery.h5", "--transient", "depth.exr"]) == 2
+    assert (
+        "depth.exr: is of kind depth, expected the transient that gallery.h5 was sensed from" in capfd.readouterr().err
+    )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from scene2spad.options.common import Common, Positional, may_stay_open
+from scene2spad.options.common import Common, Positional, may_stay_open, word
 from scenes.errors import InputError
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
@@ -22,9 +22,9 @@ class Models(Common):
     """List the models that come with the package: design, compression, training set, photon levels, error, limits; or
     make a model of a checkpoint of the published code: `import FILE.ckpt --out FOLDER`."""
 
-    name: Positional[str] = ""
+    name: Positional[Annotated[str, word("[NAME]")]] = ""
     """Show this one's whole card; or `import`."""
-    file: Positional[str] = ""
+    file: Positional[Annotated[str, word("[FILE.ckpt]")]] = ""
     """Checkpoint of the published code to import (.ckpt, written by Lightning)."""
     sensor: Annotated[str | None, may_stay_open("NAME")] = None
     """Sensor whose histograms an imported model is to take, a preset or a file (default: iccv2023-train, that of the

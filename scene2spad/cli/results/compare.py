@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 from scene2spad.cli.opening import open_for_depth
 from scene2spad.cli.paths import PNG_FIGURE, Mark, begins, check_target, input_file, keep_foreign, picture
-from scene2spad.options.common import Common, File, Positional
+from scene2spad.options.common import Common, File, GivenFile, Positional
 from scenes.errors import require
 from scenes.progress import Progress
 
@@ -21,7 +20,7 @@ class Compare(Common):
     """Estimate depth from one histogram by several methods: one table (.csv) and one figure (.png). Every method sees
     the same photons."""
 
-    file: Positional[Path]
+    file: Positional[GivenFile]
     """A histogram written by `sense` (.h5), its counts as `export` wrote them (.npz, .h5), or a frame or capture of the
     published family (.mat)."""
     methods: tuple[str, ...] = ("argmax", "log-matched", "fourier-16", "learned-1024x2x2-128x-t12-mixed-s7")

@@ -12,7 +12,7 @@ import numpy as np
 
 from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient, pixel_sensor
 from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
-from scene2spad.options.common import Common, File, Positional, may_stay_open, only_for
+from scene2spad.options.common import Common, File, GivenFile, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.json_types import JsonObject
@@ -34,7 +34,7 @@ class Export(Common):
     """Write for other programs: a dense array (.npz, .h5) of a transient or a histogram, a point cloud (.ply) of a
     depth map or of true depth, or a coding tensor (.txt, .npy) of a model, with --int8 rounded to 8 bits."""
 
-    file: Positional[Path]
+    file: Positional[GivenFile]
     """A transient or depth map (.exr), a histogram (.h5), codes (.npy), a checkpoint, or a model's name."""
     out: Path
     """File to write: .npz or .h5 (dense), .ply (points), .txt or .npy (codes)."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from scene2spad.cli.paths import holds_kind, input_file
-from scene2spad.options.common import Common, Positional, may_stay_open, only_for
+from scene2spad.options.common import Common, GivenFile, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.json_types import JsonObject
@@ -36,7 +36,7 @@ class Inspect(Common):
     or counts. FILE is a transient (.exr of render), a histogram (.h5 of sense), a pack of a set (.h5 of dataset) or
     dense arrays (.npz, .h5 of export)."""
 
-    file: Positional[Path]
+    file: Positional[GivenFile]
     """The file."""
     pixel: Annotated[tuple[int, int] | None, may_stay_open("ROW COLUMN")] = None
     """Row and column of one pixel, both from 0, row 0 on top."""

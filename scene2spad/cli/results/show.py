@@ -29,7 +29,7 @@ from scene2spad.cli.paths import (
     holds_at_start,
     keep_foreign,
 )
-from scene2spad.options.common import Common, File, Positional, only_for
+from scene2spad.options.common import Common, File, GivenFile, Positional, only_for
 from scenes.errors import InputError, require
 from scenes.io.inputs import read_text, read_whole_lines
 from scenes.json_types import JsonObject
@@ -58,7 +58,7 @@ class Show(Common):
     cloud, play the light. The page is one file and loads nothing. Or make a picture (.png, .pdf) or an animation
     (.gif, .mp4). FILE is anything that a command writes, or the name of a model that comes with the package."""
 
-    file: Positional[Path]
+    file: Positional[GivenFile]
     """The file, the folder of a set or of a run, or a model's name."""
     out: File = None
     """File to write: .html, .png, .pdf, .gif or .mp4 (default: room.histogram.html, with the kind, by room.h5)."""

@@ -18,6 +18,7 @@ from scene2spad.options.common import (
     Positional,
     check_indirect,
     may_stay_open,
+    word,
 )
 from scenes.library.sets import scene_set
 from scenes.progress import Progress
@@ -27,7 +28,7 @@ from scenes.progress import Progress
 class Dataset(Long):
     """Render a scene set to a folder of EXR files with an index; stopped at any moment, it goes on where it was."""
 
-    set: Positional[str] = "rooms"
+    set: Positional[Annotated[str, word("[SET]")]] = "rooms"
     """rooms, clutter (both also as in rooms/val and rooms/test), tabletop, middlebury or hard-cases."""
     count: Count = None
     """Views (default: all of a finite set, 100 of rooms and clutter)."""

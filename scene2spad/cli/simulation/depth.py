@@ -14,7 +14,7 @@ import numpy as np
 from scene2spad.cli.opening import open_for_depth, open_transient, pixel_sensor
 from scene2spad.cli.paths import beside_folder, holds_kind, input_file, output_file, picture
 from scene2spad.methods import codes_method, depth_method, is_codes_file
-from scene2spad.options.common import Common, Count, File, Number, Positional, may_stay_open, only_for
+from scene2spad.options.common import Common, Count, File, GivenFile, Number, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.formats.depth_map import write_depth
@@ -39,7 +39,7 @@ class Depth(Common):
     """Estimate depth from a histogram and compare it with the truth; writes the depth map and a picture. A transient is
     sensed first, as `sense` does; of a folder, every one."""
 
-    file: Positional[Path]
+    file: Positional[GivenFile]
     """A histogram written by `sense` (.h5), its counts as `export` wrote them (.npz, .h5), a frame or capture of the
     published family (.mat), a transient (.exr), or the folder of a set or of transients."""
     out: File = None

@@ -26,6 +26,7 @@ from scene2spad.options.common import (
     check_indirect,
     may_stay_open,
     only_for,
+    word,
 )
 from scenes import Ambient, InputError, Laser, Scene
 from scenes.constants import DEFAULT_WAVELENGTH_M
@@ -48,7 +49,7 @@ MAX_LUX = 1e6
 class Render(Long):
     """Render a scene's time-resolved radiance to a deep EXR file, with a picture beside it."""
 
-    scene: Positional[str] = "living-room"
+    scene: Positional[Annotated[str, word("[SCENE]")]] = "living-room"
     """A name (see `scenes`), a mesh (.obj .ply .stl .glb), a Mitsuba scene (.xml), or a photograph with --depth."""
     out: File = None
     """The .exr file (default: the scene's name in this folder, - for /)."""

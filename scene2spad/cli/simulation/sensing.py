@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from render.transient import Transient, read_transient
-from scene2spad.cli.paths import Mark, begins, check_target, input_file, keep_foreign, output_file, picture
+from scene2spad.cli.paths import Mark, begins, check_target, holds_kind, input_file, keep_foreign, output_file, picture
 from scene2spad.options.common import only_for
 from scene2spad.options.simulation import Sense
 from scenes.errors import InputError, require
@@ -130,6 +130,8 @@ def run(command: Sense, progress: Progress) -> dict:
     _refuse(command, PIXELS_OF_A_MAP if command.dark_map is not None else (), "--dark-map")
     source, out = _files(command)
     transient = read_transient(source)
+    if command.pde is not None and optics is None:
+        log.warning("--pde %g changes nothing: the photons of a budget are detected ones", command.pde)
     mat = out.with_suffix(".mat")
     if command.export == "mat":
         _check_mat(mat, transient, sensor)
@@ -169,6 +171,8 @@ def _files(command: Sense) -> tuple[Path, Path]:
     source = input_file(command.file)
     histogram_given = source.suffix.lower() in HDF5_SUFFIXES
     require(not histogram_given, f"{source}: is an HDF5 file, expected a transient (.exr) that `render` wrote")
+    if not holds_kind(source, "transient"):
+        read_transient(source)  # says what is wrong with it before anything is said of the output
     out = command.out or source.with_suffix(".h5")
     return source, output_file(out, ".h5", "histogram", figure=command.figure)
 
