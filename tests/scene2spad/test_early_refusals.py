@@ -24,6 +24,7 @@ DATASET = ["dataset", "rooms"]
         ([*DATASET, "--width", "16384", "--height", "16384"], "views of 16384 x 16384 pixels on 1 process: needs 1"),
         ([*DATASET, "--width", "16384", "--workers", "4"], "on 4 processes: needs 6"),
         ([*DATASET, "--height", "20000"], "image side 20000 is outside 1 to 16384"),
+        ([*DATASET, "--no-ambient", "--ambient-spp", "4"], "dataset: --ambient-spp 4 is for ambient light"),
         ([*DATASET, "--workers", "1000"], "workers 1000 is outside 1 to 256"),
         ([*TRAIN, "--batch", "100000000"], "a step of 100000000 patches of 8 x 8 pixels and 1024 bins: needs"),
         ([*TRAIN, "--crop", "1000000000"], "patches of 1000000000 x 1000000000 pixels"),

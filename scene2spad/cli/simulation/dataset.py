@@ -18,6 +18,7 @@ from scene2spad.options.common import (
     Positional,
     check_indirect,
     may_stay_open,
+    only_for,
     word,
 )
 from scenes.library.sets import scene_set
@@ -72,6 +73,7 @@ def run(command: Dataset, progress: Progress) -> dict:
     from scene2spad.datasets.rendering import Job, make_set
 
     check_indirect(command, "dataset", command.bounces, ("spp", "filter"))
+    only_for(command, "dataset", {"ambient_spp": (command.ambient, "ambient light (no --no-ambient)")})
     of = scene_set(command.set)
     error = (0.01 if command.bounces == 1 else 0.03) if command.error is None else command.error
     job = Job(
