@@ -12,6 +12,8 @@ class Stream(IntEnum):
     away twice before there was one list.
     """
 
+    EMULATE = 8
+    TRIAL = 9
     PLAN = 10
     INDIRECT = 11
     AMBIENT = 12
@@ -28,6 +30,7 @@ class Stream(IntEnum):
     PUBLISHED = 35
     WINDOW = 36
     DEVICE_PATCH = 37
+    CLUTTER = 40
 
     # given away twice
     VIEW = 20

@@ -16,6 +16,7 @@ from scene2spad.options.experiments import Bench
 from scenes.errors import require
 from scenes.files import whole_file
 from scenes.progress import Progress
+from scenes.random_streams import Stream
 from ultraphase import Core, CoreArray, Method, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
 from ultraphase.tables import INT8_SCALE, spatial_sum
@@ -67,7 +68,7 @@ def _proof(chosen: Method) -> Tabulated:
 
 def _counts(pixels: int, seed: int) -> np.ndarray:
     """Poisson counts with a mean of 500 uniform and 50 in three bins, (pixels, 1024) uint8."""
-    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(8, pixels)))
+    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.EMULATE, pixels)))
     counts = random.poisson((PHOTONS - 50) / TIMESTAMPS, (pixels, TIMESTAMPS)).astype(np.uint8)
     peak = random.integers(1, TIMESTAMPS - 1, pixels)
     for step, fraction in ((-1, 0.25), (0, 0.5), (1, 0.25)):

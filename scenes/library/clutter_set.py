@@ -17,9 +17,9 @@ from scenes.library.things.palette import LAMP_RADIANCE, WINDOW_RADIANCE, make_p
 from scenes.library.things.parts import Palette, Random, joined, panel, with_normals
 from scenes.library.things.patterns import on_one_sheet
 from scenes.model import Camera, Material, Scene, Surface
+from scenes.random_streams import Stream
 
 SPLITS = ("train", "val", "test")
-STREAM = 40  # of SeedSequence: nothing else draws from it
 FOV_DEG = (36.0, 66.0)
 BACK_M = (1.3, 13.0)  # camera to the wall that it faces
 TOWARDS_NEAR = 1.5  # exponent of a uniform number, then between the logarithms of BACK_M: median 2.9 m
@@ -37,7 +37,7 @@ def clutter_view(index: int, split: str = "train", *, seed: int = 0, width: int 
 
     Splits draw from streams of their own, and so does every view.
     """
-    key = (STREAM, SPLITS.index(split), index)
+    key = (Stream.CLUTTER, SPLITS.index(split), index)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
     palette = make_palette(rng)
     camera, low, high = _room(rng, width, height)

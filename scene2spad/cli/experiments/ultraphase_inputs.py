@@ -13,6 +13,7 @@ from scene2spad.options.common import only_for
 from scene2spad.options.experiments import Ultraphase
 from scenes.errors import InputError, require
 from scenes.files import read_array
+from scenes.random_streams import Stream
 from ultraphase import Method, Program, assemble_file, method
 from ultraphase.assembly.program import KINDS
 from ultraphase.catalog import TIMESTAMPS
@@ -118,7 +119,7 @@ def _alike(stream: np.ndarray) -> Photons:
 
 def _made_up(photons: float, signal: float, seed: int, core: int) -> np.ndarray:
     """Timestamps of one core in the order of detection: `signal` around bin 300 + 100 core, the rest uniform."""
-    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(8, core)))
+    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.EMULATE, core)))
     near = np.rint(random.normal(300 + 100 * core, 1.4, int(signal))).astype(np.int64)
     rest = random.integers(0, TIMESTAMPS, int(photons) - int(signal))
     return random.permutation(np.concatenate([near, rest]) % TIMESTAMPS)

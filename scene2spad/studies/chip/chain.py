@@ -14,6 +14,7 @@ from csph.networks.posterior import Decoder
 from scene2spad.emulation.emulated_chain import timestamps_of
 from scene2spad.studies.chip.code import ChipModel, codes_by_torch, leave_sensor
 from scenes.errors import require
+from scenes.random_streams import Stream
 from spad.estimators.bistatic import radial_depth_of
 from spad.measurements.histogram import Histogram
 from ultraphase import CoreArray
@@ -107,7 +108,7 @@ class FastCores:
 def trial(compiled: Compiled, seed: int) -> dict[str, int]:
     """Return one block of cores, 550 photons each, 50 of them in one return: numbers that differ from the torch
     path's."""
-    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(9,)))
+    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.TRIAL,)))
     rows, columns = compiled.block
     counts = random.poisson((_TRIAL_PHOTONS - 50) / TIMESTAMPS, (rows, columns, TIMESTAMPS)).astype(np.int32)
     counts[..., random.integers(TIMESTAMPS)] += 50
