@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from scenes.errors import InputError, listed, require
 from scenes.io.inputs import parse_json
 from scenes.io.mesh_formats import NotReadError
+from scenes.io.mesh_formats.glb_nodes import plain_nodes
 from scenes.io.textures import check_checksums
 from scenes.json_types import JsonObject
 
@@ -20,6 +21,8 @@ _GLB_INDICES = (
 )
 
 _GLB_USHORT, _GLB_FLOAT = 5123, 5126  # component types
+_NEAREST = 9728
+_WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
 
 # Extensions that files may need and are read; what is taken off a material changes no shape.
 _READ = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp")
@@ -68,10 +71,10 @@ def _check_extensions(header: JsonObject) -> None:
 
 
 def glb_notes(content: bytes) -> list[str]:
-    """Return what is left out of a sound GLB: by its extensions instances, clear surfaces, and other looks; metal and
-    glow."""
-    header, _ = _glb_chunks(content)
-    notes = []
+    """Return what is left out of a sound GLB: nodes, poses, instances, clear surfaces and other looks, metal and glow,
+    and how its textures are sampled."""
+    header, binary = _glb_chunks(content)
+    notes = plain_nodes(header, binary)
     several = sum(_INSTANCES in node.get("extensions", {}) for node in header.get("nodes", []))
     if several:
         notes.append(f"{_INSTANCES} is left out: each of {several} nodes is there once")
@@ -84,12 +87,31 @@ def glb_notes(content: bytes) -> list[str]:
     ):
         if names:
             notes.append(f"{', '.join(sorted(names))} left out: {words}")
-    return [*notes, *_metal_and_glow(used)]
+    return [*notes, *_metal_and_glow(used), *_sampling(header, used)]
+
+
+def _sampling(header: JsonObject, materials: list[JsonObject]) -> list[str]:
+    """Name the materials whose base colour is looked up in a way that is taken for another."""
+    found: dict[str, list[str]] = {}
+    for material in materials:
+        base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        texture = {} if base is None else header["textures"][base["index"]]
+        sampler = header["samplers"][texture["sampler"]] if "sampler" in texture else {}
+        words = [_WRAPS[one] for one in (sampler.get("wrapS"), sampler.get("wrapT")) if one in _WRAPS]
+        lines = [f"a texture's wrap mode {' and '.join(dict.fromkeys(words))} is taken as repeat"] if words else []
+        lines += ["a texture's magFilter NEAREST is taken as linear"] if sampler.get("magFilter") == _NEAREST else []
+        for line in lines:
+            found.setdefault(line, []).append(_name(material))
+    return [f"{line}: {listed(names)}" for line, names in found.items()]
+
+
+def _name(material: JsonObject) -> str:
+    return str(material.get("name", "without a name"))[:80]
 
 
 def _metal_and_glow(materials: list[JsonObject]) -> list[str]:
     """Name the materials that are metal, as they are where metallicFactor is not given, and those that glow."""
-    looks = [(str(one.get("name", "without a name"))[:80], one.get("pbrMetallicRoughness"), one) for one in materials]
+    looks = [(_name(one), one.get("pbrMetallicRoughness"), one) for one in materials]
     metal = [
         name for name, pbr, one in looks if pbr is not None and _is_lit(one) and _is_some(pbr, "metallicFactor", 1)
     ]
@@ -184,15 +206,18 @@ def _check_primitive(header: JsonObject, primitive: JsonObject) -> None:
     require(floats, "texture coordinates are whole numbers, which are not read; export them as floats")
 
 
-def with_bare_materials(content: bytes) -> bytes:
-    """Return a GLB in which 16-bit vertex colours have a material: trimesh keeps such of these alone as they are."""
-    header, _ = _glb_chunks(content)
+def plain_glb(content: bytes) -> bytes:
+    """Return a GLB as trimesh reads it rightly: nodes as in `plain_nodes`, and 16-bit vertex colours with a material.
+
+    trimesh keeps such colours as they are only beside a material.
+    """
+    header, binary = _glb_chunks(content)
+    plain_nodes(header, binary)
     primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" not in one]
     colours = [(one, one["attributes"].get("COLOR_0")) for one in primitives]
     wide = [one for one, at in colours if at is not None and header["accessors"][at]["componentType"] == _GLB_USHORT]
-    if not wide:
-        return content
-    header["materials"] = [*header.get("materials", []), {}]
+    if wide:
+        header["materials"] = [*header.get("materials", []), {}]
     for one in wide:
         one["material"] = len(header["materials"]) - 1
     text = json.dumps(header).encode()

@@ -14,7 +14,7 @@ import numpy as np
 from scenes.errors import InputError, listed, require
 from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_formats import NotReadError
-from scenes.io.mesh_formats.glb import check_glb, with_bare_materials
+from scenes.io.mesh_formats.glb import check_glb, plain_glb
 from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library
 from scenes.io.mesh_formats.obj import obj_fault, plain_obj
 from scenes.io.mesh_formats.ply import plain_ply
@@ -102,7 +102,7 @@ def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | N
                 return content, check_stl(content)
             case ".glb":
                 check_glb(content, beside.get)
-                content = with_bare_materials(content)
+                content = plain_glb(content)
             case ".obj":
                 # Comments and names in an old encoding must not stop the geometry from being read.
                 content = plain_obj(content.decode("utf-8", errors="replace").encode())
