@@ -205,3 +205,18 @@ def test_a_sampler_that_is_taken_for_another_is_noted(tmp_path: Path, sampler: d
         )
     )
     assert [note for note in scene.notes if note.startswith("a texture's")] == expected
+
+
+@pytest.mark.parametrize(("size", "odd"), [(0.04, True), (0.15, False), (1.0, False), (6.0, False), (60.0, True)])
+def test_a_glb_is_in_metres(tmp_path: Path, size: float, odd: bool) -> None:
+    """The standard says so (glTF 2.0, 3.4); what a mesh of another format would be scaled to is kept."""
+    path = glb(tmp_path / "a.glb", [{"mesh": 0, "scale": [size] * 3}])
+    scene = load_mesh(path, placing=Placing(bare=True))
+    extent = np.ptp(POINTS, axis=0).max() * size
+    assert np.ptp(scene.surfaces[0].vertices, axis=0).max() == pytest.approx(extent, rel=1e-5)
+    warnings = [note for note in scene.notes if note.startswith("warning")]
+    expected = f"warning: glTF is in metres, but {extent:.4g} m is outside 0.05 to 50 m; --scale says otherwise"
+    assert warnings == ([expected] if odd else [])
+    with_scale = load_mesh(path, placing=Placing(bare=True, scale=0.5))
+    assert np.ptp(with_scale.surfaces[0].vertices, axis=0).max() == pytest.approx(extent / 2, rel=1e-5)
+    assert not any(note.startswith("warning") for note in with_scale.notes)

@@ -1,6 +1,6 @@
 """Mesh files (.obj .ply .stl .glb) as scenes: the model stands on a floor before a wall, seen from its front.
 
-A mesh file knows neither its unit nor, for STL, its upward axis; what is assumed here is said in `Scene.notes`.
+Only a .glb knows its unit, metres, and an STL not even its upward axis; what is assumed here is said in `Scene.notes`.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 EXTENSIONS = (".obj", ".ply", ".stl", ".glb")
 BACKDROP_ALBEDO = 0.55
 SENSIBLE_EXTENT_M = (0.2, 2.5)  # a model whose largest extent lies in here is taken to be in metres already
+METRES_EXTENT_M = (0.05, 50.0)  # beyond it a model whose format is in metres, as glTF is, may have another unit
 UNITS_M = {"mm": 1e-3, "millimet": 1e-3, "cm": 1e-2, "centimet": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
 UNITS_M |= {"in": 0.0254, "ft": 0.3048, "met": 1.0, "m": 1.0}
 HEADER_BYTES = 4096  # where a comment may name the unit
@@ -54,12 +55,13 @@ ZERO_AREA = 1e-12  # m^2; a face of no larger area is degenerate; in a model und
 def load_mesh(path: Path, *, width: int = 128, height: int = 96, placing: Placing = AS_IT_IS) -> Scene:
     """Return the scene of one mesh file, metres, y up: floor at y = 0, wall behind, camera before the model's +z side.
 
-    The model keeps its size if its largest extent is 0.2 to 2.5 m. Otherwise the unit that the file names is taken (a
-    comment or header such as "units: mm"), else millimetres or inches where these make 0.2 to 2.5 m of it, else it is
-    scaled to 1 m; each with a warning in the notes. Every surface is
-    diffuse with the file's colour as albedo (luminance of linear colour), 0.6 where the file has none. `placing` states
-    size, upward axis and camera instead. Raises InputError in one line for a file that is missing, of another kind,
-    broken, empty, without faces or with NaNs, and for a camera that floor and wall cannot be put around.
+    A .glb is in metres, with a warning in the notes where its largest extent is not 0.05 to 50 m. Any other model keeps
+    its size if its largest extent is 0.2 to 2.5 m. Otherwise the unit that the file names is taken (a comment or header
+    such as "units: mm"), else millimetres or inches where these make 0.2 to 2.5 m of it, else it is scaled to 1 m; each
+    with a warning in the notes. Every surface is diffuse with the file's colour as albedo (luminance of linear colour),
+    0.6 where the file has none. `placing` states size, upward axis and camera instead. Raises InputError in one line
+    for a file that is missing, of another kind, broken, empty, without faces or with NaNs, and for a camera that floor
+    and wall cannot be put around.
     """
     path = Path(path)
     parts = _read(path)
@@ -219,6 +221,8 @@ def _stand(path: Path, parts: list[Part], notes: list[str], placing: Placing) ->
 
 def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
     """Metres per unit of the file, and what to warn of."""
+    if path.suffix.lower() == ".glb":
+        return 1.0, _odd_metres(extent)
     low, high = SENSIBLE_EXTENT_M
     with path.open("rb") as file:
         header = file.read(HEADER_BYTES).decode("latin-1")
@@ -229,16 +233,23 @@ def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
         for name in sorted(UNITS_M, key=len, reverse=True)
     )
     stated = re.search(rf"\bunits?\b[^a-z0-9\n]{{0,9}}(?:are |in )?({names}).*", header, re.IGNORECASE)
-    unit = "" if stated is None or path.suffix.lower() == ".glb" else stated[1].lower()
-    if stated is not None and unit and not _names_another(stated[0], UNITS_M[unit]):
+    unit = "" if stated is None else stated[1].lower()
+    if stated is not None and not _names_another(stated[0], UNITS_M[unit]):
         return UNITS_M[unit], [f"warning: unit {unit!r} taken from the file's own words"]
     if low <= extent <= high:
         return 1.0, []
     for name, metres in (("millimetres", 1e-3), ("inches (or centimetres)", 0.0254)):
-        if low <= metres * extent <= high and path.suffix.lower() != ".glb":
+        if low <= metres * extent <= high:
             return metres, [f"warning: no unit in the file, {extent:.4g} looks like {name}"]
     kept = f"; --scale 1 keeps {extent:.4g} m"
     return 1.0 / extent, [f"warning: no unit makes a sensible size of it, so its size is made up{kept}"]
+
+
+def _odd_metres(extent: float) -> list[str]:
+    """Warn of an extent that few models in metres have."""
+    low, high = METRES_EXTENT_M
+    words = f"warning: glTF is in metres, but {extent:.4g} m is outside {low:g} to {high:g} m; --scale says otherwise"
+    return [] if low <= extent <= high else [words]
 
 
 def _names_another(words: str, metres: float) -> bool:
