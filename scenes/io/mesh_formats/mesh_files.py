@@ -16,7 +16,7 @@ from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb import check_glb, plain_glb
 from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library
-from scenes.io.mesh_formats.obj import obj_fault, plain_obj
+from scenes.io.mesh_formats.obj import alike_obj, obj_fault, plain_obj
 from scenes.io.mesh_formats.ply import plain_ply
 from scenes.io.mesh_formats.stl import check_stl
 
@@ -62,6 +62,8 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
         if kind == ".obj" and options.get("skip_materials") and b"\nvn " not in content:
             # trimesh parts a mesh where materials change, and normals that are made would have a crease there
             content = re.sub(rb"^usemtl.*", b"", content, flags=re.MULTILINE)
+        if kind == ".obj":
+            content, options["split_groups"] = alike_obj(content)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             loaded = trimesh.load_scene(

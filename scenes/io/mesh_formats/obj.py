@@ -6,6 +6,10 @@ import re
 
 from scenes.errors import require
 
+_DIGITS = bytes.maketrans(b"023456789", b"111111111")
+# by whether they have texture coordinates and normals
+_CORNERS = {(False, False): b"1", (True, False): b"1/1", (False, True): b"1//1", (True, True): b"1/1/1"}
+
 
 def plain_obj(content: bytes) -> bytes:
     """Return an OBJ as trimesh reads it rightly: no indents, tabs and comments, indices from the first vertex on.
@@ -43,6 +47,72 @@ def _corner(corner: bytes, counts: list[int], line: int) -> bytes:
         if index < 0:
             parts[place] = b"%d" % (count + 1 + index)
     return b"/".join(parts)
+
+
+def alike_obj(content: bytes) -> tuple[bytes, bool]:
+    """Return an OBJ in which all faces of a material are alike, and whether trimesh must keep its groups apart.
+
+    trimesh drops the texture coordinates of a material's faces, or their normals, where one face has none. Such faces
+    follow at the end, in groups that are named by what is missing; groups of the file itself go then. A corner keeps
+    what all corners of its face have.
+    """
+    forms = content.translate(_DIGITS)
+    while b"11" in forms:
+        forms = forms.replace(b"11", b"1")
+    faces = set(re.findall(rb"^f .*", forms, re.MULTILINE))
+    if len({corner for face in faces for corner in face.split()[1:]}) <= 1:
+        return content, False
+    lines = content.split(b"\n")
+    found = _kinds(lines, forms.split(b"\n"))
+    apart = {
+        (material, kind): numbers
+        for material, kinds in found.items()
+        for kind, numbers in kinds.items()
+        if kind != max(kinds)
+    }
+    if not apart:
+        return b"\n".join(lines), False
+    lines = [b"" if line.startswith(b"g ") else line for line in lines]
+    named = [any(kind[place] for kinds in found.values() for kind in kinds) for place in (0, 1)]
+    for (material, kind), numbers in sorted(apart.items(), key=lambda one: one[0][1]):
+        missing = [key for key, has, some in zip(("vt", "vn"), kind, named, strict=True) if some and not has]
+        lines += [b"g faces without " + " and ".join(missing).encode(), b"usemtl " + material]
+        for number in numbers:
+            lines.append(lines[number])
+            lines[number] = b""
+    return b"\n".join(lines), True
+
+
+def _kinds(lines: list[bytes], forms: list[bytes]) -> dict[bytes, dict[tuple[bool, bool], list[int]]]:
+    """Return by material the lines of faces with and without texture coordinates and normals; made alike in each.
+
+    forms  the lines with 1 in place of every number
+    """
+    found: dict[bytes, dict[tuple[bool, bool], list[int]]] = {}
+    known: dict[bytes, tuple[bool, bool]] = {}
+    material = b""
+    for number, form in enumerate(forms):
+        if form.startswith(b"usemtl "):
+            material = lines[number][7:].strip()
+        elif form.startswith(b"f ") and form.split()[1:]:
+            if form not in known:
+                corners = [(corner.split(b"/") + [b"", b""])[:3] for corner in form.split()[1:]]
+                known[form] = all(corner[1] for corner in corners), all(corner[2] for corner in corners)
+            kind = known[form]
+            found.setdefault(material, {}).setdefault(kind, []).append(number)
+            if {*form.split()[1:]} != {_CORNERS[kind]}:
+                lines[number] = _cut_to(kind, lines[number])
+    return found
+
+
+def _cut_to(kind: tuple[bool, bool], face: bytes) -> bytes:
+    """Return the line of a face with no texture coordinates, or no normals, where its kind has none."""
+    kept = []
+    for corner in face.split()[1:]:
+        vertex, uv, normal = (corner.split(b"/") + [b"", b""])[:3]
+        parts = (vertex, uv if kind[0] else b"", normal if kind[1] else b"")
+        kept.append(b"/".join(parts).rstrip(b"/"))
+    return b"f " + b" ".join(kept)
 
 
 def obj_fault(content: bytes) -> str:

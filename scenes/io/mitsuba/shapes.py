@@ -49,6 +49,7 @@ class Mesh:
     normals: np.ndarray | None = None
     keeps_side: bool = True
     smooth: bool = False
+    notes: tuple[str, ...] = ()
 
 
 class Shapes:
@@ -145,6 +146,8 @@ class Shapes:
         if len(mesh.faces) == 0:
             raise plugin.fail(f"{filename}: holds no triangles")
         check_faces(mesh.faces, len(mesh.vertices), str(path))
+        for note in mesh.notes:
+            plugin.note(f"{filename}: {note}")
         return mesh
 
 
@@ -160,14 +163,49 @@ def _read(path: Path, kind: str) -> Mesh:
     parts = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = np.concatenate([part.vertices for part in parts])
-    check_vertices(vertices, path.name)
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, first, strict=False)])
-    uvs = [getattr(part.visual, "uv", None) for part in parts]
+    check_vertices(np.concatenate([part.vertices for part in parts]), path.name)
     # trimesh keeps the normals of a file in the cache, where its own exporters look for them too; None if absent.
-    normals = [part._cache["vertex_normals"] for part in parts]
-    return Mesh(vertices, faces, _joined(uvs), _joined(normals))
+    meshes = [
+        Mesh(part.vertices, part.faces, getattr(part.visual, "uv", None), part._cache["vertex_normals"])
+        for part in parts
+    ]
+    return _joined(meshes)
+
+
+def _joined(meshes: list[Mesh]) -> Mesh:
+    """Return parts as one mesh. Faces that lack what others have, which Mitsuba leaves to chance, are noted: uv are 0,
+    normals the faces' own."""
+    notes = []
+    for what, words in (("uv", "texture coordinates, (0, 0) is taken"), ("normals", "vertex normals, they are flat")):
+        counts = [len(mesh.faces) for mesh in meshes if getattr(mesh, what) is None]
+        if 0 < len(counts) < len(meshes):
+            notes.append(f"{sum(counts)} of {sum(len(mesh.faces) for mesh in meshes)} faces have no {words}")
+            meshes = [_filled(mesh, what) if getattr(mesh, what) is None else mesh for mesh in meshes]
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)])
+    uvs = [mesh.uv for mesh in meshes if mesh.uv is not None]
+    normals = [mesh.normals for mesh in meshes if mesh.normals is not None]
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        faces,
+        np.concatenate(uvs) if uvs else None,
+        np.concatenate(normals) if normals else None,
+        notes=tuple(notes),
+    )
+
+
+def _filled(mesh: Mesh, what: str) -> Mesh:
+    """Return a mesh with uv of 0, or with the normals of its faces at corners of their own."""
+    if what == "uv":
+        return replace(mesh, uv=np.zeros((len(mesh.vertices), 2)))
+    corners = mesh.faces.ravel()
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    normals[~normals.any(axis=1)] = 0, 0, 1  # of a face without area, which is not seen
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    uv = None if mesh.uv is None else mesh.uv[corners]
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    return Mesh(mesh.vertices[corners], faces, uv, np.repeat(normals, 3, axis=0))
 
 
 def _read_serialized(path: Path, index: int) -> Mesh:
@@ -175,11 +213,6 @@ def _read_serialized(path: Path, index: int) -> Mesh:
     found = read_serialized(path, index)
     check_vertices(found.vertices, path.name)
     return Mesh(found.vertices, found.faces, found.uv, found.normals)
-
-
-def _joined(arrays: list[np.ndarray | None]) -> np.ndarray | None:
-    there = [array for array in arrays if array is not None]
-    return np.concatenate(there) if len(there) == len(arrays) else None
 
 
 def _obj(builder: Shapes, plugin: Plugin) -> Mesh:
