@@ -147,14 +147,27 @@ def test_an_opacity_that_is_rounded_is_noted(tmp_path: Path, opacity: str, taken
     assert [f"opacity {opacity} is taken as {taken}" in note for note in notes] == ([] if taken is None else [True])
 
 
-def test_to_uv_and_checkerboard_are_mitsubas(tmp_path: Path, mitsuba: object) -> None:
+@pytest.mark.parametrize(
+    ("steps", "noted"),
+    [
+        ('<rotate z="1" angle="30"/><scale x="2" y="3"/><translate x="0.2"/>', False),
+        ('<rotate x="1" angle="40"/><translate x="0.2" y="0.1"/>', False),
+        ('<rotate y="1" angle="50"/><scale value="1.5"/>', False),
+        ('<matrix value="2 0.5 0.3 0.1 0 3 0.6 0.2 0 0 1 0 0 0 0 1"/>', False),
+        ('<matrix value="2 0.45 0.3 0 3 0.6 0 0 1"/>', True),
+        ('<translate z="0.5"/><matrix value="2, 0.5, 0.3 0, 3, 0.7 0, 0, 1"/><translate x="0.1"/>', True),
+        ('<matrix value="2 0.45 0 0 3 0 0 0 1"/>', False),
+    ],
+)
+def test_to_uv_and_checkerboard_are_mitsubas(tmp_path: Path, mitsuba: object, steps: str, noted: bool) -> None:
     texture = (
         '<texture type="checkerboard" name="reflectance"><rgb name="color0" value="0.1"/>'
-        '<rgb name="color1" value="0.8"/><transform name="to_uv"><rotate z="1" angle="30"/><scale x="2" y="3"/>'
-        '<translate x="0.2"/></transform></texture>'
+        f'<rgb name="color1" value="0.8"/><transform name="to_uv">{steps}</transform></texture>'
     )
     path = write(tmp_path, f'<shape type="rectangle"><bsdf type="diffuse">{texture}</bsdf></shape>')
-    surface = load_mitsuba_xml(path).surfaces[0]
+    scene = load_mitsuba_xml(path)
+    surface = scene.surfaces[0]
+    assert [("third column of a 3x3 <matrix> is no shift" in note) for note in scene.notes] == ([True] if noted else [])
     rays = [((x, y, 3), (0, 0, -1)) for x in np.linspace(-0.9, 0.95, 6) for y in np.linspace(-0.95, 0.9, 6)]
     for ray, hit in zip(rays, mitsuba(path, rays=rays)["hits"], strict=True):
         assert texel(surface.material.albedo, first_hit(surface, *ray)[3]) == pytest.approx(hit[2][0])

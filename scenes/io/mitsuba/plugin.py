@@ -264,13 +264,22 @@ class Plugin:
             full = self.transform("to_uv")
             matrix = np.eye(3)
             matrix[:2, :2] = full[:2, :2]
-            # A 3x3 matrix keeps its shift in the third column, a 4x4 one in the fourth.
-            matrix[:2, 2] = full[:2, 3] + full[:2, 2]
+            matrix[:2, 2] = full[:2, 3]
+            self._note_third_column()
             return matrix
         both = self.number("uvscale", 1.0)
         scale = self.number("uscale", both), self.number("vscale", both)
         offset = self.number("uoffset", 0.0), self.number("voffset", 0.0)
         return np.array([(scale[0], 0, offset[0]), (0, scale[1], offset[1]), (0, 0, 1)])
+
+    def _note_third_column(self) -> None:
+        """Say where the third column of a 3x3 matrix in to_uv, its shift by the looks of it, moves no texture."""
+        transform = self.value("to_uv")
+        for step in [] if transform is None else transform:
+            values = step.get("value", "").replace(",", " ").split() if step.tag == "matrix" else []
+            if len(values) == 9 and (float(values[2]) or float(values[5])):
+                words = "the third column of a 3x3 <matrix> is no shift, as in Mitsuba 3; write <translate>"
+                self.note(f"to_uv: {words}")
 
     def _step(self, name: str, step: Element) -> np.ndarray:
         matrix = np.eye(4)
