@@ -3,10 +3,14 @@
 import struct
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from render.transient import read_transient
+from scene2spad.cli import main
 from scenes import InputError, Texture
 from scenes.io.relief import RgbdFiles, dequantised, filled, middlebury, middlebury_names, read_levels, relief, rgbd
 
@@ -137,3 +141,18 @@ def test_depth_images_of_16_bits_in_several_channels_are_refused(tmp_path):
     (tmp_path / "depth.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
     with pytest.raises(InputError, match=r"^[^\n]*depth\.png: 16 bits in 3 channels[^\n]*$"):
         read_levels(tmp_path / "depth.png")
+
+
+@pytest.mark.parametrize(("options", "size"), [((), (20, 15)), (("--height", "6"), (8, 6)), (("--width", "4"), (4, 3))])
+def test_a_pair_is_rendered_at_the_size_of_its_depth_image(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], size: tuple[int, int]
+) -> None:
+    """The photograph may be larger; one of width and height keeps the proportions."""
+    Image.fromarray(np.full((30, 40), 188, np.uint8)).save(tmp_path / "photo.png")
+    Image.fromarray(np.full((15, 20), 2000, np.uint16)).save(tmp_path / "depth.png")
+    pair = ["render", str(tmp_path / "photo.png"), "--depth", str(tmp_path / "depth.png"), "--focal", "20"]
+    out = tmp_path / "a.exr"
+    rest = ["--depth-scale", "0.001", "--bounces", "1", "--grid", "1", "--no-figure", "--out", str(out)]
+    assert main([*pair, *rest, *options]) == 0
+    capsys.readouterr()
+    assert read_transient(out).depth_m.shape == size[::-1]

@@ -31,7 +31,7 @@ from scene2spad.options.common import (
 from scenes import Ambient, InputError, Laser, Scene
 from scenes.constants import DEFAULT_WAVELENGTH_M
 from scenes.errors import require
-from scenes.library.catalog import WIDTH, load_scene
+from scenes.library.catalog import load_scene
 from scenes.offsets import check_delay, check_offset
 from scenes.optics.blackbody import sunlit_sky_w_per_m2_sr_nm
 from scenes.placing import Placing
@@ -54,7 +54,8 @@ class Render(Long):
     out: File = None
     """The .exr file (default: the scene's name in this folder, - for /)."""
     width: Pixels = None
-    """Image width, pixels (default: the scene's own; one of width and height alone keeps the proportions)."""
+    """Image width, pixels (default: the scene's own, of an RGB-D pair the depth image's; one of width and height alone
+    keeps the proportions)."""
     height: Pixels = None
     """Image height, pixels."""
     laser: Mode = None
@@ -241,8 +242,7 @@ def _rgbd(command: Render) -> Scene:
     if command.depth is None or command.focal is None:
         raise InputError(f"{command.scene}: an RGB-D pair needs --depth FILE and --focal PIXELS (and --depth-scale)")
     files = RgbdFiles(Path(command.scene), command.depth, command.focal, command.depth_scale, command.cosine)
-    width = WIDTH if command.width is None and command.height is None else command.width
-    return rgbd(files, width=width, height=command.height)
+    return rgbd(files, width=command.width, height=command.height)
 
 
 def in_view(transient: Transient) -> Transient:
