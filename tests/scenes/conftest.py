@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 dr.set_thread_count(2)  # with one (1 CPU) Mitsuba waits for ever for an EXR file
 mi.set_variant("scalar_rgb")
+mi.set_log_level(mi.LogLevel.Error)  # warnings would stand before an answer
 numbers = lambda v: np.array(v, float).ravel().tolist()
 for line in sys.stdin:
     job = json.loads(line)

@@ -193,6 +193,20 @@ def test_an_stl_that_was_cut_short_is_refused(tmp_path, kind, left):
     assert "cut short" in mesh_refusal(path)
 
 
+def test_what_follows_the_last_triangle_of_an_stl_is_named(tmp_path):
+    """Nothing of such a file is missing; its header may be wrong, so that it is refused."""
+    triangle = struct.pack("<12fH", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 1, 0)
+    whole = bytes(80) + struct.pack("<I", 1) + triangle
+    path = tmp_path / "a.stl"
+    path.write_bytes(whole)
+    assert load_scene(str(path), bare=True).triangles == 1
+    path.write_bytes(whole + b"\0\0")
+    message = mesh_refusal(path)
+    assert "2 bytes after the last of the 1 triangles that its header says" in message and "cut short" not in message
+    path.write_bytes(whole[:-1])
+    assert "cut short" in mesh_refusal(path)
+
+
 def test_a_text_stl_with_a_word_for_a_number_is_refused(tmp_path):
     path = ball(tmp_path / "ball.stl", file_type="stl_ascii")
     text = path.read_text()

@@ -202,3 +202,25 @@ def test_a_black_back_that_is_seen_is_noted_once(tmp_path: Path) -> None:
     body += f'<shape type="cylinder" id="pipe">{back}{bsdfs["one"]}</shape>'
     (note,) = load(tmp_path, body).notes
     assert note == "reflects from both sides, in Mitsuba the back without twosided is black: one, none, pipe"
+
+
+@pytest.mark.parametrize(
+    ("kind", "steps", "noted"),
+    [
+        ("sphere", '<scale value="1 2 1"/>', True),
+        ("sphere", '<rotate z="1" angle="30"/><scale x="2" y="3" z="3"/>', True),
+        ("sphere", '<rotate x="1" y="0" angle="30"/><scale value="2"/><scale x="-1"/><translate x="9"/>', False),
+        ("disk", '<scale value="1 2 1"/>', False),
+        ("cylinder", '<scale value="1 2 1"/>', False),
+    ],
+)
+def test_a_sphere_that_mitsuba_keeps_round_is_noted(
+    tmp_path: Path, mitsuba: object, kind: str, steps: str, noted: bool
+) -> None:
+    """Of all shapes the sphere alone has another box in Mitsuba, where a scale is not the same along all axes."""
+    path = write(tmp_path, f'<shape type="{kind}"><transform name="to_world">{steps}</transform></shape>')
+    scene = load_mitsuba_xml(path)
+    points = scene.surfaces[0].vertices
+    same = np.allclose([points.min(axis=0), points.max(axis=0)], mitsuba(path)["bbox"], atol=1e-2)
+    assert same != noted
+    assert any("makes an ellipsoid of the sphere" in note for note in scene.notes) == noted

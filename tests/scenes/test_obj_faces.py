@@ -176,3 +176,16 @@ def test_mitsubas_faces_with_texture_coordinates_and_normals_are_its_own(tmp_pat
         expected = points[at], uv[at] * (1, -1) + (0, 1), normals[at] / lengths
         matches = [all(close(a, b) for a, b in zip(expected, one, strict=True)) for one in found]
         assert sum(matches) == 1
+
+
+def test_lines_may_end_by_carriage_returns(tmp_path: Path) -> None:
+    """As programs of old wrote them, also behind a line that goes on and in the names of materials."""
+    (tmp_path / "a.mtl").write_text("newmtl cloth\nKd 0.5 0.5 0.5\n")
+    text = "# units: m\nmtllib a.mtl\n" + VALUES + "usemtl cloth\nf 1/1 2/2 \\\n3/3\nusemtl other\nf 4 5 6\n# foot\n"
+    found = []
+    for end in ("\n", "\r\n", "\r"):
+        (tmp_path / "a.obj").write_bytes(text.replace("\n", end).encode())
+        found.append(load_mesh(tmp_path / "a.obj", placing=Placing(bare=True)))
+    assert all(one.digest() == found[0].digest() and one.notes == found[0].notes for one in found)
+    assert "usemtl names what no material file defines: other" in found[0].notes
+    assert any("unit 'm' taken" in note for note in found[0].notes)

@@ -154,7 +154,7 @@ def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEnt
 
 def _note_undefined(text: str, entries: dict[str, MaterialEntry], notes: list[str]) -> None:
     """Note the names of an OBJ's usemtl lines that no material file defines: such faces have no material."""
-    used = re.findall(r"^ *usemtl +(.*?) *$", text.replace("\t", " ").replace("\r", ""), re.MULTILINE)
+    used = re.findall(r"^ *usemtl +(.*?) *$", text.replace("\t", " ").replace("\r", "\n"), re.MULTILINE)
     undefined = [name for name in dict.fromkeys(used) if name and name not in entries]
     if undefined:
         notes.append(f"usemtl names what no material file defines: {listed(undefined)}")

@@ -225,7 +225,7 @@ def _scale(path: Path, extent: float) -> tuple[float, list[str]]:
         return 1.0, _odd_metres(extent)
     low, high = SENSIBLE_EXTENT_M
     with path.open("rb") as file:
-        header = file.read(HEADER_BYTES).decode("latin-1")
+        header = file.read(HEADER_BYTES).decode("latin-1").replace("\r", "\n")
     # short ones are whole words: neither "microns" nor "units in use" is a unit of these; "metric" is none either
     ends = {"met": "(?=er|re)", "in": r"(?! *[a-z0-9])"}
     names = "|".join(

@@ -14,11 +14,13 @@ _CORNERS = {(False, False): b"1", (True, False): b"1/1", (False, True): b"1//1",
 def plain_obj(content: bytes) -> bytes:
     """Return an OBJ as trimesh reads it rightly: no indents, tabs and comments, indices from the first vertex on.
 
+    Lines end by LF, CR LF or CR.
+
     trimesh passes over indented lines, takes the first `mtllib` of comments too, stumbles over a comment behind a face,
     counts negative indices from the end of the file instead of from their line, and takes vertex 0 for vertex 1. Raises
     InputError for an index of 0, or before the first.
     """
-    content = content.replace(b"\r\n", b"\n").replace(b"\\\n", b" ").replace(b"\t", b" ")
+    content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ").replace(b"\t", b" ")
     if content[:1] in b" #" or b"\n " in content or re.search(rb"\n#.*mtllib", content):
         content = re.sub(rb"^ +|^#.*mtllib.*", b"", content, flags=re.MULTILINE)
     if re.search(rb"^[fv].*#", content, re.MULTILINE):

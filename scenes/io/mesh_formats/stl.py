@@ -18,8 +18,10 @@ def check_stl(content: bytes) -> int:
         if len(content) == expected:
             return count
         text = content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
-        message = f"cut short or damaged: its header says {count} triangles in {expected} bytes"
-        require(text, f"{message}, it has {len(content)}")
+        message = f"cut short or damaged: its header says {count} triangles in {expected} bytes, it has {len(content)}"
+        if len(content) > expected:
+            message = f"{len(content) - expected} bytes after the last of the {count} triangles that its header says"
+        require(text, message)
     return _check_stl_text(content.lower())
 
 

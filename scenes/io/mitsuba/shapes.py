@@ -251,6 +251,10 @@ def _cube(builder: Shapes, plugin: Plugin) -> Mesh:
 def _sphere(builder: Shapes, plugin: Plugin) -> Mesh:
     centre, radius = plugin.point("center", (0, 0, 0)), _positive(plugin, "radius")
     vertices, faces, uv = shapes.sphere(1.0, SUBDIVISIONS)
+    axes = plugin.transform("to_world")[:3, :3]
+    gram = axes.T @ axes
+    if not np.allclose(gram, gram[0, 0] * np.eye(3), rtol=1e-4, atol=1e-4 * gram[0, 0]):
+        plugin.note("to_world makes an ellipsoid of the sphere; Mitsuba keeps a sphere of the length of its x axis")
     # Mitsuba turns a mirrored sphere inside out, alone among its shapes.
     return Mesh(centre + radius * vertices, faces, _flipped_v(uv), vertices, keeps_side=False)
 
