@@ -13,14 +13,18 @@ from scene2spad.studies.chip.plan import MAIN, Plan
 from scene2spad.studies.chip.study import compared_rows, in_words
 from scene2spad.studies.power.front import (
     LOST_LIMIT,
+    Design,
+    costs_of,
     loss_rows,
     lost,
     most_photons_per_s,
     printed_rows,
 )
 from scene2spad.studies.power.front import designs as designs_of
-from scene2spad.studies.power.front_figure import front
+from scene2spad.studies.power.front_figure import ENERGY, front, power_uw
 from scene2spad.studies.power.plan import WANTED
+from ultraphase import method
+from ultraphase.power import measured_cost, sweep
 
 
 def test_models_are_compared_in_pairs():
@@ -69,6 +73,21 @@ def test_published_points_have_the_printed_power_of_a_pixel():
     for row in rows.values():
         assert row["processing_uw_published"] == pytest.approx(row["published"]["processing_uw"] / 4, rel=6e-3)
         assert row["readout_uw"] == pytest.approx(row["published"]["readout_uw"] / 4, rel=6e-3)
+
+
+def test_power_has_the_columns_of_the_sweep_and_the_figure_adds_the_frames_end():
+    """Find photons and frame end apart, under one name in the front and in the sweep."""
+    coarse = method("coarse-16")
+    cost = measured_cost(coarse, None)
+    one = Design("coarse", coarse.codes, cost, np.array([cost.clocks_per_photon]), coarse.program(), {}, coarse=coarse)
+    mine = costs_of(one, 550.0, 30.0)
+    (swept,) = [row for row in sweep({"coarse": cost}, [550.0], [30.0], [1]) if row["name"] == "coarse"]
+    for name in ENERGY:
+        assert mine[name] == pytest.approx(swept[name]) and mine[name] > 0
+    parts = [mine[name] for name in ("processing_uw_energy", "frame_end_uw_energy", "readout_uw")]
+    assert power_uw(ENERGY, mine) == pytest.approx(sum(parts))
+    paper = printed_rows()[0]
+    assert power_uw(ENERGY, paper) == paper["processing_uw_energy"] + paper["readout_uw"]
 
 
 @pytest.mark.slow

@@ -87,7 +87,9 @@ def front_rows(found: list[Design], transient: Transient, seed: int, progress: P
     """Return a row for every design, number of photons and frame rate: error, power of a pixel, bytes, clocks, lost
     photons.
 
-    The error is that of a frame whose photons are all read; `keeps_up` says where that is so.
+    `processing_uw_*` are of the photons alone, as in `ultraphase.power.sweep`. The energy of the frame's end stands
+    beside them in `frame_end_uw_energy`. The error is that of a frame whose photons are all read; `keeps_up` says where
+    that is so.
     """
     rows = []
     for number, photons in enumerate(PHOTONS):
@@ -98,11 +100,12 @@ def front_rows(found: list[Design], transient: Transient, seed: int, progress: P
             errors = histogram_errors(depth, histogram)
             figures = {key: errors[key] for key in ("mae_mm", "median_abs_mm")}
             common: dict[str, object] = {"name": one.name, "photons": photons, **figures}
-            rows += [{**common, **_costs(one, photons, rate)} for rate in FRAME_RATES]
+            rows += [{**common, **costs_of(one, photons, rate)} for rate in FRAME_RATES]
     return rows
 
 
-def _costs(one: Design, photons: float, frames_per_s: float) -> dict[str, float]:
+def costs_of(one: Design, photons: float, frames_per_s: float) -> dict[str, float]:
+    """Return the columns of `front_rows` that need no depth: power of a pixel [uW], bytes, clocks, lost photons."""
     spent = power(one.cost, Load(photons, frames_per_s, pixels=1))
     alone, shared = (lost(one.clocks, photons * spads * frames_per_s) for spads in (1, SPADS))
     return {
@@ -110,7 +113,8 @@ def _costs(one: Design, photons: float, frames_per_s: float) -> dict[str, float]
         "bytes_per_pixel": one.cost.bits_per_pixel / 8,
         "clocks_per_photon": one.cost.clocks_per_photon,
         "processing_uw_published": MICRO * spent.processing_published_w,
-        "processing_uw_energy": MICRO * (spent.processing_energy_w + spent.frame_end_energy_w),
+        "processing_uw_energy": MICRO * spent.processing_energy_w,
+        "frame_end_uw_energy": MICRO * spent.frame_end_energy_w,
         "readout_uw": MICRO * spent.readout_w,
         "lost": alone,
         "lost_16_spads": shared,
@@ -159,7 +163,7 @@ def loss_rows(found: list[Design], seed: int, progress: Progress) -> list[dict[s
 
 def printed_rows() -> list[dict[str, object]]:
     """Return the published points: power from printed clocks, and the MAE that was printed for the design (8 pairs, 16
-    levels, without the chip's 8 bits)."""
+    levels, without the chip's 8 bits). The published table has no frame end."""
     rows = []
     for name, (design, block, compression) in _PRINTED.items():
         row, error = PUBLISHED[name], PUBLISHED_ERRORS[design, block][compression]
