@@ -14,8 +14,12 @@ from scene2spad.studies.tdc import study
 from scene2spad.studies.tdc.plan import CLOCKS, DELAY, FOLDED, PERFECT, REAL, TABLE, TRAINED, sensor_of
 
 
+def recorded_planes() -> dict[str, study.Recorded]:
+    return study.recorded_by_clock(TestSet("planes", random_planes(1, size=8)), 0, (50.0, 50.0), 3)
+
+
 def test_every_clock_sees_the_same_photons_and_none_is_lost() -> None:
-    found = study.recorded_by_clock(TestSet("planes", random_planes(1, size=8)), 0, (50.0, 50.0), 3)
+    found = recorded_planes()
     assert {*found, DELAY} == set(CLOCKS)
     counts = {clock: one.counts.sum(-1) for clock, one in found.items()}
     for clock, mine in counts.items():
@@ -68,6 +72,19 @@ def test_ticks_of_differences_reach_as_far_to_both_sides_as_they_do(monkeypatch,
 def test_the_mean_delay_is_that_of_codes_before_the_first_that_comes() -> None:
     """Codes that never come stand before all others: the first 18 or so of 140, 0.32 ns, whose effect falls to none."""
     assert 0.020 < study.mean_delay_m() < 0.030
+
+
+def test_a_depth_below_the_mean_delay_is_0() -> None:
+    """Leave no negative depth. No detection leaves its laser period, so that none lies at the period's end."""
+    sensor = sensor_of(REAL)
+    assert sensor.code_edges is not None and sensor.bins == sensor.bins_per_period
+    assert (sensor.code_edges[:, [0, -1]] == [0, sensor.bins]).all()
+    depth_m, truth_m = np.array([[0.01, 2.0]], np.float32), np.array([[0.5, 2.0]], np.float32)
+    subject = study.Subject("m", lambda _: depth_m, (REAL,), None, None, "")
+    real, delay = study.errors_by_clock(subject, {REAL: recorded_planes()[REAL]}, truth_m)
+    assert (real["clock"], delay["clock"]) == (REAL, DELAY)
+    assert real["mae_mm"] == pytest.approx(490 / 2, rel=1e-4)
+    assert delay["mae_mm"] == pytest.approx((500 + 1000 * study.mean_delay_m()) / 2, rel=1e-4)
 
 
 def test_models_trained_with_the_clock_begin_with_the_plain_one(tmp_path) -> None:

@@ -15,7 +15,7 @@ FOLDED, TRAINED = "folded", "trained"
 CLOCKS = {
     PERFECT: "1,024 equal codes",
     REAL: "the table's codes, uncorrected",
-    DELAY: "uncorrected; the mean delay of all pixels is taken off the depth",
+    DELAY: "uncorrected; the mean delay of all pixels is taken off the depth, down to 0",
     LINE: "a straight line a pixel before summing",
     TABLE: "a look-up table a pixel before summing",
     FOLDED: "real codes, each pixel's rows of C averaged over its codes' true times; of a histogram, recalibrated",
