@@ -10,7 +10,9 @@ import pytest
 from scene2spad.cli.main import main
 
 README = Path(__file__).parents[1] / "README.md"
-CLOSE = 0.02  # relative: other processors round otherwise, other versions must not
+# Other processors round otherwise, which draws other photons. Over draws the MAE of these lines has a standard deviation
+# of 2 to 4 %, the share within 10 mm one of 0.005; the page has two digits of both.
+CLOSE = {"mae_mm": {"rel": 0.15}, "within_10mm": {"abs": 0.02}}
 
 
 def block_after(heading: str) -> list[str]:
@@ -29,19 +31,19 @@ def test_the_shells_numbers(tmp_path, monkeypatch, capfd):
         assert main([*shlex.split(command)[1:], "--json"]) == 0
         printed = json.loads(capfd.readouterr().out.splitlines()[-1])
         for name, number in re.findall(r"(\w+): ([\d.]+)", comment):
-            assert float(number) == pytest.approx(printed[name], rel=CLOSE), line
+            assert printed[name] == pytest.approx(float(number), **CLOSE[name]), line
             shown += 1
-    assert shown == 4
+    assert shown == 5
 
 
 @pytest.mark.slow
 def test_pythons_numbers():
     names: dict = {}
-    shown = []
+    shown = 0
     for line in block_after("The same in Python"):
         exec(line, names)
-        if found := re.search(r"#.*?([\d.]+) mm|#.*'mae_mm': ([\d.]+)", line):
+        for name, number in re.findall(r"(\w+): ([\d.]+)", line.partition("#")[2]):
             errors = names["s2s"].depth_errors(names["depth_m"], names["histogram"])
-            shown.append(float(found[1] or found[2]))
-            assert shown[-1] == pytest.approx(errors["mae_mm"], rel=CLOSE), line
-    assert len(shown) == 3
+            assert errors[name] == pytest.approx(float(number), **CLOSE[name]), line
+            shown += 1
+    assert shown == 4
