@@ -27,7 +27,7 @@ from spad.sensor.model import Sensor
 
 log = logging.getLogger("csph")
 
-FULL_LENGTH_FRACTION = 0.1  # of a run with windows, its last: on all bins
+FULL_LENGTH_FRACTION = 0.1  # of a run with windows, its last, of whole epochs at least one: on all bins
 
 
 class Request(NamedTuple):
@@ -217,7 +217,8 @@ class SetData(pl.LightningDataModule):
         # made anew each epoch (`reload_dataloaders_every_n_epochs`), which decides the samples
         epoch = 0 if self.trainer is None else self.trainer.current_epoch
         config = self.config
-        late = epoch >= round((1 - FULL_LENGTH_FRACTION) * config.epochs)
+        # at least the last epoch, which is more than a tenth of a short run
+        late = epoch >= min(round((1 - FULL_LENGTH_FRACTION) * config.epochs), config.epochs - 1)
         window = 0 if late else config.window
         size = (config.crop, config.crop)
         return self._loader(Samples(self.training, config, epoch), self.training, config.batch, size, window)

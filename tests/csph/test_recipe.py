@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -347,3 +348,17 @@ def test_training_on_the_published_grid(tmp_path):
     lit_twice = views._replace(transients=tuple(late))
     with pytest.raises(InputError, match=r"one return a pixel, and .* has indirect light: .* --bounces 1"):
         train(preset("smoke", model, **FEW), *split_views(lit_twice), tmp_path / "other")
+
+
+@pytest.mark.parametrize(("epochs", "windowed"), [(1, 0), (2, 1), (3, 2), (4, 3), (6, 5), (12, 11), (24, 22)])
+def test_the_last_epochs_are_on_all_bins(epochs, windowed):
+    """A tenth of the run, and at least one epoch: without it a network never sees the whole range."""
+    training, validation = ([pack_views(one.transients)] for one in split_views(random_planes(3, size=16)))
+    config = preset("smoke", ModelConfig(design=Design()), epochs=epochs)
+    assert config.window == 512
+    data, seen = SetData(training, validation, config), []
+    for epoch in range(epochs):
+        data.trainer = SimpleNamespace(current_epoch=epoch)
+        batch = next(iter(data.train_dataloader()))
+        seen.append(bool((batch.first_bin >= 0).all()))
+    assert seen == [True] * windowed + [False] * (epochs - windowed)
