@@ -47,7 +47,7 @@ NOT_RUN = {
     "pip install 'scene2spad[video]'": "downloads 70 MB",
     "pip install 'scene2spad[cluster]'": "installs what the tests have",
     "pip install deepinv": "downloads gigabytes; the operator was tried with it, here a stand-in takes its place",
-    "scene2spad train --preset gpu --devices 2 --set rooms.h5 --out run-gpu": "needs two GPUs",
+    "scene2spad train --preset gpu --set rooms.h5 --out run-gpu": "needs a GPU",
     "scene2spad study depth-offset": "trains networks for hours; test_depth_offset runs it small",
     "scene2spad study real-data --capture FILE": "test_real_data runs it; needs trained networks beside the capture",
     "make notebooks": "jupytext is an extra; test_examples checks the cells",

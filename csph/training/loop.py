@@ -13,7 +13,7 @@
     codes.npy           a copy of the file of own codes, where there is one
     resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
 
-Devices, precision and several GPUs are Lightning's; nothing here knows how many there are.
+A run is on one device (`csph.training.hardware`). Its device and precision are Lightning's.
 """
 
 from __future__ import annotations
@@ -22,11 +22,9 @@ import json
 import logging
 import math
 import time
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -44,10 +42,11 @@ from csph.networks.posterior import DECODERS
 from csph.networks.published import soft_argmax
 from csph.training.beginning import Beginning, NetworkOf, check_init, what_is_known
 from csph.training.data import SetData, TrainBatch
+from csph.training.hardware import ANY_HARDWARE, Hardware, fit, trainer_on
 from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.optimiser import make_optimiser
 from csph.training.own_codes import own_codes_of
-from csph.training.resume import WholeFileCheckpoints, check_resume, claim_run
+from csph.training.resume import check_resume, claim_run
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
 from csph.training.views import Views, check_direct, check_light, check_names, packed_sha256, path_of, write_seen
@@ -251,19 +250,6 @@ def _check_kept(folder: Path, rows: Sequence[dict[str, float]], kept: Mapping[st
         log.warning(message, kept["step"], kept["val_rmse_mm"], best["step"], best["val_rmse_mm"])
 
 
-@dataclass(frozen=True)
-class Hardware:
-    """What a training runs on: processes that draw samples, and Lightning's names of accelerator, devices, strategy."""
-
-    workers: int = 0
-    accelerator: str = "auto"
-    devices: int | str = "auto"
-    strategy: str = "auto"
-
-
-ANY_HARDWARE = Hardware()
-
-
 def _listed(views: Views | Sequence[Views], which: str) -> list[Views]:
     """Return one set or several as a list. Raises InputError for none, sets without a view, and other objects."""
     several = [views] if isinstance(views, Views) else views
@@ -289,55 +275,6 @@ def _with_hashes(config: TrainConfig, sets: Sequence[Sequence[PackedViews]], ini
     return replace(config, data={**config.data, **data})
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence Lightning's advice on workers and devices, which is not the user's business: what is said here goes to
-    the log."""
-    loggers = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric", "lightning.pytorch")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
-
-
-def _trainer(config: TrainConfig, record: Record, hardware: Hardware) -> pl.Trainer:
-    """Make Lightning's Trainer without what `Record` does instead. InputError for mixed precision on a CPU."""
-    runner = pl.Trainer(
-        max_epochs=config.epochs,
-        precision=config.precision,
-        callbacks=[CodeEnergy(record.folder), record],
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        plugins=[WholeFileCheckpoints()],
-        reload_dataloaders_every_n_epochs=1,
-        accelerator=hardware.accelerator,
-        devices=hardware.devices,
-        strategy=hardware.strategy,
-    )
-    # there, weights' gradients in bf16 read memory that was never written (torch 2.13)
-    on_cpu = runner.strategy.root_device.type == "cpu"
-    require(config.precision == "32-true" or not on_cpu, f"precision {config.precision} needs a GPU")
-    return runner
-
-
-def _fit(runner: pl.Trainer, module: DepthTraining, data: SetData, resume: Path) -> None:
-    """Run Lightning's loop to its end, from the state in `resume` on where there is one."""
-    with _quiet():
-        try:
-            runner.fit(module, data, ckpt_path=resume if resume.is_file() else None, weights_only=True)
-        except SystemExit:  # what Lightning makes of Ctrl-C
-            raise KeyboardInterrupt from None
-
-
 def train(
     config: TrainConfig,
     training: Views | Sequence[Views],
@@ -352,7 +289,8 @@ def train(
 
     Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
     the same design to begin with (`WeightsOf`: with what it was trained on), or `NetworkOf` one of any design on the
-    same sensor, whose codes begin anew. No result depends on `hardware`, but for the order of sums on several devices.
+    same sensor, whose codes begin anew. A run is on one device; where photons are drawn and
+    sums are rounded is the device's, and nothing else of `hardware` changes a result.
     Returns steps, seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of
     parameters. Raises InputError for no set, sets or an `init` that do not fit, indirect light on the published grid,
     and another run's folder.
@@ -370,8 +308,7 @@ def train(
     check_light(given, sets, config.model.sensor)
     module_data = SetData(sets[0], sets[1], config, hardware.workers)
     record = Record(folder, progress or (lambda what, fraction: None))
-    with _quiet():
-        runner = _trainer(config, record, hardware)
+    runner = trainer_on(hardware, config, [CodeEnergy(folder), record])
     module = DepthTraining(config, init, own_codes_of(config, folder))
     claim_run(folder, config)  # once the model is known to be possible
     write_seen(folder, given[0], frozenset() if init is None else what_is_known(init).seen)
@@ -383,10 +320,8 @@ def train(
     if resume.is_file():
         check_resume(resume, module)
     if not (folder / "last.safetensors").is_file():
-        _fit(runner, module, module_data, resume)
-        if runner.is_global_zero:
-            save_model(module.kept, config, record.rows[-1], folder / "last.safetensors")
-        runner.strategy.barrier()
+        fit(runner, module, module_data, resume)
+        save_model(module.kept, config, record.rows[-1], folder / "last.safetensors")
     kept, last = (load_model(path)[2] for path in (folder, folder / "last.safetensors"))
     _check_kept(folder, record.rows, kept)
     return {

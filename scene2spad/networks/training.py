@@ -143,6 +143,8 @@ def _check_numbers(command: Train) -> None:
     check_used(command)
     for name, value in (("devices", command.devices), ("threads", command.threads)):
         require(value is None or value >= 1, f"train: --{name} {value} is below 1")
+    more = f"train: --devices {command.devices}: a training is on one device; others are for other runs"
+    require(command.devices in (None, 1), more)
     require(not command.init_share or command.init is not None, "train: --init-share needs --init")
     require(command.init is None or command.init_network is None, "train: give --init or --init-network, not both")
     weights, sets = len(command.set_weights), len(command.set)
@@ -258,7 +260,7 @@ def run_train(command: Train, progress: Progress) -> dict:
         validation,
         folder,
         init=init,
-        hardware=Hardware(command.workers, devices=command.devices or "auto"),
+        hardware=Hardware(command.workers),
         progress=progress,
     )
     return {"model": config.model.name, "views": sum(len(views.transients) for views in training), **result}

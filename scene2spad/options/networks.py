@@ -108,7 +108,7 @@ class Train(Long):
     workers: int = 0
     """Processes that sense ahead; the same patches, whatever their number."""
     devices: Count = None
-    """GPUs (default: all there are)."""
+    """Devices to train on: 1, the default. More are refused, since they would train another, shorter run."""
     out: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder of the run (default: out/train and a name from the options)."""
 

@@ -110,6 +110,7 @@ def refused(capfd, argv: list[str]) -> str:
         ("render living-room --cosine", "an RGB-D pair needs --depth FILE"),
         ("train --devices 0", "train: --devices 0 is below 1"),
         ("train --devices -2 --dry-run", "train: --devices -2 is below 1"),
+        ("train --devices 2 --dry-run", "train: --devices 2: a training is on one device"),
         ("train --threads 0", "train: --threads 0 is below 1"),
         ("train --dry-run --preset smoke --set-weights 1 2", "train: 2 --set-weights for 1 sets"),
         ("train --codes 8 --compression 64", "train: give --codes 8 or --compression, not both"),
