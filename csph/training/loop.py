@@ -207,6 +207,7 @@ class Record(pl.Callback):
         means = (module.squared_m2, module.absolute_m)
         for metric in (module.train_loss, *(_mean(mean, name) for mean in means for name in DECODERS)):
             metric.reset()
+        _check_finite(module, row, self.folder)
         self.rows = [*self.rows, row]
         if trainer.is_global_zero:
             # the hardest photon levels rule the RMSE of a few frames, and hide what the end of a cosine gains elsewhere
@@ -236,6 +237,19 @@ def _validation_mm(module: DepthTraining) -> dict[str, float]:
         "val_mae_mm": own[1],
         **{f"val_mae_mm_{name}": absolute for name, (_, absolute) in errors.items()},
     }
+
+
+def _check_finite(module: DepthTraining, row: Mapping[str, float], folder: Path) -> None:
+    """Raise InputError for an epoch that diverged, before it takes the place of the last good one.
+
+    In 16 bits a loss may overflow: the step is left out, and the run goes on.
+    """
+    names = ("val_rmse_mm",) if module.config.precision == "16-mixed" else ("train_loss", "val_rmse_mm")
+    weights = [*module.model.parameters(), *module.kept.parameters()]
+    finite = all(math.isfinite(row[name]) for name in names) and all(bool(part.isfinite().all()) for part in weights)
+    last = f"what it was after epoch {row['epoch'] - 1} is kept" if row["epoch"] > 1 else "nothing is kept"
+    found = f"training loss {row['train_loss']:.4g}, validation RMSE {row['val_rmse_mm']:.4g} mm"
+    require(finite, f"{folder}: the run diverged in epoch {row['epoch']:g} ({found}), {last}; use a lower --rate")
 
 
 def _check_kept(folder: Path, rows: Sequence[dict[str, float]], kept: Mapping[str, float]) -> None:
