@@ -121,6 +121,21 @@ def test_depth_maps_of_two_checkpoints_have_two_names():
     assert label("runs/a/last.safetensors") == "network-a-last"
 
 
+def test_depth_maps_of_one_network_read_in_two_ways_have_two_names():
+    """They overwrote one another, under one label."""
+    from scene2spad.cli.simulation.depth import Depth, depth_label
+
+    def labels(**reading: object) -> list[str]:
+        common = {"file": Path("a.h5"), "method": "network", **reading}
+        return [depth_label(Depth(**common, **of)) for of in ({"model": "m"}, {"checkpoint": Path("runs/m")})]
+
+    assert labels() == ["network-m"] * 2
+    assert labels(decoder="median") == ["network-m-median"] * 2
+    assert labels(decoder="soft-argmax", int8=True) == ["network-m-soft-argmax-int8"] * 2
+    assert labels(int8=True, int8_rule="calibrated") == ["network-m-int8"] * 2
+    assert labels(int8=True, int8_rule="published") == ["network-m-int8-published"] * 2
+
+
 def test_reprs_are_one_line_with_shapes_and_units(tmp_path):
     """A Scene's was 40 kB of arrays."""
     READERS["histogram"].make(tmp_path / "h.h5")

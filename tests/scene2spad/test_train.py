@@ -33,6 +33,7 @@ from scene2spad.networks.training import config_of
 from scene2spad.options.networks import Train
 from scenes import InputError
 from spad.detection.detect import sense
+from spad.formats.depth_map import read_depth
 from spad.measurements.histogram import write_histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
@@ -98,6 +99,8 @@ def test_train_evaluate_depth(capfd, packed, tmp_path, monkeypatch):
     mean = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--decoder", "soft-argmax")
     median = run(capfd, "depth", "planes.h5", "--method", "network", "--model", "none-s0", "--no-figure")
     assert median["mae_mm"] < mean["mae_mm"]
+    assert mean["method"] == "network-none-s0-soft-argmax" and mean["out"] != median["out"]
+    assert [read_depth(Path(one["out"]))[2]["decoder"] for one in (mean, median)] == ["soft-argmax", "median"]
     layers = OpenEXR.File("planes-network-none-s0.exr", separate_channels=True).channels()
     assert set(layers) == {"Z", "confidence"}
     sure = layers["confidence"].pixels

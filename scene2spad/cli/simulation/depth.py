@@ -199,12 +199,15 @@ def _estimated(
 
     label = depth_label(command)
     start = time.perf_counter()
+    reading: dict[str, object] = {}
     if network is None:
         depth = choose(histogram.sensor)(histogram)
         seconds = time.perf_counter() - start
         sure = confidence_map(histogram, depth, command.method)
     else:
         rule = command.int8_rule or "calibrated"
+        reading["decoder"] = command.decoder or network.config.decoder
+        reading |= {"int8_rule": rule} if command.int8 else {}
         depth, sure, overflows = network.estimate(histogram, int8=command.int8, int8_rule=rule, decoder=command.decoder)
         if overflows:
             log.warning("%d sums of 16 bits wrapped around", overflows)
@@ -215,7 +218,7 @@ def _estimated(
     unmixed = {}
     if source.suffix.lower() != ".mat":  # of whose pixels nobody knows which are mixed
         unmixed["unmixed"] = histogram_errors(depth, histogram, exclude=histogram.mixed)
-    meta = {"method": label, "histogram_sha256": histogram.sha256()}
+    meta = {"method": label, "histogram_sha256": histogram.sha256(), **reading}
     write_depth(depth, out, meta | pointing_of(histogram.meta), sure)
     result = {
         "seconds": seconds,
@@ -233,22 +236,30 @@ def _estimated(
 
 
 def depth_label(command: Depth) -> str:
-    """Name a depth map after its method, so that results of two checkpoints do not overwrite one another."""
+    """Name a depth map after its method, so that results of two checkpoints, or of two readings of one, do not
+    overwrite one another."""
     if command.method == "compressive" and command.codes_file is not None:
         return command.codes_file.stem
     if command.method == "compressive":
         return _code_name(command)
     if command.method == "network" and command.model is not None:
-        return f"network-{command.model}"
+        return f"network-{command.model}{_reading(command)}"
     if command.method != "network" or command.checkpoint is None:
         return command.method
     from csph.weights.shipped import RUN_WEIGHTS
 
     checkpoint = command.checkpoint
     if checkpoint.is_dir():
-        return f"network-{checkpoint.resolve().name}"
+        return f"network-{checkpoint.resolve().name}{_reading(command)}"
     run = f"{checkpoint.resolve().parent.name}-" if checkpoint.stem in RUN_WEIGHTS else ""
-    return f"network-{run}{checkpoint.stem}"
+    return f"network-{run}{checkpoint.stem}{_reading(command)}"
+
+
+def _reading(command: Depth) -> str:
+    """Return how a network is read, as its label ends: the decoder that is asked for, and codes in 8 bits."""
+    decoder = "" if command.decoder is None else f"-{command.decoder}"
+    published = "-published" if command.int8_rule == "published" else ""
+    return f"{decoder}-int8{published}" if command.int8 else decoder
 
 
 def _code_name(command: Depth) -> str:
