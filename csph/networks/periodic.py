@@ -10,6 +10,9 @@ times, with delays of 0, 8, 16 and 24 bins, and its logits are averaged (`eval`;
     logits(x delayed by 8 s bins) = logits(x) delayed by 8 s bins
 
 The weights are the compact network's.
+
+A return within some bins of the range's ends has its posterior on both. The median is then on one of them, right around
+the circle; the mean (soft-argmax) is somewhere between, metres off.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from csph.networks.compact import FOLD, Compact, Step
 from scenes.errors import require
 
 PERIOD = 2 * FOLD  # bins of a delay that the layers follow exactly
+ENDS_BINS = 8  # of either end of the range, within which the mean of a posterior on both ends fails
 STEP = 8  # bins of a delay that the mean over delays follows exactly
 
 

@@ -22,6 +22,7 @@ from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.renders import unsure_scenes, views_at
 from scene2spad.methods import codes_method, is_codes_file
 from scene2spad.networks.depth_maps import check_free, map_writer
+from scene2spad.networks.end_warnings import warn_of_ends
 from scene2spad.networks.training import baseline, common_tile, network_method
 from scene2spad.options.networks import Evaluate
 from scenes.errors import InputError, require
@@ -76,6 +77,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     methods: dict[str, Method] = {}
     groups: dict[str, list[str]] = {}
     for path, model, group in zip(command.checkpoints, models, designs, strict=True):
+        warn_of_ends(str(path), model.config, command.decoder)
         for suffix, int8 in (("", False), (in_8_bits, True))[: 1 + command.int8]:
             read = {"int8": int8, "int8_rule": rule, "decoder": command.decoder}
             methods[f"{path}{suffix}"] = network_method(model, **read, overflows=overflows)

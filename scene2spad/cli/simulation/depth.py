@@ -54,7 +54,8 @@ class Depth(Common):
     model: Annotated[str | None, may_stay_open("NAME")] = None
     """A model that comes with the package (see `models`), instead of --checkpoint."""
     decoder: Annotated[Literal["soft-argmax", "median"] | None, may_stay_open("{soft-argmax,median}")] = None
-    """Depth that `--method network` reads from the posterior: its mean, or its median (default: the model's)."""
+    """Depth that `--method network` reads from the posterior: its mean, or its median (default: the model's). The mean
+    of periodic networks fails near both ends of the range."""
     int8: bool = False
     """Codes of `--method network` in 8 bits, summed in 16."""
     int8_rule: Annotated[Literal["calibrated", "published"] | None, may_stay_open("{calibrated,published}")] = None
@@ -319,6 +320,10 @@ def _network(command: Depth) -> DepthModel | None:
     from csph.networks.model import load_model
     from csph.weights.cards import shipped_model
 
-    if command.model is not None:
-        return load_model(shipped_model(command.model))[0]
-    return None if command.checkpoint is None else load_model(command.checkpoint)[0]
+    from scene2spad.networks.end_warnings import warn_of_ends
+
+    checkpoint = command.checkpoint if command.model is None else shipped_model(command.model)
+    assert checkpoint is not None
+    model = load_model(checkpoint)[0]
+    warn_of_ends(command.model or str(checkpoint), model.config, command.decoder)
+    return model
