@@ -23,11 +23,13 @@ class WeightsOf(NamedTuple):
     ancestors   the model and those before it, nearest first: SHA-256 of each one's weights and, where they are known,
                 of its training sets (`csph.training.lineage`)
     seen        keys of the views that all of them were trained on (`csph.training.views.view_key`)
+    scenes      hashes that tell the scenes of these views (`csph.training.overlap.scene_hashes`)
     """
 
     model: DepthModel
     ancestors: tuple[JsonObject, ...] = ()
     seen: Set[str] = frozenset()
+    scenes: Set[str] = frozenset()
 
 
 class NetworkOf(NamedTuple):
@@ -36,6 +38,7 @@ class NetworkOf(NamedTuple):
     model: DepthModel
     ancestors: tuple[JsonObject, ...] = ()
     seen: Set[str] = frozenset()
+    scenes: Set[str] = frozenset()
 
 
 Beginning = DepthModel | WeightsOf | NetworkOf

@@ -9,7 +9,8 @@
     energy.csv          energy of a learned temporal code by groups of time bins, now and then from the start on
     last.safetensors    weights after the last step
     training-views.txt  short hashes of the views that it is trained on, by which `evaluate` knows them again
-    ancestor-views.txt  those of the models that it began with, where they are known
+    training-scenes.txt  of what tells their scenes: other views of them are known, too
+    ancestor-views.txt, ancestor-scenes.txt  those of the models that it began with, where they are known
     codes.npy           a copy of the file of own codes, where there is one
     resume.ckpt         Lightning's state after the last finished epoch: a run that was killed goes on from there
 
@@ -43,13 +44,14 @@ from csph.networks.published import soft_argmax
 from csph.training.beginning import Beginning, NetworkOf, check_init, what_is_known
 from csph.training.data import SetData, TrainBatch
 from csph.training.hardware import ANY_HARDWARE, Hardware, fit, trainer_on
+from csph.training.lineage import write_seen
 from csph.training.loss import decoded_error, kl_divergence, total_variation
 from csph.training.optimiser import make_optimiser
 from csph.training.own_codes import own_codes_of
 from csph.training.resume import check_resume, claim_run
 from csph.training.schedule import rate_factor
 from csph.training.snapshots import CodeEnergy
-from csph.training.views import Views, check_direct, check_light, check_names, packed_sha256, path_of, write_seen
+from csph.training.views import Views, check_direct, check_light, check_names, packed_sha256, path_of
 from csph.weights.shipped import RESUME, TIMINGS
 from render.backend.malloc import retain_freed_memory
 from scenes.errors import require, require_kind
@@ -325,7 +327,7 @@ def train(
     runner = trainer_on(hardware, config, [CodeEnergy(folder), record])
     module = DepthTraining(config, init, own_codes_of(config, folder))
     claim_run(folder, config)  # once the model is known to be possible
-    write_seen(folder, given[0], frozenset() if init is None else what_is_known(init).seen)
+    write_seen(folder, given[0], init)
     if config.threads:
         torch.set_num_threads(config.threads)
     retain_freed_memory()

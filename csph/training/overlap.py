@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from csph.training.views import Views, name_with_seed, set_seed, view_key
+from csph.training.views import Views, name_with_seed, set_seed, short_hash, view_key
 from render.transient import Transient
+
+SEEN_SCENES = "training-scenes.txt"  # of a run: short hashes of what tells the scenes that it was trained on
+ANCESTORS_SCENES = "ancestor-scenes.txt"  # of a run: those that the models it began with were trained on
 
 
 class Overlap(NamedTuple):
@@ -51,3 +54,18 @@ def _scene_keys(view: Transient, scene: str) -> set[str]:
     if set_seed(view.meta) is not None:
         keys.add(name_with_seed(scene, view))
     return keys
+
+
+def scene_hashes(sets: Iterable[Views]) -> frozenset[str]:
+    """Return short hashes of what tells the scenes of all views, as a run's folder keeps them."""
+    return frozenset(one for views in sets for found in _hashes_by_scene(views).values() for one in found)
+
+
+def of_seen_scenes(views: Views, seen: frozenset[str]) -> list[bool]:
+    """Return for each view whether one of these hashes tells its scene: also at another size or with another camera."""
+    shared = {scene for scene, found in _hashes_by_scene(views).items() if found & seen}
+    return [scene in shared for scene in views.scenes]
+
+
+def _hashes_by_scene(views: Views) -> dict[str, set[str]]:
+    return {scene: {short_hash(key.encode()) for key in keys} for scene, keys in _keys_by_scene(views).items()}

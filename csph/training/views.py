@@ -164,14 +164,15 @@ def view_key(view: Transient) -> str:
     The same for a view in a folder, which has finer steps, and in the pack that is made of it; with indirect light and
     without. Which pixels are mixed does not count: two renders of a view may differ in it.
     """
-    return _short_hash(_shown(view))
+    return short_hash(_shown(view))
 
 
 def _shown(view: Transient) -> bytes:
     return f"{view.height}x{view.width}".encode() + depth_steps(view.depth_m).astype("<f8").tobytes()
 
 
-def _short_hash(content: bytes) -> str:
+def short_hash(content: bytes) -> str:
+    """Return the first KEY_DIGITS digits of SHA-256."""
     return hashlib.sha256(content).hexdigest()[:KEY_DIGITS]
 
 
@@ -179,24 +180,20 @@ def is_seen(view: Transient, keys: Set[str]) -> bool:
     """Tell whether one of the keys is that of a view. Keys written by older versions hash its mixed pixels, too."""
     shown = _shown(view)
     before = shown + view.mixed.astype(np.uint8).tobytes()
-    return not keys.isdisjoint((_short_hash(shown), _short_hash(before)))
+    return not keys.isdisjoint((short_hash(shown), short_hash(before)))
 
 
-def write_seen(folder: Path, sets: Iterable[Views], inherited: Set[str] = frozenset()) -> None:
-    """Keep the keys of all training views in a run's folder, sorted, one a line; beside them, if any, the `inherited`
-    ones of the models that the run began with."""
-    own = {view_key(view) for views in sets for view in views.transients}
-    for name, keys in ((SEEN, own), (ANCESTORS_SEEN, inherited)):
-        if keys or name == SEEN:
-            with whole_file(folder / name) as beside:
-                beside.write_text("".join(f"{key}\n" for key in sorted(keys)))
+def write_keys(folder: Path, name: str, keys: Iterable[str]) -> None:
+    """Keep keys of views or scenes in a run's folder, sorted, one a line."""
+    with whole_file(folder / name) as beside:
+        beside.write_text("".join(f"{key}\n" for key in sorted(keys)))
 
 
 def read_seen(checkpoint: Path, name: str = SEEN) -> frozenset[str] | None:
     """Return the keys of the views that a run, given by its folder or a checkpoint in it, was trained on.
 
-    `name` = ANCESTORS_SEEN asks for the views of its ancestors instead. None where the folder holds no such file, as
-    those written by older versions.
+    Other names ask for the views of its ancestors (ANCESTORS_SEEN), and for scenes (`csph.training.overlap`). None
+    where the folder holds no such file, as those written by older versions.
     """
     path = (checkpoint if checkpoint.is_dir() else checkpoint.parent) / name
     return frozenset(path.read_text(errors="replace").split()) if path.is_file() else None

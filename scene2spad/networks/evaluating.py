@@ -160,15 +160,22 @@ def _scenes_counted(path: Path, views: Views) -> JsonObject:
 
 
 def warn_of_seen(command: Evaluate, configs: Sequence[TrainConfig], views: Views, whole: Views) -> None:
-    """Warn of networks that were trained on views they are evaluated on, themselves or by way of those that they began
-    with; `whole` is the set that the views are of."""
+    """Warn of networks that were trained on views they are evaluated on, or on the scenes of these, themselves or by
+    way of those that they began with; `whole` is the set that the views are of."""
     parts = cache(lambda: training_parts(whole))
     for path, config in zip(command.checkpoints, configs, strict=True):
         seen = count_seen(checkpoint_of(path), config, views, parts)
-        for how, number in (("was trained", seen.own), ("began with a model that was trained", seen.inherited)):
+        counts = {
+            "was trained": (seen.own, seen.own_scenes),
+            "began with a model that was trained": (seen.inherited, seen.inherited_scenes),
+        }
+        for how, (number, of_scenes) in counts.items():
             if number:
                 message = "%s %s on %d views of %s: its errors there are not those of a test"
                 log.warning(message, path, how, number, command.set)
+            if of_scenes:
+                message = "%s %s on scenes that %d%s views of %s show: its errors there are not those of other scenes"
+                log.warning(message, path, how, of_scenes, " other" if number else "", command.set)
         if seen.unknown:
             message = "%s goes back to weights named %s; whether those were trained on views of %s is not recorded"
             log.info(message, path, ", ".join(seen.unknown), command.set)

@@ -10,6 +10,7 @@ from small_runs import QUICK
 
 from csph.networks.model import load_model
 from csph.training.lineage import ancestors_of
+from csph.training.overlap import SEEN_SCENES
 from csph.training.views import ANCESTORS_SEEN, SEEN, Views, read_views
 from csph.weights.cards import checkpoint_of, read_card
 from csph.weights.shipped import ship
@@ -45,6 +46,34 @@ def test_views_of_training_are_known_one_by_one(capfd, packed, trained, tmp_path
     for model, path, number in ((trained, some, "2"), (before, some, None), (before, packed, r"\d")):
         assert main(["evaluate", str(model), "--set", str(path), *out]) == 0
         assert bool(re.search(rf"was trained on {number} views of {path}", capfd.readouterr().err)) == bool(number)
+
+
+def test_scenes_of_training_are_known_at_another_size(capfd, tmp_path):
+    """Also through a beginning; not scenes that were held out, nor by runs of before."""
+    large, small = (random_planes(4, size=size, seed=5) for size in (16, 8))
+    names = [f"rooms/train/room {number}" for number in range(4)]
+    for views, name in ((large, "large.h5"), (small, "small.h5")):
+        records = [
+            {"place": name, "scene": name, "notes": [f"procedural, train view {number} of seed 5: camera 0"]}
+            for number, name in enumerate(names)
+        ]
+        noted = [replace(t, meta={**t.meta, **r}) for t, r in zip(views.transients, records, strict=True)]
+        write_pack(zip(noted, records, strict=True), tmp_path / name)
+    run, child, before, small_set = (tmp_path / name for name in ("run", "child", "before", "small.h5"))
+    assert main(["train", *QUICK, "--set", str(tmp_path / "large.h5"), "--out", str(run)]) == 0
+    others = pack(random_planes(3, size=16, seed=9), tmp_path / "others.h5")
+    assert main(["train", *QUICK, "--set", str(others), "--init", str(run), "--out", str(child)]) == 0
+    shutil.copytree(run, before)
+    (before / SEEN_SCENES).unlink()
+    out = ("--levels", "50+1", "--baselines", "argmax", "--out", str(tmp_path / "out"))
+    words = f"trained on scenes that 3 views of {small_set} show: its errors there"
+    for model, told in ((run, f"{run} was {words}"), (child, f"{child} began with a model that was {words}")):
+        capfd.readouterr()
+        assert main(["evaluate", str(model), "--set", str(small_set), *out]) == 0
+        assert told in capfd.readouterr().err
+    for model, path in ((before, small_set), (run, others)):
+        assert main(["evaluate", str(model), "--set", str(path), *out]) == 0
+        assert "on scenes that" not in capfd.readouterr().err
 
 
 def pack(views: Views, path, **meta):

@@ -319,7 +319,6 @@ def _network(command: Depth) -> DepthModel | None:
         return None
     from csph.networks.model import load_model
     from csph.weights.cards import shipped_model
-
     from scene2spad.networks.end_warnings import warn_of_ends
 
     checkpoint = command.checkpoint if command.model is None else shipped_model(command.model)
