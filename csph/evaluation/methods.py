@@ -57,8 +57,8 @@ class DepthEstimator(Protocol):
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one group of pixels of one image; `pixels` counted, `missing` had no estimate and were left out;
-    `law` drew the photons (tables without it are older, and of Poisson's)."""
+    """One method on one group of pixels of one image; `pixels` counted, `missing` had no estimate: they are left out of
+    errors, and are not within any tolerance; `law` drew the photons (tables without it are older, and of Poisson's)."""
 
     method: str
     scene: str
@@ -124,12 +124,37 @@ class Evaluation:
         return Interval(mean, *(float(np.clip(end, least, most)) for end in ends))
 
     def difference(self, first: Sequence[str], second: Sequence[str], levels: str = "all") -> Interval:
-        """Return paired difference of MAE [mm], first - second, over scenes and levels."""
-        return paired_difference(self.values(first, levels=levels), self.values(second, levels=levels))
+        """Return paired difference of MAE [mm], first - second, over scenes and levels, of the pixels of each image
+        where all of both have an estimate. An evaluation of rows alone knows no pixels: there each has its own."""
+        among = [*first, *second]
+        return paired_difference(*(self._common_mae_mm(methods, among, levels) for methods in (first, second)))
+
+    def _common_mae_mm(self, methods: Sequence[str], among: Sequence[str], levels: str) -> dict[str, np.ndarray]:
+        """Return {scene: (methods, images)} of the MAE over the pixels where all methods `among` have an estimate."""
+        if not all(self.depths.get(name) for name in among):
+            return self.values(methods, levels=levels)
+        found: dict[str, dict[str, list[float]]] = {}
+        for name in methods:
+            rows = (row for row in self.rows if row.method == name and row.group == "all")
+            for row, *maps in zip(rows, *(self.depths[one] for one in among), strict=True):
+                if LEVEL_GROUPS[levels](row.signal, row.background):
+                    errors = {one: _abs_error_mm(*pair) for one, pair in zip(among, maps, strict=True)}
+                    both = np.isfinite([*errors.values()]).all(axis=0)
+                    # what nothing is missing from is in the table already
+                    mae_mm = row.mae_mm if both.all() else _mean(errors[name][both])
+                    found.setdefault(row.scene, {one: [] for one in methods})[name].append(mae_mm)
+        return {scene: np.array([*by_method.values()]) for scene, by_method in found.items()}
+
+    def counted(self, methods: Sequence[str], group: str = "all", levels: str = "all") -> dict[str, int]:
+        """Count the pixels of all images with an estimate (`pixels`) and without one (`missing`)."""
+        chosen = LEVEL_GROUPS[levels]
+        rows = [row for row in self.rows if row.method in methods and row.group == group]
+        rows = [row for row in rows if chosen(row.signal, row.background)]
+        return {"pixels": sum(row.pixels for row in rows), "missing": sum(row.missing for row in rows)}
 
     def summary(self, methods: Sequence[str]) -> JsonObject:
-        """Return figures by level group and pixel group (means over scenes), intervals of the MAE, and the bias by
-        depth."""
+        """Return figures by level group and pixel group (means over scenes), intervals of the MAE, numbers of pixels
+        with and without an estimate, and the bias by depth."""
         table: dict[str, Any] = {}
         for levels in LEVEL_GROUPS:
             table[levels] = {}
@@ -139,12 +164,20 @@ class Evaluation:
                 line: dict[str, Any] = {name: None if i is None else i.mean for name, i in found.items()}
                 mae = found["mae_mm"]
                 line["mae_interval_mm"] = None if mae is None else [mae.low, mae.high]
-                table[levels][group] = line
+                table[levels][group] = line | self.counted(methods, group, levels)
         estimate, truth = (
             np.concatenate(parts) for parts in zip(*(pair for m in methods for pair in self.depths[m]), strict=True)
         )
         far = math.floor(float(np.nanmax(truth, initial=0.0))) + 1  # a depth of whole metres begins an interval
         return {**table, "bias_by_depth": [b._asdict() for b in bias_by_depth(estimate, truth, range(far + 1))]}
+
+
+def _abs_error_mm(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.abs(estimate.astype(np.float64) - truth) * 1e3
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if values.size else math.nan
 
 
 @dataclass(frozen=True)

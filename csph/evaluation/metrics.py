@@ -27,10 +27,15 @@ def image_errors(
     estimate: np.ndarray, truth: np.ndarray, range_m: float | np.ndarray, exclude: np.ndarray | None = None
 ) -> dict:
     """Return `spad.estimators.depth.depth_errors` with the shares strictly within 1, 5, 10 and 20 mm; depths (H, W)
-    [m]."""
+    [m].
+
+    A missing estimate is not within any: the shares are of `pixels` and `missing` together, so that methods that answer
+    for other pixels compare. `depth_errors` leaves what is missing out of its own.
+    """
     errors = depth_errors(estimate, truth, range_m=range_m, exclude=exclude)
-    error = _error_mm(estimate, truth, range_m, exclude)
-    fractions = {f"within_{t}mm": float((np.abs(error) < t).mean()) if error.size else math.nan for t in TOLERANCES_MM}
+    error = np.abs(_error_mm(estimate, truth, range_m, exclude))
+    asked = error.size + errors["missing"]
+    fractions = {f"within_{t}mm": int((error < t).sum()) / asked if asked else math.nan for t in TOLERANCES_MM}
     return {**errors, **fractions}
 
 

@@ -114,8 +114,8 @@ def _others_of_scenes(views: Views, scenes: frozenset[str] | None, seen: frozens
     """Count the views of scenes that are trained on, but for the views that themselves are."""
     if not scenes:
         return 0
-    told = zip(views.transients, of_seen_scenes(views, scenes), strict=True)
-    return sum(of_scene and not is_seen(view, seen or frozenset()) for view, of_scene in told)
+    pairs = zip(views.transients, of_seen_scenes(views, scenes), strict=True)
+    return sum(of_scene and not is_seen(view, seen or frozenset()) for view, of_scene in pairs)
 
 
 def _as_a_whole(data: JsonObject, parts: Callable[[], Mapping[str, int]]) -> int:

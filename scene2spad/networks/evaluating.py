@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -89,6 +89,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     keep = map_writer(folder, methods) if command.maps else None
     found = evaluate(methods, views, sensor, plan, progress=progress, keep=keep)
     _report_plans(found, command.law)
+    _warn_of_missing(found, groups)
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(as_dicts(found.rows), command.out / "evaluation.csv")
     first = f"{designs[0]}{in_8_bits if command.int8 else ''}"
@@ -130,6 +131,22 @@ def _report_plans(found: Evaluation, law: str | None) -> None:
             100 * left_out.pile_up,
             left_out.where,
         )
+
+
+def _warn_of_missing(found: Evaluation, groups: dict[str, list[str]]) -> None:
+    """Warn where some methods have no estimate in more pixels than others: their errors are of other pixels."""
+    fractions = {name: _missing_fraction(found.counted(members)) for name, members in groups.items()}
+    if len({*fractions.values()}) > 1:
+        message = (
+            "no estimate in some pixels (%s): MAE and RMSE leave them out, method by method; shares within a tolerance "
+            "count them as not within it, and paired differences are of the pixels that both methods have"
+        )
+        log.warning(message, ", ".join(f"{name} {fraction:.2g}" for name, fraction in fractions.items() if fraction))
+
+
+def _missing_fraction(counted: Mapping[str, int]) -> float:
+    asked = counted["pixels"] + counted["missing"]
+    return counted["missing"] / asked if asked else 0.0
 
 
 def _counted(found: Evaluation, path: Path, range_m: float) -> JsonObject:
@@ -220,19 +237,22 @@ def group_names(configs: Sequence[TrainConfig], names: Sequence[str]) -> list[st
 
 
 def by_level(found: Evaluation, groups: dict[str, list[str]], full: bool) -> list[str] | list[dict[str, object]]:
-    """Return MAE [mm] and share within 10 mm of every level and group, means over scenes; as lines unless `full`."""
+    """Return MAE [mm], share within 10 mm and missing estimates of every level and group, means over scenes; as lines
+    unless `full`."""
     lines: list[JsonObject] = []
     for signal, background in dict.fromkeys((row.signal, row.background) for row in found.rows):
         here = Evaluation([row for row in found.rows if (row.signal, row.background) == (signal, background)])
         for name, members in groups.items():
             found_here = {key: here.interval(members, figure=key) for key in ("mae_mm", "within_10mm")}
             means = {key: math.nan if one is None else one.mean for key, one in found_here.items()}
+            means |= here.counted(members)
             lines.append({"signal": signal, "background": background, "method": name, **means, "laws": here.laws()})
     if full:
         return lines
     return [
         f"{line['signal']:g} + {line['background']:g} photons, {line['method']}: MAE {line['mae_mm']:.1f} mm, "
         f"{line['within_10mm']:.1%} within 10 mm"
+        + (f", {_missing_fraction(line):.1%} without an estimate" if line["missing"] else "")
         for line in lines
     ]
 
@@ -259,14 +279,15 @@ def results(found: Evaluation, groups: dict[str, list[str]], first: str, full: b
 
 
 def _lines(summaries: dict[str, dict]) -> list[str]:
-    lines = [
-        f"{'method':<40} {'MAE mm':>8} {'SBR > 0.1':>10} {'SBR <= 0.1':>11} {'mixed':>8} {'< 10 mm':>8} {'SSIM':>6}"
-    ]
+    some = any(s["all"]["all"]["missing"] for s in summaries.values())
+    head = f"{'method':<40} {'MAE mm':>8} {'SBR > 0.1':>10} {'SBR <= 0.1':>11} {'mixed':>8} {'< 10 mm':>8} {'SSIM':>6}"
+    lines = [f"{head} {'missing':>8}" if some else head]
     for name, s in summaries.items():
         every = s["all"]["all"]
         mae = (every, s["high_sbr"]["all"], s["low_sbr"]["all"], s["all"]["mixed"])
         cells = [_cell(line["mae_mm"], f"{width}.1f") for line, width in zip(mae, (8, 10, 11, 8), strict=True)]
         cells += [_cell(every["within_10mm"], "8.1%"), _cell(every["ssim"], "6.3f")]
+        cells += [_cell(_missing_fraction(every), "8.1%")] if some else []
         lines.append(f"{name[-40:]:<40} {' '.join(cells)}")
     return lines
 

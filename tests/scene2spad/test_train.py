@@ -340,6 +340,9 @@ def test_an_evaluation_without_answers_or_truth(capfd, tmp_path, monkeypatch):
     found = run(capfd, *command, "0.001+0", "--set", far)
     nothing = found["methods"]["log-matched"]["all"]["all"]["mae_mm"]
     assert nothing is None and found["mae_mm"] > 0 and found["by_level"][1]["mae_mm"] is None
+    assert found["by_level"][1]["missing"] == 32 and found["by_level"][1]["within_10mm"] == 0
+    assert main([*command, "0.001+0", "--set", far]) == 0
+    assert "no estimate in some pixels (log-matched 1): MAE" in capfd.readouterr().err
     assert found["mae_difference_mm"]["all"]["log-matched"] == {"mean": None, "low": None, "high": None}
 
 
