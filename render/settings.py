@@ -64,6 +64,19 @@ class RenderSettings:
     refraction  whether solid glass bends direct light; open: where there is any, and the laser is at the camera
 
     Raises InputError for values out of range.
+
+    Examples
+    --------
+    `render` takes these fields as keywords. A render is planned for a relative error, or for a photon budget:
+
+    >>> import scene2spad as s2s
+    >>> s2s.RenderSettings(error=0.01).budget is None
+    True
+    >>> s2s.RenderSettings(budget=(50, 20)).budget  # mean signal and background photons a pixel
+    (50, 20)
+    >>> transient = s2s.render("plane", width=4, height=3, bounces=1, error=0.01)
+    >>> transient.meta["target_met"]
+    True
     """
 
     bounces: int | None = None

@@ -16,7 +16,17 @@ _Item = TypeVar("_Item")
 
 
 class InputError(ValueError):
-    """Bad input, in one line that names value, limit and place. The command line prints it and exits with 2."""
+    """Bad input, in one line that names value, limit and place. The command line prints it and exits with 2.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> try:
+    ...     s2s.Sensor(name="mine", bins=0)
+    ... except s2s.InputError as error:
+    ...     print(error)
+    sensor mine: 0 bins is outside 1 to 65536
+    """
 
     def __init__(self, message: str) -> None:
         super().__init__(" ".join(printable(str(message)).split()))

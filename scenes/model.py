@@ -316,7 +316,10 @@ class Ambient:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """Everything that is there; `notes` say what a loader changed or left out. Raises InputError without surfaces."""
+    """Everything that is there; `notes` say what a loader changed or left out. Raises InputError without surfaces.
+
+    `help(scenes)` has an example of a scene that is built by hand from these parts.
+    """
 
     name: str
     surfaces: tuple[Surface, ...]

@@ -32,6 +32,16 @@ class Placing:
     bare     a mesh without the floor and the wall that are put around it
 
     Raises InputError that names a field of another kind, or beyond its limits, and its value.
+
+    Examples
+    --------
+    The wall of the scene `plane` is 3 m in front of the origin. A camera 1 m farther back is 4 m away from it:
+
+    >>> import scene2spad as s2s
+    >>> placing = s2s.Placing(origin=(0, 0, 1), target=(0, 0, -3), fov_deg=10)
+    >>> transient = s2s.render("plane", width=3, height=3, bounces=1, placing=placing)
+    >>> round(float(transient.depth_m[1, 1]), 3)  # [m]
+    4.0
     """
 
     up: str | None = None

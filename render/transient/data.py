@@ -51,6 +51,21 @@ class Transient:
     meta          scene, seed, plan, versions: anything JSON holds
 
     Raises InputError for arrays of other types or shapes, and values that are no light.
+
+    Examples
+    --------
+    A wall of albedo rho at d metres sends rho / (pi d^2) back, 0.5 / (4 pi) = 0.0398 at 2 m, on a path of 4 m. The
+    returns of a pixel are a slice of the list:
+
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> image = np.ones((3, 4))
+    >>> transient = s2s.transient_from_rgbd(2.0 * image, 0.5 * image, 0.0 * image)  # depth [m], albedo, ambient light
+    >>> pixel = slice(transient.offsets[5], transient.offsets[6])  # row 1, column 1
+    >>> transient.path_near_m[pixel].tolist(), transient.radiance[pixel].astype(float).round(4).tolist()
+    ([4.0], [0.0398])
+    >>> float(transient.delayed(1.0).mean_path_m()[1, 1])  # 1 m farther, there and back
+    6.0
     """
 
     height: int
@@ -184,7 +199,18 @@ class Transient:
 
 
 def write_transient(transient: Transient, path: Path) -> None:
-    """Write the multi-part EXR, whole or not at all. Raises InputError where the path cannot be written."""
+    """Write the multi-part EXR, whole or not at all. Raises InputError where the path cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import scene2spad as s2s
+    >>> transient = s2s.render("plane", width=4, height=3, bounces=1)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     s2s.write_transient(transient, folder + "/plane.exr")
+    ...     s2s.read_transient(folder + "/plane.exr").meta["scene"]
+    'plane'
+    """
     require_kind(transient, Transient, "write_transient")
     require(isinstance(path, str | os.PathLike), f"write_transient: expected a path, not {type(path).__name__}")
     with whole_file(path) as beside:
@@ -253,6 +279,18 @@ def read_transient(path: Path) -> Transient:
     """Read a transient and check parts, channels, counts and hash.
 
     Raises InputError in one line for a missing, foreign, truncated or altered file, or one of a newer schema.
+
+    Examples
+    --------
+    What is read is what was written, to the last bit:
+
+    >>> import tempfile
+    >>> import scene2spad as s2s
+    >>> transient = s2s.render("plane", width=4, height=3, bounces=1)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     s2s.write_transient(transient, folder + "/plane.exr")
+    ...     s2s.read_transient(folder + "/plane.exr").sha256() == transient.sha256()
+    True
     """
     import OpenEXR
 

@@ -57,6 +57,17 @@ def load_scene(
     as keywords: `load_scene("part.stl", scale=0.001, up="y")`. Those are `up` (x, y or z), `scale` (metres per unit of
     the file), `origin` and `target` of the camera [m], `fov_deg`, and `bare` (no floor and no wall). Raises InputError
     in one line for an unknown name, extension or keyword, or a bad file.
+
+    Examples
+    --------
+    A frontal wall at 5 m, seen by a camera at the origin of the world, which looks along -z:
+
+    >>> import scene2spad as s2s
+    >>> scene = s2s.load_scene("wall@5", width=4, height=3)
+    >>> scene
+    Scene('wall@5', 1 surfaces, 2 triangles, 4 x 3 pixels, fov 40 deg, flood laser)
+    >>> scene.surfaces[0].vertices[:, 2].tolist()  # z [m]
+    [-5.0, -5.0, -5.0, -5.0]
     """
     spec = str(spec)
     placing = stated(placing, placing_fields, "load_scene")
