@@ -83,6 +83,17 @@ def read_dense(path: Path) -> Histogram:
     Counts, truth, sensor, budget and metadata are those of the histogram. Raises InputError in one line for a file of
     light, which has to be sensed; for one that does not say its sensor, as those of other programs and of older
     versions, with the way round; and for a file that is missing, foreign or damaged.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import scene2spad as s2s
+    >>> histogram = s2s.sense(s2s.render("plane", width=4, height=3, bounces=1), signal=20, background=5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = s2s.write_dense(s2s.dense(histogram), folder + "/plane.npz")
+    ...     again = s2s.read_dense(path)
+    >>> bool((again.counts == histogram.counts).all()), again.budget == histogram.budget
+    (True, True)
     """
     require(isinstance(path, str | os.PathLike), f"read_dense: expected a path, not {type(path).__name__}")
     path = Path(path)

@@ -50,6 +50,15 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     Where nobody knows how many detections are signal, `photons`, `mean_signal_photons` and `SBR` are NaN.
     Where nothing is, and where nothing was detected, bins are 1: published loaders subtract 1 from unsigned numbers.
     Raises InputError as `check_mat` does, and where the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import scene2spad as s2s
+    >>> histogram = s2s.sense(s2s.render("plane", width=4, height=3, bounces=1), signal=20, background=5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     s2s.write_mat(histogram, folder + "/plane.mat").name  # the pulse's file, named by rows and columns
+    'PSF_used_for_simulation_nr-3_nc-4.mat'
     """
     require_kind(histogram, Histogram, "write_mat")
     require(isinstance(path, str | os.PathLike), f"write_mat: expected a path, not {type(path).__name__}")
@@ -190,6 +199,19 @@ def read_mat(path: Path, frame: int = 0) -> Histogram:
     means: files of this family hold no maps. A capture (`formats.linospad`) has no truth; its sensor is `linospad`.
 
     Raises InputError in one line for a file that is none of these, and a frame that is not there.
+
+    Examples
+    --------
+    Counts come back as they were, with bins of the same width:
+
+    >>> import tempfile
+    >>> import scene2spad as s2s
+    >>> histogram = s2s.sense(s2s.render("plane", width=4, height=3, bounces=1), signal=20, background=5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     pulse_file = s2s.write_mat(histogram, folder + "/plane.mat")
+    ...     frame = s2s.read_mat(folder + "/plane.mat")
+    >>> bool((frame.counts == histogram.counts).all()), frame.sensor.bin_width_s == histogram.sensor.bin_width_s
+    (True, True)
     """
     require(isinstance(path, str | os.PathLike), f"read_mat: expected a path, not {type(path).__name__}")
     path = Path(path)

@@ -53,6 +53,16 @@ class Histogram:
     meta                 seed, plan, what made the transient: anything JSON holds
 
     Raises InputError for arrays of other types or shapes, and values below 0.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> transient = s2s.render("plane", width=4, height=3, bounces=1)
+    >>> histogram = s2s.sense(transient, signal=20, background=5, seed=1)  # detections a pixel
+    >>> histogram.counts.shape, histogram.depth_m.shape
+    ((3, 4, 1024), (3, 4))
+    >>> round(float(histogram.expected_signal.mean()), 3), round(float(histogram.expected_background.mean()), 3)
+    (20.0, 5.0)
     """
 
     counts: np.ndarray
@@ -103,8 +113,8 @@ class Histogram:
         Examples
         --------
         >>> import numpy as np
-        >>> from spad.sensor.model import Sensor
-        >>> Histogram.from_counts(np.ones((2, 3, 8), int), Sensor(bins=8)).timestamps()[0].shape
+        >>> import scene2spad as s2s
+        >>> s2s.Histogram.from_counts(np.ones((2, 3, 8), int), s2s.Sensor(bins=8)).timestamps()[0].shape
         (48,)
         """
         sensor = pixel_sensor(sensor)
@@ -154,8 +164,8 @@ class Histogram:
 
         Examples
         --------
-        >>> from spad.sensor.model import Sensor
-        >>> Histogram.from_timestamps([5, 1, 5], [0, 2, 3], (1, 2), Sensor(bins=8)).counts[0, 0].tolist()
+        >>> import scene2spad as s2s
+        >>> s2s.Histogram.from_timestamps([5, 1, 5], [0, 2, 3], (1, 2), s2s.Sensor(bins=8)).counts[0, 0].tolist()
         [0, 1, 0, 0, 0, 1, 0, 0]
         """
         sensor = pixel_sensor(sensor)
@@ -232,6 +242,17 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
     """Write HDF5, whole or not at all: timestamps where they are the smaller form, else dense counts.
 
     Raises InputError where the path cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> measured = s2s.Histogram.from_counts(np.ones((3, 4, 8), int), s2s.Sensor(bins=8))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     s2s.write_histogram(measured, folder + "/measured.h5")
+    ...     int(s2s.read_histogram(folder + "/measured.h5").counts.sum())  # 3 x 4 pixels x 8 bins
+    96
     """
     import h5py
 
@@ -262,6 +283,18 @@ def read_histogram(path: Path) -> Histogram:
     """Read a histogram and check its hash.
 
     Raises InputError in one line for a missing, foreign, truncated or altered file, or one of a newer schema.
+
+    Examples
+    --------
+    What is read is what was written, to the last bit:
+
+    >>> import tempfile
+    >>> import scene2spad as s2s
+    >>> histogram = s2s.sense(s2s.render("plane", width=4, height=3, bounces=1), signal=20, background=5)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     s2s.write_histogram(histogram, folder + "/plane.h5")
+    ...     s2s.read_histogram(folder + "/plane.h5").sha256() == histogram.sha256()
+    True
     """
     require(isinstance(path, str | os.PathLike), f"read_histogram: expected a path, not {type(path).__name__}")
     path = Path(path)

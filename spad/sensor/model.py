@@ -46,6 +46,17 @@ class Sensor:
     tdc                   converters whose codes are not equally wide (`Tdc`); None: every bin is as wide as the others
 
     Raises InputError for values out of range or of another kind, naming the sensor.
+
+    Examples
+    --------
+    Light goes 1 m there and back in 6.67 ns, so that 1000 bins of 100 ps reach 15 m:
+
+    >>> import scene2spad as s2s
+    >>> sensor = s2s.Sensor(name="mine", bins=1000, bin_width_s=100e-12, exposure_s=1e-3, pulse=s2s.Pulse(150e-12))
+    >>> round(sensor.range_m, 2), round(1e3 * sensor.bin_depth_m)  # m, mm
+    (14.99, 15)
+    >>> round(sensor.cycles)  # of the laser in one exposure: 1 ms / 100 ns
+    10000
     """
 
     name: str = "reference"
@@ -256,7 +267,15 @@ PRESETS: dict[str, Sensor] = {
 
 
 def sensor_by_name(name: str) -> Sensor:
-    """Return the preset of that name, or an InputError that lists the names."""
+    """Return the preset of that name, or an InputError that lists the names.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> sensor = s2s.sensor_by_name("reference")
+    >>> sensor.bins, round(sensor.period_s * 1e9), round(sensor.range_m, 2)  # bins, ns, m
+    (1024, 100, 14.99)
+    """
     require(
         name in PRESETS,
         f"sensor {name!r} is unknown{did_you_mean(name, PRESETS)}, expected one of {', '.join(PRESETS)}",
@@ -298,6 +317,15 @@ class PhotonBudget:
     Primary: PDE included, dead time, pile-up and crosstalk not. Signal sums direct and indirect light, what wraps
     included. Background is dark counts, as the sensor has them, and ambient light scaled to fill the asked mean.
     Raises InputError for numbers below 0 or above 1e9.
+
+    Examples
+    --------
+    >>> import scene2spad as s2s
+    >>> budget = s2s.PhotonBudget(signal=10, background=40)  # detections a pixel and exposure
+    >>> budget.sbr
+    0.25
+    >>> s2s.sense(s2s.render("plane", width=4, height=3, bounces=1), signal=10, background=40).budget == budget
+    True
     """
 
     signal: float = 50.0
