@@ -42,7 +42,7 @@ def make_coding(
 ) -> CodingTensor:
     """Return the coding tensor that a design begins with: fixed codes, and learned parts uniform in +-1/sqrt(n), n the
     entries of one code of that part; a spatial part may begin orthogonal instead, with the same mean square. `sensor`
-    (default: the reference) lends its pulse to Gray Fourier.
+    (default: the reference) lends its pulse to Gray Fourier. `Design` has an example.
 
     Raises InputError where K does not fit the code, for own codes, which are in a file, and for what is no Design.
     """
@@ -99,6 +99,18 @@ class CompressiveLayer(nn.Module):
 
     Raises InputError for options and parts that do not go together, objects of another kind, and a background of
     another shape.
+
+    Examples
+    --------
+    One detection is found where it is: its codes correlate by 1 with those that a detection there leaves.
+
+    >>> import torch
+    >>> import scene2spad as s2s
+    >>> layer = s2s.CompressiveLayer.of(s2s.Design("learned", (16, 2, 2), 8))
+    >>> counts = torch.zeros(1, 1, 32, 4, 4)  # (B, 1, T, R, C)
+    >>> counts[0, 0, 20, 1, 3] = 1
+    >>> tuple(layer.encode(counts).shape), round(layer(counts)[0, 0, 20, 1, 3].item(), 2)
+    ((1, 8, 2, 2, 2), 1.0)
     """
 
     temporal: Tensor
@@ -155,12 +167,9 @@ class CompressiveLayer(nn.Module):
         own: CodingTensor | None = None,
         **options: bool,
     ) -> CompressiveLayer:
-        """Return the layer of a design at its start; `options` are switches of LayerOptions.
-
-        own   the codes of a design of own codes (`csph.codes.files.own_codes`)
-
-        Raises InputError for switches that it has not, and own codes that are not the design's.
-        """
+        """Return the layer of a design at its start; `options` are switches of LayerOptions, `own` the codes of a
+        design of own codes (`csph.codes.files.own_codes`). Raises InputError for switches that it has not, and own
+        codes that are not the design's."""
         check_switches(options)
         coding = make_coding(design, sensor, seed, spatial_start) if own is None else _own_coding(own, design)
         switches = replace(LayerOptions(zero_mean=bool(design.zero_mean)), **options)
@@ -285,9 +294,7 @@ class CompressiveLayer(nn.Module):
 
     def encode_mean(self, mean_counts: Tensor) -> Tensor:
         """Return the mean codes of mean counts (B, 1, T, R, C) of any scale: `encode`, but with `int8` no sum wraps.
-
-        Raises InputError as `encode`.
-        """
+        Raises InputError as `encode`."""
         with blocks.in_full(mean_counts):
             return self._encode_exactly(mean_counts)
 
@@ -323,10 +330,8 @@ class CompressiveLayer(nn.Module):
             return (sums.abs() / HALF_RANGE - 1).relu().mean()
 
     def encode_timestamps(self, timestamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:
-        """Return the same codes from detections; size (T, R, C) of the histogram that is not built.
-
-        See `encode_photons`. Raises InputError with `int8`, whose sums are each core's.
-        """
+        """Return the same codes from detections; size (T, R, C) of the histogram that is not built. See
+        `encode_photons`. Raises InputError with `int8`, whose sums are each core's."""
         require(not self.options.int8, f"coding tensor {self.name}: int8 codes are made from histograms")
         with blocks.in_full(timestamps):
             return encode_photons(timestamps, offsets, photon_table(self.weights()), self.block, size, name=self.name)
@@ -337,10 +342,8 @@ class CompressiveLayer(nn.Module):
             return self._projected(self._checked(codes))
 
     def back_project(self, codes: Tensor) -> Tensor:
-        """Return ZN(C~)^T y, (B, 1, T, R, C): `decode` of codes whose scale counts, as that of a residual does.
-
-        Raises InputError for codes of another shape.
-        """
+        """Return ZN(C~)^T y, (B, 1, T, R, C): `decode` of codes whose scale counts, as that of a residual does. Raises
+        InputError for codes of another shape."""
         with blocks.in_full(codes):
             return self._projected(self._checked(codes), normalise=False)
 

@@ -358,9 +358,16 @@ def load_model(name: str | Path) -> DepthModel:
 
     Examples
     --------
+    A network of 32 codes of 256 bins x 4 x 4 pixels finds a wall at 3 m:
+
     >>> import scene2spad as s2s
-    >>> s2s.load_model("learned-256x4x4-128x-s0").config.block
-    (256, 4, 4)
+    >>> model = s2s.load_model("learned-256x4x4-128x-s0")
+    >>> isinstance(model, s2s.DepthModel), model.config.block
+    (True, (256, 4, 4))
+    >>> histogram = s2s.sense(s2s.render("plane", width=8, height=8, bounces=1), signal=20, background=5)
+    >>> estimate = model.estimate(histogram)
+    >>> estimate.depth_m.shape, s2s.depth_errors(estimate.depth_m, histogram)["mae_mm"] < 200
+    ((8, 8), True)
     """
     from csph.networks.model import load_model as load
     from csph.weights.cards import checkpoint_of

@@ -126,6 +126,19 @@ def decode_depth(codes: Tensor | np.ndarray, coding: CodingTensor, sensor: Senso
     noise-free answer is subtracted as in `spad.estimators.depth`. NaN where all codes are zero. Codes that depend on
     each other are warned of, once; the number that goes with a background is none of those. Raises InputError for
     another number of codes or bins, codes that are not finite, and a coding tensor of rank below 2.
+
+    Examples
+    --------
+    Eight Fourier codes in place of 1024 counts hold a depth of 4 m:
+
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> wall = s2s.transient_from_rgbd(np.full((1, 2), 4.0), np.ones((1, 2)), np.zeros((1, 2)))
+    >>> histogram = s2s.sense(wall, signal=2000, background=0)  # photons a pixel
+    >>> fourier = s2s.coding_tensor("fourier", 8)
+    >>> depth_m = s2s.decode_depth(s2s.encode(histogram.counts, fourier), fourier, histogram.sensor)
+    >>> bool((abs(depth_m - 4.0) < 0.05).all())
+    True
     """
     require_kind(coding, CodingTensor, "decode_depth", " of `coding_tensor`")
     require_kind(sensor, Sensor, "decode_depth")

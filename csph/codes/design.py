@@ -33,6 +33,19 @@ class Design:
 
     Raises InputError for an unknown code, fields of another kind, and a number of codes that is not whole or more than
     it has.
+
+    Examples
+    --------
+    A block of 16 bins x 2 x 2 pixels holds 64 counts, 8 times as many as its codes. The temporal and the spatial part
+    of these are 8 x 16 + 8 x 2 x 2 = 160 numbers:
+
+    >>> import scene2spad as s2s
+    >>> design = s2s.Design.named("learned", (16, 2, 2), compression=8)
+    >>> design.codes, design.parameters
+    (8, 160)
+    >>> coding = s2s.make_coding(design)  # where training begins
+    >>> tuple(coding.temporal.shape), tuple(coding.spatial.shape)
+    ((8, 16), (8, 2, 2))
     """
 
     code: str = "learned"

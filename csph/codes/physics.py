@@ -32,6 +32,20 @@ def deepinv_physics(coding: CodingTensor) -> LinearPhysics:
     ------
     InputError
         Where deepinv is not installed; and by the operator for counts that blocks do not tile.
+
+    Examples
+    --------
+    The operator A and its adjoint: <A n, y> = <n, A^T y>.
+
+    >>> import torch
+    >>> import scene2spad as s2s
+    >>> physics = s2s.deepinv_physics(s2s.make_coding(s2s.Design("learned", (16, 2, 2), 8)))
+    >>> counts, codes = torch.ones(1, 1, 32, 4, 4), torch.ones(1, 8, 2, 2, 2)
+    >>> forward, back = physics.A(counts), physics.A_adjoint(codes)
+    >>> forward.shape == codes.shape and back.shape == counts.shape
+    True
+    >>> bool(torch.isclose((forward * codes).sum(), (counts * back).sum(), rtol=1e-3, atol=1e-3))
+    True
     """
     try:
         from deepinv.physics import LinearPhysics

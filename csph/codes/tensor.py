@@ -32,6 +32,16 @@ class CodingTensor:
 
     Both parts are copied, and kept in float32, also those given in float64 or 16 bits. Raises InputError for other
     shapes, values that are not finite, or not in float32, and more codes than counts.
+
+    Examples
+    --------
+    Two codes of a pixel's four bins, the sums of the first and of the second half:
+
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> halves = s2s.CodingTensor("halves", np.array([[1, 1, 0, 0], [0, 0, 1, 1]]))
+    >>> halves.block, halves.codes, halves.compression_ratio
+    ((4, 1, 1), 2, 2.0)
     """
 
     name: str
@@ -159,6 +169,16 @@ def encode(counts: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
 
     `counts` may be a numpy array. Raises InputError for another number of bins.
     Blocks of several pixels: `csph.codes.blocks.encode_blocks`.
+
+    Examples
+    --------
+    Three photons in bin 0 and one in bin 1 are the sum of the first half, two in bin 3 that of the second:
+
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> halves = s2s.CodingTensor("halves", np.array([[1, 1, 0, 0], [0, 0, 1, 1]]))
+    >>> s2s.encode(np.array([3, 1, 0, 2]), halves).tolist()
+    [4.0, 2.0]
     """
     _per_pixel(coding)
     counts = as_tensor(counts)
@@ -178,6 +198,16 @@ def encode_timestamps(timestamps: Tensor | np.ndarray, offsets: Tensor | np.ndar
     timestamps (N,) bin of each detection, any integer type, pixel after pixel; offsets (P + 1,) where each pixel's
     begin, and the end: 0 .. N; both may be numpy arrays, as of `Histogram.timestamps`. A pixel without detections gives
     zeros. Raises InputError for bad offsets or bins.
+
+    Examples
+    --------
+    Two pixels, of which the first has detections in bins 0, 0 and 3, and the second one in bin 2:
+
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> halves = s2s.CodingTensor("halves", np.array([[1, 1, 0, 0], [0, 0, 1, 1]]))
+    >>> s2s.encode_timestamps(np.array([0, 0, 3, 2]), np.array([0, 3, 4]), halves).tolist()
+    [[2.0, 1.0], [0.0, 1.0]]
     """
     _per_pixel(coding)
     timestamps, offsets = as_tensor(timestamps), as_tensor(offsets)

@@ -65,7 +65,7 @@ class ModelConfig:
              paper
     spatial_start   of learned spatial codes: uniform as published, or orthogonal, which keeps their rank
 
-    Raises InputError for parts of another kind, and those that do not go together.
+    Raises InputError for parts of another kind, and those that do not go together. `help(csph)` has an example.
     """
 
     front: Front = "codes"
@@ -182,7 +182,7 @@ class TrainConfig:
     data          what it was trained on: path and SHA-256, filled in by `csph.training.loop.train`; of own codes the
                   path, `codes_file`, from which `train` reads them
 
-    Raises InputError for numbers out of range.
+    Raises InputError for numbers out of range. `help(csph)` has an example.
     """
 
     model: ModelConfig = field(default_factory=lambda: ModelConfig(design=Design()))

@@ -309,7 +309,7 @@ def train(
     sums are rounded is the device's, and nothing else of `hardware` changes a result.
     Returns steps, seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of
     parameters. Raises InputError for no set, sets or an `init` that do not fit, indirect light on the published grid,
-    and another run's folder.
+    and another run's folder. `help(csph)` has an example.
     """
     require_kind(config, TrainConfig, "train", " of `preset`")
     given = [_listed(training, "training"), _listed(validation, "validation")]

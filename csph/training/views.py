@@ -27,7 +27,18 @@ VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation se
 
 
 class Views(NamedTuple):
-    """Views of a rendered set and the names of the scenes that they show."""
+    """Views of a rendered set and the names of the scenes that they show.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> image = np.ones((8, 8))
+    >>> near, far = (s2s.transient_from_rgbd(depth_m * image, image, 0 * image) for depth_m in (2.0, 5.0))
+    >>> views = s2s.Views((near, far), ("near wall", "far wall"))
+    >>> [float(view.depth_m.max()) for view in views.transients]  # [m]
+    [2.0, 5.0]
+    """
 
     transients: tuple[Transient, ...]
     scenes: tuple[str, ...]
@@ -37,6 +48,19 @@ def read_views(path: Path) -> Views:
     """Return all views of a pack (.h5), or of the folder that `scene2spad dataset` filled.
 
     Raises InputError in one line for anything else, an empty set, and a laser that is not at the camera.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> from render.transient.packs import write_pack
+    >>> image = np.ones((8, 8))
+    >>> wall = s2s.transient_from_rgbd(2.0 * image, image, 0 * image)  # at 2 m
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     count = write_pack([(wall, {"scene": "wall"})], folder + "/walls.h5")
+    ...     s2s.read_views(folder + "/walls.h5").scenes
+    ('wall',)
     """
     path = path_of(path, "read_views")
     if path.is_dir():

@@ -34,6 +34,17 @@ class Card:
     errors        MAE [mm] by set and level, where `ship` was told; of the studies' models also by the page that states
                   them, named with the set; empty where none were recorded
     not_for       what it must not be used for: what follows from its training, and `limits` measured on it
+
+    Examples
+    --------
+    A block of 256 bins x 4 x 4 pixels holds 4096 counts; 32 codes are 128 times fewer:
+
+    >>> import scene2spad as s2s
+    >>> (card,) = [card for card in s2s.models() if card.name == "learned-256x4x4-128x-s0"]
+    >>> card.model, card.compression
+    ('learned 256x4x4 K32, compact', 128.0)
+    >>> card.levels  # mean photons a pixel in training
+    'signal 2 to 10, background 2 to 50'
     """
 
     name: str
