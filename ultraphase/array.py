@@ -53,6 +53,7 @@ class CoreArray:
     RAM and registers stay from frame to frame and may be set: `ram` (cores, bytes) uint8, `registers` (16, cores).
     `words` (cores,) are where the cores of the last frame wait for another timestamp, -1 where they do not.
     Raises InputError as `Core` does, and for cores that wait for each other, saying who waits where for whom.
+    `assemble` has an example.
     """
 
     def __init__(

@@ -89,6 +89,27 @@ class Core:
 
     Raises InputError, naming place in the source and what was wrong, for RAM or alignment out of bounds, a timestamp
     read that is not there, links (a lone core has none), running behind the program, and for no progress.
+
+    Examples
+    --------
+    A core counts the photons of a frame, and puts the number out at its end:
+
+    >>> import scene2spad as s2s
+    >>> source = '''
+    ...         MOV  r1, #0
+    ... wait:   BNT  none         ; no timestamp is there
+    ...         RDT  r2
+    ...         ADD  r1, r1, #1
+    ...         JMP  wait
+    ... none:   BFE  end          ; the frame is over
+    ...         JMP  wait
+    ... end:    OUTB r1
+    ...         HALT
+    ... '''
+    >>> core = s2s.Core(s2s.assemble(source, name="count.s"))
+    >>> out, cost = core.frame([17, 230, 1001])  # time bins of three photons
+    >>> out, cost.photons, cost.cycles == 3 * cost.instructions
+    ((3,), 3, True)
     """
 
     def __init__(

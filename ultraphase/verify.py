@@ -52,7 +52,7 @@ def verify(
     Raises InputError if what a photon adds, or how long it takes, depends on the state; if the frame ends at a photon;
     if the program changes a table, lets words out, or writes other than zeros before the first photon; if a frame puts
     out other words after another frame than at first; and where it differs from the matrix, saying at which timestamp
-    and number, or puts out other than the matrix' numbers in their order.
+    and number, or puts out other than the matrix' numbers in their order. `Program` has an example.
     """
     require_loadable(program, tables, "verify")
     _require_one_core(tables)

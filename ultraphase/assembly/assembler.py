@@ -61,6 +61,22 @@ def assemble(
 
     Raises InputError with file, line and column for a mistake in the source, and with what is over for a program that
     does not fit the chip.
+
+    Examples
+    --------
+    Each of two cores side by side puts out the first timestamp of its frame:
+
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> program = s2s.assemble('''
+    ...         RDT  r1
+    ...         OUTH r1
+    ...         HALT
+    ... ''', name="first.s")
+    >>> cores = s2s.CoreArray(program, (1, 2))
+    >>> frame = cores.frame(np.array([500, 700, 30]), np.array([0, 2, 3]))  # two photons on the left, one on the right
+    >>> frame.out.tolist(), frame.cycles.tolist()  # 3 instructions of 3 clocks
+    ([[500], [30]], [[9, 9]])
     """
     require_kind(text, str, "assemble", " of source (`assemble_file` takes a path)")
     assembly = _Assembly(chip or ChipSpec(), dict(constants or {}), read)

@@ -47,6 +47,21 @@ class Program:
     lines    (file, line number) of every instruction, for messages
     labels   name -> word
     timestamps   how many it knows, from 0 on; larger ones are refused, as tables would fold them. None: all of 16 bits
+
+    Examples
+    --------
+    A coarse histogram has 16 counters of 8 bits in RAM. A photon adds 1 to one of them, each of which is 64 of the 1024
+    time bins wide; `verify` proves it, timestamp by timestamp:
+
+    >>> import numpy as np
+    >>> import scene2spad as s2s
+    >>> from ultraphase import method
+    >>> program = method("coarse-16").program()
+    >>> isinstance(program, s2s.Program), program.ram_bits
+    (True, 128)
+    >>> gates = np.kron(np.eye(16, dtype=int), np.ones(64, dtype=int))  # (16, 1024)
+    >>> bool((s2s.verify(program, gates).table.T == gates).all())
+    True
     """
 
     name: str
