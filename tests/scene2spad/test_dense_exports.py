@@ -1,6 +1,5 @@
 """Dense arrays and points from Python and by `export`: light that wraps is told, and counts come back as they were."""
 
-import doctest
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -47,12 +46,6 @@ def told(capfd, *argv: str) -> tuple[dict, str]:
     assert main([*argv, "--json"]) == 0
     found = capfd.readouterr()
     return json.loads(found.out.splitlines()[-1]), found.err
-
-
-@pytest.mark.parametrize("name", ["dense", "write_dense", "points", "write_ply"])
-def test_examples_run(name):
-    (found,) = doctest.DocTestFinder(recurse=False).find(getattr(s2s, name), name, globs={})
-    assert found.examples and doctest.DocTestRunner().run(found).failed == 0
 
 
 def test_a_wall_beyond_the_range_is_said_to_wrap(capfd):
