@@ -295,8 +295,9 @@ def depth_errors(depth_m: np.ndarray, histogram: Histogram, *, unmixed: bool = F
     Returns
     -------
     dict
-        ``mae_mm``, ``rmse_mm``, ``median_mm`` (signed) and ``within_10mm`` (a share) over ``pixels`` pixels; the
-        numbers of pixels left out are ``empty``, ``beyond_range`` and ``missing``.
+        ``mae_mm``, ``rmse_mm``, ``median_mm`` (signed) and ``median_abs_mm`` over ``pixels`` pixels; the numbers of
+        pixels left out are ``empty``, ``beyond_range`` and ``missing``. ``within_10mm`` is a share of ``pixels`` and
+        ``missing`` together.
 
     Raises
     ------

@@ -10,8 +10,8 @@ import pytest
 from scene2spad.cli.main import main
 
 README = Path(__file__).parents[1] / "README.md"
-# Other processors round otherwise, which draws other photons. Over draws the MAE of these lines has a standard deviation
-# of 2 to 4 %, the share within 10 mm one of 0.005; the page has two digits of both.
+# Other processors round otherwise, which draws other photons. Over draws the MAE of these lines has a standard
+# deviation of 2 to 4 %, the share within 10 mm one of 0.005; the page has two digits of both.
 CLOSE = {"mae_mm": {"rel": 0.15}, "within_10mm": {"abs": 0.02}}
 
 

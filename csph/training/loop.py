@@ -305,8 +305,8 @@ def train(
 
     Sets are one or several; patches are drawn from the training sets by `config.weights`. `init` is a trained model of
     the same design to begin with (`WeightsOf`: with what it was trained on), or `NetworkOf` one of any design on the
-    same sensor, whose codes begin anew. A run is on one device; where photons are drawn and
-    sums are rounded is the device's, and nothing else of `hardware` changes a result.
+    same sensor, whose codes begin anew. A run is on one device: where photons are drawn, and
+    how sums are rounded, depends on it. Nothing else of `hardware` changes a result.
     Returns steps, seconds (of this call), val_rmse_mm of the weights kept, their checkpoint, and the number of
     parameters. Raises InputError for no set, sets or an `init` that do not fit, indirect light on the published grid,
     and another run's folder. `help(csph)` has an example.

@@ -279,10 +279,11 @@ def depth_errors(
 ) -> dict[str, float | int]:
     """Return error figures of a depth map against the truth [m], both of one shape, over the pixels not in `exclude`.
 
-    mae_mm, rmse_mm, median_mm (signed), median_abs_mm (of |error|) and within_10mm (share strictly under 10 mm) over
-    `pixels` of them; left out and counted: empty (truth NaN), beyond_range (truth at the range, one for all or (H, W),
-    or beyond), missing (estimate NaN or infinite). What a masked array masks is NaN. Raises InputError for maps of
-    other shapes, of no numbers, and of depths below 0.
+    mae_mm, rmse_mm, median_mm (signed) and median_abs_mm (of |error|) are over `pixels` of them. Left out and counted:
+    empty (truth NaN), beyond_range (truth at the range, one for all or (H, W), or beyond), missing (estimate NaN or
+    infinite). within_10mm is the share strictly under 10 mm of `pixels` and `missing` together: no estimate is no good
+    one, and methods that answer for other pixels compare. What a masked array masks is NaN. Raises InputError for maps
+    of other shapes, of no numbers, and of depths below 0.
     """
     estimate, truth = map(_metres, (estimate, truth))
     keep = (
@@ -299,13 +300,14 @@ def depth_errors(
     figures = dict.fromkeys(("mae_mm", "rmse_mm", "median_mm", "median_abs_mm", "within_10mm"), math.nan)
     if error.size:
         absolute = np.abs(error)
-        figures = {
+        figures |= {
             "mae_mm": float(absolute.mean()),
             "rmse_mm": float(np.sqrt((error**2).mean())),
             "median_mm": float(np.median(error)),
             "median_abs_mm": float(np.median(absolute)),
-            "within_10mm": float((absolute < 10).mean()),
         }
+    if asked := error.size + int(missing.sum()):
+        figures["within_10mm"] = int((np.abs(error) < 10).sum()) / asked
     counted = {"empty": int(empty.sum()), "beyond_range": int(beyond.sum()), "missing": int(missing.sum())}
     return {**figures, "pixels": int(error.size), **counted}
 
