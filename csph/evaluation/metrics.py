@@ -26,8 +26,8 @@ def is_low_sbr(signal: float, background: float) -> bool:
 def image_errors(
     estimate: np.ndarray, truth: np.ndarray, range_m: float | np.ndarray, exclude: np.ndarray | None = None
 ) -> dict:
-    """Return `spad.estimators.depth.depth_errors` with the shares strictly within 1, 5, 10 and 20 mm, of pixels with and
-    without an estimate as there; depths (H, W) [m]."""
+    """Return `spad.estimators.depth.depth_errors` with the shares strictly within 1, 5, 10 and 20 mm of the pixels
+    with and without an estimate, as there; depths (H, W) [m]."""
     errors = depth_errors(estimate, truth, range_m=range_m, exclude=exclude)
     error = np.abs(_error_mm(estimate, truth, range_m, exclude))
     asked = error.size + errors["missing"]
