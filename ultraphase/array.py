@@ -14,7 +14,7 @@ import numpy as np
 from scenes.errors import InputError, require
 from ultraphase.assembly.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
 from ultraphase.assembly.program import Program
-from ultraphase.chip import ChipSpec, whole_pair
+from ultraphase.chip import ChipSpec, array_shape, chosen_chip
 from ultraphase.core import WATCHDOG_STEPS, Core, Counters, block_ends, region_contents, require_loadable
 from ultraphase.port import core_offsets, port_timestamps
 
@@ -65,8 +65,8 @@ class CoreArray:
         chip: ChipSpec | None = None,
     ) -> None:
         require_loadable(program, tables, "CoreArray")
-        shape = whole_pair(shape, "core array of shape")
-        self.program, self.shape, self.chip = program, shape, chip or ChipSpec()
+        self.program, self.chip = program, chosen_chip(chip, "CoreArray")
+        self.shape = shape = array_shape(shape, self.chip)
         program.check(self.chip)
         lanes = shape[0] * shape[1]
         flat = {n: np.asarray(t) for n, t in (tables or {}).items()}

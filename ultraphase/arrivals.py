@@ -26,7 +26,7 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from ultraphase.assembly.program import Program
-from ultraphase.chip import ChipSpec
+from ultraphase.chip import ChipSpec, chosen_chip
 from ultraphase.core import WATCHDOG_STEPS, Core
 from ultraphase.port import port_timestamps, whole_timestamps
 
@@ -182,7 +182,7 @@ def periodic_arrivals(
     timestamps (N,) whole numbers over the period, 0 to 1023 of the chip's 10 bits -> clocks (N,) rising, and the
     timestamps in that order. Raises InputError for other timestamps, and a frame that is shorter than the period.
     """
-    chip = chip or ChipSpec()
+    chip = chosen_chip(chip, "periodic_arrivals")
     stamps = whole_timestamps(timestamps, chip.timestamps, "arrivals: ")
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(11,)))
     period = period_s / chip.clock_s

@@ -10,7 +10,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from scenes.errors import InputError, normalise_fields, require, require_whole
+from scenes.errors import InputError, normalise_fields, require, require_kind, require_whole
+from scenes.limits import require_memory
+
+CORE_BYTES = 512  # of an emulated core beside its RAM: registers, links, counters
 
 ASSUMPTIONS: dict[str, str] = {
     "instruction set": "UltraPhase-constrained, ours: the chip's is not public; logic, 32-bit arithmetic, data, links",
@@ -25,15 +28,15 @@ ASSUMPTIONS: dict[str, str] = {
 }
 
 
-def whole_pair(value: Any, what: str) -> tuple[int, int]:
+def whole_pair(value: Any, what: str, least: int = 1) -> tuple[int, int]:
     """Return (rows, columns) as Python's whole numbers. Raises InputError that names `what` was given, for other than
-    two, and for one below 1."""
+    two, and for one below `least`."""
     try:
         first, second = value
     except (TypeError, ValueError):
         raise InputError(f"{what} {value!r}, expected two whole numbers (rows, columns)") from None
     rows, columns = require_whole(first, what), require_whole(second, what)
-    require(rows >= 1 and columns >= 1, f"{what} {rows} x {columns}, expected 1 or more each")
+    require(min(rows, columns) >= least, f"{what} {rows} x {columns}, expected {least} or more each")
     return rows, columns
 
 
@@ -115,3 +118,18 @@ class ChipSpec:
     def readout_power_w(self, data_rate_bit_per_s: float) -> float:
         """Return P = rate C V^2 of the digital output (S.2)."""
         return data_rate_bit_per_s * self.io_load_f * self.io_voltage_v**2
+
+
+def chosen_chip(chip: ChipSpec | None, where: str) -> ChipSpec:
+    """Return a chip that is given, or the published one for None; InputError for anything else, `where` comes first."""
+    if chip is None:
+        return ChipSpec()
+    require_kind(chip, ChipSpec, f"{where}: chip")
+    return chip
+
+
+def array_shape(shape: Any, chip: ChipSpec) -> tuple[int, int]:
+    """Return (rows, columns) of an array of cores, or an InputError, also for more cores than memory holds."""
+    rows, columns = whole_pair(shape, "core array of shape")
+    require_memory(rows * columns * (chip.ram_bytes + CORE_BYTES), f"a core array of {rows} x {columns}")
+    return rows, columns

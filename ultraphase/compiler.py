@@ -19,7 +19,7 @@ from ultraphase.assembly.assembler import assemble
 from ultraphase.assembly.codegen import loop_order, source_of, turns_of
 from ultraphase.assembly.program import Program
 from ultraphase.catalog import FOLDER, Method
-from ultraphase.chip import ChipSpec
+from ultraphase.chip import ChipSpec, chosen_chip
 from ultraphase.integer_code import IntegerCode, folded_temporal
 from ultraphase.tables import block_matrix, int8_codes, quarter_wave, wave_matrix
 
@@ -133,7 +133,7 @@ def _ways(block: tuple[int, int]) -> np.ndarray:
 def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
     """Return program and tables of a code. Raises InputError in one line that names the bytes needed and there, and
     what would fit: fewer codes, a shorter or longer block, or a table that the cores of a block share."""
-    chip = chip or ChipSpec()
+    chip = chosen_chip(chip, "compile_code")
     known = chip.timestamps % code.bins == 0 and code.bins & (code.bins - 1) == 0
     require(known, f"code {code.name}: blocks of {code.bins} bins, expected a power of two up to {chip.timestamps}")
     if code.counters:

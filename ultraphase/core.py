@@ -14,7 +14,7 @@ from scenes.errors import InputError, require, require_kind
 from ultraphase.assembly.isa import REGISTERS, Instruction, format_instruction
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.assembly.translate import source
-from ultraphase.chip import ChipSpec
+from ultraphase.chip import ChipSpec, chosen_chip, whole_pair
 from ultraphase.port import port_timestamps
 
 WATCHDOG_STEPS = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
@@ -121,7 +121,7 @@ class Core:
         place: tuple[int, int] = (0, 0),
     ) -> None:
         require_loadable(program, tables, "Core")
-        self.program, self.chip = program, chip or ChipSpec()
+        self.program, self.chip = program, chosen_chip(chip, "Core")
         program.check(self.chip)
         self.registers = [0] * REGISTERS
         self.ram = bytearray(self.chip.ram_bytes)
@@ -131,7 +131,8 @@ class Core:
         self._visits = [0] * (len(program.instructions) + 1)  # the last for what lies behind the program
         self.out: list[int] = []
         self.word = 0
-        self._place = (place[1] & 1) | (place[0] & 1) << 1
+        row, column = whole_pair(place, "Core: place", 0)
+        self._place = (column & 1) | (row & 1) << 1
         self._port: list[int] = []
         self._read = self._wraps = self._saturations = 0
         self._stop_at_wait = self._attached_to_array = False
@@ -149,7 +150,8 @@ class Core:
     def start(self, timestamps: Iterable[int], *, park: bool = False) -> None:
         """Begin a frame of these timestamps at word 0. With `park` it does not end: the core stops where it would wait
         for another timestamp. Raises InputError for timestamps that the port has no bits for, or the program does not
-        know."""
+        know. The port has 16 bits whatever the chip's `timestamp_bits`, those of its converters: programs for
+        histograms of more bins than these have run, too."""
         port = port_timestamps(timestamps, self.program).tolist()
         self._port, self._read, self._stop_at_wait, self._stopped, self._attached_to_array = port, 0, park, False, False
         self.out.clear()

@@ -26,7 +26,7 @@ from scenes.json_types import JsonObject
 from ultraphase.array import CoreArray
 from ultraphase.assembly.program import Program
 from ultraphase.catalog import PUBLISHED, Method
-from ultraphase.chip import ChipSpec
+from ultraphase.chip import ChipSpec, chosen_chip
 
 MICRO, KILO = 1e6, 1e-3
 READINGS = {
@@ -100,7 +100,7 @@ class Power:
 def power(cost: Cost, load: Load, chip: ChipSpec | None = None) -> Power:
     """Return both readings of the processing power (module docstring), and readout power = rate C V^2."""
     require_kind(cost, Cost, "power", " of `measured_cost` or `cost_of`")
-    chip = chip or ChipSpec()
+    chip = chosen_chip(chip, "power")
     time_s = chip.processing_time_s(load.photons, cost.clocks_per_photon)
     rate = chip.data_rate_bit_per_s(cost.bits_per_pixel, load.pixels, load.frames_per_s)
     energy_per_frame = chip.energy_j(cost.clocks_per_photon * load.photons) * load.pixels
@@ -158,7 +158,7 @@ def frame_end(
 
 def reference_bits(photons: float, chip: ChipSpec | None = None) -> dict[str, float]:
     """Return bits a pixel and frame without any compression: every timestamp, or the full histogram in 8 bits a bin."""
-    chip = chip or ChipSpec()
+    chip = chosen_chip(chip, "reference_bits")
     return {"raw timestamps": photons * chip.timestamp_bits, "full histogram": chip.timestamps * 8.0}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from scenes.errors import InputError, listed, require
 from ultraphase.array import CoreArray, Frame
 from ultraphase.assembly.program import KINDS, Program
-from ultraphase.chip import ChipSpec
+from ultraphase.chip import ChipSpec, chosen_chip
 from ultraphase.core import require_loadable
 from ultraphase.frame_end import words_put_out
 from ultraphase.products import Tabulated
@@ -56,7 +56,7 @@ def verify(
     """
     require_loadable(program, tables, "verify")
     _require_one_core(tables)
-    chip = chip or ChipSpec()
+    chip = chosen_chip(chip, "verify")
     count = timestamps or ((program.timestamps or chip.timestamps) if matrix is None else matrix.shape[1])
     require(bool(program.state), f"program {program.name}: declares no .space, there is nothing to verify")
     bench = _Bench(program, CoreArray(program, (1, count), tables, chip=chip), np.random.default_rng(seed))

@@ -146,3 +146,47 @@ def test_cores_that_put_out_different_numbers_of_words_are_named():
 def test_what_is_no_program_is_refused_in_one_line(call, message):
     with pytest.raises(InputError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("constants", "message"),
+    [
+        ({"A": 1.5}, "assemble: constant A 1.5, expected a whole number"),
+        ({"A": None}, "assemble: constant A None, expected a whole number"),
+        ({"A": True}, "assemble: constant A True, expected a whole number"),
+        ({"A": "7"}, "assemble: constant A '7', expected a whole number"),
+        ({"A": 1 << 40}, "assemble: constant A 1099511627776 does not fit into 32 bits"),
+        ([], "assemble: constants [], expected whole numbers by name"),
+        ({1: 2}, "assemble: constants {1: 2}, expected whole numbers by name"),
+    ],
+)
+def test_constants_are_whole_numbers_by_name(constants, message):
+    """A core of whole numbers put out 1.5."""
+    source = ".equ A, 3\n  MOV r1, #A\n  OUTH r1\n  HALT\n"
+    assert message in refused(lambda: assemble(source, constants=constants))
+    assert Core(assemble(source, constants={"A": np.int64(5)})).frame([])[0] == (5,)
+
+
+@pytest.mark.parametrize("chip", ["x", 5, 0, {}])
+def test_chips_are_of_their_kind(chip, tmp_path):
+    (tmp_path / "halt.s").write_text(" HALT\n")
+    calls = {
+        "assemble": lambda: assemble(" HALT\n", chip=chip),
+        "assemble_file": lambda: assemble_file(tmp_path / "halt.s", chip=chip),
+        "Core": lambda: Core(COARSE, chip=chip),
+        "CoreArray": lambda: CoreArray(COARSE, chip=chip),
+        "verify": lambda: verify(COARSE, chip=chip),
+    }
+    for name, call in calls.items():
+        assert f"{name}: chip: expected a ChipSpec, not {type(chip).__name__}" in refused(call)
+
+
+@pytest.mark.parametrize("place", ["a", (-1, 0), (0, 0.5), 3, (0,)])
+def test_places_of_a_core_are_two_whole_numbers_from_0(place):
+    assert refused(lambda: Core(COARSE, place=place)).startswith("Core: place ")
+    assert Core(COARSE, place=(2, 5)).frame([3])[1].photons == 1
+
+
+def test_an_array_of_more_cores_than_memory_holds_is_refused():
+    message = refused(lambda: CoreArray(COARSE, (10**6, 10**6)))
+    assert message.startswith("a core array of 1000000 x 1000000: needs ")

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.errors import InputError, did_you_mean, require, require_kind
+from scenes.errors import InputError, did_you_mean, require, require_kind, require_whole
 from scenes.io.inputs import file_inside, read_text
 from ultraphase.assembly.isa import BY_NAME, DIRECTIONS, REGISTERS, VALUE_BITS, Instruction
-from ultraphase.assembly.names import Names, name_of
+from ultraphase.assembly.names import MAX_VALUE, Names, name_of
 from ultraphase.assembly.program import KINDS, Program, Region
 from ultraphase.assembly.source import Cursor, Line, Token, source_lines
-from ultraphase.chip import ChipSpec
+from ultraphase.chip import ChipSpec, chosen_chip
 
 _MAX_STATEMENTS = 20_000
 _MAX_INCLUDES = 8  # inside one another
@@ -56,7 +56,7 @@ def assemble(
     """Return source to program, checked against the chip.
 
     name        what messages call the source
-    constants   values that win over the source's `.equ`
+    constants   whole numbers by name that win over the source's `.equ`
     read        gives the text of an included file's name; without it `.include` is refused
 
     Raises InputError with file, line and column for a mistake in the source, and with what is over for a program that
@@ -79,7 +79,7 @@ def assemble(
     ([[500], [30]], [[9, 9]])
     """
     require_kind(text, str, "assemble", " of source (`assemble_file` takes a path)")
-    assembly = _Assembly(chip or ChipSpec(), dict(constants or {}), read)
+    assembly = _Assembly(chosen_chip(chip, "assemble"), _whole_constants(constants, "assemble"), read)
     assembly.take(source_lines(name, text))
     return assembly.program(name)
 
@@ -98,9 +98,22 @@ def assemble_file(
     def read(name: str) -> str:
         return _source_text(file_inside(path.parent, name, "included file", "the program's folder"))
 
-    assembly = _Assembly(chip or ChipSpec(), dict(constants or {}), read)
+    assembly = _Assembly(chosen_chip(chip, "assemble_file"), _whole_constants(constants, "assemble_file"), read)
     assembly.take(source_lines(path.name, _source_text(path)))
     return assembly.program(name or path.name)
+
+
+def _whole_constants(constants: Mapping[str, int] | None, where: str) -> dict[str, int]:
+    """Return constants as Python's whole numbers; InputError for anything else, and for one that 32 bits do not
+    hold."""
+    if constants is None:
+        return {}
+    named = isinstance(constants, Mapping) and all(isinstance(name, str) for name in constants)
+    require(named, f"{where}: constants {constants!r}, expected whole numbers by name")
+    whole = {name: require_whole(value, f"{where}: constant {name}") for name, value in constants.items()}
+    for name, value in whole.items():
+        require(abs(value) < MAX_VALUE, f"{where}: constant {name} {value} does not fit into 32 bits")
+    return whole
 
 
 def _source_text(path: Path) -> str:

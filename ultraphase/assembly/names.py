@@ -11,7 +11,7 @@ from ultraphase.assembly.source import Cursor, Line, Token
 
 _REGISTER = re.compile(r"r(\d+)\Z")
 _MAX_NESTED = 32  # parentheses and signs
-_MAX_VALUE = 1 << 31
+MAX_VALUE = 1 << 31
 _MAX_DIGITS = 64
 
 
@@ -113,7 +113,7 @@ class Names:
             if operator.text != "*" and right == 0:
                 raise cursor.line.fail(operator.column, "division by zero")
             total = total * right if operator.text == "*" else total // right if operator.text == "/" else total % right
-            if abs(total) >= _MAX_VALUE:
+            if abs(total) >= MAX_VALUE:
                 raise cursor.line.fail(operator.column, f"{total} does not fit into 32 bits")
         return total
 
@@ -131,8 +131,8 @@ class Names:
             cursor.at += 1
             base = {"0x": 16, "0b": 2}.get(token.text[:2].lower(), 10)
             # Python refuses to convert very long decimals
-            value = int(token.text, base) if len(token.text) <= _MAX_DIGITS else _MAX_VALUE
-            if value >= _MAX_VALUE:
+            value = int(token.text, base) if len(token.text) <= _MAX_DIGITS else MAX_VALUE
+            if value >= MAX_VALUE:
                 raise cursor.line.fail(token.column, f"{token.text} does not fit into 32 bits")
             return value
         token = cursor.take("name", "a number or a name")

@@ -10,7 +10,7 @@ import numpy as np
 
 from scenes.errors import require
 from ultraphase.assembly.isa import Instruction, decode, encode, format_instruction
-from ultraphase.chip import ChipSpec
+from ultraphase.chip import ChipSpec, chosen_chip
 
 KINDS: dict[str, np.dtype[Any]] = {"u8": np.dtype("u1"), "s8": np.dtype("i1"), "s16": np.dtype("<i2")}
 
@@ -167,7 +167,7 @@ class Program:
 
 def listing(program: Program, chip: ChipSpec | None = None) -> str:
     """Return address, word, clocks and source of every instruction, under the RAM map and the totals."""
-    chip = chip or ChipSpec()
+    chip = chosen_chip(chip, "listing")
     lines = [f"; {program.name}: {len(program.instructions)} of {chip.program_words} words, "]
     lines[0] += f"{program.ram_bits} of {chip.ram_bits} bits of RAM"
     for r in program.regions:
