@@ -8,6 +8,8 @@ import numpy as np
 
 from scenes.errors import InputError, require
 
+MIN_NORMAL = 1e-15  # length; float32, in which rays are traced, holds its square
+
 # Spectral radiance [W/(m^2 sr nm)]: the sun's disk has 1e4; what lies far above is no light, and overflows in float32.
 MAX_RADIANCE = 1e9
 
@@ -72,6 +74,26 @@ def mesh_arrays(vertices: object, faces: object, farthest_m: float, where: str) 
     require(farthest <= farthest_m, f"{where}: a vertex at {farthest:g} m is beyond {farthest_m:g} m")
     check_faces(corners, len(points), where)
     return points, corners
+
+
+def vertex_array(value: object, width: int, vertices: int, label: str, where: str) -> np.ndarray:
+    """Return `width` numbers for each of `vertices` as a read-only array, or an InputError; `label` says what they
+    are."""
+    array = frozen_array(value, np.float64, (width,), f"{where}: {label}")
+    require(len(array) == vertices, f"{where}: {len(array)} {label} for {vertices} vertices")
+    require(bool(np.isfinite(array).all()), f"{where}: {label} hold NaN or infinite values")
+    return array
+
+
+def check_normals(normals: np.ndarray, faces: np.ndarray, where: str) -> None:
+    """Raise InputError if a vertex of a face has a normal without a direction, by which its surface is black."""
+    short = np.einsum("ij,ij->i", normals, normals) < MIN_NORMAL**2
+    if short.any() and short[faces].any():
+        vertex, count = faces[short[faces]][0], np.count_nonzero(short)
+        length = np.linalg.norm(normals[vertex])
+        raise InputError(
+            f"{where}: {count} of {len(normals)} normals have no length, that of vertex {vertex} {length:g}"
+        )
 
 
 def rigid_pose(value: object, what: str) -> np.ndarray:

@@ -15,14 +15,15 @@ from typing import Literal, get_args
 import numpy as np
 
 from scenes.arrays import (
+    check_normals,
     checked_radiance,
     finite_number,
-    frozen_array,
     looking_pose,
     mesh_arrays,
     number_array,
     rigid_pose,
     three_numbers,
+    vertex_array,
     whole_pixels,
 )
 from scenes.errors import require, require_choice, require_kind, require_kinds, tuple_of
@@ -131,7 +132,7 @@ class Surface:
 
     vertices (n, 3) metres, faces (m, 3), optional uv (n, 2) and shading normals (n, 3) per vertex.
     `emission` is the steady spectral radiance of an area light [W/(m^2 sr nm)], on the side of the face normals.
-    Raises InputError for a mesh that does not hold together, and numbers that are not finite.
+    Raises InputError for a mesh that does not hold together, numbers that are not finite, and normals of length 0.
     """
 
     vertices: np.ndarray
@@ -150,13 +151,11 @@ class Surface:
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
         for label, width in (("uv", 2), ("normals", 3)):
-            value = getattr(self, label)
-            if value is None:
-                continue
-            array = frozen_array(value, np.float64, (width,), f"{where}: {label}")
-            require(len(array) == len(vertices), f"{where}: {len(array)} {label} for {len(vertices)} vertices")
-            require(bool(np.isfinite(array).all()), f"{where}: {label} hold NaN or infinite values")
-            object.__setattr__(self, label, array)
+            if getattr(self, label) is not None:
+                array = vertex_array(getattr(self, label), width, len(vertices), label, where)
+                object.__setattr__(self, label, array)
+        if self.normals is not None:
+            check_normals(self.normals, faces, where)
         textured = isinstance(self.material.albedo, Texture) or isinstance(self.material.opacity, Texture)
         require(self.uv is not None or not textured, f"{where}: its material has a texture, the mesh no uv coordinates")
         object.__setattr__(self, "emission", checked_radiance(self.emission, f"{where}: emission"))

@@ -153,6 +153,20 @@ def transform_normals(normals: np.ndarray, matrix4: np.ndarray) -> np.ndarray:
     return moved / np.where(length > 0, length, 1)
 
 
+def filled_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return vertex normals with those of length 0 replaced by the mean of the faces around, weighted by area."""
+    none = ~normals.any(axis=1)
+    if not none.any():
+        return normals
+    a, b, c = (vertices[corner] for corner in faces.T)
+    around = np.zeros_like(normals)
+    for corner in faces.T:
+        np.add.at(around, corner, np.cross(b - a, c - a))
+    length = np.linalg.norm(around, axis=1, keepdims=True)
+    around = np.where(length > 0, around / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
+    return np.where(none[:, None], around, normals)
+
+
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     """Build a unit icosahedron with a vertex on each pole, every face split in four `subdivisions` times."""
     longitude = np.arange(5) * 2 * np.pi / 5

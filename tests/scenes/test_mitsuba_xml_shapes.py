@@ -88,6 +88,16 @@ def test_smooth_normals_know_no_materials_of_the_file(tmp_path: Path, mitsuba: o
     assert ours == pytest.approx(np.array(mitsuba(path, rays=[ray])["hits"][0][1]), abs=1e-4)
 
 
+def test_normals_of_length_0_in_a_file_become_those_of_the_faces(tmp_path: Path) -> None:
+    """They made the surface black."""
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 0\nvn 0 0.6 0.8\nf 1//1 2//1 3//2\n"
+    (tmp_path / "none.obj").write_text(text)
+    body = '<shape type="obj"><string name="filename" value="none.obj"/></shape>'
+    (surface,) = load(tmp_path, body).surfaces
+    found = sorted(surface.normals[surface.faces[0]].tolist())
+    assert found == [[0, 0, 1], [0, 0, 1], pytest.approx([0, 0.6, 0.8])]
+
+
 def test_a_mesh_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import trimesh
 

@@ -103,6 +103,8 @@ def test_material_refuses(changes, words):
         ({"uv": VERTICES}, "uv: shape (3, 3)"),
         ({"normals": ((0.0, 0, 1),)}, "1 normals for 3 vertices"),
         ({"normals": ((0.0, 0, INF),) * 3}, "normals hold NaN"),
+        ({"normals": np.zeros((3, 3))}, "3 of 3 normals have no length, that of vertex 0 0"),
+        ({"normals": ((0.0, 0, 1), (0, 0, 1), (0, 0, 1e-30))}, "1 of 3 normals have no length, that of vertex 2 1e-30"),
         ({"material": Material(albedo=texture()), "uv": None}, "no uv"),
         ({"material": Material(opacity=texture()), "uv": None}, "no uv"),
         ({"emission": -1.0}, "emission"),
@@ -112,6 +114,11 @@ def test_material_refuses(changes, words):
 def test_surface_refuses(changes, words):
     refuses(lambda: surface(**changes, name="chair"), words)
     refuses(lambda: surface(**changes, name="chair"), "mesh chair")
+
+
+def test_a_vertex_of_no_face_needs_no_normal():
+    points, normals = (*VERTICES, (5.0, 5, 5)), ((0.0, 0, 1),) * 3 + ((0.0, 0, 0),)
+    assert surface(vertices=points, normals=normals, uv=None, material=Material()).normals[3].tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(

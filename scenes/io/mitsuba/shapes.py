@@ -366,6 +366,8 @@ def _placed(mesh: Mesh, plugin: Plugin) -> Mesh:
         faces = faces[:, ::-1]
     if mesh.smooth and np.isfinite(vertices).all():
         normals = _smooth_normals(vertices, faces)
+    if normals is not None:
+        normals = shapes.filled_normals(normals, vertices, faces)
     mesh = replace(mesh, vertices=vertices, faces=faces, normals=normals)
     return _turned(mesh) if plugin.boolean("flip_normals", False) else mesh
 
