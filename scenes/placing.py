@@ -111,13 +111,17 @@ AS_IT_IS = Placing()
 def stated(placing: Placing, values: Mapping[str, object], where: str) -> Placing:
     """Return a placing with fields of it that were given to a function as keywords.
 
-    Raises InputError for other keywords, which comes with `where`, the call, and what it takes.
+    Raises InputError for other keywords, which comes with `where`, the call, and what it takes, and for a field that
+    both state.
     """
     require_kind(placing, Placing, f"{where}: placing", " (scenes.placing)")
     known = [item.name for item in fields(Placing)]
     for name in values:
         expected = f"expected fields of Placing: {', '.join(known)}"
         require(name in known, f"{where}: {name!r} is unknown, {expected}{did_you_mean(name, known)}")
+        there = getattr(placing, name)
+        twice = f"{where}: {name} is given twice, as {values[name]!r} and as {there!r} in placing"
+        require(there == getattr(AS_IT_IS, name), twice)
     return replace(placing, **values)  # type: ignore[arg-type]
 
 

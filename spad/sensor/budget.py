@@ -22,6 +22,7 @@ from spad.sensor.model import PhotonBudget, Sensor, detector_maps
 # G-173 about 0.9, and / pi is 0.26 to 0.29; bright haze and sunlit clouds are about as bright. Silicon SPADs see most
 # of the sun, 1.6 W/(m^2 nm) outside the atmosphere, near 500 nm: 0.5.
 BRIGHT_SKY_W_PER_M2_SR_NM = 0.5
+WAVELENGTHS_M = (1e-7, 1e-4)  # of light that is timed: 850 nm is 8.5e-7
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class Optics:
     filter_nm         width of the band that the filter lets through
     wavelength_m      of the laser
 
-    Raises InputError for values that are not above 0, a pulse energy below 0, and a transmission above 1.
+    Raises InputError for values that are not above 0, a pulse energy below 0, a transmission above 1, and a wavelength
+    outside 0.1 to 100 micrometres.
 
     Examples
     --------
@@ -67,6 +69,9 @@ class Optics:
             off = name == "pulse_energy_j"  # which a laser may be: background alone
             good = math.isfinite(value) and (value > 0 or (off and value == 0))
             require(good, f"optics: {name} {value:g} must be finite and {'0 or more' if off else 'above 0'}")
+        lowest, highest = WAVELENGTHS_M
+        outside = f"optics: wavelength_m {self.wavelength_m:g} is outside {lowest:g} to {highest:g}"
+        require(lowest <= self.wavelength_m <= highest, outside)
         require(0 < self.transmission <= 1, f"optics: transmission {self.transmission:g} is outside (0, 1]")
 
     @property

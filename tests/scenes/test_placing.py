@@ -256,3 +256,9 @@ def test_a_scene_in_other_units_is_questioned(tmp_path, capfd):
     command = ["render", "wall@2000", "--width", "8", "--bounces", "1", "--grid", "2", "--no-figure"]
     assert main([*command, "--out", str(tmp_path / "w.exr")]) == 0
     assert "say so by --scale" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "first", "second"), [("scale", 2.0, 3.0), ("up", "z", "z"), ("bare", True, False)])
+def test_a_field_given_twice_is_refused(tip, name, first, second):
+    with pytest.raises(InputError, match=f"load_scene: {name} is given twice, as {second!r} and as {first!r}"):
+        load_scene(str(tip), placing=Placing(**{name: first}), **{name: second})
