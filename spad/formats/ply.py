@@ -23,17 +23,18 @@ def points(seen: Transient | Histogram, depth_m: np.ndarray | None = None) -> np
     seen : Transient or Histogram
         What tells where the pixels look.
     depth_m : numpy.ndarray, optional
-        Depth (H, W) [m], as `estimate_depth` gives it (default: the true depth).
+        Depth (H, W) [m], 0 or more, as `estimate_depth` gives it (default: the true depth). NaN, infinite and masked
+        ones are none.
 
     Returns
     -------
     numpy.ndarray
-        Points (H, W, 3) [m], float64; NaN where the depth is.
+        Points (H, W, 3) [m], float64; NaN where no depth is.
 
     Raises
     ------
     InputError
-        For depths of another size, and where nothing tells where the pixels look, as of measured counts.
+        For depths of another size or below 0, and where nothing tells where the pixels look, as of measured counts.
 
     Examples
     --------
@@ -45,11 +46,15 @@ def points(seen: Transient | Histogram, depth_m: np.ndarray | None = None) -> np
     """
     called = f"points: expected a Transient or a Histogram, not {type(seen).__name__}"
     require(isinstance(seen, Transient | Histogram), called)
-    depth = np.asarray(seen.depth_m if depth_m is None else depth_m)
+    depth = np.ma.asarray(seen.depth_m if depth_m is None else depth_m)
     size = f"points: depth_m is {depth.dtype}{depth.shape}, expected numbers {seen.depth_m.shape}"
     require(depth.dtype.kind in "iuf" and depth.shape == seen.depth_m.shape, size)
+    metres = np.ma.filled(depth.astype(np.float64), np.nan)
+    least = float(metres.min(initial=0.0, where=metres < 0))
+    require(least >= 0, f"points: depth_m: a depth of {least:g} m, expected 0 or more, or none (NaN)")
+    metres[np.isinf(metres)] = np.nan
     try:
-        return points_of(depth, pointing_of(seen.meta) if isinstance(seen, Histogram) else seen.meta)
+        return points_of(metres, pointing_of(seen.meta) if isinstance(seen, Histogram) else seen.meta)
     except InputError as error:
         raise InputError(f"points: {error}") from None
 

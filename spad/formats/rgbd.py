@@ -7,21 +7,25 @@ one return a pixel at the rounded bin, albedo / d^2 without a cosine, c = 3e8 m/
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import NamedTuple
 
 import numpy as np
 
 from render.transient import Transient
-from scenes.errors import InputError, require, require_number, require_whole
+from scenes.errors import InputError, require, require_kind, require_number, require_whole
 from scenes.json_types import JsonObject
 from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
 
+log = logging.getLogger(__name__)
+
 PUBLISHED_SPEED_OF_LIGHT_M_PER_S = 3e8
 MIXED_M = 0.05
+FAR_M = 1e3  # depths beyond are likely in millimetres, as 16-bit images hold them
 ONE_SURFACE = 0.01  # samples whose depths differ by at most this share of their mean lie on one surface
 
 
@@ -78,9 +82,12 @@ def from_rgbd(
 
 def _alike(*images: np.ndarray) -> list[np.ndarray]:
     try:
-        arrays = [np.asarray(image, dtype=np.float64) for image in images]
+        given = [np.ma.asarray(image) for image in images]
     except (TypeError, ValueError) as error:
         raise InputError(f"RGB-D images: not an array of numbers ({error})") from None
+    for image in given:
+        require(image.dtype.kind in "uif", f"RGB-D images: values are {image.dtype}, expected real numbers")
+    arrays = [np.ma.filled(image.astype(np.float64), np.nan) for image in given]
     shapes = {array.shape for array in arrays}
     if len(shapes) != 1 or arrays[0].ndim != 2 or not arrays[0].size:
         raise InputError(f"RGB-D images of shapes {sorted(shapes)}, expected one of (H, W) for all")
@@ -92,6 +99,11 @@ def _check_values(depth: np.ndarray, albedo: np.ndarray, ambient: np.ndarray) ->
     require(bool(good.all()), "RGB-D images: albedo and ambient light must be finite and 0 or more")
     least = float(depth.min(initial=0.0, where=depth < 0))
     require(least >= 0, f"RGB-D images: a depth of {least:g} m, expected 0 or more, or none (NaN)")
+    seen = np.isfinite(depth) & (depth > 0)
+    require(bool(seen.any()), "RGB-D images: no depth is finite and above 0, nothing is seen")
+    farthest = float(depth.max(where=seen, initial=0.0))
+    if farthest > FAR_M:
+        log.warning("RGB-D images: depths of up to %.5g m: are they in millimetres? Metres are expected", farthest)
 
 
 def transient_from_rgbd(
@@ -113,9 +125,9 @@ def transient_from_rgbd(
     light is the mean. `fov_deg` is the full horizontal angle that the cosine of incidence is taken with, from the depth
     image itself; None for surfaces that face the camera. Samples without depth (not finite, or 0) return nothing; a
     pixel with samples more than 50 mm apart, or partly nowhere, is mixed.
-    `depth_m` [m], `albedo` and `ambient` [W/(m2 sr nm)] are (H, W). Raises InputError for images of other shapes, sides
-    that `block` does not divide, negative depth, and albedo or ambient light that is negative or not finite.
-    `Transient` has an example.
+    `depth_m` [m], `albedo` and `ambient` [W/(m2 sr nm)] are (H, W). Raises InputError for images of other shapes or
+    without numbers, sides that `block` does not divide, negative depth, no depth at all, and albedo or ambient light
+    that is negative or not finite. Depth beyond 1 km, as in millimetres, is warned of. `Transient` has an example.
     """
     depth, albedo, ambient = _alike(depth_m, albedo, ambient)
     block = require_whole(block, "RGB-D images: block")
@@ -124,6 +136,7 @@ def transient_from_rgbd(
         f"RGB-D images of {depth.shape[0]} x {depth.shape[1]} are no whole number of blocks of {block}",
     )
     _check_values(depth, albedo, ambient)
+    require_kind({} if meta is None else meta, dict, "RGB-D images: meta")
     seen = np.isfinite(depth) & (depth > 0)
     depth = np.where(seen, depth, np.nan)
     cosine = np.ones_like(depth) if fov_deg is None else cosine_of_incidence(depth, fov_deg)

@@ -71,7 +71,8 @@ def test_the_fraction_that_wraps_is_that_of_the_radiance():
     assert float(arrays["wrapped"]) == pytest.approx(radiance[1] / radiance.sum(), rel=1e-6)
     assert "unrecorded" not in arrays
     assert float(s2s.dense(transient, replace(SENSOR, period_s=200e-9))["wrapped"]) == 0
-    assert float(s2s.dense(relief(np.nan))["wrapped"]) == 0
+    black = np.zeros((1, 2))
+    assert float(s2s.dense(s2s.transient_from_rgbd(black + 2, black, black))["wrapped"]) == 0
 
 
 def test_light_without_bins_is_told(capfd):
@@ -242,6 +243,7 @@ def test_points_lie_at_the_depth_that_is_given():
             r"depth_m is float64\(2, 2\), expected numbers \(12, 16\)",
         ),
         (lambda t, h: s2s.points(t, "x"), "points: depth_m is <U1"),
+        (lambda t, h: s2s.points(h, -h.depth_m), r"points: depth_m: a depth of -[\d.]+ m, expected 0 or more, or none"),
         (lambda t, h: s2s.points(s2s.Histogram.from_counts(h.counts, SENSOR)), "points: does not say which camera"),
         (lambda t, h: s2s.write_ply(np.ones((2, 2)), "a.ply"), r"a.ply: points are float64\(2, 2\)"),
         (lambda t, h: s2s.write_ply(np.ones((2, 3)), "a.obj"), "a.obj: a point cloud ends in .ply"),

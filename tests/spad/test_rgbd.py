@@ -340,7 +340,10 @@ def test_radiometric_and_mean_budget_meet() -> None:
     assert twice.signal == pytest.approx(2 * budget.signal) and twice.background == pytest.approx(budget.background)
 
 
-@pytest.mark.parametrize("bad", [{"f_number": 0.0}, {"transmission": 1.5}, {"pulse_energy_j": -1.0}])
+@pytest.mark.parametrize(
+    "bad",
+    [{"f_number": 0.0}, {"transmission": 1.5}, {"pulse_energy_j": -1.0}, {"wavelength_m": 850}, {"wavelength_m": 1e-8}],
+)
 def test_bad_optics_are_refused(bad: dict) -> None:
     with pytest.raises(InputError, match="optics"):
         replace(EXAMPLE, **bad)
@@ -373,3 +376,36 @@ def test_a_negative_depth_is_refused():
         transient_from_rgbd(depth, one, one)
     depth[1, 1:] = np.nan, 0
     assert transient_from_rgbd(depth, one, one).returns == 4
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"depth_m": np.full((2, 3), 2 + 1j)}, "values are complex128, expected real numbers"),
+        ({"depth_m": np.full((2, 3), "2")}, "values are <U1, expected real numbers"),
+        ({"depth_m": np.ones((2, 3), bool)}, "values are bool, expected real numbers"),
+        ({"albedo": np.full((2, 3), None)}, "values are object, expected real numbers"),
+        ({"depth_m": np.zeros((2, 3))}, "no depth is finite and above 0"),
+        ({"depth_m": np.full((2, 3), np.inf)}, "no depth is finite and above 0"),
+        ({"depth_m": np.full((2, 3), np.nan)}, "no depth is finite and above 0"),
+        ({"meta": [("scene", "x")]}, "meta: expected a dict, not list"),
+        ({"meta": "x"}, "meta: expected a dict, not str"),
+    ],
+)
+def test_images_without_a_depth_are_refused(changed: dict, words: str) -> None:
+    given = {name: np.ones((2, 3)) for name in ("depth_m", "albedo", "ambient")} | changed
+    with pytest.raises(InputError, match=f"^RGB-D images: {words}"):
+        transient_from_rgbd(**given)
+
+
+def test_depth_in_millimetres_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    one = np.ones((2, 3))
+    transient_from_rgbd(np.full((2, 3), 1000.0), one, one)
+    assert not caplog.records
+    transient_from_rgbd(np.full((2, 3), 2345, np.uint16), one, one)
+    assert "depths of up to 2345 m: are they in millimetres?" in caplog.text
+
+
+def test_masked_depth_is_none() -> None:
+    depth = np.ma.masked_equal(np.array([[2, 3, 9]]), 9)
+    assert transient_from_rgbd(depth, np.ones((1, 3)), np.ones((1, 3))).returns == 2
