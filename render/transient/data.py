@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from render.transient.exr_files import write_exr
-from scenes.errors import InputError, require, require_kind, require_number
+from scenes.errors import InputError, require, require_kind, require_kinds, require_number, require_whole
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, silenced, whole_file
 from scenes.json_types import JsonObject
 from scenes.notebook import html_card
@@ -28,6 +28,7 @@ FLAT_PARTS = {
     "layers": ("depth", "ambient", "error"),
     "surface": ("normal.X", "normal.Y", "normal.Z", "albedo", "mixed"),
 }
+ARRAYS = ("offsets", *RETURN_FIELDS, "depth_m", "normal", "albedo", "ambient", "mixed", "error")
 LAYER_CHANNELS = ("depth", "normal.X", "normal.Y", "normal.Z", "albedo", "ambient", "mixed", "error")
 
 
@@ -50,7 +51,7 @@ class Transient:
                   each alone: the error is up to a third smaller
     meta          scene, seed, plan, versions: anything JSON holds
 
-    Raises InputError for arrays of other types or shapes, and values that are no light.
+    Raises InputError for fields of another kind, arrays of other types or shapes, and values that are no light.
 
     Examples
     --------
@@ -84,6 +85,9 @@ class Transient:
     meta: JsonObject = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        require_kinds(self, "transient", meta=dict, **dict.fromkeys(ARRAYS, np.ndarray))
+        for side in ("height", "width"):
+            require_whole(getattr(self, side), f"transient: {side}")
         pixels, shape = self.height * self.width, (self.height, self.width)
         expected = {
             "offsets": (np.int64, (pixels + 1,)),
@@ -199,7 +203,8 @@ class Transient:
 
 
 def write_transient(transient: Transient, path: Path) -> None:
-    """Write the multi-part EXR, whole or not at all. Raises InputError where the path cannot be written.
+    """Write the multi-part EXR, whole or not at all. Raises InputError for another ending than .exr, and where the path
+    cannot be written.
 
     Examples
     --------
@@ -213,6 +218,7 @@ def write_transient(transient: Transient, path: Path) -> None:
     """
     require_kind(transient, Transient, "write_transient")
     require(isinstance(path, str | os.PathLike), f"write_transient: expected a path, not {type(path).__name__}")
+    require(Path(path).suffix.lower() == ".exr", f"{path}: a transient ends in .exr")
     with whole_file(path) as beside:
         _write_exr(transient, beside)
 

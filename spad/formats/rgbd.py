@@ -86,7 +86,7 @@ def _alike(*images: np.ndarray) -> list[np.ndarray]:
     except (TypeError, ValueError) as error:
         raise InputError(f"RGB-D images: not an array of numbers ({error})") from None
     for image in given:
-        require(image.dtype.kind in "uif", f"RGB-D images: values are {image.dtype}, expected real numbers")
+        require(image.dtype.kind in "uif", f"RGB-D images: not an array of numbers (of {image.dtype})")
     arrays = [np.ma.filled(image.astype(np.float64), np.nan) for image in given]
     shapes = {array.shape for array in arrays}
     if len(shapes) != 1 or arrays[0].ndim != 2 or not arrays[0].size:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.errors import InputError, require, require_kind, require_whole
+from scenes.errors import InputError, require, require_kind, require_kinds, require_whole
 from scenes.files import ATTRIBUTE, check_seal, open_seal, seal, whole_file
-from scenes.io.hdf5 import USER_BLOCK, add_checksum, describe, open_checked, read_dataset
+from scenes.io.hdf5 import HDF5_SUFFIXES, USER_BLOCK, add_checksum, describe, open_checked, read_dataset
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.notebook import html_card
@@ -52,7 +52,7 @@ class Histogram:
     expected_signal, expected_background   (H, W) float32, detections per pixel and exposure
     meta                 seed, plan, what made the transient: anything JSON holds
 
-    Raises InputError for arrays of other types or shapes, and values below 0.
+    Raises InputError for fields of another kind, arrays of other types or shapes, and values below 0.
 
     Examples
     --------
@@ -76,6 +76,8 @@ class Histogram:
     meta: JsonObject = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        require_kinds(self, "histogram", sensor=Sensor, budget=PhotonBudget, meta=dict)
+        require_kinds(self, "histogram", **dict.fromkeys(("counts", *TRUTH), np.ndarray))
         if self.counts.ndim != 3 or self.counts.dtype != np.int32 or self.counts.shape[2] != self.sensor.bins:
             shape = f"{self.counts.dtype}{self.counts.shape}"
             raise InputError(f"histogram: counts are {shape}, expected int32 (H, W, {self.sensor.bins})")
@@ -241,7 +243,7 @@ def _checked_counts(counts: np.ndarray, bins: int) -> np.ndarray:
 def write_histogram(histogram: Histogram, path: Path) -> None:
     """Write HDF5, whole or not at all: timestamps where they are the smaller form, else dense counts.
 
-    Raises InputError where the path cannot be written.
+    Raises InputError for another ending than .h5 or .hdf5, and where the path cannot be written.
 
     Examples
     --------
@@ -258,6 +260,7 @@ def write_histogram(histogram: Histogram, path: Path) -> None:
 
     require_kind(histogram, Histogram, "write_histogram")
     require(isinstance(path, str | os.PathLike), f"write_histogram: expected a path, not {type(path).__name__}")
+    require(Path(path).suffix.lower() in HDF5_SUFFIXES, f"{path}: a histogram ends in .h5")
     meta = {**histogram.meta, "sensor": histogram.sensor.to_dict(), "budget": histogram.budget.to_dict()}
     packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     buffer = io.BytesIO()  # HDF5 itself does not survive a full disk

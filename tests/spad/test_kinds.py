@@ -1,12 +1,18 @@
 """Values of another kind than a number of its unit are refused in one line that names them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from render.transient import write_transient
 from scenes.errors import InputError
+from spad.detection.detect import sense
 from spad.formats.rgbd import transient_from_rgbd
+from spad.measurements.histogram import write_histogram
 from spad.sensor.budget import Optics
-from spad.sensor.model import Sensor
+from spad.sensor.files import load_sensor
+from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
 from spad.sensor.pulse import Pulse, SampledPulse, read_pulse
 from spad.sensor.tdc import Tdc
 
@@ -50,3 +56,62 @@ def test_numbers_of_numpy_are_numbers():
     assert Pulse(np.float64(1e-10)) == Pulse(1e-10) and type(Pulse(np.float32(1e-10)).sigma_s) is float
     assert SampledPulse(np.array([1, 2]), np.float64(1e-11)) == SampledPulse((1.0, 2.0), 1e-11)
     assert Tdc(2.5e-9, codes=np.int64(4)) == Tdc(2.5e-9, codes=4) and Optics(*np.array(LENS)) == Optics(*LENS)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"counts": None}, "histogram: counts: expected a ndarray, not NoneType"),
+        ({"counts": [[[1]]]}, "histogram: counts: expected a ndarray, not list"),
+        ({"sensor": "pf32"}, "histogram: sensor: expected a Sensor, not str"),
+        ({"budget": (1, 2)}, "histogram: budget: expected a PhotonBudget, not tuple"),
+        ({"mixed": None}, "histogram: mixed: expected a ndarray, not NoneType"),
+        ({"meta": None}, "histogram: meta: expected a dict, not NoneType"),
+    ],
+)
+def test_fields_of_a_histogram_are_of_their_kind(changed, message):
+    histogram = sense(WALL, Sensor(), PhotonBudget(5, 5), seed=0)
+    with pytest.raises(InputError, match=f"^{message}$"):
+        replace(histogram, **changed)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"meta": None}, "transient: meta: expected a dict, not NoneType"),
+        ({"offsets": None}, "transient: offsets: expected a ndarray, not NoneType"),
+        ({"mixed": [[True]]}, "transient: mixed: expected a ndarray, not list"),
+        ({"width": 2.0}, "transient: width 2.0, expected a whole number"),
+    ],
+)
+def test_fields_of_a_transient_are_of_their_kind(changed, message):
+    with pytest.raises(InputError, match=f"^{message}$"):
+        replace(WALL, **changed)
+
+
+def test_files_have_the_endings_that_readers_know(tmp_path):
+    with pytest.raises(InputError, match=r"w\.png: a transient ends in \.exr$"):
+        write_transient(WALL, tmp_path / "w.png")
+    with pytest.raises(InputError, match=r"w\.txt: a histogram ends in \.h5$"):
+        write_histogram(sense(WALL, Sensor(), PhotonBudget(5, 5), seed=0), tmp_path / "w.txt")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["pf32", "reference-tdc", "reference"])
+def test_sensors_of_the_packages_files_have_names(name):
+    assert sensor_by_name(name) == load_sensor(name).sensor
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (None, "sensor None, expected the name of one"),
+        ([], r"sensor \[\], expected the name of one"),
+        ("pf33", "sensor 'pf33' is unknown; did you mean 'pf32'.*expected one of reference, .*pf32"),
+        ("tmf8820", "sensor tmf8820 has zones, expected one of pixels"),
+        ("../x.toml", "sensor '../x.toml' is unknown"),
+    ],
+)
+def test_what_names_no_sensor_of_pixels_is_refused(name, message):
+    with pytest.raises(InputError, match=f"^{message}"):
+        sensor_by_name(name)
