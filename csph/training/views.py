@@ -13,7 +13,7 @@ import numpy as np
 
 from render.transient import Transient, read_transient
 from render.transient.packs import depth_steps, read_pack
-from scenes.errors import InputError, require
+from scenes.errors import InputError, require, tuple_of
 from scenes.files import whole_file
 from scenes.io.set_index import read_set_index
 from scenes.json_types import JsonObject
@@ -26,8 +26,15 @@ SEED_NOTE = re.compile(r"procedural, \w+ view \d+ of seed (\d+)")  # of a scene 
 VALIDATION_FRACTION = 0.1  # of a set's scenes, its last, where no validation set is given
 
 
-class Views(NamedTuple):
-    """Views of a rendered set and the names of the scenes that they show.
+class _Views(NamedTuple):
+    transients: tuple[Transient, ...]
+    scenes: tuple[str, ...]
+
+
+class Views(_Views):
+    """Views of a rendered set and the names of the scenes that they show, one for each view.
+
+    Raises InputError for no view, other objects than transients and text, and another number of names than views.
 
     Examples
     --------
@@ -40,8 +47,15 @@ class Views(NamedTuple):
     [2.0, 5.0]
     """
 
-    transients: tuple[Transient, ...]
-    scenes: tuple[str, ...]
+    __slots__ = ()
+
+    def __new__(cls, transients: Sequence[Transient], scenes: Sequence[str]) -> Views:
+        views = super().__new__(
+            cls, tuple_of(transients, Transient, "Views: transients"), tuple_of(scenes, str, "Views: scenes")
+        )
+        require(len(views.transients) > 0, "Views: a set has no view")
+        check_names(views, "Views")
+        return views
 
 
 def read_views(path: Path) -> Views:

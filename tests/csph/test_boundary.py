@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_numbers_of_numpy_become_those_that_json_holds(tmp_path):
         (None, PLANES, "train: training None, expected Views"),
         ("rooms", PLANES, "train: training 'rooms', expected Views"),
         (["rooms"], PLANES, "train: training: expected a Views of `read_views`, not str"),
-        (PLANES, Views((), ()), "train: validation: a set has no view"),
+        (PLANES, PLANES._replace(transients=(), scenes=()), "train: validation: a set has no view"),
         (PLANES._replace(scenes=()), PLANES, r"train: training: Views of \d+ transients and 0 names of scenes"),
     ],
 )
@@ -184,3 +185,25 @@ def test_torch_functions_of_a_layer_are_as_documented(design):
             transform(counts[None])
     with pytest.raises(RuntimeError):
         torch.autograd.functional.hessian(lambda one: layer(one).square().sum(), counts, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("transients", "scenes", "message"),
+    [
+        (("a",), ("b",), r"Views: transients\[0\]: expected a Transient, not str"),
+        (PLANES.transients[:1], (), "Views: Views of 1 transients and 0 names of scenes, expected as many"),
+        ((), (), "Views: a set has no view"),
+        (PLANES.transients[0], ("a",), "Views: transients: expected a list of Transient, not Transient"),
+        (PLANES.transients[:1], (3,), r"Views: scenes\[0\]: expected a str, not int"),
+        (PLANES.transients[:1], "a", "Views: scenes: expected a list of str, not str"),
+    ],
+)
+def test_views_are_transients_and_as_many_names(transients, scenes, message):
+    with pytest.raises(InputError, match=f"^{message}$"):
+        Views(transients, scenes)
+
+
+def test_views_stay_a_named_tuple():
+    again = pickle.loads(pickle.dumps(PLANES))
+    assert type(again) is Views and len(again.transients) == len(again.scenes)
+    assert again[1] == PLANES.scenes and repr(PLANES).startswith("Views(transients=(Transient(")
