@@ -24,6 +24,7 @@ NAME = "scene2spad"
 TEMPORAL_BINS = 1024
 BIN_WIDTH_OPL_M = SPEED_OF_LIGHT_M_PER_S * 100e-9 / TEMPORAL_BINS  # of the reference sensor: 100 ns in 1,024 bins
 VARIANTS = ("_mono", "_rgb")
+_registered: set[str] = set()  # names, which may be registered again for another variant
 CHUNK = 1 << 20  # returns binned at once
 
 
@@ -39,9 +40,10 @@ def register_integrator(name: str = NAME) -> None:
     Raises
     ------
     InputError
-        For another variant; and by the render for a shape, material or camera that has no counterpart here. `mi.render`
-        and `mi.load_dict` raise a RuntimeError of their own in its place, whose first line they write: the first has it
-        as its `__cause__`, the second ends with its words. `scene.integrator().render(scene)` raises it as it is.
+        For another variant, and a name that is no text or a plugin of Mitsuba's own; and by the render for a shape,
+        material or camera that has no counterpart here. `mi.render` and `mi.load_dict` raise a RuntimeError of their
+        own in its place, whose first line they write: the first has it as its `__cause__`, the second ends with its
+        words. `scene.integrator().render(scene)` raises it as it is.
 
     Examples
     --------
@@ -50,6 +52,7 @@ def register_integrator(name: str = NAME) -> None:
     >>> import mitsuba as mi
     >>> integrator = mi.load_dict({"type": "scene2spad", "temporal_bins": 512, "error": 0.05})
     """
+    require(isinstance(name, str) and bool(name), f"register_integrator: name {name!r}, expected text")
     if "mitsuba" not in sys.modules or sys.modules["mitsuba"].variant() is None:
         start_mitsuba()
     import mitsuba as mi
@@ -57,7 +60,11 @@ def register_integrator(name: str = NAME) -> None:
     variant = str(mi.variant())
     require(variant.endswith(VARIANTS), f"variant {variant}: the integrator knows those in mono and rgb")
 
+    known = mi.PluginManager.instance().plugin_type(name)
+    free = name in _registered or known == mi.ObjectType.Unknown
+    require(free, f"register_integrator: {name!r} is a plugin of Mitsuba already ({known.name}), choose another name")
     mi.register_integrator(name, _integrator_class(name, variant))
+    _registered.add(name)
 
 
 def _integrator_class(name: str, variant: str) -> type:

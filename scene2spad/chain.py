@@ -265,7 +265,8 @@ def coding_tensor(code: str, codes: int, sensor: Sensor | str | Path = "referenc
     Raises
     ------
     InputError
-        For an unknown code, a number of codes that is not whole (8.0 is none), or more codes than it has.
+        For an unknown code, a number of codes that is not whole (8.0 is none), more codes than it has, or a seed that
+        is no whole number from 0 on.
 
     Examples
     --------
@@ -277,6 +278,7 @@ def coding_tensor(code: str, codes: int, sensor: Sensor | str | Path = "referenc
     from spad.sensor.files import pixel_sensor
 
     chosen = pixel_sensor(sensor)
+    _check_seed(seed)
     return CodingTensor(f"{code}-{codes}", temporal_code(code, codes, chosen.bins, chosen, seed))
 
 
@@ -315,6 +317,7 @@ def depth_errors(depth_m: np.ndarray, histogram: Histogram, *, unmixed: bool = F
     from spad.measurements.histogram import Histogram
 
     require_kind(histogram, Histogram, "depth_errors", " as the truth")
+    require(isinstance(unmixed, bool | np.bool_), f"depth_errors: unmixed {unmixed!r}, expected True or False")
     exclude = histogram.mixed if unmixed else None
     return histogram_errors(depth_m, histogram, exclude=exclude)
 

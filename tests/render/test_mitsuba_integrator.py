@@ -149,3 +149,19 @@ np.testing.assert_allclose(*found, rtol=3e-4, atol=1e-6 * found[1].max())  # Rec
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (5, "name 5, expected text"),
+        ("", "name '', expected text"),
+        ("path", r"'path' is a plugin of Mitsuba already \(Integrator\), choose another name"),
+        ("diffuse", r"'diffuse' is a plugin of Mitsuba already \(BSDF\), choose another name"),
+    ],
+)
+def test_names_of_other_plugins_are_refused(name, message):
+    with pytest.raises(InputError, match=f"^register_integrator: {message}$"):
+        register_integrator(name)
+    for _ in range(2):
+        register_integrator("mine")
