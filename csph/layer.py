@@ -138,8 +138,8 @@ class CompressiveLayer(nn.Module):
         unknown = [name for name in learned if parts.get(name) is None]
         require(not unknown, f"coding tensor {coding.name} has no part {', '.join(unknown)} to learn")
         self.name, self.block, self.codes, self.computed = coding.name, coding.block, coding.codes, coding.computed
-        require_kind(options or LayerOptions(), LayerOptions, "CompressiveLayer: options")
-        self.options = options or LayerOptions()
+        self.options = LayerOptions() if options is None else options
+        require_kind(self.options, LayerOptions, "CompressiveLayer: options")
         for name, part in parts.items():
             copied = None if part is None else part.clone()
             if copied is not None and name in learned:

@@ -53,7 +53,8 @@ class RenderSettings:
                 and reflections in it are blurred by some pixels
     error       target of the relative error (nRMSE of the expected counts on the reference sensor after the pulse)
     min_spp     least paths per pixel of indirect light where `spp` is open, also where a pilot sees little noise
-    target_fraction  part of the squared target that is planned for; the rest is for what pilots miss
+    target_fraction  part of the squared target that is planned for; the rest is for what pilots miss. Above 1 where
+                renders are known to come out better than planned
     direct_fraction  part of the target that direct light may be off where there is other light
     budget      (signal, background) photons per pixel: Monte-Carlo variance stays under 1 % of shot variance there
     edge_threshold  edges of surfaces and shadows are followed where they could change this share of a cell or more;

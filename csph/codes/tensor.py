@@ -6,6 +6,7 @@ one column of C.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from csph.codes.photons import encode_photons, photon_table
-from scenes.errors import InputError, require, require_kind
+from scenes.errors import InputError, require, require_kind, require_kinds, require_number
 from spad.estimators.depth import by_pixels
 
 
@@ -31,7 +32,7 @@ class CodingTensor:
               already, as those of a layer trained with `int8`; None for others
 
     Both parts are copied, and kept in float32, also those given in float64 or 16 bits. Raises InputError for other
-    shapes, values that are not finite, or not in float32, and more codes than counts.
+    shapes, values that are not finite, or not in float32, more codes than counts, and steps that are not above 0.
 
     Examples
     --------
@@ -51,6 +52,7 @@ class CodingTensor:
     steps: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        require_kinds(self, "coding tensor", name=str)
         for label, ranks, layout in (
             ("temporal", (2, 4), "(K, Mt) or (K, Mt, Mr, Mc)"),
             ("spatial", (3,), "(K, Mr, Mc)"),
@@ -70,6 +72,8 @@ class CodingTensor:
             alike = self.temporal.ndim == 2 and len(self.spatial) == len(self.temporal)
             shapes = f"temporal part {tuple(self.temporal.shape)} and spatial part {tuple(self.spatial.shape)}"
             require(alike, f"coding tensor {self.name}: {shapes}, expected (K, Mt) and (K, Mr, Mc)")
+        if self.steps is not None:
+            object.__setattr__(self, "steps", _pair_of_steps(self.steps, f"coding tensor {self.name}: steps"))
         size = self.bins * self.rows * self.columns
         require(self.codes <= size, f"coding tensor {self.name}: {self.codes} codes of a block of {size} counts")
 
@@ -133,6 +137,15 @@ class CodingTensor:
         return temporal + self.parameters - self.temporal.numel()
 
 
+def _pair_of_steps(steps: object, what: str) -> tuple[float, float]:
+    pair = isinstance(steps, list | tuple) and len(steps) == 2
+    require(pair, f"{what} {steps!r}, expected a pair of numbers above 0")
+    temporal, spatial = (require_number(step, f"{what} of") for step in steps)  # type: ignore[attr-defined]
+    good = 0 < temporal < math.inf and 0 < spatial < math.inf
+    require(good, f"{what} of {temporal:g} and {spatial:g}, expected both above 0")
+    return temporal, spatial
+
+
 def full_tensor(temporal: Tensor, spatial: Tensor | None) -> Tensor:
     """Return C[k, t, r, c] = temporal[k, t] spatial[k, r, c], or the full tensor that `temporal` is: (K, Mt, Mr,
     Mc)."""
@@ -167,7 +180,8 @@ def as_tensor(values: Tensor | np.ndarray) -> Tensor:
 def encode(counts: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
     """Return y = C n of every pixel: counts (..., T) -> codes (..., K) float32, C over one pixel and all T bins.
 
-    `counts` may be a numpy array. Raises InputError for another number of bins.
+    `counts` may be a numpy array. Raises InputError for another number of bins, and counts that are NaN or infinite,
+    which their codes show. Counts below 0 are not looked for: that takes as long as the codes of few rows.
     Blocks of several pixels: `csph.codes.blocks.encode_blocks`.
 
     Examples
@@ -189,6 +203,8 @@ def encode(counts: Tensor | np.ndarray, coding: CodingTensor) -> Tensor:
         return torch.empty((*counts.shape[:-1], coding.codes), device=counts.device)
     columns = coding.tensor.flatten(1).to(counts.device).T
     codes = by_pixels(lambda part: part.float() @ columns, counts.reshape(-1, coding.bins))
+    finite = not counts.is_floating_point() or bool(codes.isfinite().all())
+    require(finite, f"codes of {coding.name} are not finite: the counts hold NaN or infinite values")
     return codes.reshape(*counts.shape[:-1], coding.codes)
 
 

@@ -100,7 +100,7 @@ def write_ply(
     Raises
     ------
     InputError
-        For arrays of other sizes, another ending, and where the file cannot be written.
+        For arrays of other sizes, no point that is known, another ending, and where the file cannot be written.
 
     Examples
     --------
@@ -117,6 +117,7 @@ def write_ply(
     shaped = points.ndim >= 1 and points.shape[-1] == 3 and points.dtype.kind in "iuf"
     require(shaped, f"{path}: points are {points.dtype}{points.shape}, expected numbers (..., 3)")
     known = np.isfinite(points).all(axis=-1)
+    require(bool(known.any()), f"{path}: none of {known.size} points is known, a cloud of none is not written")
     columns = {axis: points[known][:, i].astype("<f4") for i, axis in enumerate("xyz")}
     for name, given in (("intensity", intensity), ("confidence", confidence)):
         values = np.ones(known.shape) if given is None else np.asarray(given)

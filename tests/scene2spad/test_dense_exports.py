@@ -246,6 +246,8 @@ def test_points_lie_at_the_depth_that_is_given():
         (lambda t, h: s2s.points(h, -h.depth_m), r"points: depth_m: a depth of -[\d.]+ m, expected 0 or more, or none"),
         (lambda t, h: s2s.points(s2s.Histogram.from_counts(h.counts, SENSOR)), "points: does not say which camera"),
         (lambda t, h: s2s.write_ply(np.ones((2, 2)), "a.ply"), r"a.ply: points are float64\(2, 2\)"),
+        (lambda t, h: s2s.write_ply(np.full((2, 3), np.nan), "a.ply"), "a.ply: none of 2 points is known"),
+        (lambda t, h: s2s.write_ply(np.ones((0, 3)), "a.ply"), "a.ply: none of 0 points is known"),
         (lambda t, h: s2s.write_ply(np.ones((2, 3)), "a.obj"), "a.obj: a point cloud ends in .ply"),
         (lambda t, h: s2s.write_ply(np.ones((2, 3)), "a.ply", intensity=np.ones(3)), r"intensity is float64\(3,\)"),
         (lambda t, h: s2s.write_ply(np.ones((2, 3)), 3), "write_ply: expected a path, not int"),

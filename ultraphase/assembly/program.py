@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.errors import require
+from scenes.errors import require, require_kinds, tuple_of
 from ultraphase.assembly.isa import Instruction, decode, encode, format_instruction
 from ultraphase.chip import ChipSpec, chosen_chip
 
@@ -48,6 +48,8 @@ class Program:
     labels   name -> word
     timestamps   how many it knows, from 0 on; larger ones are refused, as tables would fold them. None: all of 16 bits
 
+    Raises InputError for fields of another kind; `assemble` makes one.
+
     Examples
     --------
     A coarse histogram has 16 counters of 8 bits in RAM. A photon adds 1 to one of them, each of which is 64 of the 1024
@@ -70,6 +72,12 @@ class Program:
     labels: Mapping[str, int]
     lines: tuple[tuple[str, int], ...]
     timestamps: int | None = None
+
+    def __post_init__(self) -> None:
+        require_kinds(self, "program", name=str, labels=Mapping, lines=tuple)
+        where = f"program {self.name}"
+        object.__setattr__(self, "instructions", tuple_of(self.instructions, Instruction, f"{where}: instructions"))
+        object.__setattr__(self, "regions", tuple_of(self.regions, Region, f"{where}: regions"))
 
     @property
     def words(self) -> tuple[int, ...]:
