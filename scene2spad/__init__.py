@@ -46,8 +46,9 @@ if TYPE_CHECKING:
     from spad.formats.rgbd import transient_from_rgbd
     from spad.measurements.histogram import Histogram, read_histogram, write_histogram
     from spad.sensor.budget import Optics
-    from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+    from spad.sensor.model import PhotonBudget, Sensor
     from spad.sensor.pulse import Pulse, read_pulse
+    from spad.sensor_names import sensor_by_name
     from ultraphase import ChipSpec, Core, CoreArray, Program, assemble, verify
 
 _MODULE_OF: dict[str, tuple[str, ...]] = {
@@ -66,7 +67,8 @@ _MODULE_OF: dict[str, tuple[str, ...]] = {
     "render.mitsuba_integrator": ("register_integrator",),
     "render.settings": ("RenderSettings",),
     "render.transient": ("Transient", "read_transient", "write_transient"),
-    "spad.sensor.model": ("PhotonBudget", "Sensor", "sensor_by_name"),
+    "spad.sensor.model": ("PhotonBudget", "Sensor"),
+    "spad.sensor_names": ("sensor_by_name",),
     "spad.sensor.pulse": ("Pulse", "read_pulse"),
     "spad.sensor.budget": ("Optics",),
     "spad.formats.dense": ("dense", "write_dense"),

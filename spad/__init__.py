@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from spad.detection.detect import sense
     from spad.estimators.depth import estimate_depth
     from spad.measurements.histogram import Histogram, read_histogram, write_histogram
-    from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+    from spad.sensor.model import PhotonBudget, Sensor
     from spad.sensor.pulse import Pulse
+    from spad.sensor_names import sensor_by_name
 
 __all__ = [
     "Histogram",
@@ -34,7 +35,8 @@ __getattr__, __dir__ = lazy_names(
         "spad.detection.detect": ("sense",),
         "spad.estimators.depth": ("estimate_depth",),
         "spad.measurements.histogram": ("Histogram", "read_histogram", "write_histogram"),
-        "spad.sensor.model": ("PhotonBudget", "Sensor", "sensor_by_name"),
+        "spad.sensor.model": ("PhotonBudget", "Sensor"),
+        "spad.sensor_names": ("sensor_by_name",),
         "spad.sensor.pulse": ("Pulse",),
     },
 )

@@ -267,9 +267,8 @@ PRESETS: dict[str, Sensor] = {
 
 
 def sensor_by_name(name: str) -> Sensor:
-    """Return the preset of that name, or that of a sensor file of the package; an InputError lists the names.
-
-    One of zones, as tmf8820, is refused: its `Sensor` alone has no pixels to record with (`scene2spad sense` takes it).
+    """Return the preset of that name, or an InputError that lists the names. `spad.sensor_names` knows those of files,
+    too.
 
     Examples
     --------
@@ -278,15 +277,11 @@ def sensor_by_name(name: str) -> Sensor:
     >>> sensor.bins, round(sensor.period_s * 1e9), round(sensor.range_m, 2)  # bins, ns, m
     (1024, 100, 14.99)
     """
-    require(isinstance(name, str), f"sensor {name!r}, expected the name of one")
-    if name in PRESETS:
-        return PRESETS[name]
-    from spad.sensor.files import pixel_sensor, preset_files, sensor_names  # which reads files into `Sensor`
-
-    names = sensor_names()
-    unknown = f"sensor {name!r} is unknown{did_you_mean(name, names)}, expected one of {', '.join(names)}"
-    require(name in preset_files(), unknown)
-    return pixel_sensor(name)
+    require(
+        isinstance(name, str) and name in PRESETS,
+        f"sensor {name!r} is unknown{did_you_mean(str(name), PRESETS)}, expected one of {', '.join(PRESETS)}",
+    )
+    return PRESETS[name]
 
 
 def detector_maps(

@@ -12,9 +12,10 @@ from spad.formats.rgbd import transient_from_rgbd
 from spad.measurements.histogram import write_histogram
 from spad.sensor.budget import Optics
 from spad.sensor.files import load_sensor
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse, read_pulse
 from spad.sensor.tdc import Tdc
+from spad.sensor_names import sensor_by_name
 
 ONES = np.ones((2, 2))
 WALL = transient_from_rgbd(ONES, ONES, ONES)
