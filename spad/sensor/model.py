@@ -122,8 +122,9 @@ class Sensor:
             require(
                 math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite"
             )
-        for label, fraction in (("hot", self.hot_share), ("dead", self.dead_share)):
-            require(0 <= fraction <= 1, f"{where}: share of {label} pixels {fraction:g} is outside 0 to 1")
+        for label in ("hot_share", "dead_share"):
+            fraction = getattr(self, label)
+            require(0 <= fraction <= 1, f"{where}: {label} {fraction:g} is outside 0 to 1")
         dark = f"{where}: hot_rate_hz 0 with hot_share {self.hot_share:g}: hot pixels would be dark"
         require(self.hot_rate_hz > 0 or not self.hot_share, f"{dark}, expected a rate above 0, such as {HOT_RATE_HZ:g}")
         require(0 < self.pde <= 1, f"{where}: PDE {self.pde:g} is outside (0, 1]")

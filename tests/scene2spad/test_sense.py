@@ -195,7 +195,7 @@ def test_a_bad_input_is_told_before_a_bad_output(scene, capfd, tmp_path):
         (["--sensor", "tmf8820", "--exposure", "1"], "--exposure does not go with a sensor of zones"),
         (["--radiometric", "--signal", "3"], "leave out --signal"),
         (["--pde", "2"], "PDE 2"),
-        (["--hot-pixels", "2"], "share of hot pixels 2 is outside 0 to 1"),
+        (["--hot-pixels", "2"], "--hot-pixels 2 is outside 0 to 1"),
         (["--dead-time", "1e-6", "--model", "first-photon"], "use free-running"),
         (["--exposure", "1e-12"], "shorter than the period"),
         (["--sensor", "retina"], "retina"),

@@ -89,7 +89,11 @@ def changed_sensor(sensor: Sensor, command: Sense) -> Sensor:
     pulse = _asked_pulse(command)
     if pulse is not None:
         changes["pulse"] = pulse
-    return replace(sensor, **changes)
+    try:
+        return replace(sensor, **changes)
+    except InputError as error:  # speaks of fields
+        words = str(error).replace("hot_share", "--hot-pixels").replace("dead_share", "--dead-pixels")
+        raise InputError(words) from None
 
 
 def _asked_pulse(command: Sense) -> AnyPulse | None:
