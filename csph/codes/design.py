@@ -16,6 +16,8 @@ _QUARTER_WAVE = ("fourier", "gray", "fourier-published", "gray-published")
 _COUNTED = ("coarse", "hadamard")  # an entry follows from its place: nothing is stored
 OWN = "own"  # fixed codes of a user's file (`csph.codes.files.own_codes`), which have no other name
 _FREE = ("learned", "random", OWN)  # K is limited by the block alone, and every entry may be a number of its own
+MAX_BINS = 65536  # of a block: as many as a sensor has
+MAX_PARAMETERS = 1 << 28  # 1 GiB: a full tensor of as many codes as a block of 1024 x 4 x 4 has counts
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,8 @@ class Design:
                      which stay as their file has them
     sha256           of the file of own codes; empty for others
 
-    Raises InputError for an unknown code, fields of another kind, and a number of codes that is not whole or more than
-    it has.
+    Raises InputError for an unknown code, fields of another kind, a number of codes that is not whole or more than it
+    has, a block of more than MAX_BINS bins, and more than MAX_PARAMETERS parameters.
 
     Examples
     --------
@@ -71,6 +73,9 @@ class Design:
         require(self.code in _FREE or not self.full, f"design {self.code}: full coding tensors are learned or random")
         hashed = isinstance(self.sha256, str) and bool(self.sha256) == (self.code == OWN)
         require(hashed, f"design {self.code}: sha256 {self.sha256!r}, expected that of a file of own codes alone")
+        size = f"{'full ' if self.full else ''}{self.code}, {self.codes} codes over a block of {self.block_name}"
+        large = f"design {size}: {self.parameters} parameters are above the limit of {MAX_PARAMETERS}"
+        require(self.parameters <= MAX_PARAMETERS, large)
         several = self.full == (math.prod(self.block[1:]) > 1) and not self.spatial_learned
         require(
             self.code != OWN or several, f"design {OWN}: codes over several pixels are full, and nothing is learned"
@@ -99,13 +104,15 @@ class Design:
         require(not plus or second == "learned", f"design {name!r}: expected CODE or CODE+learned")
         known = f"expected one of {', '.join(CODES)}, or CODE+learned"
         require(code in CODES, f"design {name!r} is unknown{did_you_mean(code, CODES)}, {known}")
-        alone = code in ("learned", "random") or plus or math.prod(block[1:]) == 1
-        require(bool(alone), f"design {name!r} over {block[1]} x {block[2]} pixels has no spatial part: {code}+learned")
         if codes is None and compression is not None:
             codes = codes_for(block, compression)
         elif codes is None or compression is not None:
             raise InputError(f"design {name!r}: give the number of codes or the compression ratio, one of them")
-        return cls(code, block, codes, full=full, spatial_learned=code == "learned" or bool(plus))
+        design = cls(code, block, codes, full=full, spatial_learned=code == "learned" or bool(plus))
+        alone = code in ("learned", "random") or plus or math.prod(block[1:]) == 1
+        cure = f"has no spatial part: {code}+learned has one, or take a block of one pixel, {block[0]} x 1 x 1"
+        require(bool(alone), f"design {name!r} over a block of {design.block_name} {cure}")
+        return design
 
     @property
     def size(self) -> int:
@@ -179,6 +186,7 @@ def _block_of(block: Sequence[int] | np.ndarray) -> tuple[int, int, int]:
     good = len(sides) == 3 and all(isinstance(n, Integral) and not isinstance(n, bool) and int(n) >= 1 for n in sides)
     require(good, f"block {block!r}: expected three positive whole numbers of bins, rows and columns")
     bins, rows, columns = map(int, sides)
+    require(bins <= MAX_BINS, f"block {' x '.join(map(str, sides))}: {bins} bins are above the limit of {MAX_BINS}")
     return bins, rows, columns
 
 

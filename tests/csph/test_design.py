@@ -2,7 +2,7 @@
 
 import pytest
 
-from csph.codes.design import Design, codes_for
+from csph.codes.design import MAX_PARAMETERS, Design, codes_for
 from csph.layer import CompressiveLayer, make_coding
 from scenes.errors import InputError
 
@@ -77,6 +77,12 @@ def test_names_and_learned_parts():
     assert not Design("coarse", (64, 1, 1), 8).zero_mean and Design("fourier", (64, 1, 1), 8).zero_mean
 
 
+def test_the_largest_designs_can_be_named():
+    """The paper's largest block without compression, and every bin of the longest sensor."""
+    assert Design("learned", (1024, 4, 4), 16384, full=True).parameters == MAX_PARAMETERS
+    assert Design("fourier", (65536, 1, 1), 64).block_name == "65536 x 1 x 1"
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -92,7 +98,17 @@ def test_names_and_learned_parts():
         (lambda: Design.named("fourier", (64, 4, 4), codes=4), "no spatial part: fourier.learned"),
         (lambda: Design.named("fourier+fixed", (64, 4, 4), codes=4), "CODE.learned"),
         (lambda: Design.named("fourier", (64, 1, 1)), "one of them"),
+        (lambda: Design.named("fourier", (300, 4, 4), codes=8), "over a block of 300 x 4 x 4 has no spatial part"),
+        (lambda: Design.named("fourier", (64, 4, 4), codes=0), "0 codes over a block of 64 x 4 x 4, .* from 1 to 64"),
+        (lambda: Design.named("fourier", (64, 4, 4), codes=999), "999 codes over .*, expected a whole number from 1 to"),
         (lambda: make_coding(Design("coarse", (64, 1, 1), 5)), "5 gates do not divide"),
+        (lambda: Design("learned", (100_000_000, 4, 4), 32), "100000000 bins are above the limit of 65536"),
+        (lambda: Design.named("learned", (65537, 1, 1), codes=1), "block 65537 x 1 x 1: 65537 bins are above"),
+        (
+            lambda: make_coding(Design("learned", (1024, 8, 8), 65536, full=True)),
+            "full learned, 65536 codes over a block of 1024 x 8 x 8: 4294967296 parameters are above the limit of 268",
+        ),
+        (lambda: Design("learned", (16, 10_000, 10_000), 8), "800000128 parameters are above the limit"),
     ],
 )
 def test_designs_that_cannot_be_end_in_one_line(make, message):
