@@ -26,6 +26,7 @@ from deepinv_stand_in import provide_deepinv
 from test_readability import PAGES, ROOT
 
 from scene2spad.cli.main import main
+from scene2spad.options.experiments import NO_PRESET
 from spad.sensor.files import read_sensor
 
 # Options of a command that are small here: as they stand in place of the page's, or added.
@@ -97,7 +98,7 @@ def shrunk(words: list[str]) -> list[str]:
     small = dict(SMALL.get(words[0], {}))
     if words[0] == "render" and words[1].endswith(".png"):
         small = {"--bounces": "1"}  # the photograph says the size
-    if "--dry-run" in words or (words[0] == "study" and "--preset" in words):
+    if "--dry-run" in words or (words[0] == "study" and ("--preset" in words or words[1] in NO_PRESET)):
         small = {}
     kept, skipping = [], False
     for word in words:

@@ -73,7 +73,10 @@ StudyName = Literal[
     "all",
 ]
 STUDIES: tuple[str, ...] = tuple(name for name in get_args(StudyName) if name != "all")
-# Options that some studies read, and which ones; the others are of all studies, or of those of trained models.
+# Studies that train, with --retrain, what they do not find.
+TRAINING = ("chip", "depth-offset", *ABLATIONS, "transport", "multipath", "tdc")
+NO_PRESET = ("tensors", "memory", "codes")  # studies whose results are the same with every preset
+# Options that some studies read, and which ones; the others are of all studies.
 OPTIONS_OF: dict[str, tuple[str, ...]] = {
     "checkpoints": ("tensors", "render-error", "real-data"),
     **dict.fromkeys(("design", "block", "codes"), ("tensors",)),
@@ -84,6 +87,9 @@ OPTIONS_OF: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("signal", "background"), ("power",)),
     **dict.fromkeys(("scene_set", "views", "cache"), ("render-error",)),
     **dict.fromkeys(("capture", "frame"), ("real-data",)),
+    **dict.fromkeys(("retrain", "set"), TRAINING),
+    "models": (*TRAINING, "power"),
+    "preset": tuple(name for name in STUDIES if name not in NO_PRESET),
 }
 
 
@@ -126,7 +132,8 @@ class Study(Long):
     retrain: bool = False
     """Train what is not finished in --models, and use no model that came with the package."""
     set: Annotated[Path | None, may_stay_open("SET")] = None
-    """Set that --retrain trains on, as in `train` (default: 2,000 rooms, rendered into --out)."""
+    """Set that --retrain or smoke trains on, as in `train` (default: 2,000 rooms, rendered into --out; planes of smoke).
+    `study depth-offset` reads from it also how far models see whose runs do not say it."""
     ship: bool = False
     """Put the models found into the package in half precision, with configuration and training log."""
     scene: str = "tabletop/kitchen"

@@ -11,7 +11,7 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
-from scene2spad.options.experiments import ABLATIONS, STUDIES, Study
+from scene2spad.options.experiments import ABLATIONS, NO_PRESET, STUDIES, Study
 from scenes.errors import InputError
 from scenes.files import append_line
 from scenes.io.inputs import read_whole_lines
@@ -23,7 +23,6 @@ log = logging.getLogger("scene2spad")
 TIMINGS = "timings.jsonl"
 ALL = "all"
 JOURNAL = "study-all.jsonl"
-NO_PRESET = ("tensors", "memory", "codes")  # studies whose results are the same with every preset
 SMOKE_MARK = "smoke run: toy size or trained for seconds"
 
 

@@ -254,6 +254,7 @@ def test_evaluate_on_the_published_pairs_reads_both_decoders(tmp_path, monkeypat
 
 def test_no_model_and_bad_models_are_one_line(capfd, tmp_path, monkeypatch):
     monkeypatch.setattr("scene2spad.networks.lookup.WEIGHTS", tmp_path)
+    (tmp_path / "empty").mkdir()
     assert main(["study", "depth-offset", "--out", str(tmp_path), "--models", str(tmp_path / "empty")]) == 2
     out, err = capfd.readouterr()
     assert out == "" and "holds none of the 20 models" in err.splitlines()[-1] and "Traceback" not in err

@@ -94,3 +94,49 @@ def test_a_render_that_cannot_be_is_refused_before_it_begins(tmp_path, capsys, m
     assert main(["render", *words.split(), "--out", str(tmp_path / "out.exr")]) == 2
     message = capsys.readouterr().err
     assert why in message and message.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("tensors --design nosuch", "design 'nosuch' is unknown"),
+        ("tensors --design learned --block 0 4 4", "block (0, 4, 4): expected three positive whole numbers"),
+        ("tensors --design learned --block 100000000 4 4", "100000000 bins are above the limit of 65536"),
+        ("tensors --design fourier --codes 0", "0 codes over a block of 256 x 4 x 4, expected a whole number from 1 to"),
+        ("tensors --design fourier --codes 99999", "99999 codes over a block of 256 x 4 x 4, expected a whole number"),
+        ("tensors --design fourier --block 300 4 4", "design 'fourier' over a block of 300 x 4 x 4 has no spatial part"),
+        ("tensors --block 300 4 4", "study tensors: --block 300 4 4 is for a --design"),
+        ("tensors --checkpoints nosuch.npy", "nosuch.npy: file not found"),
+        ("power --signal -1", "photon budget: signal -1 photons per pixel is outside 0 to 1e9"),
+        ("power --background nan", "photon budget: background nan photons"),
+        ("power --width 6", "width 6: expected a multiple of 4"),
+        ("all --signal -1", "photon budget: signal -1 photons per pixel is outside 0 to 1e9"),
+        ("codes --height 1000000", "study codes: --height 1000000 is outside 1 to 16384 pixels"),
+        ("codes --scene castle", "scene 'castle': expected one of"),
+        ("codes --scene castle.obj", "castle.obj: file not found"),
+        ("render-error --views 0", "views 0 is outside 1 to"),
+        ("render-error --cache file.txt", "file.txt: is a file, expected a folder for the renders"),
+        ("real-data --capture nosuch.mat", "nosuch.mat: file not found"),
+        ("real-data --frame 3", "study real-data: --frame 3 is for captures in files (--capture)"),
+        ("chip --models nosuch", "nosuch: folder of models not found (--models)"),
+        ("chip --models file.txt", "file.txt: is a file, expected a folder of models (--models)"),
+        ("chip --retrain --models file.txt", "file.txt: is a file, expected a folder for the models"),
+        ("chip --retrain --set nosuch.h5", "nosuch.h5: file not found (--set)"),
+        ("chip --set nosuch.h5", "--set nosuch.h5 is for models that are trained (--retrain or --preset smoke)"),
+        ("transport --preset smoke --set nosuch.h5", "--set nosuch.h5 is for models that are trained"),
+        ("tensors --retrain", "study tensors: --retrain is for study chip, depth-offset"),
+        ("memory --models nosuch", "study memory: --models nosuch is for study chip, depth-offset"),
+        ("power --set nosuch.h5", "study power: --set nosuch.h5 is for study chip, depth-offset"),
+        ("codes --preset paper", "study codes: --preset paper is for study power, chip, depth-offset"),
+    ],
+)
+@pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+def test_a_study_that_cannot_be_is_refused_before_it_is_loaded(tmp_path, capsys, monkeypatch, words, why, dry):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file.txt").write_text("mine")
+    monkeypatch.setattr("scene2spad.studies.every.run_one", None)
+    monkeypatch.setattr("scene2spad.dry_runs.studies.dry_run", None)
+    assert main(["study", *words.split(), *dry]) == 2
+    message = capsys.readouterr().err
+    assert why in message and message.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]

@@ -194,13 +194,18 @@ def test_studies_take_shipped_models_by_name(study, capfd, monkeypatch):
 
 
 def test_the_table_of_options_is_what_studies_read():
-    """Every option that a study's module reads from the command, and none that its module does not."""
+    """Every option that a study's module reads from the command, and none that its module does not; what it hands to
+    those that look models up is read there."""
+    trained = {"models", "preset", "retrain", "set"}
+    lookups = {"obtain": trained, "found_only": {"models", "preset"}}
     for name in STUDIES:
         stem = "ablations" if name in ("spatial-block", "tensor-size", "fourier") else name.replace("-", "_")
         room = STUDY_ROOM / stem
         paths = [*room.rglob("*.py")] if room.is_dir() else [STUDY_ROOM / f"{stem}.py"]
         text = "\n".join(path.read_text(encoding="utf-8") for path in paths)
         read = {option for option in OPTIONS_OF if re.search(rf"command\.{option}\b", text)}
+        for lookup, options in lookups.items():
+            read |= options if re.search(rf"\b{lookup}\(", text) else set()
         assert read == {option for option, names in OPTIONS_OF.items() if name in names}, name
 
 

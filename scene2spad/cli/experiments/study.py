@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from scene2spad.cli.experiments.study_checks import check_study
 from scene2spad.cli.paths import output_folder
-from scene2spad.options.common import only_for
-from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study
+from scene2spad.options.experiments import STUDIES, Study
 from scenes.progress import Progress
 
 
 def run(command: Study, progress: Progress) -> dict:
     """Run the command: one study or all of them, or say what that would take."""
     output_folder(command.out, "the figures")
-    if command.name != "all":
-        purposes = {
-            option: (command.name in names, f"study {', '.join(names)}") for option, names in OPTIONS_OF.items()
-        }
-        only_for(command, f"study {command.name}", purposes)
+    check_study(command)
     if not command.dry_run:
         from scene2spad.plots.style import with_pdf
         from scene2spad.studies import every
