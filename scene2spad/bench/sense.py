@@ -60,7 +60,7 @@ def run(command: Bench, progress: Progress) -> dict:
     """
     out: Path = command.out
     require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
-    repeats, scenes = max(3, command.repeats), estimators.scenes_of(command)
+    repeats, scenes = command.repeats, estimators.scenes_of(command)
     progress("seconds", 0.0)
     rows = [
         *against_dense(command.seed, repeats),

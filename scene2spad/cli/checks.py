@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import csph.weights
+from scene2spad.cli.paths import begins
 from scenes.errors import require
 from scenes.model import MAX_IMAGE_SIDE
 
@@ -16,6 +17,11 @@ def check_image(where: str, **sides: int | None) -> None:
     for option, side in sides.items():
         good = side is None or 1 <= side <= MAX_IMAGE_SIDE
         require(good, f"{where}: --{option} {side} is outside 1 to {MAX_IMAGE_SIDE} pixels")
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Tell by its first bytes whether a file is a checkpoint of `train`: the length of its header, which is JSON."""
+    return begins(path, rb".{8}\{")
 
 
 def check_model(path: Path) -> None:

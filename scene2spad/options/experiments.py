@@ -8,6 +8,9 @@ from typing import Annotated, Literal, get_args
 
 from scene2spad.options.common import Common, Count, File, Long, Number, Positional, may_stay_open, word
 
+MIN_SENSE_REPEATS = 3  # of `bench sense`
+MAX_HEADROOM_BITS = 4  # of the 7 that a code on the chip has
+
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Common):
@@ -31,7 +34,8 @@ class Bench(Common):
     peer: Literal["mitransient", "none"] = "mitransient"
     """The renderer beside ours; none measures ours alone, against its own finer results."""
     repeats: int = 3
-    """Warm runs of each quality; their median is reported. `sense` takes 3 or more, `encode` three times as many."""
+    """Warm runs of each quality; their median is reported. `sense` needs 3 or more, `encode` makes three times as
+    many."""
     seeds: int = 3
     """Runs of different seeds that the error is averaged over."""
     memory: bool = False
@@ -132,8 +136,8 @@ class Study(Long):
     retrain: bool = False
     """Train what is not finished in --models, and use no model that came with the package."""
     set: Annotated[Path | None, may_stay_open("SET")] = None
-    """Set that --retrain or smoke trains on, as in `train` (default: 2,000 rooms, rendered into --out; planes of smoke).
-    `study depth-offset` reads from it also how far models see whose runs do not say it."""
+    """Set that --retrain or smoke trains on, as in `train` (default: 2,000 rooms rendered into --out; smoke: planes).
+    `study depth-offset` also reads from it how deep the training of models was whose runs do not say it."""
     ship: bool = False
     """Put the models found into the package in half precision, with configuration and training log."""
     scene: str = "tabletop/kitchen"
@@ -192,7 +196,7 @@ class Ultraphase(Common):
     verify), or (rows, columns, count) for each core its own (run)."""
     out: File = None
     """File for the words (asm: one hexadecimal word a line), the listing (list; compile: with the tables) or the rows
-    (table, sweep: .csv)."""
+    (table, sweep: a .csv)."""
     photons: tuple[float, ...] = (550.0,)
     """Photons a pixel and frame, background included; `run` takes one whole number, `sweep` several numbers."""
     signal: Number = None

@@ -100,7 +100,10 @@ def test_the_largest_designs_can_be_named():
         (lambda: Design.named("fourier", (64, 1, 1)), "one of them"),
         (lambda: Design.named("fourier", (300, 4, 4), codes=8), "over a block of 300 x 4 x 4 has no spatial part"),
         (lambda: Design.named("fourier", (64, 4, 4), codes=0), "0 codes over a block of 64 x 4 x 4, .* from 1 to 64"),
-        (lambda: Design.named("fourier", (64, 4, 4), codes=999), "999 codes over .*, expected a whole number from 1 to"),
+        (
+            lambda: Design.named("fourier", (64, 4, 4), codes=999),
+            "999 codes over .*, expected a whole number from 1 to",
+        ),
         (lambda: make_coding(Design("coarse", (64, 1, 1), 5)), "5 gates do not divide"),
         (lambda: Design("learned", (100_000_000, 4, 4), 32), "100000000 bins are above the limit of 65536"),
         (lambda: Design.named("learned", (65537, 1, 1), codes=1), "block 65537 x 1 x 1: 65537 bins are above"),

@@ -7,12 +7,13 @@ from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 
+from scene2spad.cli.checks import CHECKPOINT, check_model, is_checkpoint
 from scene2spad.cli.experiments.ultraphase_inputs import program_of, tables_of
 from scene2spad.cli.experiments.ultraphase_run import run_frame
 from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
 from scene2spad.emulation.program_tables import all_costs, int8_temporal, verified
 from scene2spad.options.common import only_for
-from scene2spad.options.experiments import Ultraphase
+from scene2spad.options.experiments import MAX_HEADROOM_BITS, Ultraphase
 from scenes.errors import InputError, listed, require
 from scenes.files import whole_file
 from scenes.json_types import JsonObject
@@ -40,10 +41,26 @@ def run(command: Ultraphase, progress: Progress) -> dict:
     only_for(command, where, _purposes(command.action))
     needs = command.action in ("compile", "run", "asm", "list", "verify")
     require(bool(command.program) == needs, f"{where}: {_arity(command.action, needs)}")
+    if command.action == "compile":
+        _check_model(command)
     if command.out is not None:
+        table = command.action not in ("table", "sweep") or command.out.suffix.lower() == ".csv"
+        require(table, f"{command.out}: the output must end in .csv")
         check_target(command.out, Path(command.program) if needs else None)
         keep_foreign(command.out, _WRITES[command.action])
     return actions[command.action](command, progress)
+
+
+def _check_model(command: Ultraphase) -> None:
+    """Refuse what is no model, and a headroom that no code has, before torch is loaded."""
+    path, bits = Path(command.program), command.headroom
+    good = bits is None or 0 <= bits <= MAX_HEADROOM_BITS
+    require(good, f"ultraphase compile: --headroom {bits} is outside 0 to {MAX_HEADROOM_BITS}")
+    source = path.suffix == ".s"
+    kinds = f"a name of `scene2spad models`, a run's folder or its checkpoint ({CHECKPOINT})"
+    require(not source, f"{path}: is a program's source, which `ultraphase list` shows; expected {kinds}")
+    check_model(path)
+    require(not path.is_file() or is_checkpoint(path), f"{path}: is no trained model, expected {kinds}")
 
 
 def _purposes(action: str) -> dict[str, tuple[bool, str]]:
@@ -207,6 +224,9 @@ def _sweep(command: Ultraphase, progress: Progress) -> dict:
                     methods.append(one)
                 except InputError as reason:
                     refused[f"{family}-{codes}"] = str(reason)
+        asked = " ".join(map(str, command.codes))
+        none = f"ultraphase sweep: --codes {asked}: no program has so many codes; {next(iter(refused.values()), '')}"
+        require(len(refused) < 2 * len({*command.codes}), none)
     for text, values in (("photons", command.photons), ("fps", command.fps), ("pixels", command.pixels)):
         require(len(values) > 0, f"ultraphase sweep: --{text} needs a number")
     for photons, frames_per_s, pixels in product(command.photons, command.fps, command.pixels):

@@ -16,7 +16,7 @@ from scenes.files import read_array
 from scenes.random_streams import Stream
 from ultraphase import Method, Program, assemble_file, method
 from ultraphase.assembly.program import KINDS
-from ultraphase.catalog import TIMESTAMPS
+from ultraphase.catalog import FAMILIES, TIMESTAMPS
 
 MAX_PHOTONS = 20_000  # of a core
 MAX_CORES = 4096
@@ -40,7 +40,9 @@ def program_of(command: Ultraphase) -> tuple[Program, Method | None]:
     """Return the program of a name or of a source file."""
     if not command.program.endswith(".s"):
         require(not command.define, "constants by --define are for source files")
-        chosen = method(command.program)
+        far = re.fullmatch(r"([a-z]+)-(\d{5,40})", command.program)  # more codes than a name can have
+        many = far is not None and far[1] in FAMILIES
+        chosen = Method(far[1], int(far[2])) if far is not None and many else method(command.program)
         return chosen.program(), chosen
     constants = {}
     for text in command.define:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from scene2spad.cli.paths import PNG_FIGURE, check_target, keep_foreign
-from scene2spad.options.common import Common, File, Pixels, Positional, word
+from scene2spad.options.common import Common, File, Pixels, Positional, only_for, word
 from scenes.errors import InputError, require
 from scenes.library.catalog import SCENES, load_scene
 from scenes.library.sets import SETS, scene_set
@@ -30,6 +30,8 @@ class Scenes(Common):
 
 def run(command: Scenes, progress: Progress) -> dict:
     """List or describe."""
+    drawn = (command.sheet is not None, "a contact sheet (--sheet)")
+    only_for(command, "scenes", {"count": drawn, "width": drawn})
     if command.sheet is not None:
         return _sheet(command, command.sheet, progress)
     if not command.scene:

@@ -17,6 +17,7 @@ from csph.codes.temporal import block_pulse, gray_frequencies
 from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer
 from csph.networks.model import DepthModel
+from scene2spad.options.experiments import MAX_HEADROOM_BITS
 from scene2spad.studies.chip.plan import HEADROOM_BITS
 from scenes.errors import InputError, require
 from spad.sensor.model import Sensor
@@ -27,7 +28,6 @@ from ultraphase.integer_code import IntegerCode, folded_temporal
 from ultraphase.tables import block_sum, require_waves
 
 COUNTER_LIMIT = 255
-MAX_HEADROOM_BITS = 4
 
 
 @dataclass(frozen=True, eq=False)
