@@ -360,7 +360,7 @@ def make_set(
     todo = (view for view in range(count) if view not in folder.records)
     report = progress or (lambda what, fraction: None)
     start = time.perf_counter()
-    with executor(workers if missing else 1, scheduler if missing else None) as run:
+    with executor(workers if missing else 1, scheduler) as run:
         folder.begin()  # not before a scheduler has answered: a mistyped address leaves no folder
         endless = scene_set(job.set).size is None
         job = _with_grid(job, folder, run, report) if missing and endless and job.grid is None else job

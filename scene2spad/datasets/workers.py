@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import re
 import signal
 import time
 from collections import Counter
@@ -49,6 +50,13 @@ class Run(Protocol):
 def check_workers(number: int, least: int = 1) -> None:
     """Raise InputError for a number of processes that nobody means."""
     require(least <= number <= MAX_WORKERS, f"workers {number} is outside {least} to {MAX_WORKERS}")
+
+
+def check_address(scheduler: str) -> None:
+    """Raise InputError for what is no address of a Dask scheduler: whether one is there, `executor` finds out."""
+    parts = re.fullmatch(r"(?:[a-z]+://)?(?:[^\s/:\[\]]+|\[[0-9a-fA-F:.%]+\]):(\d{1,5})", scheduler)
+    good = parts is not None and 1 <= int(parts[1]) <= 65535
+    require(good, f"scheduler {scheduler}: is no address, expected tcp://HOST:PORT with a port from 1 to 65535")
 
 
 @contextmanager

@@ -24,6 +24,13 @@ def test_a_scheduler_that_is_not_there_is_one_line_and_leaves_no_folder(tmp_path
     assert not (tmp_path / "set").exists()
 
 
+def test_a_finished_set_does_not_hide_a_scheduler_that_is_not_there(tmp_path):
+    pytest.importorskip("distributed")
+    make_set(JOB, 1, tmp_path / "set")
+    with pytest.raises(InputError, match="cannot be reached"):
+        make_set(JOB, 1, tmp_path / "set", scheduler="nonsense")
+
+
 def test_a_second_run_leaves_what_a_living_one_is_writing(tmp_path):
     """Files of processes that are gone are removed, again in a process that has written to the folder before."""
     begun(tmp_path, MADE).add(finished(0))

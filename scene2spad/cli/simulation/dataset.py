@@ -71,7 +71,10 @@ def run(command: Dataset, progress: Progress) -> dict:
     """Run the command: A scene set -> a folder of .exr files, and one .h5 of them all."""
     from scene2spad.datasets.packing import check_one_size, pack_set
     from scene2spad.datasets.rendering import Job, make_set
+    from scene2spad.datasets.workers import check_address
 
+    if command.scheduler is not None:
+        check_address(command.scheduler)
     check_indirect(command, "dataset", command.bounces, ("spp", "filter"))
     only_for(command, "dataset", {"ambient_spp": (command.ambient, "ambient light (no --no-ambient)")})
     of = scene_set(command.set)
