@@ -46,7 +46,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     beside = path.with_name(f".{path.stem[:80]}.{_machine()}.{os.getpid()}.part{suffix}")
     try:
         if not path.parent.is_dir():
-            raise InputError(f"{path}: folder {path.parent} does not exist")
+            raise InputError(without_folder(path))
         if path.is_dir():
             raise InputError(f"{path}: is a folder, expected a file name")
         _sweep_once(path.parent.resolve())
@@ -59,6 +59,13 @@ def whole_file(path: Path) -> Iterator[Path]:
             beside.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or str(error).splitlines()[0]})") from None
+
+
+def without_folder(path: Path) -> str:
+    """Say why a file cannot be written that has no folder: a file is in its place, or nothing is."""
+    there = next((one for one in path.parents if one.exists()), path.parent)
+    missing = f"folder {path.parent} does not exist"
+    return f"{path}: {f'{there} is a file, expected a folder' if there.is_file() else missing}"
 
 
 def link_target(path: Path) -> Path:

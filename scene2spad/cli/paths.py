@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from scenes.errors import InputError
-from scenes.files import link_target
+from scenes.files import link_target, without_folder
 from scenes.io.hdf5 import HDF5_SUFFIXES
 
 HEAD_BYTES = 4096  # of a file, by which its format is told
@@ -65,7 +65,7 @@ def check_target(path: Path, source: Path | None = None, made: Path | None = Non
         if path.parent.resolve() in (folder, *folder.parents):
             return
     if not path.parent.is_dir():
-        raise InputError(f"{path}: folder {path.parent} does not exist")
+        raise InputError(without_folder(path))
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path}: folder {path.parent} cannot be written to")
     if path.is_dir():

@@ -23,6 +23,11 @@ def word(metavar: str) -> object:
     return tyro.conf.arg(metavar=metavar)
 
 
+def required_word(metavar: str) -> object:
+    """Return a positional argument of several values that must not stay open, with the name that its help has."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="(required)")
+
+
 Metres = tuple[float, float, float] | None
 Pixels = Annotated[int | None, may_stay_open("PIXELS")]
 Count = Annotated[int | None, may_stay_open("N")]

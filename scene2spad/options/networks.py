@@ -7,7 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from scene2spad.options.common import Common, Count, File, Long, Number, Pixels, Positional, may_stay_open, only_for
+from scene2spad.options.common import (
+    Common,
+    Count,
+    File,
+    Long,
+    Number,
+    Pixels,
+    Positional,
+    may_stay_open,
+    only_for,
+    required_word,
+)
 from scenes.errors import require
 
 TrainingPreset = Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"]
@@ -136,7 +147,7 @@ def check_used(command: Train) -> None:
 class Evaluate(Common):
     """Trained networks beside classical estimators on a rendered set, at the paper's 16 photon levels."""
 
-    checkpoints: Positional[tuple[Path, ...]]
+    checkpoints: Positional[Annotated[tuple[Path, ...], required_word("MODEL [MODEL ...]")]]
     """Checkpoints of `train`, their folders, or names of models (see `models`); the first is the one that the others
     are compared with."""
     decoder: Annotated[Literal["soft-argmax", "median"] | None, may_stay_open("{soft-argmax,median}")] = None

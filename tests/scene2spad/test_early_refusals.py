@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from contextlib import contextmanager
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from scene2spad.cli import main
 from scene2spad.datasets import rendering as dataset
 from scene2spad.datasets.rendering import Job, make_set
+from scene2spad.datasets.workers import check_address
 from scenes import InputError
 from scenes.limits import VARIABLE
 
@@ -102,9 +104,15 @@ def test_a_render_that_cannot_be_is_refused_before_it_begins(tmp_path, capsys, m
         ("tensors --design nosuch", "design 'nosuch' is unknown"),
         ("tensors --design learned --block 0 4 4", "block (0, 4, 4): expected three positive whole numbers"),
         ("tensors --design learned --block 100000000 4 4", "100000000 bins are above the limit of 65536"),
-        ("tensors --design fourier --codes 0", "0 codes over a block of 256 x 4 x 4, expected a whole number from 1 to"),
+        (
+            "tensors --design fourier --codes 0",
+            "0 codes over a block of 256 x 4 x 4, expected a whole number from 1 to",
+        ),
         ("tensors --design fourier --codes 99999", "99999 codes over a block of 256 x 4 x 4, expected a whole number"),
-        ("tensors --design fourier --block 300 4 4", "design 'fourier' over a block of 300 x 4 x 4 has no spatial part"),
+        (
+            "tensors --design fourier --block 300 4 4",
+            "design 'fourier' over a block of 300 x 4 x 4 has no spatial part",
+        ),
         ("tensors --block 300 4 4", "study tensors: --block 300 4 4 is for a --design"),
         ("tensors --checkpoints nosuch.npy", "nosuch.npy: file not found"),
         ("power --signal -1", "photon budget: signal -1 photons per pixel is outside 0 to 1e9"),
@@ -140,3 +148,81 @@ def test_a_study_that_cannot_be_is_refused_before_it_is_loaded(tmp_path, capsys,
     message = capsys.readouterr().err
     assert why in message and message.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("demo --signal nan", "photon budget: signal nan photons per pixel is outside 0 to 1e9"),
+        ("demo --width 0", "demo: --width 0 is outside 1 to 16384 pixels"),
+        ("demo --height 1000000", "demo: --height 1000000 is outside 1 to 16384 pixels"),
+        ("demo --scene castle", "scene 'castle': expected one of"),
+        ("demo --out file.txt", "file.txt: is a file, expected a folder for the demo's results"),
+        ("render plane --height 1000000", "render: --height 1000000 is outside 1 to 16384 pixels"),
+        ("ultraphase compile learned-256x2x2-128x-s0 --headroom 5", "compile: --headroom 5 is outside 0 to 4"),
+        ("ultraphase compile learned-256x2x2-128x-s0 --headroom -1", "compile: --headroom -1 is outside 0 to 4"),
+        ("ultraphase compile gate.s", "gate.s: is a program's source, which `ultraphase list` shows"),
+        ("ultraphase compile nosuch.ckpt", "nosuch.ckpt: file not found"),
+        ("ultraphase compile file.txt", "file.txt: is no trained model, expected a name of `scene2spad models`"),
+        ("evaluate none-s0 --set cut.h5", "cut.h5: is no HDF5 file of ours"),
+        ("evaluate none-s0 --set nosuch.h5", "nosuch.h5: file not found"),
+        ("evaluate nosuch.ckpt --set cut.h5", "nosuch.ckpt: file not found"),
+        ("evaluate --set cut.h5 --baselines argmax none-s0", "evaluate: no checkpoint; MODEL [MODEL ...] comes before"),
+        ("models import file.txt --out file.txt", "file.txt: is a file, expected a folder for the model"),
+        ("models import file.txt --out file.txt/m", "file.txt is a file, expected a folder"),
+        ("models import file.txt --out run", "run/model.safetensors: exists; choose another folder"),
+        ("models import nosuch.ckpt", "nosuch.ckpt: file not found"),
+    ],
+)
+def test_plain_mistakes_are_refused_before_anything_heavy_is_loaded(tmp_path, capsys, monkeypatch, words, why):
+    """Neither a model nor a renderer is called: nor can their modules be imported."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("file.txt", "cut.h5", "gate.s", "run/model.safetensors"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("mine")
+    before = {*tmp_path.rglob("*")}
+    for module in ("render.engine", "csph.networks.model", "csph.weights.cards", "csph.weights.published"):
+        monkeypatch.setitem(sys.modules, module, None)
+    assert main(words.split()) == 2
+    message = capsys.readouterr().err
+    assert why in message and message.count("\n") == 1
+    assert {*tmp_path.rglob("*")} == before
+
+
+def test_help_says_that_a_checkpoint_is_needed(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert main(["evaluate", "--help"]) == 0
+    shown = capsys.readouterr()
+    first = (shown.out + shown.err).splitlines()[0]
+    assert first.endswith("MODEL [MODEL ...]") and "[[" not in first
+    assert "compared with. (required)" in " ".join((shown.out + shown.err).replace("│", " ").split())
+
+
+@pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+@pytest.mark.parametrize("address", ["nowhere", "tcp://host", "tcp://host:0", "tcp://host:99999", "host:8786:1"])
+def test_what_is_no_address_is_refused_before_the_set_is_looked_at(tmp_path, capsys, monkeypatch, address, dry):
+    monkeypatch.setattr("scene2spad.datasets.rendering.SetFolder", None)
+    assert main([*DATASET, "--scheduler", address, "--out", str(tmp_path / "set"), *dry]) == 2
+    message = capsys.readouterr().err
+    assert f"scheduler {address}: is no address, expected tcp://HOST:PORT" in message and message.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:8786", "tls://node-3.cluster:1", "node3:65535", "tcp://[::1]:8786"]
+)
+def test_addresses_are_addresses(address):
+    check_address(address)
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["scenes --sheet a.txt/x.png", "render plane --out a.txt/x.exr", "dataset rooms --pack a.txt/p.h5 --out set"]
+    + ["ultraphase list fourier-8 --out a.txt/x.txt", "dataset rooms --pack a.txt/deep/p.h5 --out set"],
+)
+def test_a_file_where_a_folder_should_be_is_called_a_file(tmp_path, capsys, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.txt").write_text("mine")
+    assert main(words.split()) == 2
+    message = capsys.readouterr().err
+    assert message.endswith(": a.txt is a file, expected a folder\n") and message.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]

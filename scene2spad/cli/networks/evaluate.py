@@ -6,9 +6,11 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
+from scene2spad.cli.checks import check_model
 from scene2spad.cli.paths import output_folder
 from scene2spad.options.networks import Evaluate
-from scenes.errors import require
+from scenes.errors import InputError, require
+from scenes.io.hdf5 import HDF5_SUFFIXES, open_checked
 from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
@@ -20,6 +22,11 @@ def run(command: Evaluate, progress: Progress) -> dict:
     output_folder(command.out, "the table")
     twice = [name for name in command.baselines if command.baselines.count(name) > 1]
     require(not twice, f"evaluate: baseline {' '.join(twice[:1])} is named twice")
+    require(bool(command.checkpoints), "evaluate: no checkpoint; MODEL [MODEL ...] comes before the options")
+    for path in command.checkpoints:
+        check_model(path)
+    if command.set != PUBLISHED_SET:
+        _check_set(command.set)
     _check_checkpoints(command.checkpoints)
     if command.set == PUBLISHED_SET:
         from scene2spad.networks import published
@@ -31,6 +38,17 @@ def run(command: Evaluate, progress: Progress) -> dict:
         result = evaluating.run_evaluate(command, progress)
     _warn_of_old_maps(command)
     return result
+
+
+def _check_set(path: Path) -> None:
+    """Raise InputError for a set that is not there, and for a damaged pack, before torch is loaded."""
+    require(path.exists(), f"{path}: file not found")
+    if path.is_file() and path.suffix.lower() in HDF5_SUFFIXES:
+        try:
+            with open_checked(path):
+                pass
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
 
 
 def _warn_of_old_maps(command: Evaluate) -> None:

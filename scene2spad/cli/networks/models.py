@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from scene2spad.cli.checks import CHECKPOINT
+from scene2spad.cli.paths import input_file, output_folder
 from scene2spad.options.common import Common, Positional, may_stay_open, word
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
@@ -68,11 +70,14 @@ def _readable(card: JsonObject) -> JsonObject:
 def _import(command: Models) -> dict:
     if not command.file:
         raise InputError("models: import without a checkpoint, expected `models import FILE.ckpt`")
+    source = Path(command.file)
+    folder = output_folder(command.out or Path("out/models") / source.stem, "the model")
+    target = folder / f"model{CHECKPOINT}"
+    require(not target.exists(), f"{target}: exists; choose another folder")
+    input_file(source)
     from csph.weights.published import TRAINED_ON, import_checkpoint
     from spad.sensor.files import load_sensor
 
-    source = Path(command.file)
-    folder = command.out or Path("out/models") / source.stem
     made = import_checkpoint(source, folder, load_sensor(command.sensor or TRAINED_ON).sensor)
     model, design = made.config.model, made.config.model.codes_design
     log.info("depths of this model are on the published grid: bin i of T is i/(T - 1) of the range, labels whole bins")

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from scene2spad.cli.checks import check_image
 from scene2spad.cli.paths import file_stem, output_file, output_folder
 from scene2spad.cli.simulation.render import in_view
 from scene2spad.options.common import Common
@@ -44,6 +45,12 @@ class Demo(Common):
 
 def run(command: Demo, progress: Progress) -> dict:
     """Run the command: scene -> transient -> histogram -> four depth maps -> one figure."""
+    from spad.sensor.model import PhotonBudget, sensor_by_name
+
+    budget = PhotonBudget(command.signal, command.background)
+    check_image("demo", width=command.width, height=command.height)
+    folder = output_folder(command.out, "the demo's results")
+    scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
     from render.engine import render
     from render.transient import write_transient
     from scene2spad.methods import depth_method
@@ -51,11 +58,7 @@ def run(command: Demo, progress: Progress) -> dict:
     from spad.detection.detect import sense
     from spad.estimators.depth import histogram_errors
     from spad.measurements.histogram import write_histogram
-    from spad.sensor.model import PhotonBudget, sensor_by_name
 
-    budget = PhotonBudget(command.signal, command.background)
-    folder = output_folder(command.out, "the demo's results")
-    scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
     folder.mkdir(parents=True, exist_ok=True)
     light = output_file(folder / f"{file_stem(scene.name)}.exr", ".exr", "transient")
     counts = output_file(light.with_suffix(".h5"), ".h5", "histogram")

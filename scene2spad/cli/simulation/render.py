@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 
 from render.settings import RenderSettings
+from scene2spad.cli.checks import check_image
 from scene2spad.cli.paths import file_stem, output_file, picture
 from scene2spad.options.common import (
     Count,
@@ -121,6 +122,7 @@ class Render(Long):
 
 def run(command: Render, progress: Progress) -> dict:
     """Run the command: scene -> .exr and a picture of its layers."""
+    check_image("render", width=command.width, height=command.height)
     from render.engine import render
     from render.transient import write_transient
     from scene2spad.plots import figures
