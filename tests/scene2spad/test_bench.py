@@ -318,7 +318,6 @@ def test_bench_beside_mitransient_estimates_the_same_quantity(capfd, tmp_path, f
         (["--sizes", "0"], "size 0"),
         (["--seeds", "0"], "seeds 0"),
         (["--repeats", "0"], "repeats 0"),
-        (["sense", "--repeats", "1"], "bench sense: repeats 1 is below 3"),
         (["--scenes", "artist", "--data", "nowhere", "--peer", "none"], "nowhere"),
         (["--scenes", "castle"], "castle"),
     ],

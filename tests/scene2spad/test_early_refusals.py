@@ -171,7 +171,7 @@ def test_a_study_that_cannot_be_is_refused_before_it_is_loaded(tmp_path, capsys,
         ("models import file.txt --out file.txt", "file.txt: is a file, expected a folder for the model"),
         ("models import file.txt --out file.txt/m", "file.txt is a file, expected a folder"),
         ("models import file.txt --out run", "run/model.safetensors: exists; choose another folder"),
-        ("models import nosuch.ckpt", "nosuch.ckpt: file not found"),
+        ("models import nosuch.ckpt", "nosuch.ckpt: checkpoint not found"),
     ],
 )
 def test_plain_mistakes_are_refused_before_anything_heavy_is_loaded(tmp_path, capsys, monkeypatch, words, why):

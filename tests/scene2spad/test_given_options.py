@@ -102,6 +102,7 @@ def refused(capfd, argv: list[str]) -> str:
             f"evaluate {MODEL} --set published --int8-rule published",
             "evaluate: --int8-rule does not go with --set published",
         ),
+        ("bench sense --repeats 2", "bench sense: --repeats 2 is below 3"),
         ("scenes living-room --width 64", "scenes: --width 64 is for a contact sheet (--sheet)"),
         ("scenes --count 3", "scenes: --count 3 is for a contact sheet (--sheet)"),
         ("ultraphase table --out t.txt", "t.txt: the output must end in .csv"),

@@ -17,7 +17,7 @@ def run(command: Bench, progress: Progress) -> dict:
             raise InputError(f"bench: {name} {value} is outside 1 to 1000")
     stage = command.stage
     if stage == "sense" and command.repeats < MIN_SENSE_REPEATS:
-        raise InputError(f"bench sense: repeats {command.repeats} is below {MIN_SENSE_REPEATS}")
+        raise InputError(f"bench sense: --repeats {command.repeats} is below {MIN_SENSE_REPEATS}")
     purposes = {name: (stage in stages, " and ".join(stages)) for name, stages in STAGES_OF.items()}
     only_for(command, f"bench {stage}", purposes)
     return importlib.import_module(f"scene2spad.bench.{stage.replace('-', '_')}").run(command, progress)

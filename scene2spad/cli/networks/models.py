@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 from scene2spad.cli.checks import CHECKPOINT
-from scene2spad.cli.paths import input_file, output_folder
+from scene2spad.cli.paths import output_folder
 from scene2spad.options.common import Common, Positional, may_stay_open, word
 from scenes.errors import InputError, require
+from scenes.io.inputs import regular_file
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
@@ -74,7 +75,7 @@ def _import(command: Models) -> dict:
     folder = output_folder(command.out or Path("out/models") / source.stem, "the model")
     target = folder / f"model{CHECKPOINT}"
     require(not target.exists(), f"{target}: exists; choose another folder")
-    input_file(source)
+    regular_file(source, "checkpoint")
     from csph.weights.published import TRAINED_ON, import_checkpoint
     from spad.sensor.files import load_sensor
 
