@@ -26,6 +26,10 @@ def run(command: Evaluate, progress: Progress) -> dict:
     for path in command.checkpoints:
         check_model(path)
     if command.set != PUBLISHED_SET:
+        if command.maps:
+            from scene2spad.networks.depth_maps import check_free
+
+            check_free(command.out / "maps")
         _check_set(command.set)
     _check_checkpoints(command.checkpoints)
     if command.set == PUBLISHED_SET:
