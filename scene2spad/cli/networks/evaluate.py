@@ -30,6 +30,10 @@ def run(command: Evaluate, progress: Progress) -> dict:
             from scene2spad.networks.depth_maps import check_free
 
             check_free(command.out / "maps")
+        if command.levels:
+            from scene2spad.networks.evaluating import photon_levels
+
+            photon_levels(command.levels)
         _check_set(command.set)
     _check_checkpoints(command.checkpoints)
     if command.set == PUBLISHED_SET:
