@@ -155,7 +155,7 @@ def transform_normals(normals: np.ndarray, matrix4: np.ndarray) -> np.ndarray:
 
 def filled_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return vertex normals with those of length 0 replaced by the mean of the faces around, weighted by area."""
-    none: np.ndarray = ~normals.any(axis=1)
+    none = np.linalg.norm(normals, axis=1) == 0
     if not none.any():
         return normals
     a, b, c = (vertices[corner] for corner in faces.T)
